@@ -1,11 +1,6 @@
 """Estimators: the base classes of nodes that estimate poses from images, or from lidar scans."""
 
-from nodes.estimators.estimator import (
-    WORKER_ENVIRONMENT,
-    Estimator,
-    EstimatorConfig,
-)
-from nodes.estimators.lidar import LidarEstimator
+from nodes.estimators.estimator import WORKER_ENVIRONMENT, Estimator, EstimatorConfig
 from nodes.estimators.result import TrackingResult
 from nodes.estimators.rig import (
     MonocularFrame,
@@ -22,7 +17,6 @@ __all__ = [
     "WORKER_ENVIRONMENT",
     "Estimator",
     "EstimatorConfig",
-    "LidarEstimator",
     "MonocularFrame",
     "MonocularInertialFrame",
     "Mount",

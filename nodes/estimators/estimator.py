@@ -1,4 +1,4 @@
-"""The base of all estimators: choice of the camera, outputs, and the frame of the estimates.
+"""The base of all estimators: choice of the sensor, outputs, and the frame of the estimates.
 
 Poses are computed in the subclasses (`nodes.estimators.visual_odometry` and others), and judged in
 `nodes.judging.evaluation`.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence, Set
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -38,12 +39,7 @@ from events import (
 )
 from events.camera_info import COEFFICIENTS
 from nodes.estimators.rectification import ALIGNED, Rectification, misalignment
-from nodes.estimators.result import (
-    TrackingResult,
-    check_result,
-    check_shape,
-    check_transform,
-)
+from nodes.estimators.result import TrackingResult, check_result, check_trajectory
 from nodes.estimators.rig import Mount, SensorChoice
 from runtime import Bundle, Node, NodeConfig, Output, on
 from runtime.errors import DeclarationError, NodeError, suggest
@@ -94,7 +90,7 @@ C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
 
 
 class Estimator(Node[C], ABC):
-    """Base of the nodes that estimate poses from images.
+    """Base of the nodes that estimate poses from images, or from scans of a lidar.
 
     A subclass declares its input as ``frames``, a `Bundle` of one camera's images (of a stereo rig
     with the fields ``left`` and ``right``, with an IMU one more, ``imu``); says in `needs`, `eyes`,
@@ -117,6 +113,10 @@ class Estimator(Node[C], ABC):
     The tracker gives poses of the optical camera (x right, y down, z forward) in the optical camera
     at its first image. What is sent is the pose of the body (FRD) that carries the camera, as a
     `PoseEstimate`; its stamp is on the clock of the IMU (`exposed_at`).
+
+    **Lidars.** With `needs` of ``lidar`` alone, ``frames`` is an `Input` of scans. The tracker
+    gives poses of the lidar (x forward, y right, z down) in the lidar at its first scan, that of a
+    scan at its last ray; no features are sent.
 
     **Lenses.** What `refusal` says no to, and stereo pairs that are not `aligned`, is rectified
     beside the loop (`nodes.estimators.rectification`) before `frames` gives it, unless the setting
@@ -152,7 +152,8 @@ class Estimator(Node[C], ABC):
     """
 
     needs: frozenset[str] = frozenset()
-    """Kinds of image that the camera must give, all of them; ``rgb`` serves for ``grey``, too."""
+    """Kinds of image that the camera must give, all of them (``rgb`` serves for ``grey``, too); or
+    ``lidar`` alone."""
     eyes: int = 1
     """Number of cameras whose images it takes together; 2 for a stereo rig, whose left camera is
     that of the poses."""
@@ -181,11 +182,9 @@ class Estimator(Node[C], ABC):
     imu_announcement: ImuAnnouncement | None = None
     """The IMU whose samples are read, if it is `inertial`."""
     _vehicles: tuple[VehicleAnnouncement, ...] = ()
-    _choice: SensorChoice | None = None
     _rectification: Rectification | None = None
     _mounts: Mapping[int, Mount] = MappingProxyType({})
     _frame = ""
-    _given: Mapping[str, str] = MappingProxyType({})
     _lost = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
 
@@ -212,6 +211,11 @@ class Estimator(Node[C], ABC):
         bundle.name = "frames"
         vars(self)["frames"] = bundle.make(self.name)
 
+    @cached_property
+    def _choice(self) -> SensorChoice:
+        named = dict(self.sources)
+        return SensorChoice(self.needs, self.eyes, self.inertial, named, self._refusals)
+
     @property
     def camera(self) -> CameraAnnouncement | None:
         """The camera whose pose is estimated; `None` before it is known."""
@@ -227,7 +231,7 @@ class Estimator(Node[C], ABC):
             reads=(*sorted(self.needs), *(["imu"] if self.inertial else [])),
             eyes=self.eyes,
             lenses=tuple(sorted(self.lenses)),
-            rectifies=self.config.rectify,
+            rectifies=self.config.rectify and "lidar" not in self.needs,
         )
 
     def on_announcement(self, announcement: Announcement) -> None:
@@ -238,22 +242,22 @@ class Estimator(Node[C], ABC):
         """
         if isinstance(announcement, VehicleAnnouncement):
             self._vehicles += (announcement,)
-        if self._choice is None:
-            self._given = dict(self.sources)
-            self._choice = self._new_choice(self._given)
-        before = self._choice.cameras
-        self._choice.announced(announcement)
-        if self._choice.cameras is not before:
-            self._take(self._choice.cameras)
+        choice = self._choice
+        before, lidar = choice.cameras, choice.lidar
+        choice.announced(announcement)
+        if choice.cameras is not before:
+            self._take(choice.cameras)
             self.imu_announcement = None
-        if self.imu_announcement is None and self._choice.imu is not None:
-            self.imu_announcement = self._choice.imu
-            self._narrow_to("frames.imu", self._choice.imu.source)
+        if self.imu_announcement is None and choice.imu is not None:
+            self.imu_announcement = choice.imu
+            self._narrow_to("frames.imu", choice.imu.source)
+        if choice.lidar is not None and lidar is None:
+            self._narrow_to("frames", choice.lidar.source)
 
     def _take(self, cameras: tuple[CameraAnnouncement, ...]) -> None:
         """Read the images of these cameras, rectified if they are of no use as they are."""
         self.cameras, self._rectification = cameras, None
-        if self._choice is not None and self._choice.rectified:
+        if self._choice.rectified:
             self._rectification = Rectification(cameras)
             self.cameras = self._rectification.cameras
         for matcher in matchers(self).values():
@@ -264,15 +268,12 @@ class Estimator(Node[C], ABC):
 
     def _narrow_to(self, port: str, source: str) -> None:
         """Receive this source, and not the one before, unless the file names another."""
-        if port not in self._given:
+        if port not in self._choice.named:
             self.sources[port] = source
 
     async def _rectify(self, frame: F) -> F:
         assert self._rectification is not None
         return await self.offload(self._rectification.frame, frame)
-
-    def _new_choice(self, named: Mapping[str, str]) -> SensorChoice:
-        return SensorChoice(self.needs, self.eyes, self.inertial, named, self._refusals)
 
     def _refusals(self, cameras: Sequence[CameraAnnouncement], rectified: bool) -> dict[str, str]:
         """Return why images are of no use, as they are or rectified, by their cameras' sources."""
@@ -334,19 +335,32 @@ class Estimator(Node[C], ABC):
             self.log.fatal("%s", self._missing())
         return self.camera
 
+    def the_lidar(self) -> LidarAnnouncement:
+        """Return the announcement of the lidar whose scans are read.
+
+        Raises:
+            FatalError: There is none.
+        """
+        if self._choice.lidar is None:
+            self.log.fatal("%s", self._missing())
+        return self._choice.lidar
+
     def exposed_at(self, image: Frame) -> int:
         """Return when an image was exposed on the clock of IMU and ground truth (ns).
 
-        That is its stamp without the offset of the camera's clock, which was announced.
+        That is its stamp without the offset of the camera's clock, which was announced; of a scan
+        the time of its last ray.
         """
+        if isinstance(image, LidarScan):
+            return image.end
         return image.stamp - round(self.the_camera().time_offset * 1e9)
 
     def _sensor(self) -> CameraAnnouncement | LidarAnnouncement:
         """Return what the tracker gives the pose of."""
-        return self.the_camera()
+        return self._choice.lidar or self.the_camera()
 
     def _missing(self) -> str:
-        return (self._choice or self._new_choice({})).missing()
+        return self._choice.missing()
 
     def publish(self, image: Frame, result: TrackingResult, origin: int | None = None) -> None:
         """Send what a tracker found in an image: features, pose, and whether tracking was lost.
@@ -399,6 +413,8 @@ class Estimator(Node[C], ABC):
             self.tracking_events.send(TrackingLost(stamp=stamp, source=self.name, reason=reason))
 
     def _send_features(self, image: Frame, result: TrackingResult) -> None:
+        if isinstance(image, LidarScan):
+            return
         points = result.points
         if self._rectification is not None:
             points = self._rectification.eyes[0].original(points).astype(np.float32)
@@ -424,12 +440,7 @@ class Estimator(Node[C], ABC):
             poses: The optical camera as in `TrackingResult`, shape (n, 4, 4).
         """
         try:
-            check_shape("poses", poses, (len(stamps), 4, 4))
-            for pose, stamp in zip(poses, stamps.tolist(), strict=True):
-                which = f"pose at {stamp / 1e9:.3f} s"
-                if not np.isfinite(pose).all():
-                    raise ValueError(f"{which}: expected finite numbers, found others")
-                check_transform(which, pose)
+            check_trajectory(stamps, poses)
         except ValueError as error:
             raise NodeError(self.name, f"final trajectory: {error}") from None
         if (mount := self._mounts.get(number)) is not None and len(stamps):

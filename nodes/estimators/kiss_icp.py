@@ -1,13 +1,6 @@
-"""KISS-ICP as a node: the scans it reads, and the estimates it sends.
-
-KISS-ICP itself, by `kiss_icp`, for a worker's process.
-
-    kiss = await self.worker(KissIcpProcess, lidar, settings, latency=…)
-    result = await kiss.call(KissIcpProcess.track, scan.points, scan.times)
+"""KISS-ICP, in a worker's process, and the node that feeds it scans and sends its estimates.
 
 The library is imported when an object is made, so that others may import this module for its names.
-
-Settings of KISS-ICP.
 """
 
 from __future__ import annotations
@@ -18,8 +11,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import LidarAnnouncement
-from nodes.estimators import WORKER_ENVIRONMENT, EstimatorConfig, LidarEstimator, TrackingResult
+from events import LidarAnnouncement, LidarScan
+from nodes.estimators import WORKER_ENVIRONMENT, Estimator, EstimatorConfig, TrackingResult
+from runtime import Input
 from runtime.errors import MissingDependencyError
 from runtime.extras import install_command
 
@@ -129,14 +123,18 @@ class KissIcpConfig(EstimatorConfig):
     kiss: KissIcpSettings = KissIcpSettings()
 
 
-class KissIcp(LidarEstimator[KissIcpConfig]):
+class KissIcp(Estimator[KissIcpConfig]):
     """Estimates the pose of a lidar by KISS-ICP, in a process of its own.
 
     I. Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
     """
 
+    needs = frozenset({"lidar"})
+    lenses = frozenset()
     method = "KISS-ICP"
     library = "kiss_icp", INSTALL
+
+    frames = Input(LidarScan, keep="latest")
 
     async def on_ready(self) -> None:
         """Start KISS-ICP, in a process of its own."""

@@ -57,15 +57,25 @@ def check_result(result: Any) -> str:
     given |= {"velocity": (result.velocity, (3,))} if result.velocity is not None else {}
     given |= {"covariance": (result.covariance, (6, 6))} if result.covariance is not None else {}
     for name, (array, shape) in given.items():
-        check_shape(name, array, shape)
+        _check_shape(name, array, shape)
     for name, (array, _) in given.items():
         if not np.isfinite(array).all():
             return f"{name}: expected finite numbers, found {array[~np.isfinite(array)][0]}"
-    check_transform("pose", result.pose)
+    _check_transform("pose", result.pose)
     return ""
 
 
-def check_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
+def check_trajectory(stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float64]) -> None:
+    """Raise `ValueError` if these are no poses, shape (n, 4, 4), for stamps (ns), shape (n,)."""
+    _check_shape("poses", poses, (len(stamps), 4, 4))
+    for pose, stamp in zip(poses, stamps.tolist(), strict=True):
+        which = f"pose at {stamp / 1e9:.3f} s"
+        if not np.isfinite(pose).all():
+            raise ValueError(f"{which}: expected finite numbers, found others")
+        _check_transform(which, pose)
+
+
+def _check_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
     """Raise `ValueError` if something is no array of real numbers of a shape."""
     numbers = isinstance(array, np.ndarray) and array.dtype.kind in "fiu"
     if not numbers or array.shape != shape:
@@ -74,7 +84,7 @@ def check_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
         )
 
 
-def check_transform(name: str, pose: npt.NDArray[Any]) -> None:
+def _check_transform(name: str, pose: npt.NDArray[Any]) -> None:
     """Raise `ValueError` if a matrix of finite numbers, shape (4, 4), is no rigid transform."""
     turn = pose[:3, :3]
     off = np.abs(turn.T @ turn - np.eye(3)).max()

@@ -1,9 +1,4 @@
-"""Which of the announced sensors an estimator reads: one camera or a stereo rig, and an IMU.
-
-Bundles that estimators read: images of one exposure, and what belongs to them.
-
-From poses of a camera to poses of the body that carries it.
-"""
+"""The sensors of an estimator: their choice, what is read of them together, and their mounting."""
 
 from __future__ import annotations
 
@@ -33,7 +28,7 @@ from runtime.errors import suggest
 
 
 class SensorChoice:
-    """Chooses among what is announced, as far as it is known.
+    """Choice of one camera or a stereo rig, and an IMU, or of a lidar, among what is announced.
 
     Args:
         needs: Kinds of image that each camera must give.
@@ -50,6 +45,8 @@ class SensorChoice:
             images are of use as they are come before those that have to be rectified.
         rectified: Whether their images have to be.
         imu: The chosen IMU, on the vehicle of the first camera; `None` while there is none.
+        lidar: The chosen lidar, if one is needed; `None` while there is none.
+        named: As given.
     """
 
     def __init__(
@@ -63,6 +60,8 @@ class SensorChoice:
         self.cameras: tuple[CameraAnnouncement, ...] = ()
         self.rectified = False
         self.imu: ImuAnnouncement | None = None
+        self.lidar: LidarAnnouncement | None = None
+        self.named = named
         self._needs, self._eyes, self._inertial = frozenset(needs), eyes, inertial
         self._first = named.get("frames.left", named.get("frames"))
         self._second = named.get("frames.right")
@@ -73,8 +72,12 @@ class SensorChoice:
         self._refusals: dict[str, str] = {}
 
     def announced(self, announcement: Announcement) -> None:
-        """Take note of a camera or an IMU, and choose if that is possible now."""
-        if isinstance(announcement, CameraAnnouncement):
+        """Take note of a camera, an IMU or a lidar, and choose if that is possible now."""
+        if "lidar" in self._needs:
+            fits = self._first in (None, announcement.source)
+            if isinstance(announcement, LidarAnnouncement) and fits and self.lidar is None:
+                self.lidar = announcement
+        elif isinstance(announcement, CameraAnnouncement):
             self._seen.append(announcement)
             if not self.cameras or self.rectified:
                 self._choose_cameras()
@@ -86,6 +89,9 @@ class SensorChoice:
 
     def missing(self) -> str:
         """Return what is not there, in a sentence; empty if nothing is missing."""
+        if "lidar" in self._needs:
+            called = f" called {self._first}" if self._first else ""
+            return "" if self.lidar else f"expected a lidar{called}, found none"
         if not self.cameras:
             return self._no_camera()
         if self._inertial and self.imu is None:

@@ -1,13 +1,7 @@
-"""SVO as a node: the images it reads, and the estimates it sends.
+"""SVO, in a worker's process, and the node that feeds it images and sends its estimates.
 
-SVO itself, by `svo_cpp`. For a worker's process: it is GPL, and it may end or crash it.
-
-    svo = await self.worker(SvoProcess, camera.info, settings, latency=…)
-    result = await svo.call(SvoProcess.track, stamp, image)
-
-The library is imported when an object is made, so that others may import this module for its names.
-
-Settings of SVO, and the names that its own configuration has for them.
+It is under the GPL, and may end or crash its process. The library is imported when an object is
+made, so that others may import this module for its names.
 """
 
 from __future__ import annotations
