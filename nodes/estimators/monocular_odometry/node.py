@@ -6,8 +6,8 @@ import cv2
 
 from events import CameraInfo
 from nodes.estimators import WORKER_ENVIRONMENT, Estimator, EstimatorConfig, MonocularFrame
+from nodes.estimators.monocular_odometry.geometry import MonocularSettings
 from nodes.estimators.monocular_odometry.tracker import MonocularTracker
-from nodes.estimators.monocular_odometry.views import MonocularSettings
 from runtime import Bundle
 
 

@@ -3,9 +3,7 @@
 In the manner of sparse, semi-direct methods (C. Forster, M. Pizzoli and D. Scaramuzza, "SVO", ICRA
 2014): patches are aligned with the last key frame directly, poses come from the landmarks behind
 them, and new landmarks from two views far enough apart; the last key frames and their landmarks are
-then adjusted together. The unit of length is the first map's.
-
-The first map is made in `nodes.estimators.monocular_odometry.initialization`, and extended in
+then adjusted together. The unit of length is the first map's. Maps are made in
 `nodes.estimators.monocular_odometry.local_map`.
 """
 
@@ -19,10 +17,8 @@ import numpy.typing as npt
 from events import CameraInfo
 from events.geometry import inverse
 from nodes.estimators import TrackingResult
-from nodes.estimators.monocular_odometry.bundle import Indices
-from nodes.estimators.monocular_odometry.initialization import Initialization
-from nodes.estimators.monocular_odometry.local_map import LocalMap
-from nodes.estimators.monocular_odometry.views import Keyframe, MonocularSettings
+from nodes.estimators.monocular_odometry.geometry import Indices, Keyframe, MonocularSettings
+from nodes.estimators.monocular_odometry.local_map import Initialization, LocalMap
 from nodes.estimators.odometry.images import (
     Floats,
     Grey,

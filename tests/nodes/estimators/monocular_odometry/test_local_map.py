@@ -1,4 +1,4 @@
-"""The map between images: what a new key frame adds to it, corrects and forgets."""
+"""The map: how it begins, and what a new key frame adds to it, corrects and forgets."""
 
 from __future__ import annotations
 
@@ -6,10 +6,24 @@ import numpy as np
 import pytest
 
 from events.geometry import inverse
-from nodes.estimators.monocular_odometry.initialization import InitialMap
-from nodes.estimators.monocular_odometry.local_map import LocalMap
-from nodes.estimators.monocular_odometry.views import MonocularSettings
-from tests.nodes.estimators.monocular_odometry.world import MATRIX, Floats, Grey, pose
+from nodes.estimators.monocular_odometry.geometry import SPACING, MonocularSettings, new_corners
+from nodes.estimators.monocular_odometry.local_map import (
+    Initialization,
+    InitialMap,
+    LocalMap,
+    Tracks,
+)
+from tests.nodes.estimators.monocular_odometry.world import (
+    FLAT,
+    MATRIX,
+    RELIEF,
+    STEPPED,
+    Floats,
+    Grey,
+    Tile,
+    look,
+    pose,
+)
 
 BLANK: Grey = np.zeros((192, 256), np.uint8)
 """There are no corners in it: tracks are those that the tests give."""
@@ -115,3 +129,91 @@ def test_a_remembered_key_frame_is_a_map() -> None:
     np.testing.assert_array_equal(again.tracks.pixels, made.tracks.pixels[:40])
     again.tracks.points += 1.0
     np.testing.assert_array_equal(made.keyframe().landmarks, POINTS[:40])
+
+
+def initialized(path: list[Floats], tiles: tuple[Tile, ...]) -> tuple[InitialMap, int]:
+    """Return the first map and the number of its second image."""
+    initialization = Initialization(MATRIX, MonocularSettings())
+    for number, place in enumerate(path):
+        found = initialization.add(look(place, tiles))
+        if found is not None:
+            return found, number
+    pytest.fail("no map")
+
+
+WAY = [pose(0.05 * i, 0.01 * i, 0.0, yaw=0.2 * i) for i in range(20)]
+
+
+@pytest.mark.parametrize("tiles", [FLAT, STEPPED, RELIEF], ids=["flat", "stepped", "relief"])
+def test_motion_and_landmarks_are_those_of_the_world(tiles: tuple[Tile, ...]) -> None:
+    found, number = initialized(WAY, tiles)
+    np.testing.assert_array_equal(found.first, look(WAY[0], tiles))
+    assert np.median(found.points[:, 2]) == pytest.approx(1.0)
+    true = inverse(WAY[number])
+    unit = np.linalg.norm(true[:3, 3]) / np.linalg.norm(found.second[:3, 3])
+    np.testing.assert_allclose(found.second[:3, :3], true[:3, :3], atol=5e-3)
+    np.testing.assert_allclose(unit * found.second[:3, 3], true[:3, 3], atol=5e-3)
+    depths = np.array([tile[0] for tile in tiles])
+    off = np.abs(unit * found.points[:, 2, None] - depths).min(axis=1)
+    assert np.median(off) < 0.02
+    nearest = np.abs(unit * found.points[:, 2, None] - depths).argmin(axis=1)
+    assert len(set(nearest.tolist())) >= min(3, len(tiles))  # not of one depth only
+
+
+def test_landmarks_are_seen_where_the_map_says() -> None:
+    found, _ = initialized(WAY, RELIEF)
+    for view, pixels in zip((np.eye(4), found.second), found.pixels, strict=True):
+        seen = found.points @ view[:3, :3].T + view[:3, 3]
+        again = (seen @ MATRIX.T)[:, :2] / seen[:, 2:]
+        assert np.linalg.norm(again - pixels, axis=1).max() < 2.0
+
+
+def test_it_waits_for_the_motion_that_is_asked_for() -> None:
+    initializations = [
+        Initialization(MATRIX, MonocularSettings(keyframe_shift=shift)) for shift in (15.0, 35.0)
+    ]
+    numbers = [
+        next(number for number, place in enumerate(WAY) if initialization.add(look(place, FLAT)))
+        for initialization in initializations
+    ]
+    assert numbers[0] < numbers[1]
+
+
+def test_too_few_corners_begin_anew_with_the_next_image() -> None:
+    dark: Grey = np.zeros((192, 256), np.uint8)
+    initialization = Initialization(MATRIX, MonocularSettings())
+    assert initialization.add(look(WAY[0])) is None
+    assert initialization.add(dark) is None
+    found = None
+    for place in WAY[4:]:
+        found = found or initialization.add(look(place))
+    assert found is not None
+    np.testing.assert_array_equal(found.first, look(WAY[4]))
+
+
+HERE = look(pose(), FLAT)
+
+
+def test_tracks_remember_their_views_and_hand_over_landmarks_that_leave() -> None:
+    tracks = Tracks(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), 0)
+    assert not tracks.known.any()
+    tracks.points[:2] = [[0, 0, 1], [0, 0, 2]]
+    gone = tracks.keep(np.array([1, 2]))
+    assert [(point.tolist(), views) for point, views in gone] == [([0, 0, 1], {0: (1, 2)})]
+    tracks.add_view(1, np.array([[3.5, 4.0], [5.5, 6.0]]))
+    tracks.add(np.array([[9.0, 9.0]]), 1)
+    assert tracks.views == [{0: (3, 4), 1: (3.5, 4)}, {0: (5, 6), 1: (5.5, 6)}, {1: (9, 9)}]
+    assert tracks.known.tolist() == [True, False, False]
+    tracks.drop(np.array([0]))
+    assert tracks.pixels.tolist() == [[5.5, 6], [9, 9]]
+    assert len(tracks) == len(tracks.views) == len(tracks.points) == 2
+
+
+def test_corners_keep_away_from_each_other_and_from_those_that_are_taken() -> None:
+    some = new_corners(HERE, np.empty((0, 2)), 40)
+    more = new_corners(HERE, some, 40)
+    together = np.concatenate([some, more])
+    gaps = np.linalg.norm(together[:, None] - together, axis=2) + 99 * np.eye(len(together))
+    assert gaps.min() > SPACING - 1
+    assert len(some) == 40
+    assert new_corners(np.zeros_like(HERE), some, 40).shape == (0, 2)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from nodes.estimators import TrackingResult
+from nodes.estimators.monocular_odometry.geometry import MonocularSettings
 from nodes.estimators.monocular_odometry.tracker import MonocularTracker
-from nodes.estimators.monocular_odometry.views import MonocularSettings
 from tests.nodes.estimators.monocular_odometry.world import (
     BOARD,
     FLAT,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nodes.estimators.monocular_odometry.views import new_corners
+from nodes.estimators.monocular_odometry.geometry import new_corners
 from nodes.estimators.odometry.images import follow_both_ways, inside
 from tests.nodes.estimators.monocular_odometry.world import FLAT, INFO, look, pose
 

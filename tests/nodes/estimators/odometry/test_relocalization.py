@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nodes.estimators.monocular_odometry.views import new_corners
+from nodes.estimators.monocular_odometry.geometry import new_corners
 from nodes.estimators.odometry.images import Floats
 from nodes.estimators.odometry.pose import Observations, rays, solve_pose
 from nodes.estimators.odometry.relocalization import (
