@@ -16,7 +16,7 @@ from events.frames import from_rpy
 from nodes.calibration import proofs
 from nodes.calibration.allan import Curve, needed, noise
 from nodes.calibration.proofs import Figure, Points
-from nodes.calibration.readers import CENTRE, Motion, _Collector, mjcf
+from nodes.calibration.room import CENTRE, Motion, _Collector, mjcf
 from nodes.data.dataset.recording import choose
 from nodes.trajectory.formats import tum_row
 from runtime.config.model import Config, NodeSpec, to_builtins

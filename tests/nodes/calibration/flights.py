@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Imu, Odometry, PoseStamped, Vector3
-from nodes.calibration.readers import CENTRE, Floats, Motion, _Collector, hits
+from nodes.calibration.room import CENTRE, Floats, Motion, _Collector, hits
 from tests.nodes.calibration.samples import IMU
 
 ANGLE = 0.08

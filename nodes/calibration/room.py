@@ -1,0 +1,244 @@
+"""The room in which a rig is proven: its surfaces, what sensors send in it, and the true motion.
+
+Black walls, and white spheres in every direction. Its surfaces are known as numbers, so what a ray
+meets is computed here and not by a renderer.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PoseStamped,
+    Quaternion,
+    TakenOff,
+    Vector3,
+)
+from runtime import Node, on
+
+Floats = npt.NDArray[np.float64]
+
+
+CENTRE = np.array([0.0, 0.0, -1.5])
+"""About where the vehicle flies, metres in ``map``."""
+
+LOW, HIGH = np.array([-6.0, -6.0, -5.0]), np.array([6.0, 6.0, 0.0])
+"""Corners of the room, metres in ``map``: the floor is at 0, the ceiling at -5."""
+
+NEAREST = 0.45
+"""Metres along the optical axis within which only the vehicle itself can be seen."""
+
+_COUNT = 130
+
+
+def spheres(angle: float) -> tuple[Floats, Floats]:
+    """Return the spheres' centres (metres in ``map``, shape (n, 3)) and radii (metres, (n,)).
+
+    They lie on a spiral of equal areas, seen from the room's centre, before the walls.
+
+    Args:
+        angle: Half of the angle that each takes up from there, radians.
+    """
+    number = np.arange(_COUNT) + 0.5
+    down = 1.0 - 2.0 * number / _COUNT
+    around = np.pi * (1.0 + 5.0**0.5) * number
+    flat = np.sqrt(1.0 - down**2)
+    direction = np.column_stack([flat * np.cos(around), flat * np.sin(around), down])
+    # As far as it clears every wall by half its radius.
+    slow = np.maximum(np.hstack([direction, -direction]), 0.0) + 1.5 * np.sin(angle)
+    distance = (np.hstack([HIGH - CENTRE, CENTRE - LOW]) / slow).min(axis=1)
+    return CENTRE + direction * distance[:, None], np.sin(angle) * distance
+
+
+def mjcf(angle: float) -> str:
+    """Return the room as a world file; x is north, y west, z up there."""
+    walls = []
+    for axis, (low, high) in enumerate(zip(LOW, HIGH, strict=True)):
+        for side, face in ((-1.0, low), (1.0, high)):
+            place, size = (LOW + HIGH) / 2.0, (HIGH - LOW) / 2.0 + 0.2
+            place[axis], size[axis] = face + side * 0.1, 0.1
+            walls.append(f'<geom type="box" size="{_text(size)}" pos="{_text(place, -1)}"/>')
+    balls = [
+        f'<geom type="sphere" size="{radius:.9f}" pos="{_text(centre, -1)}" material="white" '
+        'rgba="1 1 1 1" contype="0" conaffinity="0"/>'
+        for centre, radius in zip(*spheres(angle), strict=True)
+    ]
+    return f"""<mujoco model="calibration room">
+  <option timestep="0.001"/>
+  <visual>
+    <quality numslices="96" numstacks="96" offsamples="8"/>
+    <headlight ambient="0 0 0" diffuse="0 0 0" specular="0 0 0"/>
+  </visual>
+  <default><geom rgba="0 0 0 1"/></default>
+  <asset><material name="white" rgba="1 1 1 1" emission="1" specular="0"/></asset>
+  <worldbody>
+    {"".join(walls)}
+    {"".join(balls)}
+  </worldbody>
+</mujoco>
+"""
+
+
+def hits(angle: float, origins: Floats, rays: Floats) -> tuple[Floats, npt.NDArray[np.int64]]:
+    """Return what rays meet first.
+
+    Args:
+        angle: As of `spheres`.
+        origins: Metres in ``map``, within the room, shape (n, 3).
+        rays: Unit directions in ``map``, shape (n, 3).
+
+    Returns:
+        Distances, metres, shape (n,); and what is met: the number of a sphere, or below 0 a wall.
+    """
+    with np.errstate(divide="ignore"):
+        faces = np.where(rays > 0, HIGH - origins, LOW - origins) / rays
+    wall = faces.argmin(axis=1)
+    best, what = (
+        faces.min(axis=1),
+        -1 - wall - 3 * (np.take_along_axis(rays, wall[:, None], 1)[:, 0] > 0),
+    )
+    for number, (centre, radius) in enumerate(zip(*spheres(angle), strict=True)):
+        to = centre - origins
+        along = (to * rays).sum(axis=1)
+        inside = radius**2 - ((to * to).sum(axis=1) - along**2)
+        distance = along - np.sqrt(np.maximum(inside, 0.0))
+        nearer = (inside > 0.0) & (distance > 0.0) & (distance < best)
+        best, what = np.where(nearer, distance, best), np.where(nearer, number, what)
+    return best, what
+
+
+def _text(vector: Floats, sign: int = 1) -> str:
+    x, y, z = vector
+    return f"{x:.9f} {sign * y:.9f} {sign * z:.9f}"
+
+
+_SAMPLES = 1500
+"""Pixels of a depth image that are kept."""
+
+
+class _Collector(Node):
+    """Keeps what sensors send, in memory, images in grey; no node to be listed for a file."""
+
+    reads_truth = "judging"
+
+    def __init__(self) -> None:
+        self.cameras: dict[str, CameraAnnouncement] = {}
+        self.imu_announced: ImuAnnouncement | None = None
+        self.odometry: list[Odometry] = []
+        self.imu: list[Imu] = []
+        self.taken_off = 0
+        self.images: dict[str, dict[int, npt.NDArray[np.uint8]]] = defaultdict(dict)
+        self.poses: dict[str, dict[int, PoseStamped]] = defaultdict(dict)
+        self.depths: dict[str, dict[int, npt.NDArray[np.float64]]] = defaultdict(dict)
+        """Rows of column, row and depth (metres), by source and stamp."""
+        self.own: dict[str, dict[int, npt.NDArray[np.bool_]]] = defaultdict(dict)
+        """Where the vehicle itself is seen, by source and stamp."""
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Note cameras and the IMU."""
+        if isinstance(announcement, CameraAnnouncement):
+            self.cameras[announcement.source] = announcement
+        elif isinstance(announcement, ImuAnnouncement):
+            self.imu_announced = announcement
+
+    @on(Odometry, Imu, TakenOff, PoseStamped)
+    def note(self, event: Event) -> None:
+        """Keep where vehicle and cameras are, what the IMU measures, and when the vehicle flies."""
+        if isinstance(event, Odometry):
+            self.odometry.append(event)
+        elif isinstance(event, Imu):
+            self.imu.append(event)
+        elif isinstance(event, PoseStamped):
+            self.poses[event.source][event.stamp] = event
+        else:
+            self.taken_off = event.stamp
+
+    @on(Image)
+    def note_image(self, event: Image) -> None:
+        """Keep an image in grey."""
+        grey = event.data if event.data.ndim == 2 else cv2.cvtColor(event.data, cv2.COLOR_RGB2GRAY)
+        self.images[event.source][event.stamp] = np.asarray(grey, np.uint8)
+
+    @on(DepthImage)
+    def note_depth(self, event: DepthImage) -> None:
+        """Keep some pixels of a depth image, the same of each, and where the vehicle is seen."""
+        depth = event.data
+        pixels = np.random.default_rng(0).integers(0, depth.size, _SAMPLES)
+        rows, columns = np.divmod(pixels, depth.shape[1])
+        kept = np.column_stack([columns, rows, depth[rows, columns]])
+        self.depths[event.source][event.stamp] = kept.astype(np.float64)
+        self.own[event.source][event.stamp] = depth < NEAREST
+
+
+Stamps = npt.NDArray[np.int64]
+
+
+class Motion:
+    """The true motion of a body: cubic between odometry's rows, with their twists.
+
+    Args:
+        rows: Of one body, two or more, in order.
+    """
+
+    def __init__(self, rows: Sequence[Odometry]) -> None:
+        self.stamps: Stamps = np.array([row.stamp for row in rows], np.int64)
+        self.rotations = Rotation.from_quat([row.orientation for row in rows], scalar_first=True)
+        self.positions: Floats = np.array([row.position for row in rows])
+        self.velocities = self.rotations.apply([row.linear_velocity for row in rows])
+        self.rates: Floats = np.array([row.angular_velocity for row in rows])
+        seconds = (self.stamps - self.stamps[0]) / 1e9
+        self._place = CubicHermiteSpline(seconds, self.positions, self.velocities)
+
+    def at(self, stamps: Stamps) -> tuple[Floats, Rotation]:
+        """Return positions (metres, shape (n, 3)) and rotations to the parent frame at some times.
+
+        Args:
+            stamps: Nanoseconds, shape (n,), within those of the rows.
+        """
+        after = np.clip(np.searchsorted(self.stamps, stamps), 1, len(self.stamps) - 1)
+        before = after - 1
+        length = ((self.stamps[after] - self.stamps[before]) / 1e9)[:, None]
+        share = ((stamps - self.stamps[before]) / 1e9)[:, None] / length
+        base = self.rotations[before]
+        whole = (base.inv() * self.rotations[after]).as_rotvec()
+        first, last = self.rates[before] * length, self.rates[after] * length
+        last = last + 0.5 * np.cross(whole, last)  # as the rotation vector changes there
+        vector = (
+            (share**3 - 2 * share**2 + share) * first
+            + (3 * share**2 - 2 * share**3) * whole
+            + (share**3 - share**2) * last
+        )
+        seconds = (stamps - self.stamps[0]) / 1e9
+        return np.asarray(self._place(seconds)), base * Rotation.from_rotvec(vector)
+
+    def mounted(
+        self, stamps: Stamps, position: Vector3, orientation: Quaternion
+    ) -> tuple[Floats, Rotation]:
+        """Return the same of what is mounted on the body, at a pose in its frame."""
+        place, turn = self.at(stamps)
+        return place + turn.apply(position), turn * Rotation.from_quat(
+            orientation, scalar_first=True
+        )
+
+    def rows_of(self, camera: CameraAnnouncement, stamp: int) -> tuple[Floats, Rotation]:
+        """Return a camera's pose at each of its rows, of an image with a stamp."""
+        height = camera.info.height
+        share = np.arange(height) / max(height - 1, 1) - 0.5
+        times = np.asarray(stamp - camera.time_offset * 1e9 + camera.readout * 1e9 * share)
+        rounded = np.clip(np.rint(times).astype(np.int64), self.stamps[0], self.stamps[-1])
+        return self.mounted(rounded, camera.position, camera.orientation)
