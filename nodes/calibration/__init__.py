@@ -2,5 +2,5 @@
 
 `formats` writes what was announced as the files of other programs, `readers` reads those files
 without knowing how they were written; `export` adds a recording's data. `rules` says what is odd
-about a rig before it flies (``lint``), and `proof` flies it and measures (``selftest``).
+about a rig before it flies (``lint``), and `command` flies it and measures (``selftest``).
 """

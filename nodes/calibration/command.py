@@ -1,19 +1,233 @@
-"""``selftest`` and ``lint``: whether a rig is what it says, and whether it says what is meant."""
+"""``selftest`` and ``lint``: whether a rig is what it says, and whether it says what is meant.
+
+For the self-test a file's vehicles are flown alone in the calibration room, and held against what
+they announced.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import math
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import typer
 
-from nodes.calibration.selftest import TITLES, Result
+from events import CameraAnnouncement, Image, ImuAnnouncement, Odometry
+from events.frames import from_rpy
+from nodes.calibration import proofs
+from nodes.calibration.allan import Curve, needed, noise
+from nodes.calibration.proofs import Figure, Points
+from nodes.calibration.room import CENTRE, Motion, _Collector, mjcf
+from nodes.data.dataset.recording import choose
 from nodes.judging.report import style
 from nodes.judging.report.page import embedded, page_of
+from nodes.trajectory.formats import tum_row
+from runtime.config.model import Config, NodeSpec, to_builtins
+from runtime.config.reading import load_configuration, parse
+from runtime.errors import ConfigError
 from runtime.paths import source_file
+from runtime.run.execute import execute
+from runtime.run.results import claim
+from runtime.run.supervisor import Supervisor
+from runtime.tools import preflight
 from runtime.tools.cli.commands import ConfigFile, Overrides
+from runtime.tools.cli.run import leave_behind
+from runtime.units import Duration
+
+TITLES = {
+    1: "The ideal IMU integrates to the truth",
+    2: "The IMU's Allan deviation is as announced",
+    3: "Known points fall on their pixels",
+    4: "Depth lies on true surfaces",
+    5: "Exported calibrations project the same",
+    6: "Stamps of image, depth, pose and IMU agree",
+}
+
+_KEPT = {
+    *("name", "images", "width", "height", "fov", "intrinsics", "lens", "undistorted", "stereo"),
+    *("position", "orientation", "rate", "latency", "readout", "time_offset"),
+}
+"""Settings of a camera that say where and when it looks; what blurs a measurement is at its
+default, which is off."""
+
+_SECONDS, _RATE = 9.0, 5.0
+"""Length of the flight; images a second, about."""
+
+_COLLECTOR = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
+
+
+class Result(msgspec.Struct, eq=False):
+    """What was proven of one vehicle.
+
+    Attributes:
+        vehicle: Its name.
+        figures: By number of the proof.
+        notes: What was switched off, or cannot be shown.
+        curves: Allan deviations.
+        points: By source of the camera.
+    """
+
+    vehicle: str
+    figures: dict[int, list[Figure]]
+    notes: list[str]
+    curves: list[Curve]
+    points: dict[str, Points]
+
+    def passed(self) -> bool:
+        """Whether every figure is within its limit."""
+        return all(figure.passed for figures in self.figures.values() for figure in figures)
+
+
+def subjects(config: Config) -> list[NodeSpec]:
+    """Return the nodes of a file that carry sensors through a world: simulators, by their ports.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    found = [
+        spec
+        for spec in config.nodes
+        if {Image, Odometry} <= {output.event for output in spec.node.declared.outputs.values()}
+        and "world" in spec.config.__struct_fields__
+    ]
+    if not found:
+        names = ", ".join(spec.type_name for spec in config.nodes)
+        raise ConfigError(f"expected a node that simulates a vehicle or a camera, found {names}")
+    return found
+
+
+def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Result:
+    """Fly one vehicle of a file, and return what that proves.
+
+    Args:
+        folder: For the room, the exported files and a free camera's path.
+        standing: Seconds of simulated time that the IMU may stand for proof 2, at most.
+
+    Raises:
+        ConfigError: The file cannot be flown.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    table = _alone(config, spec)
+    world = folder / "room.xml"
+    table["world"] = str(world.resolve())
+    world.write_text(mjcf(0.05), encoding="utf-8")
+    brought_up = preflight.of_nodes(_config([table], config, 1.0))
+    if brought_up.errors:
+        raise ConfigError("; ".join(brought_up.errors))
+    announced = brought_up.announcements
+    cameras = [each for each in announced if isinstance(each, CameraAnnouncement)]
+    focal = min((each.info.fx for each in cameras), default=256.0)
+    angle = float(np.clip(13.0 / focal, 0.035, 0.08))
+    world.write_text(mjcf(angle), encoding="utf-8")
+    notes = [
+        f"Each camera takes about {_RATE:g} images a second, without noise, blur and what else is "
+        "not geometry or time; the error of its depth is switched off, too."
+    ]
+    kept = _run(_flight(table, folder), config)
+    motion = Motion(kept.odometry)
+    result = Result(spec.name, {number: [] for number in TITLES}, notes, [], {})
+    figures = result.figures
+    imu = next((each for each in announced if isinstance(each, ImuAnnouncement)), None)
+    if imu is None or kept.imu_announced is None:
+        notes.append(f"{spec.name} has no IMU: proofs 1 and 2 do not apply.")
+    else:
+        begin = max(kept.imu[0].stamp, kept.taken_off) + 50_000_000  # in mid-flight
+        figures[1].append(proofs.integration(kept.imu_announced, kept.imu, motion, begin))
+        seconds = needed(imu, standing)
+        still = _run([table | {"cameras": [], "control_rate": 20}, _COLLECTOR], config, seconds)
+        samples = {
+            "gyroscope": np.array([sample.angular_velocity for sample in still.imu]),
+            "accelerometer": np.array([sample.linear_acceleration for sample in still.imu]),
+        }
+        for curve, found in noise(imu, samples):
+            result.curves.append(curve)
+            figures[2] += found
+    for camera in kept.cameras.values():
+        points = None
+        if kept.images[camera.source]:
+            points = proofs.discs(camera, kept, motion, angle)
+            result.points[camera.source] = points
+            figures[3].append(proofs.projection(camera, points))
+        if "depth" in camera.images:
+            figures[4].append(proofs.depth(camera, kept, motion, angle))
+        figures[6] += proofs.stamps(camera, kept, motion, points)
+    if imu is not None and kept.imu_announced is not None:
+        figures[6].append(proofs.lateness(kept.imu_announced, kept, motion))
+    if kept.cameras:
+        rig = choose([*kept.cameras.values(), *([imu] if imu else [])], spec.name)
+        figures[5] += proofs.exported(rig, folder / "calibration")
+    return result
+
+
+def _alone(config: Config, spec: NodeSpec) -> dict[str, Any]:
+    """Return the vehicle's own table, at the centre of the room, with nothing that listens."""
+    (table,) = (each for each in to_builtins(config)["nodes"] if each["name"] == spec.name)
+    for key in ("inputs", "links", "barometer", "gnss", "magnetometer", "range_finders", "lidars"):
+        table.pop(key, None)
+    for camera in table.get("cameras", ()):
+        for key in set(camera) - _KEPT:
+            del camera[key]
+        camera["rate"] /= max(math.ceil(camera["rate"] / _RATE - 1e-9), 1)
+        images = set(camera["images"]) | {"depth"}
+        camera["images"] = sorted(images if images & {"rgb", "grey"} else images | {"rgb"})
+    if "trajectory" in spec.config.__struct_fields__:
+        table["rate"] /= max(math.ceil(table["rate"] / _RATE - 1e-9), 1)
+    else:
+        table |= {"position": [0.0, 0.0], "height": 0.0}
+    return table  # type: ignore[no-any-return]
+
+
+def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
+    """Return the nodes of the flight: still, then up, then moving about all axes."""
+    if "trajectory" in table:
+        path = folder.resolve() / "path.tum"
+        path.write_text("".join(_path()), encoding="utf-8")
+        return [table | {"trajectory": str(path)}, _COLLECTOR]
+    pilot = {
+        "name": "selftest_pilot",
+        "type": "WaypointFollower",
+        "start_delay": "0.1s",
+        "waypoints": [[0.0, 0.0, float(CENTRE[2])], [0.4, 0.0, float(CENTRE[2])]],
+        "heading": "fixed",
+        "excitation": {"duration": "6s", "amplitude": 0.3, "frequency": 0.4, "yaw": 45.0},
+    }
+    if "imu" in table:
+        table = table | {"imu": table["imu"] | {"ideal": True}}
+    return [table, pilot, _COLLECTOR]
+
+
+def _path() -> Iterator[str]:
+    """Yield a smooth path about all axes for a free camera, as rows of a TUM file."""
+    for millisecond in range(round(_SECONDS * 1e3) + 1):
+        t = millisecond / 1e3
+        x, y, z = (0.4 * math.sin(w * t) for w in (2.5, 3.2, 2.0))
+        yaw, pitch, roll = (a * math.sin(w * t) for a, w in ((0.8, 1.1), (0.3, 1.9), (0.3, 2.3)))
+        place = (float(CENTRE[0]) + x, float(CENTRE[1]) + y, float(CENTRE[2]) + z)
+        yield tum_row(millisecond * 1_000_000, place, from_rpy(roll, pitch, yaw))
+
+
+def _config(nodes: list[dict[str, Any]], config: Config, seconds: float) -> Config:
+    run = {"seed": config.run.seed, "duration": seconds, "digest": False, "log": "warning"}
+    return parse({"run": run, "nodes": nodes}, "selftest")
+
+
+def _run(nodes: list[dict[str, Any]], config: Config, seconds: float = _SECONDS) -> _Collector:
+    """Run nodes, and return the last of them."""
+    kept: list[Supervisor] = []
+
+    @contextlib.contextmanager
+    def watch(supervisor: Supervisor) -> Iterator[None]:
+        kept.append(supervisor)
+        yield
+
+    execute(_config(nodes, config, seconds), watch=watch)
+    (found,) = (node for node in kept[0].state.all_nodes if isinstance(node, _Collector))
+    return found
 
 
 def selftest(
@@ -35,13 +249,6 @@ def selftest(
     the stamps of image, depth, pose and IMU agree. Writes selftest.html, with all figures.
     Ends with 0 if all is proven, and 1 if something is not as announced.
     """
-    from nodes.calibration.selftest import prove, subjects
-    from runtime.config.reading import load_configuration
-    from runtime.errors import ConfigError
-    from runtime.run.results import claim
-    from runtime.tools.cli.run import leave_behind
-    from runtime.units import Duration
-
     settings = load_configuration(config, overrides or [])
     try:
         seconds = float(Duration.parse(standing))
@@ -86,12 +293,6 @@ def lint(
     [run] accept = ["rule"] or ["rule:drone/camera"]. Ends with 0, with 1 if there is a finding,
     with 2 if the file is wrong.
     """
-    import sys
-
-    from runtime.config.reading import load_configuration
-    from runtime.tools import preflight
-    from runtime.tools.cli.run import leave_behind
-
     settings = load_configuration(config, overrides or [])
     brought_up = preflight.of_nodes(settings)
     errors = brought_up.errors

@@ -13,9 +13,8 @@ import pytest
 
 from events import Announcement, CameraAnnouncement, ImuAnnouncement
 from nodes.calibration.allan import Curve
-from nodes.calibration.command import write_page
+from nodes.calibration.command import Result, prove, subjects, write_page
 from nodes.calibration.proofs import Figure, Points
-from nodes.calibration.selftest import Result, prove, subjects
 from runtime.config.reading import load, parse
 from runtime.errors import ConfigError
 from sims.computer_vision import FreeCamera
