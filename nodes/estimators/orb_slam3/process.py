@@ -7,12 +7,7 @@
 The library is imported when an object is made, so that others may import this module for its
 names. It prints much, to standard output, which a worker gathers.
 
-One frame for all of ORB-SLAM3's maps, whose own frames it rotates, scales and merges.
-
-ORB-SLAM3's world is that of its present map: when it has been lost for long it starts another one
-at identity, when it recognizes a place it merges the two, and when the IMU's scale and gravity
-become known it turns the world upright. What stays is the map's first key frame, whose present
-pose is read whenever the world may have changed.
+`Anchor` gives one frame to all of ORB-SLAM3's maps, whose own frames it rotates, scales and merges.
 """
 
 from __future__ import annotations
@@ -54,14 +49,22 @@ class KeyFrame(NamedTuple):
 class Anchor:
     """Takes poses from ORB-SLAM3's worlds to the frame of the very first key frame.
 
+    ORB-SLAM3's world is that of its present map: when it has been lost for long it starts another
+    one at identity, when it recognizes a place it merges the two, and when the IMU's scale and
+    gravity become known it turns the world upright. What stays is the map's first key frame, whose
+    present pose is read whenever the world may have changed.
+
     A map that starts after tracking was lost is put at the last known pose of the camera, since
     nothing better is known: so the motion in between is missing, until the maps are merged.
+
+    Attributes:
+        last: The last pose that was known; identity before the first.
     """
 
     def __init__(self) -> None:
         self._first: dict[float, Floats] = {}  # first key frames of all maps, in our frame
         self._from_world = np.eye(4)
-        self._last = np.eye(4)
+        self.last = np.eye(4)
         self._doubted = False
         self._map = 0.0  # stamp of its first key frame
 
@@ -84,7 +87,7 @@ class Anchor:
         known = first.stamp in self._first
         if not known:
             begin = np.linalg.inv(pose) @ first.pose  # first key frame in the camera now
-            self._first[first.stamp] = self._last @ begin if self._first else np.eye(4)
+            self._first[first.stamp] = self.last @ begin if self._first else np.eye(4)
         from_world = self._first[first.stamp] @ np.linalg.inv(first.pose)
         # The world may turn between the moment of the pose and that of the key frame's: then the
         # old one fits this pose, and the new one the next.
@@ -95,7 +98,7 @@ class Anchor:
 
     def _jump(self, from_world: Floats, pose: Floats) -> float:
         """Return how far a pose would be from the last one."""
-        return float(np.linalg.norm((from_world @ pose)[:3, 3] - self._last[:3, 3]))
+        return float(np.linalg.norm((from_world @ pose)[:3, 3] - self.last[:3, 3]))
 
     def first(self, stamp: float) -> tuple[int, Floats] | None:
         """Return a map's number and its first key frame in our frame, by that one's stamp."""
@@ -104,13 +107,8 @@ class Anchor:
 
     def place(self, pose: Floats) -> Floats:
         """Return a pose in the frame of the very first key frame; remembered as the last one."""
-        self._last = self._from_world @ pose
-        return self._last
-
-    @property
-    def last(self) -> Floats:
-        """The last pose that was known; identity before the first."""
-        return self._last
+        self.last = self._from_world @ pose
+        return self.last
 
 
 def first_key_frame(trajectory: Path) -> KeyFrame | None:

@@ -185,14 +185,12 @@ def _distances(descriptors: Bytes, centres: Bytes) -> Integers:
     return distances
 
 
-def cached_vocabulary(shape: TreeShape, cache_dir: Path | None = None) -> Path:
+def cached_vocabulary(shape: TreeShape) -> Path:
     """Return the path of the vocabulary of this shape, whether it exists or not.
 
-    Args:
-        shape: Shape of its tree, on which the file's name depends.
-        cache_dir: ``$XDG_CACHE_HOME``, or ``~/.cache``, if not given.
+    It is below ``$XDG_CACHE_HOME``, or ``~/.cache``.
     """
-    base = cache_dir or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
     key = hashlib.sha256(msgspec.json.encode(shape)).hexdigest()[:12]
     return base / "visnav-runtime" / f"orb-vocabulary-{key}.txt"
 
@@ -263,19 +261,13 @@ def check_vocabulary(path: Path) -> tuple[int, int]:
             f"{path}: line 1: expected branching 2 to 20, depth 1 to 10, scoring 0 to 5, "
             f"weighting 0 to 3, found {header.strip()!r}"
         )
-    _numbers(path, 2, first)
-    return branching, depth
-
-
-def _numbers(path: Path, number: int, line: str) -> list[float]:
-    """Return the numbers of a node's line."""
     try:
-        row = [float(word) for word in line.split()]
+        count = len([float(word) for word in first.split()])
     except ValueError:
-        row = []
-    if len(row) != _FIELDS:
+        count = 0
+    if count != _FIELDS:
         raise ValueError(
-            f"{path}: line {number}: expected {_FIELDS} numbers (parent, leaf, 32 bytes, weight), "
-            f"found {line.strip()[:60]!r}"
+            f"{path}: line 2: expected {_FIELDS} numbers (parent, leaf, 32 bytes, weight), "
+            f"found {first.strip()[:60]!r}"
         )
-    return row
+    return branching, depth
