@@ -1,14 +1,15 @@
-"""A tilted wall with a random image on it, and a camera that moves in front of it.
+"""What tests of ORB-SLAM3 see: a tilted wall with a random image, and a camera that moves there.
 
-What the camera sees is exact: the image and its view are related by a homography, and depth is
-where the ray meets the plane.
+The image and its view are related by a homography, depth is where the ray meets the plane: both
+are exact. Besides, a node that sees one image again and again, and a stub of ORB-SLAM3's process.
 """
 
 from __future__ import annotations
 
 import math
 from functools import cache
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import msgspec
@@ -16,7 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
+from events import CameraAnnouncement, CameraInfo, Image, ImuAnnouncement
+from nodes.estimators.orb_slam3.process import OrbSlam3Result, check_arrays
+from nodes.estimators.orb_slam3.settings import Settings
+from runtime import Node, Output, Tick, every
 
 Floats = npt.NDArray[np.float64]
 
@@ -115,3 +119,50 @@ def _shot(
     along = np.stack([u, v, np.ones_like(u)], -1) @ rays.T @ _NORMAL
     depth = (left / along).astype(np.float32)
     return np.asarray(rgb), depth
+
+
+class Still(Node):
+    """Sends the same image ten times a second."""
+
+    images = Output(Image)
+
+    def __init__(self) -> None:
+        self._image = views(1)[0].rgb
+
+    @every(hz=10)
+    def show(self, tick: Tick) -> None:
+        """Send it."""
+        self.images.send(
+            Image(stamp=tick.stamp, source=f"{self.name}/front", frame_id="f", data=self._image)
+        )
+
+
+class StubProcess:
+    """Takes what `OrbSlam3Process` does; each image is a metre further than the last one.
+
+    The reason of a result names the arrays that came; the final trajectory is half as long.
+    """
+
+    def __init__(self, settings: Settings, vocabulary: Path, mapping_timeout: float) -> None:
+        self._settings = settings
+        self._stamps: list[int] = []
+
+    def track(self, stamp: int, image: Any, depth: Any, right: Any, imu: Any) -> OrbSlam3Result:
+        check_arrays(self._settings, image, depth, right, imu)
+        pose = np.eye(4)
+        pose[2, 3] = len(self._stamps)
+        self._stamps.append(stamp)
+        lost = len(self._stamps) == 3
+        given = {"depth": depth, "right": right, "imu": imu}
+        shapes = [f"{name} {a.shape}" for name, a in given.items() if a is not None]
+        return OrbSlam3Result(
+            pose=pose, lost=lost, reason=", ".join(shapes), first_keyframe=self._stamps[0]
+        )
+
+    def trajectory(self) -> tuple[Any, Any]:
+        poses = np.tile(np.eye(4), (len(self._stamps), 1, 1))
+        poses[:, 2, 3] = 0.5 * np.arange(len(self._stamps))
+        return np.array(self._stamps), poses
+
+    def close(self) -> None:
+        pass

@@ -23,7 +23,7 @@ from nodes.estimators.orb_slam3 import OrbSlam3
 from runtime.errors import NodeError, RefusedError
 from runtime.node import make_node
 from runtime.testing import run_nodes, spec
-from tests.nodes.estimators.orb_slam3.stub import StubProcess
+from tests.nodes.estimators.orb_slam3.scene import StubProcess
 from tests.nodes.estimators.test_estimator import MS, camera, imu, rgbd, sample, vehicle
 from tests.runtime.small_events import NoHost
 

@@ -21,7 +21,7 @@ duration = "1s"
 
 [[nodes]]
 name = "camera"
-type = "tests.nodes.estimators.orb_slam3.still:Still"
+type = "tests.nodes.estimators.orb_slam3.scene:Still"
 
 [[nodes]]
 name = "slam"
