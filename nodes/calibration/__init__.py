@@ -1,6 +1,6 @@
 """Calibrations in everybody's words, and the proof that they are true.
 
-`formats` writes what was announced as the files of other programs, `readers` reads those files
-without knowing how they were written; `export` adds a recording's data. `rules` says what is odd
-about a rig before it flies (``lint``), and `command` flies it and measures (``selftest``).
+`formats` writes what was announced as the files of other programs, with a recording's data;
+`readers` reads those files without knowing how they were written. `rules` says what is odd about a
+rig before it flies (``lint``), and `command` flies it in the `room` and measures (``selftest``).
 """

@@ -310,7 +310,7 @@ def export(
     gets images, IMU data and ground truth if the run has a recording. A lens that a format has no
     word for is refused.
     """
-    from nodes.calibration.export import export_calibration
+    from nodes.calibration.formats import export_calibration
     from runtime.errors import ConfigError
 
     try:

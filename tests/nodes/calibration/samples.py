@@ -1,12 +1,24 @@
-"""Rigs for tests of calibrations."""
+"""Rigs, and a flight in the calibration room without a simulator: images are cast ray by ray."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from events import CameraAnnouncement, CameraInfo, ImuAnnouncement, Vector3
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from events import (
+    CameraAnnouncement,
+    CameraInfo,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PoseStamped,
+    Vector3,
+)
 from events.camera_info import DistortionModel
 from events.frames import OPTICAL_TO_FRD, from_rpy, multiply
+from nodes.calibration.room import CENTRE, Floats, Motion, _Collector, hits
 from nodes.data.dataset.recording import Rig
 
 IMU = ImuAnnouncement(
@@ -76,3 +88,93 @@ def stereo(lens: str = "pinhole", **more: Any) -> Rig:
         **more,
     )
     return Rig("drone", (camera("left", lens, **more), right), IMU)
+
+
+ANGLE = 0.08
+
+
+def true_motion(seconds: Floats) -> tuple[Floats, Rotation]:
+    """Return places and rotations of a smooth motion from rest about all axes."""
+    share = np.clip(seconds, 0.0, 1.0)
+    swell = (share**3 * (10.0 - 15.0 * share + 6.0 * share**2))[:, None]
+    places = CENTRE + 0.4 * swell * np.sin(np.outer(seconds, [2.5, 3.2, 2.0]))
+    angles = swell * np.sin(np.outer(seconds, [1.1, 1.9, 2.3])) * [0.8, 0.3, 0.3]
+    return places, Rotation.from_euler("ZYX", angles)
+
+
+def twist(seconds: Floats, step: float = 1e-4) -> tuple[Floats, Floats, Floats]:
+    """Return velocities and accelerations in the world and angular velocities in the body."""
+    (before, turned), (now, _), (after, turning) = (
+        true_motion(seconds + d) for d in (-step, 0.0, step)
+    )
+    rates = (turned.inv() * turning).as_rotvec() / (2 * step)
+    return (after - before) / (2 * step), (after - 2 * now + before) / step**2, rates
+
+
+def flown(*cameras: CameraAnnouncement, length: float = 6.0, images: int = 4) -> _Collector:
+    """Return what cameras and an ideal IMU send on that motion, as they announce it."""
+    kept = _Collector()
+    seconds = np.arange(0.0, length, 0.005)
+    places, turns = true_motion(seconds)
+    velocities, accelerations, rates = twist(seconds)
+    speeds = turns.inv().apply(velocities)
+    forces = turns.inv().apply(accelerations - [0.0, 0.0, 9.81])
+    for k, second in enumerate(seconds):
+        common: dict[str, Any] = {
+            "stamp": round(second * 1e9),
+            "angular_velocity": vector(rates[k]),
+        }
+        w, x, y, z = turns[k].as_quat(scalar_first=True).tolist()
+        kept.note(
+            Odometry(
+                source="drone",
+                position=vector(places[k]),
+                orientation=(w, x, y, z),
+                linear_velocity=vector(speeds[k]),
+                **common,
+            )
+        )
+        kept.note(Imu(source="drone/imu", linear_acceleration=vector(forces[k]), **common))
+    kept.imu_announced = IMU
+    motion = Motion(kept.odometry)
+    for camera in cameras:
+        kept.cameras[camera.source] = camera
+        for true in np.linspace(1.2, min(length, 4.0) - 0.2, images):
+            expose(kept, camera, motion, round(true * 1e9))
+    return kept
+
+
+def expose(kept: _Collector, camera: CameraAnnouncement, motion: Motion, stamp: int) -> None:
+    """Add an image, its depth and the poses of its rows."""
+    info = camera.info
+    columns, rows = np.meshgrid(np.arange(info.width), np.arange(info.height))
+    rays = info.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
+    places, turns = motion.rows_of(camera, stamp)
+    distance, what = hits(ANGLE, places[rows.ravel()], turns[rows.ravel()].apply(rays))
+    size = (info.height, info.width)
+    kept.images[camera.source][stamp] = np.where(what >= 0, 255, 0).astype(np.uint8).reshape(size)
+    depth = (distance * rays[:, 2]).reshape(size)
+    kept.own[camera.source][stamp] = np.zeros(size, np.bool_)
+    picked = np.random.default_rng(1).integers(0, depth.size, 300)
+    v, u = np.divmod(picked, info.width)
+    kept.depths[camera.source][stamp] = np.column_stack([u, v, depth[v, u]])
+    half = round(camera.readout * 5e8)
+    for row, shift in ((0, -half), (-1, half), (info.height // 2, 0)):
+        if shift or row > 0:
+            at = np.array([stamp + shift - round(camera.time_offset * 1e9)])
+            place, turn = motion.mounted(at, camera.position, camera.orientation)
+            w, x, y, z = turn[0].as_quat(scalar_first=True).tolist()
+            kept.note(
+                PoseStamped(
+                    stamp=stamp + shift,
+                    source=camera.source,
+                    position=vector(place[0]),
+                    orientation=(w, x, y, z),
+                )
+            )
+
+
+def vector(numbers: Floats) -> Vector3:
+    """Return three numbers as a tuple."""
+    x, y, z = numbers.tolist()
+    return (x, y, z)

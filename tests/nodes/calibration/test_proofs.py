@@ -18,8 +18,7 @@ from nodes.calibration import proofs
 from nodes.calibration.allan import noise, trials, variances
 from nodes.calibration.room import HIGH, LOW, Motion, _Collector, hits, mjcf, spheres
 from nodes.data.dataset.recording import Rig
-from tests.nodes.calibration.flights import ANGLE, flown, true_motion, twist
-from tests.nodes.calibration.samples import IMU, camera
+from tests.nodes.calibration.samples import ANGLE, IMU, camera, flown, true_motion, twist
 
 pytestmark = pytest.mark.slow
 
