@@ -1,9 +1,9 @@
 """Visual odometry of a single camera: sparse, semi-direct, with local bundle adjustment.
 
-`tracker` is the method, `local_map` makes and extends its map, `geometry` is that of several views,
-`node` the node.
+`tracker` is the method and its node, `local_map` makes and extends the map, `geometry` is that of
+several views.
 """
 
-from nodes.estimators.monocular_odometry.node import MonocularOdometry, MonocularOdometryConfig
+from nodes.estimators.monocular_odometry.tracker import MonocularOdometry, MonocularOdometryConfig
 
 __all__ = ["MonocularOdometry", "MonocularOdometryConfig"]

@@ -1,4 +1,4 @@
-"""Monocular odometry on corners: poses from landmarks, landmarks from poses, both adjusted.
+"""Monocular odometry on corners, and its node: poses from landmarks, landmarks from poses.
 
 In the manner of sparse, semi-direct methods (C. Forster, M. Pizzoli and D. Scaramuzza, "SVO", ICRA
 2014): patches are aligned with the last key frame directly, poses come from the landmarks behind
@@ -11,12 +11,19 @@ from __future__ import annotations
 
 from collections import deque
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
 from events.geometry import inverse
-from nodes.estimators import TrackingResult
+from nodes.estimators import (
+    WORKER_ENVIRONMENT,
+    Estimator,
+    EstimatorConfig,
+    MonocularFrame,
+    TrackingResult,
+)
 from nodes.estimators.monocular_odometry.geometry import Indices, Keyframe, MonocularSettings
 from nodes.estimators.monocular_odometry.local_map import Initialization, LocalMap
 from nodes.estimators.odometry.images import (
@@ -29,6 +36,7 @@ from nodes.estimators.odometry.images import (
 )
 from nodes.estimators.odometry.pose import Observations, Solution, intrinsics, solve_pose
 from nodes.estimators.odometry.relocalization import describe, detect_and_describe, relocalize
+from runtime import Bundle
 
 _AGREES = 6.0
 """Standard deviations up to which a landmark agrees with a pose."""
@@ -221,3 +229,47 @@ class MonocularTracker:
             points=pixels.astype(np.float32),
             inliers=np.zeros(len(pixels), np.bool_),
         )
+
+
+class MonocularOdometryConfig(EstimatorConfig):
+    """Settings of monocular odometry.
+
+    Attributes:
+        tracker: Settings of the tracker.
+    """
+
+    tracker: MonocularSettings = MonocularSettings()
+
+
+class MonocularOdometry(Estimator[MonocularOdometryConfig]):
+    """Estimates the pose of a single camera, in a unit of length of its own."""
+
+    needs = frozenset({"grey"})
+    lenses = frozenset()
+    method = "monocular odometry"
+    scale_free = True
+
+    frames = Bundle(MonocularFrame, keep="latest")
+
+    async def on_ready(self) -> None:
+        """Start the tracker, in a process of its own."""
+        self._tracker = await self.worker(
+            make_tracker,
+            self.the_camera().info,
+            self.config.tracker,
+            latency=self.config.latency,
+            env=WORKER_ENVIRONMENT,
+        )
+
+    async def run(self) -> None:
+        """Track each image; nothing is sent until there is a map."""
+        async for (image,) in self.frames:
+            result = await self._tracker.call(MonocularTracker.track, image.stamp, image.data)
+            if result is not None:
+                self.publish(image, result)
+
+
+def make_tracker(info: CameraInfo, settings: MonocularSettings) -> MonocularTracker:
+    """Make the tracker in the process that will run it."""
+    cv2.setNumThreads(1)
+    return MonocularTracker(info, settings)
