@@ -36,6 +36,9 @@ THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))
 G = slice(15, 17)
 """That of gravity's direction: small rotations about the two level axes."""
 POSE = slice(0, 6)
+_FRAME = 7
+"""What is considered of a key frame: its pose, and by how much the inverse depths of its landmarks
+are off in the mean, 1/m: by that, a motion seen by them is too long or too short."""
 _SIZE = 17
 GRAVITY = 9.81
 _SPEED = 3.0
@@ -182,7 +185,7 @@ class InertialFilter:
 
     def forget(self) -> None:
         """Forget all key frames: a new map begins."""
-        capacity = 6 * (self._capacity + _BESIDE)
+        capacity = _FRAME * (self._capacity + _BESIDE)
         self._frames: dict[int, tuple[Floats, Floats]] = {}
         self._with_frames = np.zeros((_SIZE, capacity))
         self._of_frames = np.zeros((capacity, capacity))
@@ -199,17 +202,20 @@ class InertialFilter:
         at = int(self._slots(np.array([number]))[0])
         self._frames.pop(number - self._capacity, None)
         self._frames[number] = self.state.rotation, self.state.position
-        here = slice(at, at + 6)
+        here, depth = slice(at, at + 6), at + 6
         self._of_frames[here] = self._with_frames[POSE]
         self._of_frames[:, here] = self._with_frames[POSE].T
         self._of_frames[here, here] = self.covariance[POSE, POSE]
+        self._of_frames[depth], self._of_frames[:, depth] = 0.0, 0.0
         if placed is not None and len(placed.places):
             group, numbers = np.zeros(len(placed.places), np.intp), np.array([number])
             found = self._by_landmarks(self.state, placed, group, numbers)
             told = np.zeros((6, 6)) if found is None else found[0][POSE, POSE]
-            told = told / (1.0 + self._common[1] * (len(placed.places) - 1))
-            self._of_frames[here, here] += np.linalg.inv(told + np.eye(6) / _VAGUE**2)
+            shared = 1.0 + self._common[1] * (len(placed.places) - 1)
+            self._of_frames[here, here] += np.linalg.inv(told / shared + np.eye(6) / _VAGUE**2)
+            self._of_frames[depth, depth] = shared / (placed.scale[:, 2] ** 2).sum()
         self._with_frames[:, here] = self.covariance[:, POSE]
+        self._with_frames[:, depth] = 0.0
 
     def propagate(self, motion: Preintegrated) -> None:
         """Let a motion pass that the IMU felt, with the biases of the present state."""
@@ -266,17 +272,17 @@ class InertialFilter:
         found = camera @ inverse(self.camera)
         rotation, position = self._frames[number]
         relative = rotation.T @ found[:3, :3], rotation.T @ (found[:3, 3] - position)
-        by = np.zeros((6, 12))
+        by = np.zeros((6, 6 + _FRAME))
         by[:, :6] = np.eye(6)
         by[:3, 6:9], by[3:, 6:9] = -relative[0].T, rotation @ cross(relative[1])
-        by[3:, 9:] = -np.eye(3)
+        by[3:, 9:12] = -np.eye(3)
         mounted = self.camera[:3, :3].T
         small = np.zeros((6, 6))
         small[:3, :3], small[:3, 3:] = mounted @ cross(self.camera[:3, 3]), -camera[:3, :3].T
         small[3:, :3] = -mounted
         told = small.T @ information @ small
         if first:
-            here = self._slots(np.array([number]))
+            here = self._slots(np.array([number]))[POSE]
             lasting = np.linalg.inv(told + np.eye(6) / _VAGUE**2)
             self._of_frames[np.ix_(here, here)] += lasting
         weighted = by.T @ told
@@ -330,9 +336,9 @@ class InertialFilter:
         return True
 
     def _slots(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return where the poses of key frames stand, shape (6 n,)."""
+        """Return where key frames stand, shape (7 n,)."""
         place = np.where(numbers < 0, self._capacity - 1 - numbers, numbers % self._capacity)
-        return np.asarray((6 * place[:, None] + np.arange(6)).ravel())
+        return np.asarray((_FRAME * place[:, None] + np.arange(_FRAME)).ravel())
 
     def _by_landmarks(
         self,
@@ -358,12 +364,17 @@ class InertialFilter:
         rotations = np.array([rotation for rotation, _ in frames])[group]
         positions = np.array([position for _, position in frames])[group]
         arms = np.einsum("nji,nj->ni", rotations, seen.places - positions)
-        matrix = np.zeros((len(image), 3, 1 + len(numbers), 6))
-        matrix[:, :, 0, :3], matrix[:, :, 0, 3:] = by_body @ crosses(in_body), -by_world
-        rows = np.arange(len(image))
-        matrix[rows, :, 1 + group, :3] = -by_world @ rotations @ crosses(arms)
-        matrix[rows, :, 1 + group, 3:] = by_world
-        flat = matrix.reshape(3 * len(image), -1)
+        by_pose = np.dstack([by_body @ crosses(in_body), -by_world])
+        matrix = np.zeros((len(image), 3, len(numbers), _FRAME))
+        rows, by_arm = np.arange(len(image)), by_world @ rotations
+        matrix[rows, :, group, :3] = -by_arm @ crosses(arms)
+        matrix[rows, :, group, 3:6] = by_world
+        # A landmark moves along its first ray by its distance, times its depth there.
+        ray = arms - self.camera[:3, 3]
+        away = -ray * (ray @ self.camera[:3, 2:3])
+        matrix[rows, :, group, 6] = np.einsum("nij,nj->ni", by_arm, away)
+        flat = np.concatenate([by_pose, matrix.reshape(len(image), 3, -1)], axis=2)
+        flat = flat.reshape(3 * len(image), -1)
         share = 1.0 / (1.0 + self._common[0] * (len(image) - 1))
         return share * (flat.T @ flat), share * (flat.T @ (weight * residual).ravel())
 

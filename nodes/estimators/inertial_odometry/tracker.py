@@ -2,7 +2,8 @@
 
 The IMU says where the map should be in the next image, all landmarks found there correct the
 filter (tightly coupled: none is too few), and the filter's pose is what the map grows from. Where
-landmarks are few, an alignment of edges and surfaces corrects it, too. Where nothing is seen, the
+landmarks are few, a camera with depth corrects it by an alignment of edges and surfaces, too; a
+stereo rig, whose coarse depth is wrong there, has few landmarks only. Where nothing is seen, the
 IMU alone carries the pose on, for a while; then the camera is lost, and what it does not find
 again becomes a new map, in a frame of its own.
 """
@@ -50,6 +51,8 @@ _MISFIT = 1.5
 _PATIENCE, _DOUBTED = 0.4, 0.6
 """Seconds over which the share of images is taken whose landmarks contradict the filter, and that
 beyond which the filter is not believed: it begins anew, in a frame of its own."""
+_PREDICTED = np.diag(np.repeat([0.05**-2, 0.02**-2], 3))
+"""Information that the predicted pose counts with when landmarks are chosen: 5 cm, 0.02 radians."""
 _SLOTS = (-1, -2)
 """Numbers of the images that may be the reference of an alignment, beside those of key frames."""
 
@@ -97,6 +100,8 @@ class InertialTracker(FeatureTracker):
             features = msgspec.structs.replace(features, depth_noise=self._matcher.depth_noise)
             surfaces = self._matcher.surfaces_at
         super().__init__(camera.info, features, surfaces)
+        # Blocks misjudge the depth of edges in front of nothing, by which they slide along.
+        self._aligns = self._matcher is None
         self._imu, self._inertial, self._readout = ImuModel(imu), inertial, camera.readout
         mounted = inverse(self._imu.pose) @ pose_matrix(camera.position, camera.orientation)
         common = _COMMON if self._matcher is None else _COMMON_BY_EYES
@@ -233,6 +238,14 @@ class InertialTracker(FeatureTracker):
 
     def _starts(self, stamp: int, match: MapMatch | None) -> tuple[list[Floats], bool]:
         return ([self._pose], False) if self._is_known else super()._starts(stamp, match)
+
+    def _find(
+        self, grey: Grey, inverse_of: Depth, expected: Floats, information: Floats | None = None
+    ) -> MapMatch | None:
+        """Find the map; where nothing is aligned, few landmarks suffice beside the IMU."""
+        if not self._aligns and information is None and self._is_known:
+            information = None if self._lost_since else _PREDICTED
+        return super()._find(grey, inverse_of, expected, information)
 
     def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
         """Find the map in an image, and let the landmarks found correct the filter."""

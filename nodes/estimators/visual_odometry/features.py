@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -95,7 +95,7 @@ class FeatureTracker:
         surfaces: Reads depth at pixels, as `surfaces_at` does.
     """
 
-    _aligns: ClassVar[bool] = True
+    _aligns: bool = True
     """Whether edges and surfaces are aligned where landmarks are few."""
 
     def __init__(

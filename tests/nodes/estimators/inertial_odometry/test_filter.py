@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import msgspec
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from nodes.estimators.inertial_odometry.filter import POSE, InertialFilter, P, Sighting, State
@@ -91,6 +92,30 @@ def test_many_landmarks_with_errors_in_common_tell_no_more_than_a_few() -> None:
     for common in ((0.0, 0.0), (0.1, 0.0), (0.0, 0.1)):
         few, many = deviation(50, common), deviation(800, common)
         assert (many < 0.5 * few) == (common == (0.0, 0.0)), (few, many)
+
+
+@pytest.mark.parametrize("common", [0.0, 1.0])
+def test_a_motion_is_as_uncertain_as_the_depth_of_the_landmarks_that_it_is_seen_by(
+    common: float,
+) -> None:
+    made = InertialFilter(MODEL, np.eye(4), 5, (0.0, common))
+    made.start(np.array([0.0, 0.0, -9.81]))
+    made.covariance[POSE, POSE] = 1e-12 * np.eye(6)
+    seen = sighting(100)
+    seen = msgspec.structs.replace(seen, places=seen.places * (4.0 / seen.places[:, 2:]))
+    doubtful = np.full((100, 3), 500.0)
+    doubtful[:, 2] = 1.0 / 0.02  # 8 % of their inverse depth, together or each for itself
+    for sideways in (0.0, 1.0):
+        measured = (seen.places - (sideways, 0.0, 0.0)) / 4.0
+        measured[:, 2] = 0.25
+        now = msgspec.structs.replace(seen, measured=measured, scale=doubtful)
+        if not sideways:
+            made.remember(0, now)
+        made.state = made.state.moved(np.r_[np.zeros(3), sideways, np.zeros(13)])
+        made.covariance[POSE, POSE] += 0.04 * np.eye(6)
+    assert made.update(now)
+    spread = np.sqrt(made.covariance[P.start, P.start])
+    assert (spread > 0.07) == (common == 1.0), spread
 
 
 def test_a_map_that_contradicts_is_not_believed() -> None:

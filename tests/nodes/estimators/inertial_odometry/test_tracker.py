@@ -10,10 +10,12 @@ from nodes.estimators.inertial_odometry.tracker import InertialSettings, Inertia
 from nodes.estimators.stereo_odometry import StereoSettings
 from nodes.estimators.visual_odometry.settings import FeatureSettings
 from tests.nodes.estimators.inertial_odometry.test_preintegration import IMU
+from tests.nodes.estimators.stereo_odometry.test_stereo import BASELINE, pair
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
 
-def test_images_that_contradict_the_imu_are_lost_and_begin_a_frame_of_their_own() -> None:
+def started(baseline: float) -> InertialTracker:
+    """Return the tracker of a camera with depth, or of a stereo rig, whose body is the camera."""
     camera = CameraAnnouncement(
         stamp=0,
         source="drone/camera",
@@ -26,10 +28,13 @@ def test_images_that_contradict_the_imu_are_lost_and_begin_a_frame_of_their_own(
         position=(0.0, 0.0, 0.0),
         orientation=(1.0, 0.0, 0.0, 0.0),
     )
-    tracker = InertialTracker(
-        camera, IMU, 0.0, FeatureSettings(), InertialSettings(), StereoSettings()
+    return InertialTracker(
+        camera, IMU, baseline, FeatureSettings(), InertialSettings(), StereoSettings()
     )
-    found: list[TrackingResult] = []
+
+
+def test_images_that_contradict_the_imu_are_lost_and_begin_a_frame_of_their_own() -> None:
+    tracker, found = started(0.0), list[TrackingResult]()
     for number in range(40):
         time = number / 20
         rest = [[(time - 0.05 + k / 200) * 1e9, 0, 0, 0, 0, 0, -9.81] for k in range(1, 11)]
@@ -39,3 +44,27 @@ def test_images_that_contradict_the_imu_are_lost_and_begin_a_frame_of_their_own(
     assert not any(result.lost or result.map for result in found[:20])
     assert any(result.lost for result in found[20:35])
     assert found[-1].map > 0
+
+
+def test_a_stereo_rig_that_comes_to_see_level_edges_only_is_lost_and_not_wrong() -> None:
+    tracker, random = started(BASELINE), np.random.default_rng(1)
+    texture, stripes = pair(pose())[:2], np.full((INFO.height, INFO.width), 110.0)
+    stripes[40:90], stripes[150:170] = 60.0, 200.0
+    lost = []
+    for number in range(100):
+        time = number / 20
+        # From 1 s on, it speeds up to the right, along the stripes.
+        ahead = 0.3 * (time > 1.025)
+        felt = [[(time - 0.05 + k / 200) * 1e9, 0, 0, 0, ahead, 0, -9.81] for k in range(1, 11)]
+        left, right = texture
+        if time > 1.0:
+            drawn = stripes + random.normal(0.0, 2.0, (2, *stripes.shape))
+            left, right = drawn.clip(0, 255).astype(np.uint8)
+        result = tracker.fuse(int(time * 1e9), left, right, np.array(felt))
+        lost.append(result.lost)
+        if not result.lost and result.covariance is not None:
+            error = result.pose[:3, 3] - (0.15 * max(time - 1.0, 0.0) ** 2, 0.0, 0.0)
+            spread = np.sqrt(np.diag(result.covariance)[:3]) + 0.005
+            assert (np.abs(error) < 3.0 * spread).all(), (time, error, spread)
+    assert not any(lost[:20])
+    assert all(lost[-15:])
