@@ -266,7 +266,7 @@ class InertialFilter:
             camera: The camera in the world if the key frame is where it was remembered, (4, 4).
             number: The key frame.
             information: Inverse covariance of a small motion of the camera's frame, as `moved` in
-                `nodes.estimators.odometry.pose` has it, shape (6, 6).
+                `nodes.estimators.odometry` has it, shape (6, 6).
             first: Whether this is the first pose by that key frame.
         """
         found = camera @ inverse(self.camera)

@@ -14,8 +14,8 @@ from nodes.estimators import (
     StereoInertialFrame,
 )
 from nodes.estimators.inertial_odometry.tracker import InertialSettings, InertialTracker
-from nodes.estimators.stereo_odometry import StereoSettings, baseline
-from nodes.estimators.visual_odometry.settings import FeatureSettings
+from nodes.estimators.visual_odometry.stereo import StereoSettings, baseline
+from nodes.estimators.visual_odometry.surfaces import FeatureSettings
 from runtime import Bundle
 
 

@@ -22,16 +22,14 @@ from events.geometry import inverse, pose_matrix
 from nodes.estimators import TrackingResult
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
 from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel, cross
-from nodes.estimators.inertial_odometry.rolling_shutter import Rows as ImageRows
-from nodes.estimators.odometry.images import Depth, Grey
-from nodes.estimators.odometry.pose import rays
-from nodes.estimators.stereo_odometry import StereoMatcher, StereoSettings
+from nodes.estimators.inertial_odometry.preintegration import Rows as ImageRows
+from nodes.estimators.odometry import Depth, Grey, rays
 from nodes.estimators.visual_odometry.alignment import Alignment
 from nodes.estimators.visual_odometry.features import BELIEVED, FeatureTracker
 from nodes.estimators.visual_odometry.landmarks import MapMatch
 from nodes.estimators.visual_odometry.patches import Rows
-from nodes.estimators.visual_odometry.settings import FeatureSettings
-from nodes.estimators.visual_odometry.surfaces import Surfaces, surfaces_at
+from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings
+from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces, surfaces_at
 
 _KNOWN = 0.3, 0.03
 """Standard deviations of velocity (m/s) and gravity (radians) below which the IMU is of use."""

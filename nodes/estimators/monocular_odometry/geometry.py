@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from nodes.estimators.odometry.images import Floats, Grey
+from nodes.estimators.odometry import Floats, Grey
 
 Indices = npt.NDArray[np.int64]
 

@@ -22,8 +22,7 @@ from nodes.estimators.monocular_odometry.geometry import (
     reprojection_errors,
     triangulate,
 )
-from nodes.estimators.odometry.images import Floats, Grey, follow_both_ways
-from nodes.estimators.odometry.pose import Observations, rays, solve_pose
+from nodes.estimators.odometry import Floats, Grey, Observations, follow_both_ways, rays, solve_pose
 
 _SNAPSHOT = 5.0
 """Median pixels of motion between the views that are stored."""

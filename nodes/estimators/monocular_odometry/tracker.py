@@ -26,16 +26,21 @@ from nodes.estimators import (
 )
 from nodes.estimators.monocular_odometry.geometry import Indices, Keyframe, MonocularSettings
 from nodes.estimators.monocular_odometry.local_map import Initialization, LocalMap
-from nodes.estimators.odometry.images import (
+from nodes.estimators.odometry import (
     Floats,
     Grey,
+    Observations,
+    Solution,
+    describe,
+    detect_and_describe,
     follow_both_ways,
     grey_image,
     inside,
+    intrinsics,
     refuse_distortion,
+    relocalize,
+    solve_pose,
 )
-from nodes.estimators.odometry.pose import Observations, Solution, intrinsics, solve_pose
-from nodes.estimators.odometry.relocalization import describe, detect_and_describe, relocalize
 from runtime import Bundle
 
 _AGREES = 6.0

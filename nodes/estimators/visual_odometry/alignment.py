@@ -6,6 +6,8 @@ Sparse Odometry", IEEE T-PAMI 2018, with gain and offset of the brightness), and
 distances of surfaces (point-to-plane: Y. Chen and G. Medioni, "Object modeling by registration of
 multiple range images", ICRA 1991). Distances are compared as inverse depth, in which a plane is
 affine, and a triangulating sensor has the same noise everywhere.
+
+The pose at which it starts is that expected from the motion of the images before (`Motion`).
 """
 
 from __future__ import annotations
@@ -19,8 +21,16 @@ import numpy as np
 import numpy.typing as npt
 
 from events.geometry import inverse
-from nodes.estimators.odometry.images import Depth, Floats, Grey, inside
-from nodes.estimators.odometry.pose import intrinsics, motion_between, moved, rays
+from nodes.estimators.odometry import (
+    Depth,
+    Floats,
+    Grey,
+    inside,
+    intrinsics,
+    motion_between,
+    moved,
+    rays,
+)
 from nodes.estimators.visual_odometry.surfaces import surfaces_at
 
 _LEVELS = 4
@@ -328,3 +338,49 @@ def _distances(
     close = (measured > 0) & (errors < np.maximum(_OTHER, _OTHER_SHARE * image[2] / noise))
     weights = _huber(errors) * close / noise**2
     return _Residuals(residual, weights, by, pixels, close & (errors < _AGREES), len(good))
+
+
+_FADES = 0.5
+"""Seconds without a measurement in which the expected velocity falls to 1/e."""
+
+
+class Motion:
+    """A velocity in the camera's own frame: constant, and fading where nothing is measured."""
+
+    def __init__(self) -> None:
+        self._velocity = np.zeros(6)  # metres and radians per second
+        self._last: tuple[int, Floats] | None = None
+        self._steady: tuple[int, Floats, Floats] | None = None
+
+    def expected(self, stamp: int) -> Floats:
+        """Return the pose at a time (ns), world to camera, shape (4, 4)."""
+        if self._last is None:
+            return np.eye(4)
+        before, pose = self._last
+        return moved(pose, self._velocity * (stamp - before) * 1e-9)
+
+    def measured(self, stamp: int, pose: Floats) -> None:
+        """Note a pose that was measured, world to camera, shape (4, 4)."""
+        if self._last is not None and stamp > self._last[0]:
+            before, last = self._last
+            self._velocity = motion_between(last, pose) / ((stamp - before) * 1e-9)
+        self._last = stamp, pose
+        self._steady = stamp, pose, self._velocity
+
+    def steady(self, stamp: int) -> Floats:
+        """Return the pose at a time if the last measured velocity has not changed since."""
+        if self._steady is None:
+            return self.expected(stamp)
+        before, pose, velocity = self._steady
+        return moved(pose, velocity * (stamp - before) * 1e-9)
+
+    def carried(self, stamp: int) -> Floats:
+        """Return the pose at a time without a measurement, from which on the motion fades."""
+        pose, before = self.expected(stamp), stamp if self._last is None else self._last[0]
+        self._velocity = self._velocity * math.exp((before - stamp) * 1e-9 / _FADES)
+        self._last = stamp, pose
+        return pose
+
+    def placed(self, stamp: int, pose: Floats) -> None:
+        """Note a pose that was found again: how the camera moves is as unknown as before."""
+        self._last = stamp, pose

@@ -24,35 +24,37 @@ import numpy.typing as npt
 from events import CameraInfo
 from events.geometry import inverse
 from nodes.estimators import TrackingResult
-from nodes.estimators.odometry.images import (
+from nodes.estimators.odometry import (
     FLOW_CRITERIA,
     Depth,
     Floats,
     Grey,
-    grey_and_depth,
-    refuse_distortion,
-)
-from nodes.estimators.odometry.pose import (
     Observations,
     Solution,
+    detect_and_describe,
     from_rotation_vector,
+    grey_and_depth,
+    refuse_distortion,
+    relocalize,
     solve_pose,
 )
-from nodes.estimators.odometry.relocalization import detect_and_describe, relocalize
-from nodes.estimators.visual_odometry.alignment import Alignment, View
-from nodes.estimators.visual_odometry.keyframes import (
+from nodes.estimators.visual_odometry.alignment import Alignment, Motion, View
+from nodes.estimators.visual_odometry.landmarks import (
     ORB_POINTS,
     Described,
     Keyframe,
+    Landmarks,
+    MapMatch,
     find_corners,
     squares,
 )
-from nodes.estimators.visual_odometry.landmarks import Landmarks, MapMatch
-from nodes.estimators.visual_odometry.motion import Motion
-from nodes.estimators.visual_odometry.patches import Rows, find_patches, half_width
-from nodes.estimators.visual_odometry.references import References
-from nodes.estimators.visual_odometry.settings import FeatureSettings
-from nodes.estimators.visual_odometry.surfaces import Surfaces, inverse_depth, surfaces_at
+from nodes.estimators.visual_odometry.patches import References, Rows, find_patches, half_width
+from nodes.estimators.visual_odometry.surfaces import (
+    FeatureSettings,
+    Surfaces,
+    inverse_depth,
+    surfaces_at,
+)
 
 _FLOW_WINDOW = 15
 _LARGE = 320

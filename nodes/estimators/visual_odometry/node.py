@@ -1,10 +1,19 @@
-"""RGB-D visual odometry as a node: the images it reads, and the method that it runs."""
+"""RGB-D visual odometry as a node: the images it reads, and its methods, on features or dense.
+
+The dense one is OpenCV's `cv2.Odometry` on all pixels: colour and depth, coarse to fine (F.
+Steinbrücker, J. Sturm and D. Cremers, "Real-time visual odometry from dense RGB-D images",
+ICCV Workshops 2011), with the point-to-plane distances of depth beside the differences of colour.
+It is an example of a method from a library. The library does not tell how sure it is of a motion,
+so where little is to be seen (a plain wall, a corridor) poses are wrong by percents of the way and
+are not said to be lost.
+"""
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -16,11 +25,123 @@ from nodes.estimators import (
     RgbdFrame,
     TrackingResult,
 )
-from nodes.estimators.odometry.images import Depth
-from nodes.estimators.visual_odometry.dense import DenseSettings, DenseTracker
+from nodes.estimators.odometry import Depth, Floats, grey_and_depth, refuse_distortion
 from nodes.estimators.visual_odometry.features import FeatureTracker
-from nodes.estimators.visual_odometry.settings import FeatureSettings
+from nodes.estimators.visual_odometry.surfaces import FeatureSettings
 from runtime import Bundle
+
+
+class DenseSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the dense method.
+
+    Attributes:
+        width: Pixels to which wider images are reduced. Much less than 250 is too little for the
+            library's four levels.
+        max_depth: Metres beyond which depth is not used. (The library takes an image with more
+            than 10 m in it for one in units of a five-thousandth of a metre.)
+        keyframe_interval: Images from one key frame to the next.
+        pixel_share: Share of the pixels that are compared, at most; time grows with it.
+        max_depth_change: Metres by which a point's depth may change between key frame and image.
+        reset_timeout: Seconds without a pose after which a new map starts at the last pose.
+    """
+
+    width: Annotated[int, msgspec.Meta(ge=32)] = 256
+    max_depth: Annotated[float, msgspec.Meta(gt=0, lt=10)] = 9.9
+    keyframe_interval: Annotated[int, msgspec.Meta(ge=1)] = 2
+    pixel_share: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.3
+    max_depth_change: Annotated[float, msgspec.Meta(gt=0)] = 0.3
+    reset_timeout: Annotated[float, msgspec.Meta(ge=0)] = 1.0
+
+
+class DenseTracker:
+    """Tracks an RGB-D camera from key frame to key frame. Equal images give equal poses.
+
+    Args:
+        info: Intrinsics of the images, which must be free of distortion.
+        settings: Settings of the method.
+    """
+
+    def __init__(self, info: CameraInfo, settings: DenseSettings | None = None) -> None:
+        refuse_distortion(info)
+        self._info = info
+        self._settings = settings = settings or DenseSettings()
+        self._step = max(info.width // settings.width, 1)
+        self._odometry = cv2.Odometry(
+            cv2.OdometryType_RGB_DEPTH, self._library_settings(), cv2.OdometryAlgoType_COMMON
+        )
+        self._pose = np.eye(4)  # camera to the first camera
+        self._keyframe: Any = None
+        self._keyframe_pose = np.eye(4)
+        self._before: Any = None
+        self._age = 0
+        self._lost_since: int | None = None
+        self._maps = 0  # begun at a guessed pose
+
+    def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> TrackingResult:
+        """Return the pose of the next image; see `Tracker.track`."""
+        grey, depth = grey_and_depth(self._info, image, depth)
+        step = self._step
+        depth = depth[step // 2 :: step, step // 2 :: step]
+        usable = np.isfinite(depth) & (depth > 0) & (depth < self._settings.max_depth)
+        if usable.mean() < 0.05:
+            return self._lose(stamp, "less than a twentieth of the image has depth")
+        height, width = depth.shape
+        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        frame = cv2.OdometryFrame(np.where(usable, depth, np.nan).astype(np.float32), small)
+        self._odometry.prepareFrame(frame)
+        if self._keyframe is None:
+            self._make_keyframe(frame)
+            return TrackingResult(self._pose)
+        pose = self._align(frame, self._keyframe, self._keyframe_pose)
+        if pose is None and self._before is not None:
+            pose = self._align(frame, self._before, self._pose)
+            self._age = self._settings.keyframe_interval  # the key frame cannot be used any more
+        if pose is None:
+            lost = self._lose(stamp, "the images could not be aligned")
+            if stamp - (self._lost_since or stamp) < self._settings.reset_timeout * 1e9:
+                return lost
+            self._make_keyframe(frame)
+            self._lost_since = None
+            self._maps += 1
+            reason = "by a new map, started at the last pose"
+            return TrackingResult(self._pose, reason=reason, map=self._maps)
+        reason = "against a key frame" if self._lost_since is not None else ""
+        self._lost_since = None
+        self._pose = pose
+        self._before = frame
+        self._age += 1
+        if self._age >= self._settings.keyframe_interval:
+            self._make_keyframe(frame)
+        return TrackingResult(pose, reason=reason, map=self._maps)
+
+    def _make_keyframe(self, frame: Any) -> None:
+        """Make this the key frame."""
+        self._keyframe, self._keyframe_pose, self._age = frame, self._pose, 0
+
+    def _align(self, frame: Any, other: Any, pose: Floats) -> Floats | None:
+        found, motion = self._odometry.compute(frame, other)
+        return np.asarray(pose @ motion) if found and np.isfinite(motion).all() else None
+
+    def _lose(self, stamp: int, reason: str) -> TrackingResult:
+        if self._lost_since is None:
+            self._lost_since = stamp
+        self._before = None
+        return TrackingResult(self._pose, lost=True, reason=reason)
+
+    def _library_settings(self) -> Any:
+        info, step = self._info, self._step
+        settings = cv2.OdometrySettings()
+        matrix = info.matrix()
+        # Pixel centres are whole numbers: of every block of `step` pixels, the centre is kept.
+        matrix[:2, 2] = (matrix[:2, 2] - (step - 1) / 2) / step
+        matrix[0, 0], matrix[1, 1] = info.fx / step, info.fy / step
+        settings.setCameraMatrix(matrix.astype(np.float32))
+        settings.setMaxDepth(self._settings.max_depth)
+        settings.setMaxDepthDiff(self._settings.max_depth_change)
+        settings.setMaxPointsPart(self._settings.pixel_share)
+        settings.setMaxTranslation(1.0)
+        settings.setMaxRotation(30.0)
+        return settings
 
 
 class Tracker(Protocol):

@@ -1,4 +1,4 @@
-"""Inverse depth at corners, interpolated between pixels where the surface is continuous.
+"""Settings of the features, and inverse depth at corners where the surface is continuous.
 
 On a plane inverse depth is an affine function of the pixel, and a triangulating sensor's noise is
 the same at every distance in it; so inverse depth is smoothed, fitted, checked and weighted.
@@ -6,12 +6,14 @@ the same at every distance in it; so inverse depth is smoothed, fitted, checked 
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.estimators.odometry.images import Depth, Floats
+from nodes.estimators.odometry import Depth, Floats
 
 REACH = 6
 """Pixels around a corner over which its surface must be continuous: optical flow compares them."""
@@ -78,3 +80,36 @@ def surfaces_at(inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
     value = mean + ((pixels - centre) * slope).sum(axis=1)
     continuous &= value > _FARTHEST
     return Surfaces(np.where(continuous, value, 0.0), slope, continuous)
+
+
+class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the method on features.
+
+    Attributes:
+        spacing: Side of the squares of the image of which each holds one landmark, pixels. Time
+            grows with their number.
+        window: Side of the patches that are compared, pixels; odd.
+        levels: Times that flow halves the image for large motions between two images.
+        pixel_noise: Standard deviation of a patch's position, pixels.
+        depth_noise: Standard deviation of inverse depth, 1/m: k of a sensor with sigma = k z².
+        keyframes: Key frames that are stored. One takes the memory of a grey image.
+        keyframe_overlap: A key frame is made when less than this share of the last one's landmarks
+            is in view,
+        keyframe_rotation: or at this rotation since the last one, degrees,
+        keyframe_shift: or at this motion since the last one, pixels at the median depth.
+        min_inliers: Agreeing landmarks below which the camera is lost.
+        reset_timeout: Seconds for which a lost camera is only relocalized; then a new map starts at
+            its last pose.
+    """
+
+    spacing: Annotated[int, msgspec.Meta(ge=12, le=128)] = 28
+    window: Annotated[int, msgspec.Meta(ge=7, le=31)] = 11
+    levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 4
+    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.3
+    depth_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.002
+    keyframes: Annotated[int, msgspec.Meta(ge=2, le=10_000)] = 200
+    keyframe_overlap: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.6
+    keyframe_rotation: Annotated[float, msgspec.Meta(gt=0)] = 12.0
+    keyframe_shift: Annotated[float, msgspec.Meta(gt=0)] = 40.0
+    min_inliers: Annotated[int, msgspec.Meta(ge=6)] = 15
+    reset_timeout: Annotated[float, msgspec.Meta(ge=0)] = 1.0

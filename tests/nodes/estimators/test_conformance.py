@@ -18,9 +18,9 @@ from nodes.estimators.inertial_odometry import RgbdInertialOdometry, StereoInert
 from nodes.estimators.monocular_odometry import MonocularOdometry
 from nodes.estimators.orb_slam3 import OrbSlam3
 from nodes.estimators.orb_slam3.vocabulary import find_vocabulary
-from nodes.estimators.stereo_odometry import StereoOdometry
 from nodes.estimators.svo import Svo
 from nodes.estimators.visual_odometry import VisualOdometry
+from nodes.estimators.visual_odometry.stereo import StereoOdometry
 from nodes.outside.native import client as client_module
 from nodes.outside.process import Process
 from nodes.outside.vit import Vit

@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nodes.estimators.inertial_odometry.filter import POSE, InertialFilter, P, Sighting, State
-from nodes.estimators.inertial_odometry.preintegration import Floats
-from nodes.estimators.inertial_odometry.rolling_shutter import Rows
+from nodes.estimators.inertial_odometry.preintegration import Floats, Rows
 from tests.nodes.estimators.inertial_odometry.test_preintegration import MODEL, felt
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 

@@ -8,10 +8,9 @@ import pytest
 
 from events.geometry import inverse
 from nodes.estimators import TrackingResult
-from nodes.estimators.odometry.images import Floats
-from nodes.estimators.odometry.pose import moved
+from nodes.estimators.odometry import Floats, moved
+from nodes.estimators.visual_odometry.alignment import Motion
 from nodes.estimators.visual_odometry.features import FeatureTracker
-from nodes.estimators.visual_odometry.motion import Motion
 from tests.nodes.estimators.visual_odometry.world import INFO, pose
 
 FRAME = 33_000_000

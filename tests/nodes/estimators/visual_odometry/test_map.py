@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 from events.geometry import inverse
-from nodes.estimators.odometry.images import Floats
-from nodes.estimators.odometry.pose import rays
+from nodes.estimators.odometry import Floats, rays
 from nodes.estimators.visual_odometry.features import FeatureTracker
-from nodes.estimators.visual_odometry.keyframes import find_corners, squares
-from nodes.estimators.visual_odometry.landmarks import Landmarks
+from nodes.estimators.visual_odometry.landmarks import Landmarks, find_corners, squares
 from nodes.estimators.visual_odometry.patches import Patches, find_patches
-from nodes.estimators.visual_odometry.settings import FeatureSettings
-from nodes.estimators.visual_odometry.surfaces import inverse_depth, surfaces_at
+from nodes.estimators.visual_odometry.surfaces import FeatureSettings, inverse_depth, surfaces_at
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
 MATRIX = INFO.matrix()

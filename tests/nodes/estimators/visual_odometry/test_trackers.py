@@ -10,11 +10,10 @@ import pytest
 
 from events import CameraInfo
 from nodes.estimators import TrackingResult
-from nodes.estimators.odometry.images import Floats
-from nodes.estimators.visual_odometry.dense import DenseSettings, DenseTracker
+from nodes.estimators.odometry import Floats
 from nodes.estimators.visual_odometry.features import FeatureTracker
-from nodes.estimators.visual_odometry.node import Tracker
-from nodes.estimators.visual_odometry.settings import FeatureSettings
+from nodes.estimators.visual_odometry.node import DenseSettings, DenseTracker, Tracker
+from nodes.estimators.visual_odometry.surfaces import FeatureSettings
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
 Make = Callable[[CameraInfo], Tracker]

@@ -10,8 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from events import CameraAnnouncement, Event, Image, PoseEstimate, TrackingLost, TrackingRegained
-from nodes.outside.vit import Vit
-from nodes.outside.vit.node import patience_left
+from nodes.outside.vit import Vit, patience_left
 from runtime.errors import NodeError, VisnavError
 from runtime.testing import run_nodes, spec
 from tests.nodes.estimators.conformance import Case, Record, run

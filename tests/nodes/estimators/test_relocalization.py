@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from nodes.estimators.monocular_odometry.geometry import new_corners
-from nodes.estimators.odometry.images import Floats
-from nodes.estimators.odometry.pose import Observations, rays, solve_pose
-from nodes.estimators.odometry.relocalization import (
+from nodes.estimators.odometry import (
     DescribedPoints,
+    Floats,
+    Observations,
     describe,
     detect_and_describe,
+    rays,
     relocalize,
+    solve_pose,
 )
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 

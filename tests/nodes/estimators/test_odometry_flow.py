@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nodes.estimators.monocular_odometry.geometry import new_corners
-from nodes.estimators.odometry.images import follow_both_ways, inside
+from nodes.estimators.odometry import follow_both_ways, inside
 from tests.nodes.estimators.monocular_odometry.world import FLAT, INFO, look, pose
 
 HERE, THERE = look(pose(), FLAT), look(pose(x=0.1), FLAT)

@@ -8,10 +8,8 @@ import pytest
 
 from events import CameraAnnouncement
 from nodes.estimators.rectification import ALIGNED, misalignment
-from nodes.estimators.stereo_odometry import StereoMatcher, StereoSettings
-from nodes.estimators.stereo_odometry.node import StereoTracker
-from nodes.estimators.visual_odometry.settings import FeatureSettings
-from nodes.estimators.visual_odometry.surfaces import inverse_depth, surfaces_at
+from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings, StereoTracker
+from nodes.estimators.visual_odometry.surfaces import FeatureSettings, inverse_depth, surfaces_at
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
 BASELINE = 0.1

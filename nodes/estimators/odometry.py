@@ -1,0 +1,368 @@
+"""Tools of the odometries: grey images, corners followed by flow, poses, relocalization.
+
+Images are of the announced size and without distortion; flow goes from one to another, and back.
+
+The pose of a camera comes from the pixels and depths of landmarks by robust Gauss-Newton.
+Residuals of each landmark are its two pixels and its inverse depth, each in units of its noise, as
+a stereo camera's three coordinates would be (R. Mur-Artal and J. D. Tardós, "ORB-SLAM2", IEEE
+T-RO 2017, section III-A); weights are Huber's.
+
+A lost camera is relocalized by ORB descriptors of points whose place is known: E. Rublee et al.,
+"ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraInfo
+from events.geometry import inverse
+
+Floats = npt.NDArray[np.float64]
+Grey = npt.NDArray[np.uint8]
+Depth = npt.NDArray[np.float32]
+
+
+def refuse_distortion(info: CameraInfo) -> None:
+    """Raise `ValueError` if a camera's images are distorted."""
+    if not info.is_pinhole:
+        raise ValueError(
+            f"camera: expected images without distortion, found {info.distortion_model} "
+            f"with {info.distortion}"
+        )
+
+
+def grey_image(info: CameraInfo, image: npt.NDArray[np.uint8]) -> Grey:
+    """Return an image, shape (h, w, 3) red, green, blue, or (h, w), as grey.
+
+    Raises:
+        ValueError: The image's size is not that of the camera.
+    """
+    _check_size(info, "image", image, {(), (3,)})
+    if image.ndim == 2:
+        return image
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def grey_and_depth(
+    info: CameraInfo, image: npt.NDArray[np.uint8], depth: Depth
+) -> tuple[Grey, Depth]:
+    """Return an image as grey, and its depth, both of the camera's size.
+
+    Raises:
+        ValueError: One of them has another size.
+    """
+    _check_size(info, "depth", depth, {()})
+    return grey_image(info, image), depth
+
+
+def inside(pixels: Floats, shape: tuple[int, ...], rim: int) -> npt.NDArray[np.bool_]:
+    """Return which pixels, shape (n, 2), are at least `rim` pixels from the edge, shape (n,)."""
+    x, y = pixels.T
+    return np.asarray((x >= rim) & (x < shape[1] - rim) & (y >= rim) & (y < shape[0] - rim))
+
+
+def _check_size(
+    info: CameraInfo, name: str, array: npt.NDArray[Any], channels: set[tuple[int, ...]]
+) -> None:
+    if array.shape[:2] != (info.height, info.width) or array.shape[2:] not in channels:
+        raise ValueError(
+            f"{name}: expected {info.width}×{info.height} pixels, as the camera announced, "
+            f"found shape {array.shape}"
+        )
+
+
+FLOW_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+"""When the iterations of optical flow end: after 20, or at a step of 0.01 pixels."""
+_ROUND_TRIP = 0.5
+"""Pixels by which a corner that is followed there and back may miss its start."""
+
+
+def follow_both_ways(
+    image: Grey, other: Grey, pixels: Floats, guess: Floats, window: int, levels: int
+) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    """Follow corners from a guess, and back; only those that return to their start are good.
+
+    Args:
+        image: Where they are, grey.
+        other: Where to look for them, grey.
+        pixels: Column and row, shape (n, 2), n > 0.
+        guess: Their approximate pixels in the other image, shape (n, 2).
+        window: Side of the neighbourhood that is compared, pixels.
+        levels: Halvings of the images.
+
+    Returns:
+        Their pixels in the other image, shape (n, 2), and which are good, shape (n,).
+    """
+    start = pixels.astype(np.float32).reshape(-1, 1, 2)
+    options: Any = {
+        "winSize": (window, window),
+        "maxLevel": levels,
+        "criteria": FLOW_CRITERIA,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    }
+    there, arrived, _ = cv2.calcOpticalFlowPyrLK(
+        image, other, start, guess.astype(np.float32).reshape(-1, 1, 2), **options
+    )
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(other, image, there, start.copy(), **options)
+    miss = np.abs(back - start).reshape(-1, 2).max(axis=1)
+    found = there.reshape(-1, 2).astype(np.float64)
+    good = (arrived.ravel() == 1) & (returned.ravel() == 1) & (miss < _ROUND_TRIP)
+    return found, good & inside(found, image.shape, 3)
+
+
+_HUBER = 2.0
+"""Standard deviations beyond which a residual counts linearly."""
+_STEPS = 8
+_SMALL = 1e-7
+_DAMPING = 1e-9
+"""Share of its own information by which each motion is held back."""
+
+
+class Observations(msgspec.Struct, frozen=True, eq=False):
+    """Landmarks as one image shows them.
+
+    Attributes:
+        landmarks: Metres in the world, shape (n, 3).
+        pixels: Column and row, shape (n, 2).
+        inverse: Measured inverse depth, 1/m, shape (n,).
+        measured: Which have a measured inverse depth, shape (n,).
+    """
+
+    landmarks: Floats
+    pixels: Floats
+    inverse: Floats
+    measured: npt.NDArray[np.bool_]
+
+    @classmethod
+    def without_depth(cls, landmarks: Floats, pixels: Floats) -> Observations:
+        """Return observations of pixels only."""
+        count = len(landmarks)
+        return cls(landmarks, pixels, np.zeros(count), np.zeros(count, np.bool_))
+
+
+class Solution(msgspec.Struct, frozen=True, eq=False):
+    """A pose, and the errors of the landmarks under it.
+
+    Attributes:
+        pose: World to camera, shape (4, 4).
+        errors: Reprojection errors in standard deviations, shape (n,).
+    """
+
+    pose: Floats
+    errors: Floats
+
+
+def solve_pose(
+    seen: Observations,
+    start: Floats,
+    matrix: Floats,
+    pixel_noise: float,
+    depth_noise: float,
+    information: Floats | None = None,
+) -> Solution:
+    """Return the pose that minimises the sum of robust squared residuals.
+
+    Args:
+        seen: At least four landmarks, or fewer if something is known of the initial pose.
+        start: Initial pose, world to camera, shape (4, 4).
+        matrix: K, shape (3, 3).
+        pixel_noise: Standard deviation of a coordinate, pixels.
+        depth_noise: Standard deviation of inverse depth, 1/m.
+        information: Inverse covariance of the initial pose, if that is more than a guess: of a
+            small motion of the camera's frame, translation, then rotation, shape (6, 6).
+    """
+    fx, fy, cx, cy = intrinsics(matrix)
+    pose, count = start.copy(), len(seen.pixels)
+    # In rows of contiguous memory: coordinates, and derivatives of each by the six motions.
+    landmarks = np.ascontiguousarray(seen.landmarks.T)
+    target = np.stack([(seen.pixels[:, 0] - cx) / fx, (seen.pixels[:, 1] - cy) / fy, seen.inverse])
+    scale = np.empty((3, count))
+    scale[0], scale[1] = fx / pixel_noise, fy / pixel_noise
+    scale[2] = np.where(seen.measured, 1.0 / depth_noise, 0.0)
+    jacobian = np.zeros((6, 3, count))
+    image, errors = np.empty((3, count)), np.empty((2, count))
+    for _ in range(_STEPS):
+        p = pose[:3, :3] @ landmarks + pose[:3, 3:]
+        ahead = p[2] > 0.01
+        image[2] = 1.0 / np.where(ahead, p[2], 1.0)
+        image[:2] = p[:2] * image[2]
+        residuals = scale * (image - target)
+        # By a small motion of the camera's frame: translation, then rotation (left perturbation).
+        (x, y, inverse), by = image, jacobian
+        by[0, 0] = by[1, 1] = inverse
+        np.multiply(image, -inverse, out=by[2])
+        by[4, 1] = x * y
+        by[3, 0] = -by[4, 1]
+        by[3, 1], by[4, 0] = -1.0 - y * y, 1.0 + x * x
+        by[3, 2], by[4, 2] = -y * inverse, x * inverse
+        by[5, 0], by[5, 1] = -y, x
+        by *= scale
+        np.hypot(residuals[0], residuals[1], out=errors[0])
+        np.abs(residuals[2], out=errors[1])
+        weights = _huber(errors) * ahead
+        weighted = (by * weights[[0, 0, 1]]).reshape(6, -1)
+        normal = weighted @ by.reshape(6, -1).T
+        # In units of its own, as what landmarks in one column leave open is lost in rounding else.
+        normal += np.diag(_DAMPING * np.diag(normal) + _DAMPING)
+        gradient = weighted @ residuals.reshape(-1)
+        if information is not None:
+            normal += information
+            gradient += information @ motion_between(start, pose)
+        step = -np.linalg.solve(normal, gradient)
+        pose = moved(pose, step)
+        if np.abs(step).max() < _SMALL:
+            break
+    errors[0, ~ahead] = np.inf
+    return Solution(pose, errors[0])
+
+
+def moved(pose: Floats, step: Floats) -> Floats:
+    """Return a pose, world to camera, after a small motion of the camera's frame, shape (6,)."""
+    turn, there = cv2.Rodrigues(step[3:])[0], np.eye(4)
+    there[:3, :3] = turn @ pose[:3, :3]
+    there[:3, 3] = turn @ pose[:3, 3] + step[:3]
+    return there
+
+
+def motion_between(before: Floats, after: Floats) -> Floats:
+    """Return the small motion that `moved` takes from one pose to another, shape (6,)."""
+    between = after @ inverse(before)
+    return np.concatenate([between[:3, 3], cv2.Rodrigues(between[:3, :3])[0].ravel()])
+
+
+def _huber(errors: Floats) -> Floats:
+    return np.asarray(np.minimum(1.0, _HUBER / np.maximum(errors, _HUBER)))
+
+
+def intrinsics(matrix: Floats) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy of K, shape (3, 3)."""
+    return matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+
+
+def rays(pixels: Floats, matrix: Floats) -> Floats:
+    """Return directions in the optical frame with z = 1, shape (n, 3), of pixels, shape (n, 2)."""
+    fx, fy, cx, cy = intrinsics(matrix)
+    return np.stack(
+        [(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1
+    )
+
+
+def from_rotation_vector(rotation: npt.NDArray[Any], translation: npt.NDArray[Any]) -> Floats:
+    """Return the transform, shape (4, 4), of a rotation vector and a translation, as OpenCV's."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+    return pose
+
+
+Descriptors = npt.NDArray[np.uint8]
+
+_MAX_ERROR = 3.0
+"""Pixels by which a point may miss its place in the pose found."""
+_MIN_INLIERS = 15
+"""Agreeing points below which a pose may be chance."""
+_RADIUS = 15
+"""Pixels around a corner that give its orientation, as in ORB."""
+
+
+class DescribedPoints(msgspec.Struct, frozen=True, eq=False):
+    """Points of the world and what they look like.
+
+    Attributes:
+        points: Metres (or the map's unit) in the world, shape (n, 3).
+        descriptors: uint8, shape (n, 32).
+    """
+
+    points: Floats
+    descriptors: Descriptors
+
+
+def detect_and_describe(image: Grey, count: int) -> tuple[Floats, Descriptors]:
+    """Return up to `count` points of an image (column, row), shape (n, 2), and descriptors."""
+    no_mask: Any = None
+    found: Any  # there are none in a blank image
+    keys, found = cv2.ORB.create(count).detectAndCompute(image, no_mask)
+    if found is None:
+        return np.empty((0, 2)), np.empty((0, 32), np.uint8)
+    return np.array([key.pt for key in keys], np.float64), found
+
+
+def describe(image: Grey, pixels: Floats, points: Floats) -> DescribedPoints:
+    """Return the described points at given pixels; those too near to the edge are left out.
+
+    Args:
+        image: Grey.
+        pixels: Column and row, shape (n, 2).
+        points: Their places in the world, shape (n, 3).
+    """
+    # For given points ORB does not compute the orientation, as it does for those that it detects.
+    keys = [
+        cv2.KeyPoint(float(x), float(y), 31.0, float(angle), class_id=row)
+        for row, ((x, y), angle) in enumerate(
+            zip(pixels, _orientations(image, pixels), strict=True)
+        )
+    ]
+    found: Any  # there are none if all are near to the edge
+    kept, found = cv2.ORB.create().compute(image, keys)
+    if found is None:
+        return DescribedPoints(np.empty((0, 3)), np.empty((0, 32), np.uint8))
+    return DescribedPoints(points[[key.class_id for key in kept]], found)
+
+
+def relocalize(
+    pixels: Floats,
+    descriptors: Descriptors,
+    known: DescribedPoints,
+    matrix: Floats,
+    method: int = cv2.SOLVEPNP_ITERATIVE,
+) -> Floats | None:
+    """Return the pose from which an image shows known points, world to camera, if it does.
+
+    Args:
+        pixels: Points of the image, as `detect_and_describe` gives them, shape (n, 2).
+        descriptors: Descriptors of these, shape (n, 32).
+        known: Points that the image may show.
+        matrix: K, shape (3, 3).
+        method: OpenCV's solver of a pose from points.
+    """
+    if min(len(pixels), len(known.points)) < _MIN_INLIERS:
+        return None
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    matches = matcher.match(known.descriptors, descriptors)
+    if len(matches) < _MIN_INLIERS:
+        return None
+    cv2.setRNGSeed(1)
+    inliers: Any  # there are none if nothing was found
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        known.points[[match.queryIdx for match in matches]],
+        pixels[[match.trainIdx for match in matches]],
+        matrix,
+        None,
+        iterationsCount=300,
+        reprojectionError=_MAX_ERROR,
+        flags=method,
+    )
+    if not found or inliers is None or len(inliers) < _MIN_INLIERS:
+        return None
+    return from_rotation_vector(rotation, translation)
+
+
+def _orientations(image: Grey, pixels: Floats) -> Floats:
+    """Return the directions from corners to the centroids of their neighbourhoods, degrees.
+
+    The intensity centroid of "ORB", section 3.2; shape (n,).
+    """
+    side = np.arange(-_RADIUS, _RADIUS + 1)
+    dx, dy = (axis.ravel() for axis in np.meshgrid(side, side))
+    disc = dx**2 + dy**2 <= _RADIUS**2
+    dx, dy = dx[disc], dy[disc]
+    columns, rows = np.rint(pixels).astype(np.int64).T
+    x = np.clip(columns[:, None] + dx, 0, image.shape[1] - 1)
+    y = np.clip(rows[:, None] + dy, 0, image.shape[0] - 1)
+    weights = image[y, x].astype(np.float64)
+    return np.asarray(np.degrees(np.arctan2(weights @ dy, weights @ dx)) % 360.0)
