@@ -21,7 +21,6 @@ import numpy.typing as npt
 
 from events import Collision, Odometry, PlannedPose, PositionSetpoint
 from events.frames import from_yaw
-from nodes.judging.evaluation.alignment import Alignment, How, align, transform, umeyama
 from nodes.judging.evaluation.coverage import (
     Interval,
     Stamps,
@@ -31,8 +30,11 @@ from nodes.judging.evaluation.coverage import (
     seconds,
 )
 from nodes.judging.evaluation.metrics import (
+    Alignment,
     Floats,
+    How,
     absolute_errors,
+    align,
     consistency,
     drift_percent,
     interpolated,
@@ -41,6 +43,8 @@ from nodes.judging.evaluation.metrics import (
     rms,
     rotation_errors,
     share_errors,
+    transform,
+    umeyama,
 )
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.trajectory import PoseRows, RecentPoses, Trajectory, associate

@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.judging.evaluation.alignment import How
 from nodes.judging.evaluation.judging import Judgement, judge
+from nodes.judging.evaluation.metrics import How
 from nodes.judging.evaluation.node import EvaluationConfig
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.judging.evaluation.results import FRAMES, write_results

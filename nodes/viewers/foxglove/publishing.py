@@ -1,4 +1,6 @@
-"""What becomes of each event: ROS's messages, as the bridge sends them, and Foxglove's own.
+"""Messages of the server: ROS's as CDR, as the bridge sends them, and Foxglove's own.
+
+Foxglove's own are paths and bodies, features, and the log; all are in ROS's frames and axes.
 
 Images and point clouds are put from threads beside the loop, one of each kind at a time; the
 rest takes some microseconds and is put at once.
@@ -6,8 +8,9 @@ rest takes some microseconds and is put at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -23,29 +26,170 @@ from events import (
     PositionSetpoint,
     TrackedFeatures,
     TrackingEvent,
+    TrackingLost,
     TransformStamped,
+    Vector3,
     VehicleAnnouncement,
     VehicleEvent,
 )
 from events.frames import convert_vector
 from events.geometry import Pose
 from nodes.ros2.messages import mappings
+from nodes.ros2.messages.mappings import PUBLISHED
 from nodes.ros2.messages.publishing import Publishing as RosPublishing
-from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, ros_name
+from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, Topic, ros_name
 from nodes.ros2.messages.typestore import Stamps, TypeStore
 from nodes.trajectory import RecentPoses
 from nodes.viewers.common import (
+    INLIER,
+    OUTLIER,
     PLAN,
+    VEHICLE,
+    Box,
     Colour,
     PlanSelection,
     Trail,
+    describe,
     estimate_colour,
     estimate_frame,
     moving_body,
     truth_colour,
 )
-from nodes.viewers.foxglove.messages import Messages, RosTopic, RosTopics
 from nodes.viewers.foxglove.server import FoxgloveConfig, Server
+from runtime.time.schedule import SECOND
+
+
+class Messages:
+    """Makes messages.
+
+    Args:
+        types: ``foxglove.messages``.
+    """
+
+    def __init__(self, types: Any) -> None:
+        self._m = types
+
+    def features(self, event: TrackedFeatures) -> Any:
+        """Return an ImageAnnotations: what agrees in green, the rest in red."""
+        groups = [
+            self._m.PointsAnnotation(
+                timestamp=self._time(event.stamp),
+                type=self._m.PointsAnnotationType.Points,
+                points=[self._m.Point2(x=x, y=y) for x, y in event.points[chosen].tolist()],
+                outline_color=self._colour(colour),
+                fill_color=self._colour(colour),
+                thickness=4.0,
+            )
+            for chosen, colour in ((event.inliers, INLIER), (~event.inliers, OUTLIER))
+        ]
+        return self._m.ImageAnnotations(points=groups)
+
+    def log(self, event: Event) -> Any:
+        """Return a Log."""
+        levels = self._m.LogLevel
+        return self._m.Log(
+            timestamp=self._time(event.stamp),
+            level=levels.Warning if isinstance(event, TrackingLost) else levels.Info,
+            message=describe(event),
+            name=event.source,
+        )
+
+    def scene(self, *entities: Any) -> Any:
+        """Return a SceneUpdate of what `line` and `body` return."""
+        return self._m.SceneUpdate(entities=list(entities))
+
+    def line(self, trail: Trail, name: str, piece: list[Vector3]) -> Any:
+        """Return a piece of a path as a SceneEntity."""
+        strip = self._m.LinePrimitive(
+            type=self._m.LinePrimitiveLineType.LineStrip,
+            thickness=trail.thickness,
+            points=[self._m.Point3(x=x, y=y, z=z) for x, y, z in piece],
+            color=self._colour(trail.colour),
+        )
+        return self._m.SceneEntity(frame_id=trail.frame_id, id=name, lines=[strip])
+
+    def body(self, name: str, frame_id: str, boxes: Sequence[Box] = VEHICLE) -> Any:
+        """Return a body as a SceneEntity that goes where its frame goes; by default a vehicle's."""
+        vector = self._m.Vector3
+        cubes = []
+        for centre, (length, width, height), colour in boxes:
+            x, y, z = convert_vector("body", centre)
+            cubes.append(
+                self._m.CubePrimitive(
+                    pose=self._m.Pose(
+                        position=vector(x=x, y=y, z=z), orientation=self._m.Quaternion(w=1.0)
+                    ),
+                    size=vector(x=length, y=width, z=height),
+                    color=self._colour(colour),
+                )
+            )
+        return self._m.SceneEntity(frame_id=frame_id, id=name, frame_locked=True, cubes=cubes)
+
+    def _colour(self, colour: Colour) -> Any:
+        r, g, b = colour
+        return self._m.Color(r=r / 255, g=g / 255, b=b / 255, a=1.0)
+
+    def _time(self, stamp: int) -> Any:
+        return self._m.Timestamp(sec=stamp // SECOND, nsec=stamp % SECOND)
+
+
+E = TypeVar("E", bound=Event)
+
+
+class RosTopics:
+    """The topics of ROS's messages."""
+
+    def __init__(self, server: Server, store: TypeStore) -> None:
+        self.server = server
+        self._definitions = {row.type: store.definition(row.type) for row in PUBLISHED}
+        self._stamps = threading.local()  # of what each thread puts
+
+    def publisher(self, topic: Topic) -> RosTopic:
+        """Declare a topic."""
+        self.server.declare_ros(topic.name, topic.type, self._definitions[topic.type])
+        return RosTopic(self, topic)
+
+    def stamped(self, put: Callable[[E], None]) -> Callable[[E], None]:
+        """Return `put`, whose messages then have the time of their event."""
+
+        def put_stamped(event: E) -> None:
+            self._stamps.stamp = event.stamp
+            put(event)
+
+        return put_stamped
+
+    @property
+    def stamp(self) -> int:
+        """Return the stamp of the event whose messages this thread puts (ns)."""
+        return getattr(self._stamps, "stamp", 0)
+
+
+class RosTopic:
+    """One of them.
+
+    Viewers that come later get the newest message of what ROS keeps for late joiners, and of a
+    cloud that is no sensor's: a map.
+    """
+
+    def __init__(self, topics: RosTopics, topic: Topic) -> None:
+        self.topic = topic
+        self._topics = topics
+        cloud = topic.type == "sensor_msgs/msg/PointCloud2"
+        self._kept = topic.qos.transient_local or (cloud and topic.qos.reliable)
+
+    @property
+    def wanted(self) -> bool:
+        """Tell whether anybody looks, or may look later at what is kept."""
+        return self._kept or self._topics.server.wanted(self.topic.name)
+
+    def put(self, message: bytearray) -> None:
+        """Send a message to those who look."""
+        data, server, stamp = bytes(message), self._topics.server, self._topics.stamp
+        if self._kept:
+            server.latch(self.topic.name, lambda: data, stamp)
+        else:
+            server.log(self.topic.name, data, stamp)
+
 
 SMALL: tuple[type[Event], ...] = (
     *(kind for kind in mappings.SMALL if kind is not TrackedFeatures),

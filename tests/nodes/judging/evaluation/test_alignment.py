@@ -8,8 +8,7 @@ import pytest
 from evo.core.geometry import umeyama_alignment
 from hypothesis import given, settings
 
-from nodes.judging.evaluation.alignment import How, align, umeyama
-from nodes.judging.evaluation.metrics import absolute_errors
+from nodes.judging.evaluation.metrics import How, absolute_errors, align, umeyama
 from nodes.trajectory import Trajectory, associate
 from tests.nodes.trajectory.samples import angle, as_evo, moved, noisy, walk
 

@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
 from events.frames import angle_between
-from nodes.judging.evaluation.alignment import align
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.metrics import (
     SHARES,
     absolute_errors,
+    align,
     drift_percent,
     path_errors,
     path_pairs,
