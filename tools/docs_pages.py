@@ -54,7 +54,9 @@ def figures_section() -> str:
             f"`{each.name}`",
             each.meaning,
             each.unit,
-            each.limit and f"at {each.limit}" + f" {each.default:g}" * (each.default is not None),
+            f"at {each.limit} {'' if each.default is None else f'{each.default:g}'}".rstrip()
+            if each.limit
+            else "",
         )
         for each in FIGURES.values()
     ]
