@@ -214,7 +214,7 @@ def _pixels(path: Path) -> npt.NDArray[Any]:
     try:
         code = np.fromfile(path, np.uint8)
         pixels = cv2.imdecode(code, cv2.IMREAD_UNCHANGED) if code.size else None
-    except (OSError, cv2.error) as error:
+    except (OSError, ValueError, cv2.error) as error:  # a name may hold a null byte
         raise ReplayError(f"{path}: expected an image, found: {error}") from None
     if pixels is None:
         raise ReplayError(f"{path}: expected an image, found something else")
