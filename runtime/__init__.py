@@ -2,18 +2,19 @@
 
 Read the core in this order:
 
-- What an author writes: `node` (its `host` is the run), with its declarations in `ports`, `bundles`
-  and `declarations`.
-- How an event gets from node to node: `sender`, `streams`, `links`, `graph`; and what makes it
-  quick: `tasks`, `task_factory`.
-- Time: `schedule`, `clock`, `lockstep`, `real_clock`, `time_limits`.
-- A run: `node_runner`, `node_host`, `startup`, `run_state`, `supervisor`, `execute`, `event_loop`.
-- What a run leaves: `digest`, `summary` (with `part_summaries`, `environment`), `results`, `logs`.
-- `config`: the file; `units` and `paths` are types of settings.
-- `workers`: objects in processes of their own. `hold`, `owed`, `answers`: systems that are outside.
-- `watchdogs`, `code_location`: who blocks the loop or holds up the run.
-- `parameter_server`: settings that change in a run. `instruments`: hooks for who looks on.
-- `wire` and `peers`: events as bytes, and a run in several processes.
+- What an author writes: `node` (its `host` is the run), with its declarations in `channels.ports`
+  and `channels.bundles`.
+- How an event gets from node to node: `channels.sender`, `streams` and `links`, as `run.graph` has
+  connected them; and what makes it quick: `channels.tasks`, `run.event_loop`.
+- Time: `time.schedule`, `clock`, `lockstep`, `stepping`, `time_limits`.
+- A run: `run.node_runner`, `node_host`, `run_state`, `supervisor`, `execute`; `watchdogs` and
+  `code_location` tell who blocks the loop or holds up the run, `instruments` are for observers.
+- What a run leaves: `channels.digest`, `summary` (made by `run.summarise`), `run.results`, `logs`.
+- `config`: the file, and what may change in a run; `units` and `paths` are types of settings.
+- `workers`: objects in processes of their own. `channels.hold`, `answers`: systems that are
+outside.
+- `wire` and `peers`: events as bytes, and a run in several processes. `figures`: those of a
+verdict.
 
 `testing` is for tests of nodes. `tools` is no part of the core: the command line, the monitor,
 tracing and sweeps.

@@ -4,9 +4,8 @@ A voxel holds one measured point, never a mean: the mean of points on both sides
 neither surface. Of several it holds the one that was measured from nearest, because whatever is
 wrong with a point (noise of the depth, an angle, the size of a pixel) grows with the distance.
 
-Clouds as PLY files: binary, little-endian, coloured.
-
-The format is G. Turk's, "The PLY polygon file format" (1994); it counts what follows the header.
+Clouds are written as PLY files, binary, little-endian, coloured; the format is G. Turk's, "The PLY
+polygon file format" (1994); it counts what follows the header.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The process that writes, as the run sees it: what waits for it, and the threads that serve it.
 
 The loop puts events into the backlog, and calls nothing here that waits. One thread feeds the
-process, and another reads its replies. It is no `runtime.workers.Worker`: that copies what it is
-given on the loop, and ends its process soon after the run; this one outlives a run that is killed,
-or whose disk is slow, and closes its file in order.
+process, and another reads its replies. It is no `runtime.workers.worker.Worker`: that copies what
+it is given on the loop, and ends its process soon after the run; this one outlives a run that is
+killed, or whose disk is slow, and closes its file in order.
 """
 
 from __future__ import annotations

@@ -8,7 +8,6 @@ have the same stamps; `align` brings them together, in frame and in scale.
 from __future__ import annotations
 
 import math
-from math import erfc, sqrt
 from typing import Literal
 
 import msgspec
@@ -263,7 +262,7 @@ def rms(values: Floats) -> float:
 _SINGULAR = 1e-9
 """Smallest eigenvalue of a correlation matrix that can be inverted."""
 _BLOCK = 4096
-_THREE_SIGMA = float(chdtri(3, erfc(3.0 / sqrt(2.0))))
+_THREE_SIGMA = float(chdtri(3, math.erfc(3.0 / math.sqrt(2.0))))
 """NEES of three dimensions that is as rarely exceeded as 3 sigma of one: 14.16."""
 
 

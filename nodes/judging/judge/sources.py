@@ -3,8 +3,7 @@
 A file's format is recognized by its content. No file says which axes it means: the user does, or
 else the format's habit holds (`AXES`).
 
-A trajectory that is a topic of a bag: its messages, in our frames (`ros_messages.incoming`).
-
+A topic of a bag is read as its messages are, in our frames (`nodes.ros2.messages.incoming`).
 Of a ``nav_msgs/msg/Path``, which each time holds all poses so far, the last message counts.
 """
 
