@@ -99,6 +99,10 @@ class Handshakes:
         self._session.appear(on_message, self.on_presence)
         threading.Thread(target=self._greet, name="greet", daemon=True).start()
 
+    async def alone(self) -> bool:
+        """Return whether no process is seen, and none listens where they meet."""
+        return not self._contacts and await asyncio.to_thread(self._session.deserted)
+
     async def close(self) -> None:
         """Send what still waits, and leave."""
         self._enough.set()

@@ -19,8 +19,8 @@ Until it begins, it waits for the return of each process that is lost: for `run.
 so does whoever is still needed for the decision. Who comes back, by itself (its link had failed) or
 as a new process, begins a session, and both ends say again all that they have said. So nothing
 depends on what was lost with the session before. A new process starts its nodes anew, and must
-announce what it announced before, since nodes elsewhere have heard of it. A loss after the decision
-is one of the run, also for a process that learns of it before it was told.
+announce what it announced before, since processes elsewhere have heard of it. A loss after the
+decision is one of the run, also for a process that learns of it before it was told.
 
 At the end nodes end in reverse order of the file, wherever they are, and no process leaves before
 all summaries are exchanged. Processes that are silent for long are not waited for.
@@ -74,7 +74,7 @@ class JointStart:
         self._clock = clock
         self._startup_limit = startup_limit
         self._said: dict[type[Message], Message] = {}
-        self._heard: dict[int, Announcements] = {}
+        self._heard: dict[tuple[str, ...], Announcements] = {}
 
     async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Send the others what the nodes here announce; return what all do, in file order."""
@@ -91,7 +91,6 @@ class JointStart:
         everything = dict(own)
         for member in membership.present():
             if member.announced is not None:
-                self._heard[member.number] = member.announced
                 for name, frames in member.announced.by_node.items():
                     try:
                         everything[name] = [_announcement(frame) for frame in frames]
@@ -172,7 +171,7 @@ class JointStart:
         self._said[Ready] = Ready(begun=True)
 
     def hear(self, member: Member, message: Announcements) -> None:
-        """Take in what a process announces; if it came back, the nodes here were told that before.
+        """Take in what a process announces; if it came back, it was heard here before.
 
         Raises:
             WireError: These are not announcements of its own nodes.
@@ -180,7 +179,7 @@ class JointStart:
         if not message.by_node.keys() <= {*member.nodes}:
             raise WireError("expected announcements of its own nodes")
         member.announced = message
-        if self._heard.get(member.number, message) != message:
+        if self._heard.setdefault(member.nodes, message) != message:
             self._membership.misfit(
                 PeerError(
                     f"expected {name_of(member.nodes)}, which came back, to announce what it had "

@@ -50,6 +50,10 @@ from runtime.time.time_limits import real_time_limit
 
 log = logging.getLogger("visnav.runtime")
 
+ALONE = 1.0
+"""Seconds after which a process that sees no other looks whether any can find it: where processes
+meet, nobody listens if the one that did ended just after we connected to it."""
+
 
 class Reactions(Protocol):
     """What is notified, on the loop, of what other processes do."""
@@ -92,6 +96,7 @@ class Membership:
         self.here = tuple(name for name in self.nodes if name in chosen)
         self.me = 0
         self.count = 0
+        self._before = 0
         self.hello = Hello(
             nodes=self.here,
             config=what_all_share(config),
@@ -121,21 +126,41 @@ class Membership:
         network = self._network
         by_certificate = not network.secret and certified(network)
         secret = b"known by certificate" if by_certificate else secret_of(network.secret)
-        session = await asyncio.to_thread(Session, self._run, network, secret)
-        self._handshakes = Handshakes(derive(secret, "run", self._run), session, self)
-        await asyncio.to_thread(self._handshakes.begin, self._receive)
+        await self._appear(secret)
         if absent := self._missing():
             log.info("waiting for %s at %s", name_of(absent), network.meet)
         try:
             async with real_time_limit(float(network.wait)):
-                await self.waiting.until(lambda: not self._missing())
+                while True:
+                    with contextlib.suppress(TimeoutError):
+                        async with real_time_limit(ALONE):
+                            return await self.numbers()
+                    if self._handshakes and await self._handshakes.alone():
+                        await self._handshakes.close()
+                        await self._appear(secret)
         except TimeoutError:
             text = missing_message(self._missing(), float(network.wait), network.meet)
             raise PeerError("; ".join([text, *self._unfit])) from None
-        return self.number()
 
-    def number(self) -> int:
-        """Give the processes that are there numbers; return how often ours was there before."""
+    async def _appear(self, secret: bytes) -> None:
+        session = await asyncio.to_thread(Session, self._run, self._network, secret)
+        self._handshakes = Handshakes(derive(secret, "run", self._run), session, self)
+        await asyncio.to_thread(self._handshakes.begin, self._receive)
+
+    async def numbers(self) -> int:
+        """Wait until all were there once, and have numbers; see `meet`."""
+        await self.waiting.until(self._number_all)
+        return self._before
+
+    def _number_all(self) -> bool:
+        """Give the processes numbers when all are there; return whether they have them.
+
+        Called as each joins: when the loop comes to a coroutine that waits for it, one may be lost.
+        """
+        if self._numbers:
+            return True
+        if self._missing():
+            return False
         others = self._fitting()
         everybody = sorted(
             [self.here, *(m.nodes for m in others)], key=lambda nodes: self.nodes.index(nodes[0])
@@ -146,7 +171,8 @@ class Membership:
             member.number = self._numbers[member.nodes]
             self._numbered[member.number] = member
         running = [m.hello for m in others if m.hello.running]
-        return max((max(h.lost.count(self.here[0]), 1) for h in running), default=0)
+        self._before = max((max(h.lost.count(self.here[0]), 1) for h in running), default=0)
+        return True
 
     def largest(self) -> int:
         """Return how many nodes the process with the most has."""
@@ -309,6 +335,7 @@ class Membership:
         member.unfit = False
         if self._numbers:
             self._peers.joined(member)
+        self._number_all()
         held, member.held = member.held, None
         for message, event in held or ():
             self.take(member, message, event)

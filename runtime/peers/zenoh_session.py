@@ -67,6 +67,7 @@ class Session:
         except (zenoh.ZError, OSError) as error:
             raise PeerError(f"expected to meet at {network.meet}, found: {error}") from error
         self.id = str(self._session.info.zid())
+        self._meet = network.meet if network.meet in _endpoints(configuration, "listen") else ""
         self._prefix = f"visnav/{re.sub(r'[^A-Za-z0-9_.-]', '_', run)}"
         self._publishers: dict[str, Any] = {}
         self._kept: list[Any] = []
@@ -115,6 +116,23 @@ class Session:
             self._publishers[other].put(payload, attachment=message)
         except zenoh.ZError as error:
             raise PeerError(f"a message could not be sent: {error}") from error
+
+    def deserted(self) -> bool:
+        """Return whether nobody listens where processes meet, so far as can be told.
+
+        Zenoh tries to do so only as it opens: later, its tries would keep it from closing
+        (github.com/eclipse-zenoh/zenoh/pull/2754).
+        """
+        parts = _ENDPOINT.fullmatch(self._meet)
+        if parts is None or parts[1] not in {"tcp", "tls"}:
+            return False
+        try:
+            socket.create_connection((parts[2], int(parts[3])), timeout=1.0).close()
+        except ConnectionRefusedError:
+            return True
+        except OSError:
+            return False
+        return False
 
     def close(self) -> None:
         """Leave. What goes on for longer than `CLOSING` goes on in a thread."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 from typing import Any, cast
 
 from hypothesis import example, given
@@ -44,8 +46,9 @@ class Pair:
         self.greetings: dict[str, Handshakes] = {}
         self.under_way: dict[str, deque[bytes]] = {name: deque() for name in self.ends}
         self.said: list[tuple[str, bytes]] = []
+        self.due: deque[partial[Any]] = deque()
         for name, roster in self.ends.items():
-            roster.soon = lambda call, *args: call(*args)  # type: ignore[method-assign]
+            roster.soon = self.soon  # type: ignore[method-assign]
             greeting = Handshakes(KEY, End(self, name), roster)  # type: ignore[arg-type]
             self.greetings[name] = roster._handshakes = greeting
 
@@ -54,10 +57,23 @@ class Pair:
 
     def deliver(self, to: str) -> None:
         if self.under_way[to]:
-            self.ends[to]._receive(self.other(to), self.under_way[to].popleft(), b"")
+            self.receive(to, self.under_way[to].popleft())
+
+    def receive(self, to: str, message: bytes) -> None:
+        self.ends[to]._receive(self.other(to), message, b"")
+        self.do_all_due()
 
     def show(self, to: str, here: bool) -> None:
         self.greetings[to].on_presence(self.other(to), here)
+        self.do_all_due()
+
+    def soon(self, call: Callable[..., Any], *args: Any) -> None:
+        self.due.append(partial(call, *args))
+
+    def do_all_due(self) -> None:
+        """Be the loop of both."""
+        while self.due:
+            self.due.popleft()()
 
     def settle(self) -> None:
         """Let everything arrive; who is not known greets again and again."""
@@ -112,7 +128,7 @@ def run(pair: Pair, ops: list[tuple[str, Any]]) -> None:
                 pair.show(which, what == "meet")
             case "again" if pair.said:
                 to, message = pair.said[which % len(pair.said)]
-                pair.ends[to]._receive(pair.other(to), message, b"")
+                pair.receive(to, message)
 
 
 CROSSED: list[tuple[str, Any]] = [
@@ -132,7 +148,7 @@ def test_both_end_in_one_session_that_nothing_old_can_end(ops: list[tuple[str, A
         here, there = pair.tags()
         assert here == there != b""
         for to, message in list(pair.said):
-            pair.ends[to]._receive(pair.other(to), message, b"")
+            pair.receive(to, message)
             pair.settle()
         assert pair.tags() == [here, there]
 
@@ -147,8 +163,24 @@ def test_who_comes_back_hears_how_often_it_was_lost() -> None:
             for name in pair.ends:
                 pair.show(name, True)
             pair.settle()
-            assert pair.ends["one"].number() == times
-            assert pair.ends["asker"].number() == 0
+            assert await pair.ends["one"].numbers() == times
+            assert await pair.ends["asker"].numbers() == 0
+
+    asyncio.run(example())
+
+
+def test_who_is_lost_before_the_loop_comes_to_who_waits_for_it_was_met() -> None:
+    """Else a new process that takes its place would be one of another meeting."""
+
+    async def example() -> None:
+        pair = Pair()
+        waiting = asyncio.create_task(pair.ends["one"].numbers())
+        await asyncio.sleep(0)
+        pair.settle()
+        pair.show("one", False)
+        assert await asyncio.wait_for(waiting, 10) == 0
+        assert pair.ends["one"].count == 2
+        assert [*pair.ends["one"].waiting.absent] == [0]
 
     asyncio.run(example())
 

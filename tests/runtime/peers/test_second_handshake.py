@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,12 @@ from typing import Any
 import pytest
 
 from runtime.errors import PeerError, WireError
+from runtime.peers.authentication import secret_of
 from runtime.peers.joint import JointStart
+from runtime.peers.member import Member
 from runtime.peers.membership import Membership
 from runtime.peers.messages import Message
+from runtime.peers.zenoh_session import Session
 from runtime.run.execute import execute
 from tests.runtime.peers.samples import Offer, Process, settings
 from tests.runtime.peers.test_losses import Rig
@@ -59,8 +63,10 @@ def once(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, At], threading.
 
         def reach(membership: Membership, here: str) -> None:
             if (membership.here, here) == ((who,), point) and not reached.is_set():
-                reached.set()
-                call(membership)
+                try:
+                    call(membership)
+                finally:
+                    reached.set()
 
         def say_and_reach(start: JointStart, message: Message) -> None:
             say(start, message)
@@ -135,9 +141,26 @@ def test_links_that_fail_before_the_first_update_change_nothing(
 
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("who", WHO)
-def test_who_does_not_come_back_is_named_after_the_limit(once: Any, clock: str, who: str) -> None:
+def test_who_does_not_come_back_is_named_after_the_limit(
+    once: Any, monkeypatch: pytest.MonkeyPatch, clock: str, who: str
+) -> None:
     config = settings(*THREE, clock=clock, startup_limit=0.5)
-    once(who, "Announcements", die)
+    have_met = threading.Semaphore(0)
+    join = Membership.joined
+
+    def joined(membership: Membership, member: Member) -> None:
+        before = bool(membership._numbers)
+        join(membership, member)
+        if membership._numbers and not before:
+            have_met.release()
+
+    def die_among_those_who_have_met(membership: Membership) -> None:
+        for _ in range(3):  # who has not met yet waits for all to be there, and for longer
+            assert have_met.acquire(timeout=20)
+        die(membership)
+
+    monkeypatch.setattr(Membership, "joined", joined)
+    once(who, "Announcements", die_among_those_who_have_met)
     processes = {only: Process(config, only) for only in ("asker", "one", "other")}
     assert "Died" in repr(processes.pop(who).done().error)
     for process in processes.values():
@@ -156,18 +179,21 @@ def test_who_comes_back_with_other_announcements_ends_the_run(
     config = settings(*THREE)
     died = once("asker", "heard", die)
     heard = threading.Event()
-    take = JointStart.announce
+    announce, hear = JointStart.announce, JointStart.hear
 
-    async def announce(start: JointStart, own: Any) -> Any:
+    async def announce_anew(start: JointStart, own: Any) -> Any:
         if died.is_set():
-            heard.wait(10)
+            assert heard.wait(20)
             own = {"asker": [Offer(stamp=0, source="asker", rate=49.0)]}
-        found = await take(start, own)
+        return await announce(start, own)
+
+    def hear_it(start: JointStart, *heard_of: Any) -> None:
+        hear(start, *heard_of)
         if start._membership.here != ("asker",):
             heard.set()
-        return found
 
-    monkeypatch.setattr(JointStart, "announce", announce)
+    monkeypatch.setattr(JointStart, "announce", announce_anew)
+    monkeypatch.setattr(JointStart, "hear", hear_it)
     others = [Process(config, "asker"), Process(config, "one,other")]
     assert died.wait(20)
     back = Process(config, "asker")
@@ -175,6 +201,28 @@ def test_who_comes_back_with_other_announcements_ends_the_run(
         assert "to announce what it had announced before, found something" in str(
             process.done().error
         )
+
+
+def test_who_begins_while_the_one_that_listens_ends_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = settings(*THREE, duration=0.1)
+    ending = Session("another run", config.network, secret_of(config.network.secret))
+    appear, appeared = Membership._appear, threading.Event()
+
+    async def appear_and_tell(membership: Membership, secret: bytes) -> None:
+        await appear(membership, secret)
+        appeared.set()
+
+    monkeypatch.setattr(Membership, "_appear", appear_and_tell)
+    first = Process(config, "asker")
+    assert appeared.wait(20)
+    ending.close()
+    until = time.monotonic() + 10
+    while ending.deserted():
+        assert time.monotonic() < until
+    others = [Process(config, only) for only in ("one", "other")]
+    assert {process.ended().reason for process in [first, *others]} == {"duration"}
 
 
 @pytest.mark.slow

@@ -84,6 +84,20 @@ def test_it_listens_at_the_named_address_only(host: str) -> None:
     assert {each[:2] for each in found} <= {("tcp", ip) for ip in (address, "127.0.0.1")}
 
 
+def test_it_tells_whether_anybody_listens_where_processes_meet(tmp_path: Path) -> None:
+    network = NetworkConfig(meet=f"tcp/127.0.0.1:{free_port()}")
+    first, second = (Session("test", network, b"secret") for _ in range(2))
+    assert not second.deserted()
+    first.close()
+    assert second.deserted()
+    second.close()
+    file = tmp_path / "zenoh.json5"
+    file.write_text('{ listen: { endpoints: ["tcp/127.0.0.1:0"] } }')  # it means to be found so
+    third = Session("test", NetworkConfig(meet=network.meet, zenoh=str(file)), b"secret")
+    assert not third.deserted()
+    third.close()
+
+
 OPEN = "can be reached from other machines, and what is said there is not encrypted"
 
 
