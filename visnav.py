@@ -1,13 +1,474 @@
-"""The console command ``visnav``: the same as ``python -m runtime``.
+"""Runs, sweeps and judgements from Python; and the console command ``visnav``.
 
-It stands outside the packages, so that it can tell when `runtime` is another project's.
+    import visnav
+
+    run = visnav.run("config.toml", set={"pilot.speed": 1.5}, seed=7)
+    run.passed, run.figures["odometry"]["ate_percent"]
+    run.truth.positions, run.estimates["odometry"].positions
+    run.show()
+
+    old = visnav.load("runs/tour")
+    table = visnav.sweep("config.toml", {"camera.rate": [10, 30]}, seeds=3)
+    judged = visnav.judge("groundtruth.txt", {"mine": "estimate.txt"}, alignment="se3")
+
+A run has a thread and an event loop of its own, so it may be started from a notebook, whose own
+loop goes on, and from any thread. The first Ctrl-C ends it in order, with complete results, before
+it is raised here as `KeyboardInterrupt`.
+
+This module stands outside the packages, so that it can tell when `runtime` is another project's.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import copy
 import importlib.util
 import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+    from matplotlib.figure import Figure
+
+    from nodes.judging.report.tables import Run as _Found
+    from nodes.judging.report.tables import Verdict
+    from nodes.trajectory import Trajectory
+    from runtime.config.model import Config
+    from runtime.run.supervisor import Supervisor
+
+__all__ = ["Run", "judge", "load", "run", "sweep"]
+
+
+class Run:
+    """Results of one run, or of trajectories that were judged without one.
+
+    Attributes:
+        folder: With all files; `None` if nothing was written.
+        summary: Contents of ``summary.json``, as `json` reads it; empty if nothing was flown.
+    """
+
+    def __init__(
+        self, found: _Found, folder: Path | None, summary: Mapping[str, Any] | None = None
+    ) -> None:
+        self.folder = folder
+        self.summary = dict(summary or {})
+        self._found = found
+
+    @property
+    def name(self) -> str:
+        """Name of the run."""
+        return self._found.name
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Contents of ``evaluation/verdict.json``; `None` if nothing was evaluated."""
+        return self._found.verdict
+
+    @property
+    def passed(self) -> bool | None:
+        """Whether all estimators met their thresholds; `None` if one was not judged."""
+        return self.verdict.passed if self.verdict else None
+
+    @property
+    def figures(self) -> dict[str, dict[str, Any]]:
+        """Figures by estimator, by the names that thresholds have: ``ate_percent``."""
+        return self.verdict.estimators if self.verdict else {}
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """True poses of the (first) vehicle: base_link (FRD) in map (NED)."""
+        return self._found.truth
+
+    @property
+    def estimates(self) -> dict[str, Trajectory]:
+        """Poses by estimator, aligned with the truth as the figure ``alignment`` says."""
+        return {e.name: e.aligned for e in self._found.estimators if e.aligned is not None}
+
+    @property
+    def report(self) -> Path | None:
+        """The page ``report.html``, if there is one."""
+        page = None if self.folder is None else self.folder / "report.html"
+        return page if page is not None and page.is_file() else None
+
+    def show(self) -> list[Figure]:
+        """Draw trajectories and errors; a notebook displays the figures."""
+        from nodes.judging.report.curves import draw_errors
+        from nodes.judging.report.style import drawing
+        from nodes.judging.report.trajectories import draw_trajectories
+
+        with drawing():
+            plots = [draw(self._found) for draw in (draw_trajectories, draw_errors)]
+        figures = [plot.figure for plot in plots if plot is not None]
+        with contextlib.suppress(ImportError):
+            from IPython import get_ipython
+            from IPython.display import display
+
+            if get_ipython() is not None:
+                display(*figures)
+                return []
+        return figures
+
+    def __repr__(self) -> str:
+        states = {True: "passed", False: "failed", None: "not judged"}
+        found = []
+        for name, figures in self.figures.items():
+            ate = figures.get("ate_percent")
+            error = "" if ate is None else f", ATE {ate:.3g} % of the path ({figures['alignment']})"
+            missed = "".join(f", {reason}" for reason in figures.get("failed", ()))
+            found.append(f"{name} {states[figures['passed']]}{error}{missed}")
+        where = "" if self.folder is None else f" in {self.folder}"
+        return f"<{self.name}{where}: {'; '.join(found) or 'no estimator'}>"
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        from nodes.judging.report.tables import figures
+
+        rows = [
+            ["", "unit", *(each.name for each in self._found.estimators)],
+            *(
+                [row.meaning, row.unit, *(text for text, _ in row.cells)]
+                for row in figures(self._found, main=True)
+            ),
+        ]
+        cells = "".join(
+            f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
+        )
+        return f"<p>{escape(repr(self))}</p><table>{cells}</table>"
+
+
+def run(
+    config: str | Path | Mapping[str, Any],
+    *,
+    set: Mapping[str, Any] | None = None,  # noqa: A002  # as the command's --set
+    seed: int | None = None,
+    out: str | Path | None = None,
+    quiet: bool = False,
+) -> Run:
+    """Run the nodes of a configuration to their end.
+
+    Args:
+        config: A file, or the same as a table: ``{"run": {...}, "nodes": [{"name": ...}, ...]}``,
+            where ``type`` may be a class; one of a notebook, too.
+        set: Settings to change, as ``{"pilot.speed": 1.5, "run.duration": "5s"}``.
+        seed: Of the run's random numbers; short for ``run.seed``.
+        out: Folder for results; ``runs/<name>`` if not given. An earlier run there becomes
+            ``<name>.1``.
+        quiet: Whether to show no progress.
+
+    Raises:
+        VisnavError: The configuration is wrong, or the run failed; what was recorded until then is
+            in its folder. A missed threshold is no error: see `Run.passed`.
+        KeyboardInterrupt: After Ctrl-C, once the run has ended; `load` has its results.
+    """
+    _check_runtime()
+    from runtime.errors import ConfigError
+    from runtime.tools.preflight import of_file
+
+    changes = dict(set or {})
+    if seed is not None:
+        changes["run.seed"] = seed
+    settings = _settings(config, changes)
+    found = of_file(settings)
+    if found.errors:
+        raise ConfigError("; ".join(found.errors))
+    for warning in found.warnings:
+        warnings.warn(warning, stacklevel=2)
+    folder = Path(out) if out is not None else Path("runs") / settings.run.name
+    flight = _Flight(settings, folder, quiet)
+    flight.start()
+    flight.wait()
+    return load(folder)
+
+
+def load(folder: str | Path) -> Run:
+    """Load the results of a run or of `judge`, also of a run that failed.
+
+    Raises:
+        ValueError: The folder is not there, or is no run's.
+    """
+    import msgspec
+
+    from nodes.judging.report.folder import read_run
+
+    folder = Path(folder)
+    found = read_run(folder)
+    summary = folder / "summary.json"
+    return Run(
+        found, folder, msgspec.json.decode(summary.read_bytes()) if summary.is_file() else {}
+    )
+
+
+def sweep(
+    config: str | Path,
+    vary: Mapping[str, Sequence[Any]],
+    *,
+    seeds: int = 1,
+    repeat: int = 1,
+    set: Mapping[str, Any] | None = None,  # noqa: A002  # as the command's --set
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    fresh: bool = False,
+) -> Any:
+    """Run a file with every combination of some settings, each run in a process of its own.
+
+    What is finished already is not run again; see the command ``sweep``.
+
+    Args:
+        vary: Values by setting: ``{"camera.rate": [10, 30]}``.
+        seeds: How many seeds each combination is run with, from the file's on.
+        repeat: How often it is run with each seed.
+        set: Settings to change in all runs.
+        out: Folder for results; ``sweeps/<name>`` if not given.
+        jobs: Runs at the same time; by default, as many as fit on the cores.
+        fresh: Whether to run everything, also what is finished.
+
+    Returns:
+        A row for each run and estimator, with what was varied, seed, repeat, estimator, passed,
+        error and all figures: a `pandas.DataFrame` if pandas is installed, else a list of dicts.
+
+    Raises:
+        ConfigError: Something is wrong with the file, a path or a value.
+        KeyboardInterrupt: After Ctrl-C, once all runs have ended; those that came to their end
+            are kept.
+    """
+    _check_runtime()
+    from concurrent.futures import ThreadPoolExecutor
+
+    from runtime.tools import sweep as sweeping
+    from runtime.tools.cli.sweep import at_once
+
+    plan = sweeping.make_plan(
+        Path(config),
+        [f"{path}={','.join(_toml(value) for value in values)}" for path, values in vary.items()],
+        overrides=_changes(set or {}),
+        seeds=seeds,
+        repeats=repeat,
+        out=None if out is None else Path(out),
+    )
+    children = sweeping.Children()
+    with ThreadPoolExecutor(jobs or at_once(plan), "run") as executor:
+        watch = sweeping.Watch()
+        watch.interrupted = children.interrupt  # type: ignore[method-assign]
+        rows = sweeping.sweep(plan, executor, run=children.run, watch=watch, fresh=fresh)
+    sweeping.write_tables(plan, rows)
+    sweeping.draw_plots(plan, rows)
+    sweeping.write_page(plan, rows)
+    table = [
+        {
+            **{path: _value(text) for path, text in row["parameters"].items()},
+            "seed": row["seed"],
+            "repeat": row.get("repeat", 1),
+            "estimator": name,
+            "error": row["error"],
+            "passed": row["passed"],
+            **figures,
+        }
+        for row in rows
+        for name, figures in (row["estimators"] or {"": {}}).items()
+    ]
+    try:
+        import pandas as pd
+    except ImportError:
+        return table
+    return pd.DataFrame(table)
+
+
+def judge(
+    truth: str | Path | npt.NDArray[np.float64] | Trajectory,
+    estimates: Any,
+    *,
+    alignment: str = "auto",
+    scale_free: bool = False,
+    axes: str | None = None,
+    thresholds: Mapping[str, float] | None = None,
+    frames: str | Path | npt.NDArray[np.int64] | None = None,
+    out: str | Path | None = None,
+) -> Run:
+    """Judge trajectories that somebody else computed, as a run judges its estimators.
+
+    An estimator that was lost for most of a sequence does not look good: poses for 90 % of the
+    images, or of the truth's time, are asked for by default, and shares of it are figures.
+
+    Args:
+        truth: A trajectory: a file (TUM, EuRoC, KITTI, VSLAM-LAB), ``BAG:/TOPIC``, the folder of a
+            run, a `Trajectory`, or an array of TUM's rows, shape (n, 8): seconds, x, y, z in
+            metres, and a quaternion x, y, z, w.
+        estimates: One, named after its file or ``estimate``; or several by name.
+        alignment: ``auto``, ``none``, ``origin``, ``se3`` or ``sim3``; see the command ``judge``.
+        scale_free: Whether the estimates' unit of length is their own.
+        axes: Of estimates from files, if not their format's: ned, nwu, enu or optical.
+        thresholds: What figures may be: ``{"ate_percent": 1}``.
+        frames: Stamps of the images, for the share of them that have a pose: a file, or
+            nanoseconds, shape (n,).
+        out: Folder for figures and report; if not given, nothing is written.
+
+    Raises:
+        OSError: A file cannot be read.
+        ValueError: A trajectory is none, or cannot be compared; the message says where.
+        ConfigError: A setting is wrong.
+    """
+    _check_runtime()
+    from nodes.judging.judge import judging, sources
+    from runtime.config.reading import convert
+
+    config = convert(
+        {
+            "alignment": alignment,
+            "scale_free": scale_free,
+            "axes": axes,
+            "thresholds": dict(thresholds or {}),
+        },
+        judging.JudgeConfig,
+        "judge",
+    )
+    true = (
+        sources.read_truth(str(truth), "")
+        if isinstance(truth, str | Path)
+        else sources.Source(name="truth", file="truth", poses=_trajectory(truth, "truth"))
+    )
+    named = estimates if isinstance(estimates, Mapping) else {"": estimates}
+    found = []
+    for name, each in named.items():
+        if isinstance(each, str | Path):
+            text = f"{name}={each}" if name else str(each)
+            found.append(sources.read(text, config.axes))
+        else:
+            name = name or "estimate"
+            found.append(sources.Source(name=name, file=name, poses=_trajectory(each, name)))
+    stamps = sources.read_stamps(Path(frames)) if isinstance(frames, str | Path) else frames
+    judgements, verdict, notes = judging.judge_all(true, found, stamps, config)
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
+    if out is not None:
+        judging.write(Path(out), true, judgements, verdict, notes)
+        return load(out)
+    return Run(judging.in_memory(true, judgements, verdict, notes), None)
+
+
+class _Flight(threading.Thread):
+    """One run in a thread and an event loop of its own."""
+
+    def __init__(self, config: Config, folder: Path, quiet: bool) -> None:
+        super().__init__(name=f"run {config.run.name}", daemon=True)
+        self._config = config
+        self._folder = folder
+        self._quiet = quiet
+        self._stop: Callable[[], object] | None = None
+        self._interrupted = False
+        self._error: BaseException | None = None
+        self._over = threading.Event()
+
+    def run(self) -> None:
+        from runtime.run.execute import execute
+        from runtime.tools.cli.run import observed
+
+        try:
+            handlers, watch = observed(
+                self._config,
+                self._config.run.name,
+                quiet=self._quiet,
+                trace=None,
+                top=False,
+                web=None,
+            )
+
+            @contextlib.contextmanager
+            def watching(supervisor: Supervisor) -> Iterator[None]:
+                loop = asyncio.get_running_loop()
+                self._stop = lambda: loop.call_soon_threadsafe(supervisor.stop, "Ctrl-C")
+                if self._interrupted:
+                    self._stop()
+                with watch(supervisor):
+                    yield
+
+            execute(self._config, self._folder, handlers=handlers, watch=watching)
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._over.set()
+
+    def wait(self) -> None:
+        """Wait for the end; raise what went wrong.
+
+        A Ctrl-C ends the run first; a second one is raised at once.
+        """
+        try:
+            self._over.wait()
+        except BaseException:
+            self._interrupted = True
+            if self._stop is not None:
+                with contextlib.suppress(RuntimeError):  # the loop is closed
+                    self._stop()
+            self._over.wait()
+            raise
+        if self._error is not None:
+            raise self._error
+
+
+def _settings(config: str | Path | Mapping[str, Any], changes: Mapping[str, Any]) -> Config:
+    from runtime.config.messages import override
+    from runtime.config.reading import find_modules_in, load_configuration, parse
+
+    if not isinstance(config, Mapping):
+        return load_configuration(Path(config), _changes(changes))
+    find_modules_in(Path.cwd())
+    table = _plain(copy.deepcopy(dict(config)))
+    for change in _changes(changes):
+        override(table, change)
+    return parse(table, "config")
+
+
+def _changes(changes: Mapping[str, Any]) -> list[str]:
+    return [f"{path}={_toml(value)}" for path, value in changes.items()]
+
+
+def _toml(value: Any) -> str:
+    from runtime.config.parameters import toml
+
+    return toml(_plain(value))
+
+
+def _value(text: str) -> Any:
+    from runtime.tools.sweep.plan import value
+
+    return value(text)
+
+
+def _plain(value: Any) -> Any:
+    """Return what TOML knows for a value of Python's: a class is named, an array is a list."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, type):
+        return f"{value.__module__}:{value.__qualname__}"
+    if isinstance(value, Path):
+        return str(value)
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _trajectory(given: Any, name: str) -> Trajectory:
+    import numpy as np
+
+    from nodes.trajectory import Trajectory
+
+    if isinstance(given, Trajectory):
+        return given
+    rows = np.asarray(given, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 8:
+        raise ValueError(
+            f"{name}: expected a file, a Trajectory, or TUM's rows of shape (n, 8), found an array "
+            f"of shape {rows.shape}"
+        )
+    stamps = np.round(rows[:, 0] * 1e9).astype(np.int64)
+    return Trajectory(stamps, rows[:, 1:4], rows[:, [7, 4, 5, 6]])
 
 
 def main() -> None:

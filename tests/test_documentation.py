@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import tomllib
+import types
 from pathlib import Path
 from typing import NamedTuple
 
@@ -95,9 +96,12 @@ def test_every_block_says_its_language() -> None:
 @pytest.mark.parametrize(
     "block", [each for each in blocks("python") if ELSEWHERE not in each.text], ids=str
 )
-def test_python_runs(block: Block) -> None:
+def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a module of its own: an assertion in it is one of ours."""
-    exec(compile(block.text, str(block), "exec"), {"__name__": "snippet"})
+    module = types.ModuleType("snippet")
+    monkeypatch.setitem(sys.modules, "snippet", module)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block.text, str(block), "exec"), vars(module))
 
 
 @pytest.mark.parametrize("block", blocks("toml"), ids=str)

@@ -23,7 +23,8 @@ from nodes.judging.evaluation.results import FRAMES, write_results
 from nodes.judging.evaluation.verdict import conclude
 from nodes.judging.judge.sources import Axes, Source
 from nodes.judging.report.page import write_report
-from nodes.judging.report.tables import Facts, Verdict
+from nodes.judging.report.style import COLORS
+from nodes.judging.report.tables import Estimator, Facts, Run, Verdict
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
 from runtime import Duration
@@ -123,6 +124,42 @@ def write(
         page = _write(out, truth, judgements, verdict, notes)
         folder.flown()
     return page
+
+
+def in_memory(
+    truth: Source,
+    judgements: dict[str, Judgement],
+    verdict: Verdict,
+    notes: Sequence[str],
+) -> Run:
+    """Return what `read_run` finds in the folder that `write` writes."""
+    estimators = [
+        Estimator(
+            name=name,
+            color=COLORS[k % len(COLORS)],
+            figures=verdict.estimators[name],
+            aligned=judgement.aligned,
+            of_images=judgement.of_images,
+            of_ticks=judgement.of_ticks,
+            lost=judgement.lost,
+            final=judgement.final,
+        )
+        for k, (name, judgement) in enumerate(judgements.items())
+    ]
+    return Run(
+        folder=Path(),
+        facts=Facts(name="trajectories", verdict=verdict),
+        verdict=verdict,
+        truths={"": truth.poses},
+        plans={},
+        collisions=np.empty((0, 3)),
+        estimators=estimators,
+        frames={},
+        clouds=[],
+        config=None,
+        log=[],
+        missing=list(notes),
+    )
 
 
 def _write(

@@ -135,7 +135,7 @@ def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> li
         with (
             _signals_interrupt(children),
             display,
-            ThreadPoolExecutor(jobs or _at_once(plan), "run") as executor,
+            ThreadPoolExecutor(jobs or at_once(plan), "run") as executor,
         ):
             return sweeping.sweep(plan, executor, run=children.run, watch=display, fresh=fresh)
     except KeyboardInterrupt:
@@ -165,7 +165,7 @@ def _signals_interrupt(children: Children) -> Iterator[None]:
             signal.signal(number, before[number])
 
 
-def _at_once(plan: Plan) -> int:
+def at_once(plan: Plan) -> int:
     """Return how many runs fit on the cores: rendering takes one of its own."""
     cores = len(os.sched_getaffinity(0))
     return cores if all(job.record for job in plan.jobs) else max(cores // 2, 1)

@@ -13,6 +13,7 @@ import itertools
 import os
 import re
 import socket
+import threading
 from collections.abc import AsyncIterator
 from http import HTTPStatus
 from pathlib import Path
@@ -169,7 +170,10 @@ def socket_of(run: str) -> Path:
     Raises:
         CommandError: The folder cannot be used, or others could enter it.
     """
-    place, end = user_folder(), f"-{os.getpid()}.sock"
+    place, number = user_folder(), f"{os.getpid()}"
+    if threading.current_thread() is not threading.main_thread():  # others may run in others
+        number += f".{threading.get_native_id()}"
+    end = f"-{number}.sock"
     for other in place.glob("*.sock"):  # what killed runs have left is removed
         _answers(other)
     name = re.sub(r"[^\w.-]", "_", run)
