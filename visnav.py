@@ -486,7 +486,7 @@ def main() -> None:
 
 
 def _check_runtime() -> None:
-    """Raise ImportError if the package `runtime` is not the one beside this file."""
+    """Raise ImportError if `runtime` is not the package beside this file."""
     expected = Path(__file__).resolve().parent / "runtime"
     spec = importlib.util.find_spec("runtime")
     found = Path(spec.origin).resolve() if spec is not None and spec.origin else None

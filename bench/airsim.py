@@ -38,14 +38,14 @@ CASES: dict[str, tuple[Any, ...]] = {
     "state": ("getMultirotorState", ""),
     "image, 256×144 uncompressed": ("simGetImages", [IMAGE], "", False),
 }
-"""What is asked for, by what it is called in the results."""
+"""AirSim requests to measure, by their names in the results."""
 
 
 class AirsimRow(LateRow, frozen=True, kw_only=True):
-    """Windows of one kind; `ratio_p99` is the median of the pairs', to the quiet window's.
+    """Figures of a kind of window; `ratio_p99`: median ratio to paired quiet window.
 
     Attributes:
-        case: ``quiet``, or what is asked for.
+        case: ``quiet``, or the request.
         per_second: Answers.
         median_us: Round trip as the client sees it; so `p99_us`.
     """

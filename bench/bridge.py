@@ -1,13 +1,13 @@
-"""What the runtime adds to Zenoh between two processes: round trips and bursts, beside raw Zenoh.
+"""Overhead of the runtime over raw Zenoh between two processes: round trips and bursts.
 
 Two nodes of one run in two processes, on the real clock, against two bare Zenoh sessions in the
-same two processes. What is asked is a small event, or an image; the answer is always small. Blocks
-of both are measured in turns, in an order that is drawn, so that whatever else the machine does
-falls on both alike; a ratio is that of the two medians.
+same two processes. A request is a small event or an image; the answer is always small. Blocks of
+both sides are measured in turns, in random order, so that other load on the machine falls on both
+alike; a ratio is that of the two medians.
 
-And what an image costs on its way to ROS 2, encoded as the bridge does it, and by rosbags alone.
-Both make the same bytes, CDR of a ``sensor_msgs/msg/Image``; rosbags gets its message ready-made
-and has only to be told the time.
+Also the cost of encoding an image for ROS 2, as the bridge does it, and by rosbags alone. Both
+make the same bytes, CDR of a ``sensor_msgs/msg/Image``; rosbags gets its message ready-made, with
+only the time to set.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from runtime.config.reading import parse
 from runtime.run.execute import execute
 
 BLOCK = 50
-"""Round trips of one side before it may be the other's turn."""
+"""Round trips of a side in each of its turns."""
 
 WARM_UP = 50
 ENCODED_FIRST = 20
-"""Images that both encode before any is measured."""
+"""Images encoded by both sides before the first measurement."""
 
 IMAGE = "sensor_msgs/msg/Image"
 FRAME = "camera_optical_frame"
@@ -48,7 +48,7 @@ IMAGES = {"512×512 rgb8": (512, 512, 3), "1080×1080 rgb8": (1080, 1080, 3)}
 
 
 class BridgeRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One kind of event: round trips of ours and of raw Zenoh, medians and 99th percentiles.
+    """Round trips of a kind of event, ours and raw Zenoh's: medians, 99th percentiles.
 
     Attributes:
         bytes: Of its payload.
@@ -69,7 +69,7 @@ class BridgeRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RosImageRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One kind of image: what the bridge takes to encode it, and rosbags' ``serialize_cdr``.
+    """Encoding time of a kind of image, by the bridge and rosbags' ``serialize_cdr``.
 
     Attributes:
         bytes: Of a message.
@@ -123,7 +123,7 @@ class Mirror(Node):
 
 
 class Asker(Node):
-    """Measures what it takes to be answered, in turns with raw Zenoh."""
+    """Node to measure round trips to the other process, in turns with raw Zenoh."""
 
     questions = Output(Asked)
     images = Output(Image)
@@ -171,7 +171,7 @@ class Asker(Node):
         return time.perf_counter_ns() - begin
 
     async def _burst(self, data: npt.NDArray[np.uint8] | None, count: int) -> float:
-        """Return events a second: many questions, of which only the last is answered."""
+        """Return events per second in a burst; only the last event is answered."""
         begin = time.perf_counter_ns()
         for number in range(count):
             self._ask(data, answer=number == count - 1)
@@ -247,7 +247,7 @@ def measure(
 
 
 def mirror(meet: str, locator: str) -> None:
-    """Be the other process: a node that answers, and a bare session that does."""
+    """Run the answering process: a node, and a bare Zenoh session."""
     import zenoh
 
     with zenoh.open(zenoh_config(connect=locator)) as session:

@@ -1,4 +1,4 @@
-"""``python -m runtime bench …``: one command a benchmark."""
+"""Commands ``python -m runtime bench …``, a benchmark each."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def small(
     only: Only = None,
     plots: Plots = None,
 ) -> None:
-    """Measure the round trip from node 1 to N-1 listeners, the last of which replies."""
+    """Measure the round trip from node 1 to N-1 listeners; the last listener replies."""
     _latency("small", json, nodes, samples, warm_up, repeats, only, plots)
 
 
@@ -74,7 +74,7 @@ def stall(
     rate: Annotated[float, typer.Option(min=0.1, help="Hertz of the camera.")] = 10.0,
     size: Annotated[int, typer.Option(min=16, help="Width and height of its images.")] = 512,
 ) -> None:
-    """Measure how late a 400 Hz tick is without a camera, with one inline and beside the loop."""
+    """Measure 400 Hz tick lateness: no camera, camera inline, camera beside the loop."""
     from bench.stall import measure
 
     options: dict[str, Any] = {"seconds": seconds, "repeats": repeats, "rate": rate, "size": size}
@@ -94,7 +94,7 @@ def idle(
     json: Json = None,
     seconds: Annotated[float, typer.Option(min=0.5, help="Length of the run.")] = 10.0,
 ) -> None:
-    """Measure the processor time of one 100 Hz timer node."""
+    """Measure the processor time of a single 100 Hz timer node."""
     from bench.throughput import measure_idle
 
     _show(json, idle=lambda _: [measure_idle(seconds)])
@@ -124,7 +124,7 @@ def bridge(
     ] = 2000,
     repeats: Annotated[int, typer.Option(min=30, help="Images encoded for ROS.")] = 300,
 ) -> None:
-    """Measure what crosses between two processes beside raw Zenoh, and ROS images' encoding."""
+    """Measure events between two processes against raw Zenoh, and ROS image encoding."""
     from bench.bridge import measure, measure_ros_images
 
     _show(
@@ -151,7 +151,7 @@ def held(
     seconds: Annotated[float, typer.Option(min=2.0, help="Simulated, of each flight.")] = 8.0,
     repeats: Annotated[int, typer.Option(min=1, help="Flights of each side, in turns.")] = 5,
 ) -> None:
-    """Measure a flight with an odometry outside that is held for, beside the same in a worker."""
+    """Measure a lockstep flight with odometry in an outside program, and in a worker."""
     from bench.outside import measure_held
 
     _show(json, held=lambda say: measure_held(seconds=seconds, repeats=repeats, progress=say))
@@ -164,7 +164,7 @@ def recording(
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each kind, in turns.")] = 5,
     rate: Annotated[float, typer.Option(min=1.0, help="Hertz of the camera.")] = 30.0,
 ) -> None:
-    """Measure how late a 400 Hz tick is while a run is recorded, and while it is not."""
+    """Measure the lateness of a 400 Hz tick with and without a recorder."""
     from bench.lateness import measure_recording
 
     options: dict[str, Any] = {"seconds": seconds, "repeats": repeats, "rate": rate}
@@ -218,7 +218,7 @@ def compare(
     before: Annotated[Path, typer.Argument(help="A result file.")],
     after: Annotated[Path, typer.Argument(help="Another.")],
 ) -> None:
-    """Say what got faster or slower between two result files, beyond the noise of both."""
+    """Print the speed changes between two result files beyond the noise of both."""
     from rich.console import Console
 
     from bench.results import compare as changes_between
@@ -284,7 +284,7 @@ def _counts(nodes: str) -> list[int]:
 
 @contextlib.contextmanager
 def _status() -> Iterator[Callable[..., None]]:
-    """Show one line of what is being done, where there is a terminal to show it."""
+    """Show a status line of the current work, on a terminal only."""
     from rich.console import Console
 
     with Console(stderr=True).status("…") as status:
@@ -294,10 +294,10 @@ def _status() -> Iterator[Callable[..., None]]:
 
 
 def _show(json: Path | None, **benchmarks: Callable[[Callable[..., None]], list[Any]]) -> None:
-    """Run benchmarks and show their tables; write all rows to a file if one is given.
+    """Run benchmarks and show their tables; write all rows to the file `json`, if any.
 
     Args:
-        benchmarks: By the names of their tables; each gets what says how far it is.
+        benchmarks: By the names of their tables; each gets a progress callback.
     """
     from rich.console import Console
 

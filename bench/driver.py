@@ -24,15 +24,15 @@ import numpy as np
 from bench.system import Case, CaseName, Mode, Samples, System, in_turns
 
 _LIMIT = 120.0
-"""Seconds that one measurement may take."""
+"""Time limit of a measurement, seconds."""
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One system at one number of nodes: statistics of the samples of all rounds, pooled.
+    """Statistics of a system at a number of nodes, over all rounds' pooled samples.
 
     Attributes:
-        samples: How many round trips, in all rounds.
-        rounds_us: The median of each round.
+        samples: Round trips in all rounds.
+        rounds_us: Median of each round.
     """
 
     case: str
@@ -51,12 +51,12 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What a whole benchmark came to.
+    """Result of a whole benchmark.
 
     Attributes:
-        rows: What was measured.
-        missing: System to the reason why it was not.
-        versions: System to what was measured.
+        rows: Measurements.
+        missing: System to the reason for its absence.
+        versions: System to its version.
     """
 
     rows: list[Row]
@@ -65,7 +65,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 RIVALS = Path(__file__).with_name("systems")
-"""What the runtime is measured beside; a wheel has none of it."""
+"""Folder of the systems to compare the runtime with; absent from wheels."""
 
 
 def systems() -> dict[str, tuple[System, ...]]:
@@ -87,7 +87,7 @@ def measure_all(
     budget: float = 1.0,
     progress: Callable[[str, float], None] = lambda *_: None,
 ) -> Outcome:
-    """Measure one case with all systems that are installed.
+    """Measure a case with all installed systems.
 
     Args:
         samples: Round trips of each measurement, fewer for slow systems: see `budget`.
@@ -187,7 +187,7 @@ def _row(case: str, system: str, mode: str, nodes: int, place: str, runs: Sequen
 
 
 def find(module: str, name: str) -> System:
-    """Return a system by the module that has it and its name.
+    """Return a system by its module and name.
 
     Raises:
         LookupError: The module has no such system.

@@ -32,7 +32,7 @@ from nodes.ros2.messages.typestore import TypeStore
 
 TWIST = "geometry_msgs/msg/Twist"
 BURST = 0.001
-"""Seconds from one handful of messages to the next."""
+"""Seconds between bursts of messages."""
 
 RATE = 10_000.0
 WINDOW = 1.0
@@ -40,11 +40,11 @@ WINDOW = 1.0
 
 
 class FloodRow(LateRow, frozen=True, kw_only=True):
-    """Windows of one kind; `ratio_p99` is the median of the pairs', to the quiet window's.
+    """Figures of a kind of window; `ratio_p99`: median ratio to paired quiet window.
 
     Attributes:
         case: ``quiet`` or ``flood``.
-        messages_per_second: That came.
+        messages_per_second: Received.
         ratio_p50: Median of the pairs' ratios of medians.
     """
 
@@ -131,7 +131,7 @@ def _row(
 
 
 def main(port: int, key: str, rate: float, seconds: float, windows: int) -> None:
-    """Send in every second of so many windows, the first of which is quiet."""
+    """Send a flood of messages in every second window; the first window is quiet."""
     store = TypeStore()
     twist = bytes(store.serialize(store.zero(TWIST)))
     with zenoh.open(zenoh_config(connect=f"tcp/127.0.0.1:{port}")) as session:

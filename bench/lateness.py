@@ -1,6 +1,6 @@
-"""How late a 400 Hz tick comes while a multirotor hovers: what several benchmarks measure.
+"""Lateness of a 400 Hz tick while a multirotor hovers, for several benchmarks.
 
-Here, what a recorder costs such a controller, with a 512×512 RGB-D camera at 30 Hz, on the real
+Here: the cost of a recorder to such a controller, with a 512×512 RGB-D camera at 30 Hz, on the real
 clock. Runs with a recorder and without take turns, and the ratio is the median of the pairs'.
 """
 
@@ -45,7 +45,7 @@ class LateRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Beat(NamedTuple):
-    """A tick: its stamp, when it came (monotonic clock, ns), how late (ns), and how many missed."""
+    """Tick: stamp, arrival (monotonic clock, ns), lateness (ns), count of missed ticks."""
 
     stamp: int
     at: int
@@ -54,14 +54,14 @@ class Beat(NamedTuple):
 
 
 EDGE_NS = 30_000_000
-"""At either end of a window, ticks are left out for so long: what was sent may be under way."""
+"""Margin at both ends of a window whose ticks are left out, ns: messages may be late."""
 
 BEATS: list[Beat] = []
-"""The ticks of the probe of this process; whoever measures clears it."""
+"""Ticks of this process's probe; the measuring code clears the list."""
 
 
 class TakeoffNode(Node[C]):
-    """Base of the nodes that measure a flying vehicle: sends it up when the run begins."""
+    """Base of the nodes to measure a flying vehicle: commands take-off at the start."""
 
     commands = Output(Takeoff)
 
@@ -75,7 +75,7 @@ class Probe(TakeoffNode[NodeConfig]):
 
     @every(hz=400)
     def tick(self, tick: Tick) -> None:
-        """Note how late it is."""
+        """Record the tick's lateness."""
         BEATS.append(Beat(tick.stamp, time.monotonic_ns(), tick.late, tick.missed))
 
 
@@ -83,7 +83,7 @@ PROBE: dict[str, Any] = {"name": "probe", "type": f"{__name__}:Probe"}
 
 
 def hover(benchmark: str, seconds: float, *nodes: dict[str, Any]) -> None:
-    """Have a multirotor hover on the real clock, with the probe and other nodes beside it."""
+    """Run a hovering multirotor on the real clock, with the probe and further nodes."""
     BEATS.clear()
     run = {"clock": "real", "duration": seconds, "log": "error"}
     here = [PROBE, {"name": "drone", "type": "Multirotor"}, *nodes]
@@ -123,12 +123,12 @@ def ratios(runs: Sequence[Any], beside: Sequence[Any]) -> tuple[float, float]:
 
 
 class RecordingRow(LateRow, frozen=True, kw_only=True):
-    """Runs of one kind, all together; `ratio_p99` is the median of the pairs' ratios.
+    """Runs of a kind, pooled; `ratio_p99` is the median of the pairs' ratios.
 
     Attributes:
-        frames: Pairs of images that came.
+        frames: Pairs of images received.
         megabytes: Written.
-        dropped: Events that are not in the recordings.
+        dropped: Events missing from the recordings.
     """
 
     case: str
@@ -138,7 +138,7 @@ class RecordingRow(LateRow, frozen=True, kw_only=True):
 
 
 class _Run(msgspec.Struct):
-    """What one run leaves; lateness in nanoseconds."""
+    """Measurements of a run; lateness in nanoseconds."""
 
     late: list[int] = []
     frames: int = 0
@@ -147,7 +147,7 @@ class _Run(msgspec.Struct):
 
 
 WARM_UP = 1_500_000_000
-"""Nanoseconds of each run that are left out."""
+"""Nanoseconds left out at the start of each run."""
 
 CASES: dict[str, dict[str, object] | None] = {
     "no recorder": None,

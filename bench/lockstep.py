@@ -48,7 +48,7 @@ SHORT = 2.0
 
 
 class LockstepRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One way to simulate.
+    """Speed of a way to simulate.
 
     Attributes:
         case: ``bare loop``, ``run``, ``run with cameras``.
@@ -62,10 +62,10 @@ class LockstepRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PartRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One part of what a frame costs.
+    """Part of the cost of a frame.
 
     Attributes:
-        part: What is done.
+        part: The work.
         ms: Processor time of all processes, milliseconds a frame, median.
         share: Of the whole.
     """
@@ -218,7 +218,7 @@ def _noise() -> float:
 
 
 def _copies() -> float:
-    """Return what it takes to hand the images to the run, and from there to the odometry."""
+    """Return the cost (ms) of handing images to the run, and on to the odometry."""
     files = anonymous_file(), anonymous_file()
     ours, theirs = socket.socketpair()
     here = SharedPipe(ours, *files)

@@ -1,4 +1,4 @@
-"""Our own runtime, measured as its users meet it: nodes, ports and a supervisor, on uvloop."""
+"""Our own runtime, measured as used: nodes, ports and a supervisor, on uvloop."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from runtime.time.clock import RealClock
 
 
 class OneConfig(NodeConfig):
-    """What to measure."""
+    """Settings of node 1: the case to measure."""
 
     case: Case
 
@@ -53,7 +53,7 @@ class HandlerOne(_One):
         self.arrived = time.perf_counter_ns()
 
     async def run(self) -> None:
-        """Measure; nothing here waits, so one sample is one call of `send`."""
+        """Measure; nothing here waits, so a sample is a single call of `send`."""
         now, send, taken, payload = time.perf_counter_ns, self.pings.send, self.taken, self.payload
         target, to = self.target, self.config.case.nodes
         for number in range(len(taken)):
@@ -81,7 +81,7 @@ class StreamOne(_One):
 
 
 class OtherConfig(NodeConfig):
-    """Settings of the nodes that listen."""
+    """Settings of the listening nodes."""
 
     number: int
 
@@ -96,7 +96,7 @@ class HandlerOther(Node[OtherConfig]):
 
     @on(Ping)
     def ping(self, event: Ping) -> bool | None:
-        """Reply, if it is meant."""
+        """Reply to a ping for this node."""
         if event.receiver == self.number:
             self.pongs.send(Pong(stamp=event.stamp, source=self.name, number=event.number))
             return True
@@ -110,7 +110,7 @@ class StreamOther(Node[OtherConfig]):
     pongs = Output(Pong)
 
     async def run(self) -> None:
-        """Reply, if it is meant."""
+        """Reply to each ping for this node."""
         number = self.config.number
         async for event in self.pings:
             if event.receiver == number:

@@ -1,4 +1,4 @@
-"""What an estimator outside the process costs, beside the same in a worker.
+"""Cost of an estimator outside the process, against the same estimator in a worker.
 
 The way there: both sides get the same 512×512 RGB-D frame in shared memory and answer without
 looking at it; a time is from the call to the answer on the loop.
@@ -45,7 +45,7 @@ ESTIMATES = "odometry.estimates"
 
 
 class LinkRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One kind of frame: medians of the native interface and back, and of a worker's call.
+    """Medians of a kind of frame: round trip by the native interface, call of a worker.
 
     Attributes:
         bytes: Of its images.
@@ -137,7 +137,7 @@ async def _measure(
 
 
 class HeldRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One way to a program outside: simulated seconds per second with it, and with a worker.
+    """Simulated seconds per second: a way to an outside program, and a worker.
 
     Attributes:
         rounds: Flights of each side; speeds are medians.

@@ -1,4 +1,4 @@
-"""All benchmarks in one go, and ``RESULTS.md``: figures and plots of them, by ``page.md.jinja``."""
+"""All benchmarks in a single run, and ``RESULTS.md``: figures and plots, by ``page.md.jinja``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OURS = "visnav"
 
 
 class Results(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything that was measured; the content of ``results.json``."""
+    """All measurements; the content of ``results.json``."""
 
     environment: dict[str, str]
     quick: bool
@@ -51,7 +51,7 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
 
 
 QUICK_SYSTEMS = ("visnav", "plain", "asyncio.queue", "pyee", "thesis")
-"""Parts of the names of what a quick run measures: what is quick to start."""
+"""Parts of the names of the systems in a quick run: systems quick to start."""
 
 
 def measure(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> Results:
@@ -102,7 +102,7 @@ def measure(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> 
 
 
 def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> dict[str, Any]:
-    """Measure what goes on between processes and beside the loop, by field of `Results`."""
+    """Run the benchmarks between processes and beside the loop, by field of `Results`."""
     return {
         "bridge": bridge.measure(200 if quick else 2000, progress),
         "link": outside.measure_link(100 if quick else 1000),
@@ -140,7 +140,7 @@ def draw(rows: Sequence[Row], out: Path, boxes: Iterable[int]) -> dict[str, list
 
 
 def label(row: Row) -> str:
-    """Return what a row is called: the system, and its mode where it has several."""
+    """Return a row's label: system and mode."""
     return f"{row.system}, {row.mode}"
 
 
@@ -240,7 +240,7 @@ def page(results: Results, plots: Mapping[str, Sequence[str]], folder: str) -> s
 
 
 def _goals(results: Results) -> Iterator[tuple[Any, ...]]:
-    """Yield what is compared with the marks that the project sets itself: the cells of a row."""
+    """Yield table rows to compare measurements with the project's own goals."""
     medians = {(r.case, r.system, r.mode, r.nodes): r.median_us for r in results.rows}
     nodes = sorted({nodes for case, _, _, nodes in medians if case == "small"})
     ros, cpp, queue = "ROS 1 nodelets", "thesis client (C++)", "asyncio.Queue (uvloop)"

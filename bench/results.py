@@ -1,4 +1,4 @@
-"""Result files: where and with what it was measured, and what changed between two of them."""
+"""Result files: environment and versions of the measurements, and changes between two files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _cpu() -> str:
 
 
 class Change(msgspec.Struct, frozen=True):
-    """One figure of two files.
+    """Change of a figure between two files.
 
     Attributes:
         what: Case, system, mode, nodes.
@@ -56,7 +56,7 @@ class Change(msgspec.Struct, frozen=True):
 
 
 def read_rows(path: Path) -> dict[str, dict[str, Any]]:
-    """Return a result file's latency rows by what they measure.
+    """Return a result file's latency rows by case, system, mode and nodes.
 
     Raises:
         ConfigError: The file is missing or no result file.
@@ -76,7 +76,7 @@ def read_rows(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def compare(before: Path, after: Path) -> list[Change]:
-    """Return the changes of all figures that both files have, largest first."""
+    """Return the changes of all figures common to both files, largest first."""
     old, new = read_rows(before), read_rows(after)
     changes = [
         Change(
@@ -92,6 +92,6 @@ def compare(before: Path, after: Path) -> list[Change]:
 
 
 def _spread(row: dict[str, Any]) -> float:
-    """Return the largest to the smallest median of the rounds; a guess if there is but one."""
+    """Return largest to smallest round median, at least 1.02; 1.1 for a single round."""
     rounds = row.get("rounds_us") or [1.0]
     return max(max(rounds) / min(rounds), 1.02) if len(rounds) > 1 else 1.1

@@ -42,15 +42,15 @@ from sims.worlds import load_world
 
 Mode = Literal["none", "inline", "thread", "worker", "fetch inline", "fetch"]
 DELAY = 0.08
-"""Seconds that the server takes for an answer."""
+"""Response time of the server, seconds."""
 
 WARM_UP = 1_000_000_000
-"""Nanoseconds of each run that are left out."""
+"""Nanoseconds left out at the start of each run."""
 MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker", "fetch inline", "fetch")
 
 
 class StallRow(LateRow, frozen=True, kw_only=True):
-    """One way of fetching images.
+    """Statistics of a mode of fetching images.
 
     Attributes:
         missed: Ticks left out because an earlier one came too late.
@@ -69,7 +69,7 @@ class StallRow(LateRow, frozen=True, kw_only=True):
 
 
 class _Samples(msgspec.Struct):
-    """What one mode's runs collect; nanoseconds."""
+    """Samples of all runs of a mode, nanoseconds."""
 
     late: list[int] = []
     update: list[int] = []
@@ -100,12 +100,12 @@ class CameraConfig(NodeConfig):
 
 
 class Camera(Node[CameraConfig]):
-    """Fetches an RGB-D pair of what the vehicle sees, in one of the ways that are compared."""
+    """Node to fetch RGB-D pairs of the vehicle's view, in the mode under test."""
 
     odometry = Input(Odometry, keep="latest")
 
     async def on_startup(self) -> None:
-        """Start the renderer where the mode wants it."""
+        """Start the renderer, or connect to the server, as the mode requires."""
         config = self.config
         self._samples = _collected.setdefault(config.mode, _Samples())
         self._fetch: Callable[..., Any] | None = None
@@ -136,7 +136,7 @@ class Camera(Node[CameraConfig]):
             self._close = renderer.close
 
     async def _connect(self) -> None:
-        """Connect with the slow server, and fetch from it on the loop or awaiting it."""
+        """Connect to the slow server; fetch blocking the loop, or awaiting the answer."""
         config = self.config
         size = pair_size(config.width, config.height)
         if config.mode == "fetch":
@@ -171,7 +171,7 @@ class Camera(Node[CameraConfig]):
             self._samples.fetch.append(time.monotonic_ns() - asked)
 
     async def on_shutdown(self) -> None:
-        """Close the renderer in the thread that made it."""
+        """Close the renderer, in its own thread for mode ``thread``."""
         if self.config.mode == "thread":
             await self.clock.beside(self._pool.submit(self._close))
             self._pool.shutdown()
@@ -243,7 +243,7 @@ def _row(mode: str, samples: _Samples) -> StallRow:
 
 
 def main(delay: float, size: int) -> None:
-    """Serve one connection after another until standard input ends."""
+    """Serve successive connections until standard input ends."""
     answer = bytes(size)
     server = socket.create_server(("127.0.0.1", 0))
     print(server.getsockname()[1], flush=True)

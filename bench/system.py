@@ -1,4 +1,4 @@
-"""What is measured, the interface of every measured system, and what benchmarks share.
+"""Cases, the interface of every measured system, and shared code of the benchmarks.
 
 The exchange is the thesis's: node 1 sends a ping (sender, receiver, number, time) that all N-1
 other nodes hear; the last of them is its receiver and replies; the sample is the time at node 1
@@ -33,7 +33,7 @@ NODES = (2, 4, 8, 10, 16, 32, 50, 64, 100, 128)
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
-    """One thing to measure.
+    """Case to measure.
 
     Attributes:
         case: ``small``: no payload. ``large``: each ping carries a fresh copy of a float32 array
@@ -43,8 +43,8 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
             coroutines or threads that wait for the next message. ``routed``: the ping reaches
             its receiver only.
         nodes: N, sender included; at least 2.
-        samples: How many round trips to record.
-        warm_up: How many to leave out before.
+        samples: Round trips to record.
+        warm_up: Round trips to leave out before.
     """
 
     case: CaseName = "small"
@@ -55,19 +55,19 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
 
 
 Samples = npt.NDArray[np.int64]
-"""Round trips in nanoseconds, shape (samples,), in the order in which they were measured."""
+"""Round trips in nanoseconds, shape (samples,), in order of measurement."""
 
 
 class System(msgspec.Struct, frozen=True):
-    """Something that can be measured.
+    """Messaging system to measure.
 
     Attributes:
-        name: As it stands in tables: ``asyncio.Queue (uvloop)``.
-        modes: Which modes it has.
+        name: As in tables: ``asyncio.Queue (uvloop)``.
+        modes: Supported modes.
         measure: Measures a case; called in a fresh process of its own.
         slowness: About how many microseconds a round trip takes at N = 2; the driver shortens
             runs of slow systems by it.
-        cases: Which cases it has.
+        cases: Supported cases.
         place: Whether its nodes share a process.
         max_nodes: Beyond this it is not measured: too slow, or too many processes for a laptop.
         missing: Returns why it cannot be measured here (with what installs it), or `None`.
@@ -103,12 +103,12 @@ def in_processes(
 
 
 def large_array() -> npt.NDArray[np.float32]:
-    """Return the array that large pings carry."""
+    """Return the payload array of large pings."""
     return np.arange(np.prod(LARGE_SHAPE), dtype=np.float32).reshape(LARGE_SHAPE)
 
 
 class Ping(Event):
-    """What node 1 says to all.
+    """Message from node 1 to all nodes.
 
     Attributes:
         receiver: Number of the node that is to reply.
@@ -122,7 +122,7 @@ class Ping(Event):
 
 
 class Pong(Event):
-    """What the receiver replies to node 1.
+    """Reply of the receiver to node 1.
 
     Attributes:
         number: Of the ping.
@@ -132,12 +132,12 @@ class Pong(Event):
 
 
 def packaged(**packages: str) -> dict[str, Any]:
-    """Return `missing` and `version` of a `System` that is some packages, as for `needs`."""
+    """Return `missing` and `version` of a `System` made of packages, as for `needs`."""
     return {"missing": needs(**packages), "version": versions(*packages.values())}
 
 
 def needs(**packages: str) -> Callable[[], str | None]:
-    """Return a `System.missing` that asks for some packages.
+    """Return a `System.missing` to ask for absent packages.
 
     Args:
         packages: Name of each module that must be there, and of the package that has it.
@@ -153,7 +153,7 @@ def needs(**packages: str) -> Callable[[], str | None]:
 
 
 def versions(*packages: str) -> Callable[[], str]:
-    """Return a `System.version` that names some packages."""
+    """Return a `System.version` with the names and versions of packages."""
 
     def version() -> str:
         return ", ".join(f"{package} {importlib.metadata.version(package)}" for package in packages)
@@ -162,7 +162,7 @@ def versions(*packages: str) -> Callable[[], str]:
 
 
 def payloads(case: Case) -> Callable[[], Any]:
-    """Return what makes the payload of each ping: nothing, a fresh copy, or the same array."""
+    """Return a factory of ping payloads: nothing, a fresh copy, or the same array."""
     if case.case == "small":
         return lambda: None
     array = large_array()
@@ -177,7 +177,7 @@ def _is_here(module: str) -> bool:
 
 
 def free_port() -> int:
-    """Return a TCP port of the loopback that nobody had a moment ago."""
+    """Return a loopback TCP port, free at the time of the call."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -185,7 +185,7 @@ def free_port() -> int:
 
 
 def zenoh_config(**endpoints: str) -> Any:
-    """Return the configuration of a Zenoh peer that finds nobody but by an endpoint.
+    """Return the configuration of a Zenoh peer without scouting: endpoints only.
 
     Args:
         endpoints: ``listen`` or ``connect``, as locators.
@@ -200,7 +200,7 @@ def zenoh_config(**endpoints: str) -> Any:
 
 
 def zenoh_publisher(session: Any, key: str) -> Any:
-    """Return a publisher that sends at once and never drops."""
+    """Return an express publisher (no batching), blocking instead of dropping."""
     block = importlib.import_module("zenoh").CongestionControl.BLOCK
     return session.declare_publisher(key, express=True, congestion_control=block)
 
@@ -225,10 +225,10 @@ def in_turns(sides: Iterable[T], rounds: int) -> Iterator[tuple[int, T]]:
 
 
 def pair(taken: Mapping[str, Sequence[int]]) -> dict[str, float]:
-    """Return the fields of a row that holds one side against another.
+    """Return the fields of a row to compare two sides.
 
     Args:
-        taken: Times (ns) of both sides, by the name with which their fields begin.
+        taken: Times (ns) of both sides, by the prefix of their fields.
 
     Returns:
         Medians and 99th percentiles in microseconds, and the ratio of the two medians.

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Column(NamedTuple):
-    """One column.
+    """Column of a table.
 
     Attributes:
         heading: Above it.
@@ -26,7 +26,7 @@ class Column(NamedTuple):
     spec: str = ""
 
     def cell(self, row: Any) -> str:
-        """Return what stands in a row; nothing if the row has no such figure."""
+        """Return the text for a row; empty if the row lacks the figure."""
         value = row.get(self.key) if isinstance(row, dict) else getattr(row, self.key)
         if value is None or (self.spec.startswith("?") and not value):
             return ""
@@ -35,12 +35,12 @@ class Column(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What a table shows.
+    """Layout of a table.
 
     Attributes:
         title: What is measured, as a sentence without its end.
         columns: From the left.
-        texts: How many of them hold words; the others hold numbers.
+        texts: Leading columns of words; the others hold numbers.
     """
 
     title: str
@@ -63,7 +63,7 @@ class Table(NamedTuple):
         return table
 
     def markdown(self, rows: Sequence[Any]) -> Iterator[str]:
-        """Yield the lines of the table in Markdown, and an empty one."""
+        """Yield the table's lines in Markdown, and an empty line."""
         yield f"| {' | '.join(column.heading for column in self.columns)} |"
         yield f"|{'---|' * self.texts}{'--:|' * (len(self.columns) - self.texts)}"
         for row in rows:
@@ -157,7 +157,7 @@ TABLES = {
         "noise: noise .2f",
     ),
 }
-"""By what is measured, as `bench.page.Results` names it."""
+"""Tables by benchmark, named as the fields of `bench.page.Results`."""
 
 
 def latency(rows: Sequence[Row]) -> tuple[Table, list[dict[str, Any]]]:

@@ -28,7 +28,7 @@ from runtime.workers.worker import Worker
 
 
 class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One way through.
+    """Throughput of a case.
 
     Attributes:
         batch: How many at a time.
@@ -48,7 +48,7 @@ class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class IdleRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One run of a timer.
+    """Processor load in a run of a timer.
 
     Attributes:
         cpu_percent: Of one core, all threads of the process together.
@@ -65,7 +65,7 @@ BATCH = 256
 
 
 class Unchecked(Event):
-    """A `PoseEstimate` that nobody checks."""
+    """`PoseEstimate` without checks, for comparison."""
 
     frame_id: str = "odom"
     child_frame_id: str = "base_link"
@@ -75,10 +75,10 @@ class Unchecked(Event):
 
 
 class Mirror:
-    """Lives in a worker; gives back what it gets."""
+    """Object in a worker: returns each image to the caller."""
 
     def echo(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """Return the image, which crosses shared memory both ways."""
+        """Return the image, passed through shared memory both ways."""
         return image
 
 
@@ -111,7 +111,7 @@ async def _measure(bursts: int) -> list[ThroughputRow]:
 
 
 def _making_rows(bursts: int) -> list[ThroughputRow]:
-    """Measure what making a pose costs, and what of it are its checks; in turns."""
+    """Measure the cost of making a pose with and without its checks, in turns."""
     place, turn = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
     taken: dict[type[Unchecked] | type[PoseEstimate], list[float]] = {
         Unchecked: [],
@@ -216,7 +216,7 @@ class Timer(Node):
 
 
 def measure_idle(seconds: float = 10.0) -> IdleRow:
-    """Run the timer for so many seconds; what it takes is what a nearly idle run costs."""
+    """Measure the cost of a nearly idle run: a timer for some seconds."""
     _marks.clear()
     node = {"name": "timer", "type": f"{__name__}:Timer"}
     execute(parse({"run": {"clock": "real", "duration": seconds}, "nodes": [node]}, "bench idle"))

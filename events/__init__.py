@@ -1,4 +1,4 @@
-"""The events that nodes send each other: frozen, typed data, and nothing else.
+"""Events exchanged by nodes: frozen, typed data, and nothing else.
 
 No asyncio, no input or output, no imports from the other rooms. A node's own events subclass
 `Event`; those here are shared, so that two people's nodes fit together. They are checked when they

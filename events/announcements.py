@@ -1,4 +1,4 @@
-"""What a node will provide, sent once before the first event.
+"""Announcements of the sources a node will provide, sent once before the first event.
 
 Bridges build publishers from these, estimators their calibration, reports their tables.
 """
@@ -16,10 +16,10 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Announcement(Event):
-    """Base of all announcements; `source` names what is announced.
+    """Base of all announcements; `source` is the announced name.
 
-    Who announces a source speaks for it, and for those below it. This class itself says only that;
-    with the source ``*``, of all for whom nobody else speaks.
+    The announcing node may send in this name, and in those below it. This class itself says no
+    more; with the source ``*``, it is for all names that no other node announces.
     """
 
     category: ClassVar[Category] = Category.ANNOUNCEMENT
@@ -29,13 +29,13 @@ class Announcement(Event):
 
 
 class VehicleAnnouncement(Announcement):
-    """A vehicle that takes set-points.
+    """A vehicle controlled by set-points.
 
     Attributes:
         mass: Kilograms.
         max_thrust: Newtons, all motors together.
-        control_rate: Hertz of its controller.
-        position: Where it stands at the start, metres in ``map``.
+        control_rate: Rate of its controller, hertz.
+        position: At the start, metres in ``map``.
         orientation: Rotation from body to ``map`` at the start.
     """
 
@@ -208,7 +208,7 @@ class SensorAnnouncement(Announcement):
 
 
 class BarometerAnnouncement(SensorAnnouncement):
-    """A barometer, which sends `FluidPressure`.
+    """A barometer; its measurements are sent as `FluidPressure`.
 
     Attributes:
         noise: Standard deviation of the white noise, pascal.
@@ -224,7 +224,7 @@ class BarometerAnnouncement(SensorAnnouncement):
 
 
 class NavSatAnnouncement(SensorAnnouncement):
-    """A satellite receiver, which sends `NavSatFix`.
+    """A satellite receiver; its fixes are sent as `NavSatFix`.
 
     Attributes:
         latitude: Degrees north, of the origin of ``map``.
@@ -254,7 +254,7 @@ class NavSatAnnouncement(SensorAnnouncement):
 
 
 class MagnetometerAnnouncement(SensorAnnouncement):
-    """A magnetometer, which sends `MagneticField`.
+    """A magnetometer; its measurements are sent as `MagneticField`.
 
     Attributes:
         noise: Standard deviation of the white noise of each axis, tesla.
@@ -272,7 +272,7 @@ class MagnetometerAnnouncement(SensorAnnouncement):
 
 
 class RangeAnnouncement(SensorAnnouncement):
-    """A range finder along its frame's x axis, which sends `Range`.
+    """A range finder along the x axis of its frame; its measurements are sent as `Range`.
 
     Attributes:
         noise: Standard deviation of the white noise, metres.
@@ -288,7 +288,7 @@ class RangeAnnouncement(SensorAnnouncement):
 
 
 class LidarAnnouncement(SensorAnnouncement):
-    """A lidar, which sends a `LidarScan` for each turn.
+    """A lidar; each turn is sent as a `LidarScan`.
 
     Attributes:
         channels: Number of its rings, or of the rays of one column.
@@ -310,10 +310,10 @@ class LidarAnnouncement(SensorAnnouncement):
 
 
 class WindAnnouncement(Announcement):
-    """Wind that a vehicle feels, which is sent as `Wind`; `source` is ``world/vehicle``.
+    """Wind at a vehicle, sent as `Wind`; `source` is ``world/vehicle``.
 
     Attributes:
-        rate: Hertz at which it is sent.
+        rate: Hertz of the events.
         velocity: Mean of the wind without gusts and turbulence, m/s in ``map``.
         turbulence: Wind at a height of 20 feet by which its strength is given, m/s; 0 for none.
     """
@@ -327,11 +327,11 @@ class WindAnnouncement(Announcement):
 
 
 class BodyAnnouncement(Announcement):
-    """A body that moves in the world by itself; its true pose is sent as `PoseStamped`.
+    """A body moving by itself in the world; its true pose is sent as `PoseStamped`.
 
     Attributes:
-        kind: What it is, in a word: ``person``, ``car``, ``door``.
-        object_ids: Its numbers in a `SegmentationImage`: its mask is where one of these is.
+        kind: Kind in a word: ``person``, ``car``, ``door``.
+        object_ids: Its numbers in a `SegmentationImage`: these pixels are its mask.
     """
 
     kind: str
@@ -339,25 +339,24 @@ class BodyAnnouncement(Announcement):
 
 
 class PilotAnnouncement(Announcement):
-    """A node that sends commands or set-points; `source` is theirs.
+    """A node sending commands or set-points; `source` is their source.
 
     Attributes:
-        vehicle: Name of the vehicle that it flies; empty if it does not say, which is refused
-            where there are several.
+        vehicle: Name of its vehicle; empty if not given, which is refused where there are several.
     """
 
     vehicle: str = ""
 
 
 class PathAnnouncement(Announcement):
-    """Where a pilot is about to fly; a simulator refuses what is not free.
+    """Planned path of a pilot; a simulator refuses a path not free of obstacles.
 
     Attributes:
         waypoints: Places to pass in this order, metres in ``map``; at first the vehicle climbs from
             where it stands to the height of the first one.
         margin: Distance along each axis that the vehicle may move to and fro before it sets off,
             metres.
-        vehicle: Name of the vehicle that it is for; empty for the only one.
+        vehicle: Name of the vehicle; empty for the only one.
     """
 
     vehicle: str = ""
@@ -366,17 +365,17 @@ class PathAnnouncement(Announcement):
 
 
 class EstimatorAnnouncement(Announcement):
-    """Something that will send pose estimates; `source` is theirs.
+    """An estimator of poses; `source` is the source of its estimates.
 
     Attributes:
-        method: What it is, in a word or two: ``features``, ``ORB-SLAM3 rgbd``.
+        method: Name in a word or two: ``features``, ``ORB-SLAM3 rgbd``.
         scale_free: True if its unit of length is its own (monocular).
-        reads: Kinds of data that it computes with: ``grey``, ``depth``, ``imu``, ``lidar``;
-            ``truth`` if it is made of that, as of an estimator for studies.
-        eyes: Number of cameras whose images it takes together: 2 is a stereo rig.
-        lenses: Distortion models that it can compute with, besides an ideal camera.
-        rectifies: Whether it turns images of other lenses into those of a pinhole camera first.
-        vehicle: Whose pose it estimates, where neither `source` nor the camera that it follows
+        reads: Kinds of input data: ``grey``, ``depth``, ``imu``, ``lidar``; ``truth`` if made from
+            ground truth, as of an estimator for studies.
+        eyes: Number of cameras whose images are used together: 2 is a stereo rig.
+        lenses: Supported distortion models, besides an ideal camera.
+        rectifies: Whether images of other lenses are first rectified to a pinhole camera.
+        vehicle: Name of the estimated vehicle, where neither `source` nor the camera followed
             says so.
     """
 
@@ -390,23 +389,23 @@ class EstimatorAnnouncement(Announcement):
 
 
 class Vehicles:
-    """The vehicles of a run, and what belongs to each.
+    """Vehicles of a run, and the sources of each.
 
     A source belongs to the vehicle whose name it equals or begins with: ``drone/camera`` to
-    ``drone``. An estimator, whose name says nothing, belongs to the vehicle that it announces, or
-    that carries the camera in whose images it tracks features; what says nothing at all belongs to
-    the first vehicle.
+    ``drone``. An estimator with another name belongs to the vehicle that it announces, or that
+    carries the camera in whose images it tracks features; any other source belongs to the first
+    vehicle.
     """
 
     def __init__(self) -> None:
         self.names: list[str] = []
-        """Of the vehicles, in the order in which they were announced."""
+        """Names of the vehicles, in the order of their announcements."""
         self._cameras: dict[str, str] = {}
         """Optical frame to source."""
         self._followed: dict[str, str] = {}
         """Estimator to the optical frame of its camera."""
         self._estimated: dict[str, str] = {}
-        """Estimator to the vehicle that it announces."""
+        """Estimator to its announced vehicle."""
 
     def announced(self, announcement: Announcement) -> None:
         """Note a vehicle, a camera or an estimator."""
@@ -427,12 +426,12 @@ class Vehicles:
         self._followed[event.source] = event.frame_id
 
     def carrier(self, source: str) -> str:
-        """Return the vehicle that a source names; empty if it names none."""
+        """Return the vehicle named in a source; empty if there is none."""
         found = (v for v in self.names if source == v or source.startswith(f"{v}/"))
         return next(found, "")
 
     def of(self, source: str) -> str:
-        """Return the vehicle that a source belongs to; empty if there are no vehicles."""
+        """Return the vehicle of a source; empty if there are no vehicles."""
         camera = self._cameras.get(self._followed.get(source, ""), "")
         said = self._estimated.get(source, "") or self.carrier(source)
         return said or self.carrier(camera) or next(iter(self.names), "")

@@ -1,4 +1,4 @@
-"""The base class of all events, events of a run itself, and the checks that every event passes.
+"""Base class of all events, events of a run itself, and the checks of every event.
 
 An event is frozen data with a stamp, a source and a category. A stamp is an `int`; vectors, angles
 and the like are finite; an orientation is a unit quaternion. A wrong value raises in the node that
@@ -14,14 +14,14 @@ from typing import Any, ClassVar, dataclass_transform
 import msgspec
 
 Vector3 = tuple[float, float, float]
-"""x, y, z. Unit and frame stand beside each field that uses it."""
+"""Vector x, y, z; unit and frame are given at each field of this type."""
 
 Quaternion = tuple[float, float, float, float]
 """Unit quaternion **w, x, y, z** (Hamilton); rotates child-frame vectors into the parent frame."""
 
 
 class Category(enum.Flag):
-    """What an event is about; for filtering and logging, never for routing."""
+    """Subject of an event; for filtering and logging, never for routing."""
 
     LIFECYCLE = enum.auto()
     WINDOW = enum.auto()
@@ -50,14 +50,14 @@ class EventMeta(msgspec.StructMeta):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(msgspec.field,))
 class Event(msgspec.Struct, metaclass=EventMeta, frozen=True, kw_only=True):
-    """Something that a node sends to all that listen.
+    """Typed data sent by a node to all its listeners.
 
     Subclass it to add fields; every subclass is frozen and takes keyword arguments only.
 
     Attributes:
-        stamp: Nanoseconds on the run's clock at which what the event describes was true
-            (the exposure of an image, not its arrival). An `int`: no bool, float or numpy number.
-        source: Who sends it, as a path: ``drone``, ``drone/front_center``.
+        stamp: Time of the described state, nanoseconds on the run's clock (the exposure of an
+            image, not its arrival). An `int`: no bool, float or numpy number.
+        source: Name of the sender, as a path: ``drone``, ``drone/front_center``.
     """
 
     category: ClassVar[Category] = Category.USER
@@ -107,7 +107,7 @@ _LENGTHS = {
 
 
 def check(event: Any, *vectors: tuple[float, ...]) -> None:
-    """Check the stamp of an event, and that all its numbers in `vectors` are finite.
+    """Check the stamp of an event to be an `int`, and the numbers in `vectors` to be finite.
 
     Raises:
         TypeError: The stamp is no `int`, or a field is no tuple of as many numbers as it holds.
@@ -138,10 +138,10 @@ def check_pose(event: Any, position: tuple[float, ...], orientation: tuple[float
 
 
 def check_frames(event: Any, *names: str) -> None:
-    """Check that names of frames are not blank.
+    """Refuse blank names of frames.
 
     Raises:
-        ValueError: One of them is.
+        ValueError: A name is blank.
     """
     for name in names:
         if not name.strip():
@@ -151,10 +151,10 @@ def check_frames(event: Any, *names: str) -> None:
 
 
 def check_covariance(event: Any, field: str, size: int) -> None:
-    """Check that a covariance is empty, or has `size` rows of `size` finite numbers in one tuple.
+    """Check a covariance: empty, or `size` rows of `size` finite numbers in a single tuple.
 
     Raises:
-        TypeError: It is something else.
+        TypeError: The value is neither.
         ValueError: A number is not finite.
     """
     numbers = getattr(event, field)
@@ -170,7 +170,7 @@ def _norm(numbers: tuple[float, ...]) -> float:
 
 
 def _check_all(event: Any) -> None:
-    """Look at each field: this decides, and says what is wrong."""
+    """Check each field in full after a fast check has failed, and name the wrong field."""
     where = type(event).__name__
     if type(event.stamp) is not int:
         raise TypeError(

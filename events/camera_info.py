@@ -15,15 +15,16 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
-"""ROS's names: plumb_bob (k1, k2, p1, p2, k3), which others call radtan; rational_polynomial
-(k1, k2, p1, p2, k3, k4, k5, k6); equidistant (k1, k2, k3, k4), Kannala-Brandt's fisheye."""
+"""ROS names: plumb_bob (k1, k2, p1, p2, k3), also called radtan; rational_polynomial
+(k1, k2, p1, p2, k3, k4, k5, k6); equidistant (k1, k2, k3, k4), the Kannala-Brandt fisheye.
+"""
 
 COEFFICIENTS: dict[str, int] = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """Number of coefficients of each model."""
 
 _HALF_TURN = {"plumb_bob": math.pi / 2, "rational_polynomial": math.pi / 2, "equidistant": math.pi}
 _STEPS = 2048
-"""Angles from 0 to the widest at which a model is looked at for its monotonic range."""
+"""Number of sampled angles along a model's curve, from 0 to the widest."""
 
 
 class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,11 +88,11 @@ class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
         return self.distortion_model != "equidistant" and not any(self.distortion)
 
     def matrix(self) -> Floats:
-        """Return K, shape (3, 3), as OpenCV takes it."""
+        """Return the camera matrix K, shape (3, 3), as in OpenCV."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points: npt.ArrayLike) -> Floats:
-        """Return the pixels on which points fall, in the image or not.
+        """Return the pixels of points, inside the image or not.
 
         Args:
             points: Metres (or directions of any length) in the optical frame, shape (n, 3).
@@ -155,7 +156,7 @@ class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
         return np.asarray(rays)
 
     def widest_angle(self) -> float:
-        """Return the angle off the axis (radians) up to which the distorted radius increases.
+        """Return the angle off the axis (radians) where the distorted radius stops rising.
 
         π/2 for a pinhole; less where the polynomial turns back, beyond which one pixel would show
         two directions.
@@ -203,7 +204,7 @@ def _brown(d: tuple[float, ...], xy: Floats) -> Floats:
 
 
 def _undistort(d: tuple[float, ...], uv: Floats, xy: Floats) -> Floats:
-    """Return what `_brown` distorts to `uv`, by Newton's method with numeric slopes."""
+    """Invert `_brown` at `uv` by Newton's method with numeric slopes, starting at `xy`."""
     step = 1e-6
     right, down = np.array([step, 0.0]), np.array([0.0, step])
     # Where nothing falls on a pixel it runs away, which `unproject` finds.
@@ -246,7 +247,7 @@ def response_light(response: tuple[float, ...]) -> Floats:
 
 
 def vignette_map(info: CameraInfo, vignette: tuple[float, ...]) -> Floats:
-    """Return the share of the light that reaches each pixel, shape (height, width).
+    """Return the share of light reaching each pixel, shape (height, width).
 
     Args:
         vignette: Coefficients a1, a2, … of ``1 + a1 r² + a2 r⁴ + …``, where r is the distance from

@@ -1,4 +1,4 @@
-"""Set-points and commands for a vehicle, and what happens to it.
+"""Set-points and commands for a vehicle, and the vehicle's events.
 
 The newest set-point wins, whatever its kind. World frame NED, body frame FRD, SI units; see
 `events.geometry`.
@@ -12,10 +12,10 @@ from events.base import Category, Event, Quaternion, Vector3, check, check_pose
 
 
 class Command(Event):
-    """Base of the orders that are given once.
+    """Base of the commands, each sent once.
 
     Attributes:
-        vehicle: Name of the vehicle that it is for; empty for the only one.
+        vehicle: Name of the vehicle; empty for the only one.
     """
 
     category: ClassVar[Category] = Category.CONTROL
@@ -27,10 +27,10 @@ class Command(Event):
 
 
 class Setpoint(Event):
-    """Base of what is sent again and again, and where only the newest counts.
+    """Base of the set-points, sent repeatedly; only the newest counts.
 
     Attributes:
-        vehicle: Name of the vehicle that it is for; empty for the only one.
+        vehicle: Name of the vehicle; empty for the only one.
     """
 
     category: ClassVar[Category] = Category.CONTROL
@@ -71,7 +71,7 @@ class Hover(Command):
 
 
 class Teleport(Command):
-    """Be at a place at once, as no real vehicle can, and hold it there if it flies.
+    """Move to a pose at once, as no real vehicle can; a flying vehicle holds its place.
 
     Attributes:
         position: Metres in ``map``.
@@ -91,11 +91,11 @@ class Teleport(Command):
 
 
 class Reset(Command):
-    """Be as at the start: there, disarmed, with sensors that begin anew; time goes on."""
+    """Return to the start: initial pose, disarmed, sensors restarted; time goes on."""
 
 
 class PositionSetpoint(Setpoint):
-    """Be at a place; velocity and acceleration are feed-forward for one that follows a path.
+    """Go to a position; velocity and acceleration are feed-forward along a path.
 
     Attributes:
         position: Metres in ``map``.
@@ -117,7 +117,7 @@ class PositionSetpoint(Setpoint):
 
 
 class PoseSetpoint(Setpoint):
-    """Be at a place in an attitude; for what can be in any, such as a free camera.
+    """Go to a pose; for vehicles free to take any attitude, such as a free camera.
 
     Attributes:
         position: Metres in ``map``.
@@ -221,7 +221,7 @@ class PlannedPose(Event):
 
 
 class VehicleEvent(Event):
-    """Base of all that can happen to a vehicle."""
+    """Base of all events of a vehicle."""
 
     category: ClassVar[Category] = Category.VEHICLE
 
@@ -238,7 +238,7 @@ class Disarmed(VehicleEvent):
 
 
 class TakenOff(VehicleEvent):
-    """The vehicle has reached the altitude it was asked to take off to."""
+    """The vehicle has reached its commanded take-off altitude."""
 
 
 class Landed(VehicleEvent):

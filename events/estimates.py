@@ -22,7 +22,7 @@ from events.sensors import publish
 
 
 class PoseEstimate(Event):
-    """The estimated pose of a body, at the time of the data from which it was computed.
+    """Estimated pose of a body, at the time of the data used by the estimator.
 
     `stamp` is that of the image (or other measurement), not of the moment of sending: latency is
     measured as the difference of both.
@@ -60,9 +60,9 @@ class PoseEstimate(Event):
 
 
 class TrajectoryEstimate(Event, eq=False):
-    """The whole trajectory as an estimator sees it now, after loop closures and other corrections.
+    """Whole trajectory as now seen by an estimator, after loop closures and corrections.
 
-    The last one of a run is judged beside the poses as they were said (`PoseEstimate`). Frames and
+    The last one of a run is judged beside the poses as they were sent (`PoseEstimate`). Frames and
     units are those of the estimator's poses.
 
     Attributes:
@@ -113,7 +113,7 @@ class TrackingEvent(Event):
 
 
 class TrackingLost(TrackingEvent):
-    """An estimator lost track of its pose: from this stamp on it has none.
+    """Loss of tracking: from this stamp on, the estimator has no pose.
 
     Attributes:
         reason: Why, if known.
@@ -127,7 +127,7 @@ class TrackingRegained(TrackingEvent):
 
 
 class TrackedFeatures(Event, eq=False):
-    """The features that an estimator tracked in an image; `stamp` is that of the image.
+    """Features tracked by an estimator in an image; `stamp` is the image's.
 
     Attributes:
         frame_id: Optical frame of the image.
@@ -153,10 +153,10 @@ class TrackedFeatures(Event, eq=False):
 
 
 class Score(Event):
-    """One number about one estimate.
+    """Value of a metric for a single estimate.
 
     Attributes:
-        subject: Source of what is scored.
+        subject: Source of the estimate.
         metric: ``position_error``, ``rotation_error``, ``ate_rmse``, …
         value: In `unit`.
         unit: ``m``, ``rad``, ``m^2``, ``s``, …

@@ -27,11 +27,11 @@ import numpy.typing as npt
 from events.base import Quaternion, Vector3
 
 IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
-"""The rotation that changes nothing."""
+"""Identity rotation."""
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return a ⊗ b: the rotation that applies `b` first, then `a`."""
+    """Return the product a ⊗ b: the rotation by `b`, then by `a`."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return (
@@ -43,16 +43,16 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def inverse(rotation: Quaternion) -> Quaternion:
-    """Return the inverse of a unit quaternion, which is its conjugate."""
+    """Return the inverse of a unit quaternion, its conjugate."""
     w, x, y, z = rotation
     return (w, -x, -y, -z)
 
 
 def normalize(rotation: Quaternion) -> Quaternion:
-    """Return the quaternion scaled to length one.
+    """Return the quaternion scaled to length 1.
 
     Raises:
-        ValueError: Its length is not between 0.001 and 1000, so that it is no rotation.
+        ValueError: Its length is not between 0.001 and 1000: no rotation.
     """
     w, x, y, z = rotation
     norm = sqrt(w * w + x * x + y * y + z * z)
@@ -126,7 +126,7 @@ def yaw_of(rotation: Quaternion) -> float:
 
 
 def angle_between(a: Quaternion, b: Quaternion) -> float:
-    """Return the angle of the rotation from one orientation to another, radians in [0, π].
+    """Return the angle of the rotation between two orientations, radians in [0, π].
 
     It is taken from both parts of the quaternion between them, because an arc cosine would lose
     small angles.
@@ -141,7 +141,7 @@ def angle_between(a: Quaternion, b: Quaternion) -> float:
 
 
 def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
-    """Return the rotation that lies a share of the way from `a` to `b`, along the shorter arc.
+    """Return the spherical linear interpolation from `a` to `b`, along the shorter arc.
 
     K. Shoemake, "Animating rotation with quaternion curves", 1985.
 
@@ -180,13 +180,13 @@ def flip_yz_rotation(rotation: Quaternion) -> Quaternion:
 
 
 def rotation_to_nwu(rotation: Quaternion) -> Quaternion:
-    """Take a rotation from any child frame to NED to the one from that frame to NWU."""
+    """Convert the parent frame of a rotation from NED to NWU, for any child frame."""
     w, x, y, z = rotation
     return (-x, w, -z, y)  # (0, 1, 0, 0) ⊗ rotation
 
 
 def rotation_to_ned(rotation: Quaternion) -> Quaternion:
-    """Take a rotation from any child frame to NWU to the one from that frame to NED."""
+    """Convert the parent frame of a rotation from NWU to NED, for any child frame."""
     w, x, y, z = rotation
     return (x, -w, z, -y)  # the inverse of (0, 1, 0, 0) ⊗ rotation
 

@@ -1,4 +1,4 @@
-"""Poses and transforms, and the one place where the frames are defined.
+"""Poses and transforms, and the single definition of the frames.
 
 Frames (right-handed, metres, radians):
 
@@ -96,7 +96,7 @@ class Odometry(Event):
 
 
 class Wind(Event):
-    """True velocity of the air, for the record: what a vehicle feels at its place.
+    """True velocity of the air at a vehicle's position, for the record.
 
     Attributes:
         velocity: Metres per second in ``map``: (1, 0, 0) blows towards the north.
@@ -145,7 +145,7 @@ def inverse(matrix: Floats) -> Floats:
 
 
 def relative(base: Pose, pose: Pose) -> Pose:
-    """Return a pose in the frame that `base` is the pose of; both are in one parent frame."""
+    """Return a pose relative to `base`; both are given in the same parent frame."""
     (bx, by, bz), (px, py, pz) = base[0], pose[0]
     back = inverse_rotation(base[1])
     return rotate(back, (px - bx, py - by, pz - bz)), multiply(back, pose[1])

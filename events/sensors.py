@@ -1,4 +1,4 @@
-"""Measurements of sensors, and the fields of them that can be plotted.
+"""Measurements of sensors, and the fields of each for plotting.
 
 Arrays are checked and made read-only when the event is made: what has been sent does not change,
 and an image passes from node to node by reference.
@@ -16,7 +16,7 @@ from events.geometry import Wind
 
 
 def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
-    """Make `array` read-only, or report how it differs from what the field holds."""
+    """Make `array` read-only; raise `TypeError` for a wrong dtype or number of dimensions."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype or array.ndim not in ndim:
         found = (
             f"{array.dtype} of shape {array.shape}"
@@ -74,7 +74,7 @@ class DepthImage(Event, eq=False):
 
 
 class SegmentationImage(Event, eq=False):
-    """Which object each pixel shows.
+    """Object number of each pixel.
 
     Attributes:
         frame_id: Optical frame.
@@ -195,7 +195,7 @@ class Range(Event):
 
 
 class LidarScan(Event, eq=False):
-    """One turn of a lidar, as ROS's ``sensor_msgs/PointCloud2`` of a lidar's driver.
+    """A single turn of a lidar, like the ``sensor_msgs/PointCloud2`` of a ROS lidar driver.
 
     `stamp` is the time of the first ray. Each point is in the sensor's frame at the time of its own
     ray, `stamp` + its `times`: a moving sensor's cloud is skewed, as a real one's is. Rays that hit
@@ -232,7 +232,7 @@ class LidarScan(Event, eq=False):
 
     @property
     def end(self) -> int:
-        """Stamp of the last ray that gave a point (ns)."""
+        """Stamp of the last ray with a point, nanoseconds."""
         return self.stamp + (round(float(self.times[-1]) * 1e9) if len(self.times) else 0)
 
 
@@ -248,11 +248,11 @@ MEASURED: dict[type[Event], dict[str, str]] = {
 
 
 def fields_of(kind: type[Event]) -> dict[str, str]:
-    """Return what events of a type measure, with units; nothing if it is no such type."""
+    """Return the measured fields of an event type with their units; empty for other types."""
     return next((fields for known, fields in MEASURED.items() if issubclass(kind, known)), {})
 
 
 def numbers(event: Event, field: str) -> tuple[float, ...]:
-    """Return what an event measures in a field: one number, or x, y and z."""
+    """Return the values of a measured field: a single number, or x, y and z."""
     value = getattr(event, field)
     return value if isinstance(value, tuple) else (value,)

@@ -1,4 +1,4 @@
-"""Events of a window and its keyboard, and the names of keys that they carry."""
+"""Events of a window and its keyboard, and the names of keys in these events."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ LABELS = {letter: letter for letter in string.ascii_lowercase} | {
     "]": "right_bracket",
     "`": "grave_accent",
 }
-"""Names of the keys that are called by the label which the user's layout puts on them."""
+"""Names of the keys identified by their label in the user's keyboard layout."""
 
 _BY_POSITION = """
     escape enter tab space backspace insert delete right left down up page_up page_down home end

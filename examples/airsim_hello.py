@@ -13,7 +13,7 @@ import numpy as np
 
 
 def main(port: int = 41451) -> None:
-    """Fly, and say what was seen."""
+    """Fly, and print the height, the image's mean colour and the wall's distance."""
     client: Any = airsim.MultirotorClient(port=port)
     client.confirmConnection()
     client.enableApiControl(True)

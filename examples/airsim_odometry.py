@@ -1,4 +1,4 @@
-"""An RGB-D odometry in a script for AirSim: it steps time, follows corners, and publishes poses.
+"""RGB-D odometry as a script for AirSim: steps time, follows corners, and publishes poses.
 
 Corners of a key frame, whose places its depth gives, are followed from image to image; the camera's
 pose is that from which they are seen where they are (PnP). It needs Cosys-AirSim's client and
@@ -19,7 +19,7 @@ OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 class Odometry:
-    """Where a camera is, from its images; poses are 4 x 4, optical frame to that of the first."""
+    """Odometry of a camera; poses are 4 x 4, from optical frame to first optical frame."""
 
     def __init__(self, matrix: Any) -> None:
         self.matrix = matrix
@@ -75,7 +75,7 @@ def publish(client: Any, name: str, stamp: int, pose: Any) -> None:
 
 
 def main(port: int = 41451) -> None:
-    """Follow the camera until the drone, which somebody else flies, has landed again."""
+    """Follow the camera until the drone, flown by another client, has landed again."""
     client: Any = airsim.MultirotorClient(port=port)
     client.confirmConnection()
     client.simPause(True)

@@ -1,4 +1,4 @@
-"""A node of one's own: it tells how bright is what a camera sees."""
+"""Example of a node: measures the brightness of a camera's images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Brightness(Node):
     scores = Output(Score)
 
     async def run(self) -> None:
-        """Score what comes, beside the loop; images that come meanwhile are skipped."""
+        """Score images beside the loop; skip images arriving meanwhile."""
         async for image in self.images:
             mean = await self.offload(np.mean, image.data)
             self.scores.send(

@@ -1,4 +1,4 @@
-"""An RGB-D odometry that knows nothing but ROS 2: topics in, poses out, over Zenoh.
+"""RGB-D odometry using nothing but ROS 2: topics in, poses out, over Zenoh.
 
     python examples/outside_ros2.py [CAMERA]
 
@@ -25,7 +25,7 @@ from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 STORE = get_typestore(Stores.ROS2_JAZZY)
 LATCHED = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
 CORNERS, FEWEST = 800, 0.6
-"""Corners of a key frame at most, and the share of them that must still be tracked."""
+"""Maximum number of corners of a key frame, and minimum share still tracked."""
 
 
 class Odometry:

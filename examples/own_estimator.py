@@ -1,4 +1,4 @@
-"""An RGB-D estimator of one's own: corners, optical flow, and the camera's pose from both."""
+"""Example of an RGB-D estimator: corners, optical flow, and the camera's pose from both."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class OwnEstimator(Estimator[OwnConfig]):
         )
 
     async def run(self) -> None:
-        """Track each image; skip those that come meanwhile."""
+        """Track each image; skip images arriving meanwhile."""
         async for image, depth in self.frames:
             result = await self.tracker.call(FlowOdometry.track, image.data, depth.data)
             self.publish(image, result)

@@ -1,1 +1,1 @@
-"""Nodes that plug in: keyboard, scripted flights, recorders."""
+"""Plug-in nodes: keyboard, scripted flights, recorders."""

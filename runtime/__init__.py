@@ -1,20 +1,20 @@
-"""The runtime: nodes as coroutines on one event loop that talk through typed, awaitable channels.
+"""Runtime: nodes as coroutines on a single event loop, with typed, awaitable channels.
 
 Read the core in this order:
 
-- What an author writes: `node` (its `host` is the run), with its declarations in `channels.ports`
-  and `channels.bundles`.
-- How an event gets from node to node: `channels.sender`, `streams` and `links`, as `run.graph` has
-  connected them; and what makes it quick: `channels.tasks`, `run.event_loop`.
+- Writing a node: `node` (its `host` is the run), with its declarations in `channels.ports` and
+  `channels.bundles`.
+- Delivery of events: `channels.sender`, `streams` and `links`, as `run.graph` has connected them;
+  its speed: `channels.tasks`, `run.event_loop`.
 - Time: `time.schedule`, `clock`, `lockstep`, `stepping`, `time_limits`.
 - A run: `run.node_runner`, `node_host`, `run_state`, `supervisor`, `execute`; `watchdogs` and
-  `code_location` tell who blocks the loop or holds up the run, `instruments` are for observers.
-- What a run leaves: `channels.digest`, `summary` (made by `run.summarise`), `run.results`, `logs`.
-- `config`: the file, and what may change in a run; `units` and `paths` are types of settings.
-- `workers`: objects in processes of their own. `channels.hold`, `answers`: systems that are
-outside.
+  `code_location` find the node that blocks the loop or holds up the run, `instruments` are for
+  observers.
+- Results: `channels.digest`, `summary` (made by `run.summarise`), `run.results`, `logs`.
+- `config`: the file, and changes during a run; `units` and `paths` are types of settings.
+- `workers`: objects in processes of their own. `channels.hold`, `answers`: outside systems.
 - `wire` and `peers`: events as bytes, and a run in several processes. `figures`: those of a
-verdict.
+  verdict.
 
 `testing` is for tests of nodes. `tools` is no part of the core: the command line, the monitor,
 tracing and sweeps.

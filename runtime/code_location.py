@@ -1,4 +1,4 @@
-"""Locations in code: the node and the line at which a thread, a task or an exception stands.
+"""Locations in code: the node and line of a thread, a task or an exception.
 
 Not here: watching over a loop or a run (`runtime.run.watchdogs`).
 """
@@ -29,7 +29,7 @@ def short(place: str) -> str:
 
 
 def of_thread(frame: FrameType | None) -> tuple[str, str]:
-    """Return the node and the line of it in which a thread is; else ``runtime`` and its line."""
+    """Return the node and its line where a thread is; else ``runtime`` and its line."""
     frames = []
     while frame is not None:
         frames.append((frame, frame.f_lineno))
@@ -38,19 +38,19 @@ def of_thread(frame: FrameType | None) -> tuple[str, str]:
 
 
 def of_task(task: asyncio.Task[Any]) -> tuple[str, str]:
-    """Return the node and the line of it at which a task waits; else ``runtime`` and a line."""
+    """Return the node and its line where a task waits; else ``runtime`` and a line."""
     return _innermost(list(_awaiting(task))[::-1])
 
 
 def ready_on(loop: asyncio.AbstractEventLoop) -> list[tuple[str, str]]:
-    """Return node and line of each task that a loop of asyncio's own is about to go on with."""
+    """Return node and line of each task ready to go on in a loop of asyncio's own."""
     callbacks = [handle._callback for handle in list(loop._ready)]  # type: ignore[attr-defined]
     owners = [getattr(callback, "__self__", None) for callback in callbacks]
     return [of_task(owner) for owner in owners if isinstance(owner, asyncio.Task)]
 
 
 def of_error(error: BaseException) -> tuple[str, str]:
-    """Return the node and the line of it that raised an exception; else ``runtime`` and a line."""
+    """Return the node and its line where an exception was raised; else ``runtime`` and a line."""
     frames = []
     trace = leaf(error).__traceback__
     while trace is not None:
@@ -60,7 +60,7 @@ def of_error(error: BaseException) -> tuple[str, str]:
 
 
 def leaf(error: BaseException) -> BaseException:
-    """Return the exception that a group of one holds; any other as it is."""
+    """Return the only exception of a group, however nested; any other as given."""
     while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
         error = error.exceptions[0]
     return error
@@ -72,7 +72,7 @@ def waits_for(task: asyncio.Task[Any], future: asyncio.Future[Any]) -> bool:
 
 
 def _awaiting(task: asyncio.Task[Any]) -> Iterator[tuple[FrameType, int]]:
-    """Yield the frames of a task's coroutine and of what it awaits, the outermost first."""
+    """Yield the frames of a task's coroutine and its awaited coroutines, outermost first."""
     coro: Any = task.get_coro()
     while coro is not None:
         for kind in ("cr", "gi", "ag"):
@@ -85,9 +85,9 @@ def _awaiting(task: asyncio.Task[Any]) -> Iterator[tuple[FrameType, int]]:
 
 
 def _innermost(frames: Iterable[tuple[FrameType, int]]) -> tuple[str, str]:
-    """Return the node and line of the first frame that is a node's own, given the innermost first.
+    """Return node and line of the first frame in a node's own code, given the innermost first.
 
-    If none is: ``runtime``, and the line of the first.
+    If there is none: ``runtime``, and the line of the first.
     """
     innermost = "?"
     for frame, number in frames:
@@ -103,7 +103,7 @@ _one_at_a_time = threading.Lock()
 
 
 def frame_of(thread_id: int) -> FrameType | None:
-    """Return the frame in which a thread is; `None` if there is no such thread.
+    """Return the current frame of a thread; `None` if there is no such thread.
 
     Up to Python 3.11, `sys._current_frames` collects garbage while it holds a lock that every
     thread takes as it starts and ends; if a finalizer gives up the GIL then, the process stands

@@ -1,4 +1,4 @@
-"""Every error this package raises on purpose, and whose fault each one is.
+"""Errors raised on purpose by this package, and whose fault each is.
 
     VisnavError
     ├── ConfigError            the file or the command line: expected, found, where
@@ -43,9 +43,9 @@ class VisnavError(Exception):
 
 
 class ConfigError(VisnavError):
-    """The configuration is wrong; the message says where, what was expected and found.
+    """Wrong configuration; the message names the place, the expected and the found value.
 
-    What was found may be of any length, and is cut in the middle.
+    A long message is cut in the middle.
     """
 
     def __init__(self, message: str) -> None:
@@ -55,15 +55,15 @@ class ConfigError(VisnavError):
 
 
 class DeclarationError(VisnavError):
-    """A node's class is declared wrongly; its author must mend it."""
+    """Wrong declaration in a node's class, for its author to mend."""
 
 
 class MissingDependencyError(VisnavError):
-    """A library is missing; the message holds the command that installs it."""
+    """Missing library; the message holds the command to install the library."""
 
 
 class UnsupportedInterpreterError(VisnavError):
-    """The interpreter cannot do what the file asks for; another Python can."""
+    """The interpreter cannot do as the file asks; another Python can."""
 
 
 class NodeError(VisnavError):
@@ -73,7 +73,7 @@ class NodeError(VisnavError):
         super().__init__(f"{node}: {what}")
         self.node = node
         self.place = ""
-        """The line of the node that raised what is no error of ours, if known."""
+        """Line of the node where an exception other than ours was raised, if known."""
 
 
 class FatalError(NodeError):
@@ -81,7 +81,7 @@ class FatalError(NodeError):
 
 
 class RefusedError(NodeError):
-    """A node cannot work with what another node announced."""
+    """A node cannot work with another node's announcement."""
 
 
 class NodeTimeoutError(NodeError):
@@ -89,59 +89,59 @@ class NodeTimeoutError(NodeError):
 
 
 class ChannelError(VisnavError):
-    """Base of what can go wrong between a sender and a receiver."""
+    """Base of errors between a sender and a receiver."""
 
 
 class ChannelFullError(ChannelError):
-    """An input with ``overflow="error"`` was sent more than it holds."""
+    """An input with ``overflow="error"`` has no room for another event."""
 
 
 class ChannelClosedError(ChannelError):
-    """The input was closed, and what it held has been read."""
+    """The input is closed, and its events have been read."""
 
 
 class ChannelBusyError(ChannelError):
-    """A second coroutine wanted to wait on an input that has one waiting."""
+    """A second coroutine tried to wait on an input with a waiting reader."""
 
 
 class HandlerCircleError(ChannelError):
-    """Handlers of several nodes answer one another without end."""
+    """Handlers of several nodes answer each other without end."""
 
 
 class ChannelSourceError(ChannelError):
-    """An event says that another node has sent it."""
+    """An event or an announcement uses the source of another node."""
 
 
 class ChannelTypeError(ChannelError, TypeError):
-    """An output was sent something else than it declares, or what has no digest."""
+    """An output was sent an undeclared type of event, or data without a digest."""
 
 
 class ChannelThreadError(ChannelError):
-    """Something was sent in another thread than the loop's, in which all nodes run."""
+    """An event was sent in a thread other than the loop's."""
 
 
 class AmbiguousSourceError(ChannelError):
-    """Two sources send events for one field of a bundle; the file must name one."""
+    """Two sources send events for the same field of a bundle; the file must choose."""
 
 
 class CommandError(VisnavError):
-    """A run cannot do what it was asked; the message says why."""
+    """A command cannot be carried out; the message says why."""
 
 
 class ResultsError(VisnavError):
-    """A run's folder belongs to something else, or results cannot be written into it."""
+    """A run's folder belongs to something else, or is not writable."""
 
 
 class UncheckableError(VisnavError):
-    """While a file is only checked, a node does not know what it will announce."""
+    """A node cannot know its announcements while a file is only checked."""
 
 
 class PeerError(VisnavError):
-    """Another process of the run is missing, gone, or does not fit to this one."""
+    """Another process of the run is missing, gone or incompatible."""
 
 
 class WireError(VisnavError):
-    """Bytes are not an event that this process knows, or an event cannot be made into bytes."""
+    """Bytes are no event known to this process, or an event has no form in bytes."""
 
 
 class MissingAnswerError(VisnavError):
@@ -149,7 +149,7 @@ class MissingAnswerError(VisnavError):
 
 
 class WorkerError(VisnavError):
-    """Base of what can go wrong with a worker process."""
+    """Base of errors of a worker process."""
 
 
 class WorkerDiedError(WorkerError):

@@ -1,4 +1,4 @@
-"""The optional libraries, which are extras of the package, and how they are installed."""
+"""Optional libraries, as extras of the package, and their installation."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _PROJECT = Path(__file__).parents[1] / "pyproject.toml"
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs what an extra needs, for the message of an error.
+    """Return the command to install an extra's libraries, for the message of an error.
 
-    In a checkout that is the extra itself. A wheel's extra cannot be asked for by the name of the
-    package, which is in no index: there, the libraries themselves are named.
+    In a checkout, the command names the extra. A wheel's package is in no index, and so its extra
+    cannot be asked for by name: there, the command names the libraries.
 
     Args:
         extra: As in ``pyproject.toml``: ``ros2``, ``record``…
@@ -37,9 +37,9 @@ def install_command(extra: str) -> str:
 
 
 def why_missing(library: str) -> str:
-    """Return why a worker's library cannot be imported; empty if it can.
+    """Return why a worker's library is not importable; empty if importable.
 
-    Another process tries it, if it is there: what it needs of the system may be missing.
+    An installed library is tried in another process: its system libraries may be missing.
     """
     modules: dict[str, Any] = {**sys.modules}
     if modules.get(library):

@@ -1,4 +1,4 @@
-"""The figures of a verdict, in one table: what each means, where it is shown, what it may be.
+"""Figures of a verdict in a single table: meaning, place in reports, and thresholds.
 
 Verdict, thresholds, report, sweep, the schema of the file and the documentation read this table. A
 figure that is not in it is shown all the same, by its name, among all others.
@@ -12,18 +12,18 @@ import msgspec
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One figure of an estimator.
+    """A figure of an estimator.
 
     Attributes:
         name: In files; its end is the unit.
         meaning: In words.
-        limit: Whether a threshold is the least that it may be, or the most; "" if there is none.
+        limit: Whether a threshold is the least value allowed, or the most; "" if there is none.
         default: The threshold where the file gives none.
         counts: Whether it is a whole number.
         optional: Whether a threshold is not missed where there is no figure: not everybody sends
             velocities, and nobody who never restarts counts how often.
-        all_or_none: Percent that are asked for as soon as there is any: of what comes with some of
-            the poses only, somebody may have chosen with which.
+        all_or_none: Percentage required as soon as there is any: of values sent with some of the
+            poses only, somebody may have chosen with which.
         report: ``head`` and ``main`` stand at the top of a report, in this order.
         sweep: Column among the main figures of a sweep; 0 if it is none of them.
         plot: Title of its panel in the plots of a sweep; "" if there is none.
@@ -47,12 +47,12 @@ class Figure(msgspec.Struct, frozen=True):
 
     @property
     def side(self) -> str:
-        """What stands before a threshold in a table."""
+        """Comparison sign before the threshold in a table."""
         return "≥" if self.limit == "least" else "≤"
 
     @property
     def setting(self) -> str:
-        """What the threshold is, for the reference of settings."""
+        """Description of the threshold, for the reference of settings."""
         unit = f" ({self.unit})" if self.unit else ""
         if self.all_or_none is not None:
             unit += f"; if it is not given, {self.all_or_none:g} where there is any"
@@ -201,9 +201,9 @@ FIGURES = {figure.name: figure for figure in _TABLE}
 """All figures by name; those with thresholds in the order of ``verdict.json``."""
 
 IN_SWEEPS = tuple(f.name for f in sorted(_TABLE, key=lambda f: f.sweep) if f.sweep)
-"""Figures of an estimator that ``summary.csv`` of a sweep sums up, where a verdict has them."""
+"""Figures of an estimator summarised in a sweep's ``summary.csv``, if in the verdict."""
 
 
 def figure(name: str) -> Figure:
-    """Return the row of a figure; of one that is not in the table, its name in words."""
+    """Return the entry of a figure; for a name not in the table, the name in words."""
     return FIGURES.get(name) or Figure(name, name.replace("_", " "), report="")

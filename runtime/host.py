@@ -1,4 +1,4 @@
-"""What a run does for its nodes, and what they may know of one another."""
+"""Services of a run for its nodes, and the nodes' knowledge of each other."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ W = TypeVar("W")
 
 
 class Sibling(NamedTuple):
-    """A node of the run, as the file describes it.
+    """A node of the run, as described by the file.
 
     Attributes:
         name: As in the file.
@@ -66,11 +66,11 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Host(Protocol):
-    """What a run does for its nodes; see the methods of `Node` that call these, with themselves.
+    """Services of a run for its nodes, called by the methods of `Node` with themselves.
 
     Attributes:
         siblings: All nodes of the run, in file order.
-        shared: What nodes of this process share, by name.
+        shared: Objects shared by nodes of this process, by name.
         stepping: Pauses and steps simulated time.
         run_end: How the run ended; `None` before.
     """
@@ -93,17 +93,17 @@ class Host(Protocol):
     async def worker(
         self, node: Any, factory: Callable[..., W], args: tuple[Any, ...], **options: Any
     ) -> Worker[W]:
-        """Make a worker that ends with the node."""
+        """Make a worker, ended with the node."""
 
     def hold(self, node: Any, name: str, config: HoldConfig, latency: float) -> Hold[Any]:
-        """Make the hold of an outside system, which ends with the node."""
+        """Make the hold of an outside system, ended with the node."""
 
     def offload(self, node: Any, call: functools.partial[Any]) -> concurrent.futures.Future[Any]:
         """Run a function of a node in a thread."""
 
     @property
     def run_end(self) -> RunEnd | None:
-        """How the run ended, if it did."""
+        """How the run ended; `None` before."""
 
     def stop(self, node: Any, reason: str) -> None:
         """End the run in order, for a reason of a node's."""
@@ -112,7 +112,7 @@ class Host(Protocol):
         """Put a verdict into the summary."""
 
     def note_environment(self, name: str, value: str) -> None:
-        """Put what the run depends on into the summary."""
+        """Record a dependency of the run in the summary."""
 
     def after_run(self, call: Callable[[Path], Any]) -> None:
         """Call a function once the summary is written."""

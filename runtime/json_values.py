@@ -1,4 +1,4 @@
-"""What nodes hand over for the summary, made into what JSON knows, where they hand it over."""
+"""Conversion of nodes' values for the summary to JSON types, as they are handed over."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 
 
 def plain(value: Any, where: str) -> Any:
-    """Return a value as what JSON knows: numpy's numbers as numbers, its arrays as lists.
+    """Return a value in JSON types: numpy's numbers as numbers, its arrays as lists.
 
     Args:
         value: Numbers, texts, lists, mappings, events, and what else msgspec knows.
 
     Raises:
-        TypeError: JSON knows nothing like it.
+        TypeError: The value has no form in JSON.
     """
     try:
         found = msgspec.to_builtins(value, enc_hook=_without_numpy, str_keys=True)

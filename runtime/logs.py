@@ -1,10 +1,10 @@
-"""Logging: the standard library's, through a queue, so that a slow terminal delays no node.
+"""Logging by the standard library through a queue: a slow terminal delays no node.
 
 Levels: trace (5), debug, info, warning, error, and fatal, which also stops the run. Each node has
 a logger, ``visnav.<node>``; lines carry the time of the run's clock.
 
-Whatever is logged, a run ends: messages are cut, what waits is bounded, and a slow terminal is
-given up soon after the end. What is left out is counted and said.
+Whatever is logged, a run ends: messages are cut, the queue is bounded, and a slow terminal is
+given up soon after the end. Omissions are counted and logged.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ LONGEST_SHOWN = 2_000
 """Characters of a message in the terminal."""
 
 LONGEST_HIGHLIGHTED = 400
-"""Characters of a message with colours: finding what to colour takes the square of a word."""
+"""Most characters of a message in colour: the cost grows with the square of a word's length."""
 
 MOST_WAITING = 64 << 20
-"""Characters, of lines and about them, that wait to be written; more are dropped."""
+"""Most characters of lines and their metadata waiting to be written; more are dropped."""
 
 PATIENCE = 2.0
-"""Real seconds that a terminal has, once the run is over, to show what still waits."""
+"""Real seconds for a terminal to show the waiting lines after the end of a run."""
 
 _OF_RECORD = 300  # what a record takes besides its message, in characters
 
@@ -59,7 +59,7 @@ _HARMFUL = {
 
 
 def harmless(text: str, longest: int = LONGEST) -> str:
-    """Return a text that neither steers a terminal nor looks like other lines of a log.
+    """Return a text unable to steer a terminal or to imitate other lines of a log.
 
     It is cut to `longest` characters and says so; escapes and the like become visible, and lines
     after the first begin with a bar.
@@ -81,11 +81,11 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
         return msg, kwargs
 
     def trace(self, msg: str, *args: object) -> None:
-        """Log what helps only to find a bug."""
+        """Log a message of use only for finding a bug."""
         self.log(TRACE, msg, *args)
 
     def fatal(self, msg: str, *args: object) -> NoReturn:
-        """Log, and end the run: it cannot go on.
+        """Log a message and end the run: the node cannot go on.
 
         Raises:
             FatalError: Always.
@@ -102,7 +102,7 @@ class _Queued(logging.handlers.QueueHandler):
         self.given = self.taken = self.dropped = 0
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Queue a record, or count that there is no room; errors have some of their own."""
+        """Queue a record, or count a drop if there is no room; errors have extra room."""
         room = MOST_WAITING * (2 if record.levelno >= logging.ERROR else 1)
         if self.given - self.taken > room:
             self.dropped += 1
@@ -111,7 +111,7 @@ class _Queued(logging.handlers.QueueHandler):
         super().enqueue(record)
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Make message and traceback while what they describe is as it is."""
+        """Format message and traceback while the described objects are unchanged."""
         record = copy.copy(record)
         text = record.getMessage()
         record.length = len(text)
@@ -135,7 +135,7 @@ class _Listener(logging.handlers.QueueListener):
         self._queued = queued
 
     def handle(self, record: logging.LogRecord) -> None:
-        """Hand a record to those handlers that want it."""
+        """Pass a record to the handlers of its level; after `ends`, not to a terminal."""
         self._queued.taken += _size(record)
         late = time.monotonic() > self.ends
         for handler in self.handlers:
@@ -162,7 +162,7 @@ def _size(record: logging.LogRecord) -> int:
 
 
 class _OneLine(logging.Formatter):
-    """Leaves out tracebacks and the ends of long messages, which are for ``log.txt``."""
+    """Formatter without tracebacks and ends of long messages; these are in ``log.txt``."""
 
     def format(self, record: logging.LogRecord) -> str:
         record = copy.copy(record)
@@ -174,10 +174,10 @@ class _OneLine(logging.Formatter):
 
 
 class _File(logging.FileHandler):
-    """Writes records to a file as long as that is possible."""
+    """Handler writing records to a file as long as possible."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802, ARG002
-        """Report once why it is not possible (any more)."""
+        """Report the first failure to write, and write no more."""
         error = sys.exc_info()[1]
         self.setLevel(logging.CRITICAL + 1)
         stream, self.stream = self.stream, None
@@ -231,11 +231,11 @@ def logging_to(
 
 
 def terminal_handler(console: Console | None = None) -> logging.Handler:
-    """Return a handler that prints to standard error, in colour where that is a terminal.
+    """Return a handler printing to standard error, in colour on a terminal.
 
-    A console may be given that other things are drawn on, too, such as a progress bar.
+    The console may be given if other things, such as a progress bar, are drawn on it, too.
 
-    It leaves out tracebacks, and what the command line says itself when the run is over (records
+    Left out are tracebacks, and what the command line says itself when the run is over (records
     with `reported`).
     """
     from rich.console import Console
@@ -256,7 +256,7 @@ def _without_colours_if_long(record: logging.LogRecord) -> bool:
 
 
 def file_handler(path: Path) -> logging.Handler:
-    """Return a handler that writes everything to a file."""
+    """Return a handler writing all records to a file."""
     handler = _File(path, mode="w", encoding="utf-8", delay=False)
     handler.setFormatter(
         logging.Formatter("%(seconds)12.6f %(levelname)-8s %(logger_name)s: %(message)s")

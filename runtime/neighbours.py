@@ -1,4 +1,4 @@
-"""Whether `events`, on which the runtime stands, is this project's and not another package."""
+"""Check of the package `events`: this project's, and not another of the same name."""
 
 from __future__ import annotations
 

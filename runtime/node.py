@@ -1,4 +1,4 @@
-"""What an author of nodes writes: a class with ports, and the phases it needs.
+"""Interface for authors of nodes: a class with ports, and the phases needed.
 
     construct → on_startup → announce, on_announcement → check → on_ready → run, handlers, ticks
     → on_end → on_shutdown
@@ -59,7 +59,7 @@ class _ConfigMeta(msgspec.StructMeta):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(msgspec.field,))
 class NodeConfig(msgspec.Struct, metaclass=_ConfigMeta, frozen=True, kw_only=True):
-    """Base of a node's settings, which stand in the file beside its name and type."""
+    """Base of a node's settings, given in the file beside its name and type."""
 
 
 C = TypeVar("C", bound=NodeConfig, default=NodeConfig)
@@ -98,22 +98,26 @@ class Node(Generic[C]):
     """
 
     deterministic: ClassVar[bool] = True
-    """Whether equal inputs give equal outputs; if not, no run with it promises its digest."""
+    """Whether equal inputs give equal outputs; if not, runs with this node promise no digest."""
     flies: ClassVar[bool] = False
-    """Whether it is a part of the flight itself (a simulator, a pilot), which a sweep records once
-    for all runs with equal ones if nothing else has an influence on it."""
+    """Whether the node is a part of the flight itself (a simulator, a pilot). A sweep records the
+    flight once for all runs where these are equal, if nothing else has an influence on it.
+    """
     ends_run: ClassVar[Literal["", "plan", "hand"]] = ""
-    """What is over when it ends the run: the ``plan`` that it carries out (of a pilot, of a replay:
-    also of all that fly), or what a person wants by whose ``hand`` it acts (a window, keys). Of any
-    other node, the run ends early."""
+    """Meaning of the node ending the run: its ``plan`` is over (a pilot, a replay; the default of
+    nodes that fly), or a person acted by ``hand`` (a window, keys). Of any other node, the run ends
+    early.
+    """
     starts_programs: ClassVar[bool] = False
-    """Whether it starts programs, which are judged: what other nodes write is not in the run's
-    folder before its end then (`runtime.run.results`)."""
+    """Whether the node starts programs under judgement: files of other nodes are then not in the
+    run's folder before its end (`runtime.run.results`).
+    """
     reads_truth: ClassVar[str] = ""
-    """What it receives true poses for, if not to fly or to estimate: ``judging``, ``recording``,
-    ``showing``. All others that do are named in the summary."""
+    """Purpose of receiving true poses, if not flying or estimating: ``judging``, ``recording``,
+    ``showing``. All others that do are named in the summary.
+    """
     files: ClassVar[tuple[str, ...]] = ()
-    """What it writes into the run's folder, besides what settings of type `OutputPath` name."""
+    """Files written into the run's folder, besides those in settings of type `OutputPath`."""
     declared: ClassVar[Declared]
     config_type: ClassVar[type[NodeConfig]] = NodeConfig
 
@@ -146,32 +150,32 @@ class Node(Generic[C]):
         """Get ready: open files and devices, start workers. Nothing may be sent yet."""
 
     def announce(self) -> Iterable[Announcement]:
-        """Return what this node will provide; called once, after every node's `on_startup`."""
+        """Return this node's announcements; called once, after every node's `on_startup`."""
         return ()
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Receive what a node (any node) will provide; called before the first event.
+        """Receive an announcement of any node; called before the first event.
 
         Raises:
             ValueError: This node cannot work with it; the message says why, and the run ends.
         """
 
     def check(self) -> Iterable[str]:
-        """Return what this node lacks, a sentence each; called when all announcements are received.
+        """Return the unmet needs of this node, a sentence each; called after all announcements.
 
-        With any, the run does not begin. What may be meant is for `log.warning`.
+        With any, the run does not begin. For what may be meant, use `log.warning`.
         """
         return ()
 
     async def on_ready(self) -> None:
-        """Get ready with what was announced, such as a worker that needs a camera's calibration.
+        """Prepare from the announcements, such as a worker from a camera's calibration.
 
         Called once all announcements are received. The first event waits for every node's, so that
         in real time, too, none is missed meanwhile. Nothing may be sent yet.
         """
 
     def narrow(self, port: str, source: str) -> None:
-        """Receive only one source on a port (or on a bundle, or on ``bundle.field``).
+        """Receive a single source on a port (or on a bundle, or on ``bundle.field``).
 
         For nodes that choose among what is announced: call it in `on_announcement`. What the file
         says of the port holds nevertheless.
@@ -197,7 +201,7 @@ class Node(Generic[C]):
         """
 
     async def run(self) -> None:
-        """Do what the node does; returning is allowed. Cancelled when the run ends."""
+        """Run the node's work; returning is allowed. Cancelled when the run ends."""
 
     async def on_end(self) -> None:
         """Send last words; called in file order when the run is to end, before any node shuts down.
@@ -207,12 +211,12 @@ class Node(Generic[C]):
         """
 
     async def on_shutdown(self) -> None:
-        """Finish: flush and close. May send; nodes before this one in the file still receive it."""
+        """Flush and close. Events sent here still reach nodes before this in the file."""
 
     # What a node can ask for.
 
     def siblings(self, cls: type[Any]) -> tuple[Sibling, ...]:
-        """Return the run's nodes of a class, this one included, in file order.
+        """Return the run's nodes of a class in file order, including this node.
 
         They are known by their settings before any of them starts up, those in other processes
         too.
@@ -220,7 +224,7 @@ class Node(Generic[C]):
         return tuple(each for each in self._host.siblings if issubclass(each.node, cls))
 
     def senders_of(self, *events: type[Event]) -> list[str]:
-        """Return the names of the other nodes that may send some types of event."""
+        """Return the names of the other nodes with outputs for some types of event."""
         listener = Listener(self.name, lambda _: None, events)
         return [
             each.name
@@ -230,7 +234,7 @@ class Node(Generic[C]):
         ]
 
     def share(self, name: str, make: Callable[[], R]) -> R:
-        """Return what nodes of this process share under a name; whoever asks first makes it.
+        """Return the object shared in this process under a name, made by the first caller.
 
         It outlives a restart of any of them, and is forgotten with the run.
         """
@@ -265,7 +269,7 @@ class Node(Generic[C]):
         return await self.clock.beside(work, round(latency * SECOND))
 
     async def worker(self, factory: Callable[..., W], *args: Any, **options: Any) -> Worker[W]:
-        """Start an object in a process of its own; it ends with this node.
+        """Start an object in a process of its own, ended with this node.
 
         Args:
             factory: A class of an importable module.
@@ -289,7 +293,7 @@ class Node(Generic[C]):
         return self._host.hold(self, name, config, latency)
 
     def start(self, coro: Coroutine[Any, Any, None]) -> None:
-        """Run a coroutine beside `run`, as part of this node; it is cancelled with it."""
+        """Run a coroutine beside `run`, as part of this node, and cancelled with `run`."""
         self._host.start(self, coro)
 
     def every(self, hz: float, call: Callable[[Tick], Any], name: str = "") -> Ticker:
@@ -310,7 +314,7 @@ class Node(Generic[C]):
 
     @property
     def run_end(self) -> RunEnd | None:
-        """How the run ended, for `on_end` and `on_shutdown`; `None` while it goes on."""
+        """How the run ended, for `on_end` and `on_shutdown`; `None` before."""
         return self._host.run_end
 
     def conclude(
@@ -338,7 +342,7 @@ class Node(Generic[C]):
         self._host.conclude(str(subject), found, None if passed is None else bool(passed))
 
     def note_environment(self, name: str, value: str) -> None:
-        """Put something of this machine on which figures depend beside the summary's versions."""
+        """Record a machine property relevant to figures, beside the summary's versions."""
         self._host.note_environment(name, value)
 
     def after_run(self, call: Callable[[Path], Any]) -> None:

@@ -1,4 +1,4 @@
-"""Settings that name files, names of files of a source, and the private folder of a user.
+"""Settings naming files, file names of sources, and a user's private folder.
 
 A setting names what the file reads, or what its nodes write into the run's folder::
 
@@ -30,32 +30,32 @@ Kind = Literal["input", "json", "name", "output", "secret"]
 _MARK = "path"
 
 InputPath = Annotated[str, msgspec.Meta(extra={_MARK: "input"})]
-"""A file or folder that is read; empty for none."""
+"""Path of an input file or folder; empty for none."""
 
 NameOrPath = Annotated[str, msgspec.Meta(extra={_MARK: "name"})]
-"""A name; an `InputPath` if it contains a slash or ends with a suffix such as ``.xml``."""
+"""Name; an `InputPath` if there is a slash or a suffix such as ``.xml``."""
 
 JsonOrPath = Annotated[str, msgspec.Meta(extra={_MARK: "json"})]
-"""An object in JSON, which begins with ``{``; else an `InputPath`."""
+"""JSON object, beginning with ``{``; else an `InputPath`."""
 
 Secret = Annotated[str, msgspec.Meta(extra={_MARK: "secret"})]
-"""A text; an `InputPath` if ``file:`` stands before it."""
+"""Text; an `InputPath` after the prefix ``file:``."""
 
 OutputPath = Annotated[str, msgspec.Meta(extra={_MARK: "output"})]
-"""A file or folder in the run's folder; empty for none, or for one of the node's own name."""
+"""Path in the run's folder; empty for none, or for a name derived from the node's."""
 
 
 class GivenHere(str):
-    """A text of the command line: if it names a file, then one beside the working directory."""
+    """Text from the command line; as a path, relative to the working directory."""
 
     __slots__ = ()
 
 
 def resolve(table: Any, type_: Any, folder: Path) -> Any:
-    """Return settings, as `tomllib` gives them, with the files that they read as absolute paths.
+    """Return settings, as given by `tomllib`, with absolute paths of input files.
 
     Args:
-        table: Of a node or of the network; what is of the wrong type stays as it is.
+        table: Of a node or of the network; values of a wrong type stay as they are.
         folder: Where relative paths start.
     """
 
@@ -75,7 +75,7 @@ def resolve(table: Any, type_: Any, folder: Path) -> Any:
 
 
 def unmarked(value: Any) -> Any:
-    """Return settings with nothing told any more of what came from the command line."""
+    """Return settings without the marks of texts from the command line."""
     if isinstance(value, dict):
         return {key: unmarked(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -84,7 +84,7 @@ def unmarked(value: Any) -> Any:
 
 
 def file_names(table: Any, type_: Any) -> Any:
-    """Return settings with no more than the last part of the paths that they read.
+    """Return settings with input paths cut to their last part.
 
     For comparing the settings of two machines, whose folders may be elsewhere.
     """
@@ -94,7 +94,7 @@ def file_names(table: Any, type_: Any) -> Any:
 
 
 def written(config: msgspec.Struct) -> Iterator[str]:
-    """Yield the files and folders in the run's folder that a node's settings name."""
+    """Yield the files and folders in the run's folder named by a node's settings."""
     found: list[str] = []
 
     def note(kind: Kind, text: str) -> str:
@@ -107,7 +107,7 @@ def written(config: msgspec.Struct) -> Iterator[str]:
 
 
 def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
-    """Return a value with all texts changed that its type marks as paths."""
+    """Return a value with `change` applied to the texts marked as paths by their type."""
     for meta in getattr(type_, "__metadata__", ()):
         kind = (getattr(meta, "extra", None) or {}).get(_MARK)
         if kind is not None and isinstance(value, str):
@@ -130,7 +130,7 @@ def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
 
 
 _RESERVED = {"truth", "plan"}
-"""Names of a run's files that are no source's."""
+"""File names of a run not available to sources."""
 
 
 def source_file(source: str) -> str:
@@ -148,7 +148,7 @@ def source_file(source: str) -> str:
 
 
 def source_of(name: str) -> str:
-    """Return the source that a name of `source_file` is of."""
+    """Return the source of a file name; the inverse of `source_file`."""
     quoted = name.replace("~", "%").replace("+", "/")
     return urllib.parse.unquote(quoted, errors="surrogatepass")
 

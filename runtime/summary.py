@@ -1,4 +1,4 @@
-"""``summary.json``: what a run reports of itself and of its parts."""
+"""``summary.json``: the report of a run and of its parts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.workers.costs import Costs
 
 
 class Stall(msgspec.Struct, frozen=True):
-    """One time the loop did not turn.
+    """A period without a turn of the loop.
 
     Attributes:
         node: The node that ran, or ``runtime``.
@@ -28,7 +28,7 @@ class Stall(msgspec.Struct, frozen=True):
 
 
 class TickSummary(msgspec.Struct, frozen=True):
-    """How punctual one ticker was; microseconds of the run's clock."""
+    """Punctuality of a ticker, in microseconds of the run's clock."""
 
     hz: float
     calls: int
@@ -39,9 +39,9 @@ class TickSummary(msgspec.Struct, frozen=True):
 
 
 class StreamSummary(msgspec.Struct, frozen=True):
-    """How full one input got, and what it dropped.
+    """Bound, peak and drops of an input.
 
-    For a bundle, `missed` says how often a set did not come about, by the field that was missing.
+    For a bundle, `missed` counts incomplete sets, by the missing field.
     """
 
     bound: int
@@ -51,18 +51,18 @@ class StreamSummary(msgspec.Struct, frozen=True):
 
 
 class LinkSummary(msgspec.Struct, frozen=True):
-    """How many events a link lost, and how many it left out to keep to its rate."""
+    """Events lost by a link, and events left out to keep to its rate."""
 
     lost: int
     thinned: int
 
 
 class WorkerSummary(msgspec.Struct, frozen=True):
-    """What the calls of a worker cost this machine.
+    """Cost of a worker's calls on this machine.
 
     Attributes:
-        latency_ms: That the file declares, on the run's clock; `None` if it differs by call.
-        calls: That were answered.
+        latency_ms: As the file declares, on the run's clock; `None` if it differs by call.
+        calls: Answered calls.
         wall_p50_ms: Real time of a call in the worker's process: median.
         wall_p95_ms: 95th percentile.
         wall_max_ms: Longest.
@@ -70,8 +70,8 @@ class WorkerSummary(msgspec.Struct, frozen=True):
             next one's: median.
         cpu_p95_ms: 95th percentile.
         cpu_max_ms: Most.
-        peak_rss_mb: Most memory that one of the processes has had; `None` if unknown.
-        processes: How many there were at once.
+        peak_rss_mb: Peak memory of any of the processes; `None` if unknown.
+        processes: Most at once.
     """
 
     latency_ms: float | None
@@ -87,7 +87,7 @@ class WorkerSummary(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, costs: Costs) -> WorkerSummary:
-        """Sum up what there is."""
+        """Return the summary of a worker's costs."""
         return cls(
             latency_ms=None if costs.latency is None else round(costs.latency * 1e3, 6),
             calls=costs.calls,
@@ -102,7 +102,7 @@ class WorkerSummary(msgspec.Struct, frozen=True):
         )
 
     def row(self) -> list[str]:
-        """Return it as a table shows it, under `WORKER_COLUMNS`."""
+        """Return the cells of a table row, under `WORKER_COLUMNS`."""
         wall = (self.wall_p50_ms, self.wall_p95_ms, self.wall_max_ms)
         cpu = (self.cpu_p50_ms, self.cpu_p95_ms, self.cpu_max_ms)
         return [
@@ -121,19 +121,19 @@ WORKER_COLUMNS = (
 
 
 class OutsideSummary(msgspec.Struct, frozen=True):
-    """How a system outside the process answered what it was sent.
+    """Answers of a system outside the process to its frames.
 
     Attributes:
         latency_ms: Declared, on the run's clock; `None` if it differs by frame.
-        sent: Frames that went out.
+        sent: Frames sent.
         received: Frames that the system confirmed; `None` if it cannot say.
         answered: Frames with an answer.
-        says_lost: Answers that say that tracking is lost, among those and the empty ones.
-        empty: Frames with an answer that held nothing, such as no pose.
+        says_lost: Answers that report lost tracking, among those and the empty ones.
+        empty: Frames with an empty answer, such as no pose.
         initialising: Frames for which the system was still initialising: it said so, or had not
             yet answered any, as was allowed.
         skipped: Frames that the system left out, as a later answer says.
-        lost: Frames for which none came in time.
+        lost: Frames without an answer in time.
         open: Frames on their way when the run ended. `sent` is the sum of `answered`, `empty`,
             `initialising`, `skipped`, `lost` and `open`.
         late: Answers to frames that were given up.
@@ -144,7 +144,7 @@ class OutsideSummary(msgspec.Struct, frozen=True):
         wall_p50_ms: Real time from a frame to its answer: median.
         wall_p99_ms: 99th percentile.
         inputs: Digest of all that the system was sent; equal if it got the same.
-        answers: Digest of all that it answered, each to its frame.
+        answers: Digest of all answers, each with its frame.
         reproducible: Whether an equal run gives the same, if the system answers the same.
         why_not: Why it may not.
         repeats: Whether it has answered the same when run twice (``run --twice``); `None` if that
@@ -176,7 +176,7 @@ class OutsideSummary(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, answers: Answers) -> OutsideSummary:
-        """Sum up what there is."""
+        """Return the summary of a system's answers."""
         counts: dict[str, Any] = {
             name: answers.counts[name] for name in (*get_args(Outcome), *get_args(Wrong))
         }
@@ -198,7 +198,7 @@ class OutsideSummary(msgspec.Struct, frozen=True):
         )
 
     def row(self) -> list[str]:
-        """Return it as a table shows it, under `OUTSIDE_COLUMNS`."""
+        """Return the cells of a table row, under `OUTSIDE_COLUMNS`."""
         return [
             *(f"{self.sent}", "–" if self.received is None else f"{self.received}"),
             *(str(each) for each in (self.answered, self.empty, self.initialising, self.skipped)),
@@ -214,7 +214,7 @@ class OutsideSummary(msgspec.Struct, frozen=True):
 
 
 class TwiceSummary(msgspec.Struct, frozen=True):
-    """How a run compares with an equal one before; see `runtime.tools.twice`.
+    """Comparison of a run with an equal earlier run; see `runtime.tools.twice`.
 
     Attributes:
         repeats: Whether all was the same.
@@ -247,10 +247,10 @@ class Verdict(msgspec.Struct, frozen=True):
 
 
 class ProcessSummary(msgspec.Struct, frozen=True):
-    """One of the processes of a run.
+    """A process of a run.
 
     Attributes:
-        nodes: That ran in it.
+        nodes: Nodes in the process.
         place: Host and process number.
         clock_offset_ms: Its monotonic clock, less that of the process whose summary this is.
         round_trip_ms: Of the quickest question and answer; the offset is off by half of it at most.
@@ -269,37 +269,37 @@ class ProcessSummary(msgspec.Struct, frozen=True):
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """One run.
+    """Summary of a run.
 
     Attributes:
         name: Of the run.
         clock: ``lockstep`` or ``real``.
         seed: Of the run's random numbers.
-        reason: What ended it.
-        ended_by: Who did: a node's name, ``user``, or "" for its duration; see `RunEnd`.
-        error: What went wrong, or `None`.
+        reason: Why the run ended.
+        ended_by: A node's name, ``user``, or "" for its duration; see `RunEnd`.
+        error: Error of the run, or `None`.
         wall_seconds: Real seconds, from the first update to when the end was asked for.
-        sim_seconds: The same time on the run's clock: what was sent, was sent in it.
+        sim_seconds: The same time on the run's clock: all events were sent in it.
         digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels
             depend on the graphics driver, so digests compare on one machine.) `None` if off.
         digests: Fingerprint of each output's events, of which that of the run is made.
         not_deterministic: Nodes because of which equal runs may have unequal digests.
-        verdict: What nodes concluded; `None` if none did.
+        verdict: Conclusions of nodes; `None` if none.
         events: Events sent, by type.
         outputs: Events sent, by output.
         drops: Events dropped, by input.
         streams: Inputs' bounds and peaks.
-        links: What links did, by port.
+        links: Losses of links, by port.
         ticks: Punctuality, by ticker.
         stalls: Times the loop did not turn, by node.
         longest_stalls: The worst of them, by node.
-        announcements: What nodes announced.
+        announcements: Announcements of nodes.
         truth_readers: Nodes that received true poses, but those that fly, judge, record or show.
         environment: Machine and versions; the command line, and the commit of the current folder.
         processes: Where which nodes ran, if not all in one process.
-        workers: What workers cost, by ``node.Factory``, and programs, by their nodes.
-        outside: How systems outside the process answered, by name.
-        twice: How it compares with an equal run before; `None` if there was none.
+        workers: Costs of workers, by ``node.Factory``, and of programs, by their nodes.
+        outside: Answers of systems outside the process, by name.
+        twice: Comparison with an equal run before; `None` if there was none.
     """
 
     name: str
@@ -332,20 +332,20 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def verdict_of(found: dict[str, dict[str, Any]]) -> Verdict | None:
-    """Return what several conclusions are together; `None` if there are none."""
+    """Return the joint verdict of several conclusions; `None` if there are none."""
     if not found:
         return None
     return Verdict(overall(each["passed"] for each in found.values()), found)
 
 
 def overall(passed: Iterable[bool | None]) -> bool | None:
-    """Return what several verdicts are together: failed before not judged before passed."""
+    """Return the joint result of verdicts: failed before not judged before passed."""
     each = set(passed)
     return False if False in each else None if None in each else True
 
 
 def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
-    """Put together the summaries of one run's processes; where it runs together, once."""
+    """Merge the summaries of a run's processes; common entries are taken once."""
     first = parts[0]
     digests = {name: each for part in parts for name, each in part.digests.items()}
     verdicts = [part.verdict for part in parts if part.verdict is not None]

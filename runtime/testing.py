@@ -39,7 +39,7 @@ __all__ = ["NodeResult", "any_source", "run_in_lockstep", "run_node", "run_nodes
 
 
 class NodeResult(msgspec.Struct, frozen=True):
-    """What came of a node's run.
+    """Result of a run of nodes under test.
 
     Attributes:
         sent: Every event that the nodes under test sent, in order; announcements first.
@@ -58,7 +58,7 @@ class NodeResult(msgspec.Struct, frozen=True):
     outside: dict[str, Answers]
 
     def of(self, event: type[E]) -> list[E]:
-        """Return those events that are of this type."""
+        """Return the sent events of a type."""
         return [e for e in self.sent if isinstance(e, event)]
 
 
@@ -84,12 +84,12 @@ def run_node(
     seed: int = 0,
     out: Path | None = None,
 ) -> NodeResult:
-    """Run one node on the jumping clock.
+    """Run a single node on the lockstep clock.
 
     Args:
         inputs: Events to send to it, each at its own stamp; announcements before all.
-        config: Its settings, as they would stand in the file.
-        duration: Seconds after which the run ends, if nothing ends it before.
+        config: Its settings, as in the file.
+        duration: Seconds until the run ends, if nothing ends it before.
 
     Raises:
         ConfigError: The settings are wrong.
@@ -156,7 +156,7 @@ def spec(
     inputs: Mapping[str, str] | None = None,
     links: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> NodeSpec:
-    """Return what the file's table for a node would become."""
+    """Return a node's specification, as read from its table in a file."""
     return NodeSpec(
         name=name,
         type_name=f"{node.__module__}:{node.__name__}",
@@ -175,13 +175,13 @@ _SCRIPTED: set[type[Node[Any]]] = set()
 
 
 def any_source(node: type[N]) -> type[N]:
-    """Let nodes of a class send in any name in `run_nodes`: a decorator for what tests script."""
+    """Let nodes of a class send under any source in `run_nodes`: a decorator for tests."""
     _SCRIPTED.add(node)
     return node
 
 
 def _script(inputs: list[Event]) -> type[Node[Any]]:
-    """Return a class of node that sends what the script lists."""
+    """Return a class of node for sending the listed events."""
 
     class Script(Node):
         script = Output(Event)

@@ -45,7 +45,7 @@ class Duration(float):
 
 
 class Latency(Duration):
-    """A duration that is short by nature: a latency, delay, jitter, exposure.
+    """A duration short by nature: a latency, delay, jitter, exposure.
 
     ``latency = 40`` is rarely meant as 40 s: a number without a unit is taken up to `LONGEST_BARE`
     only. For 40 s write ``"40s"``.
@@ -68,11 +68,11 @@ class Latency(Duration):
 
 
 LONGEST_BARE = 1.0
-"""Seconds up to which a `Latency` may be a number without a unit."""
+"""Longest `Latency` (s) as a number without a unit."""
 
 
 def plain(value: Any) -> float | str:
-    """Return a duration as a file may have it, to be read back as it is; for `msgspec`."""
+    """Return a duration as in a file, equal when read back; for `msgspec`."""
     if isinstance(value, Latency) and value > LONGEST_BARE:
         return f"{float(value)!r}s"
     return float(value)

@@ -29,7 +29,7 @@ _LENGTH = struct.Struct("<I")
 
 
 class Packed(msgspec.Struct, frozen=True):
-    """An event taken apart: a head, and arrays that are still the event's own.
+    """An event taken apart: a head, and the event's own arrays, not copied.
 
     Attributes:
         head: All but the arrays, with their place in the frame.
@@ -62,20 +62,20 @@ class Packed(msgspec.Struct, frozen=True):
         return [part for part in parts if len(part)]
 
     def frame(self) -> bytes:
-        """Return the frame: the one copy there is of the arrays."""
+        """Return the frame, with the only copy of the arrays."""
         return b"".join(self.parts())
 
 
 def kind_of(event: type[Event]) -> str:
-    """Return ``module:Class``, by which a type of event is known elsewhere."""
+    """Return ``module:Class``, the name of a type of event in other processes."""
     return f"{event.__module__}:{event.__qualname__}"
 
 
 def event_type(kind: str) -> type[Event]:
-    """Return the type of event of this kind, if anything here has imported it.
+    """Return the type of event of a kind, if imported in this process.
 
     Raises:
-        WireError: Nothing has.
+        WireError: It is not imported.
     """
     known = _types.get(kind)
     if known is None:

@@ -1,1 +1,1 @@
-"""Simulators: pure physics, control and camera modules, and one thin node each."""
+"""Simulators: pure modules for physics, control and cameras, with a thin node for each."""

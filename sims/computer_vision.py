@@ -29,7 +29,7 @@ Course = Callable[[int], tuple[Vector3, Quaternion]]
 """Poses in ``map`` at times (ns)."""
 
 MOMENT = 1e-3
-"""Seconds, half of them before the stamp, over which the camera's velocity is taken."""
+"""Interval of the camera's velocity, seconds, centred on the stamp."""
 
 
 class FreeCameraConfig(SimulatorConfig):
@@ -55,19 +55,19 @@ class FreeCameraConfig(SimulatorConfig):
 
 
 class FreeCamera(Simulator[FreeCameraConfig]):
-    """Cameras that follow set-points or a trajectory file, with no vehicle and no physics.
+    """Cameras moved by set-points or a trajectory file, without vehicle and physics.
 
-    Beside vehicles it is in their world, and sees them.
+    In a run with vehicles, the cameras share their world and see them.
 
-    The odometry's twist is that of the trajectory, or of the velocity set-point. At a row of the
-    file, where two straight lines meet, it is the mean of both. After a jump to a pose it is zero.
+    The odometry's twist is that of the trajectory, or of the velocity set-point; at a row of the
+    file, where two straight lines meet, the mean of both; after a jump to a pose, zero.
     """
 
     alone = True
 
     @property
     def frame_id(self) -> str:
-        """Frame of the body that carries the cameras: the node's name."""
+        """Frame of the cameras' body: the node's name."""
         return self.name
 
     @property
@@ -76,7 +76,7 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         return _at_rate(self.config)
 
     async def on_startup(self) -> None:
-        """Build the world, and start what renders it."""
+        """Build the world and start the renderers."""
         await super().on_startup()
         config = self.config
         roll, pitch, yaw = (math.radians(angle) for angle in config.orientation)
@@ -153,13 +153,13 @@ class FreeCamera(Simulator[FreeCameraConfig]):
             self.rig.expose(camera.name, tick.stamp, state, velocities, past_state)
 
     def state_at(self, stamp: int) -> State:
-        """Return where it is and how it moves at a time (ns) not before its last update."""
+        """Return pose and velocity at a time (ns) not before the last update."""
         course = self._course(stamp)
         vx, vy, vz, wx, wy, wz = _velocity_on(course, stamp).tolist()
         return State(*course(stamp), (vx, -vy, -vz), (wx, -wy, -wz))
 
     def _course(self, stamp: int) -> Course:
-        """Return the way on which the camera is at `stamp`, as poses of times (ns) near it."""
+        """Return the camera's path near `stamp`, as poses of times (ns)."""
         rows = self._rows
         if rows is not None:
             return lambda time: pose_at(rows, time / 1e9)
@@ -179,7 +179,7 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         return drifted
 
     def _follow(self, stamp: int) -> bool:
-        """Take the pose of this time from the trajectory; False when it is over."""
+        """Move to the trajectory's pose at `stamp`; return False after its end."""
         assert self._rows is not None
         if stamp / 1e9 > self._rows[-1, 0]:
             return False
@@ -218,7 +218,7 @@ def read_tum(path: Path) -> npt.NDArray[np.float64]:
 
 
 def pose_at(rows: npt.NDArray[np.float64], seconds: float) -> tuple[Vector3, Quaternion]:
-    """Return a trajectory's pose at a time within it: positions linear, orientations by slerp.
+    """Return a trajectory's pose at a time: positions linear, orientations by slerp.
 
     Args:
         rows: As from `read_tum`.

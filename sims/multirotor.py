@@ -54,7 +54,7 @@ FRAME = "base_link"
 """Frame of the vehicle's body."""
 
 DEEPEST = 100.0
-"""Metres inside something from which on the physics would not push the vehicle out, but diverge."""
+"""Greatest depth in a solid without divergence of the physics, metres."""
 
 
 class MultirotorConfig(SensorsConfig):
@@ -107,7 +107,7 @@ class Multirotor(Simulator[MultirotorConfig]):
     vehicle = True
 
     async def on_startup(self) -> None:
-        """Build the world, and start what renders it."""
+        """Build the world and start the renderers."""
         await super().on_startup()
         config = self.config
         self._start = start_of(config)
@@ -193,7 +193,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         return self.config.trigger == "imu" and whole
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Note who sends orders, and refuse a path that cannot be flown."""
+        """Record pilots, and refuse a path the vehicle cannot fly."""
         if isinstance(announcement, PilotAnnouncement):
             self._pilots.append(announcement)
         if not isinstance(announcement, PathAnnouncement):
@@ -217,7 +217,7 @@ class Multirotor(Simulator[MultirotorConfig]):
 
     @on(Command)
     def commands(self, event: Command) -> None:
-        """Obey a command that is for this vehicle, or log why it is refused."""
+        """Obey a command for this vehicle, or log the reason for refusal."""
         if not self._is_for_this(event, "commands"):
             return
         jumps = isinstance(event, Teleport | Reset)
@@ -226,9 +226,9 @@ class Multirotor(Simulator[MultirotorConfig]):
 
     @on(Setpoint)
     def setpoints(self, event: Setpoint) -> None:
-        """Follow a set-point that is for this vehicle, or log why it is refused.
+        """Follow a set-point for this vehicle, or log the reason for refusal.
 
-        That is logged once for each reason in a row.
+        Each reason in a row is logged once.
         """
         if not self._is_for_this(event, "setpoints"):
             return
@@ -283,7 +283,7 @@ class Multirotor(Simulator[MultirotorConfig]):
             self.vehicle_events.send(event(stamp=self._physics.time_ns, source=self.name))
 
     def sample_sensors(self, tick: Tick) -> None:
-        """Send an IMU sample and the ground truth, and expose the cameras that this triggers."""
+        """Send an IMU sample and the ground truth, and expose the triggered cameras."""
         stamp = self._advance(tick)
         state, qpos, qvel = self._physics.state_at(stamp)
         self.imu.send(self._suite.imu.sample(stamp, state))
@@ -352,5 +352,5 @@ def start_of(config: MultirotorConfig) -> Vector3:
 
 
 def _stands_on(contact: Contact) -> bool:
-    """Return whether a contact is only that of the feet with the ground: upwards, and gentle."""
+    """Return whether a contact is upwards and gentle, as of feet on the ground."""
     return contact.normal[2] < -0.7 and contact.speed < 1.0

@@ -1,4 +1,4 @@
-"""What the nodes of all simulators have in common: a world, cameras in it, and what they obey."""
+"""Common base of simulator nodes: a world, its cameras, and routing of orders."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Simulator(Inhabitant, Node[C], ABC):
     @property
     @abstractmethod
     def frame_id(self) -> str:
-        """Frame of the body that carries the cameras."""
+        """Frame of the cameras' body."""
 
     @property
     def cameras(self) -> tuple[CameraSpec, ...]:
@@ -122,7 +122,7 @@ Order = Command | Setpoint | PathAnnouncement | PilotAnnouncement
 
 
 class Addressee:
-    """Decides what a vehicle, or a free camera, obeys.
+    """Routing of orders to vehicles and free cameras.
 
     An order that names a vehicle is for that one. One that names none is for the only vehicle of
     the run, and for those whose ports are narrowed to its source. A free camera is a vehicle here
@@ -139,7 +139,7 @@ class Addressee:
         self._refused: set[tuple[str, str]] = set()
 
     def obeys(self, order: Order, port: str) -> bool:
-        """Return whether an order that comes to a port, or a pilot's path, is for this vehicle."""
+        """Return whether an order at a port, or a pilot's path, is for this vehicle."""
         narrowed = self._ports.get(port)
         if narrowed and not f"{order.source}/".startswith(f"{narrowed}/"):
             return False
@@ -148,7 +148,7 @@ class Addressee:
         return bool(narrowed) or self._vehicles == [self._name]
 
     def refusal(self, order: Order) -> str:
-        """Return, the first time, why an order is for nobody; empty if it is for somebody.
+        """Return the reason against an order for nobody, the first time; else empty.
 
         Only the first of several vehicles does so.
         """
@@ -161,7 +161,7 @@ class Addressee:
         return reason
 
     def complaints(self, pilots: Iterable[PilotAnnouncement]) -> Iterator[str]:
-        """Yield what is wrong with the vehicles that pilots name; the first vehicle does so."""
+        """Yield errors in the vehicles named by pilots, if this is the first vehicle."""
         for pilot in pilots:
             if reason := self.refusal(pilot):
                 yield f"{pilot.source}: vehicle: {reason}"

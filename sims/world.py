@@ -1,4 +1,4 @@
-"""The one world of a run: built once, of all nodes that have something in it, which share it.
+"""Shared world of a run: built once, of all nodes with a part in the world.
 
 What belongs to it and to no vehicle (wind, moving bodies, lights, fog) has a node of its own.
 """
@@ -33,42 +33,42 @@ Floats = npt.NDArray[np.float64]
 
 
 class Inhabitant:
-    """Mixin of the nodes that have something in the world."""
+    """Mixin of nodes with a part in the world."""
 
     vehicle: ClassVar[bool] = False
-    """Whether it is moved by physics."""
+    """Whether the node is moved by physics."""
     alone: ClassVar[bool] = False
-    """Whether it has a world for itself if all nodes of the run that have something in it do."""
+    """Whether the node has its own world, if `alone` holds for all inhabitants."""
 
     @classmethod
     @abstractmethod
     def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
-        """Put what a node of this class has into a world, and return what of it moves by itself."""
+        """Add a node of this class to a world, and return its self-moving parts."""
 
     @classmethod
     def sees(cls, config: Any) -> bool:
-        """Return whether a node of this class has sensors that surfaces look different to."""
+        """Return whether a node of this class has sensors of surface appearance."""
         return bool(getattr(config, "cameras", ()) or getattr(config, "lidars", ()))
 
     @classmethod
     def wind_of(cls, config: Any) -> WindSpec | None:  # noqa: ARG003
-        """Return the wind that a node of this class brings; `None` for most."""
+        """Return the wind of a node of this class; `None` for most."""
         return None
 
 
 class SharedWorld:
-    """A compiled world, its physics, and what of it is to be handed to renderers.
+    """Compiled world of a run, its physics, and the data for renderers.
 
-    It outlives a restart of any node: what a vehicle does is then as it was left.
+    It outlives a restart of any node: vehicles then are as they were left.
 
     Args:
-        inhabitants: The nodes that have something in it, in file order.
-        bare: Whether images are left out, since nobody is to see them; nobody does, either, if no
-            inhabitant says so.
+        inhabitants: The nodes with a part in the world, in file order.
+        bare: Whether to leave out images, as nobody is to see them; also left out if no inhabitant
+            sees.
 
     Attributes:
-        simulation: Its physics, which all vehicles share. `None` if there is no vehicle.
-        air: Its wind; `None` if there is none, or no vehicle.
+        simulation: Physics shared by all vehicles. `None` if there is no vehicle.
+        air: The wind; `None` if there is none, or no vehicle.
         vehicles: Names of the vehicles.
         starts: State of each vehicle and free camera at its start, once that node has started up.
         free_cameras: Gives the state of each free camera at a time (ns); no physics knows it.
@@ -93,7 +93,7 @@ class SharedWorld:
         self._building = asyncio.Lock()
 
     async def build(self, node: Node[Any]) -> None:
-        """Build it, if that is not done or its physics have diverged."""
+        """Build the world, unless built already with its physics still finite."""
         async with self._building:
             if not self._built or (self.simulation and self.simulation.diverged):
                 await node.offload(self._build)
@@ -101,11 +101,11 @@ class SharedWorld:
 
     @functools.cached_property
     def model_bytes(self) -> bytes:
-        """The compiled world, for other processes; made when it is first asked for."""
+        """Compiled world for other processes, made at the first request."""
         return model_to_bytes(self.model)
 
     def state_at(self, stamp_ns: int) -> tuple[int, Floats, Floats]:
-        """Step the physics up to a time if it is not there yet, and return the world's state.
+        """Step the physics up to a time if necessary, and return the world's state.
 
         Returns:
             The state's time: that asked for, or that of the physics if it is further, as may
@@ -125,7 +125,7 @@ class SharedWorld:
             self.simulation.history.keep(seconds + 1.0)
 
     def past_state(self, stamp_ns: int) -> Floats:
-        """Return the generalised positions at a time that has come, shape (nq,)."""
+        """Return the generalised positions at a time not in the future, shape (nq,)."""
         if self.simulation is None:
             return self.state_at(stamp_ns)[1]
         self.simulation.advance_to(stamp_ns)
@@ -144,7 +144,7 @@ class SharedWorld:
             self.air.velocity = velocity
 
     def geoms_of(self, body: str) -> tuple[int, ...]:
-        """Return the numbers of a body's geoms, which are those in segmentation images."""
+        """Return the numbers of a body's geoms, as in segmentation images."""
         return tuple(np.flatnonzero(self.model.geom_bodyid == self.model.body(body).id).tolist())
 
     def _build(self) -> None:
@@ -169,7 +169,7 @@ class SharedWorld:
 
 
 async def join_world(node: Any) -> SharedWorld:
-    """Return the world in which a node has something, built by the first one that asks.
+    """Return the world of a node, built by the first caller.
 
     Raises:
         WorldError: The node names another world than the others do, or some of them are in
@@ -200,17 +200,15 @@ async def join_world(node: Any) -> SharedWorld:
 
 
 class WorldConfig(NodeConfig):
-    """Settings of a world that belong to no vehicle.
+    """Settings of a world, apart from its vehicles.
 
     Attributes:
-        world: Name or path of the world, as of a simulator; empty for that which one of the
-            vehicles names.
+        world: Name or path of the world, as of a simulator; empty for that of the vehicles.
         wind: The wind.
-        bodies: Bodies that move by themselves.
-        lights: Lights of the world that change in time.
-        fog: Fog; none unless it is given.
-        rate: Rate at which the true poses of the bodies, and the true wind round each vehicle,
-            are sent, Hz.
+        bodies: Self-moving bodies.
+        lights: Lights that change in time.
+        fog: Fog; none unless given.
+        rate: Rate of the bodies' true poses and of the true wind round each vehicle, Hz.
     """
 
     world: NameOrPath = ""
@@ -222,9 +220,9 @@ class WorldConfig(NodeConfig):
 
 
 class World(Inhabitant, Node[WorldConfig]):
-    """The world in which all vehicles and free cameras of a run are.
+    """World of all vehicles and free cameras of a run.
 
-    A run without wind, and without anything that moves or changes by itself, needs none.
+    A run needs it only for wind, and for parts that move or change by themselves.
     """
 
     flies = True

@@ -1,4 +1,4 @@
-"""The pages of the documentation that are made from the code, as a hook of MkDocs.
+"""MkDocs hook for the documentation pages made from the code.
 
 Commands, nodes and the tables of a file are read from their typed declarations, the drawing of
 the architecture from the imports, each time the site is built: so they cannot drift.
@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are made here."""
+    """Add the generated pages."""
     for path, content in {
         "reference/commands.md": commands_page(),
         "reference/configuration.md": configuration_page(),
@@ -43,12 +43,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put the table of all figures where a page asks for it."""
+    """Replace a page's placeholder by the table of all figures."""
     return re.sub(r"<!-- all figures.*-->", lambda _: figures_section(), markdown)
 
 
 def figures_section() -> str:
-    """Return what a page has of all figures: their meanings, units and thresholds."""
+    """Return the section on all figures: meanings, units and thresholds."""
     rows = [
         (
             f"`{each.name}`",
@@ -113,7 +113,7 @@ def _default(parameter: Any) -> str:
 
 
 def configuration_page() -> str:
-    """Return the page of what a file may hold besides the settings of nodes."""
+    """Return the page of a configuration file's settings, apart from the nodes'."""
     text = (ROOT / "tools" / "configuration.md").read_text(encoding="utf-8")
     tables: dict[str, type[msgspec.Struct]]
     tables = {"run": RunConfig, "network": NetworkConfig, "link": LinkConfig}
@@ -123,7 +123,7 @@ def configuration_page() -> str:
 
 
 def nodes_page(nodes: dict[str, type[Node[Any]]]) -> str:
-    """Return the page of all nodes: what each is for, its ports and its settings."""
+    """Return the page of all nodes: purposes, ports and settings."""
     lines = [
         "# Nodes",
         "",
@@ -178,7 +178,7 @@ PLACES = {
     "bench": (0, 0), "sims": (-1, 1), "nodes": (1, 1), "runtime.tools": (1, 2), "runtime": (0, 3),
     "events": (0, 4),
 }  # fmt: skip
-"""Column and row of each room: it may import what lies below it."""
+"""Column and row of each room; a room may import only from rows below."""
 
 ABOUT = {
     "bench": "benchmarks and their peers:",
@@ -191,7 +191,7 @@ ABOUT = {
 
 
 def imports_between_rooms() -> set[tuple[str, str]]:
-    """Return which room imports which, as read from every source file."""
+    """Return pairs of rooms (importer, imported), read from all source files."""
     found = set()
     for path in sorted(each for room in ABOUT for each in (ROOT / room).rglob("*.py")):
         if path.name == "__main__.py":  # it starts the command line
@@ -212,14 +212,14 @@ def _room(module: str) -> str:
 
 
 def _folders(room: str) -> list[str]:
-    """Return the words for a room: what it is, and its folders, in lines that fit into a box."""
+    """Return a room's description and folders, in lines of a box's width."""
     folder = ROOT / room.replace(".", "/")
     inside = sorted(path.parent.name for path in folder.glob("*/__init__.py"))
     return textwrap.wrap(f"{ABOUT[room]} {', '.join(i for i in inside if i != 'tools')}", 56)
 
 
 def architecture(imports: set[tuple[str, str]]) -> str:
-    """Return the rooms and their imports as SVG, without arrows that others imply.
+    """Return the rooms and their imports as SVG, without implied arrows.
 
     Raises:
         PluginError: A room imports one that does not lie below it.
@@ -264,7 +264,7 @@ def architecture(imports: set[tuple[str, str]]) -> str:
 
 
 def _prose(text: str) -> str:
-    """Return a docstring as Markdown: what stands before its sections, with single backticks."""
+    """Return a docstring's text before its sections as Markdown, with single backticks."""
     text = re.split(r"^(?:Args|Attributes|Raises|Returns):$", text, flags=re.MULTILINE)[0]
     text = re.sub(r"^::$|:(?=:$)", "", text, flags=re.MULTILINE)  # what follows is indented
     text = re.sub(r"``([^`]+)``", r"`\1`", text).strip()

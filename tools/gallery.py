@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def _seen(name: str) -> Any:
-    """Return what a camera sees of a world, BGR."""
+    """Return a camera's image of a world, BGR."""
     world, dynamics = load_scene(name, 1)
     camera = CameraSpec(name="camera", images=("rgb",), width=SIZE[0], height=SIZE[1])
     prefix = add_free_camera(world, "free", (camera,))
@@ -58,7 +58,7 @@ def _seen(name: str) -> Any:
 
 
 def _sensed() -> dict[str, Any]:
-    """Return an image of what each sensor says at the end of the flight, by its caption."""
+    """Return an image of each sensor at the end of the flight, by caption."""
     result = run_nodes(load(Path("tools/sensors.toml")).nodes, duration=7.5, seed=1)
 
     def last(kind: type[Event], source: str) -> Any:

@@ -21,7 +21,7 @@ DOCS = ROOT / "docs" / "images"
 SIZE = (150, 44)
 """Columns and lines of the terminal."""
 FLYING = 8.0
-"""Seconds of the run after which there is something to see."""
+"""Seconds of the run before the images are made."""
 
 
 def main() -> None:

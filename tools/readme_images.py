@@ -11,7 +11,7 @@ PLOTS, DOCS = Path("runs/tour/plots"), Path("docs/images")
 
 
 def main() -> None:
-    """Take over what the report drew."""
+    """Copy the report's images."""
     features = cv2.imread(str(PLOTS / "frames_odometry.png"))
     if features is None:
         raise SystemExit(f"expected {PLOTS / 'frames_odometry.png'}: run `make demo` first")

@@ -8,11 +8,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LONGEST, SHORTEST = 500, 80
-"""Lines of a file beyond which it needs a reason."""
+"""Limits of a file's lines; a file beyond them needs a reason."""
 
 
 def main() -> None:
-    """Print a row for each room, and the files that are too long or too short."""
+    """Print a row for each room, and the files too long or too short."""
     command = ["git", "ls-files", "*.py"]
     names = subprocess.check_output(command, cwd=ROOT, text=True).split()  # noqa: S603  # ours
     lines = {name: len((ROOT / name).read_text(encoding="utf-8").splitlines()) for name in names}

@@ -1,4 +1,4 @@
-"""Make an image of what Rerun shows of a recording: `python tools/viewer_image.py RRD PNG`.
+"""Make an image of a recording in Rerun: `python tools/viewer_image.py RRD PNG`.
 
 Serves the recording on this machine, opens it in a headless Chromium (which renders in software,
 so it takes a few minutes), and waits until the image no longer changes.
@@ -30,13 +30,13 @@ from nodes.viewers.rerun.sdk import program
 
 WIDTH, HEIGHT = 1440, 900
 TOP = 32
-"""Pixels of the viewer's own bar, which is left out."""
+"""Height of the viewer's own bar, cut off, pixels."""
 
 TIMEOUT = 240.0
 """Seconds until the image must be there."""
 
 STILL = 4
-"""Captures in a row, two seconds apart, that must be equal."""
+"""Number of equal captures in a row, two seconds apart, for a still page."""
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 
@@ -122,7 +122,7 @@ class Page:
                 return result
 
     def still(self) -> bytes:
-        """Return the page as PNG once it no longer changes."""
+        """Return the page as PNG, once still."""
         clip = {"x": 0, "y": TOP, "width": WIDTH, "height": HEIGHT - TOP, "scale": 1}
         self.call("Emulation.setDeviceMetricsOverride", **_SCREEN)
         end, last, equal = time.monotonic() + TIMEOUT, b"", 0
@@ -139,7 +139,7 @@ class Page:
 
 
 def free_port() -> int:
-    """Return a port of the loopback that nobody has."""
+    """Return a free port of the loopback."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

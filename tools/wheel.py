@@ -1,4 +1,4 @@
-"""What a wheel holds besides the packages: `config.toml` and the examples, for `visnav demo`."""
+"""Additions to the wheel: `config.toml` and the examples, for `visnav demo`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ INSIDE = "runtime/tools/example_files"
 
 
 class BuildWithExamples(build_py):
-    """Copies the examples into the package; a checkout is used as it is."""
+    """Build step with the examples copied into the package, except in a checkout."""
 
     def run(self) -> None:
         """Build the packages, then add the examples."""

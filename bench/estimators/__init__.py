@@ -1,4 +1,4 @@
-"""The suite: known estimators in scenarios from easy to brutal, each flown once, in one table.
+"""Estimator suite: scenarios from easy to brutal, each flown once, results in a single table.
 
     suite.toml  →  `plan`: a job for each scenario, estimator and repeat  →  `runtime.tools.sweep`
                 →  `page`: SUITE.md and its pictures

@@ -1,4 +1,4 @@
-"""``SUITE.md``: a table of all, one for each scenario, pictures, and what they do not show."""
+"""``SUITE.md``: a table over all scenarios, a table for each, pictures, and their limits."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ COLUMNS = {
 """Figure to the head of its column."""
 
 RANKED = "held_ate_percent"
-"""The figure by which all are compared: a pose that is missing counts with the last one said."""
+"""Figure to compare estimators by: ATE over the whole flight, lost time as 100 % drift."""
 
 
 class Cell(msgspec.Struct, frozen=True, kw_only=True):
-    """One estimator in one scenario, over all seeds and repeats.
+    """Result of an estimator in a scenario, over all seeds and repeats.
 
     Attributes:
         entrant: The estimator.
-        runs: How many runs there are.
-        passed: How many of them met the thresholds.
+        runs: Number of runs.
+        passed: Number of runs within the thresholds.
         reasons: Why runs failed, each once, with the figures of the first of them.
         figures: Figure to its spread over the runs that have it.
         repeatable: Whether all repeats of a seed gave the same, in words.
@@ -64,7 +64,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def short(self) -> str:
-        """The cell of the table of all: the error, and whether it failed."""
+        """Cell in the overall table: the error, and the verdict unless all runs passed."""
         error = self.figures.get(RANKED)
         words = "" if error is None else f"{error.median:.3g}"
         if error is not None and f"{error.least:.3g}" != f"{error.most:.3g}":
@@ -73,7 +73,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def cells(suite: Suite, plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Cell]]:
-    """Return what became of each estimator, by scenario and estimator."""
+    """Return each estimator's results, by scenario and estimator."""
     groups: dict[tuple[str, ...], list[Row]] = {}
     for job, row in in_order(plan, rows):
         groups.setdefault(tuple(text for _, text in job.settings), []).append(row)
@@ -111,7 +111,7 @@ def _figures(name: str, group: Sequence[Row]) -> dict[str, Spread]:
 
 
 def _costs(name: str, row: Row) -> dict[str, float | None]:
-    """Return what an estimator's process costs, by the names of `COLUMNS`."""
+    """Return the cost of an estimator's worker process, keyed as in `COLUMNS`."""
     for worker, costs in row.get("workers", {}).items():
         if worker.startswith(f"{name}."):
             return {"cpu_p50_ms": costs.get("cpu_p50_ms"), "peak_rss_mb": costs.get("peak_rss_mb")}
@@ -153,10 +153,10 @@ def draw(suite: Suite, cells: Mapping[str, Mapping[str, Cell]], path: Path) -> N
 
 
 def pictures(plan: Plan, folder: Path) -> dict[str, str]:
-    """Put one row of images of each scenario's cameras into a folder.
+    """Write a row of camera images for each scenario into a folder.
 
     Returns:
-        Scenario to the name of its file; without those of which no run has kept images.
+        Scenario to the name of its file; without scenarios of which no images are kept.
     """
     found: dict[str, str] = {}
     for job in plan.jobs:
@@ -208,7 +208,7 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
 
 
 def _graphics(plan: Plan) -> dict[str, str]:
-    """Return what drew the images, and the versions of the estimators, as the first run has it."""
+    """Return the ``graphics`` entry of the first summary to contain any."""
     for job in plan.jobs:
         with contextlib.suppress(OSError, ValueError, KeyError):
             summary = json.loads((Path(job.out) / "summary.json").read_text(encoding="utf-8"))

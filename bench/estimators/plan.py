@@ -1,4 +1,4 @@
-"""What the suite consists of, and the runs that this makes."""
+"""The suite's scenarios and estimators, and the plan of their runs."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Entrant(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     @property
     def installed(self) -> bool:
-        """Whether it can run here."""
+        """Whether the estimator's module is installed."""
         return not self.module or importlib.util.find_spec(self.module) is not None
 
 
@@ -75,10 +75,10 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     estimators: tuple[Entrant, ...]
 
     def only(self, scenarios: Sequence[str], estimators: Sequence[str]) -> Suite:
-        """Return a part of it; an empty list of names stands for all.
+        """Return a part of the suite; an empty list of names stands for all.
 
         Raises:
-            CommandError: There is none of such a name.
+            CommandError: A name is unknown.
         """
         return msgspec.structs.replace(
             self,
@@ -103,7 +103,7 @@ def read_suite(path: Path = FOLDER / "suite.toml") -> Suite:
 
 
 def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> Plan:
-    """Plan a run for each scenario, seed, estimator that is installed, and repeat.
+    """Plan a run for each scenario, seed, installed estimator, and repeat.
 
     Those of one scenario and seed follow each other: they share one flight.
 

@@ -1,4 +1,4 @@
-"""What this runtime is measured beside: one module a system, each with a `SYSTEMS` tuple.
+"""Systems to compare this runtime with: a module per system, each with a `SYSTEMS` tuple.
 
 A module must import without its system being installed; `System.missing` says what is. `measure`
 of a `System` sets up node 1, exchanges pings and tears down; where nodes have processes of their

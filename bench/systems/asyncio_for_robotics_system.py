@@ -1,4 +1,4 @@
-"""asyncio-for-robotics over Zenoh, on uvloop: in one session, and between processes over TCP.
+"""asyncio-for-robotics over Zenoh, on uvloop: in a single session, and between processes (TCP).
 
 Nodes wait in `Sub.listen_reliable`, which skips nothing, and send with Zenoh itself, as the library
 means it. Messages, sessions and their settings are those of `bench.systems.zenoh_system`; Zenoh
@@ -109,7 +109,7 @@ def serve(job: Job) -> None:
 
 
 def measure(case: Case) -> Samples:
-    """Measure round trips through one session."""
+    """Measure round trips through a single session."""
     zenoh: Any = importlib.import_module("zenoh")
     with zenoh.open(zenoh_config()) as session:
         return uvloop.run(_run(session, case, Crew({}).check, range(2, case.nodes + 1)))

@@ -38,13 +38,13 @@ PONG = struct.Struct("<qi")
 """Stamp, number."""
 
 ALL = 0
-"""As the receiver of a ping: a call of the roll, which each node answers with minus its number."""
+"""Receiver number of a roll call: each node answers with minus its own number."""
 
 TIMEOUT = 60.0
-"""Seconds without an answer after which a measurement is given up."""
+"""Seconds without an answer before a measurement is given up."""
 
 GRACE = 2.0
-"""Seconds in which a child that is to end may put away what it has, before it is ended."""
+"""Seconds for a child to clean up after SIGTERM, before a forced exit."""
 
 Send = Callable[[int, int, int], None]
 """Sends a ping to all nodes: its stamp, receiver and number."""
@@ -54,7 +54,7 @@ Receive = Callable[[], int | None]
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
-    """What one child does.
+    """Job of a child process.
 
     Attributes:
         node: Its number, from 2.
@@ -152,14 +152,14 @@ def children(module: str, case: Case, address: str, variant: str = "") -> Iterat
 
 
 def answer(node: int, receiver: int, number: int) -> int | None:
-    """Return the number with which a node answers a ping to a receiver, if it is to."""
+    """Return the number of a node's answer to a ping; `None` for another receiver."""
     if receiver == node:
         return number
     return -node if receiver == ALL else None
 
 
 def reply_to(node: int, ping: Any) -> bytes | None:
-    """Return the pong with which a node answers a ping, if it is to.
+    """Return a node's pong for a ping; `None` for another receiver.
 
     Args:
         ping: Bytes that begin with a `PING`.
@@ -202,7 +202,7 @@ def _end_with_parent() -> None:
 
 
 def main(module: str, job: str) -> None:
-    """Be one node until the measuring process ends this one."""
+    """Run a node until the measuring process ends this process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     threading.Thread(target=_end_with_parent, daemon=True).start()

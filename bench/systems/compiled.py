@@ -1,4 +1,4 @@
-"""Programs in C++, of which one is the thesis's client: compiled into a cache, run, and read.
+"""Programs in C++, the thesis's client among them: compiled into a cache, run, and read.
 
 Sources are in ``bench/systems/cpp``. A program is compiled again when a source, the compiler or
 what it is linked with has changed. Programs write their samples as raw int64.
@@ -28,7 +28,7 @@ CLIENT = "thesis_client.cpp"
 SOURCES = Path(__file__).parent / "cpp"
 
 KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": "33554432", "MALLOC_TRIM_THRESHOLD_": "1073741824"}
-"""For the environment: glibc keeps freed memory rather than returning it.
+"""Environment for glibc to keep freed memory rather than returning pages.
 
 Otherwise each large message may land on pages that the kernel first has to clear, which costs more
 than copying it: a property of the allocator's defaults and not of what is measured.
@@ -54,7 +54,7 @@ def compiler_version() -> str:
 
 
 def build(source: str, libraries: Sequence[str] = (), built_for: str = "") -> Path:
-    """Return a compiled program, from the cache if it is there.
+    """Return a compiled program, from the cache if present.
 
     Args:
         source: Name of its one file in `SOURCES`.
@@ -85,7 +85,7 @@ def build(source: str, libraries: Sequence[str] = (), built_for: str = "") -> Pa
 
 
 def run(command: Sequence[str | Path], deadline: float, env: dict[str, str] | None = None) -> str:
-    """Run a program, end it with this process or when the deadline is over; return its output.
+    """Run a program, ended with this process or at the deadline; return its output.
 
     Args:
         deadline: Seconds.
@@ -112,7 +112,7 @@ def run(command: Sequence[str | Path], deadline: float, env: dict[str, str] | No
 
 
 def guarded(command: Sequence[str | Path]) -> list[str]:
-    """Return the command such that the kernel ends it with the process that started it."""
+    """Return a command under ``setpriv``, if available: killed with its parent process."""
     words = [str(word) for word in command]
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "KILL", "--", *words] if setpriv else words
@@ -124,13 +124,13 @@ def arguments(case: Case, out: Path) -> list[str]:
 
 
 def deadline_for(case: Case) -> float:
-    """Return seconds that only a hang exceeds: 30, and 20 ms for each small round trip."""
+    """Return a deadline for hangs, seconds: 30, plus 0.02 (small) or 0.2 a round trip."""
     each = 0.02 if case.case == "small" else 0.2
     return 30 + each * (case.samples + case.warm_up)
 
 
 def read(out: Path, case: Case) -> Samples:
-    """Read what a program has written.
+    """Read the samples written by a program.
 
     Raises:
         CompiledError: Not as many samples as expected.
@@ -163,7 +163,7 @@ def measure_client(case: Case) -> Samples:
 
 
 def order_heard() -> str:
-    """Return in which order nodes hear an event that nobody handles, and one that node 2 does."""
+    """Return the order of hearing an unhandled event, and an event node 2 handles."""
     return run([build(CLIENT), "check"], 30)
 
 

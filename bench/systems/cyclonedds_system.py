@@ -61,11 +61,11 @@ class _Domain:
         self.ping, self.pong = _ping(large=large), _pong()
 
     def writer(self, kind: type) -> Any:
-        """Return what writes one of the two types."""
+        """Return a data writer of a message type."""
         return self._pub.DataWriter(self._participant, self._topic(kind), qos=self._qos)
 
     def reader(self, kind: type) -> Iterator[Any]:
-        """Return what yields samples of one of the two types; `None` after a second without."""
+        """Return an iterator of a type's samples; `None` after a second without any."""
         reader = self._sub.DataReader(self._participant, self._topic(kind), qos=self._qos)
         second = self._duration(seconds=1)
 

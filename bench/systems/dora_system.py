@@ -1,4 +1,4 @@
-"""dora between processes: a dataflow with a node each, of which node 1 is a dynamic one.
+"""dora between processes: a dataflow with a node per process, node 1 being dynamic.
 
 A coordinator and a daemon of our own run beside the nodes. Nodes wait in `Node.next`. A large ping
 is an Arrow array, which `send_output` copies into shared memory, and its header is the metadata;
@@ -122,7 +122,7 @@ def _start(address: _Address) -> None:
 
 
 def serve(job: Job) -> None:
-    """Run the dataflow; the one child of the measuring process does."""
+    """Run the dataflow, in the only child of the measuring process."""
     address = msgspec.json.decode(job.address, type=_Address)
     port = str(address.coordinator)
     os.environ[_SUPERVISOR] = str(os.getpid())

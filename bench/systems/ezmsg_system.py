@@ -1,4 +1,4 @@
-"""ezmsg: a unit a node, all in one process, or each of nodes 2 to N in a process of its own.
+"""ezmsg: a unit per node, all in a single process, or nodes 2 to N in a process each.
 
 Units are run by `ezmsg.core.run` with a graph server of our own; ezmsg brings its own loop of
 asyncio. Node 1 sends the next ping from the method that gets the pong. In one process messages go
@@ -27,7 +27,7 @@ _Method = TypeVar("_Method", bound=Callable[..., Any])
 
 
 class Exchange:
-    """What node 1 has to remember between one message and the next."""
+    """State of node 1 between messages."""
 
     def __init__(self, case: Case) -> None:
         self.taken = np.zeros(case.warm_up + case.samples, np.int64)
@@ -50,7 +50,7 @@ class Exchange:
         )
 
     def pong(self, pong: Pong) -> bool:
-        """Take note of a pong, and return whether it is time for the next ping."""
+        """Record a pong, and return whether the next ping is due."""
         arrived = time.perf_counter_ns()
         if self.absent:
             self.absent.discard(-pong.number)
@@ -65,12 +65,12 @@ class Exchange:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """What changes as long as anything comes."""
+        """Progress of the exchange, constant in a stall: ping number, absent nodes."""
         return self._number, len(self.absent)
 
 
 class _OfStream(Protocol):
-    """How ezmsg marks methods that take from or put into a stream."""
+    """Type of ezmsg's ``publisher`` and ``subscriber`` decorators of methods."""
 
     def __call__(self, stream: Any, /) -> Callable[[_Method], _Method]: ...
 

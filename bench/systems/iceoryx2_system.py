@@ -43,7 +43,7 @@ class Large(ctypes.Structure):
 
 
 class _Topic:
-    """One service for samples and, for nodes that sleep, one for events."""
+    """Service for samples and, for sleeping nodes, another for events."""
 
     def __init__(self, node: Any, name: str, kind: type, *, events: bool) -> None:
         iox2: Any = importlib.import_module("iceoryx2")
@@ -65,7 +65,7 @@ class _Topic:
             self._events = builder.open_or_create()
 
     def sender(self) -> tuple[Any, Callable[[], object]]:
-        """Return a publisher, and what to call after each send."""
+        """Return a publisher, and the function to call after each send."""
         retry = self._iox2.BackpressureStrategy.RetryUntilDelivered
         publisher = self._samples.publisher_builder().backpressure_strategy(retry).create()
         if self._events is None:
@@ -73,7 +73,7 @@ class _Topic:
         return publisher, self._events.notifier_builder().create().notify
 
     def receiver(self) -> Callable[[], Any]:
-        """Return what waits for a sample for a second at most, and returns it or `None`."""
+        """Return a function to wait for a sample, up to a second; `None` without any."""
         receive = self._samples.subscriber_builder().create().receive
         if self._events is None:
 

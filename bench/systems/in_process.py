@@ -1,4 +1,4 @@
-"""Systems whose nodes share a process, and need nothing but Python or a package of it.
+"""Systems with all nodes in a process, requiring only Python or a package for Python.
 
 Functions called within the send: a dict of handlers, the floor, since nothing in Python delivers
 events for less; and pyee's `EventEmitter`.
@@ -29,7 +29,7 @@ Put = Callable[[Any], None]
 
 
 def _call(case: Case, send: Callable[[Any], Any], hear: Callable[[type, Any], Any]) -> Samples:
-    """Return the samples; `hear` makes a function one that `send` calls for events of a type."""
+    """Return the samples; `hear` registers a function with `send` for events of a type."""
     arrived = 0
     now = time.perf_counter_ns
 
@@ -72,7 +72,7 @@ def measure_calls(case: Case) -> Samples:
 
 
 def measure_pyee(case: Case) -> Samples:
-    """Measure round trips through one emitter, whose events are named by their types."""
+    """Measure round trips through a single emitter, with types as names of events."""
     emitter: Any = importlib.import_module("pyee.base").EventEmitter()
     emit = emitter.emit
     return _call(
@@ -83,7 +83,7 @@ def measure_pyee(case: Case) -> Samples:
 
 
 async def _exchange(case: Case, puts: Sequence[Put], receive: Callable[[], Awaitable[Any]]) -> Any:
-    """Return the samples of node 1, which puts each ping to all others and awaits the reply."""
+    """Return node 1's samples; each ping is put to all others, the reply awaited."""
     payload = payloads(case)
     now = time.perf_counter_ns
     taken = np.empty(case.warm_up + case.samples, np.int64)
@@ -130,7 +130,7 @@ async def _by_queues(case: Case) -> Samples:
 async def _by_streams(
     case: Case, new: Callable[[float], tuple[Any, Any]], new_group: Callable[[], Any]
 ) -> Samples:
-    """Exchange by pairs of ends, which `new` makes, within a group of tasks, as `new_group`'s."""
+    """Exchange over pairs of stream ends from `new`, in a task group from `new_group`."""
     reply, replies = new(math.inf)
     streams = [new(math.inf) for _ in range(case.nodes - 1)]
     async with new_group() as group:

@@ -40,7 +40,7 @@ from bench.systems.compiled import (
 MASTER = Path("/usr/bin/rosmaster")
 
 CLOSING = 10.0
-"""Seconds that nodes have to end after node 1 has."""
+"""Seconds for the other nodes to end after node 1."""
 
 
 class GraphError(RuntimeError):
@@ -59,7 +59,7 @@ class Graph:
         self._await_master(self.start([MASTER, "--core", "-p", str(port)]))
 
     def start(self, command: Sequence[str | Path]) -> subprocess.Popen[bytes]:
-        """Start a node; it is ended with the graph at the latest."""
+        """Start a node, ended at the latest with the graph."""
         output = self._stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
         environment = {
             # Of this Python's packages Debian's is to see nothing.
@@ -132,7 +132,7 @@ class Graph:
 
 @contextlib.contextmanager
 def graph() -> Iterator[Graph]:
-    """Run a master; end it and all nodes with the block.
+    """Run a master; the master and all nodes end with the block.
 
     Raises:
         GraphError: The master does not come up.
@@ -157,7 +157,7 @@ LIBRARIES = ("roscpp", "rosconsole", "roscpp_serialization", "rostime", "boost_t
 
 
 def measure_roscpp(case: Case) -> Samples:
-    """Measure roscpp in one process, where its one thread runs all callbacks."""
+    """Measure roscpp in a single process, with all callbacks in its only thread."""
     return _in_one_process([_program("roscpp.cpp"), "all"], case)
 
 
@@ -177,7 +177,7 @@ def measure_roscpp_processes(case: Case) -> Samples:
 
 
 def measure_rospy_processes(case: Case) -> Samples:
-    """Measure rospy over TCP, written to by the thread that publishes; payloads are arrays."""
+    """Measure rospy over TCP, written by the publishing thread; payloads are arrays."""
     return _in_processes([PYTHON, "-P", Path(__file__).with_name("ros1_rospy.py")], case)
 
 
@@ -198,7 +198,7 @@ def _in_processes(command: list[str | Path], case: Case) -> Samples:
 
 
 def _program(source: str, *libraries: str) -> Path:
-    """Return a compiled program; it is compiled anew for another version of roscpp."""
+    """Return a compiled program, rebuilt for another version of roscpp."""
     built_for = _version("libroscpp-dev")
     return build(source, (*libraries, *LIBRARIES), built_for)
 
@@ -213,11 +213,11 @@ def _version(package: str) -> str:
 def _packaged(
     name: str, package: str, files: dict[str, Path], *, compiled: bool = True
 ) -> dict[str, Any]:
-    """Return `missing` and `version` of a `System` that is some Debian packages.
+    """Return `missing` and `version` of a `System` made of Debian packages.
 
     Args:
         name: Before the version of `package`.
-        files: One of each package that must be there.
+        files: A file of each required package.
     """
 
     def missing() -> str | None:

@@ -1,4 +1,4 @@
-"""A node of the exchange in rospy, run by Debian's Python, which has nothing of ours.
+"""Node of the exchange in rospy, run by Debian's Python, without any package of ours.
 
 ``/usr/bin/python3 -P ros1_rospy.py ping CASE NODES SAMPLES WARM_UP OUT`` or ``… listen NUMBER``
 
@@ -25,13 +25,13 @@ HELLO = -1
 """Number of pings before the exchange."""
 
 TIMEOUT = 10.0
-"""Seconds for one pong."""
+"""Seconds to wait for a pong."""
 
 FLOATS = 1080 * 1080
 
 
 def main() -> int:
-    """Be node 1 or one of the others."""
+    """Run node 1 or another node."""
     import rospy  # type: ignore[import-not-found]
     from genpy.dynamic import generate_dynamic  # type: ignore[import-not-found]
     from rospy.numpy_msg import numpy_msg  # type: ignore[import-not-found]

@@ -1,4 +1,4 @@
-"""Zenoh: one session with callbacks, and peers in processes joined over TCP on the loopback.
+"""Zenoh: a single session with callbacks, and peers in processes over TCP on the loopback.
 
 What Zenoh passes is bytes, in one process too. A large ping has its header as attachment and the
 array as payload: `put` copies it in, each receiver copies it out into bytes, and the memory of each
@@ -39,7 +39,7 @@ from bench.systems.children import PING, PONG, Job, PeerError, children, number_
 
 
 def pinger(pings: Any, case: Case) -> Callable[[int, int, int], None]:
-    """Return what puts a ping, given its stamp, receiver and number."""
+    """Return a function to put a ping, given its stamp, receiver and number."""
     if case.case == "small":
         return lambda stamp, receiver, number: pings.put(PING.pack(stamp, 1, receiver, number))
     # Zenoh takes bytearrays, which an array may be a view of, but no arrays.
@@ -50,7 +50,7 @@ def pinger(pings: Any, case: Case) -> Callable[[int, int, int], None]:
 
 
 def header(sample: Any, *, large: bool) -> bytes:
-    """Return the header of a ping, having made an array of the payload of a large one."""
+    """Return the header of a ping; make an array of the payload of a large ping."""
     payload: bytes = sample.payload.to_bytes()
     if not large:
         return payload
@@ -60,7 +60,7 @@ def header(sample: Any, *, large: bool) -> bytes:
 
 
 def measure_callbacks(case: Case) -> Samples:
-    """Measure round trips through one session."""
+    """Measure round trips through the callbacks of a single session."""
     zenoh: Any = importlib.import_module("zenoh")
     with zenoh.open(zenoh_config()) as session:
         pings, pongs = (zenoh_publisher(session, key) for key in ("ping", "pong"))

@@ -1,4 +1,4 @@
-"""Proof 2: the noise of a standing IMU, by its Allan deviation, against what is announced.
+"""Proof 2: Allan deviation of a stationary IMU, compared with the announced noise.
 
 IEEE Std 952-1997, annex C: σ²(τ) = N²/τ of white noise with the density N, K²τ/3 of a random walk
 with the density K. Both are fitted at once, to the overlapping estimates of all axes. How far such
@@ -20,13 +20,13 @@ from nodes.calibration.proofs import Figure, judged
 Floats = npt.NDArray[np.float64]
 
 ALLOWED = 0.10
-"""Share by which a density may differ from what is announced."""
+"""Permitted relative difference between measured and announced density."""
 
 _TRIALS = 24
 
 
 class Curve(msgspec.Struct, frozen=True, eq=False):
-    """Allan deviation of a sensor, with what was announced of it.
+    """Allan deviation of a sensor, measured and announced.
 
     Attributes:
         name: gyroscope or accelerometer.
@@ -55,7 +55,7 @@ def variances(samples: Floats, rate: float) -> tuple[Floats, Floats]:
 
 
 def densities(seconds: Floats, found: Floats, white: float, walk: float) -> tuple[float, float]:
-    """Return the N and K that fit Allan variances, weighed as announced numbers let expect."""
+    """Return N and K fitted to Allan variances, weighted by the announced densities."""
     terms = np.column_stack([1.0 / seconds, seconds / 3.0])
     spread = (terms @ [max(white, 1e-15) ** 2, walk**2]) * np.sqrt(seconds)
     n2, k2 = nnls(terms / spread[:, None], found / spread)[0]
@@ -65,7 +65,7 @@ def densities(seconds: Floats, found: Floats, white: float, walk: float) -> tupl
 def trials(
     white: float, walk: float, step: float, rate: float, count: int, seed: int = 7
 ) -> Floats:
-    """Return the N and K that fits of so many samples with given densities find, shape (n, 2)."""
+    """Return N and K fitted to simulated samples of given densities, shape (n, 2)."""
     generator = np.random.default_rng(seed)
     found = []
     for _ in range(_TRIALS):

@@ -1,4 +1,4 @@
-"""``selftest`` and ``lint``: whether a rig is what it says, and whether it says what is meant.
+"""``selftest`` and ``lint``: a measured check and a rule check of a rig's settings.
 
 For the self-test a file's vehicles are flown alone in the calibration room, and held against what
 they announced.
@@ -52,8 +52,7 @@ _KEPT = {
     *("name", "images", "width", "height", "fov", "intrinsics", "lens", "undistorted", "stereo"),
     *("position", "orientation", "rate", "latency", "readout", "time_offset"),
 }
-"""Settings of a camera that say where and when it looks; what blurs a measurement is at its
-default, which is off."""
+"""Camera settings kept in the self-test (optics, pose, timing); defects default to off."""
 
 _SECONDS, _RATE = 9.0, 5.0
 """Length of the flight; images a second, about."""
@@ -62,7 +61,7 @@ _COLLECTOR = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"
 
 
 class Result(msgspec.Struct, eq=False):
-    """What was proven of one vehicle.
+    """Self-test results of a vehicle.
 
     Attributes:
         vehicle: Its name.
@@ -84,7 +83,7 @@ class Result(msgspec.Struct, eq=False):
 
 
 def subjects(config: Config) -> list[NodeSpec]:
-    """Return the nodes of a file that carry sensors through a world: simulators, by their ports.
+    """Return a file's simulators of vehicles or cameras, recognised by their ports.
 
     Raises:
         ConfigError: There is none.
@@ -102,7 +101,7 @@ def subjects(config: Config) -> list[NodeSpec]:
 
 
 def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Result:
-    """Fly one vehicle of a file, and return what that proves.
+    """Fly a vehicle of a file and return its self-test results.
 
     Args:
         folder: For the room, the exported files and a free camera's path.
@@ -165,7 +164,7 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
 
 
 def _alone(config: Config, spec: NodeSpec) -> dict[str, Any]:
-    """Return the vehicle's own table, at the centre of the room, with nothing that listens."""
+    """Return the vehicle's node table at the room's centre, without inputs and links."""
     (table,) = (each for each in to_builtins(config)["nodes"] if each["name"] == spec.name)
     for key in ("inputs", "links", "barometer", "gnss", "magnetometer", "range_finders", "lidars"):
         table.pop(key, None)
@@ -241,13 +240,13 @@ def selftest(
         typer.Option(help="How long the IMU may stand for its Allan deviation, simulated time."),
     ] = "600s",
 ) -> None:
-    """Fly a file's vehicles in a room of known surfaces, and prove what they announce.
+    """Fly a file's vehicles in a room of known surfaces, and check their announcements.
 
-    Each vehicle flies alone, on a short path about all axes: the ideal IMU integrates to the
-    truth; the Allan deviation of the noisy one is as announced; known points fall on their pixels,
-    row time included; depth lies on true surfaces; exported calibrations project the same; and
-    the stamps of image, depth, pose and IMU agree. Writes selftest.html, with all figures.
-    Ends with 0 if all is proven, and 1 if something is not as announced.
+    Each vehicle flies alone, on a short path about all axes. Checks: the ideal IMU integrates to
+    the truth; the noisy IMU has the announced Allan deviation; known points fall on their pixels,
+    row time included; depth lies on true surfaces; exported calibrations project the same; the
+    stamps of image, depth, pose and IMU agree. Writes selftest.html, with all figures.
+    Ends with 0 if all checks pass, else with 1.
     """
     settings = load_configuration(config, overrides or [])
     try:
@@ -285,11 +284,11 @@ def lint(
         typer.Option(metavar="RULE", help="Leave a rule out; may be repeated."),
     ] = None,
 ) -> None:
-    """Say what a careful colleague would about a rig: a line for each finding.
+    """Report doubtful settings of a rig: a line for each finding.
 
-    Nothing flies; the nodes are brought up as by check. A rule says what is odd and what to change:
+    Nothing flies; the nodes are brought up as by check. Each line names the setting and a change:
     baselines, exposures, rates, lenses, latencies, missing noise and mountings, stamps that cannot
-    match, estimators that lack a sensor. What is meant is accepted in the file, by
+    match, estimators that lack a sensor. Accept intended settings in the file, by
     [run] accept = ["rule"] or ["rule:drone/camera"]. Ends with 0, with 1 if there is a finding,
     with 2 if the file is wrong.
     """
@@ -307,7 +306,7 @@ def lint(
 
 
 def write_page(path: Path, name: str, results: Sequence[Result]) -> None:
-    """Write the page, and its plots beside it.
+    """Write the self-test page, with its plots in the same folder.
 
     Raises:
         OSError: A file cannot be written.

@@ -1,4 +1,4 @@
-"""What was announced of a rig, as the calibration files of other programs.
+"""Announced rigs as calibration files of other programs.
 
 Each file is a template beside this module, ``<format>.<file>.jinja``, and reads like the file.
 
@@ -61,11 +61,11 @@ DEPTH_FACTOR = 5000.0
 """Steps of an exported depth image per metre, as TUM's."""
 
 GRAVITY = 9.81
-"""Metres per second squared, as an `Imu` at rest has it."""
+"""Gravity, m/s², as measured by an `Imu` at rest."""
 
 
 class Format(msgspec.Struct, frozen=True):
-    """What a format consists of, and what it can say.
+    """Files and capabilities of a calibration format.
 
     Attributes:
         files: Names of its files.
@@ -98,7 +98,7 @@ FORMATS = {
     "orbslam3": Format(("orbslam3.yaml",), 5, pair_only=True),
     "vslamlab": Format(("calibration.yaml",), 5),
 }
-"""The formats of calibrations, by the names that ``export`` knows."""
+"""Calibration formats by their names in ``export``."""
 
 
 def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
@@ -143,7 +143,7 @@ def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
 def variables(
     rig: Rig, cameras: list[dict[str, Any]] | None = None, *, topics: bool = False
 ) -> dict[str, Any]:
-    """Return what every template may use: cameras, imu, stereo, gravity and depth_factor.
+    """Return all templates' variables: cameras, imu, stereo, gravity, depth_factor.
 
     Args:
         rig: Sensors of one body.
@@ -162,7 +162,7 @@ def variables(
 
 
 def _camera(rig: Rig, camera: CameraAnnouncement, name: str, *, ros: bool) -> dict[str, Any]:
-    """Return what templates ask of a camera, besides what is announced."""
+    """Return a camera's template variables, beyond the announced fields."""
     info, in_imu = camera.info, imu_axes(rig, ros=ros) @ camera_in_imu(rig, camera)
     fisheye = info.distortion_model == "equidistant"
     k = _coefficients(camera, name)
@@ -239,7 +239,7 @@ def camera_in_imu(rig: Rig, camera: CameraAnnouncement) -> Floats:
 
 
 def imu_axes(rig: Rig, *, ros: bool) -> Floats:
-    """Return the IMU's frame (or the body's) in itself as it is on topics of ROS, shape (4, 4)."""
+    """Return the pose of the IMU's (or body's) frame in its ROS axes, shape (4, 4)."""
     frame = rig.cameras[0].parent_frame_id if rig.imu is None else rig.imu.frame_id
     turned = ros and axes_of(frame) == "body"
     return np.diag([1.0, -1.0, -1.0, 1.0]) if turned else np.eye(4)
@@ -266,7 +266,7 @@ def export_calibration(
     epoch: int | str = EPOCH,
     camera: str | None = None,
 ) -> list[Path]:
-    """Write what a run announced of its cameras and its IMU as another program's calibration.
+    """Export a run's announced cameras and IMU as another program's calibration.
 
     ``vslamlab`` also gets images, IMU and ground truth, if the run has a recording.
 
@@ -319,7 +319,7 @@ def export_calibration(
 
 
 def announcements(run: Path) -> list[Announcement]:
-    """Return what a run announced of its cameras and IMUs: they stand in its summary.
+    """Return the announcements of cameras and IMUs in a run's summary.
 
     Raises:
         ValueError: It left none, as a run that was killed does.
@@ -368,7 +368,7 @@ class VslamLab(Recording):
         self._truth = self.rows("groundtruth.csv", header)
 
     def image(self, event: Image | DepthImage) -> ImageFile | None:
-        """Note an image of one of the cameras, and return what is left to write."""
+        """Add an image; return its file, still to be written."""
         kind = "rgb" if isinstance(event, Image) else "depth"
         name = f"{kind}_{self._names.get(event.source, -1)}"
         if name not in self._stamps:
@@ -388,14 +388,14 @@ class VslamLab(Recording):
             self._truth.add(event.stamp, f"{self.epoch + event.stamp},{row}\n")
 
     def imu(self, event: Imu) -> None:
-        """Note what the IMU measures."""
+        """Add a sample of the rig's IMU."""
         if self.rig.imu is not None and event.source == self.rig.imu.source:
             values = (*event.angular_velocity, *event.linear_acceleration)
             row = ",".join(f"{value:.12g}" for value in values)
             self._imu.add(event.stamp, f"{self.epoch + event.stamp},{row}\n")
 
     def close(self) -> None:
-        """Write the rows of images that belong together: within half of the first one's period."""
+        """Write the rows of matching images, within half of the first camera's period."""
         head = ",".join(f"ts_{name} (ns),path_{name}" for name in self._stamps)
         rows = self.rows("rgb.csv", f"{head}\n")
         most = 0.5e9 / self.rig.cameras[0].rate

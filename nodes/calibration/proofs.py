@@ -1,4 +1,4 @@
-"""The six proofs: what a rig sent in the calibration room, held against what it announced.
+"""The six proofs: a rig's data from the calibration room, compared with its announcements.
 
 Pure functions on what `_Collector` has kept. Each returns figures with what is allowed of them, and
 a sentence of what is wrong.
@@ -24,21 +24,23 @@ from nodes.calibration.room import NEAREST, Floats, Motion, _Collector, hits, sp
 from nodes.data.dataset.recording import Rig
 
 INTEGRATED = 5.0
-"""Seconds over which the IMU is integrated."""
+"""Seconds of IMU integration."""
 
 _POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.005, 0.1, 0.3, 0.005, 1e-5
 """Metres; pixels, global and rolling shutter; metres; pixels."""
 
 _MOST = 0.99
-"""Share of points, and of depths, that has to be within its limit; no point may be beyond three
-times of it, and none may be missing."""
+"""Least share of points, and of depths, within the limit.
+
+No point may be missing, or beyond three times the limit.
+"""
 
 _LATE, _PLACE, _TURN = 2e-4, 5e-4, 5e-4
-"""Seconds, metres and radians by which stamps and poses may be off."""
+"""Largest errors of stamps and poses: seconds, metres, radians."""
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One number of a proof.
+    """Measured number of a proof, with its limit.
 
     Attributes:
         subject: Whose.
@@ -58,12 +60,12 @@ class Figure(msgspec.Struct, frozen=True):
 
     @property
     def passed(self) -> bool:
-        """Whether it is within its limit; NaN is not."""
+        """Whether the value is within its limit; false for NaN."""
         return self.limit is None or self.value <= self.limit
 
 
 def judged(subject: str, name: str, value: float, limit: float, unit: str, wrong: str) -> Figure:
-    """Return a figure that says what is wrong if it is not within its limit."""
+    """Return a figure, with `wrong` as its remark if the limit is exceeded."""
     return Figure(subject, name, value, limit, unit, "" if value <= limit else wrong)
 
 
@@ -123,7 +125,7 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
 
 
 def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Points:
-    """Return where a camera's discs are and should be, all that are seen whole and alone."""
+    """Return measured and expected positions of all discs seen whole and separately."""
     info, found = camera.info, []
     grid = np.stack(np.meshgrid(np.arange(info.width), np.arange(info.height)), axis=-1)
     rays = info.unproject(grid.reshape(-1, 2)).reshape(*grid.shape[:2], 3)
@@ -271,7 +273,7 @@ def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator)
 def stamps(
     camera: CameraAnnouncement, kept: _Collector, motion: Motion, points: Points | None
 ) -> Iterator[Figure]:
-    """Yield whether image, depth, pose and IMU of one exposure agree: proof 6."""
+    """Yield the agreement of image, depth, pose and IMU at each exposure: proof 6."""
     source = camera.source
     shot = set(kept.images[source]) | set(kept.depths[source])
     for name, have in (("images", kept.images), ("depth images", kept.depths)):
@@ -317,7 +319,7 @@ def lateness(imu: ImuAnnouncement, kept: _Collector, motion: Motion) -> Figure:
 
 
 def _late(source: str, what: str, flow: Floats, off: Floats) -> Figure:
-    """Return by how long something is late that changes at a rate and is off by so much."""
+    """Return the delay of a signal, by its rate of change and its error."""
     fine = np.isfinite(off).all(axis=1)
     moved = float((flow[fine] ** 2).sum())
     late = -float((off[fine] * flow[fine]).sum()) / moved if moved else 0.0
@@ -331,7 +333,7 @@ def _late(source: str, what: str, flow: Floats, off: Floats) -> Figure:
 def _boxes(
     camera: CameraAnnouncement, balls: Floats, radii: Floats, places: Floats, into: Floats
 ) -> Iterator[tuple[int, tuple[int, int, int, int]]]:
-    """Yield the spheres that may be seen, and the pixels that each takes up."""
+    """Yield the possibly visible spheres, and the pixel box of each."""
     info = camera.info
     middle = info.height // 2
     turn = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
@@ -350,7 +352,7 @@ def _boxes(
 
 
 def _likely(camera: CameraAnnouncement, points: Points) -> str:
-    """Say which one announced number would explain the errors best, if one does."""
+    """Return the announced number most likely wrong, as a remark; empty if none fits."""
     info = camera.info
     fine = np.isfinite(points.off).all(axis=1)
     off, pixels, flow = points.off[fine], points.pixels[fine], points.flow[fine]

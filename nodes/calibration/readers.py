@@ -24,7 +24,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class ReadCamera(msgspec.Struct, frozen=True, eq=False):
-    """A camera as a calibration file has it.
+    """Camera of a calibration file.
 
     Attributes:
         in_imu: Pose of its optical frame in the IMU's frame, shape (4, 4).

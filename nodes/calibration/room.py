@@ -1,4 +1,4 @@
-"""The room in which a rig is proven: its surfaces, what sensors send in it, and the true motion.
+"""The calibration room: its surfaces, the sensor data sent there, and the true motion.
 
 Black walls, and white spheres in every direction. Its surfaces are known as numbers, so what a ray
 meets is computed here and not by a renderer.
@@ -41,7 +41,7 @@ LOW, HIGH = np.array([-6.0, -6.0, -5.0]), np.array([6.0, 6.0, 0.0])
 """Corners of the room, metres in ``map``: the floor is at 0, the ceiling at -5."""
 
 NEAREST = 0.45
-"""Metres along the optical axis within which only the vehicle itself can be seen."""
+"""Depth, metres; only the vehicle itself is nearer to a camera."""
 
 _COUNT = 130
 
@@ -95,7 +95,7 @@ def mjcf(angle: float) -> str:
 
 
 def hits(angle: float, origins: Floats, rays: Floats) -> tuple[Floats, npt.NDArray[np.int64]]:
-    """Return what rays meet first.
+    """Return the first surface along each ray.
 
     Args:
         angle: As of `spheres`.
@@ -128,11 +128,11 @@ def _text(vector: Floats, sign: int = 1) -> str:
 
 
 _SAMPLES = 1500
-"""Pixels of a depth image that are kept."""
+"""Pixels kept of each depth image."""
 
 
 class _Collector(Node):
-    """Keeps what sensors send, in memory, images in grey; no node to be listed for a file."""
+    """Collector of sensor data in memory, images in grey; not a node type for files."""
 
     reads_truth = "judging"
 
@@ -158,7 +158,7 @@ class _Collector(Node):
 
     @on(Odometry, Imu, TakenOff, PoseStamped)
     def note(self, event: Event) -> None:
-        """Keep where vehicle and cameras are, what the IMU measures, and when the vehicle flies."""
+        """Store odometry, camera poses, IMU samples, and the time of take-off."""
         if isinstance(event, Odometry):
             self.odometry.append(event)
         elif isinstance(event, Imu):
@@ -229,7 +229,7 @@ class Motion:
     def mounted(
         self, stamps: Stamps, position: Vector3, orientation: Quaternion
     ) -> tuple[Floats, Rotation]:
-        """Return the same of what is mounted on the body, at a pose in its frame."""
+        """Return the same as `at` for a sensor at a pose in the body's frame."""
         place, turn = self.at(stamps)
         return place + turn.apply(position), turn * Rotation.from_quat(
             orientation, scalar_first=True

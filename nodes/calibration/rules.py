@@ -1,4 +1,4 @@
-"""The rules of ``lint`` about rigs: sensors that fit neither each other nor who reads them."""
+"""``lint`` rules for rigs: sensors at odds with each other or with their estimators."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def rates_divide(config: Config, announced: Announced) -> Iterator[Finding]:
 
 
 def extrinsics(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
-    """Who fuses two sensors has to know where both are, on one body."""
+    """Sensor fusion requires known poses of both sensors, on the same body."""
     for camera in cameras(announced):
         for imu in (each for each in announced if isinstance(each, ImuAnnouncement)):
             if body_of(imu.source) != body_of(camera.source):
@@ -100,7 +100,7 @@ def extrinsics(config: Config, announced: Announced) -> Iterator[Finding]:  # no
 
 
 def monotonic(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
-    """Where distortion turns back, two directions fall on one pixel, and none on others."""
+    """Distortion must be monotonic, or two directions fall on the same pixel."""
     for camera in cameras(announced):
         info = camera.info
         across, down = np.linspace(0, info.width - 1, 41), np.linspace(0, info.height - 1, 41)
@@ -117,7 +117,7 @@ def monotonic(config: Config, announced: Announced) -> Iterator[Finding]:  # noq
 
 
 def latency(config: Config, announced: Announced) -> Iterator[Finding]:
-    """Images are skipped by an estimator that takes longer than a period, one at a time."""
+    """Images are skipped by an estimator with a latency above the image period."""
     rate = max((camera.rate for camera in cameras(announced)), default=0.0)
     for spec in estimators(config, announced):
         taken = float(getattr(spec.config, "latency", 0.0))
@@ -130,7 +130,7 @@ def latency(config: Config, announced: Announced) -> Iterator[Finding]:
 
 
 def zero_noise(config: Config, announced: Announced) -> Iterator[Finding]:
-    """Without noise an estimator is better than it will ever be; of a recording none is known."""
+    """Without noise in simulation an estimator is flattered; recordings are exempt."""
     if not any("thresholds" in spec.config.__struct_fields__ for spec in config.nodes):
         return  # nobody is judged
     if any(isinstance(each, EstimatorAnnouncement) for each in announced):
@@ -159,7 +159,7 @@ def stamps(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: 
 
 
 def needs(config: Config, announced: Announced) -> Iterator[Finding]:
-    """Kinds of data that an estimator takes, and its IMU, have to be given by a sensor."""
+    """Kinds of data needed by an estimator, and its IMU, must come from some sensor."""
     given = {kind for camera in cameras(announced) for kind in camera.images}
     given |= {"grey"} if "rgb" in given else set()
     given |= {"lidar"} if any(isinstance(each, LidarAnnouncement) for each in announced) else set()
@@ -207,7 +207,7 @@ def stereo_pairs(
 
 
 def estimators(config: Config, announced: Announced) -> list[NodeSpec]:
-    """Return the nodes that announce themselves as estimators."""
+    """Return the nodes of announced estimators."""
     names = {a.source.partition("/")[0] for a in announced if isinstance(a, EstimatorAnnouncement)}
     return [spec for spec in config.nodes if spec.name in names]
 
@@ -228,7 +228,7 @@ def inertial_pairs(
 
 
 def body_of(source: str) -> str:
-    """Return the source of the body that carries a sensor: ``drone`` for ``drone/front``."""
+    """Return the source of a sensor's body: ``drone`` for ``drone/front``."""
     return source.rpartition("/")[0] or source
 
 

@@ -34,7 +34,7 @@ FORMATS = ("tum", "euroc", "kitti")
 
 TRUTH = "truth"
 PLAN = "plan"
-"""Names of those files that hold no estimate."""
+"""With `TRUTH`, the names of files without an estimate."""
 
 _COMMENT = {
     ("tum", TRUTH): "ground truth: base_link (FRD) in map (NED: x north, y east, z down)",
@@ -116,7 +116,7 @@ def export_trajectories(
 
 
 def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
-    """Return the transform from a camera that a run announced to its body, shape (4, 4).
+    """Return the transform from an announced camera to its body, shape (4, 4).
 
     If none is named it is the first one on a body, or else one at the body's origin that looks
     ahead.
@@ -143,7 +143,7 @@ def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
 
 
 class _Announced(msgspec.Struct):
-    """What an export asks of an announcement."""
+    """Announcement fields used by an export."""
 
     type: str
     source: str = ""
@@ -153,7 +153,7 @@ class _Announced(msgspec.Struct):
 
 
 class _Summary(msgspec.Struct):
-    """What an export asks of a run's summary."""
+    """Summary fields used by an export."""
 
     announcements: list[_Announced] = []
 
@@ -186,7 +186,7 @@ def load(run: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:
 
 
 def _truth_of(run: Path, estimate: str) -> str:
-    """Return the name of the truth that an estimate was judged by, if the verdict names one."""
+    """Return the truth's name in an estimate's verdict; `TRUTH` if not named."""
     path = run / "evaluation" / "verdict.json"
     if not path.is_file():
         return TRUTH
@@ -196,13 +196,13 @@ def _truth_of(run: Path, estimate: str) -> str:
 
 
 class _Verdict(msgspec.Struct):
-    """What an export asks of a run's verdict."""
+    """Verdict fields used by an export."""
 
     estimators: dict[str, dict[str, Any]] = {}
 
 
 def export_measurements(run: Path, out: Path | None = None, epoch: int | str = EPOCH) -> list[Path]:
-    """Write what IMUs, barometers, receivers, … measured: ``<source>.<kind>.csv``.
+    """Write the samples of IMUs, barometers, receivers, … as ``<source>.<kind>.csv``.
 
     Rows are in the order in which the measurements came; a column is named by its field and unit.
 
@@ -262,7 +262,7 @@ def _header(event: Event) -> str:
 
 
 class Format(Enum):
-    """What ``--format`` takes."""
+    """Choices of ``--format``."""
 
     tum = "tum"
     euroc = "euroc"

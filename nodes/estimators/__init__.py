@@ -1,4 +1,4 @@
-"""Estimators: the base classes of nodes that estimate poses from images, or from lidar scans."""
+"""Estimators: base classes of nodes estimating poses from images or lidar scans."""
 
 from nodes.estimators.estimator import WORKER_ENVIRONMENT, Estimator, EstimatorConfig
 from nodes.estimators.result import TrackingResult

@@ -52,7 +52,7 @@ WORKER_ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-"""Environment of an estimator's process: one core for each.
+"""Environment of an estimator's process: a single core each.
 
 The sums of linear algebra then always have the same order, and so the same result.
 """
@@ -80,17 +80,17 @@ class EstimatorConfig(NodeConfig):
 
 
 Frame = Image | DepthImage | LidarScan
-"""What a pose is estimated for."""
+"""Events to estimate a pose for."""
 
 _KINDS = ("rgb", "grey", "depth", "segmentation", "lidar")
-"""What an estimator may need."""
+"""Kinds of data an estimator may need."""
 
 F = TypeVar("F", bound=tuple[Any, ...])
 C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
 
 
 class Estimator(Node[C], ABC):
-    """Base of the nodes that estimate poses from images, or from scans of a lidar.
+    """Base class of nodes estimating poses from images or lidar scans.
 
     A subclass declares its input as ``frames``, a `Bundle` of one camera's images (of a stereo rig
     with the fields ``left`` and ``right``, with an IMU one more, ``imu``); says in `needs`, `eyes`,
@@ -152,24 +152,24 @@ class Estimator(Node[C], ABC):
     """
 
     needs: frozenset[str] = frozenset()
-    """Kinds of image that the camera must give, all of them (``rgb`` serves for ``grey``, too); or
-    ``lidar`` alone."""
+    """Kinds of image required of the camera, all of them; or ``lidar`` alone.
+
+    ``rgb`` serves for ``grey``, too.
+    """
     eyes: int = 1
-    """Number of cameras whose images it takes together; 2 for a stereo rig, whose left camera is
-    that of the poses."""
+    """Number of cameras read together; 2 for a stereo rig, with the left camera's pose."""
     inertial: bool = False
-    """Whether it needs an IMU on the vehicle that carries the camera."""
+    """Whether an IMU is needed on the camera's vehicle."""
     lenses: frozenset[str] = frozenset(COEFFICIENTS)
-    """Distortion models that it can compute with, besides an ideal camera; see `refusal` for other
-    conditions."""
+    """Supported distortion models, besides an ideal camera; see also `refusal`."""
     aligned: bool = True
     """Whether the images of a stereo rig must be those of equal pinhole cameras, row by row."""
     method: str = ""
     """Name of the method, for the report."""
     scale_free: bool = False
-    """Whether the unit of length is the tracker's own, as that of a single camera is."""
+    """Whether the unit of length is the tracker's own, as for a single camera."""
     library: tuple[str, str] = "", ""
-    """The module that its worker imports and that may be missing, and how it is installed."""
+    """Optional module imported by the worker, and its installation."""
 
     estimates = Output(PoseEstimate)
     tracking_events = Output(TrackingEvent)
@@ -177,10 +177,9 @@ class Estimator(Node[C], ABC):
     trajectories = Output(TrajectoryEstimate)
 
     cameras: tuple[CameraAnnouncement, ...] = ()
-    """The cameras whose images are read, as many as `eyes`, the left one first; if they are
-    rectified, the pinhole cameras in their place."""
+    """The `eyes` cameras read, left first; if rectified, their pinhole replacements."""
     imu_announcement: ImuAnnouncement | None = None
-    """The IMU whose samples are read, if it is `inertial`."""
+    """IMU read, if `inertial`."""
     _vehicles: tuple[VehicleAnnouncement, ...] = ()
     _rectification: Rectification | None = None
     _mounts: Mapping[int, Mount] = MappingProxyType({})
@@ -203,7 +202,7 @@ class Estimator(Node[C], ABC):
         cls.needs = frozenset(needs)
 
     def read(self, frame: type[tuple[Any, ...]]) -> None:
-        """Read sets of this type as ``frames``, for a class whose settings say what it reads.
+        """Set the type of ``frames``, for classes with inputs chosen by their settings.
 
         Call it in ``__init__``. The class declares all fields of all such types.
         """
@@ -218,11 +217,11 @@ class Estimator(Node[C], ABC):
 
     @property
     def camera(self) -> CameraAnnouncement | None:
-        """The camera whose pose is estimated; `None` before it is known."""
+        """Camera of the estimated pose; `None` before known."""
         return self.cameras[0] if self.cameras else None
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the estimates, and what they are computed from."""
+        """Announce the estimates and their inputs."""
         yield EstimatorAnnouncement(
             stamp=0,
             source=self.name,
@@ -235,7 +234,7 @@ class Estimator(Node[C], ABC):
         )
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Take the first sensors that give what is needed, or those that the file names.
+        """Choose the first sensors with the needed data, or those named in the file.
 
         The file names a camera as ``frames``, those of a stereo rig as ``frames.left`` and
         ``frames.right``, and an IMU as ``frames.imu``.
@@ -267,7 +266,7 @@ class Estimator(Node[C], ABC):
             self._narrow_to(port, camera.source)
 
     def _narrow_to(self, port: str, source: str) -> None:
-        """Receive this source, and not the one before, unless the file names another."""
+        """Receive only this source on a port, unless the file names another."""
         if port not in self._choice.named:
             self.sources[port] = source
 
@@ -304,14 +303,13 @@ class Estimator(Node[C], ABC):
 
     @on(Armed, TakenOff)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Note from when on a vehicle may have left the pose that it announced."""
+        """Note the first time a vehicle may have left its announced pose."""
         self._armed_at = {event.source: event.stamp, **self._armed_at}
 
     def check(self) -> Iterable[str]:
-        """Return the error if no camera gives what is needed, or there is no IMU for it.
+        """Return an error if a needed camera or IMU is missing.
 
-        If the file is only checked, also if its library is missing. Says in the log what is
-        rectified.
+        If the file is only checked, also if the library is missing. Logs the rectification.
         """
         library, install = self.library
         if self.checking and library and (why := why_missing(library)):
@@ -356,14 +354,14 @@ class Estimator(Node[C], ABC):
         return image.stamp - round(self.the_camera().time_offset * 1e9)
 
     def _sensor(self) -> CameraAnnouncement | LidarAnnouncement:
-        """Return what the tracker gives the pose of."""
+        """Return the sensor of the estimated pose."""
         return self._choice.lidar or self.the_camera()
 
     def _missing(self) -> str:
         return self._choice.missing()
 
     def publish(self, image: Frame, result: TrackingResult, origin: int | None = None) -> None:
-        """Send what a tracker found in an image: features, pose, and whether tracking was lost.
+        """Send a tracker's result for an image: features, pose, loss of tracking.
 
         Args:
             origin: When the image was exposed at which the tracker's poses start (ns); if `None`,
@@ -431,7 +429,7 @@ class Estimator(Node[C], ABC):
     def publish_trajectory(
         self, stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float64], number: int = 0
     ) -> None:
-        """Send the trajectory as the tracker sees it now, after loop closures; see `on_end`.
+        """Send the tracker's trajectory after loop closures; see `on_end`.
 
         Without a pose that was published in that map, none is sent.
 
@@ -447,7 +445,7 @@ class Estimator(Node[C], ABC):
             self.trajectories.send(mount.trajectory(self.clock.now(), self.name, stamps, poses))
 
     def _mount_of(self, number: int, origin: int) -> Mount:
-        """Return the mount for poses in a map; that of the first is for poses from `origin` on."""
+        """Return the mount of a map's poses; the first map's poses start at `origin`."""
         if (mount := self._mounts.get(number)) is None:
             first = next(iter(self._mounts.values()), None)
             mount = first and msgspec.structs.replace(first, frame_id=self._odom())
@@ -490,7 +488,7 @@ class Estimator(Node[C], ABC):
         return f"odom_{number}" if number else "odom"
 
     def _frame_number(self) -> int:
-        """Return a number that no frame has had, of this node or of those before a restart."""
+        """Return a frame number unused so far, also before a restart."""
         return max([self.restarts, *(number + 1 for number in self._frame_numbers())])
 
     def _frame_numbers(self) -> list[int]:

@@ -1,4 +1,4 @@
-"""KISS-ICP, in a worker's process, and the node that feeds it scans and sends its estimates.
+"""KISS-ICP in a worker's process, and its node: scans in, estimates out.
 
 The library is imported when an object is made, so that others may import this module for its names.
 """
@@ -147,7 +147,7 @@ class KissIcp(Estimator[KissIcpConfig]):
         )
 
     async def run(self) -> None:
-        """Track each scan; nothing is sent before one has enough points."""
+        """Track each scan; estimates start with the first scan of enough points."""
         tracking = False
         async for scan in self.frames:
             result = await self._kiss.call(KissIcpProcess.track, scan.points, scan.times)

@@ -62,7 +62,7 @@ def grey_and_depth(
 
 
 def inside(pixels: Floats, shape: tuple[int, ...], rim: int) -> npt.NDArray[np.bool_]:
-    """Return which pixels, shape (n, 2), are at least `rim` pixels from the edge, shape (n,)."""
+    """Return a mask, shape (n,), of pixels (n, 2) at least `rim` pixels from the edge."""
     x, y = pixels.T
     return np.asarray((x >= rim) & (x < shape[1] - rim) & (y >= rim) & (y < shape[0] - rim))
 
@@ -80,13 +80,13 @@ def _check_size(
 FLOW_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 """When the iterations of optical flow end: after 20, or at a step of 0.01 pixels."""
 _ROUND_TRIP = 0.5
-"""Pixels by which a corner that is followed there and back may miss its start."""
+"""Largest error of a corner followed there and back, pixels."""
 
 
 def follow_both_ways(
     image: Grey, other: Grey, pixels: Floats, guess: Floats, window: int, levels: int
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
-    """Follow corners from a guess, and back; only those that return to their start are good.
+    """Follow corners from a guess, and back; good corners return to their start.
 
     Args:
         image: Where they are, grey.
@@ -117,15 +117,15 @@ def follow_both_ways(
 
 
 _HUBER = 2.0
-"""Standard deviations beyond which a residual counts linearly."""
+"""Huber threshold of a residual, standard deviations."""
 _STEPS = 8
 _SMALL = 1e-7
 _DAMPING = 1e-9
-"""Share of its own information by which each motion is held back."""
+"""Damping of each motion, relative to its own information."""
 
 
 class Observations(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks as one image shows them.
+    """Landmarks observed in a single image.
 
     Attributes:
         landmarks: Metres in the world, shape (n, 3).
@@ -147,7 +147,7 @@ class Observations(msgspec.Struct, frozen=True, eq=False):
 
 
 class Solution(msgspec.Struct, frozen=True, eq=False):
-    """A pose, and the errors of the landmarks under it.
+    """Pose, and the errors of the landmarks.
 
     Attributes:
         pose: World to camera, shape (4, 4).
@@ -166,7 +166,7 @@ def solve_pose(
     depth_noise: float,
     information: Floats | None = None,
 ) -> Solution:
-    """Return the pose that minimises the sum of robust squared residuals.
+    """Return the pose with the least sum of robust squared residuals.
 
     Args:
         seen: At least four landmarks, or fewer if something is known of the initial pose.
@@ -231,7 +231,7 @@ def moved(pose: Floats, step: Floats) -> Floats:
 
 
 def motion_between(before: Floats, after: Floats) -> Floats:
-    """Return the small motion that `moved` takes from one pose to another, shape (6,)."""
+    """Return the small motion from a pose to another, as taken by `moved`, shape (6,)."""
     between = after @ inverse(before)
     return np.concatenate([between[:3, 3], cv2.Rodrigues(between[:3, :3])[0].ravel()])
 
@@ -263,15 +263,15 @@ def from_rotation_vector(rotation: npt.NDArray[Any], translation: npt.NDArray[An
 Descriptors = npt.NDArray[np.uint8]
 
 _MAX_ERROR = 3.0
-"""Pixels by which a point may miss its place in the pose found."""
+"""Largest error of a point in the found pose, pixels."""
 _MIN_INLIERS = 15
-"""Agreeing points below which a pose may be chance."""
+"""Least number of agreeing points; a pose from fewer may be chance."""
 _RADIUS = 15
-"""Pixels around a corner that give its orientation, as in ORB."""
+"""Radius of the patch for a corner's orientation, pixels, as in ORB."""
 
 
 class DescribedPoints(msgspec.Struct, frozen=True, eq=False):
-    """Points of the world and what they look like.
+    """World points with their descriptors.
 
     Attributes:
         points: Metres (or the map's unit) in the world, shape (n, 3).
@@ -321,7 +321,7 @@ def relocalize(
     matrix: Floats,
     method: int = cv2.SOLVEPNP_ITERATIVE,
 ) -> Floats | None:
-    """Return the pose from which an image shows known points, world to camera, if it does.
+    """Return an image's pose by known points, world to camera; `None` if not found.
 
     Args:
         pixels: Points of the image, as `detect_and_describe` gives them, shape (n, 2).

@@ -1,4 +1,4 @@
-"""Images of lenses that distort, turned into those of pinhole cameras; eyes row by row.
+"""Rectification: images of distorting lenses as pinhole images; stereo pairs row-aligned.
 
 For a single camera the optical axis, the principal point and the size stay. Both eyes of a stereo
 rig get one new orientation: x along the line from the left to the right one, z between both optical
@@ -33,16 +33,16 @@ WIDEST = math.radians(110.0)
 """Greatest field of view of a new image, along its longer side."""
 
 ALIGNED = 0.1
-"""Pixels by which both images of a point in a rectified pair may miss the rule above."""
+"""Largest violation of the rule above by a point's images in a rectified pair, pixels."""
 
 _NO_MAP: Any = None  # both coordinates stand in one
 
 _NARROWEST = 2.0
-"""Times the old focal length that the new one may be."""
+"""Largest ratio of the new focal length to the old."""
 
 
 class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
-    """One camera, and the pinhole camera in its place.
+    """A camera and its pinhole replacement.
 
     Attributes:
         lens: Intrinsics of its images.
@@ -66,7 +66,7 @@ class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
 
     @cached_property
     def _map(self) -> npt.NDArray[np.float32]:
-        """Pixel of the lens's image for each pixel of the new one, shape (h, w, 2)."""
+        """Pixel in the lens's image of each new pixel, shape (h, w, 2)."""
         rows, columns = np.mgrid[0 : self.pinhole.height, 0 : self.pinhole.width]
         places = self.original(np.column_stack([columns.ravel(), rows.ravel()]))
         # Far outside where there is nothing.
@@ -78,7 +78,7 @@ class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
         return cv2.convertMaps(self._map, _NO_MAP, cv2.CV_16SC2)
 
     def rectify(self, event: Image | DepthImage) -> Image | DepthImage:
-        """Return an image as the pinhole camera would have taken it.
+        """Return an image as taken by the pinhole camera.
 
         Brightness is interpolated; of depth the nearest pixel is taken, for the mean of two
         surfaces is none. Depth is measured along the optical axis, so this is for depth only if
@@ -187,7 +187,7 @@ def misalignment(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
 
 
 def _common_axes(cameras: Sequence[CameraAnnouncement], own: Sequence[Floats]) -> Floats:
-    """Return the axes (right, down, ahead; columns) that both eyes get, shape (3, 3)."""
+    """Return the common axes (right, down, ahead; columns) of both eyes, shape (3, 3)."""
     x = own[1][:3, 3] - own[0][:3, 3]
     length = float(np.linalg.norm(x))
     ahead = own[0][:3, 2] + own[1][:3, 2]
@@ -204,7 +204,7 @@ def _common_axes(cameras: Sequence[CameraAnnouncement], own: Sequence[Floats]) -
 
 
 def _focal(info: CameraInfo, eyes: list[tuple[CameraInfo, Floats]]) -> float:
-    """Return the shortest focal length with which no pixel of the eyes' new images is empty."""
+    """Return the shortest focal length without empty pixels in the eyes' new images."""
     across, down = np.arange(info.width), np.arange(info.height)
     rim = np.concatenate(
         [np.column_stack([across, np.full_like(across, v)]) for v in (0, info.height - 1)]

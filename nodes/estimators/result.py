@@ -1,4 +1,4 @@
-"""What a tracker says of one image; it crosses from a worker's process to the node."""
+"""Result of a tracker for an image, sent from a worker's process to the node."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 
 class TrackingResult(msgspec.Struct, frozen=True, eq=False):
-    """What a tracker finds in one image: the pose of the camera, and the features it is from.
+    """Result of a tracker for an image: camera pose, and the features used.
 
     Attributes:
         pose: The optical camera at this image in the optical camera at the first one: the transform
@@ -44,7 +44,7 @@ _NOT_RIGID = 1e-2
 
 
 def check_result(result: Any) -> str:
-    """Return which numbers of a tracker's result are not finite, and which these are, if any.
+    """Return a complaint about the first non-finite number of a result; empty if none.
 
     Raises:
         ValueError: It is no such result; the message says what was expected and found.

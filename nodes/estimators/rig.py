@@ -1,4 +1,4 @@
-"""The sensors of an estimator: their choice, what is read of them together, and their mounting."""
+"""Sensors of an estimator: their choice, joint reading, and mounting."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from runtime.errors import suggest
 
 
 class SensorChoice:
-    """Choice of one camera or a stereo rig, and an IMU, or of a lidar, among what is announced.
+    """Choice of a camera or stereo rig with an IMU, or of a lidar, from announcements.
 
     Args:
         needs: Kinds of image that each camera must give.
@@ -72,7 +72,7 @@ class SensorChoice:
         self._refusals: dict[str, str] = {}
 
     def announced(self, announcement: Announcement) -> None:
-        """Take note of a camera, an IMU or a lidar, and choose if that is possible now."""
+        """Add a camera, an IMU or a lidar; choose if now possible."""
         if "lidar" in self._needs:
             fits = self._first in (None, announcement.source)
             if isinstance(announcement, LidarAnnouncement) and fits and self.lidar is None:
@@ -88,7 +88,7 @@ class SensorChoice:
             self.imu = next((imu for imu in self._imus if self._fits(imu, body)), None)
 
     def missing(self) -> str:
-        """Return what is not there, in a sentence; empty if nothing is missing."""
+        """Return a sentence on the missing sensor; empty if none is missing."""
         if "lidar" in self._needs:
             called = f" called {self._first}" if self._first else ""
             return "" if self.lidar else f"expected a lidar{called}, found none"
@@ -116,7 +116,7 @@ class SensorChoice:
                 self._refusals |= found
 
     def _candidates(self) -> Iterator[tuple[CameraAnnouncement, ...]]:
-        """Yield cameras (or pairs) that give all kinds of image."""
+        """Yield cameras (or pairs) with all needed kinds of image."""
         for camera in self._seen:
             right_eye = camera.stereo and camera.source != self._first
             if right_eye or not self._gives_all(camera, self._first):
@@ -162,7 +162,7 @@ class SensorChoice:
 
 
 def given(camera: CameraAnnouncement) -> set[str]:
-    """Return the kinds of image that a camera gives; ``rgb`` serves for ``grey``, too."""
+    """Return a camera's kinds of image; ``rgb`` serves for ``grey``, too."""
     return {*camera.images} | ({"grey"} if "rgb" in camera.images else set())
 
 
@@ -195,7 +195,7 @@ class RgbdInertialFrame(NamedTuple):
 
 
 class StereoFrame(NamedTuple):
-    """The images of both cameras of a stereo rig, of one exposure."""
+    """Images of both cameras of a stereo rig, of the same exposure."""
 
     left: Image
     right: Image
@@ -219,7 +219,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class Mount(msgspec.Struct, frozen=True, eq=False):
-    """The pose of a camera on a body, and that of the body at the first image.
+    """Pose of a camera on a body, and pose of the body at the first image.
 
     Attributes:
         frame_id: Parent frame of the estimates: ``map``, or ``odom``, ``odom_1``, …

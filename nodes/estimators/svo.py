@@ -1,4 +1,4 @@
-"""SVO, in a worker's process, and the node that feeds it images and sends its estimates.
+"""SVO in a worker's process, and its node: images in, estimates out.
 
 It is under the GPL, and may end or crash its process. The library is imported when an object is
 made, so that others may import this module for its names.
@@ -87,8 +87,11 @@ class SvoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 Floats = npt.NDArray[np.float64]
 
 INSTALL = "make svo, or: pip install --no-deps 'svo-cpp>=1.5'"
-"""Without what it depends on: it asks for ``opencv-python``, which it does not import, and whose
-files would replace those of ``opencv-python-headless`` by ones that need a screen's libraries."""
+"""Installation of SVO without its dependencies.
+
+``opencv-python``, not imported, would replace files of ``opencv-python-headless`` by others in
+need of a screen's libraries.
+"""
 
 
 class SvoProcess:
@@ -169,14 +172,14 @@ class SvoProcess:
 
 
 def _grey(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return an image as SVO takes it, by the weights of ITU-R BT.601."""
+    """Return an image in grey for SVO, by the weights of ITU-R BT.601."""
     if image.ndim == 3:
         image = np.rint(image @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
     return np.ascontiguousarray(image)
 
 
 def _matrix(transform: Any) -> Floats:
-    """Return a ``Sophus::SE3d`` as a matrix, shape (4, 4); NaN if it is not finite.
+    """Return a ``Sophus::SE3d`` as a matrix, shape (4, 4); NaN if not finite.
 
     The module gives no rotation: its method for that returns a type which Python does not know. So
     the rotation is read where it lies: in an object of pybind11 the pointer to the value comes

@@ -23,7 +23,7 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class SyntheticOdometryConfig(NodeConfig):
-    """Settings of an estimator that is made of the truth.
+    """Settings of a synthetic estimator: the ground truth with errors.
 
     Attributes:
         rate: Estimates per second.
@@ -73,7 +73,7 @@ class SyntheticOdometry(Node[SyntheticOdometryConfig]):
 
     @every(hz="rate")
     def estimate(self, _: Tick) -> None:
-        """Make an estimate of the newest pose; it is sent when the latency has passed."""
+        """Estimate the newest pose, to be sent after the latency."""
         if self._truth is not None:
             self.start(self._send(self._worsened(self._truth)))
 

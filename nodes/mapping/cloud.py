@@ -1,4 +1,4 @@
-"""From depth to coloured points, and from many points to one in each voxel. Pure numpy.
+"""Coloured points from depth images, thinned to a point per voxel. Pure numpy.
 
 A voxel holds one measured point, never a mean: the mean of points on both sides of an edge lies on
 neither surface. Of several it holds the one that was measured from nearest, because whatever is
@@ -53,7 +53,7 @@ def write_ply(
     colours: npt.NDArray[np.uint8],
     frame_id: str,
 ) -> None:
-    """Write a cloud; folders that are missing are made.
+    """Write a cloud as a PLY file; missing folders are created.
 
     Args:
         path: The file. It appears whole or not at all.
@@ -123,7 +123,7 @@ def read_ply(path: Path, most: int) -> Cloud:
 
 
 def _vertices(header: list[str]) -> tuple[int, np.dtype[np.void]]:
-    """Return how many vertices there are, and how one is laid out."""
+    """Return the number of vertices and the layout of a vertex."""
     if "format binary_little_endian 1.0" not in header:
         form = next((line for line in header if line.startswith("format")), "no format")
         raise ValueError(f"expected format binary_little_endian 1.0, found {form!r}")
@@ -148,7 +148,7 @@ Points = npt.NDArray[np.float32]
 Colours = npt.NDArray[np.uint8]
 
 _BITS = 21
-"""Of a voxel's number along one axis; three of them make a key of 63."""
+"""Bits of a voxel's index along an axis; three indices make a key of 63 bits."""
 
 
 def rays_of(info: CameraInfo, stride: int) -> Points:
@@ -171,7 +171,7 @@ def rays_of(info: CameraInfo, stride: int) -> Points:
 def back_project(
     depth: Points, rays: Points, max_depth: float
 ) -> tuple[Points, npt.NDArray[np.bool_]]:
-    """Return the points that a depth image shows.
+    """Return the points of a depth image, in the optical frame.
 
     Args:
         depth: Metres along the optical z axis, shape (h, w).
@@ -192,7 +192,7 @@ def back_project(
 
 
 class VoxelCloud:
-    """One point in each voxel of a grid.
+    """Cloud with a single point per occupied voxel.
 
     Args:
         voxel: Edge of a voxel, metres.
@@ -219,7 +219,7 @@ class VoxelCloud:
 
     @property
     def points(self) -> Points:
-        """Metres, shape (n, 3), in the order in which the voxels were found. Not a copy."""
+        """Points, metres, shape (n, 3), in the order of their voxels' discovery. Not a copy."""
         return self._points[: len(self)]
 
     @property
@@ -294,7 +294,7 @@ class VoxelCloud:
 
 
 class Mapper:
-    """Puts depth images into one cloud.
+    """Builder of a cloud from depth images.
 
     Args:
         stride: The images that it is given are every n-th pixel of the camera's.
@@ -314,7 +314,7 @@ class Mapper:
         image: npt.NDArray[np.uint8],
         pose: npt.NDArray[np.float64],
     ) -> int:
-        """Add what one exposure shows.
+        """Add the points of an exposure to the cloud.
 
         Args:
             depth: Metres along the optical z axis, shape (h, w).

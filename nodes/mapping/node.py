@@ -1,4 +1,4 @@
-"""Mapping as a node: which camera it maps, where it takes that camera to be, what it leaves."""
+"""Mapping as a node: choice of the camera, source of its pose, and output."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from runtime.units import Latency
 
 
 class ColourDepthPose(NamedTuple):
-    """Image, depth image and camera pose of one exposure."""
+    """Image, depth image and camera pose of the same exposure."""
 
     image: Image
     depth: DepthImage
@@ -78,10 +78,9 @@ class Mapping(Node[MappingConfig]):
         self._used = 0
 
     async def on_startup(self) -> None:
-        """Start the process that holds the cloud.
+        """Start the worker process of the cloud.
 
-        It has one of its own because a thread would make the loop wait for Python's lock at
-        every step between numpy's functions.
+        In a thread, the loop would wait for Python's lock at every step between numpy's functions.
         """
         config = self.config
         self._mapper = await self.worker(
@@ -94,7 +93,7 @@ class Mapping(Node[MappingConfig]):
         )
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Take the first camera that gives depth and colours, or the one that the file names."""
+        """Take the first camera with depth and colours, or the camera named in the file."""
         if not isinstance(announcement, CameraAnnouncement) or self._camera is not None:
             return
         named, gives = self.sources.get("frames"), {*announcement.images}
@@ -111,13 +110,13 @@ class Mapping(Node[MappingConfig]):
         self.narrow("frames", announcement.source)
 
     def check(self) -> Iterable[str]:
-        """Say if no camera gives what is needed."""
+        """Yield an error if no camera gives depth and colours."""
         if self._camera is None:
             yield self._lacking()
 
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
-        """Note where the vehicle that carries the camera is."""
+        """Keep the newest odometry of the camera's vehicle."""
         camera, before = self._camera, self._vehicle
         if camera is not None and camera.source.startswith(f"{event.source}/"):
             self._frame_id = event.frame_id
@@ -180,7 +179,7 @@ class Mapping(Node[MappingConfig]):
         return pose_matrix(vehicle.position, vehicle.orientation) @ mounting
 
     async def _send(self) -> int:
-        """Send the cloud, and return how many points it has."""
+        """Send the cloud, and return its number of points."""
         points, colours = await self._mapper.call_for(0.0, Mapper.cloud)
         self.clouds.send(
             PointCloud(
@@ -194,7 +193,7 @@ class Mapping(Node[MappingConfig]):
         return len(points)
 
     async def on_shutdown(self) -> None:
-        """Write the cloud, and send it."""
+        """Write and send the final cloud."""
         if not self._used:
             self.log.warning("no frame came: there is no cloud")
             return

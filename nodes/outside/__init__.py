@@ -1,1 +1,1 @@
-"""Systems outside the process: programs, and the native interface that they speak."""
+"""Systems outside the process: programs, and the native interface for them."""

@@ -52,7 +52,7 @@ _L8 = 1
 
 
 class VitError(VisnavError):
-    """A library cannot be used, or has refused what it was given."""
+    """Error for an unusable library, or for input refused by a library."""
 
 
 _TYPES: dict[str, Any] = {
@@ -122,7 +122,7 @@ class Library:
         self._call("tracker_create", c.byref(given), c.byref(self._tracker))
 
     def start(self, calibrations: Sequence[c.Structure]) -> None:
-        """Start the tracker's threads, after calibrations that it has from nowhere else."""
+        """Add the calibrations to the tracker, and start its threads."""
         for each in calibrations:
             kind = "imu" if isinstance(each, ImuCalibration) else "camera"
             self._do(f"add_{kind}_calibration", c.byref(each))
@@ -151,7 +151,7 @@ class Library:
             self._do("push_img_sample", c.byref(sample))
 
     def pop(self) -> c.Structure | None:
-        """Return the next pose, if there is one already."""
+        """Return the next pose; `None` if none is ready."""
         pose = c.c_void_p()
         self._do("pop_pose", c.byref(pose))
         if pose.value is None:
@@ -162,11 +162,11 @@ class Library:
         return data
 
     def reset(self) -> bool:
-        """Have the tracker begin anew; return whether it can."""
+        """Reset the tracker; return False if the library cannot."""
         return bool(self._library.vit_tracker_reset(self._tracker) == 0)
 
     def close(self) -> None:
-        """Stop the tracker, and free it."""
+        """Stop and free the tracker."""
         with contextlib.suppress(VitError):
             self._do("stop")
         self._library.vit_tracker_destroy(self._tracker)
@@ -186,10 +186,10 @@ FOLDER = "$VISNAV_FOLDER"
 """Stands in a configuration for the folder of the calibration's files."""
 
 _POLL = 0.0005
-"""Real seconds between two looks for a pose, for which the interface does not wait."""
+"""Real seconds between two polls for a pose, as the interface does not wait."""
 
 _TOLERANCE = 1000
-"""Nanoseconds by which a pose's stamp may differ from its image's: OpenVINS has seconds inside."""
+"""Tolerated nanoseconds between stamps of pose and image: OpenVINS has seconds inside."""
 
 
 class VitTracker:
@@ -228,13 +228,13 @@ class VitTracker:
         samples: tuple[Imu, ...],
         wait: float,
     ) -> list[tuple[int, TrackingResult]]:
-        """Push samples and then images, and return the stamps and poses that have come.
+        """Push samples, then images; return stamp and result of each available pose.
 
         Args:
             stamp: Of the images (ns), on the clock of the IMU.
             images: One of each camera, grey or red, green, blue.
             samples: Of the IMU since the last images, up to these.
-            wait: Real seconds after which no pose of this stamp is waited for; it is the last one.
+            wait: Real seconds to wait for the pose of this stamp, the last of the result.
 
         Raises:
             VitError: The library refuses something.
@@ -262,7 +262,7 @@ class VitTracker:
         self._opened.close()
 
     def _result(self, data: c.Structure) -> TrackingResult:
-        """Return where the camera is; after a pose that is none the library begins anew there."""
+        """Return the camera's pose; an invalid pose resets the library at the last valid."""
         numbers = np.array([*data.position, *data.orientation, *data.velocity], np.float64)
         if not np.isfinite(numbers).all() or not numbers[3:7].any():
             if self._library.reset():
@@ -282,7 +282,7 @@ class VitTracker:
 
 
 def _write(config: str, files: dict[str, str], folder: Path) -> Path | None:
-    """Write the files, and return that of the library's settings."""
+    """Write the files, and return the path of the library's settings."""
     text = Path(config).read_text(encoding="utf-8") if config else ""
     if FOLDER in text:
         files = {Path(config).name: text.replace(FOLDER, str(folder)), **files}
@@ -294,7 +294,7 @@ def _write(config: str, files: dict[str, str], folder: Path) -> Path | None:
 
 
 def calibrations(rig: Rig) -> list[c.Structure]:
-    """Return what the interface is told of a rig: its cameras, and its IMU.
+    """Return a rig's calibrations for the interface: cameras and IMU.
 
     A radial-tangential lens has eight coefficients, and as a ninth the radius (x/z) up to which
     the model is monotonic: Basalt takes no other.
@@ -326,7 +326,7 @@ def calibrations(rig: Rig) -> list[c.Structure]:
 
 
 class Frame(NamedTuple):
-    """All that either mode reads."""
+    """Input of both modes: image, or stereo pair, and IMU samples."""
 
     image: Image
     left: Image
@@ -360,11 +360,11 @@ class VitConfig(EstimatorConfig):
 
 
 LEAST = 0.1
-"""Real seconds of patience that each image gets, if the setting has as many."""
+"""Least real seconds of patience for each image, if the setting has as many."""
 
 
 def patience_left(patience: float, image: float, now: float) -> float:
-    """Return the real seconds that an image gets for a first pose.
+    """Return the real seconds left to an image for a first pose.
 
     Args:
         image: Stamp of the image, seconds after that of the first.
@@ -398,13 +398,13 @@ class Vit(Estimator[VitConfig]):
         self._pose = np.eye(4)
 
     def refusal(self, camera: CameraAnnouncement) -> str:
-        """Return why images would come before samples of the IMU that belong to them."""
+        """Return an error for a negative time_offset: images would precede their IMU samples."""
         if camera.time_offset >= 0:
             return super().refusal(camera)
         return f"expected a time_offset of at least 0 s, found {camera.time_offset:g} s"
 
     def check(self) -> Iterable[str]:
-        """Return what is missing: sensors, library, settings."""
+        """Yield an error for each missing sensor, library or settings file."""
         yield from super().check()
         for name in ("library", "config"):
             path = getattr(self.config, name)
@@ -450,7 +450,7 @@ class Vit(Estimator[VitConfig]):
                 hold.answer(stamp, None, "initialising")
 
     async def _deliver(self, image: Image, owed: Owed[TrackingResult]) -> None:
-        """Publish the pose of an image; of one without, that it is lost."""
+        """Publish the result of an image, or lost tracking if none came after the first."""
         result = await owed
         if result is not None:
             self._pose = result.pose

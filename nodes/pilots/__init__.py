@@ -1,4 +1,4 @@
-"""Pilots: nodes that fly a vehicle, by set-points and commands.
+"""Pilots: nodes to fly a vehicle, by set-points and commands.
 
 `WaypointFollower` flies along waypoints by the vehicle's true pose, `VisualPilot` by the pose that
 an estimator gives, and `Teleop` by the keys of a keyboard.

@@ -108,7 +108,7 @@ E = TypeVar("E")
 
 
 class Pilot(Node[C], ABC):
-    """Base of the nodes that take off, follow a path, land and end the run.
+    """Base of pilots of a scripted flight: take off, follow a path, land, end the run.
 
     A subclass calls `update_pose` with the vehicle's pose as it knows it, and implements `follow`.
     """
@@ -122,7 +122,7 @@ class Pilot(Node[C], ABC):
     """Why the run ends, once the vehicle has landed."""
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the vehicle, the places to pass, and the room that the excitation needs."""
+        """Announce the vehicle, the places to pass, and the room for the excitation."""
         excitation, vehicle = self.config.excitation, self.config.vehicle
         yield PilotAnnouncement(stamp=0, source=self.name, vehicle=vehicle)
         yield PathAnnouncement(
@@ -147,7 +147,7 @@ class Pilot(Node[C], ABC):
         ]
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Listen to the vehicle that is flown; refuse to fly where it is open which is meant."""
+        """Listen to the pilot's vehicle; raise `ValueError` if the vehicle is ambiguous."""
         if not isinstance(announcement, VehicleAnnouncement):
             return
         vehicle = self.config.vehicle
@@ -168,17 +168,17 @@ class Pilot(Node[C], ABC):
             yield "expected a vehicle to fly, found none: add one, such as a Multirotor"
 
     def update_pose(self, pose: Odometry | PoseEstimate) -> None:
-        """Note the vehicle's pose; the first one starts the flight."""
+        """Store the vehicle's pose; the first pose starts the flight."""
         self.pose = pose
         self._pose_known.set()
 
     @abstractmethod
     async def follow(self, path: WaypointPath) -> None:
-        """Fly along a path that begins now."""
+        """Fly along a path, starting now."""
 
     @on(TakenOff, Landed)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Note that the vehicle has taken off, or has landed."""
+        """Note a take-off or a landing of the vehicle."""
         (self._taken_off if isinstance(event, TakenOff) else self._landed).set()
 
     async def run(self) -> None:
@@ -204,16 +204,16 @@ class Pilot(Node[C], ABC):
             self.shutdowns.send(end)
 
     def send_command(self, command: type[Command], **fields: Any) -> None:
-        """Send a command to the vehicle that is flown."""
+        """Send a command to the pilot's vehicle."""
         self.commands.send(self.made(command, **fields))
 
     def made(self, event: Callable[..., E], **fields: Any) -> E:
-        """Return an event of now about the vehicle that is flown."""
+        """Return an event about the pilot's vehicle, stamped now."""
         vehicle = self.config.vehicle
         return event(stamp=self.clock.now(), source=self.name, vehicle=vehicle, **fields)
 
     def _plan(self, start: Odometry | PoseEstimate) -> WaypointPath | None:
-        """Return the path from here; `None` if it has no length and no excitation."""
+        """Return the path from here; `None` without any length or excitation."""
         config = self.config
         yaw, step = yaw_of(start.orientation), 1 / config.rate
         parts = []
@@ -278,7 +278,7 @@ class VisualPilotConfig(PilotConfig):
 
 
 class VisualPilot(Pilot[VisualPilotConfig]):
-    """Flies a vehicle along waypoints by the poses that an estimator gives.
+    """Pilot along waypoints by an estimator's poses.
 
     It knows no other pose, and sends velocities in the frame of the vehicle's own heading, so every
     error of the estimate, that of the heading included, shows in the flight. (The vehicle itself
@@ -300,7 +300,7 @@ class VisualPilot(Pilot[VisualPilotConfig]):
 
     @on(PoseEstimate)
     def estimates(self, event: PoseEstimate) -> None:
-        """Note the estimated pose, if it is in the frame of the flight."""
+        """Store an estimated pose in the frame of the flight; ignore poses in other frames."""
         frame = self._frame = self._frame or event.frame_id
         if event.frame_id != frame:
             if event.frame_id != self._refused:

@@ -146,7 +146,7 @@ class Teleop(Node[TeleopConfig]):
         self._velocity = _STILL
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the vehicle that is flown."""
+        """Announce the vehicle to fly."""
         yield PilotAnnouncement(stamp=0, source=self.name, vehicle=self.config.vehicle)
 
     async def on_startup(self) -> None:
@@ -175,7 +175,7 @@ class Teleop(Node[TeleopConfig]):
 
     @every(hz="rate")
     def steer(self, tick: Tick) -> None:
-        """Send the velocity that the held keys stand for."""
+        """Send the velocity commanded by the held keys."""
         if not self._held:
             return
         goal, turn = self._requested()
@@ -190,7 +190,7 @@ class Teleop(Node[TeleopConfig]):
             self._stop()
 
     def _requested(self) -> tuple[Vector3, float]:
-        """Return the velocity and yaw rate that the held keys stand for."""
+        """Return the velocity and yaw rate commanded by the held keys."""
         actions = {self._actions[key] for key in self._held}
         x, y, z, turn = (
             sum(signs) for signs in zip(*map(_MOTIONS.__getitem__, actions), strict=True)
@@ -225,7 +225,7 @@ class Teleop(Node[TeleopConfig]):
 
 
 def approach(now: Vector3, goal: Vector3, step: float) -> Vector3:
-    """Return `goal`, or the point that is `step` from `now` on the way to it."""
+    """Return the point `step` from `now` towards `goal`, or `goal` if nearer."""
     distance = math.dist(now, goal)
     if distance <= step:
         return goal

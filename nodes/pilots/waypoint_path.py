@@ -18,15 +18,14 @@ from runtime import Duration
 Floats = npt.NDArray[np.float64]
 
 _SPACING = 0.02
-"""Metres between the points at which a path is computed."""
+"""Spacing of the points of a computed path, metres."""
 
 _REST = 1.0
-"""Seconds at rest at both ends, so that smoothing neither cuts the path short nor starts it with
-a jerk."""
+"""Seconds at rest at both ends, lest smoothing cut the path short or start with a jerk."""
 
 
 _COLUMNS = ("position", "velocity", "acceleration", "yaw", "yaw_rate")
-"""What a `WaypointPath` has for each moment."""
+"""Columns of a `WaypointPath`."""
 
 
 class WaypointPath(msgspec.Struct, frozen=True, eq=False):
@@ -49,7 +48,7 @@ class WaypointPath(msgspec.Struct, frozen=True, eq=False):
     yaw_rate: Floats
 
     def row(self, index: int) -> dict[str, Any]:
-        """Return position, velocity, … of one moment: tuples and numbers, by name."""
+        """Return position, velocity, … of a row: tuples and numbers, by name."""
         values = {name: getattr(self, name)[index].tolist() for name in _COLUMNS}
         return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
 
@@ -117,7 +116,7 @@ def timed(position: Floats, yaw: Floats, step: float) -> WaypointPath:
 
 
 def _round_corners(points: Floats, radius: float) -> Floats:
-    """Replace each corner by a quadratic Bézier curve, which stays inside the corner."""
+    """Replace each corner by a quadratic Bézier curve inside the corner."""
     rounded = [points[:1]]
     for before, corner, after in zip(points, points[1:], points[2:], strict=False):
         ends = []
@@ -141,7 +140,7 @@ def _resample(points: Floats, spacing: float) -> tuple[Floats, Floats]:
 
 
 def _speeds(points: Floats, along: Floats, speed: float, acceleration: float) -> Floats:
-    """Return the fastest speed at each point that respects both limits, forwards and back."""
+    """Return the highest speed at each point within both limits, forwards and back."""
     tangent = np.gradient(points, along, axis=0)
     curvature = np.linalg.norm(np.gradient(tangent, along, axis=0), axis=1)
     limit = np.minimum(speed, np.sqrt(acceleration / np.maximum(curvature, 1e-6)))
@@ -155,7 +154,7 @@ def _speeds(points: Floats, along: Floats, speed: float, acceleration: float) ->
 
 
 def _headings(velocity: Floats, yaw: float) -> Floats:
-    """Return the direction of flight; where the path hardly moves, the last one before."""
+    """Return the direction of flight, kept from before where the path hardly moves."""
     moving = np.hypot(velocity[:, 0], velocity[:, 1]) > 0.2
     heading = np.arctan2(velocity[:, 1], velocity[:, 0])
     last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), -1))
@@ -180,7 +179,7 @@ _SWEEP_ANGLE, _SWEEP_PERIOD = np.radians(40.0), 6.0
 """Radians to each side, and seconds, of a sweeping heading."""
 
 _MOST = 4.0
-"""Acceleration up to which a multirotor follows an excitation closely, m/s²."""
+"""Highest acceleration for a multirotor to follow an excitation closely, m/s²."""
 
 
 class Excitation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -214,22 +213,22 @@ class Excitation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def reach(self) -> float:
-        """Distance from the place, along each axis, that the vehicle stays within, metres."""
+        """Greatest distance of the vehicle from its place along each axis, metres."""
         return 1.25 * self.amplitude + 0.15
 
 
 class FigureEight(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A figure eight, flown after the waypoints; it begins and ends in its centre.
+    """A figure eight after the waypoints, from its centre and back to its centre.
 
     The curve is the lemniscate of Gerono: x = length/2 · sin t, y = width/2 · sin 2t.
 
     Attributes:
-        centre: Where it crosses itself, metres in ``map``.
+        centre: Crossing of the curve, metres in ``map``.
         length: Extent along its axis, metres.
         width: Extent across its axis, metres.
         rise: Height by which one loop's end is above the centre, and the other's below, metres.
         direction: Direction of its axis, degrees clockwise from north.
-        laps: How many times it is flown.
+        laps: Number of laps.
     """
 
     centre: Vector3
@@ -240,7 +239,7 @@ class FigureEight(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     laps: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
 
     def places(self) -> Floats:
-        """Return the places of one lap, metres in ``map``, shape (65, 3); the last is the first."""
+        """Return the places of a lap, metres in ``map``, shape (65, 3); the last is the first."""
         t = np.linspace(0.0, 2.0 * np.pi, 65)
         along, across = self.length / 2.0 * np.sin(t), self.width / 2.0 * np.sin(2.0 * t)
         c, s = np.cos(np.radians(self.direction)), np.sin(np.radians(self.direction))
@@ -250,7 +249,7 @@ class FigureEight(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def excited(excitation: Excitation, place: Vector3, yaw: float, step: float) -> WaypointPath:
-    """Return the excitation as a path that begins and ends at rest at a place, with a heading."""
+    """Return the excitation as a path, at rest at `place` with heading `yaw` at both ends."""
     seconds = np.arange(0.0, excitation.duration + step / 2.0, step)
     ramp = min(2.0, excitation.duration / 3.0)  # seconds in which it swells, and fades
     share = np.clip(np.minimum(seconds, seconds[-1] - seconds) / ramp, 0.0, 1.0)
@@ -281,7 +280,7 @@ def headed(path: WaypointPath, heading: Heading, yaw: float) -> WaypointPath:
 
 
 def joined(first: WaypointPath, second: WaypointPath) -> WaypointPath:
-    """Return two paths of one step, the second of which begins where the first one ends."""
+    """Join two paths of equal step; the second begins at the end of the first."""
     both = first, second
     parts = {name: np.concatenate([getattr(path, name) for path in both]) for name in _COLUMNS}
     return WaypointPath(step=first.step, **parts)

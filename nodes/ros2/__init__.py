@@ -1,1 +1,1 @@
-"""ROS 2: its messages, and a bridge that makes a run a node of it."""
+"""ROS 2 messages, and a bridge for a run as a ROS 2 node."""

@@ -36,11 +36,10 @@ EUROC_HEADER = (
 
 
 def read_tum(path: Path, *, whole: bool = True, in_order: bool = True) -> Trajectory:
-    """Read a TUM file; stamps keep every nanosecond that is written.
+    """Read a TUM file; stamps keep every nanosecond written.
 
     Args:
-        whole: Whether its last line counts though nothing ends it. That of a run that was killed
-            may be cut off.
+        whole: Whether a last line without its end counts; a killed run's may be cut off.
         in_order: Whether stamps have to rise. If not, the rows are sorted, and of several with one
             stamp the first counts.
 
@@ -78,7 +77,7 @@ def tum_row(stamp: int, position: Vector3, orientation: Quaternion) -> str:
 
 
 def read_euroc(path: Path) -> Trajectory:
-    """Read a EuRoC ground truth of 17 columns, or the 8 first of them (as TUM VI has it).
+    """Read a EuRoC ground truth of 17 columns, or its first 8 columns (as in TUM VI).
 
     Raises:
         ValueError: It cannot be read or holds something else; the message names the line.

@@ -1,9 +1,7 @@
-"""Text files of numbers in rows: what all trajectory files have in common.
+"""Text files of numbers in rows, common to all trajectory formats.
 
-Files of a run that outlast what happens to it.
-
-Text files grow with a run, so that a run that is killed leaves all but its last second; and what a
-node wrote before it was restarted is never overwritten.
+Also files of a run that outlast its failures: they grow with the run, so that a killed run leaves
+all but its last second; and files from before a node's restart are never overwritten.
 """
 
 from __future__ import annotations
@@ -21,17 +19,17 @@ from runtime import Node
 from runtime.time.schedule import SECOND
 
 _TOO_LATE = 1 << 63
-"""The first number of nanoseconds that 64 bits do not hold."""
+"""First number of nanoseconds beyond 64 bits."""
 
 EPOCH = "2020-01-01T00:00:00Z"
 """When a run begins in files of other tools, if nothing else is set. They expect stamps of
 Unix time: with 19 digits names sort, and Kalibr can take the last nine for nanoseconds."""
 
 _LATEST = 7 << 60
-"""Of an epoch, so that a run of decades has room after it."""
+"""Latest epoch (ns), with room for a run of decades."""
 
 _SHOWN = 60
-"""Characters of a wrong line that a message shows."""
+"""Characters of a wrong line shown in a message."""
 
 
 def epoch_of(given: int | str) -> int:
@@ -118,7 +116,7 @@ class Row:
         return stamp
 
     def wrong(self, expected: str, found: str) -> NoReturn:
-        """Raise a `ValueError` that names the file and the line."""
+        """Raise a `ValueError` with the file and the line."""
         shown = found if len(found) <= _SHOWN else f"{found[:_SHOWN]}…"
         raise ValueError(f"{self.where}: expected {expected}, found {shown!r}")
 
@@ -177,7 +175,7 @@ _INTERVAL = 500_000_000
 
 
 def part_name(node: Node[Any], name: str) -> str:
-    """Return the name of a node's file or folder; after a restart one beside those of before.
+    """Return the name of a node's file or folder, with a number after a restart.
 
     ``flight.png`` is followed by ``flight-2.png``, ``dataset`` by ``dataset-2``.
     """
@@ -187,7 +185,7 @@ def part_name(node: Node[Any], name: str) -> str:
 
 
 class GrowingFile:
-    """A file of lines: they are added on the loop, and written beside it twice a second.
+    """A file of lines: added on the loop, and written beside the loop twice a second.
 
     Args:
         path: The file; made anew, unless the node was restarted: then it goes on.
@@ -197,7 +195,7 @@ class GrowingFile:
         self._node = node
         self._file = path.open("ab" if node.restarts else "wb", buffering=0)
         self.begin = self._file.tell()
-        """Bytes that were there before."""
+        """Bytes there before."""
         self._lines = deque([] if self.begin else [head])
         self._due = 0
         self._writing = False
@@ -212,7 +210,7 @@ class GrowingFile:
             self._node.start(self._node.offload(self._write))
 
     def close(self) -> None:
-        """Write what is left, and close the file."""
+        """Write the remaining lines, and close the file."""
         try:
             self._write()
         finally:

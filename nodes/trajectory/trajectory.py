@@ -1,4 +1,4 @@
-"""Poses in time: checked arrays, interpolation, matrices; and rows for nodes that collect them.
+"""Poses in time: checked arrays, interpolation, matrices; and rows for nodes to collect.
 
 Pure numpy and scipy. Files are in `nodes.trajectory.formats`; errors between two trajectories in
 `nodes.judging.evaluation.metrics`.
@@ -26,12 +26,11 @@ Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
 UNIT_LENGTH = 0.01
-"""How far from 1 the length of a quaternion may be: files of few decimals are let in, and what
-is no quaternion is not."""
+"""Tolerated deviation of a quaternion's length from 1, for files of few decimals."""
 
 
 _CALENDAR = 10**17
-"""A stamp (ns) above this is Unix time (1973); below it counts from some beginning."""
+"""Least stamp (ns) taken for Unix time (1973); stamps below count from some beginning."""
 
 _ROW = np.dtype([("stamp", "i8"), ("position", "f8", 3), ("orientation", "f8", 4)])
 _BLOCK = 1024
@@ -39,7 +38,7 @@ _BLOCK = 1024
 
 
 class Trajectory(msgspec.Struct, frozen=True, eq=False):
-    """Poses of one body in one frame, in order of time. Its arrays are read-only copies.
+    """Poses of a body in a frame, in order of time. The arrays are read-only copies.
 
     Attributes:
         stamps: Nanoseconds, int64, shape (n,), n ≥ 1, strictly rising.
@@ -127,7 +126,7 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def near(self, stamps: Stamps) -> Trajectory:
-        """Return two rows before and two after each stamp (ns), for what a few of many rows tell.
+        """Return only the rows near stamps (ns): two before and two after each.
 
         Between them `velocities` are those of the whole.
         """
@@ -175,7 +174,7 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         return Trajectory(self.stamps[rows], self.positions[rows], self.orientations[rows])
 
     def covers(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
-        """Tell which stamps (ns) lie between the first pose and the last, shape as given."""
+        """Return a mask of the stamps (ns) from the first pose to the last, shape as given."""
         stamps = np.asarray(stamps)
         return np.asarray((stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]))
 
@@ -238,10 +237,10 @@ class PoseRows:
             self._spill()
 
     def trajectory(self) -> Trajectory:
-        """Return what has come so far, in order of time; of several for one stamp the latest.
+        """Return the poses so far, in order of time; of several for a stamp the latest.
 
         Raises:
-            ValueError: Nothing has, or a pose is none.
+            ValueError: There are none, or a pose is invalid.
         """
         made, written = self._whole, self._written
         parts = [*self._blocks, np.array(self._rows, _ROW)]
@@ -339,7 +338,7 @@ def quaternions(rotations: Floats) -> Floats:
 
 
 def not_rotations(matrices: Floats) -> list[int]:
-    """Return the rows of shape (n, 3, 3) that are no rotations, to 1e-4 (files of few decimals)."""
+    """Return the indices of matrices, shape (n, 3, 3), not rotations to 1e-4 (few decimals)."""
     finite = np.isfinite(matrices).all(axis=(1, 2), keepdims=True)
     matrices = np.where(finite, matrices, 0.0)
     odd = abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max(axis=(1, 2))
@@ -348,7 +347,7 @@ def not_rotations(matrices: Floats) -> list[int]:
 
 
 def _floats(name: str, array: Any, shape: tuple[int, int]) -> Floats:
-    """Return a copy as float64, or say how it differs from what the field holds."""
+    """Return a float64 copy; raise `ValueError` unless finite and of this shape."""
     copy = np.array(array, dtype=np.float64)
     if copy.shape != shape:
         raise ValueError(
@@ -364,18 +363,18 @@ def _floats(name: str, array: Any, shape: tuple[int, int]) -> Floats:
 
 
 HISTORY = 10_000_000_000
-"""Nanoseconds for which recent poses are kept, back from the newest."""
+"""Nanoseconds of recent poses to keep, back from the newest."""
 
 
 class RecentPoses:
-    """Poses of one frame in another, by time."""
+    """Recent poses of a frame in another, by time."""
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
         self._poses: list[Pose] = []
 
     def add(self, stamp: int, position: Vector3, orientation: Quaternion) -> None:
-        """Take in a pose (ns, metres, w x y z), in any order; one of the same stamp is replaced."""
+        """Add a pose (ns, metres, w x y z), in any order; a pose of the same stamp is replaced."""
         stamps, poses = self._stamps, self._poses
         place = bisect_left(stamps, stamp)
         if place < len(stamps) and stamps[place] == stamp:

@@ -1,1 +1,1 @@
-"""Viewers: windows and programs that show a run."""
+"""Viewers: windows and programs to show a run."""

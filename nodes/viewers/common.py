@@ -1,4 +1,4 @@
-"""What viewers show alike: colours and shapes, paths in pieces, which images and which plan."""
+"""Common parts of viewers: colours, shapes, paths in pieces, choice of images and plan."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _SIZES: dict[str, Vector3] = {"person": (0.5, 0.5, 1.8), "car": (4.2, 1.8, 1.5)}
 
 
 def moving_body(kind: str) -> Box:
-    """Return a box about as large as what moves by itself: nothing else is known of its shape."""
+    """Return a box of a self-moving body's usual size: nothing else is known of its shape."""
     return Box((0.0, 0.0, 0.0), _SIZES.get(kind, (0.5, 0.5, 0.5)), (235, 150, 60))
 
 
@@ -77,17 +77,17 @@ def describe(event: Event) -> str:
 
 
 SPAN = 250_000_000
-"""Nanoseconds that a piece covers."""
+"""Duration of a piece, nanoseconds."""
 
 GAP = 500_000_000
-"""Nanoseconds without a pose that break a path."""
+"""Time without a pose to break a path, nanoseconds."""
 
 GRAIN = 0.01
 """Metres: poses nearer than this to the last are left out."""
 
 
 class PathPieces:
-    """Cuts one path, as it grows, into pieces."""
+    """Divider of a growing path into pieces."""
 
     def __init__(self) -> None:
         self._points: list[Vector3] = []
@@ -95,7 +95,7 @@ class PathPieces:
         self._last = 0
 
     def add(self, stamp: int, position: Vector3) -> list[Vector3] | None:
-        """Add a pose (ns, metres); return a piece when one is complete.
+        """Add a pose (ns, metres); return a piece when complete.
 
         Each piece begins where the one before ended, unless there was a gap between them.
         """
@@ -116,7 +116,7 @@ class PathPieces:
         return piece
 
     def rest(self) -> list[Vector3] | None:
-        """Return the points that are in no complete piece, if they make a line."""
+        """Return the points of the incomplete piece, if enough for a line."""
         return list(self._points) if len(self._points) > 1 else None
 
 
@@ -140,7 +140,7 @@ _KEPT = 4000
 
 
 class Trail:
-    """A path, as far as it has been flown.
+    """Path flown so far.
 
     Args:
         thickness: Metres.
@@ -156,7 +156,7 @@ class Trail:
         self._number = 0
 
     def add(self, stamp: int, position: Vector3) -> tuple[str, list[Vector3]] | None:
-        """Add a pose (ns, metres); return a new piece and its name, if one is complete."""
+        """Add a pose (ns, metres); return a new piece and its name, if complete."""
         piece = self._path.add(stamp, position)
         if piece is None:
             return None
@@ -176,7 +176,7 @@ REMEMBERED = 64
 
 
 class ImageSelection:
-    """Selects images by their stamps, so that of one exposure all are shown or none.
+    """Selection of images by their stamps: all of an exposure are shown, or none.
 
     Args:
         rate: Images a second at most; 0: none.
@@ -188,7 +188,7 @@ class ImageSelection:
         self._selected: dict[str, deque[int]] = {}
 
     def select(self, kind: str, source: str, frame_id: str, stamp: int) -> bool:
-        """Tell whether an image is shown: it is the first of its source in its period.
+        """Tell whether an image is shown: the first of its source in its period.
 
         Args:
             kind: Of image; each kind of a source is selected for itself.
@@ -209,7 +209,7 @@ class ImageSelection:
 
 
 class PlanSelection:
-    """Selects what is drawn as a vehicle's plan: planned poses, or set-points if there are none."""
+    """Selection of a vehicle's plan to draw: planned poses, or set-points if there are none."""
 
     def __init__(self) -> None:
         self._kinds: dict[str, type[PlannedPose | PositionSetpoint]] = {}

@@ -1,4 +1,4 @@
-"""A window as a node: shows one camera's images and turns keys into events.
+"""A window as a node: shows a camera's images and turns keys into events.
 
 The window itself, by GLFW and OpenGL, runs in a worker process; the only module that imports glfw
 and OpenGL, and not before a `GlfwWindow` is made. What a key does is decided in
@@ -44,7 +44,7 @@ Change = Key | Size | Close
 
 
 class GlfwWindow:
-    """A window on the user's display that shows the newest image.
+    """Window on the user's display for the newest image.
 
     Needs the main thread of its process; draws only when there is something new to show. Letters
     and punctuation are named by the label that the user's layout puts on the key, all other keys
@@ -82,7 +82,7 @@ class GlfwWindow:
         self._canvas = _Canvas(wayland=glfw.get_platform() == glfw.PLATFORM_WAYLAND)
 
     def poll(self, image: npt.NDArray[np.uint8] | None = None) -> list[Change]:
-        """Show an image, and return what has happened since the last poll, in order.
+        """Show an image, and return the changes since the last poll, in order.
 
         Args:
             image: uint8, shape (height, width, 3) RGB or (height, width) grey, top row first;
@@ -146,7 +146,7 @@ class GlfwWindow:
 
 
 class _Canvas:
-    """One textured rectangle in the current OpenGL context."""
+    """A textured rectangle in the current OpenGL context."""
 
     def __init__(self, *, wayland: bool) -> None:
         # PyOpenGL must look for functions where GLFW made the context; a MUJOCO_GL or
@@ -170,7 +170,7 @@ class _Canvas:
         GL.glPixelStorei(GL.GL_UNPACK_ALIGNMENT, 1)  # rows are packed
 
     def upload(self, image: npt.NDArray[np.uint8]) -> None:
-        """Make an image the texture; one of the last one's shape goes into the same memory."""
+        """Make an image the texture; an image of the last shape reuses the memory."""
         if image.dtype != np.uint8 or not (image.ndim == 2 or image.shape[2:] == (3,)):
             raise ValueError(
                 "expected a uint8 image of shape (height, width, 3) or (height, width), "
@@ -219,7 +219,7 @@ def _import_glfw() -> Any:
 
 
 def _no_display(expected: str, error: str) -> str:
-    """Return one line that says what is missing, and how to do without it."""
+    """Return a line on the missing display, and on how to do without."""
     displays = [f"{n}={os.environ[n]}" for n in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(n)]
     if displays or sys.platform != "linux":
         why = ", ".join([*displays, error.strip()])
@@ -253,7 +253,7 @@ class ImageWindowConfig(NodeConfig):
 
 
 class ImageWindow(Node[ImageWindowConfig]):
-    """A window that shows images and turns keys into events.
+    """Window to show images and turn keys into events.
 
     ::
 
@@ -297,7 +297,7 @@ class ImageWindow(Node[ImageWindowConfig]):
 
     @every(hz="rate")
     async def poll(self, tick: Tick) -> None:  # noqa: ARG002
-        """Show the newest image, and send what has happened in the window."""
+        """Show the newest image, and send the window's changes."""
         image = self._newest() if self.config.show_images else None
         for change in await self._window.call(GlfwWindow.poll, image.data if image else None):
             match change:
@@ -315,7 +315,7 @@ class ImageWindow(Node[ImageWindowConfig]):
                     self.closures.send(WindowClosed(stamp=self.clock.now(), source=self.name))
 
     async def on_shutdown(self) -> None:
-        """Release the keys that are held, since no later poll can."""
+        """Release the held keys, since no later poll can."""
         for key in sorted(self._held):
             self._release(key)
 
@@ -328,7 +328,7 @@ class ImageWindow(Node[ImageWindowConfig]):
         self.key_releases.send(KeyReleased(stamp=self.clock.now(), source=self.name, key=key))
 
     def _newest(self) -> Image | None:
-        """Return the newest image if it has not been shown yet."""
+        """Return the newest image if not shown yet."""
         try:
             image = self.images.receive_nowait()
         except LookupError:

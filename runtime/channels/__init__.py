@@ -1,1 +1,1 @@
-"""Channels: how an event gets from node to node, and what it is owed for it."""
+"""Channels: the delivery of events between nodes, and the answers owed for them."""

@@ -1,4 +1,4 @@
-"""What became of the frames that a system outside the process was sent: counts, times, digest.
+"""Outcomes of the frames sent to an outside system: counts, times, digest.
 
 All that differs from run to run is in here, and nothing of it enters the run's digest.
 """
@@ -25,19 +25,19 @@ from runtime.time.schedule import SECOND
 from runtime.workers.costs import Costs
 
 Outcome = Literal["answered", "empty", "initialising", "skipped", "lost"]
-"""What became of a frame: answered; answered without content; still initialising, as the system
-says, or as it says nothing yet; skipped, as a later answer says; lost, as its time was over."""
+"""Outcome of a frame: answered; answered without content; still initialising, as the system
+says, or without an answer yet; skipped, by a later answer; lost, without an answer in time.
+"""
 
 Wrong = Literal["late", "repeated", "contradicting", "unknown"]
-"""Answers that belong to no frame which waits: after its time, a second one (or one that differs
-from the first), or of no frame."""
+"""Answers without a waiting frame: late, repeated, contradicting the first, or to no frame."""
 
 COLUMNS = ("stamp_ns", "outcome", "latency_ms")
 FOLDER = "answers"
 
 
 class Answers:
-    """The record of one outside system, in all its lives during a run. For any thread.
+    """Record of an outside system through all its lives in a run; for any thread.
 
     Attributes:
         counts: Frames by `Outcome`, and wrong answers by `Wrong`.
@@ -47,7 +47,7 @@ class Answers:
         latency: Seconds declared from a frame to its answer; `None` if they vary.
         lost_allowed: How many frames may be lost.
         why_not: Why an equal run might differ, whatever the system's own answers do.
-        costs: What its answers cost, if its processes are known.
+        costs: Cost of its answers, if its processes are known.
     """
 
     def __init__(self, latency: float | None = 0.0, lost_allowed: int = 0) -> None:
@@ -70,7 +70,7 @@ class Answers:
         self._inputs: dict[str, xxhash.xxh3_128] = {}
 
     def owed(self, stamp: int) -> None:
-        """Note a frame that goes out."""
+        """Record an outgoing frame."""
         with self._lock:
             self.sent += 1
             if self._first is None:
@@ -78,7 +78,7 @@ class Answers:
 
     @property
     def says_lost(self) -> int:
-        """Answers that say that tracking is lost."""
+        """Number of answers reporting lost tracking."""
         return sum(self._says_lost)
 
     def settled(
@@ -90,11 +90,11 @@ class Answers:
         digest: int = 0,
         says_lost: bool = False,
     ) -> None:
-        """Note what became of a frame.
+        """Record the outcome of a frame.
 
         Args:
             stamp: Of the frame (ns).
-            due: When its answer counts (ns).
+            due: When its answer is due (ns).
             latency: Real seconds that its answer took.
         """
         with self._lock:
@@ -109,7 +109,7 @@ class Answers:
                 self._initialised = stamp
 
     def end(self, now: int) -> None:
-        """Forget what came of frames that are not due by now (ns): nobody has received it.
+        """Forget the outcomes of frames not due by now (ns): nobody has received them.
 
         Whether they were answered by now was up to real time, and no figure is.
         """
@@ -124,20 +124,20 @@ class Answers:
             self.counts = +self.counts
 
     def wrong(self, kind: Wrong) -> None:
-        """Note an answer that belongs to no frame which waits."""
+        """Count an answer without a waiting frame."""
         with self._lock:
             self.counts[kind] += 1
 
     def got(self, count: int = 1) -> None:
-        """Note frames that the system says it has received."""
+        """Count frames confirmed by the system as received."""
         with self._lock:
             self.received = (self.received or 0) + count
 
     def took_in(self, stream: str, data: Buffer) -> None:
-        """Take what the system was sent into the digest of its inputs.
+        """Add data sent to the system to the digest of its inputs.
 
         Args:
-            stream: Topic, or kind of data: each has an order of its own.
+            stream: Topic, or kind of data: the order counts within each.
             data: The bytes, without anything that differs from run to run.
         """
         content = memoryview(data).cast("B")
@@ -150,13 +150,13 @@ class Answers:
 
     @property
     def initialisation(self) -> float | None:
-        """Seconds from the first frame to the first that was answered; `None` if none was."""
+        """Seconds from the first frame to the first answered; `None` without answers."""
         if self._first is None or self._initialised is None:
             return None
         return (self._initialised - self._first) / SECOND
 
     def inputs(self) -> str | None:
-        """Return the digest of all that was sent; `None` if nothing was noted."""
+        """Return the digest of all data sent to the system; `None` if there was none."""
         with self._lock:
             digests = {name: each.hexdigest() for name, each in self._inputs.items()}
         return combined(digests) if digests else None
@@ -168,17 +168,17 @@ class Answers:
         return f"{fingerprint(rows):016x}" if rows else None
 
     def latency_quantiles(self, *quantiles: float) -> list[float | None]:
-        """Return quantiles of the real seconds that answers took; `None` if there were none."""
+        """Return quantiles of the real seconds to an answer; `None` without answers."""
         known = sorted(each for each in self._latencies if not math.isnan(each))
         return [
             known[min(int(q * len(known)), len(known) - 1)] if known else None for q in quantiles
         ]
 
     def write(self, folder: Path, name: str) -> None:
-        """Write a row for each frame into ``answers/<name>.csv``, which a run can replay.
+        """Write a row for each frame to ``answers/<name>.csv``, for replay in another run.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: The file cannot be written.
         """
         (folder / FOLDER).mkdir(exist_ok=True)
         file = folder / FOLDER / f"{source_file(name)}.csv"
@@ -193,11 +193,11 @@ class Answers:
 
 
 def read_latencies(path: Path, factor: float = 1.0) -> Callable[[int], float]:
-    """Return the latencies that a run has measured, as a function of a frame's stamp.
+    """Return the measured latencies of a run as a function of a frame's stamp.
 
     Args:
         path: An ``answers/<name>.csv``.
-        factor: By which each is multiplied: how much slower the machine is that is meant.
+        factor: Multiplies each: how much slower the intended machine is.
 
     Returns:
         From a stamp (ns) to seconds: those of the last answered frame up to then, or else of the

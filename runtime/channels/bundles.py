@@ -1,4 +1,4 @@
-"""Declarations of a class of nodes, and inputs of several events of one stamp.
+"""Declarations of a node's class, and inputs of several events with a common stamp.
 
 A `Bundle` declares that image, depth and pose belong together; at run time a `Matcher` does the
 work. A set that is not completed, or that the reader skips, leaves its tuples to the next one. (A
@@ -38,24 +38,24 @@ B = TypeVar("B", bound=tuple[Any, ...])
 Kind = Literal["one", "maybe", "all"]
 
 HISTORY = 256
-"""Events of one field that wait for their partners at most; beyond it the oldest goes."""
+"""Most events of a field waiting for their partners; beyond, the oldest is dropped."""
 
 WAITING_BYTES = 64 << 20
-"""Bytes of their arrays at most, but at least one event: whatever comes first."""
+"""Most bytes of arrays in these events, but at least 1 event; the first limit counts."""
 
 GATHERED = 16_384
-"""The same for a field that gathers a tuple."""
+"""Most events of a field gathering a tuple."""
 
 
 class Field(NamedTuple):
-    """One field of a set: its type of event, and whether it must be there."""
+    """Field of a set: its event type, and whether required, optional or gathered."""
 
     event: type[Event]
     kind: Kind
 
 
 class Bundle(_Port, Generic[B]):
-    """An input of several events that belong together: the reader gets sets of one stamp.
+    """An input of several events, matched by stamp and read as sets.
 
     ::
 
@@ -124,14 +124,14 @@ class Bundle(_Port, Generic[B]):
 
 
 class Matcher(Generic[B]):
-    """Puts events of one stamp together, and holds the sets for their reader.
+    """Matcher of events by stamp, and holder of the sets for their reader.
 
     Args:
         tolerance: Nanoseconds by which stamps may differ.
 
     Attributes:
-        missed: How often a set did not come about because an event of this field was missing, or
-            (of the first field) not later than that of the set before.
+        missed: Number of sets not completed, by field: its event was missing, or (of the first
+            field) not later than that of the set before.
         prepare: Awaited with a set that is read; the reader gets its result. `None` for nothing.
     """
 
@@ -164,12 +164,12 @@ class Matcher(Generic[B]):
         return found if self.prepare is None else await self.prepare(found)
 
     async def receive(self) -> B:
-        """Wait for the next set and take it; see `Stream.receive`."""
+        """Return the next set, waiting if necessary; see `Stream.receive`."""
         found = await self.stream.receive()
         return found if self.prepare is None else await self.prepare(found)
 
     def receive_nowait(self) -> B:
-        """Take the next set if one waits, as it came; see `Stream.receive_nowait`."""
+        """Return the next set, neither waiting nor preparing; see `Stream.receive_nowait`."""
         return self.stream.receive_nowait()
 
     def close(self) -> None:
@@ -177,11 +177,11 @@ class Matcher(Generic[B]):
         self.stream.close()
 
     def statistics(self) -> StreamStatistics:
-        """Return how full the stream of sets is and was, and what it dropped."""
+        """Return fill level, peak and number of dropped sets of the stream."""
         return self.stream.statistics()
 
     def match(self) -> None:
-        """Deliver all sets that are decided; called whenever an event has come."""
+        """Deliver all decided sets; called after each new event."""
         first = self._first.events
         while first:
             if self._newest is not None and first[0].stamp <= self._newest:
@@ -211,7 +211,7 @@ class Matcher(Generic[B]):
                 self.missed[missing] += 1
 
     def _with_tuples_of(self, skipped: B, following: B) -> B:
-        """Return a set with what a skipped one before it had gathered."""
+        """Return a set with the tuples of a skipped set prepended."""
         parts = list(following)
         for at in self._tuples:
             parts[at] = (*skipped[at], *parts[at])[-GATHERED:]
@@ -219,7 +219,7 @@ class Matcher(Generic[B]):
 
 
 class Slot:
-    """The events of one field that wait for their partners."""
+    """Events of a field waiting for their partners."""
 
     __slots__ = ("_bytes", "_matcher", "_most", "_source", "events", "field", "kind", "name")
 
@@ -234,7 +234,7 @@ class Slot:
         self._source: str | None = None
 
     def take(self, event: Event) -> None:
-        """Keep an event and see what it completes.
+        """Keep an event, and deliver the sets completed by its arrival.
 
         Of two sources of which one is below the other (``drone/front/grey``), the upper one counts.
 
@@ -250,7 +250,7 @@ class Slot:
             self.pop()
 
     def is_full(self) -> bool:
-        """Tell whether what comes next finds no room."""
+        """Tell whether there is no room for another event."""
         count = len(self.events)
         return count >= self._most or (self._bytes >= WAITING_BYTES and count > 1)
 
@@ -261,7 +261,7 @@ class Slot:
         return event
 
     def _changes_to(self, source: str) -> bool:
-        """Listen to another source from now on, if it is the first or above the current one."""
+        """Switch to a source if the first or above the current; return whether switched."""
         before = self._source
         if before is not None and source.startswith(f"{before}/"):
             return False
@@ -275,7 +275,7 @@ class Slot:
         return True
 
     def find(self, stamp: int, tolerance: int) -> Any:
-        """Return what belongs to a stamp, None if there is nothing, or `_WAIT` if it may come."""
+        """Return the match for a stamp; `None` if there is none, `_WAIT` if still possible."""
         events = self.events
         if self.kind == "all":
             if not events or events[-1].stamp < stamp:
@@ -294,7 +294,7 @@ class Slot:
         return _WAIT
 
     def forget(self, stamp: int, tolerance: int) -> None:
-        """Drop what can belong to no later set."""
+        """Drop events too old for any later set."""
         events = self.events
         limit = stamp if self.kind == "all" else stamp - tolerance
         while events and events[0].stamp <= limit:
@@ -338,7 +338,7 @@ def _field(where: str, hint: Any) -> Field:
 
 
 class Declared(msgspec.Struct):
-    """What a node's class declares, by attribute name, in the order of the class body."""
+    """Declarations of a node's class by attribute name, in the order of the class body."""
 
     inputs: dict[str, Input[Any]]
     bundles: dict[str, Bundle[Any]]
@@ -346,14 +346,14 @@ class Declared(msgspec.Struct):
     handlers: dict[str, Handles]
     ticks: dict[str, Ticks]
     listening: list[str]
-    """Inputs, bundles and handlers, in the order in which they receive an event."""
+    """Inputs, bundles and handlers, in the order of delivery."""
 
     def bundle_fields(self) -> list[str]:
         """Return ``bundle.field`` for all fields of all bundles."""
         return [f"{name}.{field}" for name, b in self.bundles.items() for field in b.fields]
 
     def optional_fields(self) -> list[str]:
-        """Return ``bundle.field`` for the fields that a set can do without."""
+        """Return ``bundle.field`` for the optional fields of all bundles."""
         return [
             f"{name}.{field}"
             for name, bundle in self.bundles.items()
@@ -363,7 +363,7 @@ class Declared(msgspec.Struct):
 
 
 def read_declarations(cls: type[Any], base: type[Any]) -> Declared:
-    """Return what a class of nodes and its bases declare.
+    """Return the declarations of a node's class and its bases.
 
     Args:
         base: The base of all nodes, whose attributes are no names for ports.
@@ -398,7 +398,7 @@ def read_declarations(cls: type[Any], base: type[Any]) -> Declared:
 
 
 def _check_phases(cls: type[Any], base: type[Any]) -> None:
-    """Raise `DeclarationError` for a phase that is a coroutine function and should not, or not."""
+    """Raise `DeclarationError` for a phase with a missing or a superfluous ``async``."""
     for phase, method in vars(cls).items():
         meant = vars(base).get(phase)
         if not inspect.isfunction(method) or not inspect.isfunction(meant):

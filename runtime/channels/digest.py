@@ -36,7 +36,7 @@ class Digest:
         self._outputs: dict[str, _Output] = {}
 
     def __call__(self, sender: Sender[Any] | None, event: Event) -> None:
-        """Take in one event; a tap on every sender.
+        """Add an event to the digest; a tap on every sender.
 
         Raises:
             ChannelTypeError: It holds an object that is no data.
@@ -60,7 +60,7 @@ class Digest:
 
     @staticmethod
     def name_of(sender: Sender[Any] | None, event: Event) -> str:
-        """Return the name of the output that an event belongs to."""
+        """Return the name of an event's output."""
         return sender.name if sender else event.source.partition("/")[0] + ".announced"
 
     def mark(self, name: str) -> int:
@@ -88,7 +88,7 @@ def combined(outputs: Mapping[str, str]) -> str:
 
 
 class _Output:
-    """The events of one output."""
+    """Digest of an output: the hash, and bytes not yet hashed."""
 
     __slots__ = ("hash", "pending")
 

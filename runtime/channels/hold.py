@@ -42,11 +42,11 @@ from runtime.units import Duration
 T = TypeVar("T")
 
 LET_GO: Any = object()
-"""The outcome of a wait that has ended without an answer, which may still come."""
+"""Result of a wait released without an answer; the answer may still come."""
 
 
 class Owed(Generic[T]):
-    """The answer to one frame, to be awaited once: its content, or `None` if there is none.
+    """The answer to a frame, awaitable once: its content, or `None` if there is none.
 
     Raises:
         MissingAnswerError: There is none, and by `HoldConfig.on_missing` that is an error.
@@ -61,7 +61,7 @@ class Owed(Generic[T]):
         self.since = since
         self.work = future()
         self.later: concurrent.futures.Future[Any] | None = None
-        """Its answer, once time waits for it no more."""
+        """Future of the answer, once the clock is released."""
 
     def __await__(self) -> Generator[Any, None, T | None]:
         return self._answer().__await__()
@@ -76,45 +76,45 @@ class Owed(Generic[T]):
 
 
 def future() -> concurrent.futures.Future[Any]:
-    """Return a future that a reader who stops waiting does not cancel."""
+    """Return a future unaffected by the cancellation of its reader."""
     made: concurrent.futures.Future[Any] = concurrent.futures.Future()
     made.set_running_or_notify_cancel()
     return made
 
 
 BEHIND = 2.0
-"""Real seconds by which simulated time stays behind real time while a system initialises: so much
-an answer may take and is still the one that decides when the run begins to hold."""
+"""Lag of simulated time behind real time while a system initialises, in real seconds: an answer
+no later than this still decides when the run begins to hold.
+"""
 
 IN_A_ROW = 3
-"""Frames lost in a row after which a system is taken to hang, and is not waited for again before
-it answers something."""
+"""Frames lost in a row for a system to count as hung, not waited for until its next answer."""
 
 _LOOK = 0.02
-"""Real seconds between two looks at what has been waited for too long."""
+"""Real seconds between two checks for overdue answers."""
 
 _REMEMBERED = 4096
-"""Settled frames that are known by their stamps: an answer to one of them is a repeated one."""
+"""Settled frames remembered by stamp, to recognise answers to them."""
 
 
 class HoldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How long simulated time waits for the answers of an outside system, and what if none comes.
+    """Settings for holding simulated time until an outside system answers.
 
     Attributes:
-        skips: ``refused``: each frame is answered, in any order. ``allowed``: an answer with a
-            later stamp says that no other will come for the frames before it.
-        initialise: For frames of this long, from the first, nothing is owed before the first
-            answer to any; until then simulated time goes no faster than real time.
-        max_wait: Real seconds without any answer after which one is missing.
-        on_missing: What happens then, or when the system is gone. ``error``: the run ends.
-            ``lost``: the frame is lost; it counts, and stands in the verdict. ``continue``: the
-            run goes on without waiting, and is marked as not reproducible.
-        lost_allowed: How many frames may be lost with the verdict still passed.
-        tolerance_ns: How far an answer's stamp may be from its frame's: stamps that went through
-            a double are not exact.
-        latencies: ``answers/<name>.csv`` of a run in real time, whose measured latencies take the
-            place of the declared one.
-        latency_factor: By which those are multiplied, for a slower or quicker machine.
+        skips: ``refused``: each frame is answered, in any order. ``allowed``: an answer to a later
+            frame means that none will come for the frames before it.
+        initialise: Start-up time from the first frame: no answer is owed before the system's
+            first; until then simulated time goes no faster than real time.
+        max_wait: Real seconds without any answer after which an answer counts as missing.
+        on_missing: Reaction to a missing answer or a lost system. ``error``: the run ends.
+            ``lost``: the frame is lost, counted, and shown in the verdict. ``continue``: the run
+            goes on without waiting, and is marked as not reproducible.
+        lost_allowed: Number of frames that may be lost with the verdict still passed.
+        tolerance_ns: Greatest difference between the stamps of answer and frame: stamps that went
+            through a double are not exact.
+        latencies: ``answers/<name>.csv`` of a run in real time; its measured latencies replace the
+            declared one.
+        latency_factor: Multiplies those, for a slower or quicker machine.
     """
 
     skips: Literal["refused", "allowed"] = "refused"
@@ -128,14 +128,14 @@ class HoldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class Hold(Generic[T]):
-    """The answers that one outside system owes.
+    """Answers owed by an outside system.
 
     Args:
-        config: How long is waited, and what if nothing comes.
+        config: The wait, and the reaction to missing answers.
         latency: Seconds of the run's clock from a frame to its answer.
-        answers: Where to note what became of each frame.
-        log: Takes what the run's log should say, in any thread.
-        wall: Real seconds, but for those in which the run is paused.
+        answers: Record of each frame's outcome.
+        log: Called with lines for the run's log, in any thread.
+        wall: Returns real seconds, without those in which the run is paused.
 
     Raises:
         ConfigError: There are no latencies in the file that `config` names.
@@ -184,13 +184,13 @@ class Hold(Generic[T]):
     # On the loop.
 
     def owe(self, stamp: int) -> Owed[T]:
-        """Note that a frame goes out now, and return its answer to come.
+        """Register an outgoing frame, and return its pending answer.
 
         Args:
             stamp: Of the frame (ns); greater than that of the one before.
 
         Raises:
-            ValueError: It is not.
+            ValueError: The stamp is not greater.
             MissingAnswerError: The system is gone, or hangs, and by the settings that is an error.
         """
         with self._changed:
@@ -219,17 +219,17 @@ class Hold(Generic[T]):
 
     @property
     def expects(self) -> bool:
-        """Whether answers are expected; if not, a frame need not be sent: it is lost already."""
+        """Whether answers are expected; if not, frames are lost and need no sending."""
         return not (self._gone or (self._let_go and self.config.on_missing == "lost"))
 
     # In any thread.
 
     def sent(self, stream: str, data: Buffer) -> None:
-        """Take what the system was sent into the digest of its inputs; see `Answers.took_in`."""
+        """Add data sent to the system to the digest of its inputs; see `Answers.took_in`."""
         self.answers.took_in(stream, data)
 
     def received(self, count: int = 1) -> None:
-        """Note frames that the system says it has received."""
+        """Count frames confirmed by the system as received."""
         self.answers.got(count)
 
     def answer(
@@ -283,10 +283,10 @@ class Hold(Generic[T]):
             self._settle(owed, outcome, value, now - owed.since, digest, says_lost=lost)
 
     def gone(self, why: str) -> None:
-        """Take note, at once, that the system is there no more.
+        """Report the loss of the system, effective at once.
 
         Args:
-            why: What happened, for the log and for the error.
+            why: Reason, for the log and the error.
         """
         with self._changed:
             if self._closed or self._gone:
@@ -302,7 +302,7 @@ class Hold(Generic[T]):
                 self._settle(each, "lost")
 
     def back(self) -> None:
-        """Take note that the system is there again: it may initialise anew."""
+        """Report the system as back; the system may initialise anew."""
         with self._changed:
             if self._gone:
                 self._log(f"{self.name}: it is there again")
@@ -322,7 +322,7 @@ class Hold(Generic[T]):
         self._not_reproducible(why)
 
     def close(self) -> None:
-        """Watch no more, and take no answers; what is owed still stays so."""
+        """Stop watching and taking answers; outstanding answers stay owed."""
         with self._changed:
             if self._closed:
                 return
@@ -331,7 +331,7 @@ class Hold(Generic[T]):
             self._changed.notify_all()
 
     def look(self) -> None:
-        """Give up what has been waited for too long; a thread calls it again and again."""
+        """Give up on overdue answers; called repeatedly by a thread."""
         with self._changed:
             now = self._wall()
             while self._owed:
@@ -356,13 +356,13 @@ class Hold(Generic[T]):
         return stamp - self._began[0] < self.config.initialise * SECOND
 
     def _real_time(self, owed: Owed[T]) -> float:
-        """Return when a frame's answer would be due if time had been real since the first one."""
+        """Return when an answer would be due, had time been real since the first frame."""
         assert self._began is not None
         stamp, since = self._began
         return since + (owed.stamp - stamp) / SECOND + self._latency_at(owed.stamp)
 
     def _match(self, stamp: int) -> Owed[T] | None:
-        """Return the frame that an answer's stamp means."""
+        """Return the frame of an answer's stamp, within the tolerance."""
         near = _nearest(stamp, self._owed, self.config.tolerance_ns)
         return None if near is None else self._owed[near]
 
@@ -385,7 +385,7 @@ class Hold(Generic[T]):
         (owed.work if owed.later is None else owed.later).set_result(value)
 
     def _release(self, owed: Owed[T]) -> None:
-        """Let time go on without an answer, which may still come."""
+        """Release the clock from a frame; its answer may still come."""
         owed.later = future()
         owed.work.set_result(LET_GO)
 
@@ -428,7 +428,7 @@ class Hold(Generic[T]):
         self._owed.clear()
 
     def _contradicted(self, stamp: int) -> None:
-        """Take note of a second answer that differs: which one came first is up to real time."""
+        """Record a second, different answer: the order of the two is up to real time."""
         if self.answers.counts["contradicting"] == 1:
             self._log(
                 f"{self.name}: expected one answer to the frame of {_seconds(stamp)}, found a "
@@ -466,7 +466,7 @@ class Hold(Generic[T]):
 
 
 def _nearest(stamp: int, known: Mapping[int, Any], tolerance: int) -> int | None:
-    """Return the known stamp that another one means."""
+    """Return the known stamp nearest to another, if within the tolerance."""
     if stamp in known:
         return stamp
     near = min(known, key=lambda each: abs(each - stamp), default=None)

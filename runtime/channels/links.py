@@ -1,4 +1,4 @@
-"""A link between a sender and an input that is worse than perfect, in the run's own time.
+"""Imperfect link from a sender to an input: delay, jitter, loss, rate, in the run's own time.
 
     [nodes.links.frames]
     delay = "80ms"
@@ -6,7 +6,7 @@
     loss = 0.02
     rate = 10
 
-Any input, handler, bundle, or field of a bundle may have one. What it does depends on the run's
+Any input, handler, bundle, or field of a bundle may have one. Its effect depends on the run's
 seed and the names of node and port only.
 """
 
@@ -25,13 +25,13 @@ from runtime.units import Latency
 
 
 class LinkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a link does to events on their way to one port.
+    """Imperfections of a link to a port.
 
     Attributes:
-        delay: Every event comes this much later.
-        jitter: And up to this much later still, at random; the order is kept.
-        loss: Share of events that never come, at random.
-        rate: Events a second that pass at most, by their stamps; 0 for all.
+        delay: Delay of every event.
+        jitter: Most additional delay, at random; the order is kept.
+        loss: Share of events lost, at random.
+        rate: Most events a second, by their stamps; 0 for all.
     """
 
     delay: Latency = Latency(0)  # immutable
@@ -41,14 +41,14 @@ class LinkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class Link:
-    """Stands before one port, and delivers to it later or not at all.
+    """Link before a port; delivers each event later, or not at all.
 
     A handler behind a link with a delay cannot end a delivery: when it is called, the nodes after
     it have had the event.
 
     Args:
         name: ``node.port``.
-        before: The link that this one replaces, whose figures it carries on.
+        before: Replaced link, whose figures are carried on.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Link:
     def to(
         self, deliver: Callable[[Any], Any], fault: Callable[[BaseException], None] | None = None
     ) -> Callable[[Any], Any]:
-        """Set what is at the far end; return what to call at this one."""
+        """Connect the far end to a receiver; return the function to call at this end."""
         self._deliver = deliver
         self._fault = fault or _raise
         return self.offer
@@ -109,7 +109,7 @@ class Link:
             self._fault(error)
 
     def _is_too_soon(self, event: Any) -> bool:
-        """Let one event of a source pass in each period of the rate."""
+        """Return whether a source already had an event in this period of the rate."""
         period = int(event.stamp * self._config.rate // SECOND)
         if self._last_period.get(event.source) == period:
             return True

@@ -1,7 +1,7 @@
-"""What a node's class declares: its inputs, outputs, handlers and ticks.
+"""Declarations of a node's class: inputs, outputs, handlers and ticks.
 
 Declarations are read from the class, so that the graph is known, drawn and checked before
-anything runs. What stands behind them at run time is in `runtime.channels.streams`,
+anything runs. Their counterparts at run time are in `runtime.channels.streams`,
 `runtime.channels.sender` and `runtime.time.schedule`.
 """
 
@@ -27,7 +27,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class _Port:
-    """What an input and an output have in common: a name, and nothing to show before a run."""
+    """Common base of inputs and outputs: a name, and no value before a run."""
 
     name = "?"
 
@@ -35,14 +35,14 @@ class _Port:
         self.name = name
 
     def _declaration(self, node: object | None, owner: type) -> Self:
-        """Return the declaration; what stands behind it on an instance is the instance's own."""
+        """Return the declaration of a class; raise for an instance outside a run."""
         if node is None:
             return self
         raise AttributeError(f"{owner.__name__}.{self.name} exists once a run has made the node")
 
 
 class Input(_Port, Generic[T]):
-    """An input that a coroutine reads: ``async for image in self.images``.
+    """An input read by a coroutine: ``async for image in self.images``.
 
     On an instance this is a `runtime.channels.streams.Stream`.
 
@@ -122,14 +122,14 @@ class Output(_Port, Generic[T]):
 
 
 class Handles(msgspec.Struct, frozen=True):
-    """What `@on` declares of a method."""
+    """Declaration of a method by `@on`."""
 
     events: tuple[type[Event], ...]
     source: str | None
 
 
 class Ticks(msgspec.Struct, frozen=True):
-    """What `@every` declares of a method."""
+    """Declaration of a method by `@every`."""
 
     hz: float | str
 

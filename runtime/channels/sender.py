@@ -1,4 +1,4 @@
-"""The sending end of an output: one loop over a frozen tuple of listeners.
+"""Sending end of an output: a single loop over a frozen tuple of listeners.
 
 Delivery is synchronous: when `send` returns, every handler has run and every waiting reader has
 been resumed. Who listens is decided by `runtime.run.graph` before the first event.
@@ -36,10 +36,10 @@ sender.)"""
 
 
 class Voices:
-    """Who may send in which name: a node in its own and in those that it announces.
+    """Owners of source names: each node owns its name, and its announced sources.
 
-    What is below a name, such as ``drone/imu``, is whose the name is. Whoever announces ``*`` (a
-    replay does) speaks for all for whom nobody else does.
+    A name includes those below it, such as ``drone/imu``. A node that announces ``*`` (a replay
+    does) may send in all names without another owner.
 
     Args:
         scripted: Those that may send in any name: scripts of tests.
@@ -52,10 +52,10 @@ class Voices:
         self._announced: set[tuple[type[Announcement], str]] = set()
 
     def announce(self, node: str, announcement: Announcement) -> None:
-        """Take in that a node announces a source, and so speaks for it.
+        """Register a node as the owner of an announced source.
 
         Raises:
-            ChannelSourceError: The source is another's.
+            ChannelSourceError: The source is another node's.
         """
         kind, source = type(announcement), announcement.source
         if kind is Announcement and source == "*":
@@ -81,13 +81,13 @@ class Voices:
             self._check(port, event.source, f"{type(event).__name__} of {event.source!r}")
 
     def owner(self, source: str) -> str | None:
-        """Return the node whose a source is; `None` if it is nobody's."""
+        """Return the owner of a source; `None` if there is none."""
         while source not in self._owners and "/" in source:
             source = source.rpartition("/")[0]
         return self._owners.get(source)
 
     def _check(self, sender: str, source: str, found: str) -> None:
-        """Raise an error if a source is not that of a sender, ``node`` or ``node.port``."""
+        """Raise an error unless a source belongs to a sender, ``node`` or ``node.port``."""
         node = sender.partition(".")[0]
         owner = self.owner(source)
         if owner == node or (sender == node and owner is None):
@@ -100,12 +100,12 @@ class Voices:
 
 
 class Sender(Generic[T]):
-    """An output of one node.
+    """An output of a node.
 
     Args:
         name: ``node.port``.
-        outside: What its node does in threads just now. While there is something, each event is
-            checked to be sent by the loop's thread; else the first only.
+        outside: Work of its node in threads just now. While there is some, each event is checked
+            to be sent by the loop's thread; else the first only.
     """
 
     __slots__ = (
@@ -159,7 +159,7 @@ class Sender(Generic[T]):
         fault: Fault | None = None,
         voices: Voices | None = None,
     ) -> None:
-        """Freeze who listens, in order, and pick the shortest way to deliver to them.
+        """Freeze the listeners in their order, and pick the shortest way of delivery.
 
         Without `voices`, events may be of any source.
         """
@@ -191,7 +191,7 @@ class Sender(Generic[T]):
         self.watch()
 
     def watch(self) -> None:
-        """Check the next event, and all after it while the node does something in a thread."""
+        """Check the next event, and all further events while the node works in a thread."""
         self._expected = self._to_streams.expected = None
         self._routes = {}
 
@@ -207,7 +207,7 @@ class Sender(Generic[T]):
         return self.send(event)
 
     def _check(self, event: T) -> None:
-        """Raise if this cannot be sent, or not from here; else see to it that the next is quick."""
+        """Raise for a wrong type, thread or source; otherwise enable the fast path."""
         if not isinstance(event, self.event):
             raise ChannelTypeError(
                 f"{self.name}: expected events of type {self.event.__name__}, "
@@ -276,7 +276,7 @@ class Sender(Generic[T]):
         return tuple(c.deliver for c in self._candidates if c.receives(event, source))
 
     def sent(self) -> Counter[type[Event]]:
-        """Count what was sent, by type."""
+        """Count the sent events by type."""
         counts: Counter[type[Event]] = Counter({self.event: self._sent + self._to_streams.sent})
         for route in self._known.values():
             counts[route.key[0]] += route.sent
@@ -285,7 +285,7 @@ class Sender(Generic[T]):
     def _go_on(
         self, listeners: tuple[Deliver, ...], failed: Deliver, error: BaseException, event: T
     ) -> bool:
-        """Report the listener that raised, and deliver to those after it.
+        """Report the failed listener, and deliver to the remaining listeners.
 
         Of handlers that answer one another, the first `send` reports: the last has no room left.
         """
@@ -314,10 +314,10 @@ class Sender(Generic[T]):
 
 
 class Listener:
-    """One handler or stream, and which events it receives.
+    """Handler or stream, with the filter of its events.
 
     Args:
-        events: The types that it receives, with their subclasses.
+        events: Types received, with their subclasses.
         source: Only this source and those below it; `None` for all.
         stream: The stream, if it is one.
     """
@@ -339,11 +339,11 @@ class Listener:
         self.stream = stream
 
     def may_receive(self, event: type[Event]) -> bool:
-        """Return whether an output of this type can send what this listener receives."""
+        """Return whether an output of this type can send events for this listener."""
         return issubclass(event, self.events) or any(issubclass(e, event) for e in self.events)
 
     def receives_all(self, event: type[Event]) -> bool:
-        """Return whether this listener receives all that an output of this type sends."""
+        """Return whether this listener receives all events of an output of this type."""
         return self.source is None and issubclass(event, self.events)
 
     def receives(self, event: type[Event], source: str) -> bool:
@@ -354,7 +354,7 @@ class Listener:
 
 
 class Route:
-    """The listeners to one type of event from one source, and how often it was sent."""
+    """Listeners to an event type from a source, and the number of events sent."""
 
     __slots__ = ("key", "listeners", "sent")
 
@@ -368,14 +368,14 @@ _SENDING = {Sender._send_to_all.__code__, Sender._send_routed.__code__}
 
 
 def _sends(frame: FrameType | None) -> bool:
-    """Return whether this frame, or one that it was called by, delivers to handlers."""
+    """Return whether this frame or any of its callers delivers to handlers."""
     while frame is not None and frame.f_code not in _SENDING:
         frame = frame.f_back
     return frame is not None
 
 
 def _circle(error: BaseException) -> str:
-    """Return the ports and handlers through which an error has come again and again, if any."""
+    """Return the ports and handlers repeated in an error's traceback, if any."""
     frames: dict[FrameType, None] = {}  # each stands there once for each time it was raised in
     trace = error.__traceback__
     while trace is not None:

@@ -1,4 +1,4 @@
-"""The awaitable buffer behind an input that a coroutine reads.
+"""Awaitable buffer behind an input read by a coroutine.
 
 A stream has one reader. An event that finds the reader waiting goes straight to it; any other
 is kept up to a bound, beyond which the input's declared policy decides. A reader in a task of
@@ -24,7 +24,7 @@ T = TypeVar("T")
 Overflow = Literal["error", "drop_oldest", "wait"]
 
 TURN = 256
-"""Events that a reader may take without ever waiting before the loop gets a turn."""
+"""Events read in a row without waiting until the loop gets a turn."""
 
 _WOKEN: Any = None
 """Sent into a reader instead of an event: look again at the buffer."""
@@ -51,11 +51,11 @@ class Waiter(Protocol):
         """Continue now, with this event."""
 
     def resume_soon(self) -> None:
-        """Continue when the loop next turns, with what the stream holds then."""
+        """Continue at the loop's next turn, with the stream's events by then."""
 
 
 class Stream(Generic[T]):
-    """Events on their way to one coroutine.
+    """Buffer of events on their way to a single coroutine.
 
     Args:
         name: For messages: ``node.port``.
@@ -95,7 +95,7 @@ class Stream(Generic[T]):
         self.offer: Callable[[T], None] = self.offer_soon if soon else self._offer_now
         self._buffer: deque[T] = deque()
         self.merge: Callable[[T, T], T] | None = None
-        """Given what is dropped and what follows it, returns what is kept in place of both."""
+        """Merges a dropped item into its successor; the result replaces both."""
         self.waiter: Waiter | None = None  # set by the task that a reader yielded this stream to
         self._taken = 0
         self._seen: T | None = None
@@ -109,7 +109,7 @@ class Stream(Generic[T]):
 
     @types.coroutine
     def __anext__(self) -> Generator[Any, Any, T]:
-        """Wait for the next event and take it; a closed stream ends once it has been read."""
+        """Return the next event, waiting if necessary; stop when closed and empty."""
         buffer = self._buffer
         if buffer:
             self._taken += 1
@@ -131,7 +131,7 @@ class Stream(Generic[T]):
 
     @types.coroutine
     def _next_by_future(self) -> Generator[Any, Any, T]:
-        """Wait as `__anext__` does, on a future: for tasks that accept nothing else."""
+        """Wait as `__anext__` does, but on a future: for tasks accepting nothing else."""
         if self._buffer:
             self._taken += 1
             if self._taken == TURN:
@@ -156,7 +156,7 @@ class Stream(Generic[T]):
         cls.__anext__ = cls._next_by_future  # type: ignore[method-assign]
 
     async def receive(self) -> T:
-        """Wait for the next event and take it.
+        """Return the next event, waiting if necessary.
 
         ``await anext(stream)`` does the same, a little quicker, and ends as an iterator does.
         Cancelling loses nothing: an event that comes afterwards is kept for the next call.
@@ -171,7 +171,7 @@ class Stream(Generic[T]):
             raise ChannelClosedError(f"{self.name} is closed") from None
 
     def receive_nowait(self) -> T:
-        """Take the next event if one waits.
+        """Return the next event without waiting.
 
         Raises:
             LookupError: Nothing waits.
@@ -187,7 +187,7 @@ class Stream(Generic[T]):
         return event
 
     def peek(self) -> T | None:
-        """Return the newest event without taking it, or `None` if none waits.
+        """Return the newest event, left in the buffer; `None` if there is none.
 
         With ``keep="latest"`` and no reader, this is the newest there has been.
         """
@@ -213,10 +213,10 @@ class Stream(Generic[T]):
         self._wake()
 
     def keep(self, event: T) -> None:
-        """Put an event into the buffer, or do what the policy says if it is full.
+        """Buffer an event; when full, apply the overflow policy.
 
         Raises:
-            ChannelFullError: It is full, and the policy does not say what to drop.
+            ChannelFullError: The buffer is full, and the policy drops nothing.
         """
         buffer = self._buffer
         if self._closed:
@@ -256,14 +256,14 @@ class Stream(Generic[T]):
             await self._room.wait()
 
     def close(self) -> None:
-        """End the stream: what it holds can still be read, then iteration stops."""
+        """End the stream: buffered events can still be read, then iteration stops."""
         self._closed = True
         if self._room is not None:
             self._room.set()
         self._wake()
 
     def statistics(self) -> StreamStatistics:
-        """Return how full the stream is and was, and what it dropped."""
+        """Return fill level, peak and number of dropped events."""
         return StreamStatistics(len(self._buffer), self.peak, self.dropped)
 
     def _wake(self) -> None:
@@ -293,7 +293,7 @@ class Stream(Generic[T]):
         self.waiter = _ForeignTask(self, wakeup, context)
 
     def cancel(self, msg: Any = None) -> bool:
-        """Wake the stock task that waits here with a cancellation."""
+        """Wake the waiting stock task with a cancellation."""
         waiter = self.waiter
         if not isinstance(waiter, _ForeignTask):
             return False
@@ -303,7 +303,7 @@ class Stream(Generic[T]):
 
 
 class _ForeignTask:
-    """A reader in a task that streams cannot resume: it runs when the loop next turns."""
+    """Reader in a task not resumable by streams, run at the loop's next turn."""
 
     def __init__(
         self, stream: Stream[Any], wakeup: Callable[[Any], None], context: contextvars.Context
@@ -331,8 +331,6 @@ class _ForeignTask:
 
 
 class _FutureWaiter:
-    """A reader that waits on a future of asyncio's."""
-
     def __init__(self, stream: Stream[Any]) -> None:
         self.future = asyncio.get_running_loop().create_future()
         self._stream = stream

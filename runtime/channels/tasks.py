@@ -1,4 +1,4 @@
-"""Resuming a waiting coroutine at once, inside the `send()` that it waits for.
+"""Immediate resumption of a waiting coroutine, inside the `send()` of its event.
 
 A stock task is woken through the loop's ready queue, which costs a future, a handle and a turn
 of the loop. `ResumableCoroutine` wraps a task's coroutine so that a stream can step it directly:
@@ -27,7 +27,7 @@ DEPTH_LIMIT = 32
 stack, nor keep the loop to itself."""
 
 Fault = Callable[[Callable[[Any], Any], BaseException], None]
-"""Called with the listener and what it raised; the delivery then goes on."""
+"""Called with a failed listener and its exception; the delivery then goes on."""
 
 _NOTHING: Any = object()
 
@@ -35,7 +35,7 @@ if sys.version_info >= (3, 14):
     from asyncio.tasks import _swap_current_task
 
     class _CurrentTasks:
-        """The mapping from loop to running task that Python had up to 3.13."""
+        """Mapping from loop to running task, as in Python up to 3.13."""
 
         get = staticmethod(asyncio.current_task)
         __setitem__ = staticmethod(_swap_current_task)
@@ -52,7 +52,7 @@ else:
 
 
 class Nesting:
-    """How many resumptions are nested in one another on a loop just now; and a count of tasks."""
+    """Current depth of nested resumptions on a loop, and a count of tasks."""
 
     __slots__ = ("depth", "tasks")
 
@@ -62,7 +62,7 @@ class Nesting:
 
 
 class _Gate(asyncio.Future[None]):
-    """What a task waits on while streams step its coroutine."""
+    """Future of a parked task while streams step its coroutine."""
 
     steps: ResumableCoroutine
 
@@ -73,7 +73,7 @@ class _Gate(asyncio.Future[None]):
 
 
 class ResumableCoroutine(Coroutine[Any, Any, Any]):
-    """A task's coroutine that can be stepped by streams as well as by the task."""
+    """Coroutine of a task, stepped by streams as well as by the task."""
 
     __slots__ = (
         "__name__",
@@ -109,13 +109,13 @@ class ResumableCoroutine(Coroutine[Any, Any, Any]):
         self._outcome: Any = _NOTHING  # of a step by a stream, for the task to deal with
 
     def wrap_step(self, wrap: Callable[[Callable[[Any], Any]], Callable[[Any], Any]]) -> None:
-        """Step from now on by what `wrap` returns for the coroutine's own `send`."""
+        """Step the coroutine from now on by `wrap` around its own `send`."""
         self._step = wrap(self._coro.send)
 
     # For streams.
 
     def resume(self, event: Any) -> None:
-        """Step the coroutine now; called by the stream on which it is parked."""
+        """Step the parked coroutine now; called by its stream."""
         stream = self._stream
         assert stream is not None
         stream.waiter = self
@@ -140,7 +140,7 @@ class ResumableCoroutine(Coroutine[Any, Any, Any]):
             self._stream = None
 
     def _hand_over(self, outcome: Any) -> None:
-        """Leave what the coroutine yielded or raised to the task, which the gate lets through."""
+        """Hand the yielded value or raised error to the task, and open the gate."""
         self._stream = None
         self._outcome = outcome
         if self._gate is not None and not self._gate.done():
@@ -149,7 +149,7 @@ class ResumableCoroutine(Coroutine[Any, Any, Any]):
     # For the task.
 
     def send(self, value: Any) -> Any:
-        """Step the coroutine, or tell the task what the last step by a stream came to."""
+        """Step the coroutine, or hand out the outcome of the last step by a stream."""
         if self._task is None:
             self._task = asyncio.current_task(self._loop)
         self._gate = None
@@ -207,7 +207,7 @@ class _WakeUp:
 
 
 class FanOut:
-    """Offers events to streams, in order, and steps the readers that wait.
+    """Fan-out of events to streams, in order; steps the waiting readers.
 
     Args:
         streams: None of them declared with ``wake="soon"``.
@@ -296,7 +296,7 @@ def _accept(_: Any) -> None:
 def _set_current_task(
     loop: asyncio.AbstractEventLoop | None, task: asyncio.Task[Any] | None
 ) -> None:
-    """Put a task back in its place as the running one; without a loop it never left that."""
+    """Restore the running task after a fan-out; without a loop, nothing has changed."""
     if task is not None:
         current_tasks[loop] = task
     elif loop is not None:

@@ -1,1 +1,1 @@
-"""The configuration file: its typed settings (`model`), how it is read and overridden."""
+"""Configuration file: its typed settings (`model`), reading and overriding."""

@@ -16,7 +16,7 @@ from runtime.errors import ConfigError, suggest
 from runtime.paths import GivenHere
 
 _LONGEST_TEXT = 300
-"""Letters of a text that a message shows."""
+"""Most characters of a text shown in a message."""
 
 _NAMES = {
     "float": "a number",
@@ -29,7 +29,7 @@ _NAMES = {
 
 
 def explain(message: str, value: Any, type_: type[msgspec.Struct], where: str) -> str:
-    """Rewrite one of msgspec's messages as place, expected, found."""
+    """Rewrite a message of msgspec as place, expected, found."""
     text, _, path = message.partition(" - at `$")
     path = path.rstrip("`")
     place = where + path if not where.endswith(")") or not path else f"{where}: {path[1:]}"
@@ -56,7 +56,7 @@ def _translate(types: str) -> str:
 
 
 def _choices(type_: Any) -> list[str]:
-    """Return what a setting of a type may be."""
+    """Return the possible values of a setting's type."""
     if get_origin(type_) is Literal:
         return [show(value) for value in get_args(type_)]
     if get_args(type_):
@@ -66,7 +66,7 @@ def _choices(type_: Any) -> list[str]:
 
 
 def _at(value: Any, path: str) -> Any:
-    """Return what stands at a path such as ``.cameras[0].rate``."""
+    """Return the value at a path such as ``.cameras[0].rate``."""
     for name, index in re.findall(r"\.([\w-]+)|\[(\d+)\]", path):
         try:
             value = value[name] if name else value[int(index)]
@@ -76,7 +76,6 @@ def _at(value: Any, path: str) -> Any:
 
 
 def _fields_at(type_: Any, path: str) -> list[str]:
-    """Return the names of the settings that are known at a path."""
     struct = struct_in(_type_at(type_, path))
     return [] if struct is None else list(struct.__struct_encode_fields__)
 
@@ -91,14 +90,14 @@ def _type_at(type_: Any, path: str) -> Any:
 
 
 def struct_in(type_: Any) -> type[msgspec.Struct] | None:
-    """Return the struct that a type is, or is a list of."""
+    """Return the struct behind a type: the type itself, or of a list's entries."""
     while type_ is not None and not hasattr(type_, "__struct_fields__"):
         type_ = next(iter(get_args(type_)), None)
     return type_  # type: ignore[no-any-return]
 
 
 def show(value: Any) -> str:
-    """Return a value as it would stand in the file, in one line, shortened."""
+    """Format a value as in the file, on a single line, shortened."""
     if isinstance(value, str):
         text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in value[:_LONGEST_TEXT])
         return f'"{text}"' if len(value) <= _LONGEST_TEXT else f'"{text}..."'
@@ -109,11 +108,11 @@ def show(value: Any) -> str:
 
 
 def override(table: dict[str, Any], change: str) -> None:
-    """Change one setting of a table, as `tomllib` gives it.
+    """Change a single setting of a table given by `tomllib`.
 
     Args:
-        change: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word. For
-            ``drone.cameras.front.rate`` there is ``front.rate``, if nothing else has that name.
+        change: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word.
+            ``front.rate`` is short for ``drone.cameras.front.rate``, if nothing else has that name.
 
     Raises:
         ConfigError: There is no such node, or nothing to set there.
@@ -150,10 +149,10 @@ def override(table: dict[str, Any], change: str) -> None:
 
 
 def given(text: str) -> Any:
-    """Return what a text of the command line means: its value in TOML, or itself.
+    """Return the value of a command-line text: parsed as TOML, or the text itself.
 
     Raises:
-        ValueError: It is no value that a file could have.
+        ValueError: The text is no value that a file could have.
     """
     try:
         found = tomllib.loads(f"value = {text}")
@@ -170,7 +169,7 @@ def given(text: str) -> Any:
 
 
 def _part(nodes: dict[str, dict[str, Any]], name: str, where: str) -> dict[str, Any]:
-    """Return the one table of this name in the lists of all nodes, such as a camera's."""
+    """Return the only table of this name in the lists of all nodes, such as a camera's."""
     parts = {
         f"{node}.{key}.{part}": entry
         for node, table in nodes.items()

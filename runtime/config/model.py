@@ -75,14 +75,14 @@ class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class NodeSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """One ``[[nodes]]`` table.
+    """A ``[[nodes]]`` table.
 
     Attributes:
         name: Unique in the file.
         type_name: As in the file: a listed node's name, or ``module:Class``.
-        on_error: What an exception in the node does to the run.
+        on_error: Effect of an exception in the node on the run.
         inputs: Port or handler to the source it is narrowed to.
-        links: Port or handler to what the way there does to events.
+        links: Port or handler to the settings of its link.
         node: The class.
         config: The node's own settings.
     """
@@ -124,7 +124,7 @@ def to_builtins(config: Config) -> dict[str, Any]:
 
 
 def without_none(value: Any) -> Any:
-    """Leave out what is not set: TOML has no null."""
+    """Return a value without unset entries (`None`): TOML has no null."""
     if isinstance(value, dict):
         return {k: without_none(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):

@@ -1,13 +1,12 @@
-"""Settings that can change while a run goes on.
+"""Settings changeable during a run.
 
     class PilotConfig(NodeConfig):
         waypoints: tuple[Vector3, ...]
         gain: Changeable[float] = 1.0
 
-A node finds the new value in `self.config`, and may say in `on_change` what is to be done about
-it. Whatever the file accepts there is accepted, and nothing else. Here is only what becomes of
-the settings; who asks for it is in `runtime.tools.monitor`, and who does it in
-`runtime.run.supervisor`.
+A node finds the new value in `self.config`, and may react to it in `on_change`. Accepted are the
+values that the file accepts, and nothing else. This module computes the new settings;
+`runtime.tools.monitor` asks for a change, and `runtime.run.supervisor` makes it.
 """
 
 from __future__ import annotations
@@ -33,15 +32,16 @@ T = TypeVar("T")
 _MARK = "changeable"
 
 Changeable = Annotated[T, msgspec.Meta(extra={_MARK: True})]
-"""Around the type of a setting that can change in a run: ``Changeable[float]``. Within a table or
-a list of tables it says so of one setting (``drone.cameras.front.loss``), around one, of all."""
+"""Type of a setting changeable during a run: ``Changeable[float]``. Inside a table or a list of
+tables, this applies to the setting (``drone.cameras.front.loss``); around them, to all settings.
+"""
 
 
 class Change(NamedTuple):
-    """What becomes of a node's settings.
+    """Change of a node's settings.
 
     Attributes:
-        node: Its name; empty if nothing does.
+        node: Its name; empty if nothing changes.
         config: The new settings.
         values: Each new value, as TOML, by key: ``gain``, ``cameras.front.loss``.
     """
@@ -52,10 +52,10 @@ class Change(NamedTuple):
 
 
 def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
-    """Change a setting of one of several nodes.
+    """Return the change made by ``node.key=value`` to the nodes' settings.
 
     Args:
-        text: ``node.key=value``, as for ``--set``; ``front.loss`` does for
+        text: ``node.key=value``, as for ``--set``; ``front.loss`` is short for
             ``drone.cameras.front.loss`` if nothing else has that name.
 
     Raises:
@@ -80,7 +80,7 @@ def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
 
 
 def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
-    """Return the keys of the settings that can change; ``cameras.*.loss`` is every camera's."""
+    """Return the keys of the changeable settings; ``cameras.*.loss`` is every camera's."""
     found = []
     for field in _fields(type_):
         key = f"{before}{field.encode_name}"
@@ -93,7 +93,7 @@ def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
 
 
 def _checked(name: str, before: NodeConfig, after: NodeConfig) -> Change:
-    """Return a change if all that differs may."""
+    """Return the change between two settings, if all differences are changeable."""
     values = {}
     for path, value in _differences(_table(before), _table(after)):
         key = ".".join(path)
@@ -107,7 +107,7 @@ def _checked(name: str, before: NodeConfig, after: NodeConfig) -> Change:
 
 
 def toml(value: Any) -> str:
-    """Return a value as it would stand in the file behind the equals sign, in one line."""
+    """Format a value as TOML on a single line, as after the equals sign."""
     if isinstance(value, list):
         return f"[{', '.join(toml(each) for each in value)}]"
     if isinstance(value, dict):
@@ -116,13 +116,13 @@ def toml(value: Any) -> str:
 
 
 def _table(config: msgspec.Struct) -> dict[str, Any]:
-    """Return settings as `tomllib` would read them; what is not set is left out."""
+    """Return settings as read by `tomllib`; unset settings are left out."""
     found: dict[str, Any] = without_none(msgspec.to_builtins(config, enc_hook=plain))
     return found
 
 
 def _differences(before: Any, after: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield where two tables differ, and what is there in the second."""
+    """Yield the path of each difference between two tables, with the second's value."""
     if isinstance(before, dict) and isinstance(after, dict):
         for key in dict.fromkeys([*before, *after]):
             for path, value in _differences(before.get(key), after.get(key)):
@@ -136,14 +136,14 @@ def _differences(before: Any, after: Any) -> Iterator[tuple[tuple[str, ...], Any
 
 
 def _names(value: Any) -> list[str]:
-    """Return the names of a list of tables that all have one."""
+    """Return the names of a list of tables; empty unless all have a name."""
     if not isinstance(value, list) or not all(isinstance(v, dict) and "name" in v for v in value):
         return []
     return [v["name"] for v in value]
 
 
 def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
-    """Tell whether the setting at a path, or what it stands in, is marked."""
+    """Tell whether the setting at a path, or a table around, is marked as changeable."""
     struct = type_
     for name in path:
         if struct is None:
@@ -169,7 +169,7 @@ def is_marked(type_: Any) -> bool:
 
 
 def settings(config: NodeConfig) -> dict[str, str]:
-    """Return the settings that can change with their values, as `Change.values`."""
+    """Return the changeable settings with their values, as `Change.values`."""
     found: dict[str, str] = {}
 
     def walk(type_: Any, value: Any, before: str) -> None:

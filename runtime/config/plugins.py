@@ -33,7 +33,7 @@ _PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
 
 class Offer(NamedTuple):
-    """One entry point: which package offers what.
+    """Entry point offered by a package.
 
     Attributes:
         package: The name of the distribution.
@@ -46,7 +46,7 @@ class Offer(NamedTuple):
     value: str
 
     def load(self) -> Any:
-        """Import the module and return what the entry point names.
+        """Import the module and return the object of the entry point.
 
         Raises:
             CommandError: It cannot be imported, or is not there.
@@ -85,7 +85,7 @@ def offers(group: str) -> tuple[Offer, ...]:
 
 
 def _declared(group: str) -> list[Offer]:
-    """Return what the ``pyproject.toml`` of this checkout declares; nothing if there is none."""
+    """Return the entry points of this checkout's ``pyproject.toml``; empty without the file."""
     import tomllib
 
     if not _PROJECT.is_file():

@@ -1,4 +1,4 @@
-"""From a TOML file to typed settings, with errors that say where, what was expected and found.
+"""From a TOML file to typed settings; errors name the place, the expected and the found value.
 
 [run]                                   # -> RunConfig
 clock = "lockstep"
@@ -54,14 +54,14 @@ class _NodeHead(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def load_configuration(path: Path, overrides: Sequence[str] = ()) -> Config:
-    """Read a file that says what to run: TOML, or what a package reads by its suffix.
+    """Read a configuration file: TOML, or a package's format, chosen by suffix.
 
     Args:
         overrides: As of `load`.
 
     Raises:
-        ConfigError: Something in it is wrong.
-        CommandError: What reads it cannot be imported.
+        ConfigError: Something in the file is wrong.
+        CommandError: The package's reader cannot be imported.
     """
     for offer in offers(CONFIGURATIONS):
         if path.suffix.lower() == f".{offer.name}":
@@ -131,14 +131,14 @@ def find_modules_in(folder: Path) -> None:
 
 
 def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> Config:
-    """Turn a table, as `tomllib` gives it, into settings.
+    """Convert a table given by `tomllib` into settings.
 
     Args:
         where: Begins the message of an error.
         folder: Where relative paths start; the working directory if not given.
 
     Raises:
-        ConfigError: Something in it is wrong.
+        ConfigError: Something in the table is wrong.
     """
     folder = folder or Path.cwd()
     _refuse_extremes(table, where)
@@ -182,7 +182,7 @@ def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> C
 
 
 def _refuse_extremes(table: Mapping[str, Any], where: str) -> None:
-    """Refuse what TOML does not promise to hold, and nothing after this expects."""
+    """Refuse values beyond TOML's guarantees: integers over 64 bits, too deep nesting."""
     left: list[tuple[Any, int]] = [(table, 0)]
     while left:
         value, depth = left.pop()
@@ -202,7 +202,7 @@ _DEEPEST = 32
 
 
 def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
-    """Return what a file calls it to class, for all nodes that packages offer, sorted.
+    """Return the node classes offered by packages, by name in a file, sorted.
 
     Args:
         warn: Called with a line for each that cannot be imported; it is left out.
@@ -218,7 +218,7 @@ def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
 
 
 def find_node(type_: str, where: str) -> type[Node[Any]]:
-    """Import the class that an entry point's name, or ``module:Class``, names.
+    """Import a node's class by the name of an entry point, or by ``module:Class``.
 
     Raises:
         ConfigError: There is no such name, module or class, it is not a node, or several packages
@@ -288,7 +288,7 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
 
 
 def abstract(cls: type[Node[Any]]) -> str:
-    """Return what a class leaves to those that are derived from it, as their code has it."""
+    """Return the abstract methods of a class, as code."""
     names = sorted(getattr(cls, "__abstractmethods__", ()))
     waits = {name for name in names if inspect.iscoroutinefunction(getattr(cls, name))}
     return ", ".join(f"`{'async ' * (name in waits)}def {name}`" for name in names)

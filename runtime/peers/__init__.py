@@ -1,4 +1,4 @@
-"""One run in several processes: each has some of the file's nodes, and events cross.
+"""A run in several processes: each has some of the file's nodes, and events cross over.
 
     messages         what processes send each other
     zenoh_session    how it gets there: Zenoh, in this module only

@@ -36,15 +36,15 @@ NONCE = 16
 _HEAD = struct.Struct("<BQI")
 _TAG = 16
 _LONG = 4096
-"""Bytes of a payload from which on SHA-256, which processors know, is quicker than BLAKE2."""
+"""Least bytes of a payload for SHA-256, with hardware support, to be quicker than BLAKE2."""
 
 
 class ForgedError(WireError):
-    """A seal is not what it should be: another process wrote the message, or it is an old one."""
+    """Wrong seal: a message of another process, or an old message."""
 
 
 def derive(secret: bytes, *about: str | bytes) -> bytes:
-    """Return a key (32 bytes) for one purpose, which only holders of the secret can derive."""
+    """Return a key (32 bytes) for a single purpose, derivable only with the secret."""
     mac = hashlib.blake2b(key=hashlib.sha256(secret).digest(), digest_size=32)
     for each in about:
         part = each.encode() if isinstance(each, str) else each
@@ -53,7 +53,7 @@ def derive(secret: bytes, *about: str | bytes) -> bytes:
 
 
 class Seal:
-    """Seals, or opens what was sealed with the same key."""
+    """Puts seals on messages, and opens messages sealed with the same key."""
 
     def __init__(self, key: bytes) -> None:
         self._keyed = hashlib.blake2b(key=key, digest_size=_TAG)
@@ -95,7 +95,7 @@ class Seal:
 
 
 class Sealing:
-    """The seals of one session, in both directions.
+    """Seals of a session, in both directions.
 
     Args:
         mine: Id and nonce of this process.
@@ -115,19 +115,19 @@ class Sealing:
         self._sent = self._taken = 0
 
     def seal(self, message: bytes, payload: bytes) -> bytes:
-        """Return the next message to the other process, sealed; for one thread at a time."""
+        """Seal the next message to the other process; for a single thread at a time."""
         self._sent += 1
         return self._out.put_on(self._sent, message, payload)
 
     def open(self, sealed: bytes, payload: bytes) -> bytes:
-        """Return the next message of the other process; raises what `Seal.take_off` does."""
+        """Open the next message of the other process; raises like `Seal.take_off`."""
         message = self._in.take_off(self._taken + 1, sealed, payload)
         self._taken += 1
         return message
 
 
 def hello_seal(key: bytes, sender: str, receiver: str) -> Seal:
-    """Return the seal of hellos from one process to another."""
+    """Return the seal of hellos from a process to another."""
     return Seal(derive(key, "hello", sender, receiver))
 
 
@@ -141,7 +141,7 @@ SHORTEST = 16
 
 
 def secret_of(setting: str) -> bytes:
-    """Return the secret that all processes of a run share.
+    """Return the secret shared by all processes of a run.
 
     Args:
         setting: `network.secret`: ``env:NAME``, ``file:PATH``, the secret itself, or nothing for
@@ -180,7 +180,7 @@ def _of_this_user() -> str:
 
 
 def _make(path: Path) -> None:
-    """Write a new key; of several processes that do so at once, one succeeds."""
+    """Write a new key; of several processes at once, the first succeeds."""
     with tempfile.NamedTemporaryFile("w", dir=path.parent) as file:  # mode 0600
         file.write(secrets.token_hex(32))
         file.flush()

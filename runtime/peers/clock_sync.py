@@ -20,16 +20,16 @@ PERIOD = 0.1
 """Seconds between two exchanges."""
 
 EXCHANGES = 10
-"""Exchanges of which the quickest gives how late our clock is."""
+"""Exchanges for each correction of our clock; the quickest gives its lateness."""
 
 LIMIT = 500e-6
-"""How much quicker or slower our clock may run, as NTP has it; quartzes differ by a tenth of it."""
+"""Greatest relative change of our clock's rate, as in NTP; quartzes differ by a tenth of this."""
 
 
 async def compare(
     member: Member, until: Callable[[Callable[[], bool]], Coroutine[Any, Any, None]]
 ) -> None:
-    """Learn how far the monotonic clock of another process is from ours, unless that is lost.
+    """Measure the offset of another process's monotonic clock, unless the process is lost.
 
     Args:
         until: Waits for something that other processes bring about.
@@ -41,7 +41,7 @@ async def compare(
 
 
 def ask(member: Member) -> None:
-    """Ask what time it is there."""
+    """Ask another process for its time."""
     member.outbox.send(Ping(time.monotonic_ns()))
 
 
@@ -74,7 +74,7 @@ class PhaseLockedLoop:
 
 
 class ClockFollower:
-    """Keeps our clock with that of another process."""
+    """Follower of another process's clock, by steering ours."""
 
     def __init__(self, clock: RealClock, member: Member) -> None:
         self.member = member

@@ -1,4 +1,4 @@
-"""Greetings: how two processes that see each other come to a session, and whether they fit.
+"""Handshake: from two visible processes to a session, and a check of their compatibility.
 
 Each greets the other with a nonce; a process that answers ours with the seal of the run is
 present and knows the secret: then a session begins, and only what it seals is received. A
@@ -31,18 +31,18 @@ from runtime.peers.zenoh_session import OnMessage, Session
 log = logging.getLogger("visnav.runtime")
 
 GREET_EVERY = 0.2
-"""Seconds between two greetings of a process that has not answered."""
+"""Seconds between two greetings of a process without an answer yet."""
 
 STRANGERS = 256
-"""Processes without a session that are greeted; of more than these, the others are not seen."""
+"""Most processes greeted without a session; further processes are not seen."""
 
 
 class Contact:
-    """A process that is visible, known or not.
+    """A visible process, known or not.
 
     Attributes:
         nonce: In our greetings, until one is answered.
-        member: Who it is, while there is a session.
+        member: The process, while there is a session.
         doubt: Nonce of a greeting of another session than ours, until it is replied to.
     """
 
@@ -53,7 +53,7 @@ class Contact:
 
 
 class Meeting(Protocol):
-    """What is notified of sessions, on the loop, and describes this process."""
+    """Listener to session events, on the loop; also describes this process."""
 
     hello: Hello
 
@@ -61,26 +61,26 @@ class Meeting(Protocol):
         """Have something called on the loop."""
 
     def joined(self, member: Member) -> None:
-        """Take in that there is a session with a process."""
+        """Handle the start of a session with a process."""
 
     def left(self, member: Member, why: str = ...) -> None:
-        """Take in that a session has ended."""
+        """Handle the end of a session."""
 
     def unsent(self, member: Member, error: VisnavError) -> None:
-        """Take in what could not be sent."""
+        """Handle a failure to send."""
 
 
 class Handshakes:
-    """All processes that show themselves, and our sessions with them.
+    """All visible processes, and our sessions with them.
 
-    Zenoh calls while it holds locks of its own: what asks it for something is left to the loop.
+    Zenoh's callbacks hold its locks: requests to Zenoh are left to the loop.
 
     Args:
         membership: Describes this process, and is notified of sessions.
 
     Attributes:
         id: By which the others know us.
-        refused: Messages that were left out, since no process of the run wrote them.
+        refused: Number of messages left out, since no process of the run wrote them.
     """
 
     def __init__(self, key: bytes, session: Session, membership: Meeting) -> None:
@@ -95,7 +95,7 @@ class Handshakes:
         self._enough = threading.Event()
 
     def begin(self, on_message: OnMessage) -> None:
-        """Become visible, and greet processes that do not answer again and again."""
+        """Become visible, and greet silent processes repeatedly."""
         self._session.appear(on_message, self.on_presence)
         threading.Thread(target=self._greet, name="greet", daemon=True).start()
 
@@ -104,24 +104,24 @@ class Handshakes:
         return not self._contacts and await asyncio.to_thread(self._session.deserted)
 
     async def close(self) -> None:
-        """Send what still waits, and leave."""
+        """Send the waiting messages, and leave."""
         self._enough.set()
         for member in self.members():
             await asyncio.to_thread(member.outbox.close)
         await asyncio.to_thread(self._session.close)
 
     def member(self, sender: str) -> Member | None:
-        """Return the process with which there is a session."""
+        """Return the process of this id, if there is a session; otherwise `None`."""
         contact = self._contacts.get(sender)
         return None if contact is None else contact.member
 
     def members(self) -> list[Member]:
-        """Return all processes with which there is a session."""
+        """Return all processes with a session."""
         with self._lock:
             return [c.member for c in self._contacts.values() if c.member is not None]
 
     def on_presence(self, other: str, here: bool) -> None:
-        """Take in that a process appears or disappears."""
+        """Handle the appearance or disappearance of a process."""
         with self._lock:
             contact = self._contact(other) if here else self._contacts.pop(other, None)
             if not here:
@@ -134,11 +134,11 @@ class Handshakes:
             self._membership.soon(self._membership.left, contact.member)
 
     def receive(self, sender: str, sealed: bytes) -> None:
-        """Take in a greeting; begin a session if it is a fresh one.
+        """Handle a greeting; begin a session if the greeting is fresh.
 
         Raises:
-            ForgedError: It is none of the run's.
-            PeerError: It is of another version.
+            ForgedError: The greeting is none of the run's.
+            PeerError: The greeting is of another version.
         """
         seal = hello_seal(self._key, sender, self.id)
         try:
@@ -190,7 +190,7 @@ class Handshakes:
             log.warning("from %s: %s (network.secret): left out", sender, error)
 
     def end(self, sender: str, error: WireError) -> None:
-        """End a session in which something went wrong; there may be another."""
+        """End a session after an error; another may follow."""
         with self._lock:
             contact = self._contacts.get(sender)
             member = None if contact is None else contact.member
@@ -203,7 +203,7 @@ class Handshakes:
         )
 
     def greet_again(self) -> None:
-        """Greet processes that have not answered, or may be in another session than this one."""
+        """Greet processes without an answer, or possibly in another session than this."""
         due = []
         with self._lock:
             for other, contact in self._contacts.items():
@@ -227,7 +227,7 @@ class Handshakes:
             self._session.put(other, seal.put_on(0, encode(hello)), b"")
 
     def _contact(self, other: str) -> Contact | None:
-        """Return what is known of a process, noted if it is new; `None` if too many are."""
+        """Return the contact of a process, created if new; `None` beyond `STRANGERS`."""
         if other not in self._contacts:
             if sum(c.member is None for c in self._contacts.values()) >= STRANGERS:
                 return None
@@ -236,7 +236,7 @@ class Handshakes:
 
 
 def what_all_share(config: Config) -> dict[str, Any]:
-    """Return a file without what may differ in each process: network, log, folders of files."""
+    """Return the settings common to all processes: no network, log, stall, or file folders."""
     table: dict[str, Any] = to_builtins(config)
     types = [spec.node.config_type for spec in config.nodes]
     table["nodes"] = [file_names(*each) for each in zip(table["nodes"], types, strict=True)]
@@ -247,7 +247,7 @@ def what_all_share(config: Config) -> dict[str, Any]:
 
 
 def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:
-    """Check that another process can be part of the same run.
+    """Check the compatibility of another process with the run.
 
     Raises:
         PeerError: It runs another file, or a node that runs here, or left us out.
@@ -276,13 +276,13 @@ def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:
 
 
 def missing(present: Iterable[Hello], nodes: Sequence[str]) -> list[str]:
-    """Return the nodes that no process has, in file order."""
+    """Return the nodes of no present process, in file order."""
     found = {node for hello in present for node in hello.nodes}
     return [node for node in nodes if node not in found]
 
 
 def missing_message(absent: Sequence[str], seconds: float, meet: str) -> str:
-    """Return the message for a process that waits in vain."""
+    """Return the message for a process waiting in vain."""
     only = ",".join(absent)
     return (
         f"expected all nodes to be there within {seconds:g} s (network.wait), found none of "
@@ -302,7 +302,7 @@ def _in_order(found: Iterable[str], nodes: Sequence[str]) -> str:
 
 
 def _difference(mine: Any, other: Any, where: str = "") -> tuple[str, str, str] | None:
-    """Return the first place at which two tables differ, and what is there in either."""
+    """Return the first place where two tables differ, and both values there."""
     if isinstance(mine, Mapping) and isinstance(other, Mapping):
         for key in dict.fromkeys([*mine, *other]):
             if key not in mine or key not in other:

@@ -59,7 +59,7 @@ from runtime.time.time_limits import real_time_limit
 from runtime.wire import pack, unpack
 
 LEAD = 50_000_000
-"""Nanoseconds between the message to begin and the first update: it must reach all before."""
+"""Nanoseconds from the starting message to the first update, for the message to reach all."""
 
 
 class JointStart:
@@ -77,7 +77,7 @@ class JointStart:
         self._heard: dict[tuple[str, ...], Announcements] = {}
 
     async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
-        """Send the others what the nodes here announce; return what all do, in file order."""
+        """Send the announcements of the nodes here; return those of all, in file order."""
         self.say(
             Announcements(
                 {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in own.items()}
@@ -99,7 +99,7 @@ class JointStart:
         return [a for name in self._membership.nodes for a in everything.get(name, ())]
 
     async def begin(self) -> Member | None:
-        """Agree on when the first update is, and wait for it.
+        """Agree with the others on the first update, and wait until then.
 
         A process that comes back to a run that goes on joins it where it is.
 
@@ -132,7 +132,7 @@ class JointStart:
         return reference and (membership.numbered(reference.number) or reference)
 
     async def _decided(self, reference: Member | None) -> bool:
-        """Wait until the run begins; return whether it does so by this reference."""
+        """Wait until the run begins; return whether by this reference."""
         membership = self._membership
 
         def ready() -> bool:
@@ -155,23 +155,23 @@ class JointStart:
         return told()  # then the run has begun, even if the one that said so is gone since
 
     def say(self, message: Message) -> None:
-        """Send a message to all processes, also to those that come, or come back, from now on."""
+        """Send a message to all processes, and to those joining or returning later."""
         if self._said.get(type(message)) != message:
             self._said[type(message)] = message
             self._membership.broadcast(message)
 
     def say_again(self, member: Member) -> None:
-        """Send a process all that it needs to know of the start here."""
+        """Send a process all messages of this process about the start."""
         for _, message in sorted(self._said.items(), key=lambda item: item[0] is Ready):
             member.outbox.send(message)
 
     def over(self) -> None:
-        """Take in that the first update was: who comes from now on is told so."""
+        """Mark the start as over; processes arriving from now on are told so."""
         del self._said[FirstUpdate]
         self._said[Ready] = Ready(begun=True)
 
     def hear(self, member: Member, message: Announcements) -> None:
-        """Take in what a process announces; if it came back, it was heard here before.
+        """Record a process's announcements; after a return they must equal the first.
 
         Raises:
             WireError: These are not announcements of its own nodes.
@@ -197,11 +197,11 @@ class JointStart:
         await self._membership.waiting.until(condition, whom=whom, limit=self._limit())
 
     def _limit(self) -> float:
-        """Return the real seconds that all nodes of another process may take to start up."""
+        """Return the real seconds for all nodes of another process to start up."""
         return self._startup_limit * (self._membership.largest() + 1)
 
     def _reference(self) -> Member | None:
-        """Return the process whose clock counts, or `None` if it is this one."""
+        """Return the process with the reference clock; `None` for this process."""
         present = self._membership.present()
         running = [m for m in present if m.running]
         first = next(iter(running or present), None)
@@ -221,13 +221,13 @@ _PARTS = msgspec.json.Decoder(Summary)
 """Made once: msgspec crashes if two threads learn a type at the same time."""
 
 BUSY_EVERY = 2.0
-"""Seconds between two messages that this process is still ending its nodes."""
+"""Seconds between two `StillWorking` messages while a node here ends."""
 
 SILENCE = 8.0
-"""Seconds without a message, after which the end goes on without the silent processes."""
+"""Seconds without a message until the run ends without the silent processes."""
 
 PARTING = 5.0
-"""Seconds that the processes have to exchange their summaries."""
+"""Seconds for the processes to exchange their summaries."""
 
 
 class JointShutdown:
@@ -263,7 +263,7 @@ class JointShutdown:
             self._timer = None
 
     async def wait_to_end(self, node: str) -> None:
-        """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
+        """Wait until all nodes after `node` have ended, in any process; "" precedes all."""
         nodes = self._membership.nodes
         after = set(nodes[nodes.index(node) + 1 if node else 0 :])
         await self._membership.waiting.until(
@@ -278,7 +278,7 @@ class JointShutdown:
     def receive(
         self, member: Member, message: FinalSummary | SummaryReceived | StillWorking
     ) -> None:
-        """Take in another process's part of the summary, or that it has ours.
+        """Handle a part of the summary from another process, or its receipt of ours.
 
         Raises:
             WireError: It is no summary.
@@ -295,7 +295,7 @@ class JointShutdown:
         member.outbox.send(SummaryReceived())
 
     async def exchange_summaries(self, mine: Summary) -> Summary:
-        """Exchange each process's part of the summary; return all of it together."""
+        """Exchange the processes' parts of the summary; return the merged summary."""
         membership = self._membership
         membership.broadcast(FinalSummary(msgspec.json.encode(mine)))
         try:

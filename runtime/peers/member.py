@@ -1,4 +1,4 @@
-"""Another process of the run: the way to it, and the difference of its clocks.
+"""Another process of the run: the way to send messages, and the offset of its clocks.
 
 Zenoh waits where the network is slow, and the loop must not. A small message goes out on the spot
 as long as little is under way, by what the other process has confirmed; then Zenoh has room for
@@ -41,29 +41,29 @@ from runtime.wire import Packed, pack, unpack
 Put = Callable[[bytes, bytes], None]
 
 BOUND = 1024
-"""Events that may wait for the network: as many as an input keeps."""
+"""Most events waiting for the network: as many as an input keeps."""
 
 SMALL = 8192
-"""Bytes of a message that the loop may write itself: copying them takes a microsecond."""
+"""Most bytes of a message written by the loop itself: copying takes a microsecond."""
 
 AT_ONCE = 1 << 20
-"""Bytes of an event that the loop may put into common memory: copying them takes 0.1 ms."""
+"""Most bytes of an event put into common memory by the loop: copying takes 0.1 ms."""
 
 UNDER_WAY = 32768
-"""Bytes that may be under way for that: Zenoh's queue holds four times as many."""
+"""Most unconfirmed bytes for writing at once; Zenoh's queue holds four times as many."""
 
 
 class Outbox:
-    """Messages on their way to one process, in order.
+    """Messages on their way to a process, in order.
 
     Args:
         put: Writes one; may wait.
-        failed: Called, in the outbox's thread, with why something could not be sent.
+        failed: Called, in the outbox's thread, with the error of a failed write.
 
     Attributes:
-        replaced: Events that a newer one of the same output took the place of.
+        replaced: Number of events replaced by a newer one of the same output.
         peak: Most messages that ever waited.
-        memory: That the other process sees, once it has confirmed it.
+        memory: Shared with the other process, once confirmed.
     """
 
     def __init__(self, name: str, put: Put, failed: Callable[[VisnavError], None]) -> None:
@@ -84,7 +84,7 @@ class Outbox:
         self._thread: threading.Thread | None = None
 
     def send(self, message: Message, event: Event | None = None, skip: str = "") -> None:
-        """Send a message, or put it at the end of those that wait.
+        """Send a message now, or queue behind the waiting messages.
 
         Args:
             skip: If given, the event takes the place of one with the same word that still waits.
@@ -112,7 +112,7 @@ class Outbox:
             self._under_way = max(self._under_way - count, 0)
 
     def close(self, timeout: float = 2.0) -> None:
-        """Write what waits, for so many seconds at most, and end."""
+        """Write the waiting messages, for at most `timeout` seconds, and end."""
         with self._lock:
             self._closed = True
             self._wake.put(None)
@@ -132,7 +132,7 @@ class Outbox:
     def _in_bytes(
         self, message: Message, packed: Packed | None, *, now: bool
     ) -> tuple[bytes, bytes] | None:
-        """Return a message and its payload; `None` if making them takes too long to do it now."""
+        """Return a message and its payload; `None` if making them takes too long for now."""
         if packed is None or packed.size <= SMALL:
             return encode(message), b"" if packed is None else packed.frame()
         if self.memory is not None and not (now and packed.size > AT_ONCE):
@@ -198,8 +198,6 @@ def _describe(error: Exception) -> str:
 
 
 class _Waiting:
-    """One message in the outbox."""
-
     __slots__ = ("message", "packed", "skip")
 
     def __init__(self, message: Message, packed: Packed | None, skip: str) -> None:
@@ -209,16 +207,16 @@ class _Waiting:
 
 
 KEPT = 20
-"""Exchanges that are remembered."""
+"""Number of remembered exchanges."""
 
 
 class Exchange(NamedTuple):
-    """The result of one question and its answer, in nanoseconds.
+    """Result of a question and its answer, in nanoseconds.
 
     Attributes:
-        round_trip: What they took; half of it is how far off the others may be.
-        offset: What to add to our monotonic clock to get theirs.
-        late: How much less than theirs our clock of the run shows.
+        round_trip: Duration; half of it bounds the error of the others.
+        offset: Their monotonic clock minus ours.
+        late: Their clock of the run minus ours.
     """
 
     round_trip: int
@@ -227,10 +225,10 @@ class Exchange(NamedTuple):
 
 
 class Exchanges:
-    """The latest exchanges with one process; the quickest of them counts.
+    """Latest exchanges with a process; the quickest counts.
 
     Attributes:
-        count: How many there were in all.
+        count: Total number so far.
     """
 
     def __init__(self) -> None:
@@ -238,7 +236,7 @@ class Exchanges:
         self._latest: collections.deque[Exchange] = collections.deque(maxlen=KEPT)
 
     def add(self, exchange: Exchange) -> None:
-        """Take one in; in any thread."""
+        """Record an exchange; for any thread."""
         self._latest.append(exchange)
         self.count += 1
 
@@ -248,20 +246,20 @@ class Exchanges:
 
 
 ACK_EVERY = 8192
-"""Bytes after which the other end is notified that they have arrived."""
+"""Received bytes between two acknowledgements."""
 
 FREE_EVERY = 4
-"""Frames in its memory, read no more, after which it is notified."""
+"""Released frames of the other's memory between two acknowledgements."""
 
 
 class Member:
-    """Another process, for as long as a session with it lasts.
+    """Another process, for the duration of a session.
 
     Args:
-        hello: How it describes itself.
-        sealing: What proves that a message is its own.
+        hello: Its description of itself.
+        sealing: Seals of the session.
         put: Writes a message to it; may wait.
-        failed: Called with what could not be written.
+        failed: Called with the error of a failed write.
 
     Attributes:
         number: Its number among the processes of the run, or -1 if it is none of them.
@@ -271,7 +269,7 @@ class Member:
         unfit: Whether it is no part of the run: it runs another file, or nodes that run elsewhere.
         held: Messages it has sent, while another process with its nodes is still in the run.
         exchanges: Of the time.
-        drift_ppm: How much quicker that clock is than ours, in millionths, if we follow it.
+        drift_ppm: Drift of its clock relative to ours, parts per million, if we follow it.
         announced: What its nodes announced.
         ready: Whether its nodes can begin.
         begin: When the first update is, if it has sent that.
@@ -313,7 +311,7 @@ class Member:
         )
 
     def event(self, message: EventMessage, payload: bytes) -> Event:
-        """Return the event that it sent.
+        """Return the event of a message.
 
         Raises:
             WireError: There is none that is known here.
@@ -325,7 +323,7 @@ class Member:
         return unpack(self.incoming.frame(*message.place))
 
     def acknowledge(self, count: int) -> None:
-        """Take in that so many bytes came, and notify it once in a while."""
+        """Count received bytes, and acknowledge them once in a while."""
         self._arrived += count
         unread = 0 if self.incoming is None else self.incoming.unread
         if self._arrived >= ACK_EVERY or unread >= FREE_EVERY:
@@ -334,7 +332,7 @@ class Member:
             self._arrived = 0
 
     def acknowledged(self, ack: Ack) -> None:
-        """Take in what it has got, and what it reads no more."""
+        """Handle an acknowledgement: bytes received, and frames read no more."""
         self.outbox.arrived(ack.arrived)
         if self.outgoing is not None:
             self.outgoing.freed(ack.freed)
@@ -346,7 +344,7 @@ class Member:
 
     @property
     def place(self) -> str:
-        """Where it runs, for messages to people."""
+        """Host and process number, for messages to people."""
         return self.hello.place
 
     def summary(self) -> ProcessSummary:

@@ -1,7 +1,7 @@
-"""Which processes are present: those that have met, that join, and that leave.
+"""Presence of the run's processes: meeting, joining and leaving.
 
-What Zenoh's threads bring is handed to the loop here; of the rest of this package only handshakes
-and outboxes know of threads.
+Messages from Zenoh's threads are handed to the loop here; of the rest of this package, only
+handshakes and outboxes know of threads.
 """
 
 from __future__ import annotations
@@ -51,12 +51,13 @@ from runtime.time.time_limits import real_time_limit
 log = logging.getLogger("visnav.runtime")
 
 ALONE = 1.0
-"""Seconds after which a process that sees no other looks whether any can find it: where processes
-meet, nobody listens if the one that did ended just after we connected to it."""
+"""Seconds without another process until a check of the meeting place: nobody listens there if the
+listening process ended just after we connected to it.
+"""
 
 
 class Reactions(Protocol):
-    """What is notified, on the loop, of what other processes do."""
+    """Receiver of the other processes' messages, arrivals and losses, on the loop."""
 
     def receive(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         """Take in a message."""
@@ -65,10 +66,10 @@ class Reactions(Protocol):
         """Deal with the loss of a process in the run."""
 
     def joined(self, member: Member) -> None:
-        """Meet a process that came, or came back, after the processes were numbered."""
+        """Handle a process joining or returning after the numbering of processes."""
 
     def unsent(self, member: Member, error: VisnavError) -> None:
-        """Log what could not be sent."""
+        """Log a failure to send."""
 
     def now(self, ago: int = 0) -> int:
         """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
@@ -179,11 +180,11 @@ class Membership:
         return max(map(len, self._numbers))
 
     def owners(self) -> dict[str, int]:
-        """Return the number of the process that has each node."""
+        """Return the number of each node's process."""
         return {node: number for nodes, number in self._numbers.items() for node in nodes}
 
     def present(self) -> list[Member]:
-        """Return the other processes of the run that are there, in the order of their numbers."""
+        """Return the other processes present, in the order of their numbers."""
         return [member for _, member in sorted(self._numbered.items())]
 
     def complete(self) -> bool:
@@ -191,17 +192,17 @@ class Membership:
         return len(self._numbered) == self.count - 1
 
     def numbered(self, number: int) -> Member | None:
-        """Return the process with a number, if it is there."""
+        """Return the process of a number, if present."""
         return self._numbered.get(number)
 
     @property
     def id(self) -> str:
-        """The id by which the others know this process."""
+        """Id of this process among the others."""
         assert self._handshakes is not None
         return self._handshakes.id
 
     def broadcast(self, message: Message) -> None:
-        """Send a message to all other processes of the run that are there."""
+        """Send a message to all other processes present."""
         for member in self.present():
             member.outbox.send(message)
 
@@ -211,12 +212,12 @@ class Membership:
         self._numbered.pop(member.number, None)
 
     def settle(self, *, lost: Iterable[str] = (), left_out: Iterable[str] = ()) -> None:
-        """State from now on that the run goes on, which nodes are lost, and which left out."""
+        """State in hellos from now on: the run goes on, with these nodes lost or left out."""
         lost, left_out = (*self.hello.lost, *lost), (*self.hello.left_out, *left_out)
         self.hello = msgspec.structs.replace(self.hello, running=True, lost=lost, left_out=left_out)
 
     async def close(self) -> None:
-        """Send what still waits, and leave."""
+        """Send the waiting messages, and leave."""
         if self._handshakes is not None:
             await self._handshakes.close()
 
@@ -273,18 +274,18 @@ class Membership:
         member.acknowledge(len(data) + len(payload))
 
     def soon(self, call: Callable[..., Any], *args: Any) -> None:
-        """Have something called on the loop, if it is not closed."""
+        """Call a function on the loop, unless closed; for any thread."""
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(call, *args)
 
     def unsent(self, member: Member, error: VisnavError) -> None:
-        """Hand on what could not be sent."""
+        """Pass on a failure to send."""
         self.soon(self._peers.unsent, member, error)
 
     # On the loop.
 
     def take(self, member: Member, message: OfTheRun, event: Event | None) -> None:
-        """Hand on a message, unless its session has ended; what makes no sense is logged."""
+        """Pass on a message, unless its session has ended; invalid messages are logged."""
         try:
             if member.held is not None:
                 member.held.append((message, event))
@@ -297,14 +298,14 @@ class Membership:
         self.waiting.notify()
 
     def misfit(self, error: PeerError) -> None:
-        """Deal with a process with which there can be no run."""
+        """Handle an incompatible process: log during the run, fail before."""
         if self.hello.running:
             log.warning("%s", error)
         else:
             self.waiting.fail(error)
 
     def joined(self, member: Member) -> None:
-        """Take in a process with which a session began."""
+        """Handle the start of a session with a process."""
         try:
             check_fits(self.hello, member.hello, self.nodes)
         except PeerError as error:

@@ -1,4 +1,4 @@
-"""What processes of one run say to each other: msgpack maps with a tag, and at most one event."""
+"""Messages between the processes of a run: tagged msgpack maps, with at most a single event."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NEVER: Key = (1 << 62, 3, 0)
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
 AT_ONCE = -1
-"""The serial number of what is not taken in at a turn, but when it comes."""
+"""Serial number of a message handled on arrival, not at a turn."""
 
 
 class Message(msgspec.Struct, frozen=True, tag=True, omit_defaults=True):
@@ -23,7 +23,7 @@ class Message(msgspec.Struct, frozen=True, tag=True, omit_defaults=True):
 
 
 class Hello(Message, frozen=True):
-    """Who I am.
+    """Description of the sending process.
 
     Attributes:
         nodes: That run here.
@@ -52,13 +52,13 @@ class Hello(Message, frozen=True):
 
 
 class Announcements(Message, frozen=True):
-    """What each of my nodes announced, as frames of `runtime.wire`."""
+    """Announcements of each node of the sender, as frames of `runtime.wire`."""
 
     by_node: dict[str, tuple[bytes, ...]]
 
 
 class Subscription(msgspec.Struct, frozen=True):
-    """What one input or handler hears.
+    """Events received by an input or handler.
 
     Attributes:
         kinds: Types of events, by `runtime.wire.kind_of`; their subclasses come too.
@@ -72,13 +72,13 @@ class Subscription(msgspec.Struct, frozen=True):
 
 
 class Subscriptions(Message, frozen=True):
-    """What my nodes hear."""
+    """Events received by the sender's nodes."""
 
     wanted: tuple[Subscription, ...]
 
 
 class Ping(Message, frozen=True):
-    """Ask what time it is there.
+    """Request for the receiver's time.
 
     Attributes:
         sent: My monotonic clock, in nanoseconds.
@@ -124,12 +124,12 @@ class FirstUpdate(Message, frozen=True):
 
 
 class MemoryOffer(Message, frozen=True):
-    """Memory into which I can put what is large for you, if you see it.
+    """Memory of the sender for large frames, if visible to the receiver.
 
     Attributes:
         machine: Where it is.
         path: To its file.
-        key: What stands at its beginning.
+        key: Its first bytes.
     """
 
     machine: str
@@ -181,15 +181,15 @@ class NodeEnded(Message, frozen=True):
 
 
 class FinalSummary(Message, frozen=True):
-    """What there is to say of the run in my process: a part of the summary, as JSON."""
+    """The sender's part of the run's summary, as JSON."""
 
     part: bytes
 
 
 class SummaryReceived(Message, frozen=True):
-    """I have what you had to say of the run: leave when you like.
+    """Receipt of a final summary: the other process may leave.
 
-    That a process goes is told before its last messages may have arrived.
+    A process's departure may be noticed before its last messages arrive.
     """
 
 
@@ -198,7 +198,7 @@ class StillWorking(Message, frozen=True):
 
 
 class TimeToken(Message, frozen=True):
-    """It is your turn in lockstep.
+    """Turn in lockstep, passed to the receiver.
 
     Attributes:
         epoch: Turns of an earlier one are void.
@@ -217,7 +217,7 @@ class TimeToken(Message, frozen=True):
     sent: tuple[tuple[Count, ...], ...]
 
     def fits(self, count: int) -> bool:
-        """Tell whether it is a turn of so many processes."""
+        """Tell whether the token is for so many processes."""
         return len(self.keys) == len(self.sent) == count and all(
             len(row) == count for row in self.sent
         )
@@ -235,7 +235,7 @@ class TokenRequest(Message, frozen=True):
 
 
 class StateReport(Message, frozen=True):
-    """Where I stand, after a process went or came: what a new turn is made of.
+    """Lockstep state of the sender after a process left or joined, for a new turn.
 
     Attributes:
         processes: Ids of all that I know to be there.
@@ -255,8 +255,9 @@ class StateReport(Message, frozen=True):
 
 
 Ordered = EventMessage | Stop | NodeEnded
-"""In lockstep these are taken in at one's turn, in the order of their serial numbers; but at once
-if they have none."""
+"""Messages handled in lockstep at the receiver's turn, in the order of their serial numbers;
+without one, at once.
+"""
 
 OfTheRun = (
     Announcements

@@ -40,7 +40,7 @@ class Others:
         return list(chain(*own.values()))
 
     async def begin(self, connect: Callable[[], None]) -> None:
-        """Agree on when the first update is, and wait for it.
+        """Agree with the others on the first update, and wait until then.
 
         Args:
             connect: Connects the nodes here, so that each process knows what the others receive.
@@ -61,14 +61,14 @@ class Others:
         """Connect the listeners here to outputs elsewhere, and notify the others."""
 
     def stopping(self, reason: str, error: Exception | None, *, by: str, from_peer: bool) -> None:
-        """Notify the others that the run ends, and why; also where the reason is `from_peer`."""
+        """Notify the others of the run's end and its reason, also if `from_peer`."""
 
     async def wait_to_end(self, node: str) -> None:
-        """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
+        """Wait until all nodes after `node` have ended, in any process; "" precedes all."""
 
     def node_ended(self, node: str) -> None:
-        """Notify the others that a node here has ended."""
+        """Notify the others of the end of a node here."""
 
     async def leave(self, summary: Summary) -> Summary:
-        """Exchange summaries; return that of all processes, and talk to them no more."""
+        """Exchange summaries and leave; return the summary of all processes."""
         return summary

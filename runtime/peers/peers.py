@@ -49,7 +49,7 @@ log = logging.getLogger("visnav.runtime")
 
 
 class Run(Protocol):
-    """What the other processes can bring about here."""
+    """Operations on the run here, as requested by other processes."""
 
     def stop(
         self,
@@ -59,14 +59,14 @@ class Run(Protocol):
         by: str = "user",
         from_peer: bool = False,
     ) -> None:
-        """End the run; `from_peer` if another process reported it."""
+        """End the run; `from_peer` if reported by another process."""
 
     def connect(self) -> None:
-        """Freeze anew which listener receives which output."""
+        """Freeze the listeners of each output anew."""
 
 
 class Peers(Others):
-    """All processes of a run but this one.
+    """All other processes of a run.
 
     Attributes:
         shutdown: Our part in the end of it.
@@ -118,11 +118,11 @@ class Peers(Others):
         return before
 
     async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
-        """Send the others what the nodes here announce; return what all do, in file order."""
+        """Send the announcements of the nodes here; return those of all, in file order."""
         return await self._start.announce(own)
 
     async def begin(self, connect: Callable[[], None]) -> None:
-        """Agree on when the first update is, and wait for it."""
+        """Agree with the others on the first update, and wait until then."""
         connect()
         self._follow(await self._start.begin())
 
@@ -132,7 +132,7 @@ class Peers(Others):
             self._follower = ClockFollower(self._clock, member)
 
     def start_clock(self) -> None:
-        """Do nothing: `begin` has started it."""
+        """Do nothing: `begin` has started the clock."""
 
     def nodes_run(self) -> None:
         """Deliver messages from now on: the nodes here have begun."""
@@ -148,7 +148,7 @@ class Peers(Others):
             self.lost(absent.pop(min(absent)))
 
     def _receive_early(self) -> None:
-        """Take in what came too early, but for what a process said that was lost since."""
+        """Handle messages received too early, but not those of processes lost since."""
         early, self._early = self._early, []
         for item in early:
             self._membership.take(*item)
@@ -169,7 +169,7 @@ class Peers(Others):
         )
 
     def stopping(self, reason: str, error: Exception | None, *, by: str, from_peer: bool) -> None:
-        """Notify the others that the run ends, and why; also where the reason is `from_peer`.
+        """Notify the others of the run's end and its reason, also if `from_peer`.
 
         They may receive it from us first.
         """
@@ -192,25 +192,25 @@ class Peers(Others):
         self.shutdown.begin()
 
     def node_ended(self, node: str) -> None:
-        """Notify the others that a node here has ended."""
+        """Notify the others of the end of a node here."""
         self.shutdown.at_work = False
         self._ended_here.append(node)
         self._broadcast_in_order(NodeEnded(node))
 
     async def wait_to_end(self, node: str) -> None:
-        """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
+        """Wait until all nodes after `node` have ended, in any process; "" precedes all."""
         await self.shutdown.wait_to_end(node)
 
     # After the run.
 
     async def leave(self, summary: Summary) -> Summary:
-        """Exchange summaries; return that of all processes, and send what still waits."""
+        """Exchange summaries and leave; return the summary of all processes."""
         whole = await self.shutdown.exchange_summaries(summary)
         await self.close()
         return whole
 
     async def close(self) -> None:
-        """Send what still waits, and leave."""
+        """Send the waiting messages, and leave."""
         self._ends = True
         self.shutdown.close()
         if self._follower is not None:
@@ -314,7 +314,7 @@ class Peers(Others):
         self._run.connect()
 
     def joined(self, member: Member) -> None:
-        """Meet a process that came, or came back, after the processes were numbered."""
+        """Handle a process joining or returning after the numbering of processes."""
         self._start.say_again(member)
         if self._begun:  # until it is ready, the run goes on without it
             self._returning.add(member.number)
@@ -325,12 +325,12 @@ class Peers(Others):
         return self._clock.now() - round(ago * speed)
 
     def unsent(self, member: Member, error: VisnavError) -> None:
-        """Log what could not be sent; that a process has gone is noticed elsewhere."""
+        """Log a failure to send; the loss of a process is noticed elsewhere."""
         if not self._ends:
             log.warning("to %s: %s", name_of(member.nodes), error)
 
     def _do(self, number: int, message: Ordered, event: Event | None) -> None:
-        """Do what another process's message asks; in lockstep, at our turn."""
+        """Carry out another process's message; in lockstep, at our turn."""
         try:
             match message:
                 case EventMessage() if self._remote is not None and event is not None:
@@ -347,7 +347,7 @@ class Peers(Others):
         self._membership.waiting.notify()
 
     def _take_back(self, member: Member, *, begun: bool) -> None:
-        """Let a process take part again: a new one, or one that had begun and was disconnected."""
+        """Readmit a process: a new instance, or (if `begun`) the same, reconnected."""
         what = "found again" if begun else "back"
         log.warning("%s: %s, at %s", name_of(member.nodes), what, member.place)
         if not begun:
@@ -384,7 +384,7 @@ class Peers(Others):
         self._new.clear()
 
     def _go_on_without(self, member: Member) -> None:
-        """Take a process out of the turns: it has not begun, or has given up."""
+        """Exclude a process from the turns: not begun yet, or given up."""
         self._apart.add(member.number)
         for node in self._ended_here:  # what was to be sent at our turn is lost
             member.outbox.send(NodeEnded(node))
@@ -393,7 +393,7 @@ class Peers(Others):
     # Sending.
 
     def _broadcast_in_order(self, message: Ordered) -> None:
-        """Send a message that others take in in its place among the events."""
+        """Send a message to all, for handling in its place among the events."""
         for member in self._membership.present():
             if self._token is not None and self._begun and member.number not in self._apart:
                 self._token.post(member.number, message)

@@ -14,12 +14,11 @@ from runtime.peers.messages import Subscription
 from runtime.wire import event_type, kind_of
 
 Leave = Callable[[int, str, Event, bool], None]
-"""Sends an event to a process: its number, the output, the event, and whether a newer one may
-take its place on the way."""
+"""Sends an event: process number, output, event, and whether a newer event may replace this."""
 
 
 class RemoteEvents:
-    """What crosses between this process and the others.
+    """Events between this process and the others.
 
     Args:
         owners: The number of the process that has each node.
@@ -38,7 +37,7 @@ class RemoteEvents:
                     self._arrivals[name] = (owners[spec.name], Sender(name, output.event))
 
     def wants(self, process: int, wanted: tuple[Subscription, ...]) -> None:
-        """Note what a process receives; nothing, if it is gone.
+        """Record the subscriptions of a process; empty for a process gone.
 
         Raises:
             WireError: It listens to a kind of event that is not known here.
@@ -49,7 +48,7 @@ class RemoteEvents:
         self._wanted[process] = wanted
 
     def listeners(self, output: str) -> list[Listener]:
-        """Return the listeners in other processes for an output of this one.
+        """Return the listeners of an output in other processes.
 
         They come before those in this process, so that a handler here ends no delivery there.
         """
@@ -81,7 +80,7 @@ class RemoteEvents:
 
 
 class RemoteListener(Listener):
-    """All inputs and handlers of another process, as one listener of an output here."""
+    """All inputs and handlers of another process, as a single listener of an output."""
 
     __slots__ = ("_leave", "_listeners", "_may_skip", "_output", "_process", "name")
 
@@ -104,7 +103,7 @@ class RemoteListener(Listener):
         return any(listener.may_receive(event) for listener, _ in self._listeners)
 
     def receives_all(self, event: type[Event]) -> bool:
-        """Return whether something there receives all that an output of this type sends."""
+        """Return whether any listener there receives all events of an output of this type."""
         return any(listener.receives_all(event) for listener, _ in self._listeners)
 
     def receives(self, event: type[Event], source: str) -> bool:
@@ -122,7 +121,7 @@ class RemoteListener(Listener):
 
 
 def subscriptions(listeners: Iterable[Listener]) -> tuple[Subscription, ...]:
-    """Return what these listeners receive, for other processes."""
+    """Return the subscriptions of these listeners, for other processes."""
     found = {
         Subscription(
             kinds=tuple(kind_of(event) for event in listener.events),

@@ -1,9 +1,9 @@
-"""Large events between processes of one machine: put once into memory that both see.
+"""Large events between processes of a machine: put once into memory visible to both.
 
-A process offers the other a nameless file, by the way to it in ``/proc`` and a key that stands at
-its beginning. Who can open that file and finds the key is on the same machine, and reads frames
-where they stand; the others get them over the network. A block is used again once the last array
-on it is gone. The file cannot shrink: what is mapped stays readable, whatever its owner does.
+A process offers the other a nameless file, by its path in ``/proc`` and a key at its beginning. A
+process that can open the file and finds the key is on the same machine, and reads frames in
+place; the others get them over the network. A block is used again once the last array on it is
+gone. The file cannot shrink: mapped memory stays readable, whatever its owner does.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from runtime.workers.shared_memory import Arena, MappedFile, anonymous_file
 log = logging.getLogger("visnav.runtime")
 
 LIMIT = 1 << 28
-"""Bytes of a file at most; what does not fit crosses the network."""
+"""Most bytes of a file; events without room cross the network."""
 
 KEY = 32
 
 
 class Outgoing:
-    """Memory into which this process puts what is large for another one.
+    """Memory written by this process, with large events for another.
 
     `put` is called by one thread at a time, `freed` by any. The file is closed when this
     object is used no more.
@@ -51,7 +51,7 @@ class Outgoing:
         self._taken: set[int] = set()
 
     def offer(self) -> MemoryOffer:
-        """Return what the other process needs to find it."""
+        """Return the offer of this memory to the other process."""
         return MemoryOffer(
             machine=machine(), path=f"/proc/{os.getpid()}/fd/{self._fd}", key=self._key
         )
@@ -70,12 +70,12 @@ class Outgoing:
         return offset, packed.size
 
     def freed(self, offsets: Iterable[int]) -> None:
-        """Take in which frames the other process reads no more."""
+        """Note the frames read no more by the other process."""
         self._freed.extend(offsets)
 
 
 class Incoming:
-    """Memory into which another process puts what is large for this one.
+    """Memory written by another process, with large events for this process.
 
     The file is closed when this object is used no more; arrays that stand in it stay valid.
     """
@@ -86,7 +86,7 @@ class Incoming:
 
     @classmethod
     def found(cls, offer: MemoryOffer) -> Incoming | None:
-        """Return the memory that is offered, or `None` if it is not to be had here."""
+        """Return the offered memory; `None` if not accessible from here."""
         here = offer.machine and offer.machine == machine()
         if not (here and re.fullmatch(r"/proc/\d+/fd/\d+", offer.path)):
             return None
@@ -110,7 +110,7 @@ class Incoming:
         return cls(fd)
 
     def frame(self, offset: int, size: int) -> memoryview:
-        """Return a frame where it stands.
+        """Return a frame in place, without a copy.
 
         Raises:
             WireError: There is none.
@@ -124,17 +124,17 @@ class Incoming:
 
     @property
     def unread(self) -> int:
-        """How many frames are read no more here, but for those that `freed` returned."""
+        """Number of frames read no more here and not yet returned by `freed`."""
         return len(self._window.freed)
 
     def freed(self) -> tuple[int, ...]:
-        """Return which frames are read no more here, each once."""
+        """Return the frames read no more here, each once."""
         freed = self._window.freed
         return tuple(freed.popleft() for _ in range(len(freed)))
 
 
 def machine() -> str:
-    """Return what only processes of one machine have in common; "" if there is no such thing."""
+    """Return the boot id, common to the processes of a machine; "" if there is none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
     except OSError:

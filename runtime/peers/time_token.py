@@ -1,4 +1,4 @@
-"""Lockstep in several processes: one at a time goes on, the one with the next thing due.
+"""Lockstep in several processes: the turn passes to the process with the earliest thing due.
 
 Each process has a loop on simulated time. The one that has the turn runs on until another has
 something due before its own next thing, or until it has sent something that others must receive
@@ -33,25 +33,25 @@ Deliver = Callable[[int, Ordered, Event | None], None]
 
 
 class Timeline(Protocol):
-    """The simulated time of one process."""
+    """Simulated time of a process."""
 
     @property
     def now(self) -> int:
         """Nanoseconds."""
 
     def orders(self) -> tuple[int, int]:
-        """Return what the next things added will be numbered with."""
+        """Return the next order numbers: of the schedule, and of the loop."""
 
     def move(self, now: int, orders: tuple[int, int]) -> None:
         """Go to a time, and go on with these numbers."""
 
 
 class TimeTokenHolder:
-    """One process's part in whose turn it is.
+    """A process's part in passing the turn.
 
     Args:
         me: Number of this process; they are numbered in the order of their first nodes.
-        count: How many there are.
+        count: Number of processes.
         deliver: Given the messages of others, in order, at this process's turn.
     """
 
@@ -114,7 +114,7 @@ class TimeTokenHolder:
     # What the loop asks, whenever nothing is ready.
 
     def may_go(self, key: Key) -> bool:
-        """Return whether time may go on to what is due here next."""
+        """Return whether time may advance to the next thing due here."""
         if self._report_due:
             self._report_state(key)
         if not self.holding:
@@ -135,7 +135,7 @@ class TimeTokenHolder:
         return False
 
     def post(self, other: int, message: Ordered, event: Event | None = None) -> None:
-        """Send a message that the other takes in before time goes on."""
+        """Send a message to be handled by the other before time advances."""
         self._outbox.append((other, message, event))
 
     # What comes from others.
@@ -170,7 +170,7 @@ class TimeTokenHolder:
         self._begin()
 
     def _begin(self) -> None:
-        """Take the turn that was passed to us once all that was sent before is here."""
+        """Take the passed turn once all messages sent before have arrived."""
         turn = self._next
         if turn is None or any(
             self._received[other] < turn.sent[other][self._me] for other in self._alive - {self._me}
@@ -224,7 +224,7 @@ class TimeTokenHolder:
     # After a process left or joined.
 
     def _report_state(self, key: Key) -> None:
-        """Report our state to the process that makes the next turn."""
+        """Report our state to the process making the next turn."""
         self._report_due = False
         self._reported_key = key
         standing = StateReport(
@@ -243,7 +243,7 @@ class TimeTokenHolder:
             self._send(maker, standing, None)
 
     def _resume(self) -> None:
-        """Make a turn, if it is ours to make and all have reported their state."""
+        """Make a turn, if ours to make and all have reported their state."""
         found = [self._reports.get(n) for n in sorted(self._alive)]
         if min(self._alive, default=-1) != self._me or any(
             s is None or s.processes != self._ids for s in found

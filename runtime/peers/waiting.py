@@ -1,4 +1,4 @@
-"""Waiting for other processes: named when it takes long, and never for ever."""
+"""Waiting for other processes: slow processes are named, and none is awaited for ever."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from runtime.time.time_limits import real_time_limit
 log = logging.getLogger("visnav.runtime")
 
 NAMED_EVERY = 5.0
-"""Real seconds between two log lines that name the processes waited for."""
+"""Real seconds between two log lines naming the awaited processes."""
 
 
 class Waiting:
-    """Who waits for something that other processes bring about, and for whom.
+    """Waits of this process for conditions met by other processes.
 
     Args:
         present: Returns the other processes of the run that are there.
@@ -49,10 +49,10 @@ class Waiting:
         whom: Callable[[Member], bool] | None = None,
         limit: float = math.inf,
     ) -> None:
-        """Wait for something that others bring about; simulated time stands until the run begins.
+        """Wait until others meet a condition; holds simulated time unless `despite`.
 
         Args:
-            condition: Looked at whenever something has come.
+            condition: Checked whenever something has come.
             despite: Go on waiting though something has failed: the run ends anyway.
             whom: Tells who is waited for; they are named when it takes long.
             limit: Real seconds after which it takes too long, if `whom` is given. They count from
@@ -85,30 +85,30 @@ class Waiting:
                 self._futures.discard(future)
 
     def notify(self) -> None:
-        """Have all who wait look again."""
+        """Have all waits check their conditions again."""
         for future in list(self._futures):
             if not future.done():
                 future.set_result(None)
 
     def fail(self, error: VisnavError) -> None:
-        """Let all who wait fail."""
+        """Let all waits fail."""
         self._broken = self._broken or error
         self.notify()
 
     def lost(self, member: Member) -> None:
-        """Wait from now on for the return of a process that was lost before the first update."""
+        """Await the return of a process lost before the first update."""
         log.warning("%s: waiting for its return", _loss(member))
         if member.number >= 0:
             self.absent[member.number] = member
             self._first_losses.setdefault(member.number, member.lost_at)
 
     def returned(self, member: Member) -> None:
-        """Take in that a process is there; it may have been absent."""
+        """Record a process as present, perhaps after an absence."""
         if self.absent.pop(member.number, None) is not None:
             log.warning("%s: back, at %s", name_of(member.nodes), member.place)
 
     def _time_left(self, begin: float, limit: float) -> float:
-        """Return the real seconds that a wait may go on."""
+        """Return the real seconds left for a wait."""
         if limit == math.inf:
             return limit
         ends = [max([begin, *self._first_losses.values()]) + limit]
@@ -117,7 +117,7 @@ class Waiting:
         return min(ends) - time.monotonic()
 
     def _name(self, whom: Callable[[Member], bool], limit: float, *, late: bool) -> None:
-        """Log who is waited for.
+        """Log the awaited processes.
 
         Raises:
             PeerError: It is too late.
@@ -138,7 +138,7 @@ def _loss(member: Member) -> str:
 
 
 class _Closed:
-    """A gate of simulated time that nothing passes."""
+    """Closed gate of simulated time: nothing passes."""
 
     def may_go(self, key: Key) -> bool:  # noqa: ARG002
         return False
@@ -146,7 +146,7 @@ class _Closed:
 
 @contextlib.contextmanager
 def _time_stands() -> Iterator[None]:
-    """Hold simulated time: how long others take must not decide what is due before they come."""
+    """Hold simulated time: other processes' delays must not decide the order of things due."""
     loop = asyncio.get_running_loop()
     if not isinstance(loop, LockstepLoop):
         yield

@@ -1,6 +1,6 @@
-"""A Zenoh session between the processes of one run: the only module with zenoh.
+"""A Zenoh session between the processes of a run: the only module using zenoh.
 
-Zenoh has threads of its own and no asyncio: what it calls runs there, and must not wait.
+Zenoh has threads of its own and no asyncio: callbacks run there, and must not wait.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ OnPresence = Callable[[str, bool], None]
 """Called in Zenoh's thread when a process appears (True) or disappears."""
 
 CLOSING = 3.0
-"""Seconds; a peer that stands still keeps Zenoh waiting for longer."""
+"""Real seconds for a session to close; a hung peer keeps Zenoh waiting for longer."""
 
 _ENDPOINT = re.compile(r"(\w+)/\[?([^\]#?]+?)\]?:(\d+)([#?].*)?")
 """Protocol, host and port."""
@@ -135,14 +135,14 @@ class Session:
         return False
 
     def close(self) -> None:
-        """Leave. What goes on for longer than `CLOSING` goes on in a thread."""
+        """Leave; after `CLOSING` seconds, closing goes on in a thread."""
         thread = threading.Thread(target=self._session.close, name="zenoh close")
         thread.start()
         thread.join(CLOSING)
 
 
 def _configuration(network: NetworkConfig) -> zenoh.Config:
-    """Return the file's configuration, and where that is silent, one that finds who is there."""
+    """Return the file's configuration; where silent, settings to find the other processes."""
     plain, configuration = zenoh.Config(), zenoh.Config()
     if network.zenoh:
         if not Path(network.zenoh).is_file():
@@ -197,7 +197,7 @@ def _endpoints(configuration: zenoh.Config, way: str) -> list[str]:
 
 
 def _warn_if_open(configuration: zenoh.Config) -> None:
-    """Warn of an endpoint at which messages can be read on the way."""
+    """Warn of an endpoint open to other machines without encryption."""
     bare = [
         endpoint
         for endpoint in _endpoints(configuration, "listen")
@@ -212,7 +212,7 @@ def _warn_if_open(configuration: zenoh.Config) -> None:
 
 
 def _beside(meet: str) -> list[str]:
-    """Return where to listen besides: a free port at the address by which `meet` is reached."""
+    """Return another endpoint for listening: a free port at our address towards `meet`."""
     parts = _ENDPOINT.fullmatch(meet)
     if parts is None or parts[1] not in {"tcp", "tls", "quic"}:
         return []

@@ -1,1 +1,1 @@
-"""One run: its nodes started, watched and ended, and what it leaves."""
+"""A run: starting, watching and ending its nodes, and its results."""

@@ -1,4 +1,4 @@
-"""Loops that run to the end of a coroutine whatever their tasks do, and tasks that streams resume.
+"""Event loops run until a coroutine ends, whatever their tasks do; tasks resumable by streams.
 
 Unlike `asyncio.Runner`, `run_to_end` survives a `SystemExit` or `KeyboardInterrupt` that some task
 or callback lets out of the loop, and waits a limited time for tasks that swallow their
@@ -34,7 +34,7 @@ Factory = Callable[..., asyncio.Task[Any]]
 
 
 def install(loop: asyncio.AbstractEventLoop) -> None:
-    """Make every task created on `loop` from now on one that streams can resume.
+    """Make every task created on `loop` from now on resumable by streams.
 
     If the interpreter does not allow it, its tasks stay as they are, and the log says so once.
     """
@@ -44,7 +44,7 @@ def install(loop: asyncio.AbstractEventLoop) -> None:
 
 @functools.cache
 def resumable() -> bool:
-    """Return whether streams can resume tasks at once here; what cannot be done is logged."""
+    """Return whether streams can resume tasks at once here; limitations are logged."""
     if not works(None):
         Stream.use_futures()
         log.warning("%s: streams wait on futures, since its tasks accept nothing else", PYTHON)
@@ -100,17 +100,17 @@ async def _exercise(factory: Factory | None, loop: asyncio.AbstractEventLoop) ->
 
 
 class RunTask(asyncio.Task[Any]):
-    """A task whose place in a set does not depend on its address, and that the run may protect.
+    """Task hashed independently of its address; protectable by the run.
 
     Code that goes through a set of tasks (a `TaskGroup` that cancels them, a caller of
     `asyncio.wait`) does so in the same order in equal runs.
     """
 
     tasks = 0
-    """How many this one has made: its own count, so that no observer changes it."""
+    """Tasks made by this task: a count of its own, unchanged by observers."""
 
     protected = False
-    """Whether nodes cannot cancel it, but for the one whose name it has: it is the run's."""
+    """Whether the task is protected: of all nodes, only the node of its name may cancel."""
 
     def __init__(self, number: int, coro: Coroutine[Any, Any, Any], **options: Any) -> None:
         self._number = number
@@ -120,10 +120,10 @@ class RunTask(asyncio.Task[Any]):
         return self._number
 
     def cancel(self, msg: Any | None = None) -> bool:
-        """Cancel it, as `asyncio.Task` does.
+        """Cancel the task, as `asyncio.Task` does.
 
         Raises:
-            NodeError: It is protected, and a node that is not its own cancels it.
+            NodeError: It is protected, and a node other than its own cancels it.
         """
         caller = sys._getframe(1)
         if self.protected and not caller.f_globals.get("__name__", "").startswith("runtime."):
@@ -163,13 +163,14 @@ def _task_factory(
 R = TypeVar("R")
 
 GRACE = 1.0
-"""Real seconds in which tasks and asynchronous generators must end when the loop is closed."""
+"""Real seconds for tasks and asynchronous generators to end when the loop is closed."""
 
 _MOST_ESCAPES = 100
 
 LEFT: list[Any] = []
-"""Tasks that would not end. They are kept: thrown away, they would complain on standard error. A
-process in which there are some must end by `os._exit`."""
+"""Tasks not ended in time. They are kept: thrown away, they would complain on standard error. A
+process with any must end by `os._exit`.
+"""
 
 
 def run_to_end(

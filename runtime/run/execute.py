@@ -1,4 +1,4 @@
-"""One whole run, from settings to results: loop, clock, signals, logging, progress and files."""
+"""A whole run, from settings to results: loop, clock, signals, logging, progress and files."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def execute(
 
 
 def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
-    """Return a new loop for the clock that a run asks for.
+    """Return a new event loop for the run's clock.
 
     Raises:
         UnsupportedInterpreterError: Time cannot be simulated on this interpreter.
@@ -116,11 +116,11 @@ def make_clock(run: RunConfig, loop: asyncio.AbstractEventLoop) -> Clock:
 
 
 class _Run:
-    """One run, from its loop to what is called when it is over; see `execute`."""
+    """A run, from its loop to the callbacks after its end; see `execute`."""
 
     supervisor: Supervisor
     private: Path | None = None
-    """Where nodes write that start no programs; `None` for the run's folder."""
+    """Output folder of nodes starting no programs; `None` for the run's folder."""
 
     def __init__(
         self,
@@ -148,11 +148,11 @@ class _Run:
             self._taps.append(_log_event)
 
     def now(self) -> int:
-        """Return the time of the run's clock (ns); 0 before there is one."""
+        """Return the time of the run's clock (ns); 0 before there is a clock."""
         return self._clock.now() if self._clock is not None else 0
 
     async def main(self) -> Summary:
-        """Run the nodes to their end, and put together what there is to say of it."""
+        """Run the nodes to their end, and return the run's summary."""
         loop, run = asyncio.get_running_loop(), self._config.run
         event_loop.install(loop)
         clock = self._clock = make_clock(run, loop)
@@ -196,13 +196,13 @@ class _Run:
         return summary
 
     def escaped(self, error: BaseException) -> None:
-        """Deal with what came out of the loop."""
+        """Hand an exception of the loop to the supervisor; without any, re-raise."""
         if not hasattr(self, "supervisor"):  # a Ctrl-C before there was anything to end
             raise error
         self.loop.call_soon(self.supervisor.escaped, error)
 
     def failed(self, error: Exception) -> None:
-        """Note an error; the first one counts."""
+        """Log an error; the first becomes the error of the run."""
         first = self.supervisor.state.error is None
         if isinstance(error, NodeError):
             log_error(error, last=first)
@@ -212,7 +212,7 @@ class _Run:
             self.supervisor.state.error = error
 
     def conclude(self, out: Path, summary: Summary) -> None:
-        """Write the summary, and call what nodes want called after it, whatever goes wrong."""
+        """Write the summary, then call all `after_run` functions, whatever goes wrong."""
         if summary.error is None and self.supervisor.state.error is not None:
             error = with_place(self.supervisor.state.error)
             summary = msgspec.structs.replace(summary, error=error)
@@ -268,7 +268,7 @@ def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> It
 
 @contextlib.contextmanager
 def _no_long_collections() -> Iterator[None]:
-    """Leave what is there already out of garbage collections, which delay ticks."""
+    """Exclude existing objects from garbage collection, whose pauses delay ticks."""
     gc.collect()
     gc.freeze()
     try:

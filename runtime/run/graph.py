@@ -1,4 +1,4 @@
-"""Which listener receives which output: a pure function of the nodes, made before the first event.
+"""Connections from outputs to listeners: a pure function of the nodes, before the first event.
 
 Every output of a node is connected to the inputs and handlers of all *other* nodes that know its
 type of event, in the order of the nodes in the file and of the declarations in each node.
@@ -18,17 +18,17 @@ from runtime.channels.tasks import Fault
 from runtime.node import Node, senders
 
 Sources = Mapping[str, Mapping[str, str]]
-"""Node to port to the source that the port is narrowed to."""
+"""Source of each narrowed port, by node and port."""
 
 Links = Mapping[str, Mapping[str, Link]]
-"""Node to port to the link that stands before it."""
+"""Link before each port, by node and port."""
 
 Wrap = Callable[[str, Deliver], Deliver]
-"""Given a node and a handler of it, returns what is called instead."""
+"""Wrapper of handlers: from a node's name and a handler to the function called instead."""
 
 
 def unwrapped(_: str, deliver: Deliver) -> Deliver:
-    """Return a handler as it is."""
+    """Return a handler unchanged."""
     return deliver
 
 
@@ -82,7 +82,7 @@ def connect(
     wrap: Wrap = unwrapped,
     voices: Voices | None = None,
 ) -> list[Listener]:
-    """Freeze every output's listeners, and return all that are here.
+    """Freeze the listeners of every output, and return all listeners of this process.
 
     May be called again when nodes come or go.
 
@@ -115,7 +115,7 @@ def truth_readers(
     listeners: Iterable[Listener],
     announcements: Iterable[Announcement],
 ) -> set[str]:
-    """Return the nodes that receive true poses of vehicles or cameras, and do not say what for."""
+    """Return the nodes receiving true poses of vehicles or cameras for no declared use."""
     truths = [
         (Odometry if isinstance(each, VehicleAnnouncement) else PoseStamped, each.source)
         for each in announcements
@@ -159,7 +159,7 @@ def input_types(cls: type[Node[Any]]) -> dict[str, tuple[Any, ...]]:
 
 
 def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str]]:
-    """Return the inputs that no node can send to, as (node, port, event).
+    """Return the inputs without any possible sender, as (node, port, event).
 
     A handler that is never called is nothing to warn of: most nodes can do more than is asked.
     """
@@ -175,7 +175,7 @@ def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str,
 
 
 def circles(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[str]:
-    """Return the circles of handlers each of which always sends what the next one handles."""
+    """Return circles of handlers, each always sending an event handled by the next."""
     after = {
         (name, handler): [
             (f"{name}.{output} → {other}.{another}", (other, another))
@@ -206,7 +206,7 @@ def circles(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[str]:
 
 
 def _always_sends(cls: type[Node[Any]], handler: str) -> list[str]:
-    """Return the outputs by which a handler sends whatever the event is: it has no branches."""
+    """Return the outputs always used by a handler; none if there are branches."""
     code = list(dis.get_instructions(inspect.unwrap(getattr(cls, handler))))
     names = {each.argval for each in code if each.opname in {"LOAD_ATTR", "LOAD_METHOD"}}
     if "send" not in names or any(each.is_jump_target for each in code):
@@ -215,7 +215,7 @@ def _always_sends(cls: type[Node[Any]], handler: str) -> list[str]:
 
 
 def _linked(link: Link, deliver: Deliver, fault: Fault | None) -> Deliver:
-    """Put a link before a port; what its far end raises later is reported as its near end's is."""
+    """Put a link before a port; errors of delayed deliveries go to `fault`, too."""
     return link.to(deliver, None if fault is None else lambda error: fault(deliver, error))
 
 

@@ -1,9 +1,9 @@
-"""Instruments: hooks by which a trace or a monitor looks at a run, at no cost when there are none.
+"""Instruments: hooks for a trace or a monitor to observe a run, at no cost when there are none.
 
-Attaching an instrument connects the run anew and exchanges what tickers and coroutines call;
-detaching puts back what was there. So a run without instruments does not even ask for them. What
-an instrument does with what it sees is its own business (`runtime.tools.tracing`,
-`runtime.tools.monitor`). The idea is trio's (https://trio.readthedocs.io, Instrument API).
+Attaching an instrument connects the run anew and replaces the functions that tickers and coroutines
+call; detaching restores them. A run without instruments does not even ask for them. For instruments
+see `runtime.tools.tracing` and `runtime.tools.monitor`. The idea is trio's
+(https://trio.readthedocs.io, Instrument API).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Call = Callable[[Any], Any]
 
 
 class Instrument:
-    """Base of all instruments: override the hooks that you need.
+    """Base of all instruments; override the hooks you need.
 
     Attributes:
         event_sent: Called with each event and its sender, before the event's listeners are.
@@ -32,7 +32,7 @@ class Instrument:
     event_sent: Tap | None = None
 
     def wrap_call(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
-        """Return what is called instead of `call`, by which the loop gets into a node.
+        """Return the function to call instead of `call`, the loop's entry into a node.
 
         Args:
             what: The handler, the tick or the coroutine.
@@ -46,17 +46,17 @@ class Instrument:
         call: Callable[[], Any],
         name: str,  # noqa: ARG002
     ) -> Callable[[], Any]:
-        """Return what a thread calls instead of `call`, which a node offloads now."""
+        """Return the function for a thread to call instead of the offloaded `call`."""
         return call
 
     def worker_called(
         self, process: str, method: str, answer: concurrent.futures.Future[Any]
     ) -> None:
-        """Note that a worker's process is asked to run a method, and the answer to come."""
+        """Note a method call in a worker's process, and the future of its answer."""
 
 
 class Instruments:
-    """The instruments of one run.
+    """The instruments of a run.
 
     Args:
         reconnect: Connects the run's senders and listeners anew, if it is running.
@@ -68,29 +68,29 @@ class Instruments:
         self._attached: tuple[Instrument, ...] = ()
 
     def attach(self, instrument: Instrument) -> None:
-        """Let an instrument look from now on; on the loop, or before it runs."""
+        """Attach an instrument; call on the loop, or before the loop runs."""
         self._attached += (instrument,)
         self._renew()
 
     def detach(self, instrument: Instrument) -> None:
-        """Let it look no more."""
+        """Detach an instrument."""
         self._attached = tuple(each for each in self._attached if each is not instrument)
         self._renew()
 
     @property
     def attached(self) -> tuple[Instrument, ...]:
-        """The instruments that look just now."""
+        """The attached instruments."""
         return self._attached
 
     # What the run asks while it connects senders and starts things.
 
     @property
     def taps(self) -> tuple[Tap, ...]:
-        """What sees every event before its listeners do."""
+        """Taps of the instruments, called with every event before its listeners."""
         return tuple(each.event_sent for each in self._attached if each.event_sent is not None)
 
     def listener(self, node: str, deliver: Deliver) -> Deliver:
-        """Return what is called instead of a handler, or of what is behind a link."""
+        """Return a handler, or the far end of a link, wrapped by all instruments."""
         if not self._attached:
             return deliver
         name = getattr(getattr(deliver, "__func__", None), "__name__", "handler")
@@ -116,14 +116,14 @@ class Instruments:
         worker.called = self._worker_called if self._attached else None
 
     def offloaded(self, node: str, call: Any) -> Callable[[], Any]:
-        """Return what a thread calls instead of a `functools.partial` that a node offloads."""
+        """Return a node's offloaded `functools.partial`, wrapped by all instruments."""
         name = getattr(call.func, "__qualname__", type(call.func).__name__)
         for each in self._attached:
             call = each.wrap_offload(node, call, name)
         return call  # type: ignore[no-any-return]
 
     def _renew(self) -> None:
-        """Put the instruments round all that there is."""
+        """Wrap all tickers, tasks and workers anew, and reconnect the run."""
         for name, runner in self._runners.items():
             for ticker in runner.tickers:
                 self.on_ticker(ticker)

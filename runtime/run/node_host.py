@@ -1,4 +1,4 @@
-"""What a run does for its nodes: their tasks, ticks, workers and threads."""
+"""Services of a run for its nodes: tasks, ticks, workers and threads."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class NodeHost:
 
     @property
     def run_end(self) -> RunEnd | None:
-        """How the run ended, if it did."""
+        """End of the run; `None` before."""
         return self.state.end
 
     def stop(self, node: Node[Any], reason: str) -> None:
@@ -123,7 +123,7 @@ class NodeHost:
     async def worker(
         self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
     ) -> Worker[W]:
-        """Make a worker that ends with the node."""
+        """Start a worker, and end the worker with the node."""
         loop = asyncio.get_running_loop()
 
         def died(error: Exception) -> None:
@@ -146,7 +146,7 @@ class NodeHost:
         return worker
 
     def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:
-        """Make the hold of an outside system, which ends with the node."""
+        """Make the hold of an outside system, and end the hold with the node."""
         known = self.state.outside.get(name)
         answers = self.state.outside.setdefault(name, Answers())
         hold: Hold[Any] = Hold(
@@ -170,7 +170,7 @@ class NodeHost:
         return self._executor.submit(self.instruments.offloaded(node.name, call))
 
     def note_environment(self, name: str, value: str) -> None:
-        """Put what the run depends on into the summary."""
+        """Add a property of the run's environment to the summary."""
         self.state.environment[name] = value
 
     def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
@@ -210,7 +210,7 @@ class NodeHost:
                 self._fault(node.name, error)
 
     def _has_run(self, node: Node[Any]) -> None:
-        """Log it if a node has stopped reading its inputs."""
+        """Log a warning if a node's `run` has returned and its inputs are read no more."""
         runner = self.state.runners[node.name]
         ports = [*node.declared.inputs, *node.declared.bundles]
         over = self.state.stopped is not None or runner.shutting_down or runner.restarting
@@ -225,7 +225,7 @@ class NodeHost:
     def _in_background(
         self, node: Node[Any], call: Callable[[Tick], Any], name: str
     ) -> Callable[[Tick], None]:
-        """Return a function that hands ticks to a coroutine, and skips those it is too busy for."""
+        """Return a function to hand ticks to a coroutine; ticks are skipped while busy."""
         ticks: Stream[Tick] = Stream(name, bound=1, overflow="drop_oldest")
 
         async def serve() -> None:
@@ -243,7 +243,7 @@ class NodeHost:
 
 
 def siblings(config: Config, here: Container[str]) -> tuple[Sibling, ...]:
-    """Return all nodes of a file, as nodes get to know each other; `here` are those that run."""
+    """Return all nodes of a file as siblings; `here` holds the nodes of this process."""
     return tuple(
         Sibling(spec.name, spec.node, spec.config, spec.inputs, spec.name in here)
         for spec in config.nodes

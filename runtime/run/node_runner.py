@@ -1,4 +1,4 @@
-"""One node while it runs: its tasks and limits, its errors, and the phases up to the first update.
+"""A running node: its tasks, limits and errors, and the phases up to the first update.
 
 A node may raise whatever it likes, `SystemExit` and the like included, and swallow its
 cancellation: each of its steps is a task, waited for within a limit and then left behind. The
@@ -41,13 +41,13 @@ from runtime.workers.worker import Worker
 log = logging.getLogger("visnav.runtime")
 
 GRACE = 0.5
-"""Real seconds that a step which is over its limit, or not wanted any more, has to give up."""
+"""Real seconds for a step to end after its cancellation, such as over its limit."""
 
 Create = Callable[[Coroutine[Any, Any, Any], str], asyncio.Task[Any]]
 
 
 class NodeRunner:
-    """What belongs to one node while it runs.
+    """State of a node in a run: its tasks, tickers, workers, holds, links and phase.
 
     Args:
         create: Makes a task that the run owns.
@@ -68,7 +68,7 @@ class NodeRunner:
         self.starts = 0
         self.failures = 0
         self.running_since = 0
-        """When it last began to run, on the run's clock (ns)."""
+        """Start of the node's ticks and `run`, on the run's clock (ns)."""
         self.restarting = False
         self.shutting_down = False
         self.shutdown_lock = asyncio.Lock()
@@ -77,20 +77,20 @@ class NodeRunner:
         self._create = create
         self._succeeded = False
         self.first_error = False
-        """Whether what fails in a step of the end is the run's error, which is printed then."""
+        """Whether an error in a step of the end is the run's error, to be printed then."""
 
     def awaited(self) -> list[asyncio.Task[Any]]:
-        """Return the tasks that the run waits for in this phase."""
+        """Return the tasks awaited by the run in this phase."""
         return [self.phase_task] if self.phase_task is not None else list(self.tasks)
 
     async def start_up(self, host: Host, limit: float) -> None:
-        """Make the node and the links before its ports, and start it up.
+        """Make the node and the links before its ports, and run `on_startup`.
 
         Args:
-            limit: Real seconds that `on_startup` may take.
+            limit: Real seconds for `on_startup`.
 
         Raises:
-            NodeError: Something went wrong in it.
+            NodeError: The node failed.
         """
         spec = self.spec
         self.shutting_down = False
@@ -112,10 +112,10 @@ class NodeRunner:
             self.starts += self._succeeded
 
     def announcements(self) -> list[Announcement]:
-        """Return what the node announces.
+        """Return the node's announcements.
 
         Raises:
-            NodeError: Something went wrong in it, or it returns something else.
+            NodeError: The node failed, or returned something else.
         """
         assert self.node is not None
         name = self.spec.name
@@ -135,10 +135,10 @@ class NodeRunner:
             raise wrap(name, error) from error
 
     def receive_announcements(self, announcements: Iterable[Announcement]) -> None:
-        """Hand the node all announcements, then ask what it lacks.
+        """Hand the node all announcements, then call its `check`.
 
         Raises:
-            NodeError: Something went wrong in it; a `RefusedError` if it cannot work with one, or
+            NodeError: The node failed; a `RefusedError` if it cannot work with an announcement, or
                 lacks something.
         """
         assert self.node is not None
@@ -159,19 +159,19 @@ class NodeRunner:
             raise RefusedError(name, "; ".join(lacks))
 
     async def get_ready(self, limit: float) -> None:
-        """Let the node get ready with what was announced.
+        """Run the node's `on_ready`, after all announcements.
 
         Args:
-            limit: Real seconds that `on_ready` may take.
+            limit: Real seconds for `on_ready`.
 
         Raises:
-            NodeError: Something went wrong in it.
+            NodeError: The node failed.
         """
         assert self.node is not None
         await self._within(limit, "on_ready", self.node.on_ready())
 
     async def end(self, limit: float) -> list[NodeError]:
-        """Let the node say its last words, within so many real seconds; return what went wrong."""
+        """Run the node's `on_end` within a limit (real seconds), and return its errors."""
         node = self.node
         if node is None or not self.started or type(node).on_end is Node.on_end:
             return []
@@ -213,7 +213,7 @@ class NodeRunner:
     async def _last_step(
         self, limit: float, what: str, coro: Coroutine[Any, Any, Any]
     ) -> list[NodeError]:
-        """Run a step of the end, which goes on whatever happens in it; return what went wrong."""
+        """Run a step of the end; log and return its errors instead of raising them."""
         try:
             await self._within(limit, what, coro)
         except BaseException as error:
@@ -226,7 +226,7 @@ class NodeRunner:
         return []
 
     async def _within(self, limit: float, what: str, coro: Coroutine[Any, Any, Any]) -> None:
-        """Run a step of the node as a task of its own, which is left behind if it does not end.
+        """Run a step of the node as a separate task; left behind after the limit.
 
         Raises:
             NodeTimeoutError: It did not end within the limit.
@@ -252,7 +252,7 @@ class NodeRunner:
             raise wrap(self.spec.name, error) from error
 
     async def _end_tasks(self, limit: float) -> list[NodeError]:
-        """Cancel the node's tasks, and those that these start meanwhile, and wait for them."""
+        """Cancel the node's tasks, and any started meanwhile, and await their end."""
         wrong: list[NodeError] = []
         until = time.monotonic() + limit
         while self.tasks:
@@ -267,7 +267,7 @@ class NodeRunner:
     async def _end_by(
         self, seconds: float, what: str, tasks: list[asyncio.Task[Any]], limit: float = 0.0
     ) -> list[NodeError]:
-        """Wait for tasks, leave behind those that do not end, and return what there is to say."""
+        """Wait for tasks, leave late ones behind, and return an error for the first."""
         self.phase = what if tasks else ""
         late = await ended(tasks, max(seconds, 0.0))
         self.phase = ""
@@ -290,10 +290,9 @@ class NodeRunner:
 
 
 def log_error(error: NodeError, *, last: bool) -> None:
-    """Log a node's error, with the traceback of what is not an error of ours.
+    """Log a node's error; with its traceback unless the cause is a `VisnavError`.
 
-    If it is the last thing that happens, the command line prints it, and the terminal need not
-    have it twice.
+    With `last`, the command line prints the error, and the terminal need not show it twice.
     """
     cause = error.__cause__
     ours = isinstance(code_location.leaf(error if cause is None else cause), VisnavError)
@@ -301,13 +300,13 @@ def log_error(error: NodeError, *, last: bool) -> None:
 
 
 def with_place(error: Exception) -> str:
-    """Return an error's message, and the line that raised it if that is known."""
+    """Return an error's message, with the raising line if known."""
     place = getattr(error, "place", "")
     return f"{error} ({code_location.short(place)})" if place else str(error)
 
 
 def wrap(name: str, error: BaseException) -> NodeError:
-    """Return a node's exception as an error that names the node; such an error as it is."""
+    """Return a node's exception as a `NodeError` naming the node; a `NodeError` as is."""
     if isinstance(error, NodeError):
         return error
     found = code_location.leaf(error)
@@ -322,7 +321,7 @@ def wrap(name: str, error: BaseException) -> NodeError:
 
 
 def _described(error: BaseException) -> str:
-    """Return type and message of an exception in one line; of a group, those of its parts."""
+    """Return an exception's type and message as a line; of a group, those of its parts."""
     if isinstance(error, BaseExceptionGroup):
         parts = [_described(code_location.leaf(part)) for part in error.exceptions]
         return f"{len(parts)} errors: " + "; ".join(parts)
@@ -336,7 +335,7 @@ def _described(error: BaseException) -> str:
 
 
 async def _outcome(coro: Coroutine[Any, Any, Any]) -> BaseException | None:
-    """Await a step of a node, and return what it raises: a loop would not survive all of that."""
+    """Await a step of a node, and return its exception: some would end the loop."""
     try:
         await coro
     except BaseException as error:
@@ -352,7 +351,7 @@ def _is_cancelled() -> bool:
 Phase = Literal["on_startup", "announce", "check", "on_ready"]
 
 Announced = dict[str, list[Announcement]]
-"""What nodes announced, by the node's name."""
+"""Announcements of each node, by name."""
 
 Step = Callable[[NodeRunner], Awaitable[None]]
 

@@ -1,4 +1,4 @@
-"""A run's folder: its owner, and files in it that are written as a whole or not at all.
+"""A run's folder: its owner, and files written as a whole or not at all.
 
 A folder that the runtime has made has a marker in it, and only such a folder is ever moved or
 removed. The marker says which process uses it, when its first update was, and in the end which
@@ -43,7 +43,7 @@ _SUMMARY_OF_OURS = {"clock", "seed", "reason", "digest", "sim_seconds", "announc
 
 
 class Folder:
-    """The folder of one run, which no other run may use meanwhile.
+    """The folder of a run, locked against other runs.
 
     An earlier run that is in it is put aside. With the first update it becomes ``NAME.1``, in the
     place of what was kept there before; if there is none, it comes back, and the start that failed
@@ -108,7 +108,7 @@ class Folder:
             self._flown = True
 
     def _take(self) -> None:
-        """Put aside what is there, and write into the marker who is here now."""
+        """Move an earlier run aside, and write this process into the marker."""
         if self._aside.exists():  # a start was killed
             self._give_back()
         for place in (self._kept, self._failed):
@@ -122,7 +122,7 @@ class Folder:
         os.write(self._marker, f"process: {os.getpid()}\n".encode())
 
     def _give_back(self) -> None:
-        """Put the earlier run where it was, and what is there now to ``NAME.failed``."""
+        """Restore the earlier run; the present content goes to ``NAME.failed``."""
         if self._out.exists():
             _move(self._out, self._failed)
         self._aside.rename(self._out)
@@ -138,11 +138,11 @@ class Folder:
 
 
 def clear(out: Path) -> None:
-    """Make an empty folder for a run that is to be given it, in the place of an earlier one.
+    """Make an empty folder for a run to come, in place of an earlier run's.
 
     Raises:
-        ResultsError: A run uses it, or no run has made it.
-        OSError: It cannot be made.
+        ResultsError: A run uses the folder, or no run has made it.
+        OSError: The folder cannot be made.
     """
     os.close(_mark(out))
     shutil.rmtree(out)
@@ -150,7 +150,7 @@ def clear(out: Path) -> None:
 
 
 def claim(out: Path) -> None:
-    """Make a folder, if it is missing, and mark it as a run's.
+    """Make a folder, if missing, and mark the folder as a run's.
 
     Raises:
         ResultsError: There is something in it, and no run has made it.
@@ -164,7 +164,7 @@ def claim(out: Path) -> None:
 
 
 def _check(out: Path) -> None:
-    """Refuse a folder with something in it if no run has made it."""
+    """Raise `ResultsError` for a non-empty folder not made by a run."""
     if not out.exists() or (out / MARKER).is_file() or _has_summary_of_ours(out):
         return
     found = next(iter(sorted(each.name for each in out.iterdir())), None)
@@ -203,9 +203,9 @@ def _read(marker: int) -> str:
 
 
 def _move(source: Path, place: Path) -> None:
-    """Move a run's folder into the place of another, which is removed if all in it is a run's.
+    """Move a run's folder to `place`, and remove a folder of only a run's files there.
 
-    Else it is kept, by the first free number from 2 on.
+    Else that one is kept, by the first free number from 2 on.
     """
     _check(place)
     if place.exists():
@@ -223,14 +223,14 @@ def _move(source: Path, place: Path) -> None:
 
 
 def _files(folder: Path) -> set[str]:
-    """Return what is in a folder that a run has made, by its path in there, but for the marker."""
+    """Return the files in a run's folder, as relative paths, without the marker."""
     found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     return {str(path.relative_to(folder)) for path in found} - {MARKER}
 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Let others that move runs in a folder wait."""
+    """Hold the lock of a folder while its runs are moved."""
     number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         with contextlib.suppress(OSError):  # a file system without locks
@@ -255,7 +255,7 @@ def write(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give the place of a new file, which then takes the place of `path`.
+    """Yield a path for a new file, then move the new file to `path`.
 
     Only a file is ever replaced. A link stays, and so does a device, which is written to itself.
 
@@ -291,10 +291,10 @@ def write_config(out: Path, config: Config) -> None:
 
 
 def write_summary(out: Path, summary: Summary) -> None:
-    """Write a run's ``summary.json``, and make the folder anew if somebody has removed it.
+    """Write a run's ``summary.json``; a folder removed meanwhile is made anew.
 
     Raises:
-        ResultsError: It cannot be written.
+        ResultsError: The file cannot be written.
     """
     encoded = msgspec.json.format(msgspec.json.encode(summary, enc_hook=_plain), indent=2)
     with _readable(out):
@@ -304,7 +304,7 @@ def write_summary(out: Path, summary: Summary) -> None:
 
 
 def _has_summary_of_ours(out: Path) -> bool:
-    """Tell whether a folder has a summary that only a run can have written."""
+    """Tell whether a folder has a ``summary.json`` written by a run."""
     try:
         found = msgspec.json.decode((out / "summary.json").read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -324,7 +324,7 @@ def _readable(out: Path) -> Iterator[None]:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON knows for a value that a node handed over, lest one lose all others."""
+    """Return a node's value as plain data for JSON; its `repr` rather than an error."""
     for convert in ("item", "tolist"):
         if hasattr(value, convert):
             with contextlib.suppress(Exception):
@@ -334,7 +334,7 @@ def _plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def private_results(out: Path) -> Iterator[Path]:
-    """Make a folder for what nodes write, and put it into the run's own in the end.
+    """Yield a private folder for nodes' files, moved into the run's folder at the end.
 
     Raises:
         ResultsError: It cannot be made.
@@ -372,7 +372,7 @@ def _home() -> Path:
 
 @contextlib.contextmanager
 def _private_results_locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder, which a process loses when it ends in any way.
+    """Hold the lock of a folder; any end of the process releases the lock.
 
     Raises:
         OSError: Another process has it, or it is no folder.
@@ -386,14 +386,14 @@ def _private_results_locked(folder: Path) -> Iterator[None]:
 
 
 def _is_left(folder: Path) -> bool:
-    """Tell whether the run whose folder it is has ended without moving it."""
+    """Tell whether a private folder was left behind by a run already ended."""
     with contextlib.suppress(OSError), _private_results_locked(folder):
         return True
     return False
 
 
 def _private_results_move(source: Path, target: Path) -> None:
-    """Move what is in a folder into another one, in the place of files of the same names."""
+    """Move a folder's content into another folder, replacing files of the same names."""
     target.mkdir(parents=True, exist_ok=True)
     for each in source.iterdir():
         there = target / each.name

@@ -1,4 +1,4 @@
-"""State of a run while it goes on, and changes of its nodes' settings.
+"""State of a run in progress, and changes of its nodes' settings.
 
 The supervisor writes the state, observers read it. Which settings may change is decided in
 `runtime.config.parameters`.
@@ -31,13 +31,15 @@ from runtime.time.schedule import SECOND, Ticker
 from runtime.workers.costs import Costs
 
 SHUTDOWN_SHARE = 0.05
-"""Share of a run's length, on the longer of the clock and real time, by which `shutdown_limit`
-grows: what a node has to finish grows with it."""
+"""Share of a run's length in `shutdown_limit`: longer runs have more to finish.
+
+The length is the longer of the clock's and real time.
+"""
 
 
 @dataclass
 class RunState:
-    """One run in this process.
+    """State of a run in this process.
 
     Attributes:
         config: What runs.
@@ -93,7 +95,7 @@ class RunState:
     after_run: list[Callable[[Path], Any]] = field(default_factory=list)
 
     def note_error(self, error: Exception) -> None:
-        """Note that something went wrong; the first error counts."""
+        """Record an error; the first becomes the error of the run."""
         self.error = self.error or error
 
     def shutdown_limit(self) -> float:
@@ -119,7 +121,7 @@ class ParameterServer:
         self._sender = Sender("run.parameters", ParameterChanged)
 
     def connect(self, listeners: Iterable[Listener], taps: Iterable[Tap], fault: Fault) -> None:
-        """Connect the listeners to changes: all that can, those of the changed node too."""
+        """Connect all capable listeners to changes, also those of the changed node."""
         self._sender.connect(listeners, taps, fault)
 
     def set(self, text: str) -> dict[str, str]:

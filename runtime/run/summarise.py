@@ -33,7 +33,7 @@ from runtime.time.schedule import SECOND
 
 
 def environment() -> dict[str, str]:
-    """Return what a figure depends on: machine, Python and the libraries' versions."""
+    """Return the environment of a run's figures: machine, Python and library versions."""
     libraries = [
         "visnav-runtime",
         "numpy",
@@ -59,11 +59,11 @@ def environment() -> dict[str, str]:
 
 
 _SECRET = re.compile(r"(secret\s*=\s*)(?!\W*(?:file|env):).*", re.DOTALL)
-"""A secret in a setting of the command line, unless it only says where the secret is."""
+"""A secret in a command-line setting, unless given by ``file`` or ``env``."""
 
 
 def command_line() -> str:
-    """Return the command that started this process, without Python's folder and secrets."""
+    """Return the command line of this process, without Python's folder and secrets."""
     program, *arguments = sys.orig_argv
     shown = [_SECRET.sub(r"\1…", each) for each in arguments]
     return shlex.join([Path(program).name, *shown])
@@ -86,7 +86,7 @@ def commit(folder: Path | None = None) -> str:
 
 
 def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
-    """Count what was sent so far, by type of event and by output."""
+    """Count the events sent so far, by type and by output."""
     by_type: Counter[str] = Counter()
     by_output: Counter[str] = Counter()
     for node in state.all_nodes:
@@ -98,7 +98,7 @@ def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
 
 
 def count_drops(state: RunState) -> dict[str, StreamSummary]:
-    """Return how full each input got and what it dropped."""
+    """Return each input's bound, peak and drops."""
     found: dict[str, StreamSummary] = {}
     for node in state.all_nodes:
         missed = {port: matcher.missed for port, matcher in matchers(node).items()}
@@ -136,7 +136,7 @@ def summarise(
     stalls: Counter[str],
     longest_stalls: dict[str, Stall],
 ) -> Summary:
-    """Put together what is known at the end of a run."""
+    """Return the summary of a run at its end."""
     by_type, by_output = count_events(state)
     by_input = count_drops(state)
     ended = state.stopped or time.monotonic()
@@ -188,7 +188,7 @@ def _not_deterministic(state: RunState) -> list[str]:
 
 
 def _losses(outside: dict[str, Answers]) -> dict[str, dict[str, Any]]:
-    """Return a verdict on each system that has lost more frames than it may."""
+    """Return a failed verdict for each outside system with too many lost frames."""
     return {
         f"{name} (answers)": {
             "passed": False,

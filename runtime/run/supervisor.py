@@ -50,7 +50,7 @@ LONGEST_BACKOFF = 30.0
 """Seconds of the clock before a restart at most."""
 
 HEALTHY = 60.0
-"""Seconds of the clock after which a node that has not failed counts as one that never did."""
+"""Seconds of the clock without failure until a node's failures are forgotten."""
 
 
 class Supervisor:
@@ -116,7 +116,7 @@ class Supervisor:
         self._restarts: dict[asyncio.Task[Any], None] = {}
 
     async def main(self) -> None:
-        """Run until something ends the run; the state's `reason` and `error` then say what did."""
+        """Run to the end of the run; its cause is in the state's `reason` and `error`."""
         self._startup = self._own(self._start_all(), "start")
         try:
             await self._ended.wait()
@@ -180,21 +180,21 @@ class Supervisor:
             self._startup.cancel()
 
     def _is_planned(self, by: str) -> bool:
-        """Tell whether the run's plan is over if `by` ends it without an error."""
+        """Tell whether an end by `by`, without an error, completes the run's plan."""
         if by != "user":
             return not by or self._ends_run(by) == "plan"
         config = self.state.config  # no simulator alone has a plan
         return not config.run.duration and all(n.node.ends_run != "plan" for n in config.nodes)
 
     def _ends_run(self, name: str) -> str:
-        """Return what is over if a node ends the run; see `Node.ends_run`."""
+        """Return the purpose fulfilled if a node ends the run; see `Node.ends_run`."""
         nodes = {spec.name: spec.node for spec in self.state.config.nodes}
         if name not in nodes:
             return ""
         return nodes[name].ends_run or ("plan" if nodes[name].flies else "")
 
     def escaped(self, error: BaseException) -> None:
-        """Deal with an exception that came out of the loop: some task or callback let it."""
+        """Handle an exception raised out of the loop by a task or callback."""
         name, place = code_location.of_error(error)
         if name in self.state.runners:
             self.fault(name, error)
@@ -224,10 +224,10 @@ class Supervisor:
             self.restart(name)
 
     def restart(self, name: str, *, anyway: bool = False) -> None:
-        """Take a node out, and bring up a new one in its place if its `on_error` wants that.
+        """Shut a node down, and start a new instance if its `on_error` says so.
 
         Args:
-            anyway: Bring one up whatever that says: it was requested.
+            anyway: Start a new instance whatever `on_error` says, on request.
         """
         runner = self.state.runners[name]
         runner.restarting = True
@@ -406,7 +406,7 @@ class Supervisor:
         await self._wait_to_end("")
 
     async def _wait_to_end(self, name: str) -> None:
-        """Let the nodes after this one end first, in whichever process they are."""
+        """Wait until the nodes after this node have ended, in any process."""
         try:
             await self.others.wait_to_end(name)
         except VisnavError as error:
@@ -414,7 +414,7 @@ class Supervisor:
             self.state.note_error(error)
 
     async def _shut_down(self, runner: NodeRunner) -> None:
-        """End one node, unless that is done: it receives nothing afterwards."""
+        """Shut a node down, once; afterwards the node receives nothing."""
         async with runner.shutdown_lock:
             runner.first_error = self.state.error is None
             for error in await runner.shut_down(self.state.shutdown_limit()):

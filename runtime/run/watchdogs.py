@@ -1,4 +1,4 @@
-"""Watchdogs: threads that notice a loop that does not turn, and a run in which nothing goes on.
+"""Watchdogs: threads to detect a loop without turns, and a run without progress.
 
 A watchdog looks a few times per limit. `LoopWatchdog`, where it finds the loop busy, asks it to
 sign a note; a note that stays unsigned for the limit is a stall, reported with the node and the
@@ -39,15 +39,17 @@ _LONGEST_PAUSE = 0.05
 """Seconds between two looks at most; a run's end waits for the last of them."""
 
 _WAITING = {selectors.__file__, lockstep.__file__}
-"""Modules in which a loop that has nothing to do waits…"""
+"""Modules with the wait of an idle loop, if called from `_LOOPS`."""
 
 _LOOPS = {asyncio.base_events.__file__, asyncio.runners.__file__}
-"""…when called from these. (uvloop, being compiled, shows nothing but `Runner.run`.) A node that
-waits for a lock or a child's output is not idle: it blocks the loop."""
+"""Callers of an idle loop's wait; compiled uvloop shows nothing but `Runner.run`.
+
+A node that waits for a lock or a child's output is not idle: it blocks the loop.
+"""
 
 
 class LoopWatchdog:
-    """Watches the loop of the thread that makes it.
+    """Watchdog for the loop of the constructing thread.
 
     Args:
         limit: Real seconds without a turn that are a stall; 0 watches nothing.
@@ -122,19 +124,19 @@ log = logging.getLogger("visnav.runtime")
 
 _LONGEST_LOOK = 0.25
 _LOOK = 0.01
-"""Real seconds between two looks at what a busy loop does."""
+"""Real seconds between two looks at a busy loop."""
 
 _MOST_NAMED = 3
 
 _PATIENCE = 3.0
-"""Real seconds after Ctrl-C in which a node that blocks the loop in the start-up may go on."""
+"""Real seconds after Ctrl-C until a start-up blocking the loop is interrupted."""
 
 
 class ProgressWatchdog:
-    """Watches a run of the thread that makes it; a context as long as the run.
+    """Watchdog for a run of the constructing thread; a context manager around the run.
 
     Args:
-        limit: Real seconds without progress after which this is reported; 0 for never.
+        limit: Real seconds without progress until a report; 0 for never.
     """
 
     def __init__(self, state: RunState, loop: asyncio.AbstractEventLoop, limit: float) -> None:
@@ -200,14 +202,14 @@ class ProgressWatchdog:
         return bool(run.stop_requested) and run.stopped is None and run.first_update is None
 
     def _mark(self) -> tuple[Any, ...]:
-        """Return what is the same for as long as nothing goes on; in any thread."""
+        """Return a mark of the run's progress, constant without any; in any thread."""
         run = self._state
         now = self._loop.now if isinstance(self._loop, LockstepLoop) else 0
         phases = tuple((runner.starts, runner.phase) for runner in list(run.runners.values()))
         return now, run.first_update, run.stopped, run.stop_requested, phases
 
     def _ask(self, until: float, seen: Counter[tuple[str, str]]) -> str | None:
-        """Let the loop explain, and note where it is meanwhile; `None` if it does not answer."""
+        """Ask the loop to explain, and sample its line; `None` without an answer."""
         answers: list[tuple[str, list[tuple[str, str]]]] = []
         asked = known = 0
 
@@ -239,7 +241,7 @@ class ProgressWatchdog:
         return answers[-1][0] if known else None
 
     def _explain(self) -> str:
-        """Return who is waited for; ``""`` if all is well, ``"busy"`` if nobody is; on the loop."""
+        """Return the awaited nodes; ``""``: all is well, ``"busy"``: none; on the loop."""
         run, loop = self._state, self._loop
         waiting = [runner for runner in run.runners.values() if runner.phase]
         if waiting:
@@ -267,7 +269,7 @@ class ProgressWatchdog:
         return f"for {seconds:.1f} s the run has waited for {answer}"
 
     def _blocking_limit(self) -> float:
-        """Return how long a node may block the loop: as long as the step may take that it is in."""
+        """Return the limit (real s) for a node to block the loop in its present step."""
         run = self._state
         if run.stopped is not None or run.stop_requested:
             return run.shutdown_limit()
@@ -288,7 +290,7 @@ class ProgressWatchdog:
 
 
 def _explain_time(loop: LockstepLoop, run: RunState) -> str:
-    """Describe what simulated time waits for."""
+    """Explain a wait of simulated time, in the words of `_explain`."""
     if isinstance(loop.gate, Stepping):
         if loop.gate.state == "paused":
             return ""
@@ -314,6 +316,6 @@ def _all(run: RunState) -> str:
 
 
 def _at(tasks: Any) -> str:
-    """Return at which line the first of some tasks waits that has not ended."""
+    """Return the waiting line of the first unfinished task, as a text to append."""
     waiting = [task for task in tasks if not task.done()]
     return f", at {code_location.short(code_location.of_task(waiting[0])[1])}" if waiting else ""

@@ -1,4 +1,4 @@
-"""The run's clock, which is all that a node knows of time.
+"""The run's clock: all a node knows of time.
 
 Two implementations: `runtime.time.lockstep` (simulated time that jumps) and `RealClock`, whose
 ticks come from a Linux timerfd, because uvloop's own timers have a grain of 1 ms.
@@ -35,11 +35,11 @@ class Clock(ABC):
 
     @abstractmethod
     def now(self) -> int:
-        """Return nanoseconds since the first update; 0 before it."""
+        """Return nanoseconds since the first update; 0 before."""
 
     @abstractmethod
     async def beside(self, work: concurrent.futures.Future[R], latency: int = 0) -> R:
-        """Await work done elsewhere, which takes `latency` nanoseconds of this clock.
+        """Await work done elsewhere, taking `latency` nanoseconds of this clock.
 
         Its result is available at the time of the call plus `latency`. In lockstep exactly then:
         time runs on up to there and waits for slower work. In real time not before then.
@@ -50,7 +50,7 @@ class Clock(ABC):
         await self.sleep_until(self.now() + round(seconds * SECOND))
 
     async def sleep_until(self, stamp: int) -> None:
-        """Wait until a time (ns) of this clock; return at once if it has passed."""
+        """Wait until a time (ns) of this clock; return at once if already past."""
         if stamp <= self.now():
             await asyncio.sleep(0)
             return
@@ -66,13 +66,13 @@ class Clock(ABC):
         """Let time run, from 0: the first update is now."""
 
     def hurry(self) -> None:  # noqa: B027  # real time has no order to keep
-        """End soon: nothing that is due waits for slower work any more, as it would in order.
+        """End soon: nothing due waits for slower work any more, as order would require.
 
         For a run that ends by an error or by a signal: neither comes at a promised time.
         """
 
     def close(self) -> None:  # noqa: B027  # most clocks hold nothing
-        """Give back what the clock holds."""
+        """Release the clock's resources."""
 
 
 class Alarm(Protocol):
@@ -106,7 +106,7 @@ class RealClock(Clock):
         self.schedule.on_sooner = self._set_alarm
 
     def now(self) -> int:
-        """Return nanoseconds since the first update; 0 before it. In any thread."""
+        """Return nanoseconds since the first update; 0 before. In any thread."""
         return 0 if self._pace is None else self._pace.at(time.monotonic_ns())
 
     def start(self) -> None:
@@ -136,7 +136,7 @@ class RealClock(Clock):
         return result
 
     async def sleep_until(self, stamp: int) -> None:
-        """Wait until a time (ns) of this clock; before the first update, that long in real time."""
+        """Wait until a time (ns) of this clock; in real time before the first update."""
         if self._pace is None:
             await asyncio.sleep(stamp / self.speed / SECOND)
         else:
@@ -162,7 +162,7 @@ class RealClock(Clock):
 
 
 class _Pace:
-    """How time of the run goes with that of `time.monotonic_ns`: linearly, from a point on."""
+    """Linear map from `time.monotonic_ns` to the run's time, from a point on."""
 
     __slots__ = ("_rate", "_since", "_then")
 

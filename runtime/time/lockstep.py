@@ -1,4 +1,4 @@
-"""Simulated time: an asyncio loop that jumps to the next thing due when nothing is ready.
+"""Simulated time: an asyncio loop with jumps to the next due time when nothing is ready.
 
 A selector loop calls `select(timeout)` with a timeout above zero only when nothing is ready to
 run. Then, instead of sleeping, this loop moves its clock: to the next timer of asyncio's (so plain
@@ -35,7 +35,7 @@ from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND, Once, Schedule
 
 LIMIT = 20.0
-"""Real seconds after which a test that has not ended has failed; busy machines take their time."""
+"""Real seconds until an unfinished test has failed; busy machines take their time."""
 
 PYTHON = f"{platform.python_implementation()} {platform.python_version()}"
 
@@ -44,7 +44,7 @@ def passes(
     make_loop: Callable[[], asyncio.AbstractEventLoop],
     test: Callable[[asyncio.AbstractEventLoop], Coroutine[Any, Any, bool]],
 ) -> bool:
-    """Return whether a test succeeds on a loop of its own, with nothing reported to that.
+    """Return whether a test succeeds on a new loop, with no exceptions reported.
 
     It runs in a thread, because another loop may run in this one, and costs 3 ms.
     """
@@ -72,7 +72,7 @@ R = TypeVar("R")
 _Work = concurrent.futures.Future[Any]
 _Ready = list[tuple[selectors.SelectorKey, int]]
 _Held = tuple[int, int, _Work, asyncio.Future[Any]]
-"""Work done elsewhere: when it is due (ns), its order, its outcome, and who awaits that."""
+"""Work done elsewhere: due time (ns), order, outcome, and the awaiting future."""
 
 _NEVER = 1 << 62
 _POLL_EVERY = 64
@@ -80,7 +80,7 @@ _POLL_EVERY = 64
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Asks the loop what to do instead of sleeping."""
+    """Selector to advance simulated time instead of sleeping."""
 
     advance: Callable[[float | None], _Ready]
 
@@ -96,11 +96,11 @@ class Gate(Protocol):
     """Decides when time may go on: other processes may have to, first."""
 
     def may_go(self, key: tuple[int, int, int]) -> bool:
-        """Tell whether to go on to what is due next: at a time (ns), of a kind, with an order."""
+        """Tell whether to go on to the next due entry: its time (ns), kind and order."""
 
 
 class _Timer(asyncio.TimerHandle):
-    """A timer that comes after those set before it for the same time; a bare heap mixes them."""
+    """Timer sorted by order of setting among equal times; a bare heap mixes them."""
 
     __slots__ = ("order",)
 
@@ -123,7 +123,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         self.now = 0
         self.gate: Gate | None = None
         self.hurried = False
-        """Whether work that is due is taken as it is done, out of its order: see `Clock.hurry`."""
+        """Whether due work is taken once done, out of its order: see `Clock.hurry`."""
         self._held: list[_Held] = []
         self._orders = itertools.count()
         self._jumps = 0
@@ -147,7 +147,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         *args: Any,
         context: contextvars.Context | None = None,
     ) -> asyncio.TimerHandle:
-        """Call a function at a simulated time, after what was set for that time before."""
+        """Call a function at a simulated time, after those set before for this time."""
         self._check_closed()  # type: ignore[attr-defined]
         timer = _Timer(when, callback, args, self, context)
         timer.order = next(self._orders)
@@ -156,7 +156,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         return timer
 
     def hold(self, work: _Work, due: int) -> asyncio.Future[Any]:
-        """Return a future that gets the outcome of `work` at simulated time `due`, exactly."""
+        """Return a future set to the outcome of `work` exactly at simulated time `due`."""
         future = self.create_future()
         heapq.heappush(self._held, (due, next(self._orders), work, future))
         work.add_done_callback(lambda _: self._wake_up())
@@ -165,7 +165,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
     def run_in_executor(  # type: ignore[override]
         self, executor: concurrent.futures.Executor | None, func: Callable[..., R], *args: Any
     ) -> asyncio.Future[R]:
-        """Run a function beside the loop; simulated time waits for it."""
+        """Run a function beside the loop; simulated time waits for its end."""
         executor = executor or self._default_executor  # type: ignore[attr-defined]
         return self.hold(executor.submit(func, *args), self.now)
 
@@ -174,7 +174,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         self._default_executor.shutdown(wait=False, cancel_futures=True)  # type: ignore[attr-defined]
 
     def orders(self) -> tuple[int, int]:
-        """Return the numbers that the next things due will have: the schedule's, and all others'.
+        """Return the order numbers of the next entries: the schedule's and all others'.
 
         Of things due at one time, those with lower numbers come first.
         """
@@ -189,9 +189,9 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         self._orders = itertools.count(orders[1])
 
     def waits_for(self) -> asyncio.Future[Any] | Literal["pace", "nothing"] | None:
-        """Return what time waits for: offloaded work, its pace, or nothing that is due ever.
+        """Return the cause of waiting time: offloaded work, pace, or nothing ever due.
 
-        `None` if it waits for nothing, and what is ready runs; called on the loop.
+        `None` if time does not wait, and ready callbacks run; called on the loop.
         """
         entry = self.schedule.next_due()
         held = self._held[0][0] if self._held else _NEVER
@@ -260,7 +260,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         return wait(0) if self._jumps % _POLL_EVERY == 0 or timeout == 0 else []
 
     def _take_over(self, due: int) -> bool:
-        """Put work that is over before what else is due; tell if there is any."""
+        """Move finished work ahead of other due work; tell if there is any."""
         over = [work for work in self._held if work[0] <= due and _is_over(work)]
         if over:
             self._held.remove(first := min(over))
@@ -269,7 +269,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         return bool(over)
 
     def _key(self, due: int, timer: int, held: int) -> tuple[int, int, int]:
-        """Return the place of what is due next among what is due in all processes."""
+        """Return the place of the next due entry in all processes: time, kind, order."""
         if due == _NEVER:
             return (_NEVER, 3, 0)
         if timer <= due:
@@ -289,10 +289,10 @@ class LockstepLoop(asyncio.SelectorEventLoop):
 
 @functools.cache
 def check_interpreter() -> None:
-    """Check that simulated time goes on this interpreter as it does on others.
+    """Check by a self-test whether time can be simulated on this interpreter.
 
     Raises:
-        UnsupportedInterpreterError: It does not, and there is no other way to simulate it.
+        UnsupportedInterpreterError: The test failed.
     """
     if not passes(LockstepLoop, _exercise):
         raise UnsupportedInterpreterError(
@@ -335,7 +335,7 @@ class LockstepClock(Clock):
         return self._loop.now
 
     def hurry(self) -> None:
-        """Take work that is due as it is done, from here on."""
+        """Take due work once done, out of its order, from here on."""
         self._loop.hurried = True
 
     async def beside(self, work: concurrent.futures.Future[R], latency: int = 0) -> R:
@@ -361,4 +361,4 @@ def _settle(future: asyncio.Future[Any], work: _Work) -> None:
 
 
 def _nothing() -> None:
-    """Be what wakes the loop."""
+    """Do nothing: only called to wake the loop."""

@@ -28,7 +28,7 @@ class DurationHistogram:
         self.maximum = 0
 
     def add(self, duration: int) -> None:
-        """Count one duration (ns); negative ones count as 0."""
+        """Count a duration (ns); negative values count as 0."""
         if duration <= 0:  # always so in lockstep
             self._none += 1
             return
@@ -42,7 +42,7 @@ class DurationHistogram:
         return self._none + sum(self._counts.values())
 
     def quantile(self, q: float) -> int:
-        """Return the duration (ns) below or at which a share `q` of them lies; 0 if none."""
+        """Return the duration (ns) not exceeded by a share `q` of all; 0 if none."""
         rank = q * self.count()
         seen = self._none
         if seen >= rank:
@@ -64,7 +64,7 @@ SECOND = 1_000_000_000
 
 
 class Tick(msgspec.Struct, frozen=True, gc=False):
-    """One call of an `@every` method.
+    """A call of an `@every` method.
 
     Attributes:
         stamp: Nanoseconds at which it was due. After missed ticks, the last of them.
@@ -92,12 +92,12 @@ class Schedule:
     def __init__(self) -> None:
         self.heap: list[tuple[int, int, Entry]] = []
         self.order = 0
-        """Number of what is added next; of things due at one time, the lowest comes first."""
+        """Number of the next entry added; the lowest comes first among equal times."""
         self.on_sooner: Callable[[int], None] = _ignore
-        """Called when something is added that is due before all else."""
+        """Called when an entry is added with a due time (ns) before all others."""
 
     def add(self, due: int, entry: Entry) -> None:
-        """Run `entry` at `due`, after all that was added for that time before."""
+        """Run `entry` at `due`, after entries added earlier for the same time."""
         order = self.order
         self.order = order + 1
         self._push((due, order, entry))
@@ -107,7 +107,7 @@ class Schedule:
         return self.heap[0][0] if self.heap else None
 
     def run_first(self, now: int) -> None:
-        """Run the entry due first; it keeps its place among its equals when it comes again."""
+        """Run the entry due first; when repeated, its place among equal times stays."""
         heap = self.heap
         item = due, order, entry = heap[0]
         again = None
@@ -124,7 +124,7 @@ class Schedule:
                 heapq.heapreplace(heap, (again, order, entry))
 
     def run_due(self, now: Callable[[], int]) -> None:
-        """Run all that is due by now, in order; what falls due meanwhile is left for later."""
+        """Run all entries due by now, in order; those due meanwhile are left for later."""
         limit = now()
         while self.heap and self.heap[0][0] <= limit:
             self.run_first(now())
@@ -144,7 +144,7 @@ class Once:
         self.call: Callable[[], Any] | None = call
 
     def fire(self, due: int, now: int) -> None:  # noqa: ARG002
-        """Call it."""
+        """Call the function, unless cancelled."""
         if self.call is not None:
             self.call()
 
@@ -200,7 +200,7 @@ class Ticker:
         self._index = 0
 
     def wrap_call(self, wrap: Callable[[Callable[[Tick], Any]], Callable[[Tick], Any]]) -> None:
-        """Call from now on what `wrap` returns for the function, in place of what was before."""
+        """Call the function wrapped by `wrap` from now on, without any earlier wrapper."""
         self._call = wrap(self._function)
 
     def begin(self, start: int) -> None:
@@ -219,7 +219,7 @@ class Ticker:
         return self._start + self._index * self._period // self._hz.numerator
 
     def fire(self, due: int, now: int) -> int | None:
-        """Call the function, and return when it is due again."""
+        """Call the function, and return its next due time (ns); `None` if stopped."""
         if self.stopped:
             return None
         late = now - due

@@ -20,7 +20,7 @@ from runtime.time.schedule import SECOND
 
 
 class Stepping:
-    """Controls a run's clock; it is the loop's `runtime.time.lockstep.Gate` while time is paused.
+    """Control of a run's clock; the loop's `runtime.time.lockstep.Gate` while paused.
 
     All of its methods are called on the run's loop.
 
@@ -38,16 +38,18 @@ class Stepping:
         self._over = over
         self._wall = wall
         self._pauses: tuple[float | None, float] = None, 0.0
-        """Since when time stands (`wall`), if it does, and for how long it stood before; read and
-        written at once, as other threads read it."""
+        """Start of the present pause (`wall`), or `None`; seconds of earlier pauses.
+
+        Read and written at once, as other threads read it.
+        """
         self._loop = clock._loop if isinstance(clock, LockstepClock) else None
         self._limit = 0
-        """The time (ns) up to which the loop may go while this is its gate."""
+        """Latest time (ns) of the loop while this is its gate."""
         self._steps: list[tuple[int, asyncio.Future[int]]] = []
-        """When each step that goes on now began (ns), and who waits for it."""
+        """Start (ns) and waiting future of each step in progress."""
 
     def fixed(self) -> str:
-        """Return why time cannot be controlled; empty if it can."""
+        """Return why time cannot be controlled; empty if controllable."""
         if self._loop is None:
             return "the run is in real time, which cannot be stopped: sensors do not wait"
         if self._loop.gate not in {None, self}:
@@ -63,13 +65,13 @@ class Stepping:
 
     @property
     def target_speed(self) -> float | None:
-        """The speed that was asked for; `None`: as fast as it can, or real time."""
+        """Requested speed; `None` for as fast as possible, or for real time."""
         if self._loop is None or not self._loop._pace:
             return None
         return round(1.0 / (self._loop._pace * SECOND), 9)
 
     def may_go(self, key: tuple[int, int, int]) -> bool:
-        """Tell whether the loop may go on to what is due next."""
+        """Tell whether the loop may go on to the next due entry."""
         if self._over():
             self._end_steps()
             return True
@@ -83,7 +85,7 @@ class Stepping:
         return False
 
     def pause(self) -> None:
-        """Let time stand once all that is due by now is done; a step ends.
+        """Pause time once all work due by now is done; ends a step in progress.
 
         Raises:
             CommandError: Time cannot be controlled.
@@ -132,9 +134,9 @@ class Stepping:
         return done
 
     def stands(self) -> asyncio.Future[int]:
-        """Return a future that is done once time stands, if it is to stand, or else at once.
+        """Return a future done once time is paused; at once if no pause is requested.
 
-        After `pause` what else is due now is still done, before time stands.
+        After `pause`, all else due now is still done before time stands.
 
         Raises:
             CommandError: Time cannot be controlled.
@@ -160,7 +162,7 @@ class Stepping:
         loop._wall_origin = None
 
     def real_seconds(self) -> float:
-        """Return real seconds, but for those in which time stood; in any thread."""
+        """Return real seconds without pauses; in any thread."""
         since, before = self._pauses
         return (self._wall() if since is None else since) - before
 

@@ -1,4 +1,4 @@
-"""Limits in real time, which hold on a simulated clock too.
+"""Limits in real time, valid on a simulated clock too.
 
 `asyncio.timeout` on a lockstep loop is simulated: where nothing else is due, it is over at once.
 """
@@ -20,7 +20,7 @@ LOOK_EVERY = 1.0
 
 @contextlib.asynccontextmanager
 async def real_time_limit(seconds: float) -> AsyncIterator[None]:
-    """Cancel the block and raise `TimeoutError` if it takes more than `seconds` of real time."""
+    """Cancel the block and raise `TimeoutError` after `seconds` of real time."""
     loop = asyncio.get_running_loop()
     task = asyncio.current_task()
     assert task is not None
@@ -54,13 +54,13 @@ async def real_time_limit(seconds: float) -> AsyncIterator[None]:
 
 
 class Starvation:
-    """Real seconds in which a process, or one that it has started, waited for a processor.
+    """Real seconds of waiting for a processor, by a process or its descendants.
 
     On a busy machine that is most of the time, and no fault of whoever has a limit. It is 0 where
     the kernel does not tell. It counts from the first look.
 
     Args:
-        process: Its number; this one, if not given.
+        process: Process number; this process, if not given.
     """
 
     def __init__(self, process: int | None = None) -> None:
@@ -70,7 +70,7 @@ class Starvation:
         self._seconds = 0.0
 
     def look(self) -> float:
-        """Return the seconds; between two looks, those of the thread that waited longest."""
+        """Return the seconds; between two looks, those of the longest waiting thread."""
         now, waits, before = time.monotonic(), waits_of(self._process), self._waits
         if before is not None:
             longest = max((wait - before.get(key, 0) for key, wait in waits.items()), default=0)

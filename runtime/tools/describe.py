@@ -26,7 +26,7 @@ TYPE_DOC = "The class of the node: its name if a package lists it, else module:C
 
 
 class PortDescription(msgspec.Struct, frozen=True, kw_only=True):
-    """One port of a node.
+    """A port of a node.
 
     Attributes:
         name: As in ``inputs`` and ``links`` of the file; ``bundle.field`` for a part of a bundle.
@@ -45,7 +45,7 @@ class PortDescription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TickDescription(msgspec.Struct, frozen=True, kw_only=True):
-    """One method that is called at a rate.
+    """A method called at a rate.
 
     Attributes:
         name: Of the method.
@@ -59,7 +59,7 @@ class TickDescription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SettingDescription(msgspec.Struct, frozen=True, kw_only=True):
-    """One setting, as it stands in a TOML file.
+    """A setting of a TOML file.
 
     Attributes:
         name: Its key.
@@ -83,7 +83,7 @@ class SettingDescription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NodeDescription(msgspec.Struct, frozen=True, kw_only=True):
-    """A node, as a user sees it.
+    """A node from the user's point of view.
 
     Attributes:
         type: Its name or ``module:Class``, as in the file.
@@ -139,7 +139,7 @@ def describe(cls: type[Node[Any]], type_name: str = "") -> NodeDescription:
 
 
 def describe_settings(table: type[msgspec.Struct]) -> tuple[SettingDescription, ...]:
-    """Describe the settings of a table of the file, those of tables within it included."""
+    """Describe the settings of a table of the file, including nested tables."""
     docs = attribute_docs(table)
     found = []
     for field in msgspec.structs.fields(table):
@@ -161,12 +161,12 @@ def describe_settings(table: type[msgspec.Struct]) -> tuple[SettingDescription, 
 
 
 def summary(described: type | Callable[..., Any]) -> str:
-    """Return the first paragraph of a docstring, in one line."""
+    """Return the first paragraph of a docstring as a single line."""
     return " ".join((inspect.getdoc(described) or "").split("\n\n")[0].split())
 
 
 def attribute_docs(cls: type) -> dict[str, str]:
-    """Return what the docstrings of a class and its bases say of each attribute, in one line."""
+    """Return the docstring text of each attribute of a class and its bases, as a line."""
     found: dict[str, str] = {}
     for each in reversed(cls.__mro__):
         section = inspect.cleandoc(each.__doc__ or "").partition("Attributes:\n")[2]
@@ -201,7 +201,7 @@ NODE_SETTINGS = (
     ),
     _head("links", "table of table", "A port, handler or bundle to what delays events to it."),
 )
-"""What every ``[[nodes]]`` table may have beside the node's own settings."""
+"""Settings of every ``[[nodes]]`` table, beside the node's own."""
 
 
 def _inputs(cls: type[Node[Any]], docs: dict[str, str]) -> Iterator[PortDescription]:
@@ -236,7 +236,7 @@ def _delivery(bound: int, overflow: str, keep: str) -> str:
 
 
 def _structs(info: types.Type) -> Iterator[type[msgspec.Struct]]:
-    """Return the structs that a type is, or that its items are."""
+    """Yield the structs in a type: the type itself, or its items."""
     match info:
         case types.StructType():
             yield info.cls
@@ -255,7 +255,7 @@ def _structs(info: types.Type) -> Iterator[type[msgspec.Struct]]:
 
 
 def _default(field: Any) -> str:
-    """Return a default as TOML has it; JSON writes such values in the same way."""
+    """Return a default as in TOML; JSON writes such values in the same way."""
     if field.required:
         return ""
     default = field.default

@@ -1,4 +1,4 @@
-"""What can be said of a run before it begins, by its file and by its nodes.
+"""Checks of a run before its begin, by its file and by its nodes.
 
 `of_file` looks at classes and settings only, and is quick enough for every run. `of_nodes` also
 goes through all phases before the first update, and then through the last one:
@@ -52,16 +52,16 @@ from runtime.time.schedule import Tick, Ticker
 from runtime.time.stepping import Stepping
 
 RUN_FILES = ("config.toml", "log.txt", "summary.json")
-"""What the run itself writes into its folder."""
+"""Files written by the run itself into its folder."""
 
 
 class Findings(msgspec.Struct, frozen=True):
-    """What was found.
+    """Results of a check.
 
     Attributes:
         errors: With any of these the run cannot do what the file says: a line each.
         warnings: What is odd, and may be meant.
-        announcements: What the nodes announced, if they were brought up.
+        announcements: Of the nodes, if they were brought up.
     """
 
     errors: list[str]
@@ -70,7 +70,7 @@ class Findings(msgspec.Struct, frozen=True):
 
 
 def of_file(config: Config, only: Collection[str] = ()) -> Findings:
-    """Look at what the file says, and at the classes of its nodes.
+    """Check the settings of a file, and the classes of its nodes.
 
     Args:
         only: Nodes that run in this process; all, if empty.
@@ -161,7 +161,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
 
 
 class _NoWorkerError(VisnavError):
-    """A node asked a worker that a check has not started."""
+    """A node's call of a worker in a check, without any worker started."""
 
 
 class _Absent:
@@ -177,7 +177,7 @@ class _Absent:
 
 
 class _DryHost:
-    """What a check does for its nodes: as little as it can."""
+    """Host for nodes in a check: does as little as possible."""
 
     checking = True
     out: Path | None = None
@@ -228,7 +228,7 @@ class _DryHost:
 
 @contextlib.contextmanager
 def _warnings() -> Iterator[list[str]]:
-    """Collect what nodes warn of, instead of printing it."""
+    """Collect the warnings of nodes, instead of printing them."""
     found: list[str] = []
 
     class Collect(logging.Handler):
@@ -247,7 +247,7 @@ def _warnings() -> Iterator[list[str]]:
 
 
 def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:
-    """Say which nodes would write the same file."""
+    """Yield errors for files of two writers, or outside the run's folder."""
     writers = dict.fromkeys(RUN_FILES, "the run itself")
     for spec in nodes:
         files = dict.fromkeys(
@@ -265,7 +265,7 @@ def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:
 
 
 def _unread(cls: type[Node[Any]]) -> list[str]:
-    """Return the inputs that no method of a class mentions."""
+    """Return the inputs not mentioned by any method of a class."""
     mentioned = mentioned_in(cls)
     return [port for port in (*cls.declared.inputs, *cls.declared.bundles) if port not in mentioned]
 
@@ -291,7 +291,7 @@ def mentioned_in(cls: type[Node[Any]]) -> set[Any]:
 
 
 def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement]) -> Iterator[str]:
-    """Say which `inputs` name a source from which nothing will come.
+    """Yield errors for `inputs` narrowed to a source without events.
 
     A node that announces nothing may send from anywhere below its name.
     """
@@ -322,7 +322,7 @@ def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement
 
 
 def _types(cls: type[Node[Any]], port: str) -> tuple[Any, ...]:
-    """Return the types of event that a port hears, or that a bundle's fields do."""
+    """Return the types of event of a port, or of a bundle's fields."""
     return tuple(
         event
         for name, events in input_types(cls).items()
@@ -374,7 +374,7 @@ def rules() -> dict[str, Rule]:
 def lint(
     config: Config, announcements: Sequence[Announcement], ignore: Collection[str] = ()
 ) -> list[Finding]:
-    """Return what is odd about a file, but for what it accepts itself.
+    """Return the findings of all rules, except those accepted by the file.
 
     Args:
         ignore: Names of rules that are left out, or ``rule:subject``.
@@ -403,7 +403,7 @@ def no_end(config: Config, announced: Sequence[Announcement]) -> Iterator[Findin
 
 
 def idle(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:  # noqa: ARG001
-    """Without anybody who sends it orders, a vehicle stands still."""
+    """Without a node to send its orders, a vehicle stands still."""
     heard = {receiver for *_, receiver, _ in edges([(s.name, s.node) for s in config.nodes])}
     for spec in config.nodes:
         handlers = spec.node.declared.handlers
@@ -415,7 +415,7 @@ def idle(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]
 
 
 def nobody_judged(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:
-    """Who judges wants an estimator."""
+    """Without an estimator, there is nothing to judge."""
     sent = edges([(spec.name, spec.node) for spec in config.nodes])
     judged = {receiver for *_, receiver, port in sent if port == "estimates"}
     for spec in config.nodes:

@@ -1,4 +1,4 @@
-"""A JSON schema of configuration files, from which editors complete and check TOML.
+"""A JSON schema of configuration files, for editors to complete and check TOML.
 
     #:schema https://…/config.schema.json     # or a path: the first line of a file
 
@@ -70,7 +70,7 @@ def schema(nodes: Mapping[str, type[Node[Any]]]) -> Schema:
 
 
 def _head() -> Schema:
-    """Return what every ``[[nodes]]`` table may have."""
+    """Return the settings common to all ``[[nodes]]`` tables."""
     return {
         "name": {**_NAME, "description": "Unique in the file."},
         "type": {"type": "string", "description": TYPE_DOC},
@@ -118,7 +118,7 @@ class _Maker:
         return key
 
     def struct(self, cls: type[msgspec.Struct]) -> Schema:
-        """Define a struct; return a reference to it."""
+        """Define a struct; return its reference."""
         key = f"{cls.__module__}.{cls.__name__}"
         if key not in self.definitions:
             self.definitions[key] = {}  # it may hold itself
@@ -143,7 +143,7 @@ class _Maker:
         return made | ({"required": required} if required else {})
 
     def _of(self, info: types.Type) -> Schema:
-        """Return the schema of a type as msgspec describes it."""
+        """Return the schema of a type described by msgspec."""
         match info:
             case types.Metadata():
                 return self._of(info.type)
@@ -182,7 +182,7 @@ def _text(pattern: str) -> Schema:
 
 
 def _beside(found: Schema, key: str, value: Any) -> Schema:
-    """Add a key; draft 7 ignores what stands beside a reference, so that goes into a list."""
+    """Add a key; references go into ``allOf``: draft 7 ignores all keys beside them."""
     return {"allOf": [found], key: value} if "$ref" in found else {**found, key: value}
 
 
@@ -196,5 +196,5 @@ def _bounds(info: Any, of: Literal["", "Items", "Length"] = "") -> Schema:
 
 
 def _may_stand(default: Any) -> bool:
-    """Tell whether a default is one that a file may have; a table's are those of its settings."""
+    """Tell whether a default may stand in a file; a table's are those of its settings."""
     return default not in (None, msgspec.NODEFAULT) and not isinstance(default, msgspec.Struct)

@@ -1,4 +1,4 @@
-"""``run --twice``: whether an equal run gives the same; if not, who differs first, and by how much.
+"""``run --twice``: two equal runs compared, with the first difference and its size.
 
 The first of both runs writes nothing: so no program finds in a folder what it is judged by.
 """
@@ -26,11 +26,11 @@ log = logging.getLogger("visnav.runtime")
 
 
 class Track(Digest):
-    """A digest of all events that remembers each, to be compared with those of an equal run.
+    """A digest with a memory of all events, to be compared with those of an equal run.
 
     Attributes:
-        first: The first event that is not as it was then: output, event, and metres between the
-            positions, if it has one.
+        first: The first different event: output, event, and metres between the positions, if it
+            has one.
     """
 
     def __init__(self, before: Track | None = None) -> None:
@@ -41,7 +41,7 @@ class Track(Digest):
         self._places: dict[str, array[float]] = {}
 
     def __call__(self, sender: Sender[Any] | None, event: Event) -> None:
-        """Take in one event."""
+        """Take in an event, and compare with the earlier run."""
         super().__call__(sender, event)
         name = self.name_of(sender, event)
         marks = self._marks.setdefault(name, array("Q"))
@@ -83,7 +83,7 @@ def run_twice(config: Config, out: Path | None, only: Collection[str], **options
 
 
 def compared(before: Summary, after: Summary, track: Track) -> Summary:
-    """Return the summary of the second run, with what there is to say of both."""
+    """Return the summary of the second run, with the comparison of both."""
     outputs = sorted(
         name
         for name in before.digests | after.digests
@@ -110,7 +110,7 @@ def _compared(was: OutsideSummary, now: OutsideSummary) -> OutsideSummary:
 
 
 def _who(summary: Summary, track: Track, differ: list[str]) -> str:
-    """Return who differs first, in words."""
+    """Return the first difference, in words."""
     if track.first is None:  # events are missing at the end of an output
         return f"{', '.join(differ)} at the end"
     output, event, apart = track.first

@@ -1,4 +1,4 @@
-"""What runs in a worker's process: one object, and the calls that arrive for it, in order.
+"""Main program of a worker's process: an object, and the calls of its methods, in order.
 
 Started by `runtime.workers.worker` as ``python -m runtime.workers.child SOCKET IN OUT LIMIT``:
 inherited file descriptors, and the seconds that a call may take. The process ends with the run,
@@ -22,10 +22,10 @@ from typing import Any
 from runtime.workers.shared_memory import SharedPipe
 
 _LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
-"""Folders of code that is not a worker's own."""
+"""Folders of libraries: code not of the worker's own."""
 
 _GRACE = 5.0
-"""Seconds in which a call may end, and the object close, once the run has gone."""
+"""Seconds for a call to end, and the object to close, once the run has gone."""
 
 _MOST_STARVED = 10
 """How many times longer a call may take on a busy machine."""
@@ -73,7 +73,7 @@ def _end_with_the_run(connection: socket.socket) -> None:
 
 
 def _end_group(number: signal.Signals) -> None:
-    """Send a signal to what this process has started, if it leads a group of its own."""
+    """Send a signal to the process group, if this process leads the group."""
     if os.getpgrp() == os.getpid():
         os.killpg(0, number)
 

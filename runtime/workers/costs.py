@@ -1,6 +1,6 @@
-"""What the calls of a worker cost this machine: real time, processor time, memory.
+"""Costs of a worker's calls on this machine: real time, processor time, memory.
 
-It differs from run to run, so nothing of it enters a digest.
+They differ from run to run, so none of them enters a digest.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ _CPUCLOCK_SCHED = 2
 
 
 class Costs:
-    """Costs of all processes that a worker has had, in constant memory; used from any thread.
+    """Costs of all processes of a worker, in constant memory; used from any thread.
 
     Attributes:
-        calls: How many were answered.
+        calls: Answered calls.
         wall: Real time of each (ns), from its arguments in the process to its result.
         cpu: Processor time of all threads of the process (ns), since the call before: what they
             go on doing after an answer is counted with the next one.
-        peak: Most memory (bytes) that one of the processes has had; 0 if unknown.
-        processes: How many there were at once.
-        latency: Seconds of the run's clock that a call was said to take; `None` if it varied.
+        peak: Peak memory (bytes) of any of the processes; 0 if unknown.
+        processes: Most at once.
+        latency: Declared seconds of a call on the run's clock; `None` if it varied.
     """
 
     def __init__(self) -> None:
@@ -42,16 +42,16 @@ class Costs:
         self._used: dict[int, int] = {}
 
     def add(self, wall: int, cpu: int) -> None:
-        """Count one call."""
+        """Count a call, with its real and processor time (ns)."""
         with self._lock:
             self.calls += 1
             self.wall.add(wall)
             self.cpu.add(cpu)
 
     def measure(self, wall: int, pids: Iterable[int]) -> None:
-        """Count one call of processes that do not measure themselves, but for the first time.
+        """Count a call of processes without own timing; the first only sets the start.
 
-        Their processor time is that since the time before; the first one is where it counts from.
+        Their processor time is counted from the call before.
         """
         before, self._used = self._used, {pid: cpu_time(pid) for pid in pids}
         for pid in self._used:
@@ -68,7 +68,7 @@ class Costs:
 
 
 def cpu_time(pid: int) -> int:
-    """Return the processor time (ns) of all threads of a process; 0 if it has gone."""
+    """Return the processor time (ns) of all threads of a process; 0 if gone."""
     try:
         return time.clock_gettime_ns(~pid << 3 | _CPUCLOCK_SCHED)
     except OSError:
@@ -76,9 +76,9 @@ def cpu_time(pid: int) -> int:
 
 
 def peak_memory(pid: int) -> int:
-    """Return the most memory (resident, bytes) that a process has had; 0 if there is no knowing.
+    """Return the peak resident memory (bytes) of a process; 0 if unknown.
 
-    From ``/proc``: what `resource.getrusage` says begins with the memory of the parent.
+    From ``/proc``: the figure of `resource.getrusage` begins with the memory of the parent.
     """
     try:
         status = Path(f"/proc/{pid}/status").read_bytes()

@@ -1,4 +1,4 @@
-"""What a process prints, and how its end is told."""
+"""Output of a process, and the report of its end."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import time
 from collections.abc import Callable, Iterable
 
 _LONGEST = 4096
-"""Bytes of a line; a longer one is cut into several."""
+"""Bytes of a line at most; a longer line is cut into several."""
 
 _KEPT = 20
-"""Lines that are told of a process that has ended."""
+"""Last lines reported of an ended process."""
 
 LINES = 100
-"""Lines a (real) second of one process that are handed on; what is beyond is counted."""
+"""Lines handed on per real second of a process; lines beyond are only counted."""
 
 # A lone carriage return, as of a progress bar, ends a line, too; the next byte may be its "\n".
 _LINE_END = re.compile(rb"\r?\n|\r(?!\Z)")
@@ -29,7 +29,7 @@ _ESCAPES = re.compile(
 
 
 def plain_lines(data: bytes | bytearray) -> Iterable[str]:
-    """Yield text of another process in lines of bounded length, without what controls terminals."""
+    """Yield another process's text in bounded lines, without terminal control codes."""
     for line in _LINE_END.split(data.removesuffix(b"\r")):
         for begin in range(0, max(len(line), 1), _LONGEST):
             text = line[begin : begin + _LONGEST].decode(errors="replace")
@@ -65,7 +65,7 @@ class Throttle:
                 self._printed(line)
 
     def take(self, text: bytes | bytearray) -> None:
-        """Hand the lines of a text on, or count them, which costs little."""
+        """Hand the lines of a text on; beyond the limit only count, at little cost."""
         with self._lock:
             if self._shown > LINES and int(self._now()) == self._second:
                 self._shown += text.count(b"\n") + 1
@@ -85,7 +85,7 @@ class Throttle:
 
 
 class Output:
-    """The lines that a process prints, and the last of them for the story of its end.
+    """Lines printed by a process, and the last of them for the report of its end.
 
     Args:
         printed: Called with each line, without its end.
@@ -97,7 +97,7 @@ class Output:
         self._last: collections.deque[str] = collections.deque(maxlen=_KEPT)
 
     def take(self, data: bytes) -> None:
-        """Take what was read."""
+        """Take bytes read from the process."""
         *lines, begun = _LINE_END.split(self._begun + data)
         while len(begun.removesuffix(b"\r")) > _LONGEST:
             lines.append(begun[:_LONGEST])
@@ -107,13 +107,13 @@ class Output:
             self._take_line(line)
 
     def end(self) -> None:
-        """Take what stands after the last end of a line."""
+        """Take the unfinished last line."""
         if self._begun:
             self._take_line(self._begun)
             self._begun = b""
 
     def story(self, what: str) -> str:
-        """Return what became of the process, and its last lines."""
+        """Return the report of the process's end, with its last lines."""
         if not self._last:
             return f"{what}; it said nothing"
         return f"{what}; its last output:\n" + "\n".join(self._last)
@@ -125,7 +125,7 @@ class Output:
 
 
 def how_it_ended(code: int) -> str:
-    """Return an exit code in words; one below 0 is the signal that killed the process."""
+    """Return an exit code in words; a negative code is the signal of the kill."""
     if code >= 0:
         return f"ended with exit code {code}"
     return f"killed by signal {-code} ({signal.strsignal(-code) or 'unknown'})"

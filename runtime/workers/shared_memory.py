@@ -30,10 +30,10 @@ INLINE = 4096
 """Buffers smaller than this (bytes) travel inside the message."""
 
 MAPPED = 1 << 24
-"""Length to which a file grows at first (bytes); from there on it doubles."""
+"""First length of a file (bytes); doubled from there on."""
 
 LIMIT = 1 << 30
-"""A file never grows beyond this (bytes); what does not fit travels inside the message."""
+"""Maximum length of a file (bytes); buffers without room travel inside the message."""
 
 _LENGTH = struct.Struct("<Q")
 
@@ -49,7 +49,7 @@ def anonymous_file() -> int:
 
 
 class Arena:
-    """The writer's side of a file: which blocks are free.
+    """The writer's side of a file, with its free blocks.
 
     Blocks are whole pages. A new one takes the first room by address that it fits into, and room
     that comes free joins with what is free beside it. So the file stays near the most that was
@@ -132,10 +132,10 @@ class MappedFile:
         self._fd = fd
         self._map: mmap.mmap | None = None
         self.freed: collections.deque[int] = collections.deque()
-        """Offsets of blocks that are read no more; appended to from any thread."""
+        """Offsets of blocks no longer read; appended to from any thread."""
 
     def view(self, offset: int, size: int) -> Any:
-        """Return the bytes of a block; when the last array on them is gone, it is freed."""
+        """Return the bytes of a block, freed when the last array on them is gone."""
         if self._map is None or offset + size > len(self._map):
             self._map = mmap.mmap(self._fd, os.fstat(self._fd).st_size)
         block = (ctypes.c_char * size).from_buffer(self._map, offset)
@@ -143,12 +143,12 @@ class MappedFile:
         return block
 
     def close(self) -> None:
-        """Close the file; what it shows stays mapped until the last array is gone."""
+        """Close the file; blocks in view stay mapped until the last array is gone."""
         os.close(self._fd)
 
 
 class SharedPipe:
-    """A connection over which objects pass, one way each file.
+    """A connection for objects, with a file of shared memory for each direction.
 
     One thread may send and another receive, each always the same one.
 
@@ -169,7 +169,7 @@ class SharedPipe:
         self._writer: threading.Thread | None = None
 
     def send(self, message: Any) -> None:
-        """Send an object, and wait until the connection has taken it.
+        """Send an object, and wait until the connection has taken all bytes.
 
         Raises:
             OSError: The other side is gone.
@@ -177,11 +177,11 @@ class SharedPipe:
         self.write(self.pack(message))
 
     def write(self, packed: bytes) -> None:
-        """Send what `pack` returned, as `send` does."""
+        """Send the result of `pack`, as `send` does."""
         self._connection.sendall(packed)
 
     def pack(self, message: Any) -> bytes:
-        """Put the arrays of an object into shared memory, and return what is to be sent of it."""
+        """Put an object's arrays into shared memory, and return the message to send."""
         while self._returned:
             self._arena.free(self._returned.popleft())
         spans: list[tuple[int, int]] = []
@@ -205,7 +205,7 @@ class SharedPipe:
         return _LENGTH.pack(len(frame)) + frame
 
     def post(self, packed: bytes) -> None:
-        """Send what `pack` returned without ever waiting.
+        """Send the result of `pack` without ever waiting.
 
         What the connection does not take at once, a thread sends as soon as it does.
 
@@ -242,7 +242,7 @@ class SharedPipe:
         return self.unpack(self.read())
 
     def read(self) -> bytearray:
-        """Wait for a message, and return it as it came.
+        """Wait for a message, and return its bytes.
 
         Raises:
             EOFError: The other side is gone.
@@ -253,22 +253,22 @@ class SharedPipe:
         return self._read(length)
 
     def unpack(self, message: bytearray) -> Any:
-        """Return the object of a message; raises whatever making it raises."""
+        """Return the object of a message; raises any exception of making the object."""
         freed, spans, body = pickle.loads(message)  # noqa: S301  # from our child, or to it
         self._returned.extend(freed)
         return pickle.loads(body, buffers=[self._window.view(*span) for span in spans])  # noqa: S301
 
     def poll(self, timeout: float) -> bool:
-        """Wait up to `timeout` seconds for a message, and return whether there is one."""
+        """Wait up to `timeout` seconds for a message, and return whether there is any."""
         return bool(self._readable.poll(timeout * 1e3))
 
     def shut_down(self) -> None:
-        """End the connection for both sides; a thread that waits in `receive` is notified."""
+        """End the connection for both sides; a thread waiting in `receive` is notified."""
         with contextlib.suppress(OSError):  # it has ended already
             self._connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Close connection and files; arrays that came through them stay valid."""
+        """Close connection and files; received arrays stay valid."""
         self.shut_down()
         if self._writer is not None:
             self._writer.join()

@@ -41,20 +41,20 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 Called = Callable[[str, str, concurrent.futures.Future[Any]], None]
-"""Called with the process, the method that it is to run, and the answer to come."""
+"""Callback for a call: names of process and method, and the future of the answer."""
 
 _GRACE = 2.0
 """Seconds a process gets to end by itself once its connection is closed."""
 
 _LOOK = 0.25
-"""Seconds after which a thread that receives nothing from a process looks whether there is one."""
+"""Seconds without data until a thread checks whether its process is still there."""
 
 _LONGEST = 1e8
-"""Seconds of the longest limit that the kernel is given."""
+"""Seconds of the longest limit given to the kernel."""
 
 
 class Worker(Generic[W]):
-    """One object, or several alike, each in its own process.
+    """An object, or several alike, each in its own process.
 
     The processes begin with `ready` and end with `close`, whatever is cancelled in between.
 
@@ -99,7 +99,7 @@ class Worker(Generic[W]):
         self.costs.latency = latency
         self.costs.processes = processes
         self.called: Called | None = None
-        """Called with every call, if it is set."""
+        """Callback for every call, if set."""
         self._clock = clock
         self._latency = latency
         self._processes: list[_Process] = []
@@ -115,7 +115,7 @@ class Worker(Generic[W]):
         self._to_make = factory, args, niceness, cores
 
     async def ready(self) -> None:
-        """Start the processes, and wait until the object has been made in every one.
+        """Start the processes, and wait until each has made its object.
 
         Raises:
             WorkerError: A process died or hung; or whatever making the object raised.
@@ -166,7 +166,7 @@ class Worker(Generic[W]):
     async def call_untimed(
         self, method: Callable[Concatenate[W, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
-        """Call a method and await its result, for which simulated time does not wait.
+        """Call a method and await its result; simulated time does not wait meanwhile.
 
         For what leaves the run, such as an image for a client outside: at which simulated time the
         result comes is not the same in every run, unless time stands meanwhile.
@@ -203,7 +203,7 @@ class Worker(Generic[W]):
 
 
 def spare_cores() -> tuple[int, ...]:
-    """Return all cores but the first, which is left to the loop; none if there is no other.
+    """Return all cores but the first, left to the loop; none if there is no other.
 
     On two cores with a camera rendering, this brings the 99th percentile of a 400 Hz tick's
     lateness from three times that without a camera down to the same.
@@ -214,10 +214,10 @@ def spare_cores() -> tuple[int, ...]:
 
 
 class _Process:
-    """One process and the calls on their way to and from it.
+    """A process, and its calls in both directions.
 
-    It is that process whose end counts: what it has started may live on, and hold its connection
-    and its output open.
+    Only its own end counts: processes started by it may live on, and hold its connection and its
+    output open.
     """
 
     def __init__(
@@ -272,7 +272,7 @@ class _Process:
         self._reader = threading.Thread(target=self._read_answers, name=name, daemon=True)
 
     def start(self, to_make: Any) -> concurrent.futures.Future[Any]:
-        """Have the object made; the future has whether that went well."""
+        """Start to make the object; the future has the success or the error."""
         self._output.start()
         with contextlib.suppress(OSError):  # if it is gone already, the request below says so
             self._pipe.send(sys.path)
@@ -378,7 +378,7 @@ class _Process:
         return self._lines.story(f"worker {self.name}: {what}")
 
     def _read_output(self) -> None:
-        """Read what the process prints until it ends, even if others could still write there."""
+        """Read the process's output until its end, even if others could write there."""
         assert self._child.stdout is not None
         readable = select.poll()
         readable.register(self._child.stdout, select.POLLIN)
@@ -402,12 +402,12 @@ class _Process:
         self._pipe.shut_down()
 
     def _kill(self) -> None:
-        """Kill the process, and what it has started and left behind."""
+        """Kill the process, and its remaining children."""
         with contextlib.suppress(OSError):
             os.killpg(self._child.pid, signal.SIGKILL)
 
     def join(self, until: float) -> None:
-        """Wait until it has ended, by force if it has not by a time of `time.monotonic`."""
+        """Wait for the end, by force if still running at a time of `time.monotonic`."""
         try:
             self._child.wait(max(until - time.monotonic(), 0))
         except subprocess.TimeoutExpired:

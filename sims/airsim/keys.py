@@ -51,13 +51,13 @@ _HOLDS = {
 
 
 def parse(text: str, where: str) -> tuple[dict[str, Any], str, list[str]]:
-    """Read JSON as people write it: comments, trailing commas, NaN and infinities are accepted.
+    """Parse lenient JSON: comments, trailing commas, NaN and infinities are accepted.
 
     Args:
         where: Begins the message of an error.
 
     Returns:
-        Its values; the text, made strict JSON if need be; what AirSim would not have taken.
+        Its values; the text as strict JSON; notes on what AirSim would not have taken.
 
     Raises:
         ConfigError: It is no JSON, no object, or nested too deep.
@@ -101,7 +101,7 @@ def parse(text: str, where: str) -> tuple[dict[str, Any], str, list[str]]:
 
 
 class Keys:
-    """One object; its keys are asked for by name.
+    """JSON object with access to its keys by name.
 
     What is not given, null or NaN has its default, as in AirSim. What is of the wrong type is a
     `ConfigError`. `notes` get lines on what is not honoured, which begin with `path`: where the
@@ -134,7 +134,7 @@ class Keys:
         return found
 
     def whole(self, key: str, default: int) -> int:
-        """Return a whole number; 256.0 is one."""
+        """Return a whole number; 256.0 counts as whole."""
         found = self.number(key, default)
         if found != int(found):
             raise self.error(key, f"expected a whole number, found {found:g}")
@@ -169,7 +169,7 @@ class Keys:
         return default if found is None else str(found)
 
     def table(self, key: str) -> Keys:
-        """Return an inner object; an empty one if there is none."""
+        """Return an inner object; empty if missing."""
         return Keys(self._get(key, dict, "an object") or {}, self._at(key), self._notes)
 
     def tables(self, key: str) -> Iterator[tuple[str, Keys]]:
@@ -186,7 +186,7 @@ class Keys:
             yield inner.table(name)
 
     def done(self) -> None:
-        """Note each key that nobody asked for, unless it asks for what is so anyway."""
+        """Note each key never asked for, unless its value holds anyway."""
         for key, value in self._table.items():
             so_anyway = key in IGNORED and (not value or value != value or value == _HOLDS.get(key))
             if key not in self._asked and not so_anyway:
@@ -216,5 +216,5 @@ class Keys:
 
 
 def _printable(line: str) -> str:
-    """Return a line that stays one, whatever the keys in it are made of."""
+    """Return a line with unprintable characters, such as line breaks, escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)

@@ -38,8 +38,9 @@ DEFAULT_CAMERAS: tuple[tuple[tuple[str, ...], Vector3, Vector3], ...] = (
     (("bottom_center", "3"), (0.0, 0.0, 0.12), (0.0, -90.0, 0.0)),
     (("back_center", "4"), (-0.46, 0.0, 0.0), (0.0, 0.0, 180.0)),
 )
-"""Names, position (metres FRD) and orientation (degrees) of the cameras that are always there.
-Source: the multirotor's blueprint in AirSim 1.8.1."""
+"""Names, position (metres FRD) and orientation (degrees) of the built-in cameras.
+Source: the multirotor's blueprint in AirSim 1.8.1.
+"""
 
 GRAVITY = 9.80665
 # By AirSim's SensorType: our settings, what differs from our defaults, and the names of numbers.
@@ -75,11 +76,11 @@ def default_mount(name: str, free: bool) -> tuple[Vector3, Vector3]:
 
 
 def read(text: str, path: str, warn: Callable[[str], None], world: str = "hall") -> Table:
-    """Return what a TOML file of ours would hold that says the same.
+    """Return AirSim's settings as the content of an equivalent TOML file.
 
     Args:
         path: Its name, for messages.
-        warn: Called with a line on each thing that is odd, and each that is not honoured.
+        warn: Called with a line on each oddity, and each setting not honoured.
         world: Name or path of the world.
 
     Raises:
@@ -99,9 +100,9 @@ def import_(
     settings: Annotated[Path, typer.Argument(help="AirSim's settings.json.")],
     world: Annotated[str, typer.Option(help="World to fly in: a name, or an MJCF file.")] = "hall",
 ) -> None:
-    """Print AirSim's settings.json as a TOML file that runs the same.
+    """Print AirSim's settings.json as an equivalent TOML file.
 
-    What is not honoured is a warning on standard error, and a comment at the top of the file.
+    Settings not honoured are warnings on standard error, and comments at the top of the file.
     """
     import tomli_w
 
@@ -284,7 +285,7 @@ def _captures(keys: Keys) -> dict[int, Table]:
 
 
 def _sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a multirotor's sensors, and add what the server is to know of them.
+    """Return a multirotor's sensor settings, and add the sensor settings of the server.
 
     A sensor that is listed, even if it is not enabled, replaces the default ones of its type: a
     barometer, an IMU, a satellite receiver and a magnetometer, or those of ``DefaultSensors``. The

@@ -1,4 +1,4 @@
-"""msgpack-rpc as AirSim speaks it, and AirSim's structures: bytes to messages and back. No sockets.
+"""AirSim's msgpack-rpc and structures: bytes to messages and back. No sockets.
 
 A connection carries msgpack objects one after another, without frames: a request is
 ``[0, id, "method", [arguments]]``, its reply ``[1, id, error, result]``. Source: the specification
@@ -33,7 +33,7 @@ Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 
 
 class WireFormatError(Exception):
-    """Bytes that are no message; what follows them cannot be understood any more."""
+    """Bytes without a valid message; later bytes cannot be understood either."""
 
 
 class Request(NamedTuple):
@@ -45,7 +45,7 @@ class Request(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """What a call led to: an error's text, or else a result."""
+    """Outcome of a call: an error's text, or else a result."""
 
     id: int
     error: Any
@@ -53,7 +53,7 @@ class Reply(NamedTuple):
 
 
 class Decoder:
-    """Makes messages of the bytes of one connection, however they are split.
+    """Decoder of a connection's bytes into messages, however the bytes are split.
 
     A message is decoded once it is complete: until then it takes no more memory than its bytes,
     whatever lengths it claims.
@@ -69,7 +69,7 @@ class Decoder:
         self._begin = 0  # where in the stream `_bytes` begins
 
     def feed(self, data: bytes) -> Iterator[Request | Reply]:
-        """Yield the messages that are complete with these bytes, in order.
+        """Yield the messages completed by these bytes, in order.
 
         Raises:
             WireFormatError: They are no messages, or one is longer than allowed.
@@ -99,10 +99,10 @@ class Decoder:
 
 
 def decode(message: bytes) -> Request | Reply:
-    """Return the message that these bytes are; text that is not UTF-8 is made so.
+    """Return the message in these bytes; invalid UTF-8 in text is replaced.
 
     Raises:
-        WireFormatError: They are none.
+        WireFormatError: There is none.
     """
     left = MOST_LISTS
 
@@ -184,7 +184,7 @@ class Quaternionr(msgspec.Struct, frozen=True):
 
 
 class Pose(msgspec.Struct, frozen=True):
-    """A position, metres, and an orientation; of one that is not known all is NaN."""
+    """Position, metres, and orientation; all NaN if unknown."""
 
     position: Vector3r = Vector3r()
     orientation: Quaternionr = Quaternionr()
@@ -230,7 +230,7 @@ class CollisionInfo(msgspec.Struct, frozen=True):
 
 
 class RCData(msgspec.Struct, frozen=True):
-    """A remote control, which is never there."""
+    """State of a remote control, always absent."""
 
     timestamp: int = 0
     pitch: float = 0.0
@@ -257,14 +257,14 @@ class MultirotorState(msgspec.Struct, frozen=True):
 
 
 class ComputerVisionState(msgspec.Struct, frozen=True):
-    """State of a free camera, as Cosys-AirSim has it."""
+    """State of a free camera, in Cosys-AirSim's format."""
 
     kinematics_estimated: KinematicsState = KinematicsState()
     timestamp: int = 0
 
 
 class ImageRequest(msgspec.Struct, frozen=True):
-    """An image to take; `image_type` is one of `sims.airsim.server.cameras`."""
+    """Request for an image; for `image_type` see `sims.airsim.server.rendering`."""
 
     camera_name: str = ""
     image_type: int = 0
@@ -294,7 +294,7 @@ class ImageResponse(msgspec.Struct, frozen=True):
 
 
 class CosysImageResponse(ImageResponse, frozen=True):
-    """An image as Cosys-AirSim sends it."""
+    """Image in Cosys-AirSim's format."""
 
     annotation_name: str = ""
 
@@ -340,7 +340,7 @@ class MagnetometerData(msgspec.Struct, frozen=True):
 
 
 class GnssReport(msgspec.Struct, frozen=True):
-    """What a receiver says; `time_utc` in µs."""
+    """Report of a GNSS receiver; `time_utc` in µs."""
 
     geo_point: GeoPoint = GeoPoint()
     eph: float = 0.0
@@ -369,7 +369,7 @@ class DistanceSensorData(msgspec.Struct, frozen=True):
 
 
 class LidarData(msgspec.Struct, frozen=True):
-    """A lidar's scan: x, y, z of all points in one list; the sensor's pose in local NED."""
+    """Lidar scan: x, y, z of all points in a single list; sensor pose in local NED."""
 
     time_stamp: int = 0
     point_cloud: Any = ()
@@ -378,7 +378,7 @@ class LidarData(msgspec.Struct, frozen=True):
 
 
 class CosysLidarData(msgspec.Struct, frozen=True):
-    """A lidar's scan as Cosys-AirSim sends it: the name of what each point lies on."""
+    """Lidar scan in Cosys-AirSim's format: with the name of the object at each point."""
 
     time_stamp: int = 0
     point_cloud: Any = ()
@@ -398,7 +398,7 @@ class EnvironmentState(msgspec.Struct, frozen=True):
 
 
 class RotorParameters(msgspec.Struct, frozen=True):
-    """One rotor: rad/s, N, N m."""
+    """State of a rotor: rad/s, N, N m."""
 
     speed: float = 0.0
     thrust: float = 0.0

@@ -1,4 +1,4 @@
-"""Cameras: settings, mounting, rendering. Pure functions and one renderer."""
+"""Cameras: settings, mounting, rendering. Pure functions and a renderer."""
 
 from sims.cameras.renderer import CameraRenderer, Frame, model_from_bytes, model_to_bytes
 from sims.cameras.spec import (

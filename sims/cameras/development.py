@@ -1,4 +1,4 @@
-"""From light to an image: what lens and image sensor make of what was drawn for one exposure.
+"""Image formation: effects of lens and image sensor on the drawn images of an exposure.
 
 The grey levels that MuJoCo draws are taken to be sRGB's (IEC 61966-2-1), and their white to be the
 light that fills a pixel at the reference exposure. Light beyond it was cut off in drawing, so a
@@ -40,14 +40,14 @@ Depths = npt.NDArray[np.float32]
 Holes = npt.NDArray[np.bool_]
 
 _WINDOW = (7, 7)
-"""The pixels in which a stereo camera looks for texture."""
+"""Window of a stereo camera's texture check, pixels."""
 
 _FARTHEST = 1e6
 """Metres; stands for ``inf`` where its inverse has to be more than zero."""
 
 
 class DepthMeter:
-    """Measures the depth of one camera's exposures.
+    """Depth measurement of a camera's exposures.
 
     Args:
         light: Factor on the lights of the scene in the images: the projector's is the same.
@@ -69,7 +69,7 @@ class DepthMeter:
     def measure(
         self, depth: Depths, colour: npt.NDArray[np.uint8] | None, random: np.random.Generator
     ) -> Depths:
-        """Return what the sensor measures of true depth.
+        """Return the sensor's measurement of true depth.
 
         Args:
             depth: Metres along the optical axis, shape (height, width); ``inf`` for none.
@@ -97,7 +97,7 @@ class DepthMeter:
         return np.where(hole, np.float32(np.inf), found)
 
     def _hidden(self, inverse: Depths) -> Holes:
-        """Return which pixels the second eye does not see: something nearer is in its way.
+        """Return a mask of the pixels hidden from the second eye by a nearer surface.
 
         A pixel's ray meets the second image in the column ``x - disparity``. On one surface that
         rises with x; where a column further right falls left of it, that one's surface is nearer.
@@ -114,7 +114,7 @@ class DepthMeter:
         return hidden
 
     def _unmatched(self, inverse: Depths, colour: npt.NDArray[np.uint8] | None) -> Holes:
-        """Return which pixels are aslant, at an edge, dark or without texture.
+        """Return a mask of the pixels aslant, at an edge, dark or without texture.
 
         Inverse depth of a plane is affine in the pixel: its gradient gives the normal n, and the
         cosine of the angle to the ray r is ``inverse / (|n| |r|)``.
@@ -159,7 +159,7 @@ _METERED = 4
 
 
 class Development:
-    """Develops the exposures of one camera.
+    """Effects of lens, shutter and image sensor on a camera's exposures.
 
     In this order: mean over the moments of the exposure (motion blur), defocus, vignette, exposure
     time and gain, shot noise, response, and noise of the same size at all grey levels. All but the
@@ -192,7 +192,7 @@ class Development:
         exposure: float = 0.0,
         gain: float = 1.0,
     ) -> Image:
-        """Return the image of one exposure.
+        """Return the developed image of an exposure.
 
         Args:
             images: What was drawn at equally spaced moments of it, each of shape (height, width, 3)
@@ -212,7 +212,7 @@ class Development:
     def measure(
         self, depth: Depths, images: Sequence[Image], random: np.random.Generator
     ) -> Depths:
-        """Return what is measured of true depth.
+        """Return the measurement of true depth.
 
         Args:
             depth: Metres, shape (height, width); ``inf`` where nothing was hit.
@@ -223,13 +223,13 @@ class Development:
         return self._depth_meter.measure(depth, middle, random)
 
     def meter(self, image: Image) -> float:
-        """Return the mean light of a developed image, 0 to 1, as an exposure meter sees it."""
+        """Return an exposure meter's reading of a developed image: mean light, 0 to 1."""
         codes = np.rint(self._light * _LINEAR).astype(np.uint16)
         seen = codes[image[::_METERED, ::_METERED]]  # whole numbers: any order of adding will do
         return int(seen.sum(dtype=np.int64)) / (seen.size * _LINEAR)
 
     def _collected(self, images: Sequence[Image]) -> Image | Codes:
-        """Return what passes the lens: grey levels as drawn, or codes of linear light."""
+        """Return the collected light: grey levels as drawn, or codes of linear light."""
         if len(images) == 1 and self._spec.blur <= 0.0:
             return images[0]
         codes = np.rint(srgb_light() * _LINEAR).astype(np.uint16)[None]
@@ -237,7 +237,7 @@ class Development:
         return defocused(light, self._spec.blur)
 
     def _make_table(self, itemsize: int, factor: float, root: bool) -> Image | Codes:
-        """Return what becomes of light: the code of its root, or its grey level at once."""
+        """Return the lookup table from light to codes of its root, or to grey levels."""
         light = factor * (srgb_light() if itemsize == 1 else np.arange(65536) / _LINEAR)
         if root:
             return np.minimum(np.rint(np.sqrt(light) * _ROOT), 65535).astype(np.uint16)[None]
@@ -261,7 +261,7 @@ class Development:
         return np.asarray(cv2.LUT(root, self._levels(sigma)), np.uint8)
 
     def _make_levels(self, sigma: float) -> Image:
-        """Return the grey level of each code of a root that has noise."""
+        """Return the grey level of each code of a noisy root."""
         root = np.arange(65536) / _ROOT
         return self._grey_levels(np.maximum(root * root - sigma * sigma, 0.0))
 

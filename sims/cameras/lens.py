@@ -1,4 +1,4 @@
-"""A camera's intrinsics and lens, and where each pixel of its image lies in what is drawn for it.
+"""Intrinsics and lens of a camera, and lookup of its image's pixels in drawn pinhole images.
 
 A rasteriser draws straight lines as straight lines: pinhole images, here called faces. A lens's
 image is looked up in one of them that is wide enough, or, beyond 120°, in those faces of a cube
@@ -21,20 +21,20 @@ Floats = npt.NDArray[np.float64]
 Maps = npt.NDArray[np.float32]
 
 ONE_FACE = math.radians(61.0)
-"""Angle off the axis up to which one face is drawn; farther out its pixels become too many."""
+"""Largest angle off the axis for a single face, radians; beyond, too many pixels."""
 
 FINER = 1.3
-"""Pixels of a face for one of the image, where the image is sharpest."""
+"""Face pixels per image pixel, where the image is sharpest."""
 
 MARGIN = 3
-"""Pixels of a face around all that is looked up in it."""
+"""Margin of a face around its looked-up area, pixels."""
 
 LARGEST = 8192
 """Pixels of a face's side, at most."""
 
 
 class Face(NamedTuple):
-    """One pinhole drawing.
+    """Pinhole drawing for a camera's image.
 
     Attributes:
         turn: Its axes (right, down, ahead) in the optical frame, shape (3, 3), one in each row.
@@ -75,7 +75,7 @@ _CUBE = np.array(
 
 
 def faces(info: CameraInfo) -> tuple[Face, ...]:
-    """Return what is to be drawn for a camera; empty if no ray falls on its image."""
+    """Return the faces to draw for a camera; empty if no ray falls on its image."""
     if info.is_pinhole:
         pitch = 1.0 / info.fx, 1.0 / info.fy
         left, top = (-0.5 - info.cx) * pitch[0], (-0.5 - info.cy) * pitch[1]
@@ -121,7 +121,7 @@ def pixel_rays(info: CameraInfo) -> Floats:
 
 
 def _face(info: CameraInfo, rays: Floats, mask: npt.NDArray[np.bool_], turn: Floats) -> Face:
-    """Return the face with some axes on which some pixels' rays, shape (h, w, 3), fall."""
+    """Return the face with axes `turn` for the masked pixels' rays, shape (h, w, 3)."""
     places = np.full((*mask.shape, 2), np.nan)
     turned = rays[mask] @ turn.T
     places[mask] = turned[:, :2] / turned[:, 2:]
@@ -168,7 +168,7 @@ _OTHERS_CALL_IT = {
 
 
 class Lens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A lens that distorts.
+    """Settings of a lens with distortion.
 
     Attributes:
         model: ``plumb_bob`` (others say radtan), ``rational_polynomial``, or ``equidistant``
@@ -200,7 +200,7 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 def intrinsics(
     width: int, height: int, fov: float, given: Intrinsics | None, lens: Lens | None
 ) -> CameraInfo:
-    """Return the intrinsics that a camera's settings describe.
+    """Return the intrinsics for a camera's settings.
 
     Args:
         fov: Horizontal field of view, degrees, with what the lens does to it; of no effect beside

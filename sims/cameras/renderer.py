@@ -1,4 +1,4 @@
-"""Rendering: what a camera sees in an exposure, with the effects of its lens, shutter and sensor.
+"""Rendering of camera exposures, with the effects of lens, shutter and sensor.
 
 Made for a worker process (a GL context belongs to the thread that made it), but works in-process.
 A *shot* is *captured* (drawn, at each of its moments) and then *developed* (made a frame: the
@@ -49,7 +49,7 @@ class Motion(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """One exposure of one camera.
+    """Exposure to render: camera, stamp, world state, exposure time and gain.
 
     Attributes:
         stamp: Nanoseconds on the run's clock: the middle row's mid-exposure.
@@ -98,7 +98,7 @@ class Shot(NamedTuple):
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """One exposure: all its images and its pose are of the same instant, or are read out alike.
+    """Images and pose of an exposure, all of the same instant or read out alike.
 
     Images of kinds that the camera's settings do not name are None.
 
@@ -132,7 +132,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 def delay_of(spec: CameraSpec, seed: int, stamp_ns: int) -> float | None:
-    """Return the seconds from an exposure to its delivery, or None if it is lost."""
+    """Return the seconds from an exposure to its delivery, or None if lost."""
     # No camera's name has a slash: what is drawn here and the noise are independent.
     random = generator(seed, f"{spec.name}/delivery", stamp_ns)
     if random.random() < spec.loss:
@@ -141,7 +141,7 @@ def delay_of(spec: CameraSpec, seed: int, stamp_ns: int) -> float | None:
 
 
 def stamp_error(spec: CameraSpec, seed: int, stamp_ns: int) -> int:
-    """Return the nanoseconds by which the stamps of an exposure are late."""
+    """Return the delay of an exposure's stamps, nanoseconds."""
     random = generator(seed, f"{spec.name}/stamp", stamp_ns)
     error = float(spec.time_jitter) * random.uniform(-1.0, 1.0) if spec.time_jitter else 0.0
     return round((float(spec.time_offset) + error) * 1e9)
@@ -155,7 +155,7 @@ def model_to_bytes(model: Any) -> bytes:
 
 
 def model_from_bytes(data: bytes) -> Any:
-    """Return the model that `model_to_bytes` wrote.
+    """Return the model written by `model_to_bytes`.
 
     Raises:
         ValueError: The bytes are none, or were written by another version of MuJoCo.
@@ -167,7 +167,7 @@ Pose = tuple[Vector3, Quaternion]
 
 
 class Captured(NamedTuple):
-    """What falls on a camera's sensor in one exposure, before its own errors.
+    """Light on a camera's sensor in an exposure, before the sensor's errors.
 
     Attributes:
         colours: uint8 images, shape (height, width, 3), of the moments that make up the exposure,
@@ -185,7 +185,7 @@ class Captured(NamedTuple):
 
 
 class CameraRenderer:
-    """Renders the images of the cameras of one model.
+    """Renderer of all cameras of a model.
 
     Not thread-safe: stay in the thread that made it.
 
@@ -231,7 +231,7 @@ class CameraRenderer:
     def render(
         self, stamp_ns: int, qpos: Floats, names: tuple[str, ...], qvel: Floats | None = None
     ) -> dict[str, Frame]:
-        """Expose some cameras at one state: `expose`, with a frame for each name."""
+        """Expose some cameras at a single state: `expose`, with a frame for each name."""
         shots = []
         for name in names:
             spec, _ = self._cameras[name]
@@ -258,7 +258,7 @@ class CameraRenderer:
         return tuple(frames)
 
     def graphics(self) -> str:
-        """Return the name of what draws, as GL knows it: a graphics card, or ``llvmpipe``."""
+        """Return the GL name of the renderer: a graphics card, or ``llvmpipe``."""
         self._stage.enter()
         return gl_renderer()
 
@@ -267,7 +267,7 @@ class CameraRenderer:
         self._stage.close()
 
     def _capture(self, shot: Shot, spec: CameraSpec, number: int) -> Captured:
-        """Draw what falls on the sensor, in each band of rows that is exposed at a time of its own.
+        """Draw the light on the sensor, for each band of rows exposed at its own time.
 
         Colours are drawn at each of the moments that make up the exposure, all else in its middle.
         """
@@ -304,7 +304,6 @@ class CameraRenderer:
         )
 
     def _develop(self, shot: Shot, spec: CameraSpec, captured: Captured) -> Frame:
-        """Make of what was drawn the images that the sensor gives."""
         random = generator(self._seed, spec.name, shot.stamp)
         development, exposure, gain = self._developments[spec.name], shot.exposure, shot.gain
         rgb = grey = light = None
@@ -346,7 +345,7 @@ class CameraRenderer:
         return msgspec.structs.replace(frame, undistorted=twin)
 
     def _look(self, shot: Shot, spec: CameraSpec, number: int, seconds: float) -> None:
-        """Set the scene up as a camera sees it some seconds after an exposure's stamp."""
+        """Set up the scene for a camera, some seconds after an exposure's stamp."""
         state = shot.state(self._model, seconds)
         self._stage.look(number, state, shot.stamp * 1e-9 + seconds, spec.light)
 
@@ -356,7 +355,7 @@ class CameraRenderer:
         return self._stage.pose(number)
 
     def _speeds(self, shot: Shot, spec: CameraSpec, number: int, seconds: float) -> Floats:
-        """Return the speeds of what a camera sees while it is exposed, pixels per second."""
+        """Return the image speeds in view during an exposure, pixels per second."""
         small = self._small[spec.name]
         # At least every 2 ms, or a vibration would be missed.
         times = np.linspace(-0.5, 0.5, 2 * math.ceil(seconds / 0.004) + 1) * seconds

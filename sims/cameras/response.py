@@ -27,7 +27,7 @@ _GAMMA = 2.2
 
 
 def read_response(name: str) -> tuple[float, ...]:
-    """Return the light of each of the 256 grey levels, as a `CameraAnnouncement` has it.
+    """Return the light of the 256 grey levels, as in `CameraAnnouncement.response`.
 
     Args:
         name: ``srgb``, for which the result is empty; ``linear``; ``gamma``, of 2.2; or the path of
@@ -69,7 +69,7 @@ Image = npt.NDArray[np.uint16]
 """Codes of linear light, shape (height, width, 3) or (height, width)."""
 
 MOST = 9
-"""Renderings of one exposure, at most: each costs as much as an image without motion blur."""
+"""Most renderings of an exposure: each costs as much as an image without motion blur."""
 
 
 def defocused(image: Image, sigma: float) -> Image:
@@ -80,7 +80,7 @@ def defocused(image: Image, sigma: float) -> Image:
 
 
 def moments(exposure: float, shift: float) -> list[float]:
-    """Return when to draw what a moving camera sees, so that a step is about a pixel.
+    """Return the moments to draw for motion blur, about a pixel of motion apart.
 
     Args:
         exposure: Seconds that the shutter is open.
@@ -95,7 +95,7 @@ def moments(exposure: float, shift: float) -> list[float]:
 
 
 def mean(images: Sequence[Image]) -> Image:
-    """Return the mean of images of one shape, rounded."""
+    """Return the rounded mean of images of equal shape."""
     if len(images) == 1:
         return images[0]
     total = np.zeros(images[0].shape, np.float32)  # exact: whole numbers below 2**24
@@ -114,7 +114,7 @@ _FARTHEST = np.float32(1e9)
 
 
 def generator(seed: int, camera: str, stamp_ns: int) -> np.random.Generator:
-    """Return the generator of one exposure's noise: the same in whatever process asks for it."""
+    """Return the generator of an exposure's noise, the same in every process."""
     words = (seed, zlib.crc32(camera.encode()), stamp_ns)
     return np.random.default_rng([word & 0xFFFF_FFFF_FFFF_FFFF for word in words])
 
@@ -196,22 +196,22 @@ def _steps(sigma: float, limit: int) -> npt.NDArray[np.int16]:
 
 
 _MOST = 8.0
-"""Factor that one image may ask for, either way: a black one says nothing of how dark it is."""
+"""Largest correction factor per image, either way: black gives no measure of darkness."""
 
 
 class AutoExposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the automatic exposure, which first makes use of the time and then of the gain.
+    """Settings of automatic exposure, first by exposure time and then by gain.
 
     Attributes:
-        target: Mean light of an image that is well exposed, as a share of white's; in linear
-            light, where 0.18 is a middle grey.
+        target: Mean light of a well-exposed image, as a share of white's; in linear light, where
+            0.18 is a middle grey.
         min_exposure: Shortest exposure time.
         max_exposure: Longest exposure time.
-        exposure_step: Exposure times are whole multiples of it, as of an image sensor's row time.
+        exposure_step: Step of the exposure time, such as an image sensor's row time.
         max_gain: Largest factor of the amplifier.
-        gain_step: Gains are whole multiples of it, decibels.
-        damping: Share of the error (of its logarithm) that stays after each image: 0 is quickest.
-        tolerance: Error, as a share of the target, that is left alone.
+        gain_step: Step of the gain, decibels.
+        damping: Share of the error (of its logarithm) left after each image: 0 is quickest.
+        tolerance: Error, as a share of the target, left uncorrected.
     """
 
     target: Annotated[float, msgspec.Meta(ge=0.01, le=0.9)] = 0.18
@@ -232,11 +232,10 @@ class AutoExposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class ExposureControl:
-    """Exposure time and gain of one camera, image by image.
+    """Automatic exposure time and gain of a camera, image by image.
 
-    What an image asks for is computed from its own exposure time and gain, so images that come late
-    make the control slow, and do not make it oscillate: it never goes beyond what an image
-    asked for.
+    The exposure an image asks for is computed from its own exposure time and gain, so late images
+    slow the control, but do not make it oscillate: it never goes beyond an image's request.
     """
 
     def __init__(self, settings: AutoExposure, exposure: float) -> None:
@@ -249,7 +248,7 @@ class ExposureControl:
         self._seen.append((stamp, exposure * gain, light))
 
     def next(self, stamp: int) -> tuple[float, float]:
-        """Return exposure time (seconds) and gain of an exposure that begins at a time.
+        """Return exposure time (seconds) and gain of an exposure beginning at `stamp`.
 
         Args:
             stamp: Nanoseconds; above that of the call before. The last image that was delivered

@@ -1,4 +1,4 @@
-"""From a physics state to image events: the cameras of one vehicle, rendered beside the loop.
+"""Cameras of a vehicle: image events from physics states, rendered beside the event loop.
 
 Used by the nodes of `sims`; the drawing itself is in `sims.cameras.renderer`.
 """
@@ -31,14 +31,14 @@ from sims.cameras.response import ExposureControl
 from sims.cameras.spec import CameraSpec, announcement, eyes, optical_frame, optical_in_body
 
 STEP = 1_000_000
-"""Nanoseconds between the states that are known of an exposure."""
+"""Interval of the states recorded during an exposure, nanoseconds."""
 
 UNDISTORTED = "/undistorted"
 """Ends the source of a camera's images without distortion."""
 
 
 class CameraOutputs(msgspec.Struct, frozen=True):
-    """Outputs of the node that carries the cameras."""
+    """Outputs of a node with cameras."""
 
     images: Sender[Image]
     depth_images: Sender[DepthImage]
@@ -47,7 +47,7 @@ class CameraOutputs(msgspec.Struct, frozen=True):
 
 
 class DrawnWorld(Protocol):
-    """What the renderers are told of the world."""
+    """World as passed to the renderers."""
 
     dynamics: Any
 
@@ -65,13 +65,13 @@ class _Exposure(NamedTuple):
     shots: tuple[Shot, ...]
     """Of each of its eyes."""
     due: int
-    """Time of delivery (ns), unless that of the exposure before is later."""
+    """Delivery time (ns), unless the previous exposure's is later."""
     states: States | None
     """Gives the states while the shutter is open, when they have come about."""
 
 
 class CameraRig:
-    """All cameras of one body.
+    """All cameras of a body.
 
     Every image has the stamp of its exposure (with the error of the camera's clock), and is sent
     `latency` seconds, and up to `jitter` more, after it. Just before, the pose of the camera is
@@ -109,7 +109,7 @@ class CameraRig:
             if spec.auto_exposure is not None
         }
         self.lost = dict.fromkeys(self._specs, 0)
-        """Exposures not delivered because a camera's settings ask for that."""
+        """Exposures lost by the camera's `loss` setting."""
         self.skipped = dict.fromkeys(self._specs, 0)
         """Exposures left out because the renderer was behind; never in lockstep."""
 
@@ -188,7 +188,7 @@ class CameraRig:
 
     @property
     def past(self) -> float:
-        """Seconds for which a vehicle has to remember its states, for `expose` to ask for them."""
+        """Seconds of past states a vehicle must remember for `expose`."""
         return max(
             (2.0 * spec.half + spec.offset for spec in self._specs.values() if _spans(spec)),
             default=0.0,

@@ -1,4 +1,4 @@
-"""What a camera is: how it is written down, what it announces, how it enters a model.
+"""Cameras: settings, announcements and mounting in a model.
 
 No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.spec`, the vehicles).
 
@@ -91,7 +91,7 @@ class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     @property
     def needs_colours(self) -> bool:
-        """Whether what is measured depends on how bright things are."""
+        """Whether measured depth depends on the brightness of surfaces."""
         limit = self.min_contrast if self.model == "stereo" else self.min_brightness
         return limit > 0.0
 
@@ -101,7 +101,7 @@ class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class Stereo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A second camera beside the first, with one trigger for both.
+    """Settings of a stereo rig: two cameras with a common trigger.
 
     Attributes:
         baseline: Distance of the right camera from the left one along the image's rows, metres.
@@ -240,22 +240,22 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def longest_exposure(self) -> float:
-        """Longest time for which the shutter is open, seconds."""
+        """Longest exposure time, seconds."""
         return self.auto_exposure.max_exposure if self.auto_exposure else self.exposure
 
     @property
     def half(self) -> float:
-        """Seconds from the first row's opening to the stamp, and on to the last one's closing."""
+        """Seconds from the first row's opening to the stamp, and to the last's closing."""
         return 0.5 * (self.readout + self.longest_exposure)
 
     @property
     def offset(self) -> float:
-        """Seconds by which the last of its exposures is later than the first."""
+        """Delay of the right camera of a stereo rig, seconds; 0 without a rig."""
         return float(self.stereo.offset) if self.stereo else 0.0
 
 
 def eyes(spec: CameraSpec) -> tuple[CameraSpec, ...]:
-    """Return the cameras that an entry describes: itself, or the left and the right one."""
+    """Return the cameras of an entry: itself, or the left and right of a stereo rig."""
     if spec.stereo is None:
         return (spec,)
     left = msgspec.structs.replace(spec, name=f"{spec.name}_left", stereo=None)
@@ -266,7 +266,7 @@ def eyes(spec: CameraSpec) -> tuple[CameraSpec, ...]:
 
 
 def check_cameras(specs: Iterable[CameraSpec]) -> None:
-    """Check what can be known of a body's cameras before there is a world.
+    """Check a body's cameras as far as possible without a world.
 
     Raises:
         ValueError: Two have one name, a shutter would still be open at the next exposure or at the
@@ -369,7 +369,7 @@ def announcement(
 
 
 def _depth_truth(spec: CameraSpec) -> dict[str, Any]:
-    """Return what is announced of the depth: its noise, steps and limits."""
+    """Return the announced depth errors: noise, steps and limits."""
     sensor = spec.depth_sensor
     if sensor is None:
         return {"depth_noise": spec.depth_noise}
@@ -383,9 +383,9 @@ def _depth_truth(spec: CameraSpec) -> dict[str, Any]:
 
 
 def vertical_fov(spec: CameraSpec) -> float:
-    """Return the vertical field of view in degrees, which is what MuJoCo's cameras are given.
+    """Return the vertical field of view for MuJoCo's camera, degrees.
 
-    Of a camera that draws in frames of its own (`sims.cameras.view`) it has no effect.
+    It has no effect on a camera with frames of its own (`sims.cameras.view`).
     """
     if not is_plain(spec):
         return 90.0
@@ -425,7 +425,7 @@ def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: s
 
 
 def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ...]) -> str:
-    """Add a body that carries cameras, meets nothing and falls nowhere.
+    """Add a body with cameras, without collisions and gravity.
 
     Returns:
         The prefix of the cameras' names, as `CameraRenderer` takes it.

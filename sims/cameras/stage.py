@@ -1,4 +1,4 @@
-"""A model in a GL context without a screen, as one camera sees it: colour, depth, numbers, pose.
+"""Off-screen rendering of a model for a camera: ideal colour, depth, object numbers, pose.
 
 Here everything is ideal. What lens, shutter and sensor do to an image is put together in
 `sims.cameras.renderer`. Nothing happens on import: the environment is changed by `open_context`,
@@ -28,7 +28,7 @@ class GraphicsError(MissingDependencyError, RuntimeError):
 
 
 def keep_memory() -> None:
-    """Have the allocator keep what images leave behind, in the place of giving it back each time.
+    """Make the allocator keep the freed memory of images for reuse.
 
     glibc maps a large array anew, page by page: for each image that took a tenth of the time of a
     plain camera, and a third of that of one with all effects. Does nothing where there is no glibc.
@@ -39,7 +39,7 @@ def keep_memory() -> None:
 
 
 def open_context(width: int, height: int, threads: int) -> Any:
-    """Return a current off-screen GL context: EGL's, or OSMesa's where MUJOCO_GL asks for it.
+    """Return a current off-screen GL context: EGL's, or OSMesa's if MUJOCO_GL says so.
 
     Args:
         threads: Threads of the software renderer; takes effect with the first context only.
@@ -70,7 +70,7 @@ def gl_renderer() -> str:
 
 
 def set_fog(start: float, end: float) -> None:
-    """Set the distances (metres) between which the present context's fog grows to its full.
+    """Set start and end distance (metres) of the fog in the current context.
 
     MuJoCo sets them once, when a model enters a context.
     """
@@ -95,30 +95,30 @@ RANGE = 500.0
 depth; at the rim of the widest view (170°) that is a planar depth of some 600 m."""
 
 _OUT_OF_VIEW = mujoco.mjNGROUP - 1
-"""Group of the geoms that an image cannot show; groups from 3 on are not drawn."""
+"""Group of the geoms outside an image; groups from 3 on are not drawn."""
 
 _SPARE = 1.001
-"""Factor on the size of boxes, so that rounding never leaves out what is just in view."""
+"""Factor on the size of boxes, so as to keep geoms at the edge of the view."""
 
 _PLAIN = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
 
 LOOK = ".look"
-"""A geom `<name>.look` is the image of the geom `<name>`, and is numbered as that one is."""
+"""Suffix of looks: geom `<name>.look` is the image of geom `<name>`, with its number."""
 
 
 class Changing(Protocol):
-    """What a stage must know of what moves in a world by itself."""
+    """Moving and changing parts of a world, as a stage needs them."""
 
     @property
     def fog(self) -> bool:
         """Whether there is fog."""
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Make the world as it is at a time."""
+        """Set the world to its state at a time."""
 
 
 class Stage:
-    """Draws the geoms of groups 0 to 2 (MuJoCo's default) of one model.
+    """Off-screen stage for the geoms of groups 0 to 2 (MuJoCo's default) of a model.
 
     Not thread-safe: stay in the thread that made it.
 
@@ -165,7 +165,7 @@ class Stage:
         self._gl.make_current()
 
     def look(self, camera_id: int, qpos: Floats, seconds: float = 0.0, light: float = 1.0) -> None:
-        """Set the scene up as a camera sees it."""
+        """Set up the scene of a camera for a state and time."""
         model, data = self.model, self._data
         data.qpos[:] = qpos
         if self._dynamics is not None:
@@ -186,7 +186,7 @@ class Stage:
                     part *= light
 
     def aim(self, turn: Floats, left: float, right: float, top: float, bottom: float) -> None:
-        """Draw what follows with another frame than the camera's own, until the next `look`.
+        """Replace the camera's own view frame until the next `look`.
 
         Args:
             turn: Axes of the view (right, down, ahead) in the camera's optical frame, shape (3, 3).
@@ -210,7 +210,7 @@ class Stage:
     def colour_and_depth(
         self, size: Size, colour: bool, depth: bool
     ) -> tuple[Colours | None, Depths | None]:
-        """Draw once and read both, or what of them is wanted; None stands for the other."""
+        """Draw once and read colour and depth as requested; None for the other."""
         rgb = np.empty((*size, 3), np.uint8) if colour else None
         buffer = np.empty(size, np.float32) if depth else None
         if rgb is None and buffer is None:
@@ -260,7 +260,7 @@ class Stage:
     def _draw(
         self, size: Size, rgb: Colours | None, depth: Depths | None, plain: bool = False
     ) -> None:
-        """Draw what is in view, and read it, from the bottom row upwards.
+        """Draw the geoms in view and read the image, from the bottom row upwards.
 
         Args:
             plain: Draw every object in a colour that is its number, without texture, lights and
@@ -277,12 +277,12 @@ class Stage:
         mujoco.mjr_readPixels(rgb, depth, viewport, self._context)
 
     def _opaque(self) -> bool:
-        """Return whether nothing is transparent: what is does not hide, but has a number."""
+        """Return whether all geoms are opaque: others hide nothing, but have numbers."""
         model = self.model
         return bool((model.geom_rgba[:, 3] >= 1.0).all() and (model.mat_rgba[:, 3] >= 1.0).all())
 
     def _in_view(self, size: Size) -> npt.NDArray[np.bool_]:
-        """Return which geoms may be seen: those whose boxes are not beyond an edge of the view."""
+        """Return a mask of the geoms in view: their boxes are not beyond an edge."""
         model, data, camera = self.model, self._data, self._scene.camera[0]
         near, up = camera.frustum_near, np.array(camera.up, np.float64)
         ahead = np.array(camera.forward, np.float64)
@@ -330,7 +330,7 @@ def metric_depth(buffer: Depths) -> Depths:
 
 
 def _set_quality(model: Any, width: int, height: int) -> None:
-    """Leave out what costs much in software, and set the clipping planes."""
+    """Switch off costly effects of software rendering, and set the clipping planes."""
     visual = model.vis
     visual.quality.offsamples = 0  # multisampling would also blur depth and numbers
     visual.quality.shadowsize = 0
@@ -341,7 +341,7 @@ def _set_quality(model: Any, width: int, height: int) -> None:
 
 
 def _surfaces_only() -> Any:
-    """Return the options that show geoms with their textures, and no sites, tendons or arrows."""
+    """Return the options for textured geoms, without sites, tendons or arrows."""
     option = mujoco.MjvOption()
     option.flags[:] = 0
     option.flags[mujoco.mjtVisFlag.mjVIS_TEXTURE] = 1
@@ -355,7 +355,7 @@ def _surfaces_only() -> Any:
 
 
 def _object_numbers(model: Any) -> npt.NDArray[np.int32]:
-    """Return each geom's object number: its own id, or its namesake's if it is a look."""
+    """Return each geom's object number: its own id, or for a look its solid's."""
     numbers = np.arange(model.ngeom, dtype=np.int32)
     for geom in range(model.ngeom):
         name = model.geom(geom).name

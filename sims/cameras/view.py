@@ -1,4 +1,4 @@
-"""From drawings to what falls on a camera's sensor: whole images, or bands of a rolling shutter."""
+"""Sensor images from drawings: whole images, or bands of a rolling shutter."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from sims.cameras.stage import RANGE, Colours, Depths, Stage
 Numbers = npt.NDArray[np.int32]
 
 CREASE = 1e-3
-"""Second difference of the inverse depth, as a share of it, from which on neighbouring pixels are
-taken to show different surfaces. On a plane it is zero."""
+"""Least second difference of the inverse depth, as a share, between two surfaces.
+
+On a plane it is zero.
+"""
 
 
 class Drawn(NamedTuple):
-    """What a camera sees, as far as it was asked for, of some of its rows.
+    """Requested images of a camera, for some of its rows.
 
     Attributes:
         colours: uint8, shape (rows, width, 3); black where no ray falls on the image.
@@ -38,7 +40,7 @@ class Drawn(NamedTuple):
 
 
 class View:
-    """How one camera's images come from drawings.
+    """Images of a camera, assembled from drawings.
 
     Args:
         framed: Whether the model's camera has just this frame, so that nothing is aimed.
@@ -50,7 +52,7 @@ class View:
         self._faces = faces(info)
 
     def largest(self) -> tuple[int, int]:
-        """Return width and height of a buffer that takes every drawing, pixels."""
+        """Return width and height of a buffer for all drawings, pixels."""
         width = max((face.width for face in self._faces), default=1)
         return width, max((face.height for face in self._faces), default=1)
 
@@ -62,7 +64,7 @@ class View:
         numbers: bool,
         rows: tuple[int, int] | None = None,
     ) -> Drawn:
-        """Draw what the camera sees."""
+        """Draw the requested images of the camera."""
         first, last = rows or (0, self.info.height)
         size = last - first, self.info.width
         if self._framed and rows is None:
@@ -81,7 +83,7 @@ class View:
 
 
 def stacked(pieces: list[Drawn]) -> Drawn:
-    """Return bands of rows, from the top, as one image."""
+    """Return bands of rows, from the top, joined into an image."""
     if len(pieces) == 1:
         return pieces[0]
     colours, depth, numbers = zip(*pieces, strict=True)
@@ -119,7 +121,7 @@ def looked_up(drawn: Drawn, columns: Maps, rows: Maps) -> Drawn:
 
 
 def _add(seen: Drawn, stage: Stage, face: Face, first: int, last: int) -> None:
-    """Draw of a face what some rows of an image need, and put it there."""
+    """Draw the part of a face needed for some rows of an image, into `seen`."""
     assert face.columns is not None
     assert face.rows is not None
     assert face.mask is not None
@@ -141,7 +143,7 @@ def _add(seen: Drawn, stage: Stage, face: Face, first: int, last: int) -> None:
 
 
 def _span(places: Maps, length: int) -> tuple[int, int]:
-    """Return the first pixel to draw, and the one after the last, for all places to be known."""
+    """Return the first pixel to draw, and the end of the range, for all places."""
     first, last = math.floor(places.min()) - MARGIN + 1, math.ceil(places.max()) + MARGIN
     return max(first, 0), min(last, length)
 
@@ -161,16 +163,16 @@ def _drawn(stage: Stage, size: tuple[int, int], colour: bool, depth: bool, numbe
 Floats = npt.NDArray[np.float64]
 
 OFF = 0.25
-"""Pixels by which a row may be off because it is drawn at the time of another one."""
+"""Largest shift of a row drawn at another row's time, pixels."""
 
 FINER_FOR_DEPTH = 2.5
 """Times as many bands where depth is wanted: on a slanted floor a pixel is some centimetres."""
 
 MOST_BANDS = 128
-"""Bands of one image, at most; beyond 64 pixels of motion in a readout, rows are farther off."""
+"""Most bands per image; beyond 64 pixels of motion in a readout, rows exceed `OFF`."""
 
 SAMPLES = 32
-"""Pixels along the longer side of the small image by which motion is measured."""
+"""Longer side of the small image for motion measurement, pixels."""
 
 
 def row_time(readout: float, row: float, height: int) -> float:
@@ -193,7 +195,7 @@ def row_bands(height: int, shift: float) -> list[tuple[int, int]]:
 
 
 def small_camera(info: CameraInfo) -> CameraInfo:
-    """Return a camera that sees the same with few pixels."""
+    """Return a camera with the same view and few pixels."""
     share = min(SAMPLES / max(info.width, info.height), 1.0)
     width, height = max(round(info.width * share), 1), max(round(info.height * share), 1)
     across, down = width / info.width, height / info.height
@@ -215,7 +217,7 @@ def image_speeds(
     poses: list[Floats],
     seconds: float,
 ) -> Floats:
-    """Return how quickly what a camera sees moves through its image, pixels per second.
+    """Return the speeds of visible points in the image, pixels per second.
 
     Args:
         depth: Planar depth as the small camera sees it at the middle pose, shape (h, w).

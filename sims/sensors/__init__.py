@@ -1,4 +1,4 @@
-"""Sensors other than cameras: pure models, and what runs them for a vehicle's node.
+"""Sensors other than cameras: pure models, and the suite for a vehicle's node.
 
 A model is told the truth and returns what its sensor measures; it knows no clock and sends
 nothing. `SensorSuite` runs all of a vehicle's models at their rates, and sends what they measure

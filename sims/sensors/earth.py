@@ -1,4 +1,4 @@
-"""Sensors of the earth: of its air, of its magnetic field, and of the place on it."""
+"""Barometer, magnetometer and GNSS receiver."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sims.sensors.sensor import GaussMarkov, NonNegative, Place, Positive, Senso
 
 _SEA_LEVEL = 101325.0
 _RADIUS = 6378.137
-"""Kilometres that AirSim takes for the earth's radius."""
+"""Radius of the earth in AirSim, kilometres."""
 
 
 class BarometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,7 +58,7 @@ def temperature_at(altitude: float) -> float:
 
 
 def altitude_at(pressure: float) -> float:
-    """Return the pressure altitude (metres) that a barometer with QNH 1013.25 hPa shows."""
+    """Return the pressure altitude of a barometer with QNH 1013.25 hPa, metres."""
     return float((1.0 - (pressure / _SEA_LEVEL) ** 0.190284) * 145366.45 * 0.3048)
 
 
@@ -172,7 +172,7 @@ class Magnetometer(Sensor[MagnetometerSpec]):
 
 
 class GnssSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a satellite receiver; by default those of AirSim's GPS, which is free of errors.
+    """Settings of a GNSS receiver; the defaults are AirSim's GPS, free of errors.
 
     Attributes:
         horizontal_noise: Standard deviation of the white noise, north and east, metres.
@@ -181,12 +181,12 @@ class GnssSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True
         vertical_drift: Standard deviation of the slow error, down, metres.
         drift_time: Time constant of the slow error, a first-order Gauss-Markov process.
         velocity_noise: Standard deviation of the velocity's white noise, metres per second.
-        eph_initial: Uncertainty that the receiver shows at the start, metres (AirSim:
-            ``EphInitial`` and ``EpvInitial``). It is part of `position_covariance`, and of nothing
-            else: the position itself is as good at the start as later.
-        eph_final: What the uncertainty sinks to, metres (AirSim: ``EphFinal``, ``EpvFinal``).
-        eph_time_constant: Time constant with which it sinks (AirSim: ``EPH_TimeConstant``).
-        eph_min_3d: Uncertainty, metres, from which on a fix has status 0 (AirSim: ``EphMin3d``).
+        eph_initial: Reported uncertainty at the start, metres (AirSim: ``EphInitial`` and
+            ``EpvInitial``). It affects `position_covariance` only: the position itself is as good
+            at the start as later.
+        eph_final: Final reported uncertainty, metres (AirSim: ``EphFinal``, ``EpvFinal``).
+        eph_time_constant: Time constant of the decay between them (AirSim: ``EPH_TimeConstant``).
+        eph_min_3d: Largest uncertainty of a fix with status 0, metres (AirSim: ``EphMin3d``).
     """
 
     latency: Latency = Latency(0.2)  # immutable

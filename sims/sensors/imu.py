@@ -15,7 +15,7 @@ from events.frames import cross, inverse, multiply, rotate, rotate_inverse, sler
 from sims.sensors.sensor import Mount, NonNegative
 
 _BLOCK = 512
-"""Samples drawn at once: numpy's cost per call is that of a few hundred random numbers."""
+"""Samples per draw: a numpy call costs as much as a few hundred random numbers."""
 
 Floats = npt.NDArray[np.float64]
 
@@ -100,7 +100,7 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def mounted(self) -> bool:
-        """Whether it is anywhere but in the body's origin, and its axes."""
+        """Whether the IMU's pose differs from the body's origin and axes."""
         return any(self.position) or any(self.orientation)
 
 
@@ -145,7 +145,7 @@ class ImuNoise:
         self._next = 0
 
     def add(self, angular_velocity: Vector3, specific_force: Vector3) -> tuple[Vector3, Vector3]:
-        """Return what the IMU measures at its next sample.
+        """Return the IMU's measurement at its next sample.
 
         Args:
             angular_velocity: True, rad/s.
@@ -180,7 +180,7 @@ class ImuNoise:
 
 
 class ImuModel:
-    """An IMU with all its errors: told the true motion of its place, it returns what it measures.
+    """Model of an IMU with all its errors: measurements from true motion.
 
     Args:
         noise: Source of the random numbers of its noise.
@@ -243,7 +243,7 @@ class ImuModel:
         return _limited(rates, *self._limits[0]), _limited(force, *self._limits[1])
 
     def announcement(self, source: str, body: str, stamp: int = 0) -> ImuAnnouncement:
-        """Return what the IMU will provide."""
+        """Return the announcement of the IMU."""
         p = self.parameters
         fields = ImuAnnouncement.__struct_fields__
         same = {name: getattr(p, name) for name in fields if hasattr(p, name)}
@@ -338,7 +338,7 @@ NOISES = (
 
 _EYE = np.eye(3)
 _NO_ERRORS = ("sampling", "position", "orientation")
-"""Settings that are the same of an ideal IMU."""
+"""Settings kept for an ideal IMU."""
 
 
 def _matrix(given: tuple[float, ...], scale: float, angle: float, numbers: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Lidars: where their rays go and when, what these meet, and when the scans are sent.
+"""Lidars: ray patterns, ray casting, and delivery of scans.
 
 MuJoCo casts the rays, in a worker process, each from where the sensor is at the ray's own time.
 """
@@ -96,7 +96,7 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Pattern(NamedTuple):
-    """The rays of one turn.
+    """Rays of a turn.
 
     Attributes:
         directions: Unit vectors in the sensor's frame (FRD), shape (columns, channels, 3).
@@ -108,7 +108,7 @@ class Pattern(NamedTuple):
 
 
 def pattern_of(spec: LidarSpec, start: float) -> Pattern:
-    """Return the rays of the turn that begins at a time, seconds."""
+    """Return the rays of a turn beginning at `start`, seconds."""
     low, high = np.radians(spec.elevations)
     first, last = np.radians(spec.azimuths)
     share = np.arange(spec.columns) / spec.columns
@@ -145,7 +145,7 @@ class Lidar(Mounted[LidarSpec]):
 _STEP = TIMESTEP_NS * 1e-9
 _ONLY_FIRST = np.array([1, 0, 0, 0, 0, 0], np.uint8)
 _DEFAULT = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
-"""Colour of a geom that has been given none, and so has its material's."""
+"""MuJoCo's default colour of a geom, replaced by its material's."""
 
 
 class _Boxes:
@@ -161,14 +161,14 @@ class _Boxes:
         ]
 
     def extents(self, normals: Floats, origins: Floats) -> tuple[Floats, Floats]:
-        """Return between which heights each box is over planes, shape (planes, geoms)."""
+        """Return lower and upper height of each box over planes, shape (planes, geoms)."""
         height = normals @ self._centres - (normals * origins).sum(axis=1)[:, None]
         half = sum(np.abs(normals @ edges) for edges in self._edges)
         return height - half, height + half
 
 
 class Scanner:
-    """Scans turns of the lidars of one body.
+    """Ray-casting scanner for the lidars of a body.
 
     Args:
         model_bytes: The compiled world, from `sims.cameras.renderer.model_to_bytes`.
@@ -198,7 +198,7 @@ class Scanner:
         self._boxes = _Boxes(self._rays)
 
     def scan(self, name: str, start: int, states: Floats) -> LidarScan:
-        """Scan one turn.
+        """Scan a single turn.
 
         Args:
             start: Stamp of the first ray (ns).
@@ -250,7 +250,7 @@ class Scanner:
     def _aside(
         self, origins: Floats, rays: Floats, borders: npt.NDArray[np.intp], reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Return which geoms no ray of a group can meet, shape (groups, geoms).
+        """Return a mask of geoms no ray of a group can meet, shape (groups, geoms).
 
         Four planes through the group's origin have all its rays on one side; a geom whose box is
         wholly on the other side of one of them, behind the origin or out of reach, is aside.
@@ -288,7 +288,7 @@ class Scanner:
         distances: Floats,
         returned: Floats,
     ) -> LidarScan:
-        """Return what the sensor makes of true distances; arrays of columns and channels."""
+        """Return the scan for true distances; arrays of columns and channels."""
         intensities = np.clip(returned, 0.0, 1.0)
         intensities *= np.minimum(1.0, spec.full_range / np.maximum(distances, 1e-9)) ** 2
         valid = np.isfinite(distances) & (intensities >= spec.min_intensity)
@@ -317,7 +317,7 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def _put_first(model: Any, met: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-    """Have MuJoCo forget those of the world's own geoms that light does not meet.
+    """Hide the world's own geoms not met by light from MuJoCo's ray casting.
 
     For each ray it goes through all geoms of a body, the first `body_geomnum` of its own.
 
@@ -336,7 +336,7 @@ def _put_first(model: Any, met: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
 
 
 def solids(model: Any) -> npt.NDArray[np.bool_]:
-    """Return which geoms light meets, shape (ngeom,): what is drawn, and is not transparent.
+    """Return a mask of geoms met by light, shape (ngeom,): drawn and not transparent.
 
     Where a built-in world has a solid and its look, which coincide, it is the solid: rays meet its
     plain shape in less time than the look's mesh.
@@ -365,7 +365,7 @@ def reflectivities(model: Any) -> Floats:
 
 
 def _mean_of(model: Any, texture: int) -> Floats:
-    """Return the mean colour of a texture, from one pixel in sixteen."""
+    """Return the mean colour of a texture, from every sixteenth pixel."""
     channels = int(model.tex_nchannel[texture])
     size = int(model.tex_height[texture]) * int(model.tex_width[texture]) * channels
     begin = int(model.tex_adr[texture])
@@ -375,7 +375,7 @@ def _mean_of(model: Any, texture: int) -> Floats:
 
 
 def _looks(model: Any) -> list[tuple[int, int]]:
-    """Return geoms that are another's look, and that other geom."""
+    """Return pairs of geoms: a look, and its solid."""
     pairs = []
     for look in range(model.ngeom):
         name = model.geom(look).name
@@ -387,11 +387,11 @@ def _looks(model: Any) -> list[tuple[int, int]]:
 
 
 LATE = 1.0
-"""Seconds by which a turn may end late, as it may in real time; one that ends later is skipped."""
+"""Longest delay of a turn's end in real time, seconds; later turns are skipped."""
 
 
 class LidarRig:
-    """All lidars of one vehicle.
+    """All lidars of a vehicle.
 
     A turn begins at one tick and ends at the next. It is then made from the states in which the
     vehicle was meanwhile, and sent `latency` after its end, with the stamp of its first ray.
@@ -413,7 +413,7 @@ class LidarRig:
         self._skipped: set[str] = set()
 
     async def start(self, world: DrawnWorld) -> None:
-        """Start what scans the world, and the turns; call it in `on_startup`."""
+        """Start the scanner and the turns; call in `on_startup`."""
         if not self._lidars:
             return
         specs = tuple(lidar.spec for lidar in self._lidars)
@@ -427,7 +427,7 @@ class LidarRig:
             self._node.every(lidar.spec.rate, functools.partial(self._turn, lidar), lidar.spec.name)
 
     def _turn(self, lidar: Lidar, tick: Tick) -> None:
-        """End the turn that began at the tick before, and begin the next."""
+        """End the turn of the previous tick, and begin the next."""
         end = self._advance(tick)
         start = self._starts.get(lidar.source, end)
         self._starts[lidar.source] = end

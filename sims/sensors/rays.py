@@ -1,4 +1,4 @@
-"""Rays through a world, and range finders, which send some."""
+"""Ray casting in a world, and range finders."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from sims.worlds import Dynamics
 Floats = npt.NDArray[np.float64]
 
 DRAWN = np.array([1, 1, 1, 0, 0, 0], np.uint8)
-"""Groups of geoms that cameras see, too."""
+"""Groups of geoms visible to cameras."""
 
 
 class Hits(NamedTuple):
-    """What rays of one origin meet.
+    """Intersections of rays from a common origin.
 
     Attributes:
         distances: Metres; ``inf`` for those that meet nothing. Shape (n,).
@@ -36,7 +36,7 @@ class Hits(NamedTuple):
 
 
 class Rays:
-    """A model in which rays are cast, at one state after the other.
+    """Ray casting in a model, state by state.
 
     Args:
         model: The compiled world; lights and colours of it are changed by its dynamics.
@@ -50,7 +50,7 @@ class Rays:
         self._body = int(model.body(body).id)
 
     def look(self, qpos: Floats, seconds: float) -> None:
-        """Put the world as it is at a time, with generalised positions, shape (nq,)."""
+        """Set the world to generalised positions, shape (nq,), and a time."""
         self.data.qpos[:] = qpos
         self._dynamics.apply(self.model, self.data, seconds)
         mujoco.mj_kinematics(self.model, self.data)
@@ -62,7 +62,7 @@ class Rays:
         reach: float,
         groups: npt.NDArray[np.uint8] = DRAWN,
     ) -> Hits:
-        """Cast rays from one place, shape (3,), along unit vectors, shape (n, 3); NWU, metres."""
+        """Cast rays from a point, shape (3,), along unit vectors, (n, 3); NWU, metres."""
         count = len(directions)
         geoms, distances = np.empty(count, np.int32), np.empty(count)
         normals = np.empty((count, 3))
@@ -85,7 +85,7 @@ class Rays:
 
 
 class RangeFinderSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a range finder, which looks along its x axis.
+    """Settings of a range finder, pointing along its x axis.
 
     Attributes:
         name: Name of the sensor, unique on its body.
@@ -112,7 +112,7 @@ class RangeFinderSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def cone(angle: float) -> Floats:
-    """Return unit vectors about the x axis, shape (n, 3): one, or 25 over a cone's angle (rad)."""
+    """Return unit vectors about the x axis, shape (n, 3): 1, or 25 over a cone (rad)."""
     rows = [(1.0, 0.0, 0.0)]
     if angle > 0.0:
         for radius, count in ((angle / 4.0, 8), (angle / 2.0, 16)):

@@ -1,4 +1,4 @@
-"""What all sensors but cameras and the IMU have in common: settings, place, source, truth."""
+"""Common base of all sensors but cameras and IMU: settings, place, source, truth."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SensorSpec(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Truth(NamedTuple):
-    """What is true of the body that carries a sensor, at one instant."""
+    """True state of a sensor's body at an instant."""
 
     stamp: int
     """Nanoseconds."""
@@ -64,11 +64,11 @@ class Truth(NamedTuple):
     velocity: Vector3
     """Metres per second NED."""
     qpos: Any
-    """The world's generalised positions, shape (nq,), for sensors that see it."""
+    """The world's generalised positions, shape (nq,), for sensors of the surroundings."""
 
 
 class Place(NamedTuple):
-    """Where a sensor is, and what its measurements are called."""
+    """Source, frame and geographic origin of a sensor."""
 
     source: str
     """Of its measurements: ``drone/barometer``."""
@@ -85,7 +85,7 @@ class Mounted(Generic[S]):
     """A sensor on a body."""
 
     announced: ClassVar[type[SensorAnnouncement]]
-    """What announces it; the fields that its settings have, too, are theirs."""
+    """Announcement type; its fields named like settings take the settings' values."""
 
     def __init__(self, spec: S, place: Place) -> None:
         self.spec = spec
@@ -97,11 +97,11 @@ class Mounted(Generic[S]):
         return self.place.source
 
     def also_announced(self) -> dict[str, Any]:
-        """Return those fields of the announcement that are not among the settings."""
+        """Return the announcement's fields not found among the settings."""
         return {}
 
     def announcement(self) -> Any:
-        """Return what the sensor will provide."""
+        """Return the announcement of the sensor."""
         fields = {
             name: getattr(self.spec, name)
             for name in self.announced.__struct_fields__
@@ -119,10 +119,10 @@ class Mounted(Generic[S]):
 
 
 class Sensor(Mounted[S], ABC):
-    """Model of one sensor: told the truth at its rate, it returns what it measures."""
+    """Model of a sensor: from the truth to measurements, at its rate."""
 
     port: ClassVar[str]
-    """Output of the vehicle's node that its measurements are sent on."""
+    """Output of the vehicle's node for the measurements."""
 
     def __init__(self, spec: S, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place)
@@ -158,6 +158,6 @@ class GaussMarkov:
 
 
 def generator_of(parent: np.random.Generator, name: str) -> np.random.Generator:
-    """Return a generator that depends on a node's and a sensor's name; the parent's stays."""
+    """Return a generator seeded by node and sensor name; the parent's state stays."""
     entropy = parent.bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
     return np.random.default_rng([*entropy, zlib.crc32(name.encode())])

@@ -71,7 +71,7 @@ def mount_imu(world: mujoco.MjSpec, vehicle: str, parameters: ImuParameters) -> 
 
 
 class VehicleImu:
-    """The IMU of one vehicle: its model, fed from the physics."""
+    """IMU of a vehicle: its model, fed from the physics."""
 
     def __init__(
         self, node: Node[Any], config: SensorsConfig, physics: Physics, frame_id: str
@@ -108,20 +108,20 @@ class VehicleImu:
 
     @property
     def mounted(self) -> bool:
-        """Whether it has a frame of its own."""
+        """Whether the IMU has a frame of its own."""
         return self._model.parameters.mounted
 
     def announcement(self) -> ImuAnnouncement:
-        """Return what the IMU will provide."""
+        """Return the announcement of the IMU."""
         return self._model.announcement(self.source, self._body)
 
     def forget(self) -> None:
-        """Forget how its place has moved, which did not lead to where it is now."""
+        """Forget the last motion, after a jump of the vehicle."""
         self._before = None
 
 
 class SensorSuite:
-    """All sensors of one vehicle but its cameras.
+    """All sensors of a vehicle but its cameras.
 
     Every measurement has the stamp of the state that it is of, and is sent `latency` later. A
     sensor's random numbers depend on the run's seed, its node's name and its own only.
@@ -173,7 +173,7 @@ class SensorSuite:
         self.lidars = LidarRig(node, lidars, physics, advance)
 
     async def start(self) -> None:
-        """Have all sensors measure at their rates; call it in `on_startup`."""
+        """Start the measurements of all sensors; call in `on_startup`."""
         await self.lidars.start(self._world)
         self._random = self._node.rng.bit_generator.state
         for index, sensor in enumerate(self.sensors):
@@ -181,7 +181,7 @@ class SensorSuite:
             self._node.every(sensor.spec.rate, measure, sensor.source.partition("/")[2])
 
     def reset(self) -> None:
-        """Begin anew, with the random numbers of the start; lidars, and what is due, go on."""
+        """Begin anew with the start's random numbers; lidars and pending sends go on."""
         self._node.rng.bit_generator.state = self._random
         self._begin()
 

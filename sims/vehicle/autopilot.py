@@ -68,7 +68,7 @@ _STOPPED: Motors = (0.0, 0.0, 0.0, 0.0)
 _IDLE: Motors = (0.05, 0.05, 0.05, 0.05)
 
 _FIRST_DT = 0.0025
-"""Seconds assumed before the first update, when there is no last one to count from."""
+"""Time step assumed at the first update, seconds."""
 
 
 class Phase(enum.Enum):
@@ -82,11 +82,11 @@ class Phase(enum.Enum):
 
 
 FARTHEST, FASTEST, FASTEST_TURN = 1e4, 50.0, 50.0
-"""Most that a vehicle may be teleported with: m, m/s, rad/s; physics would not bear much more."""
+"""Limits of a teleport: m, m/s, rad/s; the physics would not bear much more."""
 
 
 def teleport_fault(event: Teleport) -> str | None:
-    """Return what is wrong with a `Teleport`, None if nothing is."""
+    """Return the error in a `Teleport`, or None."""
     for field, limit, unit in (
         ("position", FARTHEST, "m"),
         ("linear_velocity", FASTEST, "m/s"),
@@ -154,7 +154,7 @@ class Autopilot:
         self._standing_ns: int | None = None
 
     def command(self, event: Event) -> str | None:
-        """Take an order or a set-point; it acts with the next update.
+        """Take an order or a set-point for the next update.
 
         Returns:
             None if it is obeyed, else why not.
@@ -192,14 +192,14 @@ class Autopilot:
         return self._controller.update(state, dt)
 
     def take_events(self) -> list[type[VehicleEvent]]:
-        """Return what has happened since the last call (`Armed`, `TakenOff`, …), oldest first."""
+        """Return the events since the last call (`Armed`, `TakenOff`, …), oldest first."""
         events = self._events
         if events:
             self._events = []
         return events
 
     def _refusal(self, event: Event) -> str | None:
-        """Return why a command is not obeyed now, None if it is."""
+        """Return the reason to refuse a command now, or None."""
         phase = self.phase
         grounded = phase in (Phase.DISARMED, Phase.ARMED)
         reason = None
@@ -274,7 +274,6 @@ class Autopilot:
         self._events.append(Disarmed)
 
     def _begin(self, order: Event, state: State) -> None:
-        """Start what was ordered from where the vehicle is now."""
         self._expires_ns = None
         match order:
             case PositionSetpoint():
@@ -332,17 +331,17 @@ class Autopilot:
 
 
 DEPTH = 0.02
-"""Metres that a vehicle may reach into something: feet that stand, a propeller that brushes."""
+"""Tolerated depth in a solid, metres: standing feet, a brushing propeller."""
 
 FALL = 0.05
-"""Metres above the ground at which a vehicle does not stand on it."""
+"""Greatest height above the ground of a standing vehicle, metres."""
 
 _SOLIDS = np.array([1, 0, 0, 0, 0, 0], np.uint8)
-"""Groups of geoms that rays hit: 0 alone."""
+"""Groups of geoms hit by rays: 0 alone."""
 
 
 class Clearance:
-    """What a vehicle would meet at a place, or on a straight line."""
+    """Obstacles to a vehicle, at a place or on a straight line."""
 
     def __init__(self, model: mujoco.MjModel, name: str) -> None:
         self._model = model
@@ -357,7 +356,7 @@ class Clearance:
         self._no_hits = np.where(solid & (np.array(self._movers) == ""), 0, 1)
 
     def at(self, place: Vector3, *, now: bool = False) -> str:
-        """Return the name of what the vehicle would be stuck in, level; empty for nothing.
+        """Return the obstacle's name for a level vehicle at a place; empty for none.
 
         Args:
             place: Metres NED.
@@ -419,7 +418,7 @@ class Clearance:
 
 
 def trouble_at_start(world: Clearance, place: Vector3) -> str:
-    """Return why a vehicle cannot stand at a position; empty if it can."""
+    """Return the reason against starting at a position; empty if free."""
     if found := world.at(place, now=True):
         return f"expected a free place to start at, found {show(place)} in {found}"
     if world.ground_below(place) is None:
@@ -430,7 +429,7 @@ def trouble_at_start(world: Clearance, place: Vector3) -> str:
 def trouble_on_path(
     world: Clearance, start: Vector3, waypoints: Iterable[Vector3], margin: float = 0.0
 ) -> str:
-    """Return why a vehicle cannot fly from point to point; empty if it can.
+    """Return the reason against flying from point to point; empty if free.
 
     Args:
         start: Position of the vehicle, which first climbs to the height of the first waypoint.
@@ -467,5 +466,5 @@ def _troubles(
 
 
 def show(place: Vector3) -> str:
-    """Return a place as it stands in a file."""
+    """Return a place in the notation of a configuration file."""
     return f"[{', '.join(f'{component + 0.0:g}' for component in place)}]"

@@ -25,7 +25,7 @@ from sims.vehicle.position import Gains, Limits, PositionController
 
 
 class AttitudeController:
-    """Quaternion attitude control that puts tilt before yaw.
+    """Quaternion attitude control with priority of tilt over yaw.
 
     The error is split into the shortest turn that brings the thrust where it should point and a
     turn about it (D. Brescianini, R. D'Andrea, *Tilt-prioritized quadrocopter attitude control*,
@@ -41,7 +41,7 @@ class AttitudeController:
         self._yaw_rate = limits.yaw_rate
 
     def update(self, orientation: Quaternion, target: Quaternion, yaw_rate: float) -> Vector3:
-        """Return the body rates (rad/s, FRD) that turn `orientation` to `target`.
+        """Return the body rates (rad/s, FRD) to turn `orientation` to `target`.
 
         Args:
             yaw_rate: Feed-forward, rad/s about the world's z (down).
@@ -96,7 +96,7 @@ class BodyRateController:
     )  # fmt: skip
 
     _INTEGRAL = 10.0
-    """Most that an integrator adds, rad/s²."""
+    """Limit of an integrator, rad/s²."""
 
     def __init__(self, parameters: VehicleParameters, gains: Gains) -> None:
         self._jx, self._jy, self._jz = parameters.inertia
@@ -116,7 +116,7 @@ class BodyRateController:
         self._started = False
 
     def update(self, rates: Vector3, target: Vector3, dt: float) -> Vector3:
-        """Return the torque (N m, FRD) that brings `rates` to `target` (both rad/s, FRD)."""
+        """Return the torque (N m, FRD) to bring `rates` to `target` (both rad/s, FRD)."""
         wx, wy, wz = rates
         tx, ty, tz = target
         if self._started:
@@ -188,13 +188,13 @@ class Controller:
         self._motors: Motors | None = None
 
     def reset(self) -> None:
-        """Forget what was learnt in flight (integrals, last measurements)."""
+        """Forget the integrals and last measurements of a flight."""
         self.position.reset()
         self.rates.reset()
         self._in_velocity = False
 
     def follow(self, setpoint: Setpoint, state: State) -> None:
-        """Take a set-point; it replaces the last one.
+        """Follow a set-point in place of the last.
 
         Args:
             state: The vehicle now: a velocity set-point without yaw rate keeps its heading.
@@ -243,7 +243,7 @@ class Controller:
         self.position.to_position(position, velocity, yaw=yaw)
 
     def brake(self, state: State, vertical_velocity: float = 0.0) -> None:
-        """Stop and hold the place, or go on only up or down (m/s, NED), looking where it looks."""
+        """Stop and hold the place, or only climb or sink (m/s, NED); keep the heading."""
         self._take_over()
         self.position.brake(yaw_of(state.orientation), vertical_velocity)
 
@@ -265,7 +265,7 @@ class Controller:
         return self.mixer.mix(thrust, roll, pitch, yaw)
 
     def _take_over(self) -> None:
-        """Go to position or velocity flight; what its loops remember from before is stale."""
+        """Switch to position or velocity flight, with a reset of stale loop states."""
         if not self._in_position:
             self.position.reset()
         self._leave_motors()
@@ -273,7 +273,7 @@ class Controller:
         self._in_velocity = False
 
     def _leave_motors(self) -> None:
-        """Let the loops turn the motors again; what they remember from before is stale."""
+        """Hand the motors back to the loops, with a reset of stale loop states."""
         if self._motors is not None:
             self._motors = None
             self.rates.reset()
@@ -293,14 +293,14 @@ def _clip(value: float, limit: float) -> float:
 
 
 Setpoint = PositionSetpoint | VelocitySetpoint | AttitudeSetpoint | BodyRateSetpoint | MotorSetpoint
-"""What the cascade can follow."""
+"""Set-points accepted by the cascade."""
 
 MOST = 1e6
 """In SI units; squares of much greater numbers would overflow in the control loops."""
 
 
 def fault(setpoint: Setpoint) -> str | None:
-    """Return what is wrong with a set-point, None if nothing is."""
+    """Return the error in a set-point, or None."""
     match setpoint:
         case PositionSetpoint():
             numbers = [*setpoint.position, *setpoint.velocity, *setpoint.acceleration]

@@ -1,4 +1,4 @@
-"""The vehicle as a MuJoCo model: how it gets into a world, what it weighs, what its motors can do.
+"""MuJoCo model of the vehicle: attachment to a world, mass, motor limits.
 
 The numbers stand in ``vehicle.xml`` only; whoever needs them reads them from the compiled model
 with `read_parameters`. Stepping is in `physics`.
@@ -18,7 +18,7 @@ from events.frames import flip_yz, flip_yz_rotation, from_yaw
 from sims.worlds import WorldError
 
 TIMESTEP_NS = 1_000_000
-"""Nanoseconds of one physics step."""
+"""Time step of the physics, nanoseconds."""
 
 GRAVITY = 9.81
 """Metres per second squared."""
@@ -41,13 +41,13 @@ _OPTIONS: dict[str, Any] = {
     # Semi-implicit Euler: nothing here is stiff, and MuJoCo's implicit integrators cost more.
     "integrator": int(mujoco.mjtIntegrator.mjINT_EULER),
 }
-"""Of a world in which there is a vehicle."""
+"""MuJoCo options of a world with vehicles."""
 
 _VEHICLE = Path(__file__).with_name("vehicle.xml")
 
 
 class Motor(msgspec.Struct, frozen=True, kw_only=True):
-    """One rotor.
+    """Rotor of a vehicle.
 
     Attributes:
         position: Metres from the centre of mass, FRD.
@@ -62,7 +62,7 @@ class Motor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True):
-    """What a controller must know of its vehicle.
+    """Parameters of a vehicle for its controller.
 
     Attributes:
         mass: Kilograms.
@@ -85,7 +85,7 @@ class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def hover_thrust(self) -> float:
-        """What holds the weight, 0 to 1 of `max_thrust`."""
+        """Thrust at hover, 0 to 1 of `max_thrust`."""
         return self.mass * self.gravity / self.max_thrust
 
 
@@ -145,9 +145,9 @@ def read_parameters(model: mujoco.MjModel, name: str) -> VehicleParameters:
 
 
 def mover_of(model: mujoco.MjModel, geom: int) -> str:
-    """Return the name of the vehicle, or of the body that moves by itself, that a geom is part of.
+    """Return the name of a geom's vehicle or self-moving body.
 
-    Empty for what is part of neither: it stands, or is moved by physics only.
+    Empty for a geom of neither: static, or moved by physics only.
     """
     root = int(model.body_rootid[model.geom_bodyid[geom]])
     name = str(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, root) or "")
@@ -157,7 +157,7 @@ def mover_of(model: mujoco.MjModel, geom: int) -> str:
 
 
 def name_of(model: mujoco.MjModel, geom: int) -> str:
-    """Return a geom's name, or that of its body if it has none; empty if neither has."""
+    """Return a geom's name, else its body's; empty if neither has a name."""
     kinds = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
     numbers = geom, int(model.geom_bodyid[geom])
     names = (mujoco.mj_id2name(model, *each) for each in zip(kinds, numbers, strict=True))
@@ -211,7 +211,7 @@ class Mixer:
     def mix(
         self, thrust: float, roll: float, pitch: float, yaw: float
     ) -> tuple[float, float, float, float]:
-        """Return the motor commands, each in 0 to 1, that come closest to what is asked."""
+        """Return the motor commands, 0 to 1 each, closest to the requested wrench."""
         a, b, c, d = self._roll
         e, f, g, h = self._pitch
         m0 = a * roll + e * pitch
@@ -261,7 +261,7 @@ class Mixer:
 
 
 def _room(motor: float, change: float) -> float:
-    """Return the share, 0 to 1, of `change` that keeps `motor` within 0 to 1."""
+    """Return the largest share of `change`, 0 to 1, to keep `motor` within 0 to 1."""
     if change > 0.0:
         room = (1.0 - motor) / change
     elif change < 0.0:

@@ -1,4 +1,4 @@
-"""What is true of one vehicle in a simulated world at an instant, and what the air does to it.
+"""True state of a vehicle in a simulated world, and the forces of the air.
 
 Stepping is in `simulation`. No sensor noise (see `sims.sensors`), no control (see `control`), no
 images. Everything that comes out is in our frames: world NED, body FRD.
@@ -33,7 +33,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class State(msgspec.Struct, frozen=True, gc=False):
-    """Where the vehicle is and how it moves.
+    """Pose and velocity of a vehicle.
 
     Attributes:
         position: Metres NED.
@@ -49,7 +49,7 @@ class State(msgspec.Struct, frozen=True, gc=False):
 
 
 class Contact(msgspec.Struct, frozen=True, gc=False):
-    """One point at which the vehicle touches something.
+    """Contact point of the vehicle with another object.
 
     Attributes:
         other: Name of the vehicle, or of the body that moves by itself, that it touches; else of
@@ -68,7 +68,7 @@ class Contact(msgspec.Struct, frozen=True, gc=False):
 
 
 class Physics:
-    """A vehicle's view of a simulation: its motors, its state, and what it feels.
+    """Interface of a vehicle to a simulation: motors, state, IMU and contacts.
 
     Whoever writes a state into `data` does it before anything is read at that instant.
 
@@ -125,11 +125,11 @@ class Physics:
         motors[3] = m3
 
     def state(self) -> State:
-        """Return where the vehicle is and how it moves."""
+        """Return the vehicle's pose and velocity."""
         return self.state_at(self.time_ns)[0]
 
     def state_at(self, stamp_ns: int) -> tuple[State, Floats, Floats]:
-        """Return the state at a time at or after `time_ns`, less than or just one step later.
+        """Return the state at a time from `time_ns` up to a whole step later.
 
         Returns:
             The vehicle's state; the world's, as `Simulation.state_at` returns it, for a renderer.
@@ -141,7 +141,7 @@ class Physics:
         return self.state_in(qpos, qvel), qpos, qvel
 
     def state_in(self, qpos: Floats, qvel: Floats) -> State:
-        """Return the vehicle's state in one of the world, such as one of `history`."""
+        """Return the vehicle's state in a world state, such as from `history`."""
         return _state(qpos[self._of_pose], qvel[self._of_twist])
 
     def imu(self, stamp_ns: int = 0) -> tuple[Vector3, Vector3]:
@@ -180,7 +180,7 @@ class Physics:
         return bool(self.data.ncon) and bool(self._own_contacts())
 
     def contacts(self) -> list[Contact]:
-        """Return every point at which the vehicle touches something."""
+        """Return all contact points of the vehicle."""
         self.simulation.refresh()
         if not self.data.ncon:
             return []
@@ -208,7 +208,7 @@ class Physics:
         self.simulation.changed()
 
     def settle(self) -> None:
-        """Have the vehicle rest on the ground, its weight carried, if that is where it starts.
+        """Let the vehicle rest on the ground, its weight carried, if starting there.
 
         Feet that only just touch the ground are pushed by nothing: the vehicle would begin with a
         free fall of 0.1 mm. A vehicle that does not come to rest within 1 cm and half a second
@@ -225,7 +225,7 @@ class Physics:
         self.simulation.reset()
 
     def _own_contacts(self) -> list[tuple[int, int]]:
-        """Return (contact, which of its two geoms is the vehicle's) for each that pushes."""
+        """Return (contact, side of the vehicle's geom) for each pushing contact."""
         body_of = self.model.geom_bodyid
         contact = self.data.contact
         own = []
@@ -310,7 +310,7 @@ class Air:
         return self._felt[vehicle].wind
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Move the air as it moves at the next millisecond."""
+        """Set the air to its motion in the next millisecond."""
         common = self.velocity
         for gust in self._spec.gusts:
             share = gust.share(seconds)
@@ -328,7 +328,7 @@ class Air:
 
 
 class _Felt:
-    """What one vehicle feels of the air."""
+    """Wind and turbulence at a vehicle."""
 
     def __init__(self, model: Any, name: str, turbulence: Turbulence) -> None:
         self.wind: Vector3 = (0.0, 0.0, 0.0)
@@ -342,7 +342,7 @@ class _Felt:
     def disturb(
         self, model: Any, data: Any, mean: Vector3, common: Vector3, w20: float, noise: list[float]
     ) -> None:
-        """Add turbulence to the wind that is common to all, and its force to the vehicle's."""
+        """Add turbulence to the common wind, and its force to the vehicle."""
         pose = data.qpos[self._pose : self._pose + 7].tolist()
         vx, vy, vz = data.qvel[self._twist : self._twist + 3].tolist()
         wx, wy, wz = flip_yz(mean)
@@ -359,7 +359,7 @@ class _Felt:
 
 
 def equivalent_box(model: Any, body: int) -> Vector3:
-    """Return the edges, metres, of the box that MuJoCo takes for a body in the air."""
+    """Return the edges of MuJoCo's equivalent inertia box of a body, metres."""
     inertia, mass = model.body_inertia[body], float(model.body_mass[body])
     total = float(inertia.sum())
     x, y, z = (math.sqrt(max(total - 2.0 * each, 0.0) * 6.0 / mass) for each in inertia.tolist())
@@ -367,7 +367,7 @@ def equivalent_box(model: Any, body: int) -> Vector3:
 
 
 def drag(model: Any, box: Vector3, velocity: Vector3) -> Vector3:
-    """Return the force of the air on a box, as MuJoCo's fluid model on inertia boxes has it.
+    """Return the air's force on a box, as in MuJoCo's inertia-box fluid model.
 
     Args:
         box: Its edges, metres.

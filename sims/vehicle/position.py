@@ -67,7 +67,7 @@ class Gains(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Limits that the cascade keeps, whatever the set-point.
+    """Limits of the control cascade, for all set-points.
 
     Attributes:
         tilt: Angle between the thrust and the vertical in position and velocity flight, radians.
@@ -102,10 +102,10 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 _STILL = 0.2
-"""Metres per second below which a braking vehicle takes hold of its place."""
+"""Speed of a braking vehicle at the start of position hold, metres per second."""
 
 _LARGE = 0.5 * 0.5
-"""Square of the velocity error (m/s) at which integrators learn half as fast.
+"""Square of the velocity error (m/s) at half the learning rate of the integrators.
 
 A large error says that a manoeuvre is under way, not that there is wind; learning from it would
 leave a slow tail after every step.
@@ -113,7 +113,7 @@ leave a slow tail after every step.
 
 
 class PositionController:
-    """Flies to places and at velocities, one target at a time.
+    """Controller of position or velocity, with a single target at a time.
 
     The thrust vector becomes an attitude as in D. Mellinger, V. Kumar, *Minimum snap trajectory
     generation and control for quadrotors*, ICRA 2011, with the x axis taken so that the heading is
@@ -186,7 +186,7 @@ class PositionController:
         self._heading_frame = heading_frame
 
     def brake(self, yaw: float, vertical_velocity: float = 0.0) -> None:
-        """Stop, and then hold the place where that was; or go on only up or down (m/s, NED)."""
+        """Stop and hold the place reached, or only climb or sink (m/s, NED)."""
         self.to_velocity((0.0, 0.0, vertical_velocity), yaw)
         self._braking = True
 

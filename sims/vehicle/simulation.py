@@ -1,4 +1,4 @@
-"""The physics of one world, with all vehicles in it: stepping, its present state, and its past."""
+"""Physics of a world with all its vehicles: stepping, present state and past states."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class History:
             self._states = deque(self._states, maxlen=steps)
 
     def add(self) -> None:
-        """Keep the present state, from which the next step is about to begin."""
+        """Store the present state, before the next step."""
         data = self._simulation.data
         self._states.append((data.qpos.copy(), data.qvel.copy()))
 
@@ -48,7 +48,7 @@ class History:
         self._states.clear()
 
     def at(self, stamp_ns: int) -> tuple[Floats, Floats]:
-        """Return the world's state at a time in the past that is kept, or a step ahead at most.
+        """Return the world's state at a stored time, or up to a step ahead.
 
         On a whole millisecond positions are those of that step, between two as the step carried
         them (semi-implicit Euler); velocities are as of `Simulation.state_at`. Before time 0 all
@@ -84,14 +84,14 @@ class History:
 
 
 class PhysicsDivergedError(Exception):
-    """The state is no longer finite: the world's model or what was written into it is at fault."""
+    """State no longer finite: the world's model or a written state is at fault."""
 
 
 class Influence(Protocol):
-    """What makes a world other than its physics do: wind, bodies that move by themselves."""
+    """Influence on a world besides its physics: wind, self-moving bodies."""
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Make it as it is at a time; called once for each millisecond, the first one included."""
+        """Apply the influence at a time; called every millisecond, from the first on."""
 
 
 class Simulation:
@@ -160,7 +160,7 @@ class Simulation:
             )
 
     def state_at(self, stamp_ns: int) -> tuple[Floats, Floats]:
-        """Return the state at a time at or after `time_ns`, less than or just one step later.
+        """Return the state at a time from `time_ns` up to a whole step later.
 
         Between two steps the world is carried on as the next step will carry it: a whole step
         later this is what `advance_to` gives. (Damped joints of other bodies, which MuJoCo steps
@@ -193,11 +193,11 @@ class Simulation:
             self._fresh = True
 
     def changed(self) -> None:
-        """Take note that somebody has written a state into `data`."""
+        """Take note of a state written into `data`."""
         self._fresh = False
 
     def add_influence(self, influence: Influence) -> None:
-        """Have an influence be applied at each millisecond from the next one on, after the others.
+        """Apply an influence at each millisecond from the next on, after the others.
 
         `reset` does not take it away.
         """

@@ -36,16 +36,18 @@ WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {
     "night": night,
     "forest": forest,
 }
-"""The worlds that are built in: name to the function that makes one from a seed, bare or not. One
-in which something moves by itself is a `Scene`."""
+"""Built-in worlds by name: functions of a seed and `bare`.
+
+A world with self-moving parts is a `Scene`.
+"""
 
 
 class WorldError(VisnavError, ValueError):
-    """There is no such world, or the file is not one."""
+    """Unknown world, or an invalid world file."""
 
 
 def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> mujoco.MjSpec:
-    """Return a world without what moves in it by itself; see `load_scene`."""
+    """Return a world without its self-moving parts; see `load_scene`."""
     return load_scene(name_or_path, seed, bare=bare).spec
 
 

@@ -1,4 +1,4 @@
-"""Bodies that move by themselves: people, cars, doors and boxes, on splines and hinges.
+"""Self-moving bodies: people, cars, doors and boxes, on splines and hinges.
 
 Their settings are in ``map`` (NED); what is built of them, in MuJoCo's axes (NWU), from the shapes
 in ``bodies.xml``.
@@ -42,23 +42,22 @@ COLOURS: dict[Kind, Vector3] = {
 
 
 class BodySpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a body that moves by itself.
+    """Settings of a self-moving body.
 
     Attributes:
-        name: Its name, unique in the world; its source is ``<node>/<name>``.
-        kind: What it is: ``person``, ``car``, ``door`` or ``box``.
-        waypoints: Places that it passes on a smooth curve, the middle of its foot, metres in
-            ``map``. Its heading is that of its way. One place: it stands there. Of a door: its
-            hinge.
-        times: When it is at each waypoint, and in a loop once more at the first. If left out,
-            `speed` says it.
+        name: Name, unique in the world; the source is ``<node>/<name>``.
+        kind: ``person``, ``car``, ``door`` or ``box``.
+        waypoints: Points of a smooth curve for the middle of its foot, metres in ``map``. The body
+            heads along the curve. A single point: it stands there. Of a door: its hinge.
+        times: Time at each waypoint, and in a loop once more at the first. From `speed` if left
+            out.
         speed: Mean speed on the straight lines between the waypoints, metres per second.
         loop: Whether it returns from the last waypoint to the first and goes on for ever; else it
             starts and ends at rest.
-        heading: Heading of what stands, degrees clockwise from north; of a door: that of its
-            panel when it is closed.
-        angles: Of a door: how far it is open at each of the `times`, degrees clockwise seen from
-            above. In a loop the last is the first.
+        heading: Heading of a standing body, degrees clockwise from north; of a door: that of its
+            closed panel.
+        angles: Opening of a door at each of the `times`, degrees clockwise seen from above. In a
+            loop the last is the first.
         size: Length along its heading, width and height, metres; that of its kind if left out.
         colour: Red, green and blue, 0 to 1; that of its kind if left out.
     """
@@ -97,7 +96,7 @@ class BodySpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             raise ValueError(f"{where}: waypoints: expected no two neighbours alike")
 
     def places(self) -> tuple[Vector3, ...]:
-        """Return the waypoints, of a loop with the first one again at the end."""
+        """Return the waypoints; of a loop, with the first repeated at the end."""
         return self.waypoints + (self.waypoints[:1] if self.loop else ())
 
 
@@ -122,7 +121,7 @@ class BodyMotion(NamedTuple):
 
     @property
     def solid(self) -> bool:
-        """Whether vehicles can touch it: always."""
+        """Whether vehicles can touch the body: always."""
         return True
 
     def pose(self, seconds: float) -> tuple[Vector3, Quaternion]:
@@ -136,7 +135,7 @@ class BodyMotion(NamedTuple):
         return self.place, from_yaw(yaw)
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Put it where it is at a time."""
+        """Move the body to its pose at a time."""
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, self.name)
         place, turn = self.pose(seconds)
         mocap = model.body_mocapid[body]
@@ -181,7 +180,7 @@ def add_bodies(scene: Scene, node: str, specs: tuple[BodySpec, ...]) -> Dynamics
 
 
 def add_shape(scene: Scene, body: Any, kind: Kind, size: Vector3, colour: Vector3) -> None:
-    """Give a body of a world the shape of a kind: its parts, called after it, and their materials.
+    """Add the shape of a kind to a body: parts named after the body, and materials.
 
     Args:
         body: MuJoCo's body, with its origin in the middle of its foot.
@@ -204,7 +203,7 @@ class _Shape:
         self._parts = 0
 
     def cloth(self, given: ET.Element) -> None:
-        """Add a material with small marks on it, so that it is not smooth to a camera."""
+        """Add a material with small marks, as texture for cameras."""
         name = f"{self._name}/{given.get('name')}"
         shade = float(given.get("shade", 1.0))
         colour = _numbers(given, "rgb") or [shade * each for each in self._colour]

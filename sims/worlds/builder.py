@@ -1,4 +1,4 @@
-"""Boxes, cylinders, walls, arches, crowns: so that a layout reads like a floor plan.
+"""Builder of worlds: boxes, cylinders, walls, arches and crowns, as on a floor plan.
 
 The world here is MuJoCo's: x north, y **west**, z up (NWU), metres. A thing that can be hit is two
 geoms: `<name>` is the solid (a primitive, group 3, not drawn), `<name>.look` the textured surface
@@ -57,7 +57,7 @@ WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 def sides(
     half: tuple[float, float], middle: tuple[float, float] = (0.0, 0.0)
 ) -> Iterator[tuple[str, tuple[float, float], float, float]]:
-    """Yield name, place of the foot, direction that it faces and width of a room's four walls."""
+    """Yield name, foot position, facing (degrees) and width of a room's four walls."""
     (x, y), (u, v) = half, middle
     yield "wall_north", (u + x, v), 180.0, 2.0 * y
     yield "wall_south", (u - x, v), 0.0, 2.0 * y
@@ -66,7 +66,7 @@ def sides(
 
 
 class Builder:
-    """Collects a world: materials, surfaces, lights, and the solids that it is built of.
+    """Builder of a world: materials, surfaces, lights and solids.
 
     Args:
         name: Name of the model, which its random numbers depend on.
@@ -116,7 +116,7 @@ class Builder:
         return Material(name, width / density, height / density, module)
 
     def sky(self, draw: Draw) -> None:
-        """Add a sky: the six faces of a cube, one below the other, as OpenGL has them."""
+        """Add a sky: the six faces of a cube, stacked in OpenGL's order."""
         self._texture("sky", draw, mujoco.mjtTexture.mjTEXTURE_SKYBOX)
 
     def cut(self, material: Material, width: float, height: float) -> Window:
@@ -141,12 +141,12 @@ class Builder:
         turn: float = 0.0,
         tilt: float = 0.0,
     ) -> None:
-        """Add a surface that is drawn, without collisions."""
+        """Add a drawn surface without collisions."""
         self.mesh(name, surface)
         self.hang(name, name, material, self.spec.worldbody, place, turn, tilt)
 
     def mesh(self, name: str, surface: Surface) -> None:
-        """Add a surface that can be hung up more than once."""
+        """Add a surface for repeated use by `hang`."""
         self.spec.add_mesh(
             name=name,
             uservert=surface.points.ravel(),
@@ -157,7 +157,7 @@ class Builder:
         )
 
     def moving(self, name: str) -> Any:
-        """Add a body that moves by itself, to hang surfaces on; it has no weight that matters."""
+        """Add a self-moving body to hang surfaces on; its weight does not matter."""
         return self.spec.worldbody.add_body(
             name=name, mocap=True, mass=1.0, inertia=[1.0, 1.0, 1.0], explicitinertial=True
         )
@@ -172,7 +172,7 @@ class Builder:
         turn: float = 0.0,
         tilt: float = 0.0,
     ) -> None:
-        """Put a surface that `mesh` added on a body: drawn, without collisions."""
+        """Hang a surface of `mesh` on a body: drawn, without collisions."""
         body.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_MESH,
@@ -285,7 +285,7 @@ class Builder:
     def crate(
         self, name: str, material: Material, edge: float, place: Vector, turn: float | None = None
     ) -> None:
-        """Add a cube, each side of which shows one of the nine images of a material at random.
+        """Add a cube, each side with a random image of the nine of a material.
 
         Without a `turn` (degrees) it stands a little askew, at random.
         """
@@ -330,7 +330,7 @@ class Builder:
         thick: float = 0.3,
         window: Window = WHOLE,
     ) -> None:
-        """Add a wall that has one side; `place` is the middle of its foot.
+        """Add a single-sided wall; `place` is the middle of its foot.
 
         It shows all of the material, or that `window` of it, which may repeat it.
         """
@@ -428,7 +428,7 @@ class Builder:
         place: Vector,
         turn: float = 0.0,
     ) -> None:
-        """Add a round arch: two legs and a half ring; one flies through it along its x.
+        """Add a round arch: two legs and a half ring, open along its x axis.
 
         Args:
             name: Its name; the legs are ``<name>/left``, ``/right``, the ring ``<name>/ring``.
@@ -478,5 +478,4 @@ def _tours() -> dict[str, tuple[Vector3, ...]]:
 
 TOURS = _tours()
 TOURS["night"] = TOURS["yard"]
-"""Each world's tour: waypoints in NED (metres), in order; from the last it goes back to the first.
-Each is about 50 to 60 m long."""
+"""Tour of each world: waypoints (NED, metres) of a closed path, about 50 to 60 m long."""

@@ -1,4 +1,4 @@
-"""`corridor`: a long corridor round a block, 57 m long, every door of which looks alike.
+"""`corridor`: a closed corridor round a block, 57 m long, with doors all alike.
 
 Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres. The corridor runs round a
 rectangle, and the origin is in the middle of its east side. Walls, floor and ceiling repeat one
@@ -78,7 +78,7 @@ def _pixels(metres: float) -> int:
 
 
 def _wall(random: np.random.Generator) -> Image:
-    """Return one module of wall: a door with its frame, a notice, a handrail, a skirting."""
+    """Return a wall module: a door with its frame, a notice, a handrail, a skirting."""
     shape = (_pixels(HEIGHT), _pixels(MODULE))
     height = HEIGHT - np.arange(shape[0], dtype=np.float32)[:, None] / DENSITY
     wall = materials.paint(shape, random, (0.86, 0.85, 0.79))
@@ -114,7 +114,7 @@ def _wall(random: np.random.Generator) -> Image:
 
 
 def _square(random: np.random.Generator, colour: tuple[float, float, float]) -> tuple[Image, Image]:
-    """Return a module of plain surface, and how near each pixel is to the lamp above it, 0..1."""
+    """Return a module of plain surface, and each pixel's nearness to the lamp, 0..1."""
     shape = (_pixels(MODULE), _pixels(MODULE))
     place = (np.arange(shape[0], dtype=np.float32) + 0.5) / DENSITY - MODULE / 2.0
     near = np.exp(-(place[:, None] ** 2 + place[None, :] ** 2) / 0.9)

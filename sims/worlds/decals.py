@@ -45,7 +45,7 @@ def letters(image: Image, text: str, where: Box, colour: Colour, worn: Image | N
 
 
 def poster(shape: tuple[int, int], random: np.random.Generator, number: int) -> Image:
-    """Return a printed poster: one of several compositions, its inks and word by `number`."""
+    """Return a printed poster: composition, inks and word by `number`."""
     height, width = shape
     paper, ink, second = INKS[number % len(INKS)]
     sheet = share(_composition(shape, random, number))
@@ -102,13 +102,13 @@ def _composition(
 
 
 def sheets(images: list[Image], columns: int) -> Image:
-    """Lay images of one size out in rows."""
+    """Lay out images of equal size in rows."""
     rows = [np.concatenate(images[i : i + columns], 1) for i in range(0, len(images), columns)]
     return np.concatenate(rows, 0)
 
 
 def crate_face(size: int, random: np.random.Generator, number: int) -> Image:
-    """Return one side of a wooden crate: boards, a frame, a brace, a stencilled mark."""
+    """Return a side of a wooden crate: boards, a frame, a brace, a stencilled mark."""
     shape = (size, size)
     tint = random.uniform(0.85, 1.12, 3)
     tone = tuple(
@@ -143,7 +143,7 @@ def crate_face(size: int, random: np.random.Generator, number: int) -> Image:
 
 
 def window_pane(shape: tuple[int, int], random: np.random.Generator, lit: bool) -> Image:
-    """Return a framed window with panes that reflect the sky, or are lit from within."""
+    """Return a framed window; its panes reflect the sky, or are lit from within."""
     height, width = shape
     fall = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
     top, bottom = (
@@ -169,7 +169,7 @@ def window_pane(shape: tuple[int, int], random: np.random.Generator, lit: bool) 
 
 
 def paste(image: Image, piece: Image, left: int, top: int, border: int = 0) -> None:
-    """Put a piece into an image, with a shadow line around it."""
+    """Paste a piece into an image, with a shadow line around the piece."""
     height, width = piece.shape[:2]
     if border:
         end = (left + width + border - 1, top + height + border - 1)
@@ -189,14 +189,14 @@ def stripes(image: Image, where: Box, worn: Image) -> None:
 
 
 def contact_shadow(image: Image, footprints: Image, reach: float, strength: float) -> Image:
-    """Darken a floor under and around what stands on it; `footprints` is a mask in 0..1."""
+    """Darken a floor under and around objects; `footprints` is a mask in 0..1."""
     wide = cv2.GaussianBlur(footprints, (0, 0), reach)
     close = cv2.GaussianBlur(footprints, (0, 0), reach / 4.0)
     return shade(image, -strength * np.clip(0.6 * wide + 0.5 * close, 0.0, 1.0))
 
 
 def tile(number: int, columns: int, rows: int) -> tuple[float, float, float, float]:
-    """Return the window of one image of `sheets`, by its number, a hair inside its edges."""
+    """Return the window of an image of `sheets`, by number, a hair inside its edges."""
     row, column = divmod(number % (columns * rows), columns)
     hair = 0.002
     left, top = column / columns + hair, row / rows + hair

@@ -1,4 +1,4 @@
-"""What moves or changes in a world by itself: pure functions of simulated time; lights, and fog.
+"""Dynamics of a world: pure functions of simulated time for bodies, lights and fog.
 
 Physics, renderers and lidars, each in its own process, apply the same `Dynamics` to their copy of
 the model, and so see the same world at the same time.
@@ -25,18 +25,18 @@ from runtime.units import Duration
 
 
 class Motion(Protocol):
-    """One thing that moves or changes. An implementation can be pickled.
+    """Motion or change in a world. An implementation can be pickled.
 
     Attributes:
-        solid: Whether vehicles can touch what it moves; else the physics need not know of it.
+        solid: Whether vehicles can touch the moved part; else physics need not know it.
     """
 
     @property
     def solid(self) -> bool:
-        """Whether vehicles can touch what it moves."""
+        """Whether vehicles can touch the moved part."""
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Put it where, or make it as, it is at a time.
+        """Move or change the part to its state at a time.
 
         What is written must not depend on what was there before, only on `seconds`.
 
@@ -47,7 +47,7 @@ class Motion(Protocol):
 
 
 class Dynamics(NamedTuple):
-    """All that moves or changes in a world by itself.
+    """All self-moving and changing parts of a world.
 
     Attributes:
         fog: Whether the world is drawn with fog, as MuJoCo's settings of it say.
@@ -57,32 +57,32 @@ class Dynamics(NamedTuple):
     fog: bool = False
 
     def joined(self, other: Dynamics) -> Dynamics:
-        """Return these and what moves or changes besides."""
+        """Return these dynamics combined with others."""
         return Dynamics(self.motions + other.motions, self.fog or other.fog)
 
     @property
     def solid(self) -> Dynamics:
-        """What of it vehicles can touch."""
+        """Dynamics of the parts vehicles can touch."""
         return Dynamics(tuple(motion for motion in self.motions if motion.solid))
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Make the world as it is at a time; kinematics and lights are computed after that."""
+        """Set the world to a time; kinematics and lights are computed afterwards."""
         for motion in self.motions:
             motion.apply(model, data, seconds)
 
 
 class Scene(NamedTuple):
-    """A world before it is compiled, and what moves in it by itself."""
+    """World before compilation, with its dynamics."""
 
     spec: mujoco.MjSpec
     dynamics: Dynamics = Dynamics()
 
 
 _YAW_STEP = 0.02
-"""Seconds between the headings that are worked out beforehand."""
+"""Interval of the precomputed headings, seconds."""
 
 _TURN = 0.25
-"""Seconds over which changes of heading are smoothed (standard deviation)."""
+"""Standard deviation of the smoothing of headings, seconds."""
 
 
 def within(seconds: float, times: Sequence[float], loop: bool) -> float:
@@ -167,7 +167,7 @@ def path_through(
 def _smoothed(
     yaws: np.ndarray[tuple[int], np.dtype[np.float64]], loop: bool
 ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Average headings over a Gaussian window; a loop goes on as it began, with its turns."""
+    """Smooth headings with a Gaussian window; loops continue, with their turns."""
     width = _TURN / _YAW_STEP
     reach = min(math.ceil(3 * width), len(yaws) - 1)
     window = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
@@ -185,7 +185,7 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 HEADLIGHT = "headlight"
-"""MuJoCo's name for the light that comes from everywhere, which all worlds have."""
+"""MuJoCo's name for the light from everywhere, present in all worlds."""
 
 
 class Changing(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -216,13 +216,13 @@ class Changing(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class LightSpec(Changing, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a light of the world that changes in time.
+    """Settings of a time-varying light of the world.
 
     Attributes:
-        name: The light's name in the world; ``headlight`` for the light that comes from everywhere;
-            ``*`` for all of them.
-        flicker: Share of its strength by which it flickers, at random but always alike.
-        flicker_rate: How often a second it does.
+        name: The light's name in the world; ``headlight`` for the light from everywhere; ``*`` for
+            all lights.
+        flicker: Share of its strength lost in flicker, at random but always alike.
+        flicker_rate: Rate of the flicker, Hz.
         directions: Directions of its rays at the `times`, north, east, down: a sun that moves.
             Empty for that in the world.
     """
@@ -270,11 +270,11 @@ class LightMotion(NamedTuple):
 
     @property
     def solid(self) -> bool:
-        """Whether vehicles can touch it: never."""
+        """Whether vehicles can touch the light: never."""
         return False
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
-        """Give it the strength and direction of a time."""
+        """Set the light's strength and direction at a time."""
         strength = self.spec.strength(seconds)
         colours = [[strength * each for each in colour] for colour in self.colours]
         if self.name == HEADLIGHT:
@@ -300,11 +300,11 @@ class FogMotion(NamedTuple):
 
     @property
     def solid(self) -> bool:
-        """Whether vehicles can touch it: never."""
+        """Whether vehicles can touch the fog: never."""
         return False
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
-        """Make it as thick as it is at a time."""
+        """Set the fog's thickness at a time."""
         factor = max(self.spec.factor(seconds), 1e-3)
         fog = model.vis.map
         fog.fogstart = self.spec.start / factor / model.stat.extent
@@ -341,6 +341,6 @@ def change_lights(scene: Scene, specs: tuple[LightSpec, ...]) -> Dynamics:
 
 
 def add_fog(scene: Scene, spec: FogSpec) -> Dynamics:
-    """Put fog into a world, and return how it changes."""
+    """Add fog to a world, and return its dynamics."""
     scene.spec.visual.rgba.fog = [*spec.colour, 1.0]
     return Dynamics((FogMotion(spec),), fog=True)

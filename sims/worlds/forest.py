@@ -45,7 +45,7 @@ class Sway(NamedTuple):
         return False
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Move the bodies ``sway_0`` and those after it."""
+        """Move the bodies from ``sway_0`` on."""
         count = len(self.swing)
         first = int(model.body("sway_0").mocapid[0])
         phases = 2.4 * np.arange(count)
@@ -55,7 +55,7 @@ class Sway(NamedTuple):
 
 
 def forest(seed: int = 0, bare: bool = False) -> Scene:
-    """Return the wood and what moves in it; every seed has its own bark, ground and leaves."""
+    """Return the wood and its dynamics; bark, ground and leaves depend on the seed."""
     b = Builder("forest", seed, bare)
     b.spec.visual.headlight.ambient = [0.50, 0.55, 0.48]
     bark = b.material("bark", lambda r: materials.bark((768, 192), r, 96.0, 0.05), 96.0)
@@ -158,7 +158,7 @@ def _cluster(b: Builder, count: int, reach: float, size: float, *, flat: bool = 
 
 
 def _shadows(b: Builder, sways: list[Any]) -> None:
-    """Lay the crowns' moving shadows on the ground, last: they are drawn over it."""
+    """Lay the crowns' moving shadows on the ground; last, to be drawn over the ground."""
     b.spec.add_material(name="shadow", rgba=[0.02, 0.03, 0.02, 0.30], specular=0.0)
     b.mesh("shadow", _cluster(b, 40, 1.6, 0.36, flat=True))
     places = np.random.default_rng(12).uniform(-11.0, 11.0, (18, 2)).tolist()
@@ -181,7 +181,7 @@ def _ground(random: np.random.Generator) -> Image:
 
 
 def _thicket(random: np.random.Generator) -> Image:
-    """Return 20 x 24 m of dense wood in the distance: stems, leaves, and light that falls in."""
+    """Return 20 x 24 m of dense wood in the distance: stems, leaves, light in gaps."""
     shape = (576, 480)
     height = np.broadcast_to(np.linspace(1.0, 0.0, shape[0], dtype=np.float32)[:, None], shape)
     wood = materials.leaves(shape, random, 40.0)

@@ -71,7 +71,7 @@ def _wall(random: np.random.Generator, width: float) -> Image:
 
 
 def _floor(random: np.random.Generator) -> Image:
-    """Return slabs and cast concrete, lines of a flying course, shadows of what stands there."""
+    """Return slabs and cast concrete, with course lines and the objects' shadows."""
     shape = (int(2 * NORTH * DENSITY), int(2 * WEST * DENSITY))
     slabs = materials.tiles(
         shape, random, DENSITY, ((0.58, 0.56, 0.52), (0.50, 0.49, 0.47), (0.64, 0.60, 0.53)),
@@ -270,7 +270,7 @@ def _shelf(b: Builder, wood: Material, crates: Material) -> None:
 
 
 def _shell(b: Builder, posters: Material) -> None:
-    """Add floor and walls; last, so that what stands before them is drawn first."""
+    """Add floor and walls; last, for objects before them to be drawn first."""
     count = 0
     for name, place, facing, width in sides((NORTH, WEST)):
         inward = np.array([np.cos(np.radians(facing)), np.sin(np.radians(facing))])

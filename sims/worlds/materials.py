@@ -1,4 +1,4 @@
-"""Materials, and the patterns that they are made of: noise, masonry, specks, drips, cracks.
+"""Materials and their patterns: noise, masonry, specks, drips, cracks.
 
 Images here are float32 in 0..1, shape (h, w) or (h, w, 3) RGB; sizes are pixels. Each material is
 drawn in any size, at `density` pixels per metre, and never twice alike. Things painted on them
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 Image = npt.NDArray[Any]
-"""float32; numpy's stubs lose that in sums with plain floats, so it isn't in the type."""
+"""float32; typed as Any, since numpy's stubs lose float32 in sums with plain floats."""
 Colour = tuple[float, float, float]
 
 
@@ -43,7 +43,7 @@ def fractal(
     stretch: tuple[float, float] = (1.0, 1.0),
     gain: float = 0.7,
 ) -> Image:
-    """Return noise with mean 0 and standard deviation 1 that has detail at every scale.
+    """Return noise of mean 0 and standard deviation 1, with detail at every scale.
 
     Args:
         coarse: Size of the largest blobs, pixels.
@@ -104,7 +104,7 @@ def cells(
 def per_cell(
     layout: Cells, random: np.random.Generator, palette: tuple[Colour, ...], spread: float
 ) -> Image:
-    """Colour each cell with one of the palette's colours, its brightness varied by `spread`."""
+    """Colour each cell from the palette, its brightness varied by `spread`."""
     colours = np.asarray(palette, np.float32)[random.integers(0, len(palette), layout.count)]
     tone = 1.0 + spread * random.standard_normal((layout.count, 1), dtype=np.float32)
     return np.asarray((colours * tone)[layout.index], dtype=np.float32)
@@ -140,12 +140,12 @@ def cracks(shape: tuple[int, int], random: np.random.Generator, *, count: int) -
 
 
 def share(stencil: npt.NDArray[np.uint8]) -> Image:
-    """Return a mask that was drawn in bytes as shares 0..1."""
+    """Return a byte mask as shares 0..1."""
     return np.asarray(stencil, dtype=np.float32) / np.float32(255.0)
 
 
 def smooth(low: float, high: float, value: Image) -> Image:
-    """Return a soft step (Hermite) from 0 where `value` <= low to 1 where it is >= high."""
+    """Return a soft step (Hermite), 0 for `value` <= low and 1 for `value` >= high."""
     out = np.empty(value.shape, np.float32)
     for rows in _strips(out):
         t = np.clip((value[rows] - low) / (high - low), 0.0, 1.0)
@@ -154,7 +154,7 @@ def smooth(low: float, high: float, value: Image) -> Image:
 
 
 def mix(below: Image, above: Image | Colour, amount: Image | float) -> Image:
-    """Lay an image or a colour over another; `amount` is 0..1, shape (h, w) or one number."""
+    """Lay an image or a colour over another; `amount` is 0..1, shape (h, w) or scalar."""
     if not isinstance(above, np.ndarray):
         # One row of it: numpy is slow where the innermost loop is three long.
         above = np.tile(np.asarray(above, np.float32), (1, below.shape[1], 1))
@@ -176,14 +176,14 @@ def shade(image: Image, amount: Image) -> Image:
 
 
 def _strips(image: Image) -> Iterator[slice]:
-    """Yield runs of rows of about 64 kB, which stay in a processor's cache while worked on."""
+    """Yield runs of rows of about 64 kB, small enough for a processor's cache."""
     count = max(1, 65536 // max(image[:1].nbytes, 1))
     for top in range(0, len(image), count):
         yield slice(top, top + count)
 
 
 def _three(amount: Image) -> Image:
-    """Repeat an image of one channel as three."""
+    """Repeat a single-channel image as three channels."""
     flat = np.ascontiguousarray(amount, dtype=np.float32)
     return np.asarray(cv2.merge((flat, flat, flat)), dtype=np.float32)
 
@@ -265,7 +265,7 @@ def planks(
     palette: tuple[Colour, ...] = OAK,
     width: float = 0.16,
 ) -> Image:
-    """Return boards that run across the image, with grain, knots and nails."""
+    """Return boards across the image, with grain, knots and nails."""
     layout = cells(shape, random, high=width * density, wide=1.9 * density, stagger=1.0, uneven=0.3)
     wood = per_cell(layout, random, palette, 0.13)
     grain = fractal(shape, random, coarse=0.06 * density, fine=2, stretch=(1.0, 14.0), gain=0.9)
@@ -321,7 +321,7 @@ def plaster(
     colour: Colour,
     under: Image,
 ) -> Image:
-    """Return old paint over `under` (same shape): it has flaked off in places."""
+    """Return old paint over `under` (same shape), flaked off in places."""
     coat = np.full((*shape, 3), colour, np.float32)
     coat = shade(coat, 0.06 * fractal(shape, random, coarse=1.2 * density, gain=0.85))
     area = shape[0] * shape[1] / density**2
@@ -397,7 +397,7 @@ SIZE = 384
 
 
 def sky(random: np.random.Generator, night: bool = False) -> Image:
-    """Return a sky for `Builder.sky`: haze at the horizon, blue above, clouds in one plane.
+    """Return a sky for `Builder.sky`: haze at the horizon, blue above, flat clouds.
 
     By night all of that is hardly seen, before a few stars.
     """

@@ -55,7 +55,7 @@ def office(seed: int = 0, bare: bool = False) -> Any:
 
 
 def _desk(b: Builder, name: str, at: tuple[float, float, float], of: tuple[Material, ...]) -> None:
-    """Add a desk with its legs, two screens and a chair, which stands in front of it (-x)."""
+    """Add a desk with its legs, two screens, and a chair in front (-x)."""
     top, steel, dark, cloth = of
     x, y, turn = at
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
@@ -91,7 +91,7 @@ def _shell(b: Builder, white: Material, window: Material, frame: Material) -> No
 
 
 def _glazing(b: Builder, frame: Material) -> None:
-    """Add the meeting room's panes, the last of all: they are drawn over what is behind them."""
+    """Add the meeting room's panes; last of all, to be drawn over the background."""
     x, y = MEETING
     b.spec.add_material(name="glass", rgba=[0.72, 0.86, 0.88, 0.28], specular=0.0)
     glass = Material("glass", 1.0, 1.0)

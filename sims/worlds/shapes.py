@@ -21,7 +21,7 @@ STEP = 1.0
 
 
 class Surface(NamedTuple):
-    """Triangles, with everything that MuJoCo needs to draw them.
+    """Triangle mesh for MuJoCo.
 
     Attributes:
         points: Metres, shape (n, 3).
@@ -59,7 +59,7 @@ def grid(points: Array, texture: Array) -> Surface:
 
 
 def join(surfaces: list[Surface]) -> Surface:
-    """Return several surfaces as one."""
+    """Return several surfaces joined."""
     starts = np.cumsum([0] + [len(surface.points) for surface in surfaces[:-1]])
     return Surface(
         np.concatenate([surface.points for surface in surfaces]),
@@ -107,7 +107,7 @@ def face_size(name: str, size: tuple[float, float, float]) -> tuple[float, float
 
 
 def box(size: tuple[float, float, float], windows: dict[str, Window]) -> Surface:
-    """Return those faces of a box about the origin that `windows` names."""
+    """Return a box about the origin, with the faces named by `windows`."""
     extent = np.asarray(size)
     surfaces = []
     for name, window in windows.items():
@@ -119,7 +119,7 @@ def box(size: tuple[float, float, float], windows: dict[str, Window]) -> Surface
 def cylinder(
     radius: float, height: float, side: Window, top: Window | None, sides: int = 24
 ) -> Surface:
-    """Return an upright cylinder about the origin, its top closed if it has a window."""
+    """Return an upright cylinder about the origin, its top closed if `top` is given."""
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)[None, :]  # outside: to the right
     levels = np.linspace(0.5, -0.5, max(1, math.ceil(height / STEP)) + 1)[:, None]
     ones = np.ones((len(levels), 1))
@@ -140,7 +140,7 @@ def cylinder(
 
 
 def disc(radius: float, level: float, window: Window) -> Surface:
-    """Return a flat round lid that looks up, at height `level`."""
+    """Return a flat round lid facing up, at height `level`."""
     angle = np.linspace(0.0, 2.0 * np.pi, 25)
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = np.concatenate([[[0.0, 0.0]], rim])
@@ -175,7 +175,7 @@ def blob(radii: tuple[float, float, float], bumps: Array, window: Window) -> Sur
 def arch(
     inner: float, outer: float, depth: float, angles: int, per_metre: tuple[float, float]
 ) -> Surface:
-    """Return a half ring that stands on its feet, with the opening along x.
+    """Return a half ring standing on its feet, with the opening along x.
 
     Args:
         inner: Radius of the opening, metres.

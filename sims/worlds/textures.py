@@ -35,13 +35,13 @@ _TABLE = _HERE / "leaps.toml"
 _LEAPS: dict[str, dict[str, tuple[int, int]]] = tomllib.loads(_TABLE.read_text(encoding="utf-8"))
 _DIGEST, _SIZE = 16, 4
 _UNUSED = 14 * 86400.0
-"""Seconds after which textures of another version that nobody has used are removed."""
+"""Age at removal of another version's unused textures, seconds."""
 
 
 def own_generator(
     world: str, seed: int, name: str, random: np.random.Generator
 ) -> np.random.Generator:
-    """Return a texture's own generator, and leap with the world's over what it is to draw."""
+    """Return a texture's own generator, and advance the world's past its draws."""
     leap = _LEAPS.get(world, {}).get(name)
     if leap is None:
         return np.random.default_rng([seed, *f"{world}/{name}".encode()])
@@ -74,10 +74,10 @@ def texture(
 
 
 def folder() -> Path:
-    """Return where textures that are drawn as they would be here are.
+    """Return the folder of this version's textures.
 
     Raises:
-        OSError: The source of what draws them is not there, so nobody knows whether they are.
+        OSError: The source of the drawing code is missing, so its version is unknown.
         RuntimeError: The user has no home.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
@@ -120,7 +120,7 @@ def _write(path: Path, image: npt.NDArray[np.uint8]) -> None:
 
 
 def _tidy(here: Path) -> None:
-    """Remove versions beside this one which have not been used for long."""
+    """Remove long unused textures of other versions."""
     for other in here.parent.iterdir():
         used = max((each.stat().st_atime for each in other.glob("*")), default=0.0)
         if other != here and time.time() - used > _UNUSED:

@@ -17,22 +17,26 @@ from runtime.units import Duration
 FOOT = 0.3048
 KNOT = 0.514444
 W20 = {"none": 0.0, "light": 15 * KNOT, "moderate": 30 * KNOT, "severe": 45 * KNOT}
-"""Wind at a height of 20 feet, m/s, by the strength of the turbulence that it makes."""
+"""Wind at a height of 20 feet by strength of turbulence, m/s."""
 
 STRONGEST = 50.0
-"""Metres per second of mean wind and gusts together. In a step of 1 ms, a vehicle that is carried
-by more may get past a wall without touching it."""
+"""Limit of mean wind and gusts together, metres per second.
+
+In a step of 1 ms, a vehicle carried by more may get past a wall without touching it.
+"""
 
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT
-"""Heights between which the model holds, metres; it is used beyond with these."""
+"""Range of heights of the model, metres; other heights are clipped."""
 
 SLOWEST = 1.0
-"""Metres per second through the air below which turbulence is met as at this speed: at 0 it would
-stand still."""
+"""Least airspeed assumed for turbulence, metres per second.
+
+At 0, turbulence would stand still.
+"""
 
 
 def check_strength(*velocities: Vector3) -> None:
-    """Refuse air that moves faster than a step of the physics resolves.
+    """Refuse air too fast for a step of the physics.
 
     Raises:
         ValueError: The velocities (m/s) are more than `STRONGEST` together.
@@ -46,14 +50,14 @@ def check_strength(*velocities: Vector3) -> None:
 
 
 class Gust(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One discrete gust of the shape 1 - cos, in addition to the mean wind.
+    """Discrete gust of the shape 1 - cos, in addition to the mean wind.
 
     Attributes:
-        velocity: What it adds at its strongest, m/s north, east, down.
-        start: When it begins.
-        rise: Time in which it rises, and in which it falls again.
-        hold: Time for which it is at its strongest in between.
-        period: Time from its beginning to its next one; 0 if it comes once.
+        velocity: Peak velocity, m/s north, east, down.
+        start: Time of its beginning.
+        rise: Time of its rise, and of its fall.
+        hold: Time at its peak in between.
+        period: Time from its beginning to the next; 0 for a single gust.
     """
 
     velocity: Vector3
@@ -72,7 +76,7 @@ class Gust(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             )
 
     def share(self, seconds: float) -> float:
-        """Return how strong it is at a time, 0 to 1."""
+        """Return the gust's strength at a time, 0 to 1."""
         since = seconds - self.start
         if since <= 0.0:
             return 0.0
@@ -106,7 +110,7 @@ class WindSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def w20(self) -> float:
-        """Wind at 20 feet by which the turbulence is given, m/s."""
+        """Wind at a height of 20 feet for the turbulence, m/s."""
         return W20[self.turbulence] if isinstance(self.turbulence, str) else self.turbulence
 
     @property
@@ -130,7 +134,7 @@ def scales(height: float, w20: float) -> tuple[Vector3, Vector3]:
 
 
 class Turbulence:
-    """The Dryden filters, driven by white noise and discretised exactly, for one place in the air.
+    """Exactly discretised Dryden filters of white noise, for a place in the air.
 
     Their states have no unit: what they are at a height is them times that height's intensity, so
     that a change of height or speed changes nothing suddenly but the velocity's scale.
@@ -140,7 +144,7 @@ class Turbulence:
     """
 
     NUMBERS = 5
-    """Random numbers that each step takes."""
+    """Random numbers per step."""
 
     def __init__(self, start: list[float]) -> None:
         u, v1, v2, w1, w2 = start

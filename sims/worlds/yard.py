@@ -125,7 +125,7 @@ def _manholes(ground: Image, random: np.random.Generator) -> Image:
 
 
 def _shadows(shape: tuple[int, int], sun: tuple[float, float, float]) -> Image:
-    """Return how dark it is (0..1): each thing's footprint, swept along the sun by its height."""
+    """Return the shadows' darkness (0..1): footprints swept along the sun by height."""
     mask = np.zeros(shape, np.float32)
     shift = np.array([sun[0], sun[1]]) / -sun[2]
     things = [(x, y, 6.06, 2.44, turn, base, 2.59) for x, y, base, turn in CONTAINERS]
@@ -224,7 +224,7 @@ def _daylight(b: Builder) -> None:
 
 
 def _lamps(b: Builder) -> None:
-    """Light the lamps on the posts, a few windows, and a moon that hardly helps."""
+    """Light the lamps on the posts, a few windows, and a faint moon."""
     shine = b.material("shine", lambda r: materials.paint((64, 64), r, (1.0, 0.93, 0.74)), 64.0,
                        glow=1.0)  # fmt: skip
     lit = b.material("lit", lambda r: decals.window_pane((102, 67), r, True), 64.0, glow=0.9)
@@ -321,7 +321,7 @@ def _walls(b: Builder, red: Material) -> None:
 
 
 def _houses(b: Builder) -> None:
-    """Add four rows of houses, each with one texture for its fronts."""
+    """Add four rows of houses, each with a common texture for its fronts."""
     for side, (line, turn, row) in SIDES.items():
         heights = [int(decals.height_of(storeys) * HOUSE_DENSITY) for _, storeys in row]
         tall = max(heights)
@@ -360,7 +360,7 @@ def _fronts(random: np.random.Generator, row: Sequence[tuple[float, int]], side:
 
 
 def _containers(random: np.random.Generator) -> Image:
-    """Four containers' long side and end, one below the other, each with its name."""
+    """Return long side and end of four named containers, stacked downwards."""
     rows = []
     paints = ((0.20, 0.36, 0.50), (0.66, 0.30, 0.18), (0.30, 0.44, 0.34), (0.74, 0.58, 0.24))
     for number, paint in enumerate(paints):

@@ -1,4 +1,4 @@
-"""The layout of the EuRoC MAV data sets (ASL's), for any number of cameras of one body.
+"""EuRoC MAV (ASL) data set layout, for any number of cameras on a body.
 
 M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016;
 projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets. The body's frame is FRD.
@@ -76,11 +76,11 @@ class Euroc(Recording):
         self._describe_truth("velocities as the vehicle sent them")
 
     def image(self, event: Image) -> ImageFile | None:
-        """Note an image of one of the cameras."""
+        """Add an image of the rig; return its file, still to be written."""
         return self._note(self._images, event, functools.partial(ImageFile, convert=in_grey))
 
     def depth(self, event: DepthImage) -> ImageFile | None:
-        """Note a depth image of one of the cameras."""
+        """Add a depth image of the rig; return its file, still to be written."""
         convert = functools.partial(depth_in_steps, per_metre=self.depth_factor)
         return self._note(self._depths, event, functools.partial(ImageFile, convert=convert))
 
@@ -99,20 +99,20 @@ class Euroc(Recording):
             self._truth.add(event.stamp, row)
 
     def imu(self, event: Imu) -> None:
-        """Note what the IMU measures."""
+        """Add a sample of the rig's IMU."""
         if self.rig.imu is not None and event.source == self.rig.imu.source:
             values = (*event.angular_velocity, *event.linear_acceleration)
             row = ",".join(f"{value:.12g}" for value in values)
             self._imu.add(event.stamp, f"{self.epoch + event.stamp},{row}\n")
 
     def close(self) -> None:
-        """Write out what is left, and say so if the velocities are none."""
+        """Close all files; mark the ground truth's velocities as unknown if none came."""
         if self._velocity_unknown:
             self._describe_truth("velocities unknown (zeros)")
         super().close()
 
     def warnings(self) -> list[str]:
-        """Return what a reader should know."""
+        """Return warnings for readers of the data set."""
         if self._velocity_unknown:
             return ["the vehicle moved and sent no velocity: those of the ground truth are zeros"]
         return []
@@ -133,7 +133,7 @@ class Euroc(Recording):
         mounted: CameraAnnouncement | ImuAnnouncement | None = None,
         **more: Any,
     ) -> None:
-        """Write a sensor.yaml: what it is, where it sits on the body, and more of some kinds."""
+        """Write a sensor.yaml: kind, pose on the body, and further fields by kind."""
         pose = np.eye(4)
         if mounted is not None:
             pose = pose_matrix(mounted.position, mounted.orientation)
@@ -166,10 +166,10 @@ class Euroc(Recording):
 
 
 def _lens(camera: CameraAnnouncement) -> tuple[str, str, tuple[float, ...]]:
-    """Return a distortion model as Kalibr calls it, the coefficients' names, and they themselves.
+    """Return Kalibr's name of a distortion model, the coefficients' names and values.
 
     Raises:
-        ValueError: It has no name for the model.
+        ValueError: Kalibr has no name for the model.
     """
     model, lens = camera.info.distortion_model, camera.info.distortion
     if model == "equidistant":

@@ -24,11 +24,14 @@ _LAYOUTS: dict[str, type[Recording]] = {
     "tum_mono": TumMono,
 }
 _AT_ONCE = 4
-"""Images that are being written."""
+"""Image files written concurrently."""
 
 _WAITING = 64
-"""Images of a kind that wait for that. In lockstep, time waits for the files, and none ever has
-to be dropped; in real time the oldest is, and the run's summary counts it."""
+"""Images of a kind waiting to be written.
+
+In lockstep, time waits for the files, and none is dropped; in real time the oldest is, and the
+run's summary counts it.
+"""
 
 
 class DatasetConfig(NodeConfig):
@@ -78,7 +81,7 @@ class DatasetWriter(Node[DatasetConfig]):
             await self.offload(_make_empty, self._folder)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Note what sensors there are."""
+        """Store an announcement, to choose the sensors later."""
         self._announcements.append(announcement)
 
     async def run(self) -> None:
@@ -95,7 +98,7 @@ class DatasetWriter(Node[DatasetConfig]):
                 await self._queue.put(file)
 
     async def _write(self) -> None:
-        """Write one image after the other, beside the loop."""
+        """Write queued images, each offloaded from the event loop."""
         while True:
             file = await self._queue.get()
             await self.offload(file)
@@ -120,7 +123,7 @@ class DatasetWriter(Node[DatasetConfig]):
             recording.imu(event)
 
     async def on_shutdown(self) -> None:
-        """Write what has come and is not written yet, and say what is missing."""
+        """Write the remaining images, and report missing data."""
         if self._recording is None:
             return
         for images in (self.images, self.depth_images):
@@ -150,7 +153,7 @@ class DatasetWriter(Node[DatasetConfig]):
         return self._recording
 
     def _note(self, event: Image | DepthImage) -> ImageFile | None:
-        """Note an image, and remember it until it is written, should the run end before."""
+        """Add an image, and keep its file until written, in case the run ends before."""
         if (recording := self._open()) is None:
             return None
         file = recording.image(event) if isinstance(event, Image) else recording.depth(event)
@@ -160,10 +163,10 @@ class DatasetWriter(Node[DatasetConfig]):
 
 
 def _make_empty(folder: Path) -> None:
-    """Make a folder that holds nothing of an earlier run.
+    """Create a folder without files of an earlier run.
 
     Raises:
-        ConfigError: It holds something else.
+        ConfigError: It has other files.
     """
     if folder.is_dir() and any(folder.iterdir()):
         if not any((folder / sign).exists() for sign in ("mav0", "rgb.txt", "times.txt")):
@@ -176,7 +179,7 @@ def _make_empty(folder: Path) -> None:
 
 
 def _finish(recording: Recording, files: list[ImageFile]) -> None:
-    """Write the rest; images that another thread is writing are waited for."""
+    """Write the remaining images, also waiting for other threads; close the recording."""
     try:
         for file in files:
             file()

@@ -1,4 +1,4 @@
-"""What data sets of all layouts have in common: a rig of sensors, events in, rows and images out.
+"""Common parts of all data set layouts: a rig, events in, rows and images out.
 
 Rows are written at once; an image is returned as a `ImageFile`, for whoever has time to write
 it. Nothing here waits or knows a clock.
@@ -31,13 +31,14 @@ from events import (
 from events.announcements import Vehicles
 
 WORLD_AXES = "world: x north, y west, z up; origin on the ground"
-"""The world of a data set, for the heads of its files: z up, as their readers expect it.
+"""World axes of a data set, for file headers: z up, as expected by readers.
 
-Bodies stay FRD and cameras optical, so measurements and mountings stay as they are."""
+Bodies stay FRD and cameras optical, so measurements and mountings stay as they are.
+"""
 
 
 class Rig(msgspec.Struct, frozen=True):
-    """The sensors of one body.
+    """Sensors of a body.
 
     Attributes:
         body: Source of its odometry.
@@ -51,7 +52,7 @@ class Rig(msgspec.Struct, frozen=True):
 
 
 def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
-    """Choose the cameras of one body, and its IMU.
+    """Choose the cameras and the IMU of a single body.
 
     Args:
         named: A source to keep to: a camera, or a body; None for the first camera's body.
@@ -88,18 +89,18 @@ def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
 
 
 def _belongs(camera: CameraAnnouncement, named: str) -> bool:
-    """Tell whether a camera is the named source, below it, or (its grey images) above it."""
+    """Return whether a camera is, is below, or (grey images) is above the named source."""
     return f"{camera.source}/".startswith(f"{named}/") or named == f"{camera.source}/grey"
 
 
 Pixels = npt.NDArray[Any]
 
 _DEPTH = (cv2.IMWRITE_PNG_COMPRESSION, 1)
-"""A third of the default's size, at half as much time again; colours gain nothing by it."""
+"""PNG options of depth: third of the default size, 1.5 times the time; not for colour."""
 
 
 class ImageFile:
-    """An image on its way to a file: call it to write it, from any thread, as often as need be."""
+    """Image with its file's path; a call from any thread writes the file, only once."""
 
     def __init__(self, path: Path, data: Pixels, convert: Callable[[Pixels], Pixels]) -> None:
         self._path = path
@@ -108,10 +109,10 @@ class ImageFile:
         self._lock = threading.Lock()
 
     def __call__(self) -> None:
-        """Write the file, unless that is done; if it is being done, wait until it is.
+        """Write the file if not yet written; wait for another thread's write.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: The file cannot be written.
         """
         with self._lock:
             if self._data is not None:
@@ -123,7 +124,7 @@ class ImageFile:
 
 
 def in_colour(data: Pixels) -> Pixels:
-    """Return an ``rgb8`` or ``mono8`` image as OpenCV writes it."""
+    """Return an ``rgb8`` or ``mono8`` image in OpenCV's channel order."""
     return cv2.cvtColor(data, cv2.COLOR_RGB2BGR) if data.ndim == 3 else data
 
 
@@ -147,13 +148,13 @@ class RowFile:
         self.count = 0
         """Rows so far."""
         self.left_out = 0
-        """Rows that came with a stamp not above the last one: readers expect them to rise."""
+        """Rows left out because their stamp did not rise, as readers expect."""
         self._last: int | None = None
         self._file = path.open("w", encoding="utf-8", newline="\n")
         self._file.write(header)
 
     def add(self, stamp: int, row: str) -> bool:
-        """Add a row, which ends its own line; tell whether it was in order and is in."""
+        """Add a row with its line end; return whether its stamp was in order."""
         if self._last is not None and stamp <= self._last:
             self.left_out += 1
             return False
@@ -163,12 +164,12 @@ class RowFile:
         return True
 
     def close(self) -> None:
-        """Write out what is left."""
+        """Close the file, with all rows written."""
         self._file.close()
 
 
 class Recording(ABC):
-    """A data set that is being written.
+    """Base class of data sets being written.
 
     Args:
         folder: Where; it exists and is empty.
@@ -186,12 +187,12 @@ class Recording(ABC):
 
     @abstractmethod
     def image(self, event: Image) -> ImageFile | None:
-        """Note an image, and return what is left to write."""
+        """Add an image; return its file, still to be written."""
 
     # What a layout has no place for is passed over.
 
     def depth(self, event: DepthImage) -> ImageFile | None:  # noqa: ARG002
-        """Note a depth image, and return what is left to write."""
+        """Add a depth image; return its file, still to be written."""
         return None
 
     def pose(self, event: PoseStamped) -> None:  # noqa: B027
@@ -201,10 +202,10 @@ class Recording(ABC):
         """Note where the body is."""
 
     def imu(self, event: Imu) -> None:  # noqa: B027
-        """Note what the IMU measures."""
+        """Add an IMU sample."""
 
     def close(self) -> None:
-        """Write out what is left."""
+        """Close all files."""
         for file in self.files:
             file.close()
 
@@ -223,16 +224,16 @@ class Recording(ABC):
         path.write_text(text, encoding="utf-8")
 
     def describe(self, name: str, template: str, **values: Any) -> None:
-        """Write a file from a template beside this module, which also knows ``epoch``."""
+        """Write a file from a template beside this module, with variable ``epoch``."""
         found = templates(Path(__file__).parent).get_template(f"{template}.jinja")
         self.write(name, found.render(values, epoch=self.epoch))
 
     def empty(self) -> list[str]:
-        """Return the files that have no rows yet."""
+        """Return the files without rows."""
         return [str(f.path.relative_to(self.folder)) for f in self.files if not f.count]
 
     def warnings(self) -> list[str]:
-        """Return what else a reader should know."""
+        """Return further warnings for readers of the data set."""
         return []
 
     def left_out(self) -> int:
@@ -241,13 +242,13 @@ class Recording(ABC):
 
 
 def real(value: float) -> str:
-    """Return a number as YAML 1.1 has it: ``2e-05`` would be a text, ``2.0e-05`` is none."""
+    """Return a number in YAML 1.1: ``2.0e-05``, since ``2e-05`` would be text."""
     digits, e, exponent = repr(value).partition("e")
     return f"{digits if '.' in digits else digits + '.0'}{e}{exponent}"
 
 
 def templates(folder: Path) -> jinja2.Environment:
-    """Return what reads the templates of a folder; they have the filters ``real`` and ``row``."""
+    """Return the template environment of a folder, with filters ``real`` and ``row``."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder),
         autoescape=False,  # noqa: S701  # neither YAML nor JSON is HTML

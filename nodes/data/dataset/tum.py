@@ -1,4 +1,4 @@
-"""The layouts of two of TUM's benchmarks, for one camera.
+"""Layouts of two TUM benchmarks, for a single camera.
 
 monoVO, with its photometric calibration, as DSO reads it: J. Engel, V. Usenko, D. Cremers, "A
 photometrically calibrated benchmark for monocular visual odometry", arXiv:1607.02555, 2016.
@@ -140,7 +140,7 @@ class TumRgbd(Recording):
         self.describe("camera.yaml", "tum_rgbd.camera.yaml", camera=camera, factor=depth_factor)
 
     def image(self, event: Image) -> ImageFile | None:
-        """Note an image of the camera: in colour if it has any."""
+        """Add an image of the camera, in colour if available."""
         if event.source != self._camera.source or not self._add("rgb", event.stamp):
             return None
         return ImageFile(self._path("rgb", event.stamp), event.data, in_colour)
@@ -166,7 +166,7 @@ class TumRgbd(Recording):
             self._files["accelerometer"].add(event.stamp, row)
 
     def _add(self, kind: str, stamp: int) -> bool:
-        """Note an image, and its partner if that has come; tell whether it is in order."""
+        """Add an image, and its partner if received; return whether in order."""
         name = f"{self._seconds(stamp)} {kind}/{self._seconds(stamp)}.png"
         if kind not in self._files or not self._files[kind].add(stamp, f"{name}\n"):
             return False
@@ -191,7 +191,7 @@ class TumRgbd(Recording):
         return self._rows(kind, title, f"camera: {self._camera.source}", "timestamp filename")
 
     def _rows(self, name: str, *header: str) -> RowFile:
-        """Open a file with a head of three lines: there are readers that skip just that many."""
+        """Open a file with a header of three lines, as some readers skip exactly three."""
         return self.rows(f"{name}.txt", "".join(f"# {line}\n" for line in header))
 
 

@@ -23,7 +23,7 @@ from runtime.errors import VisnavError
 MAGIC = b"\x89MCAP0\r\n"
 
 HEAD = struct.Struct("<BQ")
-"""Before each record: what it is, and how long."""
+"""Head of each record: opcode, length of the content."""
 
 _FOOTER = struct.Struct("<BQQQI")
 """With its head: where the summary begins, where its offsets do, checksum of the summary."""
@@ -31,7 +31,7 @@ _FOOTER = struct.Struct("<BQQQI")
 _IS_FOOTER, _IS_CHUNK, _IS_DATA_END, _LAST, _PRIVATE = 0x02, 0x06, 0x0F, 0x0F, 0x80
 
 LARGEST = 1 << 29
-"""Bytes that a chunk may have when it is unpacked: many times what any writer makes."""
+"""Largest permitted size of an unpacked chunk, bytes: far above any writer's."""
 
 _CHUNK = struct.Struct("<QQQII")
 """First and last time, size when unpacked, checksum, length of the compression's name."""
@@ -53,7 +53,7 @@ class TornError(ValueError):
 
 
 def pieces(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
-    """Yield the records of a file that are of some kinds (opcodes), up to its footer.
+    """Yield the records of some opcodes from a file, up to its footer.
 
     Raises:
         TornError: There is no footer, or something else than a record before it.
@@ -64,7 +64,7 @@ def pieces(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, byte
 
 
 def check_chunks(file: IO[bytes]) -> None:
-    """Look at what all chunks say of their sizes, for readers that would believe it.
+    """Check the claimed sizes of all chunks, on behalf of readers without such a check.
 
     Raises:
         ValueError: One of them claims more than `LARGEST`.
@@ -78,7 +78,7 @@ def check_chunks(file: IO[bytes]) -> None:
 
 
 def check_chunk(content: bytes) -> None:
-    """Look at what the beginning of a chunk says of its size: its own word, and its frame's.
+    """Check the sizes claimed at a chunk's beginning: by its head, and by its frame.
 
     Raises:
         ValueError: That is more than `LARGEST`, or there is no such beginning.
@@ -93,7 +93,7 @@ def check_chunk(content: bytes) -> None:
 
 
 def frame_size(data: bytes) -> int:
-    """Return the size that a compressed frame claims (RFC 8878; LZ4's frame format); 0 if none."""
+    """Return the size claimed by a compressed frame (RFC 8878 or LZ4), 0 if none."""
     if data.startswith(_ZSTD):
         flags = data[4]
         single = flags >> 5 & 1
@@ -130,7 +130,7 @@ def _heads(file: IO[bytes]) -> Iterator[tuple[int, int]]:
 
 
 def piece_at(file: IO[bytes], at: int, size: int) -> bytes:
-    """Return the content of the record at a place, where an index says that there is one.
+    """Return the content of a record at a position from an index.
 
     Args:
         size: Its bytes, with those before its content.
@@ -147,7 +147,7 @@ def piece_at(file: IO[bytes], at: int, size: int) -> bytes:
 
 
 def has_summary(file: IO[bytes]) -> bool:
-    """Tell whether a file ends with a summary that is as it was written."""
+    """Return whether a file ends with an intact summary."""
     size = file.seek(0, io.SEEK_END)
     at = size - len(MAGIC) - _FOOTER.size
     if at < len(MAGIC):
@@ -165,7 +165,7 @@ def has_summary(file: IO[bytes]) -> bool:
 
 
 def _why(file: IO[bytes], at: int, size: int) -> str:
-    """Distinguish a file that ends too early from one that is damaged in the middle."""
+    """Return the error text for a file cut short, or damaged in the middle."""
     file.seek(-len(MAGIC), os.SEEK_END)
     if file.read() != MAGIC:
         return NOT_CLOSED
@@ -177,7 +177,7 @@ class RecordingError(VisnavError):
 
 
 class WholeWrites(io.BufferedIOBase):
-    """A file in which a piece is whole, or is not there: no half a chunk if the disk is full.
+    """File of whole pieces: a full disk leaves no half of a chunk.
 
     A piece is all that is written until `flush`.
     """
@@ -224,12 +224,12 @@ class WholeWrites(io.BufferedIOBase):
         return self._raw.fileno()
 
     def close(self) -> None:
-        """Close the file, without what was not flushed."""
+        """Close the file; unflushed data is discarded."""
         self._raw.close()
 
 
 def open_anew(path: Path) -> IO[bytes]:
-    """Open a file to write it from its beginning, and keep others from doing so meanwhile.
+    """Open a file for writing from the beginning, locked against other writers.
 
     Raises:
         OSError: It cannot be opened, or somebody else is writing it.
@@ -249,12 +249,12 @@ def open_anew(path: Path) -> IO[bytes]:
 
 
 def is_being_written(file: IO[bytes]) -> bool:
-    """Tell whether a process holds a file that it got from `open_anew`."""
+    """Return whether a process holds a file from `open_anew`."""
     return not _locked(file, fcntl.LOCK_SH)
 
 
 def unwritable(path: Path, error: OSError) -> RecordingError:
-    """Return the error that says which file cannot be written, and how much room there is."""
+    """Return the error for an unwritable file, with the free disk space."""
     try:
         free = f"{shutil.disk_usage(path.parent).free / 1e6:.1f} MB free"
     except OSError:

@@ -1,4 +1,4 @@
-"""MCAP files, written so that a killed process loses little, and read even if they are torn.
+"""MCAP files: written with little loss if the process is killed, and read even if torn.
 
 What the messages mean is not known here. What stands in a file is for `records`.
 
@@ -25,7 +25,7 @@ from nodes.data.mcap.layout import WholeWrites, open_anew, unwritable
 Compression = Literal["zstd", "lz4", "none"]
 
 LIBRARY = "visnav-runtime"
-"""The library that a file's header names as its writer."""
+"""Writer library in a file's header."""
 
 
 class Record(NamedTuple):
@@ -49,7 +49,7 @@ class Record(NamedTuple):
 
 
 class Contents(msgspec.Struct, frozen=True):
-    """What a file says of itself.
+    """Writer, state and metadata of a file.
 
     Attributes:
         ours: Whether `McapWriter` wrote it.
@@ -150,11 +150,11 @@ class McapWriter:
 
     @property
     def full(self) -> bool:
-        """Tell whether it is time to end the chunk."""
+        """Return whether the chunk has reached its size."""
         return self._pending >= self._chunk_size
 
     def end_chunk(self) -> None:
-        """Compress what has come, and give it to the system.
+        """Compress the pending messages and write them as a chunk.
 
         Raises:
             RecordingError: The disk is full, or the like; what was written before is readable.
@@ -186,7 +186,7 @@ class McapWriter:
         self._file.close()
 
     def bag_metadata(self) -> str:
-        """Return the text of the metadata.yaml with which the file's folder is a bag of ROS 2."""
+        """Return the metadata.yaml text to make the file's folder a ROS 2 bag."""
         first, last = self._times or (0, 0)
         facts = {
             "starting_time": {"nanoseconds_since_epoch": first},
@@ -217,7 +217,7 @@ class McapWriter:
         self._writer.add_attachment(0, 0, name, media_type, data)
 
     def abandon(self) -> None:
-        """Close the file after an error, as a valid one without an index where there is room."""
+        """Close the file after an error: valid without an index, space permitting."""
         with contextlib.suppress(OSError):  # it is torn, then; `recover` mends it
             self._file.write(layout.END_WITHOUT_INDEX)
             self._file.flush()
@@ -225,7 +225,7 @@ class McapWriter:
 
 
 def contents(path: Path) -> Contents:
-    """Return what a file says of itself.
+    """Return a file's writer, state and metadata.
 
     Raises:
         RecordingError: It is no MCAP file.
@@ -241,7 +241,7 @@ def contents(path: Path) -> Contents:
 def read(
     path: Path, start: int = 0, end: int | None = None, damaged: Callable[[str], None] | None = None
 ) -> Iterator[Record]:
-    """Yield the messages of a file in the order in which they were written.
+    """Yield the messages of a file in the order of writing.
 
     Args:
         path: The file; torn ones are read as far as they go.

@@ -1,4 +1,4 @@
-"""What stands in an MCAP file: its records, sound or not, and events as they are.
+"""Records of an MCAP file, intact or damaged, and events in their own encoding.
 
 The only module that imports mcap (mcap.dev/spec). Records are found by the index, or one after the
 other. An event is a ``std_msgs/msg/UInt8MultiArray``, so that a file holds nothing but CDR: ``ros2
@@ -43,7 +43,7 @@ _decode = msgspec.msgpack.Decoder(tuple[str, list[tuple[str, list[int], int]], m
 
 
 class Shape(msgspec.Struct, frozen=True):
-    """An array that a frame has, or lacks.
+    """Array of a frame, present or lacking.
 
     Attributes:
         dtype: As numpy writes it.
@@ -76,7 +76,7 @@ def describe(frame: bytes | bytearray | memoryview) -> tuple[str, str]:
 
 
 def lacking(data: bytes) -> list[Shape]:
-    """Return which arrays a message lacks: none, or all.
+    """Return the arrays lacking in a message: none, or all.
 
     Raises:
         WireError: It is no message of ours.
@@ -130,7 +130,7 @@ Shapes = list[tuple[str, list[int], int]]
 
 
 def _shapes(data: bytes) -> tuple[Shapes, int, int]:
-    """Return the arrays of a frame, where they begin in it, and where its head ends."""
+    """Return a frame's arrays, the offset of their data, and the end of its head."""
     _, shapes, _, end = _head(memoryview(data)[_HEAD.size :])
     return shapes, -(-end // ALIGNED) * ALIGNED, end
 
@@ -155,7 +155,7 @@ HOLDERS = {
     "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/PointCloud2",
 }
-"""Types of messages that have an event's arrays."""
+"""Message types with room for an event's arrays."""
 
 
 def arrays(
@@ -226,7 +226,7 @@ __all__ = [
 ]
 
 _DAMAGED = (struct.error, EOFError, ValueError, OSError, OverflowError, MemoryError, LookupError)
-"""What mcap raises when it reads what is no record, beside its own errors."""
+"""Exceptions of mcap on damaged records, besides its own errors."""
 
 _TIMES = struct.Struct("<QQ")
 """At the beginning of a chunk: of its first message, and of its last."""
@@ -235,7 +235,7 @@ _TIMES = struct.Struct("<QQ")
 def writer(
     file: IO[bytes], *, compression: str, chunk_size: int, profile: str, library: str
 ) -> Writer:
-    """Return mcap's writer of a file, which it has begun.
+    """Return mcap's writer of a file, already started.
 
     Args:
         compression: Of chunks: ``zstd``, ``lz4`` or ``none``.
@@ -274,10 +274,10 @@ def open_file(path: Path) -> IO[bytes]:
 
 
 def check() -> None:
-    """Make sure that mcap is there.
+    """Check for mcap.
 
     Raises:
-        MissingDependencyError: It is not.
+        MissingDependencyError: mcap is missing.
     """
     if _MISSING is not None:
         raise MissingDependencyError(
@@ -286,7 +286,7 @@ def check() -> None:
 
 
 def header_of(file: IO[bytes]) -> Header:
-    """Return a file's header, or an empty one if that is damaged."""
+    """Return a file's header, empty if damaged."""
     with contextlib.suppress(McapError, *_DAMAGED):
         for opcode, content in layout.pieces(file, {Opcode.HEADER}):
             found: Header = _parsed(opcode, content)
@@ -295,7 +295,7 @@ def header_of(file: IO[bytes]) -> Header:
 
 
 def summary_of(file: IO[bytes]) -> Summary | None:
-    """Return a file's index, if it has one that is sound."""
+    """Return a file's index; `None` if missing or damaged."""
     if not layout.has_summary(file):
         return None
     file.seek(0)
@@ -306,7 +306,7 @@ def summary_of(file: IO[bytes]) -> Summary | None:
 
 
 def metadata_of(file: IO[bytes], summary: Summary) -> dict[str, dict[str, str]]:
-    """Return a file's metadata by name; none from where it is damaged."""
+    """Return a file's metadata by name, up to the first damaged record."""
     found: dict[str, dict[str, str]] = {}
     with contextlib.suppress(McapError, *_DAMAGED):
         for index in summary.metadata_indexes:
@@ -420,7 +420,7 @@ def _parsed(opcode: int, content: bytes) -> Any:
 
 
 def _broken_up(content: bytes, damaged: Callable[[str], None]) -> list[Any]:
-    """Return the records of a chunk; none if it is damaged."""
+    """Return the records of a chunk; none if damaged."""
     stream = ReadDataStream(BytesIO(content))
     try:
         layout.check_chunk(content)
@@ -435,7 +435,7 @@ def _broken_up(content: bytes, damaged: Callable[[str], None]) -> list[Any]:
 
 
 def _unpacked(chunk: Chunk) -> Chunk:
-    """Return a chunk without compression: however much comes out, no more is made than it says."""
+    """Return a chunk uncompressed, unpacking no more than the claimed size."""
     size = chunk.uncompressed_size
     if chunk.compression == "zstd":
         data = (

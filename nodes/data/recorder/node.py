@@ -16,17 +16,17 @@ from runtime import Input, Node
 from runtime.workers.worker import spare_cores
 
 _WAITING = 1 << 16
-"""Events that may come while simulated time waits: more than are ever sent at one moment."""
+"""Event queue length while simulated time waits: above any number sent at a time."""
 
 _LOOK = 0.5
-"""Real seconds between two looks at a process that simulated time waits for."""
+"""Real seconds between checks of the process while simulated time waits."""
 
 _END_TIMEOUT = 8.0
-"""Real seconds that the run's end may take; `run.shutdown_limit` is 10 unless changed."""
+"""Real seconds for the end of the run; `run.shutdown_limit` is 10 by default."""
 
 
 class McapRecorder(Node[McapRecorderConfig]):
-    """Writes all events to a file that ROS 2's tools, Foxglove and `nodes.data.replay` read.
+    """Recorder of all events, for ROS 2 tools, Foxglove and `nodes.data.replay`.
 
     ::
 
@@ -77,12 +77,12 @@ class McapRecorder(Node[McapRecorderConfig]):
         self.after_run(self._finish)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Record it, unless it says of a node of this run for whom it speaks and nothing else."""
+        """Record an announcement; a bare `Announcement` only names sources: left out."""
         if self._process is not None and type(announcement) is not Announcement:
             self._backlog.put(0, announcement)
 
     async def run(self) -> None:
-        """Hand all events to the thread that passes them to the writing process."""
+        """Pass all events to the thread feeding the writing process."""
         if self._process is None:
             return
         self.start(self._watch())
@@ -96,7 +96,7 @@ class McapRecorder(Node[McapRecorderConfig]):
                 await self._wait()
 
     async def on_shutdown(self) -> None:
-        """Write what still waits, and the index; if that takes long, it goes on after the run.
+        """Write queued events and the index; on a slow disk, continue after the run.
 
         Raises:
             FatalError: The disk is full, or the like.
@@ -117,7 +117,7 @@ class McapRecorder(Node[McapRecorderConfig]):
             self.log.fatal("%s", process.error)
 
     def _finish(self, _: Path) -> None:
-        """Give a slow disk the time that it needs, when the run is over and nobody waits for it.
+        """Give a slow disk more time, after the run.
 
         Raises:
             RecordingError: The disk is full, or the like.
@@ -130,7 +130,7 @@ class McapRecorder(Node[McapRecorderConfig]):
             raise process.error
 
     def _log_result(self, process: WriterProcess) -> None:
-        """Log how much was written, and count what was not."""
+        """Log the size of the recording, and count lost events."""
         backlog, result = self._backlog, process.result
         lost = backlog.dropped + process.unwritten
         self.events.dropped += lost

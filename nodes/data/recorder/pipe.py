@@ -1,4 +1,4 @@
-"""What a run and the process that writes for it send each other: a request, replies, events.
+"""Protocol of a run and its writing process: a request, replies, events.
 
 Events go through a pipe, which a thread feeds:
 
@@ -84,13 +84,13 @@ class WriteRequest(msgspec.Struct, frozen=True):
     metadata: str = ""
 
     def command(self) -> list[str]:
-        """Return the command that starts such a process."""
+        """Return the command to start the writing process."""
         text = msgspec.json.encode(self).decode()
         return [sys.executable, "-m", "nodes.data.recorder.process", text]
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A line that the process sends.
+    """Line sent by the writing process.
 
     Attributes:
         what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``;
@@ -114,7 +114,7 @@ it."""
 
 
 class Piece(NamedTuple):
-    """What comes out of the pipe."""
+    """Unit of the pipe: an event, an announcement, or the end."""
 
     time: int
     what: int
@@ -122,7 +122,7 @@ class Piece(NamedTuple):
 
 
 def write(file: IO[bytes], time: int, what: int, event: Packed | None = None) -> None:
-    """Write a piece to a buffered pipe; Python's lock is free while that waits.
+    """Write a piece to a buffered pipe; the GIL is free while blocked.
 
     Raises:
         OSError: Nobody reads any more.
@@ -135,7 +135,7 @@ def write(file: IO[bytes], time: int, what: int, event: Packed | None = None) ->
 
 
 def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator[Piece]:
-    """Yield what comes, up to the end of the pipe; half a piece at its end is left out.
+    """Yield pieces up to the end of the pipe; an incomplete last piece is left out.
 
     Args:
         idle: Seconds without anything after which `while_idle` is called, again and again.

@@ -1,4 +1,4 @@
-"""The process that records: reads events from its standard input, and writes the file.
+"""The recording process: reads events from its standard input, and writes the file.
 
 Started by `writer_process` as ``python -m nodes.data.recorder.process``. It is a process of its
 own because encoding holds Python's lock, and would keep the run's loop from it for milliseconds;
@@ -44,7 +44,7 @@ PREFIX = "/visnav"
 """Before the topics of events as they are."""
 
 _LEFT_OUT = ("clock", "paths")
-"""Groups of topics that only repeat what others have."""
+"""Topic groups left out, as they only repeat other topics."""
 
 _LATCHED = (
     "- history: keep_last\n  depth: 1\n  reliability: reliable\n  durability: transient_local\n"
@@ -53,11 +53,11 @@ _LATCHED = (
     "  liveliness: automatic\n  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}\n"
     "  avoid_ros_namespace_conventions: false\n"
 )
-"""As rosbag2 writes it; a player then offers the transforms to those that come late."""
+"""Latched QoS as written by rosbag2; a player offers the transforms to late joiners."""
 
 
 class EventWriter:
-    """Writes events to a file. It is a `Sink`: where `Publishing` puts ROS's messages.
+    """Writer of events to a file; as a `Sink`, target of `Publishing`'s ROS messages.
 
     Args:
         complain: Called for events that are recorded as they are, but not as ROS's messages.
@@ -83,7 +83,7 @@ class EventWriter:
         self._begun = False
         self._time = 0
         self._holder = ""
-        """Topic that has got the arrays of the event at hand."""
+        """Topic holding the arrays of the current event."""
 
     def write(self, time: int, frame: bytes | bytearray, announcement: bool) -> None:
         """Write an event.
@@ -128,7 +128,7 @@ class EventWriter:
         return self._writer.channel(topic, type_, self._store.definition, metadata)
 
     def _putter(self, kind: str) -> Any:
-        """Return what writes ROS's messages of a kind of event; `None` if there are none."""
+        """Return the writer of ROS messages for a kind of event; `None` if none exist."""
         cls = _type_of(kind)
         if cls is None:
             return None
@@ -163,7 +163,7 @@ class RecordedTopic(msgspec.Struct, frozen=True):
 
 
 def _type_of(kind: str) -> type[Event] | None:
-    """Return a type of event, imported if need be; `None` for what only its own process knows."""
+    """Return an event type, imported if needed; `None` if unknown in this process."""
     with contextlib.suppress(WireError):
         return event_type(kind)
     with contextlib.suppress(Exception):  # a module of the user's own, which may do anything
@@ -173,11 +173,11 @@ def _type_of(kind: str) -> type[Event] | None:
 
 
 LONGEST = 0.4
-"""Seconds, real and of the run's clock, after which a chunk ends."""
+"""Longest duration of a chunk: seconds, real and of the run's clock."""
 
 
 class FileWriter:
-    """Writes one file.
+    """Writer of a recording.
 
     Raises:
         RecordingError: The file cannot be made.
@@ -204,7 +204,7 @@ class FileWriter:
         """Real seconds, and the run's nanoseconds."""
 
     def run(self, file: int) -> Reply:
-        """Write what comes from a file descriptor, and close the file."""
+        """Write the pieces from a file descriptor, and close the file."""
         last = 0
         try:
             for piece in pipe.read_all(file, LONGEST / 2, self._while_idle):
@@ -262,7 +262,7 @@ class FileWriter:
 
 
 def send(reply: Reply) -> None:
-    """Send a reply to the run, if it is still there."""
+    """Send a reply to the run, if still there."""
     line = msgspec.json.encode(reply) + b"\n"
     try:
         while line:
@@ -272,7 +272,7 @@ def send(reply: Reply) -> None:
 
 
 def main(request: str) -> None:
-    """Do what is requested, and reply what came of it."""
+    """Carry out a write request, and reply with the result."""
     for each in (signal.SIGINT, signal.SIGHUP):  # the terminal is the run's business
         signal.signal(each, signal.SIG_IGN)
     wanted = msgspec.json.decode(request, type=WriteRequest)

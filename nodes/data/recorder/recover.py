@@ -1,4 +1,4 @@
-"""``recover`` mends recordings of runs that were killed, or whose disk was full."""
+"""The command ``recover``: mends recordings of killed runs or full disks."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from nodes.data.mcap.layout import RecordingError, is_being_written, unwritable
 from nodes.data.mcap.mcap_file import contents
 
 MENDED = "visnav_mended"
-"""Metadata of a file in which something could not be mended: what, by number."""
+"""Metadata record of a mended file: the unreadable parts, by number."""
 
 
 class Recovery(msgspec.Struct, frozen=True):
-    """What came of it.
+    """Result of mending a file.
 
     Attributes:
         path: The whole file.
@@ -39,7 +39,7 @@ class Recovery(msgspec.Struct, frozen=True):
 
 
 def recover_file(path: Path, out: Path | None = None) -> Recovery:
-    """Write a whole, indexed file from what can be read of a torn one.
+    """Write a whole, indexed file from the readable parts of a torn file.
 
     Args:
         out: The whole one; if `None`, it takes the place of the torn one when it is complete, and
@@ -80,7 +80,7 @@ def _all_of(path: Path, trouble: list[str]) -> Iterator[Any]:
 
 
 def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
-    """Write all that can be read of a file to another, complete and with an index.
+    """Write the readable messages of a file to another, complete and with an index.
 
     Returns:
         How many messages there were, and what could not be read.
@@ -138,10 +138,10 @@ def recover(
         typer.Option(help="A new file to write; if not given, the whole file replaces the torn."),
     ] = None,
 ) -> None:
-    """Mend the recording of a run that was killed, or whose disk was full.
+    """Mend the recording of a killed run, or of a run with a full disk.
 
-    What can be read is written to a complete file with an index. Such a run has at most its last
-    second missing. A file that has its index is only looked through.
+    Readable messages are written to a complete file with an index; at most the last second of such
+    a run is missing. A file with an index is only checked.
     """
     from runtime.errors import ConfigError
 

@@ -1,4 +1,4 @@
-"""The process that writes, as the run sees it: what waits for it, and the threads that serve it.
+"""The writing process as seen by the run: its backlog and its threads.
 
 The loop puts events into the backlog, and calls nothing here that waits. One thread feeds the
 process, and another reads its replies. It is no `runtime.workers.worker.Worker`: that copies what
@@ -33,33 +33,35 @@ from runtime.errors import MissingDependencyError, WireError
 from runtime.wire import pack
 
 SMALL = 512
-"""Bytes that an event without arrays is reckoned at."""
+"""Assumed size of an event without arrays, bytes."""
 
 _LARGE = 1 << 14
-"""Bytes from which an event is one of those that ``drop_images`` drops."""
+"""Least size of an event dropped by ``drop_images``, bytes."""
 
 _PAUSE = 0.005
 """Seconds between two looks at an empty backlog: cheaper than waking the thread at every event."""
 
 _AT_ONCE = 1 << 16
-"""Bytes that are handed over together."""
+"""Bytes handed over together."""
 
 _IN_A_ROW = 16
-"""Events between two chances for the loop to run, which needs Python's lock too."""
+"""Events in a row before the loop gets the GIL."""
 
 STANDSTILL = 10.0
-"""Real seconds without any sign of life after which the process is given up: it may be stopped or
-frozen, and then it would be waited for without end. A slow disk shows in the file's size."""
+"""Real seconds without any sign of life before the process is given up.
+
+A stopped or frozen process would be waited for without end. A slow disk shows in the file's size.
+"""
 
 _LOOK = 0.5
-"""Real seconds between two looks at it."""
+"""Real seconds between checks of the process."""
 
 _PIPE = 1 << 20
-"""Bytes that the pipe holds: Linux allows no more without privileges."""
+"""Size of the pipe, bytes: Linux's maximum without privileges."""
 
 
 class Waiting(NamedTuple):
-    """An event that waits: when it was published (ns), and the bytes that it is reckoned at."""
+    """Queued event, with its time of publication (ns) and assumed size (bytes)."""
 
     time: int
     event: Event
@@ -104,7 +106,7 @@ class Backlog:
     # On the loop.
 
     def put(self, time: int, event: Event) -> None:
-        """Add an event, or drop one."""
+        """Add an event; if the backlog is full, drop some."""
         size = self._size(event)
         waiting = self.bytes + size
         if waiting > self.limit and self.when_full != "wait":
@@ -136,20 +138,20 @@ class Backlog:
     # In other threads.
 
     def take(self) -> Waiting | None:
-        """Return the oldest; `None` if nothing waits. Call `done` when it is written."""
+        """Return the oldest event, `None` if empty; call `done` after writing."""
         try:
             return self._queue.popleft()
         except IndexError:
             return None
 
     def done(self, waiting: Waiting) -> None:
-        """Note that an event is written, and needs no memory any more."""
+        """Release the memory of a written event."""
         self._written += waiting.size
         if not self._room.is_set() and self.bytes <= self.limit // 2:
             self._room.set()
 
     def wait_for_room(self, timeout: float | None = None) -> bool:
-        """Wait until half of the room is free, or `release` is called; tell whether that came.
+        """Wait for half of the room, or for `release`; return False on timeout.
 
         Args:
             timeout: Real seconds to wait at most.
@@ -164,7 +166,7 @@ class Backlog:
 
 
 class WriterProcess:
-    """Hands a backlog to a process that writes it.
+    """Process for writing a recording, fed from a backlog.
 
     Args:
         failed: Called in a thread, once, with what ended the writing.
@@ -229,7 +231,7 @@ class WriterProcess:
         self._feeder.start()
 
     def close(self, end: int, timeout: float | None = None) -> bool:
-        """Have what still waits written, and tell whether the file is closed. Not on a loop.
+        """Write all queued events; return whether the file is closed. Not for a loop.
 
         A process that somebody stopped is continued, and one that shows no sign of life for
         `STANDSTILL` seconds is ended; `error` then says so.
@@ -260,7 +262,7 @@ class WriterProcess:
         return True
 
     def still_for(self) -> float:
-        """Return the real seconds for which the process has shown no sign of life."""
+        """Return the real seconds since the process's last sign of life."""
         try:
             size = Path(self.path).stat().st_size
             fields = Path(f"/proc/{self._child.pid}/stat").read_text().rpartition(")")[2].split()
@@ -273,7 +275,7 @@ class WriterProcess:
         return now - self._seen_at
 
     def standstill(self) -> RecordingError:
-        """Return the error for a process that shows no sign of life."""
+        """Return the error for a process without a sign of life."""
         return RecordingError(
             f"{self.path}: the process that writes it ({self._child.pid}) has taken nothing for "
             f"{STANDSTILL:g} s; what it had taken is kept"

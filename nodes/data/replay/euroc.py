@@ -156,7 +156,7 @@ class Euroc(FolderReader):
         )
 
     def _odometry(self, stamp: int, values: list[float]) -> Odometry:
-        """Return the truth; the data set has no angular velocity, so that is 0."""
+        """Return the true odometry; the data set has no angular velocity, so 0."""
         x, y, z, qw, qx, qy, qz, u, v, w = values[:10]
         turn = qw, qx, qy, qz
         velocity = rotate_inverse(turn, (u, v, w))
@@ -226,7 +226,7 @@ class Euroc(FolderReader):
 
 
 def noted_epoch(path: Path) -> list[int]:
-    """Return the epoch that a data set of ours notes in a file (ns); none if there is none.
+    """Return the epoch (ns) noted in a file of our own data sets; empty if none.
 
     Raises:
         ReplayError: It is no number.

@@ -1,4 +1,4 @@
-"""What data sets in folders have in common: a world with z up, images in files, rows to merge."""
+"""Common parts of data sets in folders: world with z up, image files, rows to merge."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
 
 
 def while_seen(truth: list[R], first: int, last: int) -> list[R]:
-    """Return the truth of the time of the sensors, with the row before it and the one after.
+    """Return the truth during the sensors' time, with the row before and the row after.
 
     More than that belongs to no flight that an estimator could have seen.
 
@@ -47,7 +47,7 @@ def while_seen(truth: list[R], first: int, last: int) -> list[R]:
 
 
 def vehicle_at(pose: Odometry) -> VehicleAnnouncement:
-    """Return the announcement of a vehicle of which only the first pose is known, and when."""
+    """Return a vehicle's announcement from its first known pose."""
     return VehicleAnnouncement(
         stamp=pose.stamp,
         source=pose.source,
@@ -83,7 +83,7 @@ def camera_at(
 
 
 def as_pair(left: CameraAnnouncement, right: CameraAnnouncement) -> CameraAnnouncement:
-    """Return the right camera as that of a stereo rig, or as it is if both are none.
+    """Return the right camera as of a stereo rig, or unchanged if both are none.
 
     Both are if they have one size and one rate, and stand side by side: less than 60 degrees apart
     in direction, and the right one at least half of their distance to the left one's right.
@@ -99,7 +99,7 @@ def as_pair(left: CameraAnnouncement, right: CameraAnnouncement) -> CameraAnnoun
 
 
 class Rows(NamedTuple):
-    """Rows of a data set, in order, and what makes events of them.
+    """Ordered rows of a data set, and the function turning them into events.
 
     Attributes:
         kind: Type of the events.
@@ -126,15 +126,15 @@ class FolderReader(Reader):
         self._folder = folder
         self._vehicle = vehicle
         self._origin = 0
-        """The stamp in the data set (ns) that is 0 in the run."""
+        """Stamp in the data set (ns) of the run's time 0."""
         self._announcements: list[Announcement] = []
 
     def announcements(self) -> Sequence[Announcement]:
-        """Return the vehicle where it begins, and its sensors."""
+        """Return the announcements of the vehicle, at its first pose, and its sensors."""
         return self._announcements
 
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
-        """Yield all events by their stamps; of one stamp, those of earlier `Rows` first."""
+        """Yield all events by stamp; at equal stamps, those of earlier `Rows` first."""
 
         def made(each: Rows) -> Iterator[Event]:
             for row in each.rows:
@@ -148,7 +148,7 @@ class FolderReader(Reader):
 
     @abstractmethod
     def _rows(self) -> Iterator[Rows]:
-        """Yield what there is."""
+        """Yield the rows of the truth and of each sensor."""
 
     def _pose(
         self,
@@ -157,7 +157,7 @@ class FolderReader(Reader):
         orientation: Quaternion,
         velocity: Vector3 = (0.0, 0.0, 0.0),
     ) -> Odometry:
-        """Return the truth; velocities that a data set does not have are 0."""
+        """Return the true odometry; velocities missing in the data set are 0."""
         return Odometry(
             stamp=stamp - self._origin,
             source=self._vehicle,

@@ -1,4 +1,4 @@
-"""Sequences in the layout of KITTI's odometry benchmark: rectified cameras in one row on a car.
+"""KITTI odometry sequences: rectified cameras in a row on a car.
 
 A. Geiger, P. Lenz and R. Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark
 suite", CVPR 2012, and cvlibs.net/datasets/kitti/eval_odometry.php::
@@ -102,7 +102,7 @@ class Kitti(FolderReader):
 
 
 def _camera(source: str, row: Row, image: Path, rate: float) -> CameraAnnouncement:
-    """Return a camera by its projection K [I | t], which takes points of the left grey camera."""
+    """Return a camera by its projection K [I | t] of points in the left grey camera."""
     projection = np.reshape(row.numbers(1, 13), (3, 4))
     first = read_image(image, 0, source, "")
     (fx, _, cx), (_, fy, cy) = projection[:2, :3].tolist()

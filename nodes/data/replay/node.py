@@ -47,7 +47,7 @@ class ReadAhead:
         self._batches: deque[tuple[Batch, int]] = deque()
         self._waiting = 0
         self.peak = 0
-        """Most bytes that ever waited."""
+        """Largest number of bytes waiting so far."""
         self._change = threading.Condition()
         self._ended = False
         self._closed = False
@@ -171,21 +171,21 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
 
 
 class Timeline:
-    """Where the times of a recording lie on the run's clock, by the stretches that were played."""
+    """Map from recording times to the run's clock, by the stretches played."""
 
     def __init__(self) -> None:
         self._stretches: list[tuple[int, int, bool]] = []
-        """Begin (recording), begin (run), and whether it goes on from the one before."""
+        """Begin (recording), begin (run), whether the previous stretch continues."""
         self.shift = 0
         """The run's clock less the recording's time now (ns)."""
 
     def go_on(self, position: int, now: int, *, pause: bool = False) -> None:
-        """Note that from now on (ns of the run) the recording is played from this position."""
+        """Start a stretch: the recording is played from `position` at `now` (run, ns)."""
         self._stretches.append((position, now, pause))
         self.shift = now - position
 
     def moved(self, event: Event) -> Event | None:
-        """Return an event on the run's clock; `None` if it was true before the run.
+        """Return an event on the run's clock; `None` if true before the run.
 
         A stamp of before a pause stays where it was then; of a trajectory those poses are left out
         that were not played.
@@ -217,7 +217,7 @@ class Timeline:
     def _stamps(
         self, times: npt.NDArray[np.int64]
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
-        """Return which times were played, and when they last were."""
+        """Return a mask of the times played, and their last time on the run's clock."""
         known, found = np.zeros(times.shape, np.bool_), times.copy()
         first = last = np.iinfo(np.int64).max  # of what was played later: on recording and run
         for position, now, _ in reversed(self._stretches):
@@ -277,11 +277,11 @@ class Replay(Node[ReplayConfig]):
             self.log.fatal("%s", error)
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce what was announced, and that others' events come from here."""
+        """Announce the recorded announcements, and this node as source of the events."""
         return [*self._announcements, Announcement(stamp=0, source="*")]
 
     async def run(self) -> None:
-        """Send all events, from start to end, and again if that is wanted."""
+        """Send all events from start to end, repeatedly if set."""
         assert self._reader is not None
         begin = round(self.config.start * SECOND)
         end = round(self.config.end * SECOND) or None
@@ -344,14 +344,14 @@ class Replay(Node[ReplayConfig]):
 
     @property
     def position(self) -> float:
-        """Return which time of the recording it is, or will be on resuming, seconds."""
+        """Return the position in the recording, now or on resuming, seconds."""
         if self._target is not None:
             return self._target / SECOND
         now = self.clock.now() if self._paused_at is None else self._paused_at
         return (now - self._timeline.shift) / SECOND
 
     async def _play(self, start: int, end: int | None) -> int | None:
-        """Send the events from one time to another; return the last time, if there was any."""
+        """Send the events of an interval; return the time of the last, if any."""
         assert self._reader is not None
         await self._close_ahead()
         events = self._reader.events(start, end, self._choice)
@@ -394,7 +394,7 @@ class Replay(Node[ReplayConfig]):
             self._announcements = [self._starting(reader, each) for each in self._announcements]
 
     def _starting(self, reader: Reader, announcement: Announcement) -> Announcement:
-        """Return a vehicle's announcement with the pose that it has at the start."""
+        """Return a vehicle's announcement with its pose at the start."""
         if not isinstance(announcement, VehicleAnnouncement):
             return announcement
 

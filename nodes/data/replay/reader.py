@@ -1,4 +1,4 @@
-"""What a recording is to a replay, whatever its format, which of its events are wanted; settings.
+"""Recordings as seen by a replay, in any format; choice of their events; settings.
 
 All of it is for threads beside the loop, and knows no clock: times count from the recording's
 beginning.
@@ -25,25 +25,25 @@ from runtime import Changeable, Duration, NodeConfig
 from runtime.paths import InputPath
 
 MOST_TROUBLE = 20
-"""Different complaints about a recording that are kept."""
+"""Largest number of different complaints kept about a recording."""
 
 
 class ReplayError(ValueError):
-    """A recording cannot be read; the message names the file and says what is wrong."""
+    """A recording cannot be read; the message names the file and the reason."""
 
 
 class Timed(NamedTuple):
-    """An event, and when it was published (ns from the recording's beginning)."""
+    """Event with its time of publication (ns from the recording's beginning)."""
 
     time: int
     event: Event
 
 
 class Wants(Protocol):
-    """Tells whether events of a type and source are to be sent; what is not is not decoded."""
+    """Test of type and source for events to send; others are not decoded."""
 
     def __call__(self, kind: type[Event], source: str) -> bool:
-        """Tell it."""
+        """Return whether to send events of this type and source."""
 
 
 class Reader(ABC):
@@ -60,7 +60,7 @@ class Reader(ABC):
 
     @abstractmethod
     def announcements(self) -> Sequence[Announcement]:
-        """Return what its nodes announced, or what can be concluded instead.
+        """Return the recorded announcements, or their equivalent from the data.
 
         Raises:
             ReplayError: It cannot be read.
@@ -68,7 +68,7 @@ class Reader(ABC):
 
     @abstractmethod
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
-        """Yield the events from `start` to before `end`, in the order in which they were sent.
+        """Yield the events from `start` to before `end`, in their original order.
 
         Events may share arrays with nothing that changes. Their stamps are on the same clock as
         the times.
@@ -82,25 +82,25 @@ class Reader(ABC):
         """
 
     def end(self) -> int | None:
-        """Return when it ends (ns), if it says so; else it ends with its last event."""
+        """Return the noted end (ns); `None` if the last event is the end."""
         return None
 
     def complain(self, what: str) -> None:
-        """Note what cannot be read; of more than anyone would look at, only that there is more."""
+        """Note an unreadable part; beyond `MOST_TROUBLE`, only the existence of more."""
         if what in self.trouble or len(self.trouble) > MOST_TROUBLE:
             return
         self.trouble.append(what if len(self.trouble) < MOST_TROUBLE else "and more of that kind")
 
     def close(self) -> None:  # noqa: B027  # most hold nothing
-        """Let go of what it holds."""
+        """Release all resources."""
 
 
 USUAL = Category.SENSOR | Category.GEOMETRY | Category.VEHICLE
-"""What a simulator says, and nobody else should."""
+"""Categories sent by default: reserved for simulators."""
 
 
 class Choice:
-    """Tells which events are wanted; see `nodes.data.replay.reader` for the rules.
+    """Selection of events; see `nodes.data.replay.reader` for the rules.
 
     Args:
         only: Types and sources; if there are any, an event must be of one of the types and from
@@ -124,7 +124,7 @@ class Choice:
         }
         self._known: dict[tuple[type[Event], str], bool] = {}
         self.unmatched = {*only, *skip}
-        """What was named, and is of no event so far."""
+        """Names without a matching event so far."""
 
     def __call__(self, kind: type[Event], source: str) -> bool:
         """Tell whether events of a type from a source are wanted."""
@@ -172,7 +172,7 @@ Use = Literal["image", "depth", "imu", "odometry", "truth", "estimate", "camera"
 
 
 class BagTopic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A topic of a ROS bag, and what its messages become.
+    """A topic of a ROS bag and the use of its messages.
 
     Attributes:
         topic: Its name.
@@ -190,7 +190,7 @@ class BagTopic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Pinhole(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Intrinsics of a camera, for data sets that do not come with them.
+    """Intrinsics of a camera, for data sets without intrinsics.
 
     Attributes:
         fx: Pixels.

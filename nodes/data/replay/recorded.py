@@ -1,4 +1,4 @@
-"""Recordings that `nodes.data.recorder` made: events come back as they were."""
+"""Recordings of `nodes.data.recorder`: events are restored unchanged."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from runtime.errors import WireError
 from runtime.wire import event_type
 
 _LOOK = 64
-"""Messages within which a recording of ours has one of its own kind."""
+"""Messages searched for our own metadata, in files rewritten by other tools."""
 
 
 class Recorded(Reader):
@@ -44,11 +44,11 @@ class Recorded(Reader):
                 self._frames.add(announcement)
 
     def announcements(self) -> Sequence[Announcement]:
-        """Return what its nodes announced."""
+        """Return the recorded announcements."""
         return self._announcements
 
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
-        """Yield its events, equal to what was recorded."""
+        """Yield the recorded events, equal to the originals."""
         holders: dict[str, Record] = {}  # the newest of each topic, until its event has come
         for record in read(self._path, start, end, self.complain):
             if record.type in HOLDERS:
@@ -65,7 +65,7 @@ class Recorded(Reader):
                 self.complain(f"{record.topic}: {error}")
 
     def end(self) -> int | None:
-        """Return when the recorder ended; `None` if it could not say so."""
+        """Return the recorder's end time (ns); `None` if not noted."""
         end = self._contents.metadata.get("visnav", {}).get("end", "")
         return int(end) if end.isdigit() else None
 
@@ -82,7 +82,7 @@ class Recorded(Reader):
         return native.event(record.data, found)
 
     def _read_announcements(self) -> Iterator[Announcement]:
-        """Yield the announcements, which come before all events."""
+        """Yield the announcements; all precede the events."""
         for record in read(self._path):
             if record.metadata.get("announcement"):
                 try:
@@ -97,7 +97,7 @@ class Recorded(Reader):
 
 
 def is_ours(path: Path) -> bool:
-    """Tell whether a file is a recording of ours, though another tool may have written it anew.
+    """Return whether a file is our recording, possibly rewritten by another tool.
 
     Raises:
         ReplayError: It is no MCAP file.

@@ -1,4 +1,4 @@
-"""Bags of ROS that others made: their messages as events, in our frames (`nodes.ros2.messages`).
+"""Foreign ROS bags: their messages as events, in our frames (`nodes.ros2.messages`).
 
 Messages with a header keep its stamp, unless that is zero; they are sent at their time of receipt.
 Where the two are of different clocks (a simulator's and the recording machine's), each counts
@@ -37,13 +37,13 @@ from runtime.errors import VisnavError, suggest
 from runtime.time.schedule import SECOND
 
 TYPES = {use: tuple(t for t, to in READERS if to == use) for use in get_args(Use)}
-"""What can be read of which type of message."""
+"""Readable message types of each use."""
 
 _PARTS = {
     "image", "image_raw", "image_rect", "image_color", "image_rect_color", "image_mono",
     "camera_info", "compressed", "compressedDepth", "depth", "color", "rgb", "depth_registered",
 }  # fmt: skip
-"""Parts of a topic's name that say what it is, and not whose."""
+"""Parts of topic names for the kind of data rather than its source."""
 
 
 def chosen(
@@ -150,7 +150,7 @@ class Mountings:
                 self._parents[each.child_frame_id] = each.header.frame_id, pose
 
     def of(self, optical: str, body: str = "base_link") -> Pose | None:
-        """Return the pose of an optical frame in the body, FRD; `None` if it is not known."""
+        """Return the pose of an optical frame in the body, FRD; `None` if unknown."""
         frame, (position, rotation) = optical, _HERE
         for _ in range(LONGEST):
             if frame == body:
@@ -167,12 +167,12 @@ class Mountings:
 
 
 _SAME_CLOCK = 60 * SECOND
-"""Nanoseconds between stamp and receipt above which they are of different clocks."""
+"""Largest difference of stamp and receipt on a common clock, nanoseconds."""
 
 _EVENTS = {use: row.becomes or row.events[0] for (_, use), row in READERS.items() if use in TYPES}
 
 _LATER = 1 << 62
-"""Stands for the stamp of a message that has none."""
+"""Placeholder for the stamp of a message without a stamp."""
 
 
 class RosBag(Reader):
@@ -205,11 +205,11 @@ class RosBag(Reader):
             raise
 
     def announcements(self) -> Sequence[Announcement]:
-        """Return the vehicle where it begins, cameras, IMUs and estimators."""
+        """Return the announcements of vehicle (first pose), cameras, IMUs, estimators."""
         return self._announcements
 
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
-        """Yield what the topics' messages become; one that makes no sense is left out."""
+        """Yield the events of the topics' messages; invalid messages are left out."""
         names = [
             name
             for name, topic in self._topics.items()
@@ -261,7 +261,7 @@ class RosBag(Reader):
         return found
 
     def _origins(self) -> tuple[int, Stamps]:
-        """Return the time of receipt that is 0 from now on, and how stamps are converted."""
+        """Return the time of receipt counted as 0, and the conversion of stamps."""
         times = [time for _, time, _ in self._firsts.values()]
         found = ((time, _stamp(message)) for _, time, message in self._firsts.values())
         stamped = [(time, at) for time, at in found if at]
@@ -335,7 +335,7 @@ class RosBag(Reader):
 
 
 def open_bag(path: Path) -> Bag:
-    """Open a bag whose chunks are as long as they claim; call it within `readable`."""
+    """Open a bag after a check of its chunks' claimed sizes; call within `readable`."""
     for each in [path] if path.is_file() else sorted(path.glob("*.mcap")):
         with each.open("rb") as file:
             if file.read(len(layout.MAGIC)) == layout.MAGIC:
@@ -345,7 +345,7 @@ def open_bag(path: Path) -> Bag:
 
 @contextlib.contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Make of whatever a damaged bag raises, in rosbags and below it, an error with its name."""
+    """Turn any exception of rosbags on a damaged bag into an error with the bag's name."""
     try:
         yield
     except VisnavError:
@@ -358,6 +358,6 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def _stamp(message: Any) -> int:
-    """Return a header's stamp (ns); 0 if it has none."""
+    """Return a header's stamp (ns), 0 if unset."""
     stamp = message.header.stamp
     return int(stamp.sec) * SECOND + int(stamp.nanosec)

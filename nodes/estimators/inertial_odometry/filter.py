@@ -1,4 +1,4 @@
-"""An error-state Kalman filter of a body with an IMU and a camera that sees a map.
+"""Error-state Kalman filter of a body with an IMU, and a camera with a map.
 
 The state is orientation, position and velocity of the IMU, the biases of gyroscope and
 accelerometer, and the direction of gravity, on the sphere, as in W. Xu, Y. Cai, D. He, J. Lin and
@@ -32,45 +32,49 @@ from nodes.estimators.inertial_odometry.preintegration import (
 )
 
 THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))
-"""Where the errors stand; that of the orientation is a small rotation in the IMU's own frame."""
+"""Slices of the error state; orientation errors are small rotations in the IMU's frame."""
 G = slice(15, 17)
-"""That of gravity's direction: small rotations about the two level axes."""
+"""Slice of gravity's direction: small rotations about the two level axes."""
 POSE = slice(0, 6)
 _FRAME = 7
-"""What is considered of a key frame: its pose, and by how much the inverse depths of its landmarks
-are off in the mean, 1/m: by that, a motion seen by them is too long or too short."""
+"""States considered of a key frame: pose, and mean error of its inverse depths, 1/m.
+
+By the latter, a motion seen by its landmarks is too long or too short.
+"""
 _SIZE = 17
 GRAVITY = 9.81
 _SPEED = 3.0
 """Standard deviation of the unknown velocity at the start, m/s."""
 _TILT = 0.35
-"""Standard deviation of gravity's direction as the first samples give it, radians: that of a
-vehicle that accelerates by 3.5 m/s²."""
+"""Standard deviation of gravity's direction from the first samples, radians.
+
+That of a vehicle with an acceleration of 3.5 m/s².
+"""
 _NO_TILT = 1.5
 """The same without samples."""
 _UNSTATED = np.array([0.01, 0.1])
-"""Standard deviations of biases of which nothing is announced: rad/s, m/s²."""
+"""Standard deviations of unannounced biases: rad/s, m/s²."""
 _STEPS = 2
 _HUBER = 2.0
 _FLOOR = 1e-3
-"""Metres and radians by which a pose may be off without a surprise."""
+"""Pose error accepted as no surprise: metres, radians."""
 _IMPLAUSIBLE = 60.0
-"""Squared Mahalanobis distance (6 degrees of freedom) beyond which a map's pose is not believed."""
+"""Largest squared Mahalanobis distance (6 degrees of freedom) of a plausible map pose."""
 _AHEAD = 0.8
-"""Least share of a sighting's landmarks that must be ahead of the camera in each step."""
+"""Least share of a sighting's landmarks ahead of the camera in each step."""
 _BESIDE = 2
-"""Images that are remembered beside the key frames, with the numbers -1 and -2."""
+"""Images remembered beside the key frames, numbered -1 and -2."""
 _ORIGIN = 2e-4
 """Standard deviation of the pose at the start, metres and radians: the camera is the world."""
 _VAGUE = 0.1
-"""Standard deviation of what the landmarks of a key frame do not tell: metres, radians."""
+"""Standard deviation of a key frame's pose without landmarks: metres, radians."""
 
 Measurement = Callable[["State"], tuple[Floats, Floats] | None]
 """Returns Λ and Aᵀr about a state, by its pose and by those of key frames; `None`: impossible."""
 
 
 class State(msgspec.Struct, frozen=True, eq=False):
-    """What is estimated.
+    """Estimated state.
 
     Attributes:
         rotation: From the IMU to the world, shape (3, 3).
@@ -92,7 +96,7 @@ class State(msgspec.Struct, frozen=True, eq=False):
         return np.asarray(GRAVITY * self.level[:, 2])
 
     def moved(self, error: Floats) -> State:
-        """Return the state that differs by an error, shape (17,)."""
+        """Return the state changed by an error, shape (17,)."""
         return State(
             self.rotation @ Rotation.from_rotvec(error[THETA]).as_matrix(),
             self.position + error[P],
@@ -102,7 +106,7 @@ class State(msgspec.Struct, frozen=True, eq=False):
         )
 
     def error_of(self, other: State) -> Floats:
-        """Return by how much another state differs from this one, shape (17,)."""
+        """Return the difference of another state from this state, shape (17,)."""
         x, y, z = self.level.T @ other.level[:, 2]
         tilt = np.array([-y, x]) * (np.arctan2(np.hypot(x, y), z) / max(np.hypot(x, y), 1e-12))
         turn = Rotation.from_matrix(self.rotation.T @ other.rotation).as_rotvec()
@@ -118,7 +122,7 @@ class State(msgspec.Struct, frozen=True, eq=False):
 
 
 class Sighting(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks as one image shows them.
+    """Landmarks seen in a single image.
 
     Attributes:
         places: Metres in the world, shape (n, 3).
@@ -191,7 +195,7 @@ class InertialFilter:
         self._of_frames = np.zeros((capacity, capacity))
 
     def remember(self, number: int, placed: Sighting | None = None) -> None:
-        """Note the present pose as that of a key frame.
+        """Store the present pose as a key frame's.
 
         Args:
             number: Its number, that of the newest one; or below zero, for an image beside them, of
@@ -218,7 +222,7 @@ class InertialFilter:
         self._with_frames[:, depth] = 0.0
 
     def propagate(self, motion: Preintegrated) -> None:
-        """Let a motion pass that the IMU felt, with the biases of the present state."""
+        """Propagate the state by an IMU motion, with the present biases."""
         state, t = self.state, motion.seconds
         turn = np.kron(np.eye(3), state.rotation)
         turn[:3, :3] = np.eye(3)
@@ -257,7 +261,7 @@ class InertialFilter:
         return float(np.median(np.hypot(*((seen.measured - image) * seen.scale)[:, :2].T)))
 
     def update_pose(self, camera: Floats, number: int, information: Floats, first: bool) -> bool:
-        """Take in a pose that an image has by a key frame; return False if it contradicts.
+        """Update by an image's pose from a key frame; return False if contradictory.
 
         The error of such a pose is half that of the image, and half that of the key frame, which
         does not change from image to image.
@@ -294,7 +298,7 @@ class InertialFilter:
         return self._correct(np.array([number]), measure)
 
     def _correct(self, numbers: npt.NDArray[np.int64], measure: Measurement) -> bool:
-        """Take in a measurement by the poses of key frames, unless it contradicts.
+        """Update by a measurement relative to key frames, unless contradictory.
 
         Iterated Kalman update in the information form of the measurements: with their information
         Λ and the covariance M of the poses concerned, gain and covariance need (I + ΛM)⁻¹ only.
@@ -379,7 +383,7 @@ class InertialFilter:
         return share * (flat.T @ flat), share * (flat.T @ (weight * residual).ravel())
 
     def _image(self, state: State, seen: Sighting) -> tuple[Floats, npt.NDArray[np.bool_], Floats]:
-        """Return landmarks in the IMU's frame, which are ahead, and what should be measured."""
+        """Return landmarks in the IMU's frame, a mask of those ahead, expected values."""
         in_body = (seen.places - state.position) @ state.rotation
         x, y, z = ((in_body - self.camera[:3, 3]) @ self.camera[:3, :3]).T
         ahead = z > 0.05
@@ -388,7 +392,7 @@ class InertialFilter:
 
 
 def _level(down: Floats) -> Floats:
-    """Return axes of which the third is a direction, or that of no vector, shape (3, 3)."""
+    """Return axes with a given third axis, (0, 1, 0) for a zero vector; shape (3, 3)."""
     length = float(np.linalg.norm(down))
     down = down / length if length > 0 else np.array([0.0, 1.0, 0.0])
     across = np.cross(down, np.eye(3)[np.abs(down).argmin()])

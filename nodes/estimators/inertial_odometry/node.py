@@ -1,4 +1,4 @@
-"""Visual-inertial odometry as nodes: one for a camera with depth, one for a stereo rig."""
+"""Visual-inertial odometry nodes: for a camera with depth, and for a stereo rig."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from runtime import Bundle
 
 
 class InertialOdometryConfig(EstimatorConfig):
-    """Settings of visual-inertial odometry. The noise of the IMU is the announced one.
+    """Settings of visual-inertial odometry; the IMU's noise is as announced.
 
     Attributes:
         inertial: Settings of the fusion with the IMU.
@@ -34,7 +34,7 @@ class InertialOdometryConfig(EstimatorConfig):
 
 
 class _InertialOdometry(Estimator[InertialOdometryConfig]):
-    """What both have in common: the tracker, in a process of its own."""
+    """Common base: the tracker in a process of its own."""
 
     inertial = True
     lenses = frozenset()
@@ -57,7 +57,7 @@ class _InertialOdometry(Estimator[InertialOdometryConfig]):
         )
 
     async def fuse(self, image: Image, other: Image | DepthImage, imu: tuple[Imu, ...]) -> None:
-        """Track one image, and publish what was found."""
+        """Track an image and publish the result."""
         result = await self._tracker.call(
             InertialTracker.fuse, self.exposed_at(image), image.data, other.data, as_rows(imu)
         )
@@ -73,7 +73,7 @@ class RgbdInertialOdometry(_InertialOdometry):
     frames = Bundle(RgbdInertialFrame, keep="latest")
 
     async def run(self) -> None:
-        """Track each image; those that arrive meanwhile are skipped, the IMU's samples are not."""
+        """Track each image; images arriving meanwhile are skipped, IMU samples are not."""
         async for image, depth, imu in self.frames:
             await self.fuse(image, depth, imu)
 
@@ -88,7 +88,7 @@ class StereoInertialOdometry(_InertialOdometry):
     frames = Bundle(StereoInertialFrame, keep="latest")
 
     async def run(self) -> None:
-        """Track each pair; those that arrive meanwhile are skipped, the IMU's samples are not."""
+        """Track each pair; pairs arriving meanwhile are skipped, IMU samples are not."""
         async for left, right, imu in self.frames:
             await self.fuse(left, right, imu)
 

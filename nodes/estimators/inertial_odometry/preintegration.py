@@ -1,4 +1,4 @@
-"""Preintegration of an IMU's samples, and images of a rolling shutter made into global ones by it.
+"""IMU preintegration, and its use for rolling shutter correction.
 
 The samples say of a motion the same, whatever pose and speed it began at: C. Forster, L. Carlone,
 F. Dellaert and D. Scaramuzza, "On-manifold preintegration for real-time visual-inertial odometry",
@@ -25,13 +25,13 @@ from nodes.estimators.odometry import Depth, rays
 Floats = npt.NDArray[np.float64]
 
 _GAP = 3.0
-"""Sampling intervals beyond which nothing is known about what happened between two samples."""
+"""Sampling intervals; the motion in a longer gap between samples is unknown."""
 _UNKNOWN = np.array([1.0, 5.0])
 """Standard deviations then: of the angular velocity, rad/s, and of the acceleration, m/s²."""
 
 
 class Preintegrated(msgspec.Struct, frozen=True, eq=False):
-    """A motion as an IMU felt it, without gravity and without the velocity at its start.
+    """Preintegrated IMU motion, without gravity and initial velocity.
 
     Attributes:
         seconds: How long it took.
@@ -52,7 +52,7 @@ class Preintegrated(msgspec.Struct, frozen=True, eq=False):
 
 
 class ImuModel:
-    """What an announcement says of an IMU, as the filter needs it.
+    """IMU parameters for the filter, from an announcement.
 
     Args:
         imu: The announcement.
@@ -163,7 +163,7 @@ def crosses(vectors: Floats) -> Floats:
 
 
 _STEP = 8
-"""Pixels between two for which the shift is computed."""
+"""Spacing of the computed shifts, pixels."""
 
 
 class Rows:
@@ -186,7 +186,7 @@ class Rows:
         self._at = np.rint(self._pixels).astype(int).clip(max=(info.width - 1, info.height - 1))
 
     def image(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """Return an image as all its rows would have shown it at once, of things far away."""
+        """Return an image as taken by a global shutter, valid for distant things."""
         return self._moved(image, np.zeros(len(self._pixels)))[0]
 
     def image_and_depth(

@@ -1,4 +1,4 @@
-"""Visual-inertial odometry: the map of the RGB-D tracker, and a filter that the IMU drives.
+"""Visual-inertial odometry: the RGB-D tracker's map, and a filter driven by the IMU.
 
 The IMU says where the map should be in the next image, all landmarks found there correct the
 filter (tightly coupled: none is too few), and the filter's pose is what the map grows from. Where
@@ -32,27 +32,29 @@ from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSetting
 from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces, surfaces_at
 
 _KNOWN = 0.3, 0.03
-"""Standard deviations of velocity (m/s) and gravity (radians) below which the IMU is of use."""
+"""Standard deviations of velocity (m/s) and gravity (radians) required to use the IMU."""
 _READING = 0.8
-"""Noise of a reading of depth, as a share of that of one pixel: errors of place included."""
+"""Noise of a depth reading, relative to a single pixel's; errors of place included."""
 _BENT = 0.003
-"""The same of surfaces that are not quite planes, as a share of inverse depth."""
+"""Noise of depth on surfaces not quite planar, relative to inverse depth."""
 _PLACED = 0.5, 0.5
-"""Noise of a landmark's place, which does not change from image to image, as a share of that of one
-sighting: of its pixel, and of its depth."""
+"""Constant noise of a landmark's place, relative to a sighting: of pixel, of depth."""
 _COMMON, _COMMON_BY_EYES = (0.02, 0.0), (0.02, 0.1)
-"""Shares of variance that the errors of all landmarks in an image have in common: of what is seen,
-and of places. That of a depth sensor's noise is none; how a surface lies and looks shifts the
-disparities of all that is on it."""
+"""Correlated shares of the landmarks' variance in an image: of sightings, of places.
+
+None of a depth sensor's noise; the slope and texture of a surface shift all its disparities.
+"""
 _MISFIT = 1.5
-"""Standard deviations of a pixel by which half of the landmarks may miss theirs."""
+"""Largest median error of the landmarks, in standard deviations of a pixel."""
 _PATIENCE, _DOUBTED = 0.4, 0.6
-"""Seconds over which the share of images is taken whose landmarks contradict the filter, and that
-beyond which the filter is not believed: it begins anew, in a frame of its own."""
+"""Averaging time (s) and limit of the share of images contradicting the filter.
+
+Beyond the limit the filter begins anew, in a frame of its own.
+"""
 _PREDICTED = np.diag(np.repeat([0.05**-2, 0.02**-2], 3))
-"""Information that the predicted pose counts with when landmarks are chosen: 5 cm, 0.02 radians."""
+"""Information of the predicted pose in the choice of landmarks: 5 cm, 0.02 radians."""
 _SLOTS = (-1, -2)
-"""Numbers of the images that may be the reference of an alignment, beside those of key frames."""
+"""Numbers of possible reference images of an alignment, beside the key frames'."""
 
 
 class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,7 +71,7 @@ class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 class InertialTracker(FeatureTracker):
-    """Tracks a camera with depth, or a stereo rig, and an IMU on one body.
+    """Tracker of a camera with depth, or a stereo rig, and an IMU on the same body.
 
     Equal images and samples give equal poses, to the bit.
 
@@ -209,7 +211,7 @@ class InertialTracker(FeatureTracker):
         return velocity
 
     def _camera_covariance(self) -> Floats:
-        """Return the covariance of the camera's pose, as `TrackingResult` has it."""
+        """Return the camera pose's covariance, as in `TrackingResult`."""
         state, camera = self._filter.state, self._filter.camera
         moved = np.zeros((6, 6))
         moved[:3, :3] = -state.rotation @ cross(camera[:3, 3])
@@ -220,7 +222,7 @@ class InertialTracker(FeatureTracker):
     def _straightened(
         self, image: npt.NDArray[np.uint8], other: npt.NDArray[np.uint8] | Depth
     ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | Depth]:
-        """Return both images as if all rows had been exposed with the middle one."""
+        """Return both images as if all rows had been exposed with the middle row."""
         turn = self._filter.camera[:3, :3].T @ self._rates[:3]
         velocity = self._camera_velocity() if self._is_known else np.zeros(3)
         rows = ImageRows(self._info, self._readout, turn, velocity)
@@ -231,7 +233,7 @@ class InertialTracker(FeatureTracker):
     # What the map's tracker asks for.
 
     def _expect(self, grey: Grey) -> Floats | None:
-        """Return the pose that the IMU predicts, once the filter knows enough; world to camera."""
+        """Return the IMU's predicted pose, world to camera, once the filter is sure."""
         return inverse(self._camera_pose()) if self._is_known else super()._expect(grey)
 
     def _starts(self, stamp: int, match: MapMatch | None) -> tuple[list[Floats], bool]:
@@ -312,9 +314,9 @@ class InertialTracker(FeatureTracker):
         self._filter.remember(number, self._seen(new, self._map.pixels[new], read, _PLACED))
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
-        """Return that nothing was found; after a while, start a new map.
+        """Return a lost result; after a while, start a new map.
 
-        That is where the IMU has carried the camera, while that is known; else in a new frame.
+        The map starts at the IMU's pose while known, else in a new frame.
         """
         result = self._lost(stamp, "too few landmarks of the map were found")
         waited = stamp - (self._lost_since or stamp)
@@ -341,7 +343,7 @@ class InertialTracker(FeatureTracker):
         return found
 
     def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:
-        """Return the landmarks of a match that agree with it."""
+        """Return the agreeing landmarks of a match."""
         rows, pixels = match.rows[match.agree], match.pixels[match.agree]
         read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
         return self._seen(rows, pixels, read, (1.0, 1.0))

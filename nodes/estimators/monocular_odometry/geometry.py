@@ -24,7 +24,7 @@ from nodes.estimators.odometry import Floats, Grey
 Indices = npt.NDArray[np.int64]
 
 _HUBER = 2.0
-"""Standard deviations beyond which a residual counts linearly."""
+"""Huber threshold of a residual, standard deviations."""
 _DAMPING = 1e-4
 
 
@@ -40,7 +40,7 @@ def adjust(
     noise: float,
     steps: int = 4,
 ) -> tuple[Floats, Floats, Floats]:
-    """Return poses and landmarks that fit all observations better, and the remaining errors.
+    """Return poses and landmarks after bundle adjustment, and the remaining errors.
 
     Args:
         poses: World to camera, shape (k, 4, 4).
@@ -158,9 +158,9 @@ def linearise(
 
 
 _PLANE = 3.0
-"""Pixels up to which a corner fits a homography."""
+"""Inlier threshold of a corner under a homography, pixels."""
 _EPIPOLAR = 1.0
-"""Pixels up to which it fits an essential matrix."""
+"""Inlier threshold of a corner under an essential matrix, pixels."""
 
 
 def triangulate(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
@@ -219,7 +219,7 @@ def centre(pose: Floats) -> Floats:
 
 
 def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
-    """Return the motions that two views of the same corners allow.
+    """Return the possible motions between two views of the same corners.
 
     A homography (the corners lie on a plane; up to four motions: E. Malis and M. Vargas, "Deeper
     understanding of the homography decomposition", INRIA 2007) and an essential matrix (they do
@@ -281,7 +281,7 @@ _QUALITY = 0.005
 
 
 def new_corners(image: Grey, taken: Floats, count: int) -> Floats:
-    """Return up to `count` corners that keep away from other ones.
+    """Return up to `count` corners away from existing corners.
 
     Args:
         image: Grey.

@@ -25,13 +25,13 @@ from nodes.estimators.monocular_odometry.geometry import (
 from nodes.estimators.odometry import Floats, Grey, Observations, follow_both_ways, rays, solve_pose
 
 _SNAPSHOT = 5.0
-"""Median pixels of motion between the views that are stored."""
+"""Median motion between stored views, pixels."""
 _GOOD = 2.0
-"""Pixels of reprojection error up to which a corner agrees with a motion."""
+"""Largest reprojection error of a corner in agreement with a motion, pixels."""
 
 
 class InitialMap(msgspec.Struct, frozen=True, eq=False):
-    """Two key frames and the landmarks that both see; the median depth from the first is 1.
+    """Two key frames and their common landmarks; the median depth from the first is 1.
 
     Attributes:
         first: The first image; its camera is the world.
@@ -62,7 +62,7 @@ class Initialization:
         self._count = 0
 
     def add(self, image: Grey) -> InitialMap | None:
-        """Add the next image, grey; return a map once there is one.
+        """Add the next image, grey; return a map once available.
 
         It starts again with this image if too few corners are left, or if a long motion gave no
         map, as rotation alone does not.
@@ -102,7 +102,7 @@ class Initialization:
         self._count = len(corners)
 
     def _build(self) -> InitialMap | None:
-        """Try all motions that the first and the newest view allow, and keep the best one."""
+        """Try all motions between the first and newest view; return the best map."""
         first, *between, last = self._views
         assert self._first is not None
         best: tuple[float, Floats, Floats] | None = None
@@ -151,7 +151,7 @@ class Initialization:
         return np.asarray((first < _GOOD) & (last < _GOOD))
 
     def _cost(self, points: Floats, pose: Floats) -> float | None:
-        """Return the error of a motion over all views; `None` if too few corners agree with it."""
+        """Return a motion's error over all views; `None` if too few corners agree."""
         fits = self._fits(points, pose)
         if fits.sum() < max(self._settings.min_inliers, 0.5 * len(points)):
             return None
@@ -176,7 +176,7 @@ View = tuple[float, float]
 
 
 class Tracks:
-    """Corners that are followed.
+    """Corners followed from image to image.
 
     Attributes:
         pixels: Column and row in the newest key frame, shape (n, 2).
@@ -194,7 +194,7 @@ class Tracks:
 
     @property
     def known(self) -> Mask:
-        """Which have a known point in the world, shape (n,)."""
+        """Mask of corners with a known point in the world, shape (n,)."""
         return np.asarray(np.isfinite(self.points[:, 0]))
 
     def keep(self, rows: npt.NDArray[np.int64]) -> list[tuple[Floats, dict[int, View]]]:
@@ -231,7 +231,7 @@ class Tracks:
 
 
 class LocalMap:
-    """Key frames and landmarks; it grows by one key frame at a time and forgets the oldest.
+    """Key frames and landmarks; adding a key frame may remove the oldest.
 
     Attributes:
         image: Image of the newest key frame, grey.
@@ -307,7 +307,7 @@ class LocalMap:
 
     @property
     def depth(self) -> float:
-        """Median depth of the landmarks that the newest key frame sees; 1 if it sees none."""
+        """Median depth of the newest key frame's landmarks; 1 without any."""
         points = self.tracks.points[self.tracks.known]
         if not len(points):
             return 1.0
@@ -327,7 +327,7 @@ class LocalMap:
         return points
 
     def add_keyframe(self, image: Grey, pose: Floats, rows: Indices, pixels: Floats) -> None:
-        """Make an image a key frame, and improve the map by it.
+        """Add an image as a key frame, and refine the map.
 
         Args:
             image: Grey.
@@ -351,7 +351,7 @@ class LocalMap:
         self.tracks.add(new_corners(self.image, self.tracks.pixels, count), self.newest)
 
     def _triangulate(self) -> None:
-        """Compute the points of corners that now have been seen with enough parallax."""
+        """Triangulate corners with enough parallax by now."""
         tracks, pose = self.tracks, self.pose
         by_first: dict[int, list[int]] = {}
         for row in np.flatnonzero(~tracks.known).tolist():
@@ -416,7 +416,7 @@ class LocalMap:
         tracks.drop(live[~good[:count]])
 
     def _remove_keyframes(self) -> None:
-        """Remove key frames that are neither adjusted any more nor needed by a track."""
+        """Remove key frames neither adjusted any more nor needed by a track."""
         needed = {min(views) for views in self.tracks.views}
         needed.update(self.keyframes[-self._settings.keyframes :])
         self._poses = {number: pose for number, pose in self._poses.items() if number in needed}

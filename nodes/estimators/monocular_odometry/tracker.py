@@ -44,13 +44,13 @@ from nodes.estimators.odometry import (
 from runtime import Bundle
 
 _AGREES = 6.0
-"""Standard deviations up to which a landmark agrees with a pose."""
+"""Inlier threshold of a landmark, standard deviations."""
 _FEW = 120
-"""Corners that suffice for an approximate pose."""
+"""Number of corners sufficient for an approximate pose."""
 _STORED = 6
-"""Newest key frames by which a lost camera is relocalized."""
+"""Number of newest key frames searched to relocalize a lost camera."""
 _ORB_POINTS = 1000
-"""Points by which the image of a lost camera is described."""
+"""Number of points describing a lost camera's image."""
 
 
 class MonocularTracker:
@@ -152,7 +152,7 @@ class MonocularTracker:
         )
 
     def _continue_from(self, world: LocalMap) -> None:
-        """Go on from the map's newest key frame, and store it."""
+        """Store the map's newest key frame, and continue from there."""
         keyframe = world.keyframe()
         self._pose = self._guess = keyframe.pose
         self._before = keyframe.image, keyframe.landmarks, keyframe.pixels
@@ -175,7 +175,7 @@ class MonocularTracker:
         return self._refine(points[few][good], there[good], self._guess).pose
 
     def _follow(self, grey: Grey, world: LocalMap, expected: Floats) -> tuple[Indices, Floats]:
-        """Find the newest key frame's corners; return which were found, and their pixels."""
+        """Follow the newest key frame's corners; return found rows and their pixels."""
         points = world.approximate_points()
         window = self._settings.window
         fx, fy, cx, cy = intrinsics(self._matrix)
@@ -191,7 +191,7 @@ class MonocularTracker:
         return rows[good], pixels[good]
 
     def _solve(self, points: Floats, pixels: Floats, expected: Floats) -> Solution | None:
-        """Return the pose, if enough landmarks agree with it."""
+        """Return the pose; `None` if too few landmarks agree."""
         least = self._settings.min_inliers
         if len(points) < least:
             return None
@@ -275,6 +275,6 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
 
 
 def make_tracker(info: CameraInfo, settings: MonocularSettings) -> MonocularTracker:
-    """Make the tracker in the process that will run it."""
+    """Make the tracker; for a call in the worker's process."""
     cv2.setNumThreads(1)
     return MonocularTracker(info, settings)

@@ -25,7 +25,7 @@ from runtime.paths import InputPath
 
 
 class Frame(NamedTuple):
-    """All that any mode reads."""
+    """Fields read in any mode."""
 
     image: Image
     depth: DepthImage | None
@@ -104,7 +104,7 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         self._slam = await self.worker(OrbSlam3Process, *told, latency=self.config.latency)
 
     async def run(self) -> None:
-        """Track each image; those that arrive meanwhile are skipped."""
+        """Track each image; images arriving meanwhile are skipped."""
         initialized = False
         async for frame in self.frames:
             given = frame._asdict()

@@ -1,4 +1,4 @@
-"""ORB-SLAM3 itself, by `pyorbslam3`. For a worker's process: it is GPL, and it may end or crash it.
+"""ORB-SLAM3 by `pyorbslam3`, for a worker's process: under the GPL, and able to crash.
 
     slam = await self.worker(OrbSlam3Process, settings, vocabulary, latency=…)
     result = await slam.call(OrbSlam3Process.track, stamp, image, depth)
@@ -75,11 +75,11 @@ class Anchor:
 
     @property
     def map(self) -> int:
-        """Number of the map that poses are placed by; 0 before there is one."""
+        """Number of the map in use; 0 before the first."""
         return list(self._first).index(self._map) if self._first else 0
 
     def world_may_have_changed(self, first: KeyFrame, pose: Floats) -> None:
-        """Take note of the first key frame of the map in which the camera is now.
+        """Note the first key frame of the camera's present map.
 
         Args:
             pose: The camera now in the same world, shape (4, 4).
@@ -97,22 +97,22 @@ class Anchor:
             self._from_world, self._map = from_world, first.stamp
 
     def _jump(self, from_world: Floats, pose: Floats) -> float:
-        """Return how far a pose would be from the last one."""
+        """Return the distance of a pose from the last pose."""
         return float(np.linalg.norm((from_world @ pose)[:3, 3] - self.last[:3, 3]))
 
     def first(self, stamp: float) -> tuple[int, Floats] | None:
-        """Return a map's number and its first key frame in our frame, by that one's stamp."""
+        """Return a map's number and its first key frame in our frame, by the stamp."""
         known = enumerate(self._first.items())
         return next(((n, pose) for n, (at, pose) in known if abs(at - stamp) < 1e-4), None)
 
     def place(self, pose: Floats) -> Floats:
-        """Return a pose in the frame of the very first key frame; remembered as the last one."""
+        """Return a pose in the very first key frame's frame; kept as the last pose."""
         self.last = self._from_world @ pose
         return self.last
 
 
 def first_key_frame(trajectory: Path) -> KeyFrame | None:
-    """Read the first pose of a trajectory in TUM's format; None if it is empty."""
+    """Return the first pose of a TUM trajectory; `None` if empty."""
     with trajectory.open(encoding="ascii") as lines:
         words = lines.readline().split()
     if len(words) != 8:
@@ -128,15 +128,17 @@ INSTALL = (
     "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6, and then "
     "python -m runtime vocabulary config.toml"
 )
-"""All that ORB-SLAM3 needs, with its vocabulary; `make` serves in a checkout."""
+"""Installation of ORB-SLAM3 with its vocabulary; `make` serves in a checkout."""
 
 _REACH = 6.0
-"""Pixels between a map point, projected, and the corner that it was found at; a corner high in
-the pyramid is known to a few pixels only."""
+"""Largest distance of a projected map point from its corner, pixels.
+
+A corner high in the pyramid is known to a few pixels only.
+"""
 
 
 class OrbSlam3Result(TrackingResult, frozen=True, eq=False):
-    """What ORB-SLAM3 finds in one image.
+    """Result of ORB-SLAM3 for an image.
 
     The pose is in the optical camera at the first key frame; the points are all corners, without
     distortion, and the inliers those that agree with the map.
@@ -156,7 +158,7 @@ class OrbSlam3Result(TrackingResult, frozen=True, eq=False):
 
 
 class OrbSlam3Process:
-    """ORB-SLAM3 with its threads: one of them tracks in `track`, the others map meanwhile.
+    """ORB-SLAM3 with its threads: tracking in `track`, mapping in the background.
 
     Args:
         settings: Mode, settings file, size of images.
@@ -236,7 +238,7 @@ class OrbSlam3Process:
         return found
 
     def trajectory(self) -> tuple[npt.NDArray[np.int64], Floats, int]:
-        """End ORB-SLAM3's threads, and return the poses as it sees them after all corrections.
+        """End ORB-SLAM3's threads; return the poses after all corrections.
 
         They are those of the images that were tracked in its largest map.
 
@@ -310,7 +312,7 @@ class OrbSlam3Process:
         )
 
     def _update_map(self, pose: Floats) -> None:
-        """Ask for the first key frame of the present map, which only its trajectory gives."""
+        """Read the present map's first key frame, available only from its trajectory."""
         file = Path(self._folder.name) / "key_frames.tum"
         self._slam.save_keyframe_trajectory_tum(str(file))
         first = first_key_frame(file)
@@ -321,7 +323,7 @@ class OrbSlam3Process:
                 self._first_keyframe = self._stamps[nearest]
 
     def _corners_of(self, points: Points, pose: Floats, corners: Points) -> npt.NDArray[np.int64]:
-        """Return the corners at which map points (n, 3) of ORB-SLAM3's world were found."""
+        """Return the corners matched to map points (n, 3) of ORB-SLAM3's world."""
         seen = (points - pose[:3, 3]) @ pose[:3, :3]
         ahead = seen[seen[:, 2] > 0]
         fx, fy, cx, cy = self._settings.intrinsics
@@ -337,7 +339,7 @@ def check_arrays(
     right: npt.NDArray[np.uint8] | None,
     imu: Floats | None,
 ) -> None:
-    """Refuse arrays for which ORB-SLAM3 would end the process, or which it would not notice.
+    """Reject arrays ORB-SLAM3 would exit on, or silently misread.
 
     Raises:
         ValueError: An array is missing, superfluous, or of the wrong shape.
@@ -373,7 +375,7 @@ def _wait_for_other_threads(until: float) -> None:
 
 
 def _naps() -> dict[str, tuple[bool, str]]:
-    """Return whether each other thread of this process runs, and how often it has waited so far."""
+    """Return by thread id, for all other threads, whether running, and waits so far."""
     found = {}
     for task in Path("/proc/self/task").iterdir():
         with contextlib.suppress(OSError):  # it has ended

@@ -29,7 +29,7 @@ LENSES: dict[str, frozenset[str]] = {
     "monocular": frozenset({"plumb_bob", "equidistant"}),
     "stereo": frozenset(),
 }
-"""Distortion models that ORB-SLAM3 computes with, by the mode without its IMU.
+"""Distortion models supported by ORB-SLAM3, by the mode without IMU.
 
 With depth it takes key points for those of a pinhole unless they have plumb_bob's distortion
 (``Frame::UndistortKeyPoints`` and ``Frame::UnprojectStereo``). Of a stereo pair it looks for a
@@ -69,7 +69,7 @@ class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """All that an ORB-SLAM3 process needs to start.
+    """Start-up settings of an ORB-SLAM3 process.
 
     Attributes:
         mode: The sensors that are used.
@@ -141,7 +141,7 @@ def _distortion(info: CameraInfo) -> dict[str, float]:
 
 
 def _pose(sensor: CameraAnnouncement | ImuAnnouncement) -> npt.NDArray[np.float64]:
-    """Return a sensor on the body that carries it, shape (4, 4)."""
+    """Return a sensor's pose on its body, shape (4, 4)."""
     return pose_matrix(sensor.position, sensor.orientation)
 
 
@@ -161,7 +161,7 @@ def _on_imu(camera: CameraAnnouncement, imu: ImuAnnouncement) -> npt.NDArray[np.
 
 
 def _real(value: float) -> str:
-    """Return a number that OpenCV's YAML reader takes for a real one: with a point."""
+    """Return a number as a real for OpenCV's YAML reader: with a point."""
     text = f"{value:.9g}"
     mantissa, e, exponent = text.partition("e")
     return text if "." in mantissa else f"{mantissa}.0{e}{exponent}"

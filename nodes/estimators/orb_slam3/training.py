@@ -1,4 +1,4 @@
-"""A node that trains ORB-SLAM3's vocabulary from the images of a run, and writes it at the end.
+"""Training of ORB-SLAM3's vocabulary from a run's images, by a node; written at the end.
 
 ``python -m runtime vocabulary CONFIG`` runs it in place of the ORB-SLAM3 nodes of a file.
 
@@ -56,7 +56,7 @@ class VocabularyTrainer(Node[VocabularyTrainerConfig]):
         self._descriptors: list[Bytes] = []
 
     async def run(self) -> None:
-        """Describe one of every `image_interval` images."""
+        """Describe every `image_interval`-th image."""
         seen: dict[str, int] = {}
         async for image in self.images:
             count = seen[image.source] = seen.get(image.source, -1) + 1
@@ -103,7 +103,7 @@ def vocabulary(
     overrides: Overrides = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.")] = False,
 ) -> None:
-    """Train ORB-SLAM3's vocabulary from what the cameras of a file see.
+    """Train ORB-SLAM3's vocabulary from the images of a file's cameras.
 
     Runs the file without its ORB-SLAM3 nodes and without a folder of results; once done, the
     file's ORB-SLAM3 nodes find the vocabulary by themselves. One made from one world serves in

@@ -1,4 +1,4 @@
-"""The bag of visual words by which ORB-SLAM3 recognizes places: its training, and its file.
+"""ORB-SLAM3's bag of visual words for place recognition: training, and file format.
 
 A tree of binary descriptors, made by k-majority (Grana et al., *A fast approach for integrating
 ORB descriptors in the bag of words model*, 2013): k-means with Hamming distance, where a centre's
@@ -25,13 +25,13 @@ Bytes = npt.NDArray[np.uint8]
 Integers = npt.NDArray[np.int64]
 
 _BYTES = 32
-"""Bytes of one ORB descriptor."""
+"""Bytes of an ORB descriptor."""
 
 _ITERATIONS = 10
 """Of moving the centres, at most; later ones change next to nothing."""
 
 _SCORING, _WEIGHTING = 0, 0
-"""L1 norm and tf-idf, which ORB-SLAM3 expects (DBoW2's ScoringType and WeightingType)."""
+"""L1 norm and tf-idf, as expected by ORB-SLAM3 (DBoW2's ScoringType, WeightingType)."""
 
 _FIELDS = 2 + _BYTES + 1
 """Numbers on a node's line: parent, leaf or not, descriptor, weight."""
@@ -54,7 +54,7 @@ class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
 
     def header_depth(self) -> int:
-        """Return L as the file states it.
+        """Return L as stated in the file.
 
         ORB-SLAM3 takes the nodes four levels above L for its index (``transform(…, 4)``), however
         deep the tree is.
@@ -126,7 +126,7 @@ def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary
 
 
 def _grow(descriptors: Bytes, shape: TreeShape) -> tuple[Integers, Bytes, Integers]:
-    """Split all descriptors again and again, one level of the tree at a time.
+    """Split all descriptors repeatedly, level by level of the tree.
 
     Returns:
         Parents (n,), centres (n, 32), and each descriptor's leaf.
@@ -186,7 +186,7 @@ def _distances(descriptors: Bytes, centres: Bytes) -> Integers:
 
 
 def cached_vocabulary(shape: TreeShape) -> Path:
-    """Return the path of the vocabulary of this shape, whether it exists or not.
+    """Return the path of the cached vocabulary of this shape, existing or not.
 
     It is below ``$XDG_CACHE_HOME``, or ``~/.cache``.
     """
@@ -196,7 +196,7 @@ def cached_vocabulary(shape: TreeShape) -> Path:
 
 
 def find_vocabulary(setting: str) -> Path:
-    """Return the vocabulary that a node's setting names: a file, or, if empty, the cached one.
+    """Return the vocabulary of a node's setting: a file, or the cached file if empty.
 
     Raises:
         ValueError: There is none, or it is not in DBoW2's text format.

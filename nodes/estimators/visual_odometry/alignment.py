@@ -35,14 +35,14 @@ from nodes.estimators.visual_odometry.surfaces import surfaces_at
 
 _LEVELS = 4
 _CELL = 4
-"""Side of the squares of the half-sized image of which each gives one edge pixel at most."""
+"""Side of the squares of the half-sized image with at most a single edge pixel each."""
 _EDGE = 2.0
 """Least gradient of an edge in the half-sized image, grey levels per pixel."""
 _EDGES = 1000
 _SPACING = 16
 """Distance of the surface points, pixels."""
 _OUTLINE = 0.05
-"""Share by which inverse depth differs around an outline."""
+"""Relative difference of inverse depth around an outline."""
 _BRIGHTNESS_NOISE = 3.0
 """Least standard deviation of a difference of brightness, grey levels."""
 _HUBER = 1.5
@@ -51,21 +51,21 @@ _STEPS = 6
 _RIM = 4
 """Pixels at the edge of the image without points."""
 _CORRELATED = 9.0
-"""Number of residuals that count as one, as neighbours share their errors."""
+"""Number of correlated residuals counted as a single residual."""
 _AGREES = 3.0
-"""Standard deviations up to which a point agrees, and"""
+"""Inlier threshold of a point, standard deviations."""
 _OFF = 0.5
-"""the pixels by which an edge may be off besides."""
+"""Additional tolerance of an edge, pixels."""
 _FEW = 30
-"""Edges below which their agreement says nothing."""
+"""Least number of edges for a meaningful agreement."""
 _OTHER, _OTHER_SHARE = 6.0, 0.1
-"""Standard deviations, and share of inverse depth, beyond which a surface is another one."""
+"""Least difference of another surface: standard deviations, share of inverse depth."""
 _HIDDEN = 1.15
-"""Share of an edge's inverse depth from which on what is there hides it."""
+"""Least inverse depth of a surface hiding an edge, relative to the edge's."""
 _ORDINARY = np.diag([1e2, 1e-2])
-"""Information that gain and offset are those of equal exposures."""
+"""Prior information on gain and offset, about equal exposures."""
 _SMALL = 2e-4
-"""Step, metres and radians, after which the smallest change of pose is found; of full images."""
+"""Convergence threshold of a step in full images: metres, radians."""
 
 
 class View(msgspec.Struct, frozen=True, eq=False):
@@ -91,7 +91,7 @@ class View(msgspec.Struct, frozen=True, eq=False):
 
 
 class Reference(msgspec.Struct, frozen=True, eq=False):
-    """Points of an image with which others are aligned.
+    """Points of an image as the reference of alignments.
 
     Attributes:
         pose: World to camera, shape (4, 4).
@@ -136,7 +136,7 @@ class Reference(msgspec.Struct, frozen=True, eq=False):
 
 
 class Alignment(NamedTuple):
-    """What an alignment has found.
+    """Result of an alignment.
 
     Attributes:
         pose: World to camera, shape (4, 4).
@@ -184,7 +184,7 @@ def align(
     noise: float,
     prior: tuple[float, float],
 ) -> Alignment:
-    """Return the pose from which an image shows what a reference shows.
+    """Return the alignment of an image with a reference.
 
     Args:
         reference: The reference.
@@ -324,7 +324,7 @@ def _brightness(
 def _distances(
     reference: Reference, view: View, pose: Floats, matrix: Floats, noise: float
 ) -> _Residuals:
-    """Return the differences of inverse depth from that of the reference's planes."""
+    """Return the residuals of inverse depth to the reference's planes."""
     image, pixels = _project(reference.surfaces, pose, matrix)
     good = np.flatnonzero(inside(pixels, view.inverse_of.shape, _RIM))
     image, pixels = image[:, good], pixels[good]
@@ -341,7 +341,7 @@ def _distances(
 
 
 _FADES = 0.5
-"""Seconds without a measurement in which the expected velocity falls to 1/e."""
+"""Decay time (to 1/e) of the expected velocity without a measurement, seconds."""
 
 
 class Motion:
@@ -360,7 +360,7 @@ class Motion:
         return moved(pose, self._velocity * (stamp - before) * 1e-9)
 
     def measured(self, stamp: int, pose: Floats) -> None:
-        """Note a pose that was measured, world to camera, shape (4, 4)."""
+        """Record a measured pose, world to camera, shape (4, 4)."""
         if self._last is not None and stamp > self._last[0]:
             before, last = self._last
             self._velocity = motion_between(last, pose) / ((stamp - before) * 1e-9)
@@ -375,12 +375,12 @@ class Motion:
         return moved(pose, velocity * (stamp - before) * 1e-9)
 
     def carried(self, stamp: int) -> Floats:
-        """Return the pose at a time without a measurement, from which on the motion fades."""
+        """Return the pose expected without a measurement, and let the motion fade."""
         pose, before = self.expected(stamp), stamp if self._last is None else self._last[0]
         self._velocity = self._velocity * math.exp((before - stamp) * 1e-9 / _FADES)
         self._last = stamp, pose
         return pose
 
     def placed(self, stamp: int, pose: Floats) -> None:
-        """Note a pose that was found again: how the camera moves is as unknown as before."""
+        """Record a relocalized pose; the velocity stays as before."""
         self._last = stamp, pose

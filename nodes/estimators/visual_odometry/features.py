@@ -58,31 +58,35 @@ from nodes.estimators.visual_odometry.surfaces import (
 
 _FLOW_WINDOW = 15
 _LARGE = 320
-"""Side (pixels) of images that are halved before corners are followed."""
+"""Least side (pixels) of images halved before following corners."""
 _AGREES = 4.0
-"""Standard deviations up to which a landmark agrees with a pose."""
+"""Inlier threshold of a landmark, standard deviations."""
 _FEW = 120
-"""Corners that suffice for an approximate pose, at most."""
+"""Number of corners sufficient for an approximate pose, at most."""
 _ENOUGH = 60 / 512**2
-"""Agreeing landmarks a pixel that give a pose alone: a smaller image has room for fewer of them.
-With less than that, edges and surfaces are aligned, too."""
+"""Agreeing landmarks per pixel sufficient for a pose: smaller images have fewer.
+
+With less than that, edges and surfaces are aligned, too.
+"""
 BELIEVED = 0.03
-"""Share of an alignment's information that counts beside landmarks: errors of pixels that lie
-beside each other are not independent, and some of the pixels may be on things that move."""
+"""Weight of an alignment's information beside landmarks.
+
+Errors of neighbouring pixels are not independent, and some pixels may be on moving things.
+"""
 _FEWEST = 4
-"""Agreeing landmarks that are of use beside that."""
+"""Least number of agreeing landmarks beside an alignment."""
 _SEARCHED = 20
-"""Newest key frames by which a lost camera is relocalized."""
+"""Number of newest key frames searched to relocalize a lost camera."""
 _SEARCHED_PER_IMAGE = 2
 """Key frames tried with each image, because each takes as long as tracking does."""
 _SURE = 0.6
-"""Share of the landmarks looked for that must agree with a pose found by relocalization."""
+"""Least share of agreeing landmarks, among those searched, in a relocalized pose."""
 _NEAR = 64.0
-"""Pixels beyond the image's edge up to which landmarks may soon be in view."""
+"""Margin around the image for landmarks soon in view, pixels."""
 _SOON = 8
-"""Images for which a list of such landmarks is used."""
+"""Images between updates of the list of such landmarks."""
 _READING = 0.5
-"""Noise of a reading of depth, as a share of that of one pixel.
+"""Noise of a depth reading, relative to a single pixel's.
 
 A reading is the mean of many pixels, but not of an exact plane.
 """
@@ -190,13 +194,13 @@ class FeatureTracker:
         alignment: Alignment,
         match: MapMatch | None,  # noqa: ARG002
     ) -> MapMatch | None:
-        """Return what was found in an image that is aligned, beside a match of few landmarks."""
+        """Return the match of an aligned image, beside a match of few landmarks."""
         believed = BELIEVED * alignment.information
         found = self._find(grey, inverse_of, alignment.pose, believed)
         return found or MapMatch.without_landmarks(alignment.pose)
 
     def _note(self, grey: Grey, inverse_of: Depth, aligned: bool) -> None:
-        """Remember an image whose pose is known, and whether it is by an alignment."""
+        """Remember an image of known pose, and whether known by an alignment."""
         self._references.note(grey, inverse_of, self._pose, aligned)
 
     def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
@@ -267,7 +271,7 @@ class FeatureTracker:
         return from_rotation_vector(rotation, translation)
 
     def _reduced(self, grey: Grey) -> Grey:
-        """Return the image in which corners are followed: half as large, if it is large."""
+        """Return the image for following corners: half-sized, if large."""
         return np.asarray(cv2.pyrDown(grey), np.uint8) if self._reduction > 1 else grey
 
     def _find(
@@ -277,7 +281,7 @@ class FeatureTracker:
         expected: Floats,
         information: Floats | None = None,
     ) -> MapMatch | None:
-        """Find the map in an image that was taken near an expected pose.
+        """Find the map in an image taken near an expected pose.
 
         If that pose comes with its information, as an alignment gives it, few landmarks suffice.
         """
@@ -390,7 +394,7 @@ class FeatureTracker:
         self._near_until = 0
 
     def _start_map(self, stamp: int, grey: Grey, inverse_of: Depth, reason: str) -> TrackingResult:
-        """Make the first key frame of a new map, at the present pose, if it shows enough."""
+        """Start a new map with a key frame at the present pose, given enough corners."""
         corners = find_corners(grey, self._settings.spacing, np.empty((0, 2)))
         seen = self._surfaces_at(inverse_of, corners, self._settings.depth_noise)
         count = int(seen.continuous.sum())
@@ -417,13 +421,13 @@ class FeatureTracker:
 
     @property
     def _is_carried(self) -> bool:
-        """Whether the pose is known without the map, so that a new one goes on in its frame."""
+        """Whether the pose is known without the map: a new map stays in the frame."""
         return False
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
-        """Return that tracking is lost; after a while, start a new map.
+        """Return a lost result; after a while, start a new map.
 
-        Where that starts is known from the images meanwhile, or guessed from the last motion.
+        Its start is known from the images meanwhile, or guessed from the last motion.
         """
         result = self._lost(stamp, "too few landmarks of the map were found")
         assert self._lost_since is not None

@@ -1,4 +1,4 @@
-"""The map: key frames, and landmarks with the depth at which each was first seen in one of them.
+"""The map: key frames, and landmarks with the depth in their first key frame.
 
 Rows are in the order of age, so that forgetting the oldest key frame is cutting off the front. A
 lost camera is relocalized by key frames. Landmarks are corners, the best of each square of the
@@ -31,11 +31,11 @@ from nodes.estimators.visual_odometry.surfaces import Surfaces, surfaces_at
 _SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5
 """Limits of how much smaller, larger or more slanted a landmark may look than at first."""
 _MEAN_OF = 20.0
-"""Readings of depth after which the mean of a landmark's depth becomes a moving one."""
+"""Depth readings in the mean of a landmark's depth; a moving mean beyond."""
 _CONTRADICTS = 5.0
-"""Standard deviations by which a reading of depth may differ from a landmark's."""
+"""Largest difference of a depth reading from a landmark's, standard deviations."""
 _HIDES = 0.05
-"""Share of a landmark's inverse depth by which another surface must differ from it."""
+"""Least difference of another surface from a landmark, relative to inverse depth."""
 
 
 class Landmarks:
@@ -108,14 +108,14 @@ class Landmarks:
         return np.arange(before, len(self))
 
     def forget_before(self, number: int) -> int:
-        """Forget landmarks of key frames before this one, and return how many those were."""
+        """Remove landmarks of earlier key frames; return their number."""
         gone = int(np.searchsorted(self.keyframes, number))
         for name in self._COLUMNS:
             setattr(self, name, getattr(self, name)[gone:])
         return gone
 
     def in_view(self, pose: Floats, size: tuple[int, int], margin: float, rows: Rows) -> Rows:
-        """Return which of some landmarks fall into an image, or miss it by `margin` at most.
+        """Return those of some landmarks in an image, or outside by at most `margin`.
 
         Args:
             pose: World to camera, shape (4, 4).
@@ -151,7 +151,7 @@ class Landmarks:
         return np.asarray(rows[(there <= 0) | (off < np.maximum(_HIDES / z, 4 * noise))])
 
     def active(self, now: int, rows: Rows) -> Rows:
-        """Return those of some landmarks that are looked for now, as `update_found` says."""
+        """Return those of some landmarks to search now, as set by `update_found`."""
         return np.asarray(rows[self._inactive_until[rows] <= now])
 
     def patches(self, pose: Floats, rows: Rows) -> tuple[Rows, Patches]:
@@ -182,7 +182,7 @@ class Landmarks:
         return rows, Patches(self.keyframes[rows], self.pixels[rows], expected[good], warps[good])
 
     def update_found(self, now: int, found: Rows, missed: Rows) -> None:
-        """Note which landmarks were found; the others are left out for a while.
+        """Record found landmarks; missed landmarks are left out for a while.
 
         That is the longer, the more often they were missed in a row.
         """
@@ -219,7 +219,7 @@ class Landmarks:
 
 
 class MapMatch(msgspec.Struct, frozen=True, eq=False):
-    """The landmarks of the map that were found in an image, and the pose from them.
+    """Landmarks of the map found in an image, and the pose from them.
 
     Attributes:
         pose: World to camera, shape (4, 4).
@@ -237,22 +237,22 @@ class MapMatch(msgspec.Struct, frozen=True, eq=False):
 
     @classmethod
     def without_landmarks(cls, pose: Floats) -> MapMatch:
-        """Return that none were looked for, as the pose is known without."""
+        """Return a match without landmarks, for a pose known otherwise."""
         none = np.empty(0, np.int64)
         return cls(pose, none, np.empty((0, 2)), np.empty(0, np.bool_), none)
 
     @property
     def share(self) -> float:
-        """Share of the landmarks looked for that agree with the pose."""
+        """Share of the searched landmarks in agreement with the pose."""
         return float(self.agree.sum()) / (len(self.rows) + len(self.missed))
 
 
 ORB_POINTS = 500
-"""Points by which an image is described."""
+"""Number of points describing an image."""
 
 
 class Keyframe(msgspec.Struct, frozen=True, eq=False):
-    """An image in which landmarks were first seen.
+    """Image with the first sight of some landmarks.
 
     Attributes:
         image: Grey.
@@ -293,20 +293,20 @@ class Described:
 RIM = 12
 """Pixels at the edge of the image without corners: patches need a neighbourhood."""
 _APART = 10
-"""Least distance of a new corner from another one, pixels."""
+"""Least distance of a new corner from another, pixels."""
 _BLOCK = 5
 _TEXTURE = 1.5e-4
-"""Least eigenvalue of a corner, as OpenCV scales it: more than noise of two grey levels gives."""
+"""Least eigenvalue of a corner in OpenCV's scale: above noise of two grey levels."""
 
 
 def squares(pixels: Floats, spacing: int) -> Floats:
-    """Return the number of the square that each pixel lies in, shape (n,)."""
+    """Return the number of each pixel's square, shape (n,)."""
     column, row = np.floor(pixels.T / spacing)
     return np.asarray(row * 65536 + column)
 
 
 def find_corners(image: Grey, spacing: int, taken: Floats) -> Floats:
-    """Return corners in squares that hold none, as whole pixels (column, row), shape (n, 2).
+    """Return corners in empty squares, as whole pixels (column, row), shape (n, 2).
 
     Args:
         image: Grey, shape (h, w).

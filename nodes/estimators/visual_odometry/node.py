@@ -1,4 +1,4 @@
-"""RGB-D visual odometry as a node: the images it reads, and its methods, on features or dense.
+"""RGB-D visual odometry node: its images, and its methods, feature-based and dense.
 
 The dense one is OpenCV's `cv2.Odometry` on all pixels: colour and depth, coarse to fine (F.
 Steinbrücker, J. Sturm and D. Cremers, "Real-time visual odometry from dense RGB-D images",
@@ -198,7 +198,7 @@ class VisualOdometry(Estimator[VisualOdometryConfig]):
         )
 
     async def run(self) -> None:
-        """Track each image; those that arrive meanwhile are skipped."""
+        """Track each image; images arriving meanwhile are skipped."""
         async for image, depth in self.frames:
             self.publish(
                 image, await self._tracker.call(Tracker.track, image.stamp, image.data, depth.data)
@@ -206,7 +206,7 @@ class VisualOdometry(Estimator[VisualOdometryConfig]):
 
 
 def make_tracker(config: VisualOdometryConfig, info: CameraInfo) -> Tracker:
-    """Make the tracker that the settings ask for, in the process that will run it."""
+    """Make the tracker chosen by the settings; for a call in the worker's process."""
     cv2.setNumThreads(1)
     if config.method == "dense":
         return DenseTracker(info, config.dense)

@@ -1,4 +1,4 @@
-"""Finding patches of key frames in an image, each warped as the image should show it.
+"""Search of an image for patches of key frames, each warped to the expected view.
 
 A patch is always compared with the key frame in which it was first seen, so that no error
 accumulates, and it is warped, so that neither distance nor slant shifts it.
@@ -19,13 +19,15 @@ from nodes.estimators.odometry import Depth, Floats, Grey, follow_both_ways
 from nodes.estimators.visual_odometry.alignment import Alignment, Reference, View, align
 
 SAME = 0.5
-"""Least correlation of a patch with what is found: flow finds noise wherever it begins, and so says
-of any expected place that it is right."""
+"""Least correlation of a patch with its counterpart.
+
+Flow finds noise wherever it begins, and so confirms any expected place.
+"""
 
 Rows = npt.NDArray[np.int64]
 
 MARGIN = 4
-"""Pixels by which a patch may lie off the place expected."""
+"""Largest distance of a patch from its expected place, pixels."""
 
 
 class Patches(msgspec.Struct, frozen=True, eq=False):
@@ -56,7 +58,7 @@ def half_width(window: int) -> int:
 def find_patches(
     patches: Patches, images: Mapping[int, Grey], image: Grey, window: int
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
-    """Return where patches are, shape (n, 2), and which of them were found, shape (n,).
+    """Return the places of patches, shape (n, 2), and a mask of the found, shape (n,).
 
     Args:
         patches: At least one; expected `half_width` or more from the image's edge.
@@ -101,7 +103,7 @@ def correlation(one: Grey, other: Grey) -> Floats:
 
 
 def _cut_warped(patches: Patches, images: Mapping[int, Grey], centre: Floats, half: int) -> Grey:
-    """Return the squares around `centre` as the new image should show them, one above another."""
+    """Return squares around `centre` as expected in the new image, stacked vertically."""
     side = 2 * half + 1
     steps = np.arange(-half, half + 1, dtype=np.float32)
     back = np.linalg.inv(patches.warps).astype(np.float32)
@@ -124,9 +126,9 @@ def _cut_warped(patches: Patches, images: Mapping[int, Grey], centre: Floats, ha
 
 
 _UNSURE = 0.1
-"""Metres of a position's standard deviation from which on an image says too little."""
+"""Largest standard deviation of position of a usable alignment, metres."""
 _AGREE = 0.6
-"""Least share of the points in view that must agree,"""
+"""Least share of agreeing points in view."""
 _AGREE_AGAIN = 0.8
 """the same of edges after a loss, when the alignment may have found the wrong ones,"""
 _POINTS = 60
@@ -136,11 +138,11 @@ _PRIOR = 0.02, 0.02
 _PRIOR_LOST = 0.3, 0.2
 """The same while tracking is lost."""
 _READING = 0.5
-"""Noise of the distance of a surface, as a share of that of one pixel."""
+"""Noise of a surface's distance, relative to a single pixel's."""
 
 
 class References:
-    """Aligns images with the last one that was made a reference.
+    """Alignment of images with the last reference.
 
     Args:
         matrix: K, shape (3, 3).
@@ -155,7 +157,7 @@ class References:
         self._known: tuple[Grey, Depth, Floats] | None = None
 
     def note(self, grey: Grey, inverse_of: Depth, pose: Floats, aligned: bool) -> None:
-        """Remember an image whose pose is known; it becomes the reference should one be needed.
+        """Remember an image of known pose, as a possible reference.
 
         Args:
             grey: Grey image.
@@ -192,7 +194,7 @@ class References:
     def _best(
         self, reference: Reference, view: View, starts: list[Floats], lost: bool
     ) -> Alignment | None:
-        """Return the alignment from one of some poses in which most edges agree."""
+        """Return the alignment with most agreeing edges, from several initial poses."""
         tried = (self._align(reference, view, start, lost) for start in starts)
         return max((found for found in tried if found), key=lambda f: f.sharp, default=None)
 
@@ -208,7 +210,7 @@ class References:
         return pose
 
     def suffices(self, view: View) -> bool:
-        """Return whether a view shows enough for others to be aligned with it."""
+        """Return whether a view suffices as a reference of alignments."""
         start = np.eye(4)
         return self._align(self._made(view, start), view, start, False) is not None
 

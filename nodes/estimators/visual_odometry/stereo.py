@@ -32,25 +32,27 @@ from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces,
 from runtime import Bundle
 
 _LARGE = 320
-"""Side (pixels) of images that are halved before blocks are matched."""
+"""Least side (pixels) of images halved before block matching."""
 _BLOCK = 11
 _WINDOW = 15
 _REFINED = 1.5
-"""Pixels by which flow may move what block matching found."""
+"""Largest correction of block matching by flow, pixels."""
 _OFF_ROW = 0.6
-"""Pixels by which a corner may leave its row."""
+"""Largest distance of a corner from its row, pixels."""
 _COARSE = 2.0
-"""Noise of block matching, in units of that of flow."""
+"""Noise of block matching, relative to flow."""
 _STEP, _DISTINCT = 3.0, 1.5
-"""Pixels beside a disparity at which what differs, by the correlation, must be so many times more:
-so it is known to 3 / 15 / √0.5 = 0.3 pixels, if noise is all that differs."""
+"""Pixels beside a disparity, and least ratio of the difference there to its own.
+
+The disparity is then known to 3 / 15 / √0.5 = 0.3 pixels, if all difference is noise.
+"""
 _LEVELS = 3
-"""Times that flow halves the images where block matching found nothing."""
+"""Halvings of the images for flow, where block matching found nothing."""
 _ASIDE = 4
-"""Pixels from such a corner to its neighbours, by which its plane is found."""
+"""Distance of such a corner from the neighbours defining its plane, pixels."""
 _BESIDE = np.array([(_ASIDE, 0), (-_ASIDE, 0), (0, _ASIDE), (0, -_ASIDE)])
 _TORN, _BENT = 0.02, 0.15
-"""Share of its disparity, and pixels, by which a corner's may differ from its neighbours' mean."""
+"""Largest deviation from the neighbours' mean disparity: share of disparity, pixels."""
 
 
 class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -128,7 +130,7 @@ class StereoMatcher:
         return depth
 
     def surfaces_at(self, inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
-        """Return the planes around pixels of the pair that `depth` was last called with.
+        """Return the planes around pixels of the pair last given to `depth`.
 
         Args:
             inverse: Of its coarse depth, as
@@ -168,7 +170,7 @@ class StereoMatcher:
     def _disparity(
         self, pixels: Floats, guess: Floats, levels: int
     ) -> tuple[Floats, npt.NDArray[np.bool_]]:
-        """Return disparities by flow from a guess, shape (n,), and which are good, shape (n,)."""
+        """Return disparities by flow from a guess, and a mask of the good, both (n,)."""
         assert self._pair is not None
         there = pixels - guess[:, None] * (1.0, 0.0)
         found, good = follow_both_ways(*self._pair, pixels, there, _WINDOW, levels)
@@ -177,7 +179,7 @@ class StereoMatcher:
         return disparity, good & (disparity > self._least)
 
     def _is_distinct(self, pixels: Floats, disparity: Floats) -> npt.NDArray[np.bool_]:
-        """Return which disparities are those of something: noise and level edges fit any."""
+        """Return a mask of distinct disparities; noise and level edges fit any."""
         assert self._pair is not None
         left, there = around(self._pair[0], pixels, _WINDOW), pixels - disparity[:, None] * (1, 0)
         at, before, after = (
@@ -223,7 +225,7 @@ class StereoOdometry(Estimator[StereoOdometryConfig]):
         )
 
     async def run(self) -> None:
-        """Track each pair; those that arrive meanwhile are skipped."""
+        """Track each pair; pairs arriving meanwhile are skipped."""
         async for left, right in self.frames:
             self.publish(
                 left,
@@ -257,5 +259,5 @@ class StereoTracker:
 
 
 def baseline(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
-    """Return the metres from the left camera to the right one, both aligned."""
+    """Return the distance from the left to the right camera, both aligned, metres."""
     return math.dist(left.position, right.position)

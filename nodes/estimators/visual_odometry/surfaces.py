@@ -16,15 +16,15 @@ import numpy.typing as npt
 from nodes.estimators.odometry import Depth, Floats
 
 REACH = 6
-"""Pixels around a corner over which its surface must be continuous: optical flow compares them."""
+"""Radius of continuous surface required around a corner by optical flow, pixels."""
 NEAREST = 0.05
-"""Metres; depth below it is ignored, as that of dirt on the lens."""
+"""Least depth, metres; smaller values are ignored, as of dirt on the lens."""
 _FARTHEST = 0.02
 """1/m: beyond 50 m depth says nothing about a motion of metres."""
 _HOLE = -200.0
-"""1/m: stands for no depth; so low that smoothing leaves a neighbour of a hole below zero."""
+"""Placeholder for no depth, 1/m: so low, a smoothed neighbour stays below zero."""
 _TORN = 0.02
-"""Share of its inverse depth by which a neighbourhood may differ from a plane."""
+"""Largest deviation of a neighbourhood from a plane, relative to inverse depth."""
 _NOISY = 2.0
 """The same, in standard deviations of a reading."""
 

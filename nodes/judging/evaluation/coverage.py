@@ -1,4 +1,4 @@
-"""For how much of a flight there was a pose: coverage, and the intervals without one.
+"""Coverage of a flight by poses, and the intervals without a pose.
 
 Everything is measured on the stamps of the images there were, from the first to the last: silence
 before the first pose and after the last one counts. When a pose arrived plays no part here, so an
@@ -27,7 +27,7 @@ class Interval(NamedTuple):
 
 
 class Coverage(msgspec.Struct, frozen=True):
-    """What an estimator covered of a flight.
+    """Coverage of a flight by an estimator's poses.
 
     Attributes:
         flight: From the first image to the last.
@@ -43,7 +43,7 @@ class Coverage(msgspec.Struct, frozen=True):
 
     @property
     def percent(self) -> float:
-        """Share of the flight's time in which the estimator was not lost, in percent."""
+        """Share of the flight's time not lost, percent."""
         length = self.flight.end - self.flight.start
         if not length:
             return 100.0 if self.answered else 0.0
@@ -51,7 +51,7 @@ class Coverage(msgspec.Struct, frozen=True):
 
     @property
     def frames_percent(self) -> float:
-        """Share of the images that have a pose, in percent."""
+        """Share of the images with a pose, percent."""
         return 100.0 * self.answered / self.frames
 
 
@@ -62,7 +62,7 @@ def cover(
     announced: Sequence[Interval] = (),
     planned: int | None = None,
 ) -> Coverage:
-    """Return what poses cover of a flight.
+    """Return the coverage of a flight by poses.
 
     Lost is what a user means by it: no pose for longer than `gap` although there were images, or
     the estimator's own word. A camera that is slower than `gap` makes nobody lost.
@@ -97,7 +97,7 @@ def cover(
 
 
 def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
-    """Tell which images have a pose within half the usual period between images, shape (n,).
+    """Return a mask, shape (n,), of images with a pose within half the image period.
 
     Stamps that went through a double or a clock of their own still count; a wrong pose for the
     stamp is found by the errors.
@@ -112,16 +112,16 @@ def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
 
 
 def choose_frames(cameras: Mapping[str, Stamps], poses: Stamps) -> Stamps | None:
-    """Return the stamps of the camera that an estimator follows: most of its poses have them.
+    """Return the stamps of an estimator's camera: shared by most of its poses.
 
-    Of cameras that fit as well as each other it is the first; `None` if no camera has images.
+    The first of equally good cameras; `None` if no camera has images.
     """
     there = (stamps for stamps in cameras.values() if len(stamps))
     return max(there, key=lambda stamps: int(np.isin(poses, stamps).sum()), default=None)
 
 
 def union(intervals: Sequence[Interval]) -> list[Interval]:
-    """Return the same time as intervals that do not touch, in order."""
+    """Return the union of intervals, disjoint and in order."""
     found: list[Interval] = []
     for each in sorted(intervals):
         if found and each.start <= found[-1].end:

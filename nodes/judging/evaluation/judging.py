@@ -1,4 +1,4 @@
-"""From the estimates and the truth to figures: pure functions, and the flight of one vehicle.
+"""Figures from estimates and ground truth: pure functions, and the flight of a vehicle.
 
 The errors of the poses there are (`nodes.judging.evaluation.metrics`) say nothing of those that are
 missing: an estimator that gives up when it gets difficult would look better than one that drifts.
@@ -54,7 +54,7 @@ from runtime.time.schedule import SECOND
 def held_errors(
     truth: Trajectory, frames: Stamps, poses: Stamps, errors: Floats, lost: Sequence[Interval]
 ) -> Floats:
-    """Return the position error at each image of a flight, as its estimator said at that time.
+    """Return the position error at each image of a flight, by the poses as first sent.
 
     An image has the error of the worst pose that is nearer to it in time than to any other image,
     so that nothing hides between images; if there is none, that of the nearest pose; or, if it has
@@ -93,7 +93,7 @@ def held_errors(
 
 
 def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory) -> Floats:
-    """Return the position error at each image of a flight, for poses that were corrected later.
+    """Return the position error at each image of a flight, by poses corrected later.
 
     Between two poses, key frames perhaps, the estimate is interpolated. Before the first and after
     the last, the nearer one is held, and the true path length from there is added.
@@ -121,12 +121,15 @@ MILLISECOND = 1_000_000
 _MOST_TICKS = 100_000
 _BLOCK = 65_536
 _LATE = 5
-"""Periods that a pose may be late: whoever answers image by image needs two, and its camera one or
-two. Later than that, it had images after its own for it, if it answers them all."""
+"""Largest delay of a pose, in image periods.
+
+An estimator that answers each image needs two, and its camera one or two; any later, it had images
+after that of the pose.
+"""
 
 
 class Errors(msgspec.Struct, frozen=True, eq=False):
-    """Errors over time, one row a pose; all arrays of shape (n,).
+    """Errors over time, a row per pose; all arrays of shape (n,).
 
     Attributes:
         stamps: Nanoseconds: of the image, or of the control tick.
@@ -143,7 +146,7 @@ class Errors(msgspec.Struct, frozen=True, eq=False):
 
 
 class Judgement(msgspec.Struct, frozen=True, eq=False):
-    """All that is known of one estimator at the end.
+    """Final judgement of an estimator.
 
     Attributes:
         figures: Its figures, by name (a unit is the name's end).
@@ -310,7 +313,7 @@ def _judge_final(
     alignment: How | Literal["auto"],
     figures: dict[str, Any],
 ) -> Trajectory | None:
-    """Judge the trajectory after loop closures: add its figures, and return it aligned."""
+    """Judge the trajectory after loop closures: add figures, return aligned poses."""
     if record.final is None:
         return None
     figures["final_poses"] = len(record.final)
@@ -354,7 +357,7 @@ def _said_with_poses(
 
 
 def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
-    """Return how far the vehicle flew from where its pilot meant it to be.
+    """Return the vehicle's distance from its planned path.
 
     Args:
         truth: Its true poses.
@@ -373,7 +376,7 @@ def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
 
 
 def choose_alignment(scale_free: bool, frame_id: str) -> How:
-    """Return what an estimate's frame allows.
+    """Return the alignment implied by an estimate's frame.
 
     ``sim3`` if its unit is its own, ``none`` if it claims to be in ``map``, else ``origin``: its
     first pose is laid on the true one.
@@ -386,7 +389,7 @@ def choose_alignment(scale_free: bool, frame_id: str) -> How:
 def errors_at_ticks(
     truth: Trajectory, estimate: Trajectory, arrivals: npt.NDArray[np.int64], rate: float
 ) -> tuple[Errors | None, dict[str, float]]:
-    """Return the errors of the newest pose that a controller would have had at each of its ticks.
+    """Return the errors of the newest pose available to a controller at each tick.
 
     Args:
         truth: True poses.
@@ -425,7 +428,7 @@ def errors_at_ticks(
 
 
 class Flight:
-    """The flight of one vehicle, as far as it has gone.
+    """Flight of a vehicle so far.
 
     Attributes:
         truth: Its true poses.
@@ -443,23 +446,23 @@ class Flight:
         self._setpoints = PoseRows()
 
     def add(self, event: Odometry) -> None:
-        """Note where it is."""
+        """Add a true pose."""
         self.body = event.child_frame_id
         self.truth.add(event.stamp, event.position, event.orientation)
         self.recent.add(event.stamp, event.position, event.orientation)
 
     def add_plan(self, event: PlannedPose | PositionSetpoint) -> None:
-        """Note where its pilot means it to be."""
+        """Add a planned pose or a set-point."""
         rows = self._plan if isinstance(event, PlannedPose) else self._setpoints
         rows.add(event.stamp, event.position, from_yaw(event.yaw))
 
     def plan(self) -> Trajectory | None:
-        """Return where it was meant to be: by planned poses, or else by set-points."""
+        """Return the planned path: from planned poses, or else from set-points."""
         rows = self._plan if len(self._plan) else self._setpoints
         return rows.trajectory() if len(rows) else None
 
     def figures(self, truth: Trajectory | None) -> dict[str, float]:
-        """Return how often it hit something, and how far it was from its planned poses."""
+        """Return the number of collisions, and the distance from planned poses."""
         found: dict[str, float] = {"collisions": len(self.collisions)}
         if truth is not None and len(self._plan):
             found |= beside_the_plan(truth, self._plan.trajectory())

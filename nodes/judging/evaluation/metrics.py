@@ -22,7 +22,7 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 SHARES = (1, 2, 5, 10, 20)
-"""Percent of a flight's path over which relative errors are taken; see `share_errors`."""
+"""Path lengths of relative errors, percent of the flight's path; see `share_errors`."""
 
 
 def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
@@ -213,7 +213,7 @@ def _turns(first: Floats, last: Floats) -> Floats:
 
 
 def interpolated(known: Indices, values: Floats, stamps: Indices) -> Floats:
-    """Return values at other times, which may repeat: shapes (n,), (n, d) and (k,) to (k, d)."""
+    """Return values at other times, also repeated: shapes (n,), (n, d), (k,) to (k, d)."""
     times = stamps - known[0], known - known[0]  # so that a float holds every nanosecond
     return np.stack([np.interp(*times, column) for column in values.T], axis=1)
 
@@ -260,16 +260,16 @@ def rms(values: Floats) -> float:
 
 
 _SINGULAR = 1e-9
-"""Smallest eigenvalue of a correlation matrix that can be inverted."""
+"""Smallest eigenvalue of an invertible correlation matrix."""
 _BLOCK = 4096
 _THREE_SIGMA = float(chdtri(3, math.erfc(3.0 / math.sqrt(2.0))))
-"""NEES of three dimensions that is as rarely exceeded as 3 sigma of one: 14.16."""
+"""NEES in three dimensions, as rarely exceeded as 3 sigma in a single dimension: 14.16."""
 
 
 def consistency(
     truth: Trajectory, estimate: Trajectory, covariances: Floats
 ) -> dict[str, float | int | None]:
-    """Return how well the errors of poses agree with the covariances that came with them.
+    """Return the consistency of pose errors with the received covariances.
 
     The normalized estimation error squared (NEES) is ``eᵀ P⁻¹ e``, with the error e and its stated
     covariance P. If the covariances are true, it is distributed as chi-squared: its mean is the
@@ -314,7 +314,7 @@ def consistency(
 
 
 def positive_definite(matrices: Floats) -> npt.NDArray[np.bool_]:
-    """Tell which matrices, shape (n, k, k), are symmetric and positive definite, shape (n,).
+    """Return a mask, shape (n,), of symmetric positive definite matrices (n, k, k).
 
     They are scaled to correlations before, as their units differ.
     """
@@ -331,12 +331,14 @@ def positive_definite(matrices: Floats) -> npt.NDArray[np.bool_]:
 
 
 How = Literal["none", "origin", "se3", "sim3"]
-"""``none``: as it is. ``origin``: first pose on first pose. ``se3``: rigid, by least squares over
-all positions. ``sim3``: the same with scale, for estimates whose unit of length is their own."""
+"""``none``: as is. ``origin``: first pose on first pose. ``se3``: rigid, least squares.
+
+``sim3``: the same with scale, for estimates in their own unit. Both use all positions.
+"""
 
 
 class Alignment(msgspec.Struct, frozen=True, eq=False):
-    """An aligned estimate, and what was done to it: position ``scale · R · p + t``.
+    """Aligned estimate, and its transform: position ``scale · R · p + t``.
 
     Attributes:
         trajectory: The estimate, now in the truth's frame.
@@ -395,7 +397,7 @@ def transform(
 
 
 def umeyama(source: Floats, target: Floats, *, with_scale: bool) -> tuple[Floats, Floats, float]:
-    """Return R, t, c that minimise the mean square of ``target - (c · R · source + t)``.
+    """Return R, t, c with the least mean square of ``target - (c · R · source + t)``.
 
     S. Umeyama, "Least-squares estimation of transformation parameters between two point
     patterns", IEEE PAMI 13(4), 1991; equation numbers are that paper's.

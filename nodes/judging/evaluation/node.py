@@ -1,4 +1,4 @@
-"""The node that holds estimates against the truth, live and at the end."""
+"""Node for evaluating estimates against the ground truth, live and at the end."""
 
 from __future__ import annotations
 
@@ -43,7 +43,10 @@ from runtime.paths import source_file
 
 
 class LiveErrors:
-    """Errors of one estimator so far. An estimate in ``odom`` is laid on the truth at its first."""
+    """Errors of an estimator so far.
+
+    Estimates in ``odom`` are laid on the truth at the first.
+    """
 
     def __init__(self) -> None:
         self.count = 0
@@ -102,7 +105,7 @@ class EvaluationConfig(NodeConfig):
 
 
 class Evaluation(Node[EvaluationConfig]):
-    """Judges every estimator that it receives against the odometry of its vehicle.
+    """Evaluation of every received estimator against the odometry of its vehicle.
 
     Errors are sent as `Score` as the estimates come; the rest is written at the end, and the
     verdict put into the run's summary.
@@ -188,26 +191,26 @@ class Evaluation(Node[EvaluationConfig]):
 
     @on(TrackingEvent)
     def tracking_events(self, event: TrackingEvent) -> None:
-        """Note that an estimator lost or regained its way."""
+        """Record loss or recovery of an estimator's tracking."""
         record = self._records.setdefault(event.source, EstimatorRecord())
         record.note(event, self.clock.now())
 
     @on(TrajectoryEstimate)
     def trajectories(self, event: TrajectoryEstimate) -> None:
-        """Note an estimator's trajectory after loop closures; the last one counts."""
+        """Record an estimator's trajectory after loop closures; the last counts."""
         if not self._closed:
             self._records.setdefault(event.source, EstimatorRecord()).add_final(event)
 
     @on(LidarScan)
     def scans(self, event: LidarScan) -> None:
-        """Note that there was a scan, when it was complete: a pose may be for any of its rays."""
+        """Record a scan's end time; a pose may be for any of its rays."""
         stamps = self._scans.setdefault(event.source, array("q"))
         if not stamps or event.end > stamps[-1]:
             stamps.append(event.end)
 
     @on(Image)
     def images(self, event: Image) -> None:
-        """Note that there was an image; hold it for a while: its features may follow."""
+        """Record an image's stamp; keep the image for a while, for features to follow."""
         stamps = self._frames.setdefault(event.source, array("q"))
         exposed = event.stamp - self._late.get(event.source.removesuffix("/grey"), 0)
         if not stamps or exposed > stamps[-1]:
@@ -221,12 +224,12 @@ class Evaluation(Node[EvaluationConfig]):
 
     @on(TrackedFeatures)
     def features(self, event: TrackedFeatures) -> None:
-        """Note whose images an estimator looks at; keep one with its features at intervals."""
+        """Record an estimator's camera; keep an image with its features at intervals."""
         self._vehicles.tracked(event)
         self._album.add_features(event)
 
     async def on_shutdown(self) -> None:
-        """Judge, and write what came of it."""
+        """Judge all estimators and write the results."""
         self._closed = True  # while it judges, beside the loop, nothing may change
         for file in self._files.values():
             file.close()
@@ -283,7 +286,7 @@ class Evaluation(Node[EvaluationConfig]):
         return judgements, verdict
 
     def _judge(self, record: EstimatorRecord, truth: Trajectory | None, **seen: Any) -> Judgement:
-        """Judge one estimator; whatever it sent, the others are judged."""
+        """Judge an estimator; invalid data do not affect the judgement of others."""
         if truth is None:
             why = "expected a truth to hold it against, found no odometry"
             return Judgement(figures={"why": why}, estimate=None)
@@ -304,7 +307,6 @@ class Evaluation(Node[EvaluationConfig]):
             return Judgement(figures={"why": why}, estimate=None)
 
     def _vehicle_of(self, estimator: str) -> str:
-        """Return the vehicle that an estimator is judged by."""
         found = self.config.vehicle or self._vehicles.of(estimator)
         flying = [vehicle for vehicle, flight in self._flights.items() if len(flight.truth)]
         return flying[0] if len(flying) == 1 else found  # the file may have chosen its odometry
@@ -315,7 +317,7 @@ class Evaluation(Node[EvaluationConfig]):
     def _seen(
         self, vehicle: str, sensors: dict[str, array[int]]
     ) -> dict[str, npt.NDArray[np.int64]]:
-        """Return the stamps of those sensors that may be a vehicle's: of several, its own."""
+        """Return the stamps of a vehicle's sensors; of all, if alone."""
         several = len(self._vehicles.names) > 1
         return {
             sensor: np.array(stamps, np.int64)
@@ -329,7 +331,7 @@ class Evaluation(Node[EvaluationConfig]):
         return what if vehicle == first else f"{what}.{source_file(vehicle)}"
 
     def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
-        """Add a pose to a file: should the run be killed, what was sent until then is there."""
+        """Append a pose to a file at once: a killed run keeps all poses sent."""
         if self.out is None:
             return
         file = self._files.get(name)

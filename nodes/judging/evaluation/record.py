@@ -1,4 +1,4 @@
-"""What one estimator sent during a run, and what is plainly wrong with it."""
+"""Record of an estimator's events, with counts of its invalid poses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from nodes.trajectory import PoseRows, Trajectory
 Floats = npt.NDArray[np.float64]
 
 _AHEAD = 1_000_000
-"""Nanoseconds by which a stamp may be later than its arrival: clocks are that close."""
+"""Tolerated difference of clocks: nanoseconds between a stamp and an earlier arrival."""
 
 
 class Said:
-    """Rows of numbers that came with some of the poses, by their stamps, which rise.
+    """Rows of numbers of some of the poses (velocity, covariance), by rising stamp.
 
     Args:
         width: Numbers of a row.
@@ -30,7 +30,7 @@ class Said:
         self._stamps, self._numbers = array("q"), array("d")
 
     def add(self, stamp: int, numbers: tuple[float, ...]) -> None:
-        """Note what came with a pose."""
+        """Add the row of a pose."""
         self._stamps.append(stamp)
         self._numbers.extend(numbers)
 
@@ -38,34 +38,34 @@ class Said:
         return len(self._stamps)
 
     def at(self, stamps: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.bool_], Floats]:
-        """Tell which stamps have a row, shape (n,), and return these, shape (m, width)."""
+        """Return a mask of the stamps with a row, shape (n,), and their rows, (m, width)."""
         mine = np.array(self._stamps, np.int64)
         rows = np.array(self._numbers, np.float64).reshape(-1, self._width)
         return np.isin(stamps, mine), rows[np.isin(mine, stamps)]
 
 
 class EstimatorRecord:
-    """Everything that came from one estimator.
+    """Events of an estimator, sorted into a trajectory and counts.
 
-    Its trajectory is made of the poses in the frame of its first pose, with stamps that
-    rise. All others are counted, and are no poses of the flight:
+    The trajectory has the poses in the frame of the first pose, with strictly rising stamps. All
+    other poses are only counted.
 
     Args:
-        scale_free: Whether its unit of length is its own.
+        scale_free: Whether its unit of length is arbitrary.
         reads: Kinds of data that it computes with; see `events.EstimatorAnnouncement`.
 
     Attributes:
-        rows: The poses of its trajectory.
+        rows: Poses of the trajectory.
         repeated: Poses whose stamp was not later than the one before: sent twice, or backwards.
-        future: Poses, and losses, of a time that had not come when they arrived.
-        bodies: How many poses are of which body (`child_frame_id`).
+        future: Poses and tracking events stamped later than their arrival.
+        bodies: Number of poses by body (`child_frame_id`).
         elsewhere: Poses in another frame than the first one.
-        restarts: How often it changed to another frame: each time it has lost where it is.
-        velocities: Those that poses came with: 3 numbers.
+        restarts: Number of changes to another frame, one after each loss of tracking.
+        velocities: Velocities of the poses that carry one: 3 numbers.
         covariances: Likewise: 36 numbers, row by row.
-        final: Its trajectory after loop closures, the last one that it sent; `None` if it sent
-            none, or an empty one.
-        final_frame_id: Frame of that.
+        final: The last trajectory sent after loop closures; `None` if there was none, or it was
+            empty.
+        final_frame_id: Frame of `final`.
     """
 
     def __init__(
@@ -92,14 +92,14 @@ class EstimatorRecord:
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> EstimatorRecord:
-        """Return the record of a trajectory of which nobody knows when its poses came."""
+        """Return the record of a trajectory without arrival times."""
         record = cls()
         for pose in trajectory.poses():
             record.rows.add(*pose)
         return record
 
     def add(self, event: PoseEstimate, now: int | None) -> bool:
-        """Note an estimate and when it came (ns), if known; tell if it is of the trajectory."""
+        """Add an estimate and its arrival (ns, if known); return whether the trajectory grew."""
         if now is not None and event.stamp > now + _AHEAD:
             self.future += 1
             return False
@@ -124,13 +124,13 @@ class EstimatorRecord:
         return True
 
     def add_final(self, event: TrajectoryEstimate) -> None:
-        """Note its trajectory as it sees it now."""
+        """Store the estimator's latest trajectory after loop closures."""
         poses = event.stamps, event.positions, event.orientations
         self.final = Trajectory(*poses) if len(event.stamps) else None
         self.final_frame_id = event.frame_id
 
     def note(self, event: TrackingEvent, now: int) -> None:
-        """Note that tracking was lost or regained; of a time to come, it counts from now (ns)."""
+        """Record a tracking event; a stamp in the future is counted, and clipped to `now` (ns)."""
         self.future += event.stamp > now + _AHEAD
         self._tracking.append((min(event.stamp, now + _AHEAD), isinstance(event, TrackingLost)))
 
@@ -142,10 +142,10 @@ class EstimatorRecord:
         return np.array(self._arrivals, np.int64)
 
     def reported_lost(self, end: int) -> list[Interval]:
-        """Return when it was lost by its own tracking events.
+        """Return the lost intervals by the estimator's own tracking events.
 
         Args:
-            end: Of the run (ns); it is lost until then if it does not report that it has regained.
+            end: End of the run (ns); a loss without recovery lasts until then.
         """
         found = []
         since: int | None = None

@@ -1,4 +1,4 @@
-"""What an evaluation leaves in a run's folder, for people, for plots and for other tools.
+"""Files of an evaluation in a run's folder: trajectories, errors and the verdict.
 
 trajectories/truth.tum              the true poses; it grows with the run
 trajectories/<estimator>.tum        the estimates as they were sent; likewise (of ``a/b``: a+b.tum)
@@ -42,7 +42,7 @@ def write_results(
     judgements: dict[str, Judgement],
     verdict: dict[str, Any],
 ) -> None:
-    """Write all of the above into a run's folder, but for what has grown with the run."""
+    """Write the files above into a run's folder, except those written during the run."""
     trajectories, evaluation = out / "trajectories", out / "evaluation"
     trajectories.mkdir(exist_ok=True)
     evaluation.mkdir(exist_ok=True)
@@ -69,7 +69,7 @@ def write_results(
 
 
 def read_errors(path: Path) -> Errors:
-    """Read one of the files of errors.
+    """Read a file of errors.
 
     Raises:
         OSError: It cannot be read.
@@ -115,7 +115,7 @@ class Album:
         self._next: dict[str, int] = {}
 
     def add_image(self, image: Image) -> None:
-        """Hold an image until its features have come; keep some of a camera that nobody tracks."""
+        """Hold an image for its features; keep some images of untracked cameras."""
         if not self._size:
             return
         self._images[image.frame_id, image.stamp] = image
@@ -125,7 +125,7 @@ class Album:
             self._keep(image.source, image, None)
 
     def add_features(self, features: TrackedFeatures) -> None:
-        """Keep the image of these features, if it is time for another."""
+        """Keep the image of these features, if the interval since the last has passed."""
         self._tracked.add(features.frame_id)
         image = self._images.get((features.frame_id, features.stamp))
         if image is not None:
@@ -143,7 +143,7 @@ class Album:
         self._next[name] = image.stamp + interval
 
     def write(self, folder: Path) -> None:
-        """Draw all that was kept into JPEG files: ``<estimator or camera>_<stamp>.jpg``."""
+        """Draw the kept images into JPEG files: ``<estimator or camera>_<stamp>.jpg``."""
         for name, kept in self._kept.items():
             for image, features in kept:
                 if features is None and image.frame_id in self._tracked:

@@ -1,4 +1,4 @@
-"""From figures to a verdict: what they may be, and what they are."""
+"""Verdict on an evaluation: figures held against thresholds."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from runtime.time.schedule import SECOND
 class _Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def given(self) -> bool:
-        """Whether anything is asked for beyond what is asked of everybody."""
+        """Whether any threshold differs from its default."""
         return self != type(self)()
 
     def missed(self, figures: Mapping[str, Any]) -> list[str]:
-        """Return a sentence for each threshold that is not met."""
+        """Return a sentence for each missed threshold."""
         asked = {name: getattr(self, name) for name in self.__struct_fields__}
         found = (FIGURES[k].missed(limit, figures.get(k)) for k, limit in asked.items())
         return [*filter(None, found)]
@@ -29,7 +29,7 @@ class _Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 if TYPE_CHECKING:
 
     class Thresholds(_Limits, frozen=True):
-        """Settings: a number for each figure that may have a threshold; `None` asks for nothing."""
+        """Settings: thresholds of the figures; `None` for no threshold."""
 
         def __init__(self, **limits: float | None) -> None: ...
 
@@ -66,7 +66,7 @@ def conclude(
     end: RunEnd | None = None,
     declared: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Return the verdict on figures by estimator, as ``evaluation/verdict.json`` has it.
+    """Return the verdict on figures by estimator, for ``evaluation/verdict.json``.
 
     Args:
         found: See `judge`.
@@ -120,14 +120,14 @@ def conclude(
 
 
 def planned_end(end: RunEnd | None) -> int | None:
-    """Return when the flight should have ended (ns), if it ended before and that is known."""
+    """Return the planned end (ns) of a run cut short by anyone but the user, if known."""
     if end is None or end.planned or end.by == "user" or end.duration is None:
         return None
     return round(end.duration * SECOND)
 
 
 def _of_run(name: str, figures: Mapping[str, Any], end: RunEnd, declared: bool) -> dict[str, Any]:
-    """Return the figures of an estimator that only the run's end tells."""
+    """Return an estimator's figures from the run's end: early end, restarts, use of the truth."""
     missing: float | None = 0.0
     if not end.planned:  # of a run that has no planned duration nobody knows how much is missing
         planned = end.duration
@@ -142,6 +142,6 @@ def _of_run(name: str, figures: Mapping[str, Any], end: RunEnd, declared: bool) 
 
 
 def node_of(source: str, nodes: Iterable[str]) -> str:
-    """Return the node that a source names: the longest name that it is, or is below; "" if none."""
+    """Return the node of a source: the longest name equal to or above the source; or ""."""
     own = (n for n in nodes if n and (source == n or source.startswith(f"{n}/")))
     return max(own, key=len, default="")

@@ -1,1 +1,1 @@
-"""Trajectories that somebody else computed, judged as a run judges its estimators."""
+"""Evaluation of trajectories from outside a run, with a run's figures and report."""

@@ -1,4 +1,4 @@
-"""Several trajectories held against one truth, and the folder that is left of it.
+"""Evaluation of several trajectories against a common truth, and its results folder.
 
 The figures are those of an evaluation (`nodes.judging.evaluation.judging`), but for what poses
 alone do not tell: when they came, and thus latencies, errors at control ticks and stamps of the
@@ -57,7 +57,7 @@ def judge_all(
     config: JudgeConfig,
     finals: Mapping[str, Trajectory] = MappingProxyType({}),
 ) -> tuple[dict[str, Judgement], Verdict, list[str]]:
-    """Judge estimates by the truth; the flight is that of the images, if their stamps are known.
+    """Judge estimates against the truth, at the stamps of the images if known.
 
     Args:
         truth: The true poses.
@@ -68,8 +68,8 @@ def judge_all(
         Judgements by name, the verdict, and sentences on what was not compared.
 
     Raises:
-        ValueError: Two have one name, one is nowhere near to a true pose in time, or a final
-            trajectory is of none of them.
+        ValueError: A name is not unique, an estimate is nowhere near a true pose in time, or a
+            final trajectory names no estimate.
     """
     names = [source.name for source in estimates]
     if strangers := finals.keys() - {*names}:
@@ -111,7 +111,7 @@ def write(
     verdict: Verdict,
     notes: Sequence[str],
 ) -> Path:
-    """Write a folder as a run leaves it, with figures and a report; return the report's path.
+    """Write a results folder like a run's, with figures and a report; return the report's path.
 
     What an earlier judgement left there goes to ``NAME.1``.
 
@@ -188,7 +188,7 @@ def _write(
 
 
 def _compared(truth: Trajectory, source: Source, most: float) -> tuple[Trajectory, str]:
-    """Return the poses but those far from true ones, and a sentence on what is not compared."""
+    """Return the poses except those far in time from true ones, and a note on exclusions."""
     poses = source.poses
     after = np.searchsorted(truth.stamps, poses.stamps)
     ends = truth.stamps[np.clip([after - 1, after], 0, len(truth) - 1)]

@@ -64,7 +64,7 @@ def read_topic(path: Path, topic: str) -> tuple[Trajectory, EventAxes, Estimator
 
 
 def _poses(bag: Bag, topic: str) -> Iterator[tuple[str, Any]]:
-    """Yield the messages with one pose each, and their types."""
+    """Yield type and message for each pose of a topic; a Path gives the newest message's poses."""
     path = bag.topics()[topic][0] == _PATH
     for _, type_, _, message in bag.messages([topic], newest=path):
         if not path:
@@ -221,7 +221,7 @@ def read_stamps(path: Path) -> npt.NDArray[np.int64]:
 
 
 def _read_file(path: Path, times: str) -> tuple[Axes, str, Trajectory]:
-    """Return the axes that a file's format usually has, the frame that it names, and its poses."""
+    """Return the usual axes of a file's format, the frame named in the file, and its poses."""
     number, head, row = _start(path)
     commas = "," in row
     fields = row.split("," if commas else None)
@@ -248,7 +248,7 @@ def _read_file(path: Path, times: str) -> tuple[Axes, str, Trajectory]:
 
 
 def _start(path: Path) -> tuple[int, list[str], str]:
-    """Return the number of a file's first row, the lines before it, and the row."""
+    """Return the line number of a file's first row, the lines before, and the row."""
     head: list[str] = []
     try:
         with path.open(encoding="utf-8-sig") as file:

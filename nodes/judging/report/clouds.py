@@ -1,4 +1,4 @@
-"""Clouds from one viewpoint on one scale, side by side: what is smeared shows beside what is not.
+"""Point clouds side by side, with a common viewpoint and scale, to reveal smearing.
 
 Points are painted straight into an array of pixels, the nearer over the farther; matplotlib only
 adds axes.
@@ -21,14 +21,14 @@ Indices = npt.NDArray[np.int64]
 Painting = tuple[npt.NDArray[np.uint8], int]
 
 MOST = 1_000_000
-"""Points of a cloud that are drawn: their numbers take 20 bits."""
+"""Points of a cloud drawn at most: their indices take 20 bits."""
 
 _DEPTHS = 0xFFFFF
 _BACKGROUND = np.array([250, 250, 248], np.uint8)
 
 
 class Shown(msgspec.Struct, frozen=True, eq=False):
-    """A cloud as it is drawn.
+    """A cloud prepared for drawing.
 
     Attributes:
         name: Of its file.
@@ -62,14 +62,14 @@ class View(msgspec.Struct, frozen=True, eq=False):
 
 
 def visible(cloud: Shown, view: View, pixels: float) -> tuple[Indices, Indices, Indices]:
-    """Return the nearest point of each pixel that has one.
+    """Return the nearest point of each pixel with a point.
 
     Args:
         cloud: East, north, up; at most `MOST` points.
-        pixels: To a metre.
+        pixels: Per metre.
 
     Returns:
-        Their rows and columns in the image, and their numbers in the cloud; each of shape (m,),
+        Their rows and columns in the image, and their indices in the cloud; each of shape (m,),
         the farthest first.
     """
     width = _size(view, pixels)[1]
@@ -92,12 +92,12 @@ def visible(cloud: Shown, view: View, pixels: float) -> tuple[Indices, Indices, 
 
 
 def paint(cloud: Shown, view: View, pixels: float, dot: int | None = None) -> Painting:
-    """Return what a view shows of a cloud as an image, shape (h, w, 3), and its width of dots.
+    """Return a cloud painted in a view as an image, shape (h, w, 3), and the dot width.
 
     Args:
         cloud: East, north, up; with colours.
-        pixels: To a metre.
-        dot: Width of a point in pixels; as wide as fills gaps between them, if not given.
+        pixels: Per metre.
+        dot: Width of a point in pixels; if not given, enough to fill the gaps between points.
     """
     height, width = _size(view, pixels)
     row, column, number = visible(cloud, view, pixels)
@@ -120,27 +120,26 @@ def _size(view: View, pixels: float) -> tuple[int, int]:
 
 
 ABREAST = 3
-"""Clouds side by side in one figure."""
+"""Clouds side by side in a figure, at most."""
 
 _ENOUGH = 100_000
-"""Points that say where a cloud lies."""
+"""Points of a cloud sampled to choose its views, at most."""
 _CLEARANCE = 0.4
-"""Metres above the highest pose from where a cloud is cut off: it is what lies under a ceiling
-that a reader wants to see."""
+"""Metres from the highest pose up to the cut-off of clouds, to show rooms below the ceiling."""
 _AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(42.0)
 """Of the oblique view: from the south-west, and from above."""
 _TALLEST, _TITLE = 6.0, 0.55
-"""Inches of a view at most, and of what stands above and below it."""
+"""Height of a view at most, and of its title and labels, inches."""
 _THINNEST = 0.15
-"""Of a view's longer side: its shorter one at least."""
+"""Least ratio of a view's shorter side to its longer side."""
 _DETAIL = 3.6
 """Metres across of the detail."""
 
 
 def draw_clouds(run: Run) -> list[Plot]:
-    """Draw all clouds that can be read; `Run.missing` says which cannot.
+    """Draw all readable clouds; `Run.missing` names the others.
 
-    If there are many, each figure has the first again to hold the others against.
+    Of several figures, each begins with the first cloud, for comparison.
     """
     height = _ceiling(run)
     clouds = []
@@ -167,13 +166,13 @@ def draw_clouds(run: Run) -> list[Plot]:
 
 
 def _ceiling(run: Run) -> float | None:
-    """Return the height (m) above which clouds are cut off: somewhat above where anyone flew."""
+    """Return the cut-off height (m) of clouds: `_CLEARANCE` above the highest true pose."""
     highest = [float(-truth.positions[:, 2].min()) for truth in run.truths.values()]
     return max(highest) + _CLEARANCE if highest else None
 
 
 def _shown(name: str, cloud: Cloud, height: float | None) -> Shown:
-    """Return a cloud's points up to some height, with colours: by height if it has none."""
+    """Return a cloud's points below `height`, coloured by height if without colours."""
     points = cloud.points[:, [1, 0, 2]] * np.array([1, 1, -1], np.float32)
     colors = cloud.colors
     if colors is None:
@@ -188,7 +187,7 @@ def _shown(name: str, cloud: Cloud, height: float | None) -> Shown:
 
 
 def _views(cloud: Shown) -> list[View]:
-    """Choose what to look at, by the one cloud that the others are held against."""
+    """Choose the views (from above, oblique, detail) by the first cloud."""
     some = slice(None, None, -(-len(cloud.points) // _ENOUGH))
     points = cloud.points[some].astype(np.float64)
     low, high = np.percentile(points, (0.3, 99.7), axis=0)
@@ -213,7 +212,7 @@ def _views(cloud: Shown) -> list[View]:
 
 
 def _frame(low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return the corners of a view, of which no side is all too thin: a cloud may be one point."""
+    """Return the corners of a view, with a least side length even for a single point."""
     middle, half = (low + high) / 2, (high - low) / 2
     half = np.maximum(half, max(_THINNEST * float(half.max()), 0.05))
     return middle - half, middle + half
@@ -235,7 +234,7 @@ def _busiest(points: Floats, colors: npt.NDArray[np.uint8]) -> Floats:
 
 
 def _draw(clouds: list[Shown], views: list[View], number: int, height: float | None) -> Plot:
-    """Draw clouds side by side: one column a cloud, and one row a view."""
+    """Draw clouds side by side: a column per cloud, a row per view."""
     across = (WIDTH - 0.6) / len(clouds)
     heights = [min(across * _aspect(view), _TALLEST) + _TITLE for view in views]
     figure = sheet(sum(heights))
@@ -249,7 +248,7 @@ def _draw(clouds: list[Shown], views: list[View], number: int, height: float | N
 
 
 def _draw_one(cloud: Shown, views: list[View], height: float | None) -> Plot:
-    """Draw a cloud that has none to be held against: the view from above beside the others."""
+    """Draw a single cloud: the view from above beside the others."""
     above, *others = views
     # Widths of the columns such that both are equally tall.
     left = 1.0 / _aspect(above)

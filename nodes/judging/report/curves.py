@@ -1,4 +1,4 @@
-"""Errors over time, how they are spread, latencies, and what is lost over a length of path."""
+"""Plots of errors over time, error distributions, latencies and relative errors."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from nodes.trajectory import Trajectory
 SECOND = 1e9
 MILLISECOND = 1e6
 LENGTHS = (1.0, 2.0, 5.0, 10.0, 20.0)
-"""Metres of path over which relative errors are shown."""
+"""Path lengths of the relative errors, metres."""
 
 _STYLES: dict[str, Any] = {"at image time": "-", "newest at control ticks": (0, (4, 2))}
 """Of the lines of distributions."""
 _LOST = "lost, in the estimator's colour"
 _SHOWN = 95
-"""Percent of the errors that the distributions show at least."""
+"""Percentile of the errors at the end of the axis of distributions, at least."""
 _FEWEST = 5
-"""Pairs of poses that make a box."""
+"""Least number of pose pairs for a box."""
 
 
 def draw_errors(run: Run) -> Plot | None:
@@ -121,7 +121,7 @@ def draw_axes(run: Run) -> Plot | None:
 
 
 def draw_distributions(run: Run) -> Plot | None:
-    """Draw what share of errors is below a value: at image time and at the control ticks."""
+    """Draw the cumulative distribution of errors, at image time and at the control ticks."""
     known = [e for e in run.estimators if e.of_images is not None or e.of_ticks is not None]
     if not known:
         return None
@@ -197,10 +197,10 @@ def draw_latency(run: Run) -> Plot | None:
 
 
 def _shares(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, ylabel: str) -> None:
-    """Draw what share of the values of each estimator is at most so large.
+    """Draw the cumulative distribution of each estimator's values.
 
-    A histogram of values that come in steps, as those of a fixed latency or of ticks do, would
-    have gaps wherever its bins do not fit the steps.
+    A histogram of stepped values, as of a fixed latency or of ticks, would have gaps wherever its
+    bins do not fit the steps.
     """
     axis.set(xlabel=xlabel, ylabel=ylabel, ylim=(0, 101))
     if not series:
@@ -280,7 +280,7 @@ def _boxes(axis: Any, each: Estimator, boxes: list[tuple[float, float, Floats]])
 
 
 def _scale(axis: Any, series: list[Floats], which: str, share: float = 100.0) -> None:
-    """Start an axis at 0, or make it logarithmic where that would flatten all but one.
+    """Start an axis at 0, or make the axis logarithmic for series of very unlike size.
 
     Args:
         which: ``x`` or ``y``.

@@ -1,7 +1,7 @@
-"""What a run left in its folder, read leniently for the report.
+"""Lenient reader of a run's folder, for the report.
 
-Everything is optional, as a run may have been killed at any time: what is not there, or cannot be
-read, is named in `Run.missing`, and the rest of the report goes on without it.
+Every file is optional, as a run may have been killed at any time: missing and unreadable files
+are named in `Run.missing`, and the rest of the report goes on without them.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from runtime.time.schedule import SECOND
 Floats = npt.NDArray[np.float64]
 
 GAP = SECOND // 2
-"""Silence that counts as lost (ns)."""
+"""Silence counted as lost (ns)."""
 
 _FARTHEST = 1e12
-"""Metres: an estimate that has burst goes beyond all that can be squared, or drawn."""
+"""Limit of coordinates, metres: a diverged estimate overflows squares and plots."""
 
 
 def read_poses(path: Path) -> Trajectory:
-    """Read a TUM file that may end in the middle of a line, as that of a killed run does.
+    """Read a TUM file, whose last line may be cut off as by a killed run.
 
     Raises:
         ValueError: It cannot be read or holds something else.
@@ -56,7 +56,7 @@ def gaps(estimate: Trajectory | None, truth: Trajectory | None) -> list[Interval
 
 
 def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interval]) -> Floats:
-    """Return a copy in which a line does not go on across a lost interval: NaN at its end.
+    """Return a copy with NaN in each lost interval, to break the plotted line.
 
     Args:
         values: Shape (n,) or (n, k).
@@ -76,20 +76,20 @@ def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interva
 T = TypeVar("T")
 
 SIGNS = ("summary.json", "config.toml", "log.txt", "trajectories", "evaluation")
-"""A folder with one of these is a run's."""
+"""Files and folders of a run; any of them marks a run's folder."""
 
 _LOG_LINES = 200
 _NO_ESTIMATES = {"truth", "plan"}
 _ABOUT = 0.25
-"""Seconds by which two counts of lost time may differ."""
+"""Tolerated difference between two counts of lost time, seconds."""
 _LOUD = {"WARNING", "ERROR", "CRITICAL"}
 
 
 def read_run(folder: Path) -> Run:
-    """Read what there is.
+    """Read a run's folder.
 
     Raises:
-        ValueError: The folder is not there, or is no run's.
+        ValueError: The folder is missing, or is no run's.
     """
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected the folder of a run, found none")
@@ -146,7 +146,7 @@ class _Reader:
         )
 
     def _by_vehicle(self, what: str, first: str) -> dict[str, Trajectory]:
-        """Read the file of the first vehicle, and those of all others: ``<what>.<vehicle>.tum``."""
+        """Read the trajectory files of a kind, by vehicle, the first vehicle's first."""
         paths = sorted((self.folder / "trajectories").glob(f"{what}.*tum"))
         names = {
             source_of(p.stem.partition(".")[2]) or first: f"trajectories/{p.name}" for p in paths
@@ -219,7 +219,7 @@ class _Reader:
         )
 
     def _try(self, name: str, read: Callable[[Path], T], without: str = "") -> T | None:
-        """Read a file; say so if it is not there (and is expected) or is not what it should be."""
+        """Read a file or return `None`; note in `missing` if invalid, or expected but absent."""
         path = self.folder / name
         if not path.is_file():
             if without:
@@ -234,7 +234,7 @@ class _Reader:
 
 
 def _first_vehicle(facts: Facts) -> str:
-    """Return the name of the vehicle that was announced first; empty if none was."""
+    """Return the source of the first announced vehicle; empty if none."""
     vehicles = (a["source"] for a in facts.announcements if a.get("type") == "VehicleAnnouncement")
     return str(next(vehicles, ""))
 
@@ -278,7 +278,7 @@ def _frames(folder: Path) -> dict[str, list[Path]]:
 
 
 def _loud(log: str) -> list[str]:
-    """Return warnings and errors, with the lines that go on about them; the last ones."""
+    """Return the last warnings and errors of a log, with their continuation lines."""
     found: list[str] = []
     loud = False
     for line in log.splitlines():

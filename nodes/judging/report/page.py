@@ -1,4 +1,4 @@
-"""The page itself, in one file that needs no network and no script; its node and its command."""
+"""The report page (a single file without network or scripts), its node and its command."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def render(
 
 
 def page_of(template: Path) -> jinja2.Template:
-    """Return the template of a page, which may include the report's ``style.css.jinja``."""
+    """Return a page's template; the report's ``style.css.jinja`` can be included."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([template.parent, Path(__file__).parent]),
         autoescape=True,
@@ -134,7 +134,7 @@ def page_of(template: Path) -> jinja2.Template:
 
 
 def embedded(plot: Plot, folder: Path, formats: Sequence[str] = ()) -> dict[str, str]:
-    """Write a figure; return it for a page that holds it whole: its title, caption and source."""
+    """Write a figure; return its title, caption and data URI for a self-contained page."""
     data, kind = plot.write(folder, formats).read_bytes(), "png"
     if plot.photo:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -148,7 +148,7 @@ def embedded(plot: Plot, folder: Path, formats: Sequence[str] = ()) -> dict[str,
 
 
 def _judged(run: Run) -> list[tuple[str, dict[str, Any], str]]:
-    """Return name, figures and colour of each estimator, and of all else that was judged."""
+    """Return name, figures and colour of each estimator and of all other judged sources."""
     found = [(each.name, each.figures, each.color) for each in run.estimators]
     summary = {} if run.facts.verdict is None else run.facts.verdict.estimators
     known = {name for name, _, _ in found}
@@ -156,7 +156,7 @@ def _judged(run: Run) -> list[tuple[str, dict[str, Any], str]]:
 
 
 def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
-    """Return what the top of the page says of an estimator."""
+    """Return the entry of an estimator at the top of the page."""
     passed = figures.get("passed")
     failed = figures.get("failed")
     if passed is None and "why" in figures:
@@ -185,10 +185,10 @@ class ReportConfig(NodeConfig):
 
 
 class Report(Node[ReportConfig]):
-    """Writes ``report.html`` and its figures, of all that the other nodes left in the run's folder.
+    """Writer of ``report.html`` and its figures, from the files of all other nodes.
 
-    It comes last, after the summary, whether or not an evaluation judged anything. The command
-    ``report`` writes the same page anew from the folder.
+    Runs last, after the summary, with or without an evaluation. The command ``report`` writes the
+    same page anew from the folder.
     """
 
     files = ("plots", "report.html")

@@ -1,4 +1,4 @@
-"""How a report looks: one colour for each estimator in every figure, plain axes, few digits."""
+"""Style of a report: a colour per estimator in all figures, plain axes, few digits."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ TRUTHS = ("#3a3a3a", "#8a6d3b", "#4f6f52", "#6b5b7a")
 HIT = "#b3261e"
 PLAN = "#111111"
 LINE = COLORS[0]
-"""Of what belongs to no estimator."""
+"""Colour of data of no estimator."""
 
 WIDTH = 10.0
 """Inches of a figure across the page."""
 DPI = 110
 
 _MOST = 2500
-"""Points of a line; more than that no figure shows."""
+"""Points of a plotted line, at most."""
 
 _LETTERS, _HANDLE = 115, 8
-"""Letters of a legend across the page; letters that a line and its margin take."""
+"""Letters of a legend across the page; letters taken by a line sample and its margin."""
 
 _STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
@@ -136,11 +136,11 @@ def sheet(
 
 
 def bounds(points: Floats, least: float | Sequence[float]) -> tuple[Floats, Floats]:
-    """Return the corners of what is drawn, with a margin; no side is all too thin.
+    """Return the corners of plotted points, with a margin and a least side length.
 
     Args:
         points: Metres, shape (n, k); rows may be NaN.
-        least: What share of the longest side each side has at least; one for all, or k.
+        least: Least share of the longest side for each side; one for all, or k.
     """
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     middle, extent = (low + high) / 2, high - low
@@ -152,7 +152,7 @@ def bounds(points: Floats, least: float | Sequence[float]) -> tuple[Floats, Floa
 def mark_ends(
     axis: Any, start: tuple[float, float] | None, end: tuple[float, float], color: str
 ) -> None:
-    """Mark where a line starts, by a ring, and where it ends, by a square that fits inside it."""
+    """Mark the start of a line by a ring, and its end by a square inside the ring's size."""
     style: dict[str, Any] = {"color": color, "ls": "", "zorder": 4}
     if start is not None:
         axis.plot(*start, "o", label="start", ms=12, mfc="none", mew=2.0, **style)
@@ -161,18 +161,18 @@ def mark_ends(
 
 
 def label(name: str) -> str:
-    """Return a name that fits a legend, and that matplotlib doesn't leave out of it."""
+    """Return a name for a legend: shortened, and never hidden by matplotlib."""
     shown = name if len(name) <= 40 else f"{name[:39]}…"
     return f"\u200a{shown}" if shown.startswith("_") else shown
 
 
 def thin(count: int) -> slice:
-    """Return which of so many points are enough for a line."""
+    """Return a slice to thin `count` points to at most `_MOST`."""
     return slice(None, None, max(-(-count // _MOST), 1))
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Return a number with some significant digits, and no exponent if it can be read without."""
+    """Return a number with `digits` significant digits; no exponent from 1e-4 to 1e7."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
     if value == 0:
@@ -185,10 +185,10 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def wide_range(values: list[Floats], share: float = 95.0) -> bool:
-    """Tell whether several series are so unlike that only a logarithmic axis shows all.
+    """Tell whether series need a logarithmic axis: tops differ over 20-fold.
 
     Args:
-        share: Percent of each that count, as a few values may be of any size.
+        share: Percentile taken as a series' top, as a few values may be of any size.
     """
     tops = [top for v in values if len(v) and (top := float(np.nanpercentile(v, share))) > 0.0]
     return len(tops) > 1 and max(tops) > 20.0 * min(tops)
@@ -201,7 +201,7 @@ def legend_columns(names: Sequence[str]) -> int:
 
 
 def legend_above(figure: Figure, axes: Any, *extra: Artist) -> None:
-    """Put the legend of some axes, and what else it should name, above all of a figure."""
+    """Put the legend of some axes, and of further artists, at the top of a figure."""
     handles, names = axes.get_legend_handles_labels()
     handles, names = [*handles, *extra], [*names, *(str(each.get_label()) for each in extra)]
     if handles:

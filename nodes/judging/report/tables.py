@@ -1,4 +1,4 @@
-"""What there is to report of a run, read by `nodes.judging.report.folder`, and its tables."""
+"""Report data of a run, read by `nodes.judging.report.folder`, and its tables."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from runtime.summary import (
 
 
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
-    """What the report wants of ``summary.json``; see `runtime.summary.Summary`.
+    """Contents of ``summary.json`` for the report; see `runtime.summary.Summary`.
 
-    Of trajectories that were judged without a run (`nodes.judging.judge`), ``judged`` has the files
-    that they came from, by name, and ``notes`` has what is to be said of them.
+    Of trajectories judged without a run (`nodes.judging.judge`), ``judged`` has their files by
+    name, and ``notes`` the remarks on them.
     """
 
     name: str | None = None
@@ -57,13 +57,13 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Verdict(summary.Verdict, frozen=True):
-    """What ``evaluation/verdict.json`` holds, and without thresholds the summary."""
+    """Contents of ``evaluation/verdict.json``, and without thresholds of the summary's."""
 
     thresholds: dict[str, float | None] = msgspec.field(default_factory=dict)
 
 
 class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """One of those that were judged, or that would have been.
+    """An estimator of the report, judged or not.
 
     Attributes:
         name: Its source.
@@ -87,7 +87,7 @@ class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """One run's folder.
+    """Contents of a run's folder, as far as read.
 
     Attributes:
         folder: Where it is.
@@ -128,12 +128,12 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         return next(iter(self.truths.values()), None)
 
     def truth_of(self, estimator: Estimator) -> Trajectory | None:
-        """Return the true poses of the vehicle that an estimator was judged by."""
+        """Return the true poses of an estimator's vehicle."""
         return self.truths.get(str(estimator.figures.get("vehicle")), self.truth)
 
     @property
     def start(self) -> int:
-        """What times in the figures count from: 0, or for stamps of a calendar the first one."""
+        """Origin of times in the figures (ns): 0, or the first stamp if stamps are Unix time."""
         first = int(self.truth.stamps[0]) if self.truth is not None else 0
         return first if first > 1e15 else 0
 
@@ -184,7 +184,7 @@ def figures(run: Run, *, main: bool) -> list[Row]:
 
 
 def show(value: Any) -> str:
-    """Return a figure as it is read."""
+    """Return a figure as text."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -197,7 +197,7 @@ def show(value: Any) -> str:
 
 
 def facts(run: Run) -> list[tuple[str, str]]:
-    """Return what is known of the run as a whole."""
+    """Return the table of facts on the run as a whole."""
     f = run.facts
     rows = list(f.judged.items())
     for vehicle, truth in run.truths.items():
@@ -248,7 +248,7 @@ def _digest(f: Facts) -> str:
 
 
 def sensors(run: Run) -> list[list[str]]:
-    """Return what was announced of each sensor: source, kind, rate, and the rest in words."""
+    """Return the table of announced sensors: source, kind, rate, and the rest in words."""
     rows = []
     for each in run.facts.announcements:
         kind = str(each.get("type", "")).removesuffix("Announcement")
@@ -268,7 +268,7 @@ _PLACES = {
     "type", "source", "stamp", "rate", "info", "frame_id", "parent_frame_id", "position",
     "orientation",
 }  # fmt: skip
-"""What the table of sensors shows elsewhere, or not at all."""
+"""Announcement fields shown elsewhere than in the table of sensors, or not at all."""
 
 
 def _said(value: Any) -> str:
@@ -287,17 +287,17 @@ def ticks(run: Run) -> list[list[str]]:
 
 
 def workers(run: Run) -> list[list[str]]:
-    """Return what estimators (and all else in processes of its own) cost."""
+    """Return the table of worker processes (estimators and others) and their costs."""
     return [[name, *worker.row()] for name, worker in sorted(run.facts.workers.items())]
 
 
 def outside(run: Run) -> list[list[str]]:
-    """Return how systems outside the process answered what they were sent."""
+    """Return the table of systems outside the process and their answers."""
     return [[name, *each.row()] for name, each in sorted(run.facts.outside.items())]
 
 
 def outputs(run: Run) -> list[list[str]]:
-    """Return what was sent."""
+    """Return the table of outputs: name, events sent, events a second."""
     seconds = max(run.facts.sim_seconds or 0.0, 1e-9)
     return [[k, str(n), f"{n / seconds:.1f}"] for k, n in sorted(run.facts.outputs.items())]
 

@@ -48,7 +48,7 @@ Rectangle = tuple[float, float, float, float]
 
 
 class _Line(msgspec.Struct, frozen=True, eq=False):
-    """What is drawn: stamps (ns), points east, north, up (m)."""
+    """A line to draw: stamps (ns), points east, north, up (m)."""
 
     name: str
     stamps: npt.NDArray[np.int64]
@@ -152,7 +152,7 @@ def _shown(positions: Floats) -> Floats:
 
 
 def _bounds(lines: list[_Line]) -> tuple[Floats, Floats]:
-    """Return the corners of what is drawn, with a margin; no side is all too thin.
+    """Return the corners of plotted lines, with a margin and a least side length.
 
     An estimate that goes astray is followed only so far: as far again as the truth is wide.
     """
@@ -204,7 +204,7 @@ def _layout(
 
 
 def _ends(above: Any, beside: Any, line: _Line, *, main: bool) -> None:
-    """Mark where a line ends, and where the main one starts."""
+    """Mark the end of a line, and the start of the main line."""
     known = line.points[~np.isnan(line.points[:, 0])]
     if len(known):
         (first, last), color = known[[0, -1]].tolist(), line.style["color"]
@@ -222,7 +222,7 @@ _CAPTION = 26
 
 
 def draw_frames(run: Run) -> list[Plot]:
-    """Draw one sheet for each estimator that left images, and each camera that nobody tracks."""
+    """Draw a sheet for each estimator with images, and for each untracked camera."""
     names = {source_file(e.name): e.name for e in run.estimators}
     plots = []
     for file, paths in run.frames.items():

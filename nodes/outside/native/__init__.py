@@ -1,4 +1,4 @@
-"""The native interface: images and IMU samples for a program that runs outside, without ROS.
+"""Native interface: images and IMU samples for an external program, without ROS.
 
 `client` is the program's side, one file of standard library and numpy, to be copied, and
 ``visnav_link.hpp`` the same for C++17; ``python -m nodes.outside.native`` prints the folder that

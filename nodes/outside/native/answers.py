@@ -1,6 +1,6 @@
-"""What comes from the program of a link, checked field by field.
+"""Answers of a linked program, checked field by field.
 
-What a program is told about the run's cameras and IMU: the JSON text of WELCOME.
+Also the JSON text of WELCOME: the description of the run's cameras and IMU.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from nodes.outside.native.client import COVARIANCE, DONE_BODY, POSE_HEAD, STATUS
 from runtime.errors import VisnavError
 
 TOLERANCE = 1e-4
-"""By which a rotation of single precision may miss orthonormality."""
+"""Tolerated deviation from orthonormality, for rotations in single precision."""
 
 FARTHEST = 1e9
-"""Metres from the start beyond which no pose is taken."""
+"""Largest accepted coordinate of a pose, metres."""
 
 MATRIX, POINT = 12 * 8, 2 * 4 + 1
 """Bytes of a pose, and of a point with its flag."""
 
 FOLLOWS = (COVARIANCE, 36), (VELOCITY, 3)
-"""What may follow a pose, and the numbers that it has."""
+"""Optional fields after a pose: flag, and count of numbers."""
 
 
 class LinkError(VisnavError):

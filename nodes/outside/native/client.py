@@ -81,13 +81,13 @@ class LinkImage(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """The images of one exposure.
+    """Images and IMU samples of an exposure.
 
     Attributes:
         sequence: 0, 1, 2, …
         stamp: Time of the exposure (ns).
         images: All images.
-        imu: Samples that came since the frame before, of type `SAMPLE`.
+        imu: Samples since the last frame, of type `SAMPLE`.
     """
 
     sequence: int
@@ -96,7 +96,7 @@ class Frame(NamedTuple):
     imu: npt.NDArray[Any]
 
     def image(self, kind: str, camera: int = 0) -> npt.NDArray[Any]:
-        """Return the image of a kind that a camera gave; `LookupError` if there is none."""
+        """Return a camera's image of a kind; raise `LookupError` if there is none."""
         for image in self.images:
             if (image.camera, image.kind) == (camera, kind):
                 return image.data
@@ -105,7 +105,7 @@ class Frame(NamedTuple):
 
 
 class Link:
-    """A connection to a run. Answers may be given from any thread; one thread receives.
+    """Connection to a run. Any thread may answer; a single thread receives.
 
     Args:
         name: Of the program, for messages and the report.
@@ -165,7 +165,7 @@ class Link:
         self._send(READY, struct.pack("<II", POSE_OF[pose_of], 0))
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames, each with the IMU samples since the one before, until the run ends."""
+        """Yield the frames until the run ends, each with the IMU samples since the frame before."""
         samples = [np.empty(0, SAMPLE)]
         while (received := self.receive()) is not None:
             if isinstance(received, Frame):
@@ -175,7 +175,7 @@ class Link:
                 samples.append(received)
 
     def receive(self) -> Frame | npt.NDArray[Any] | None:
-        """Wait for what comes next: a frame without its samples, samples, or `None`, the end.
+        """Wait for a frame (without its samples) or samples; return `None` at the end of the run.
 
         Raises:
             ProtocolError: The run has gone without a word, or does not keep to the protocol.
@@ -251,15 +251,15 @@ class Link:
         self._send(POSE, POSE_HEAD.pack(*head), *arrays)
 
     def lost(self, frame: Frame, points: npt.ArrayLike = ()) -> None:
-        """Answer that tracking is lost."""
+        """Answer a frame with lost tracking."""
         self.pose(frame, np.eye(4), status="lost", points=points)
 
     def initialising(self, frame: Frame, points: npt.ArrayLike = ()) -> None:
-        """Answer that there is no pose yet."""
+        """Answer a frame before the first pose."""
         self.pose(frame, np.eye(4), status="initialising", points=points)
 
     def done(self, frame: Frame) -> None:
-        """Answer that this frame gets no pose, as of one that was skipped."""
+        """Answer a frame without a pose, for example a skipped frame."""
         self._send(DONE, DONE_BODY.pack(frame.sequence, frame.stamp))
 
     def log(self, text: str) -> None:
@@ -324,5 +324,5 @@ def _exactly(connection: Any, size: int) -> bytearray:
 
 
 def text_of(data: bytearray) -> str:
-    """Return the text in the body of a message; what is no UTF-8 is replaced."""
+    """Return the text of a message's body; invalid UTF-8 is replaced."""
     return data[:LONGEST_TEXT].decode(errors="replace").rstrip()

@@ -1,4 +1,4 @@
-"""The run's side of the native interface: a socket, shared memory with slots, one program.
+"""Run's side of the native interface: socket, shared-memory slots, a single program.
 
 Threads and no asyncio: one accepts, one for each connection reads; the caller's thread sends.
 """
@@ -29,10 +29,10 @@ from runtime.workers.output import plain_lines
 from runtime.workers.shared_memory import anonymous_file
 
 _AT_ONCE = 1 << 16
-"""Bytes that are read together, should a program have much to say."""
+"""Size of the read buffer for a program's messages, bytes."""
 
 GREETING_TIME = 10.0
-"""Real seconds that a connection has for HELLO."""
+"""Real seconds for a connection to send HELLO."""
 
 GREETING = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
 
@@ -45,7 +45,7 @@ ALIGNMENT = 64
 
 
 class _Program:
-    """A connection, and the frames that it has not answered yet."""
+    """Connection of a program, with its unanswered frames."""
 
     def __init__(self, connection: socket.socket, slots: int) -> None:
         self.connection = connection
@@ -66,7 +66,7 @@ class _Program:
         return False
 
     def end(self, kind: int, *parts: bytes) -> None:
-        """Send a last message, if that is possible at once, and disconnect."""
+        """Send a last message, if possible at once, and disconnect."""
         with contextlib.suppress(OSError):  # it has ended already
             if self.sending.acquire(timeout=0.5):
                 try:
@@ -78,30 +78,30 @@ class _Program:
 
 
 class _Stream(io.BufferedReader):
-    """What comes by a socket, read in large pieces."""
+    """Messages of a socket, read in large pieces."""
 
     def recv_into(self, buffer: memoryview, _: int, __: int) -> int:
-        """Read as a socket does that waits for all."""
+        """Fill the buffer, as `socket.recv_into` does with MSG_WAITALL."""
         return self.readinto(buffer)
 
 
 class Endpoint:
-    """Where one program at a time connects to a run.
+    """Socket of a run, for a single program at a time.
 
-    Everything that a program sends is checked; one that sends something else is disconnected. When
-    a program is gone, another may connect: `wait` for it again. Its frames are numbered from 0.
+    All input is checked; a program that sends anything invalid is disconnected. When a program is
+    gone, another may connect: `wait` for it again. Its frames are numbered from 0.
 
     Args:
         path: The socket; at most 107 bytes.
-        description: What the program is told: see `describe`.
-        slots: Frames that the program may have without having answered them.
+        description: Sent to the program: see `describe`.
+        slots: Unanswered frames of the program, at most.
         slot_bytes: Size of a frame's images, of which there are 16 at most.
         answered: Called with each answer, in the thread that reads.
         gone: Called once when the program is gone or is disconnected, with the reason; in the
             thread that reads. Not after `close`.
-        logged: Called with each text for the log as it came, in the thread that reads: whatever
-            stands in it, and however many come.
-        skips: Whether an answer frees the slots of all frames before its own, too.
+        logged: Called with each text for the log, unchecked and unlimited, in the thread that
+            reads.
+        skips: Whether an answer also frees the slots of all earlier frames.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Endpoint:
         self._memory = mmap.mmap(self._file, slots * self._slot_bytes)
 
     def listen(self) -> None:
-        """Make the socket, in the place of one that a dead run has left.
+        """Create the socket; replace the socket of a dead run.
 
         Raises:
             LinkError: The path is a living run's, or another file's, or no socket can be made.
@@ -145,7 +145,7 @@ class Endpoint:
         self._start(self._accept)
 
     def wait(self, seconds: float) -> str:
-        """Wait for a program that is ready for frames, and return its name.
+        """Wait for a program to be ready for frames, and return its name.
 
         Raises:
             LinkError: None came within `seconds` (real time), or one came and was refused.
@@ -362,7 +362,7 @@ def _in_a_line(text: bytearray) -> str:
 
 
 def _bound(path: Path) -> socket.socket:
-    """Return a socket that listens at `path`; only this user may connect."""
+    """Return a socket listening at `path`, open to this user only."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         if path.is_socket() and not _alive(path):

@@ -1,4 +1,4 @@
-"""A program that runs beside the run: started with it, fed by it, judged, and ended with it.
+"""External program of a run: started, fed, judged and ended by the run.
 
 `node` is the node; `launch` says where and with what the program is started, and what is written
 for it; `program` is the process and what feeds it; `guard` ends all that it has started.

@@ -1,4 +1,4 @@
-"""Stands between the run and a program, and ends all that the program has started with it.
+"""Guard between the run and a program, to end the program with all its processes.
 
     python -I -S guard.py SOCKET GRACE WORD…
 
@@ -19,11 +19,11 @@ import time
 from pathlib import Path
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
-"""prctl(2): the signal that ends a process with its parent; who becomes the parent of orphans."""
+"""prctl(2) options: signal on the parent's death; adoption of orphaned processes."""
 
 
 def main(control: socket.socket, grace: float, command: list[str]) -> None:
-    """Run a command until it ends, or the other side of `control` is closed; then end the rest."""
+    """Run a command until its end, or until `control` is closed; then end all other processes."""
     prctl = ctypes.CDLL(None).prctl
     prctl(PR_SET_CHILD_SUBREAPER, 1)
     try:

@@ -1,4 +1,4 @@
-"""How a program is started: where, with which variables, and what is written for it.
+"""Start of an external program: its settings, folder, environment and files.
 
 Settings of a program that runs beside the run.
 """
@@ -29,11 +29,11 @@ from runtime.paths import InputPath
 
 
 class FileConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A file that is written for the program before it starts.
+    """A file written for the program before its start.
 
     Attributes:
         path: In the program's folder of the run, ``$VISNAV_FOLDER``.
-        template: A jinja2 template; docs/how-to/judge-your-slam.md says what may be used in it.
+        template: A jinja2 template; its variables are in docs/how-to/judge-your-slam.md.
     """
 
     path: str
@@ -46,30 +46,30 @@ class FileConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class ProcessConfig(EstimatorConfig):
-    """Settings of a program that runs beside the run.
+    """Settings of an external program.
 
     Attributes:
         command: The program and its arguments, started without a shell; ``$VISNAV_FOLDER`` and
-            other variables may stand in them. If empty, it is started by hand: the log says where
-            it has to connect.
-        build: A command that is run before, in the same folder; the run ends if it fails.
+            other variables are replaced. If empty, it is started by hand: the log says where it
+            has to connect.
+        build: A command run before, in the same folder; the run ends if it fails.
         folder: Working folder; if empty, that in which the run is started.
         environment: Variables beside those of the run, ``VISNAV_FOLDER`` (where the program may
             write, in the run's folder), ``VISNAV_SOCKET``, ``VISNAV_INCLUDE`` (with
             visnav_link.hpp and client.py) and ``VISNAV_PYTHON`` (the run's own interpreter).
         feed: ``link``: the program connects to ``$VISNAV_SOCKET``, see docs/reference/link.md.
             ``ros2``: a `Ros2Bridge` of the run feeds it, and holds for its answers.
-        images: Kinds of image that it gets, of each camera.
-        cameras: Cameras whose images of one exposure it gets together, as those of a stereo rig:
-            sources, or last parts of them. The poses are the first one's. If empty, the first
-            camera that gives the `images`.
-        method: Name of the method, for the report; if empty, that of the program.
-        scale_free: Whether the unit of its poses is its own, as that of a single camera is.
-        hold: How long simulated time waits for its answers, and what if none comes. Of a program
-            that ROS 2 feeds, that stands at the subscriptions of the bridge.
-        files: What is written before it starts.
-        timeout: Real seconds within which it must have connected.
-        grace: Real seconds that it gets to end after the last frame, and again after SIGTERM.
+        images: Kinds of image to send, of each camera.
+        cameras: Cameras whose images of one exposure are sent together, as of a stereo rig:
+            sources, or last parts of them. Poses are of the first. If empty, the first camera
+            that gives the `images`.
+        method: Name of the method in the report; if empty, that of the program.
+        scale_free: Whether the unit of its poses is arbitrary, as with a single camera.
+        hold: How long simulated time waits for an answer, and what follows if none comes. With
+            ``ros2``, set it at the subscriptions of the bridge instead.
+        files: Files written before the program starts.
+        timeout: Real seconds for the program to connect.
+        grace: Real seconds to end after the last frame, and again after SIGTERM.
     """
 
     command: tuple[str, ...] = ()
@@ -135,7 +135,7 @@ class Launch:
             }
 
     def missing(self, what: str, command: Sequence[str]) -> str:
-        """Return what keeps a command from being started; empty if nothing does."""
+        """Return an error if a command cannot be started; empty otherwise."""
         if not self.working.is_dir():
             return f"folder: expected a folder, found none at {self.working}"
         word = self._expanded(command[0])
@@ -145,7 +145,7 @@ class Launch:
         return f"{what}: expected a program that can be executed, found none at {place}"
 
     def make_folder(self, *, anew: bool) -> None:
-        """Make the program's folder; `anew` removes what is there, which it might read."""
+        """Create the program's folder; `anew` removes old content, lest the program read any."""
         if self._folder is None or len(os.fsencode(self.socket)) > _LONGEST:
             self._temporary = Path(tempfile.mkdtemp(prefix="visnav-"))
             self.socket = self._temporary / "link.socket"
@@ -171,7 +171,7 @@ class Launch:
         )
 
     def close(self) -> None:
-        """Remove what is of no use after the run."""
+        """Remove the temporary folder, if any."""
         if self._temporary is not None:
             shutil.rmtree(self._temporary, ignore_errors=True)
 
@@ -190,10 +190,10 @@ class Launch:
         return re.sub(r"\$(?:(\w+)|{(\w+)})", lambda m: known.get(m[1] or m[2], m[0]), word)
 
     def texts(self, known: Mapping[str, Any]) -> dict[Path, str]:
-        """Return the files that are to be written, with their texts.
+        """Return the texts of the program's files, by path.
 
         Args:
-            known: What templates may use, by name.
+            known: Variables of the templates, by name.
 
         Raises:
             ProgramError: A template is missing or wrong.

@@ -1,4 +1,4 @@
-"""A program as a node: started with the run, fed with its images, and ended with it."""
+"""External program as a node: started with the run, fed with images, ended with the run."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from runtime.channels.streams import Stream
 from runtime.workers.output import Throttle
 
 _BEYOND = 64
-"""Frames beyond its slots that wait for a program without which a run in lockstep goes on."""
+"""Waiting frames beyond the slots, in lockstep with `on_missing = "continue"`."""
 
 _STORY = 0.5
-"""Real seconds in which the exit code of a program is known that has closed its connection."""
+"""Real seconds to wait for a program's exit code after its connection has closed."""
 
 
 _TOGETHER: Any = types.SimpleNamespace(_make=tuple)
-"""What a `Matcher` makes of the images of one stamp."""
+"""Bundle type for a `Matcher`: a tuple of the images of a stamp."""
 
 
 class Process(Estimator[ProcessConfig]):
-    """Runs a program of any language beside the run: an estimator that is judged as it is.
+    """External program of any language as an estimator, judged unchanged.
 
     ::
 
@@ -57,8 +57,8 @@ class Process(Estimator[ProcessConfig]):
         path = "settings.yaml"
         template = "settings.yaml.jinja"
 
-    It ends with the run, however that ends, and with it all that it has started. If it ends before,
-    its exit code and last lines are in the error, and `hold` says what becomes of the run.
+    The program and all its processes end with the run, however the run ends. If it ends before, the
+    error has its exit code and last lines, and `hold` says what becomes of the run.
     """
 
     starts_programs = True
@@ -86,7 +86,7 @@ class Process(Estimator[ProcessConfig]):
     # Before the run.
 
     async def on_startup(self) -> None:
-        """Make the program's folder, and run the command that builds it."""
+        """Create the program's folder, and run the build command."""
         if self.checking:
             return
         await self.offload(self._launch.make_folder, anew=not self.restarts)
@@ -133,7 +133,7 @@ class Process(Estimator[ProcessConfig]):
             self.sources.pop("frames", None)  # those of the others are wanted, too
 
     def check(self) -> Iterable[str]:
-        """Return what is missing: cameras, a bridge, a program, a template."""
+        """Yield an error for each missing camera, bridge, program or template."""
         config = self.config
         if config.feed == "ros2" and self._bridge is None:
             yield 'feed: expected a Ros2Bridge in the file for "ros2", found none'
@@ -159,7 +159,7 @@ class Process(Estimator[ProcessConfig]):
             yield str(error)
 
     async def on_ready(self) -> None:
-        """Write the files, start the program, and wait until it has connected."""
+        """Write the files, start the program, and wait for its connection."""
         config, launch = self.config, self._launch
         self._loop = asyncio.get_running_loop()
         self._end: asyncio.Future[str] = self._loop.create_future()
@@ -187,7 +187,7 @@ class Process(Estimator[ProcessConfig]):
         self.log.info("%s is connected", name)
 
     def _make_feed(self) -> Feed:
-        """Make what feeds the program, and what holds time for its answers."""
+        """Create the feed of the program, and the hold for its answers."""
         config, rig = self.config, self._rig()
         assert rig is not None
         if rig.imu is not None:
@@ -221,7 +221,7 @@ class Process(Estimator[ProcessConfig]):
     # In the run.
 
     async def run(self) -> None:
-        """Wait for the end of a program that ROS 2 feeds."""
+        """Raise `ProgramError` when a program fed by ROS 2 ends."""
         if self.config.feed == "ros2":
             raise ProgramError(await self._end)
 
@@ -239,7 +239,7 @@ class Process(Estimator[ProcessConfig]):
             slot.take(event)
 
     def _send(self, images: tuple[Image | DepthImage, ...]) -> None:
-        """Send an exposure, with the samples since the last one, and wait for the answer."""
+        """Send an exposure, with the samples since the last, and await the answer."""
         assert self._feed is not None
         owed = self._hold.owe(images[0].stamp)
         if not self._hold.expects or len(self._feed.unanswered) >= self._room:
@@ -252,7 +252,7 @@ class Process(Estimator[ProcessConfig]):
         self.start(self._deliver(images[0], owed))
 
     async def _deliver(self, image: Image | DepthImage, owed: Owed[LinkAnswer]) -> None:
-        """Publish what the program answers to a frame."""
+        """Publish the program's answer to a frame."""
         answer = await owed
         if answer is None:
             return
@@ -265,7 +265,7 @@ class Process(Estimator[ProcessConfig]):
     # After the run.
 
     async def on_shutdown(self) -> None:
-        """Say goodbye to the program, and end it if it does not end."""
+        """Close the connection, and end the program if still running."""
         if self._unsent:
             self.log.warning(
                 "%d frames were not sent: the program was gone or had no room", self._unsent
@@ -291,7 +291,7 @@ class Process(Estimator[ProcessConfig]):
         return [] if self._program is None else self._program.processes()
 
     def _note_end(self, story: str) -> None:
-        """Take note that the program has ended by itself."""
+        """Report the program's end before the run's."""
         if self._closing:  # as it was told
             return
         story = f"{self.config.command[0]} {story}"
@@ -306,12 +306,12 @@ class Process(Estimator[ProcessConfig]):
             self.log.warning("%s", story)
 
     def _ends_the_run(self) -> bool:
-        """Tell whether the bridge that feeds a program cannot do without its answers."""
+        """Tell whether the bridge depends on the program's answers."""
         held = [each.hold for each in getattr(self._bridge, "subscriptions", ()) if each.answers_to]
         return not held or any(hold.on_missing == "error" for hold in held)
 
     def _story(self, why: str) -> str:
-        """Return why a program is not connected, and what else is known of it."""
+        """Return the reason of a missing connection, with the program's end and last output."""
         if self._program is None:
             return why
         self._program.wait(_STORY)
@@ -320,7 +320,7 @@ class Process(Estimator[ProcessConfig]):
     # What was announced.
 
     def _rig(self) -> Rig | None:
-        """Return the cameras whose images are sent, and the IMU of their body, if there is one."""
+        """Return the cameras whose images are sent, and the IMU of their body, if any."""
         names = self.config.cameras
         cameras = [self._named[name] for name in names if name in self._named]
         if self.camera is None or len(cameras) < len(names):
@@ -332,7 +332,7 @@ class Process(Estimator[ProcessConfig]):
         return Rig(body, tuple(cameras) or (self.camera,), imu)
 
     def _known(self) -> dict[str, Any]:
-        """Return what templates may use."""
+        """Return the variables of the templates."""
 
         def topic(kind: TopicKind, source: str) -> str:
             found = publication(kind, source, self._bridge or PublishingConfig())

@@ -1,9 +1,7 @@
-"""A command that runs beside the run: its output, its end, and the end of all it has started.
+"""Command beside a run, with its output and all its processes, and its feed.
 
-What feeds a program by the native interface, and hands its answers to the hold.
-
-A thread of its own sends, in the order in which things are due: time never waits for a slot, but
-for answers only.
+The feed sends by the native interface, and hands the answers to the hold. Its own thread sends,
+in the order in which things are due: time waits for answers, never for a slot.
 """
 
 from __future__ import annotations
@@ -32,13 +30,13 @@ from runtime.channels.hold import Hold
 from runtime.workers.output import Output, how_it_ended
 
 _AT_ONCE = 1 << 16
-"""Bytes that are read together."""
+"""Bytes of a single read."""
 
 _REST = 1.0
-"""Seconds for the last output of a program that has ended, which others may still write to."""
+"""Seconds to read the last output of an ended program, as others may still write."""
 
 _LATE = 3.0
-"""Seconds beyond its grace after which a guard is killed, and with it the program."""
+"""Seconds beyond the grace time until the guard is killed, and the program with the guard."""
 
 
 class Program:
@@ -96,11 +94,11 @@ class Program:
         self._watcher.start()
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait until it has ended, and tell whether it has."""
+        """Wait at most `seconds` for the program's end; return whether the program has ended."""
         return self._over.wait(seconds)
 
     def processes(self) -> list[int]:
-        """Return the numbers of its process, and of all that it has started and that still run."""
+        """Return the process IDs of the program and of its running descendants."""
         found = [self._guard.pid]
         for pid in found:
             for thread in Path(f"/proc/{pid}/task").glob("*/children"):
@@ -109,17 +107,17 @@ class Program:
         return found[1:]
 
     def story(self) -> str:
-        """Return how it ended, if it did, and what it last printed."""
+        """Return how the program ended, or "still runs", and its last output."""
         return self._output.story(self._how or "still runs")
 
     def leave(self) -> None:
-        """Have it ended, and wait for nothing."""
+        """Ask the guard to end the program; return at once."""
         self._closing = True
         with contextlib.suppress(OSError):
             self._control.shutdown(socket.SHUT_WR)
 
     def close(self) -> None:
-        """End it, and all that it has started. Takes up to its grace: not on a loop."""
+        """End the program and all its processes. Takes up to its grace: not on a loop."""
         self.leave()
         self._watcher.join(self._grace + _LATE)
         if self._watcher.is_alive():  # somebody stopped the guard
@@ -127,7 +125,7 @@ class Program:
             self._watcher.join()
 
     def _watch(self) -> None:
-        """Read what it prints, and note its end, until its guard has gone."""
+        """Read the output and the exit code, until the guard has gone."""
         output, control = self._terminal, self._control.fileno()
         news = select.poll()
         news.register(output, select.POLLIN)
@@ -155,7 +153,7 @@ class Program:
         return bool(data)
 
     def _note_end(self, output: int, told: str) -> None:
-        """Tell of its end, once the last that it printed is read."""
+        """Report the program's end, after its last output is read."""
         rest, until = select.poll(), time.monotonic() + _REST
         rest.register(output, select.POLLIN)
         while rest.poll(0) and time.monotonic() < until and self._read(output):
@@ -182,10 +180,10 @@ def _terminal() -> tuple[int, int]:
 
 
 KINDS = {"rgb": ("rgb8", 3), "grey": ("mono8", 1), "depth": ("depth32f", 4)}
-"""What the link calls a kind of image, and the bytes of its pixels."""
+"""Name of a kind of image on the link, and its bytes per pixel."""
 
 Exposure = Sequence[tuple[int, str, Image | DepthImage]]
-"""Images of one stamp: number of the camera, kind for the link, and event."""
+"""Images of the same stamp: index of the camera, kind on the link, and event."""
 
 
 class Feed:
@@ -211,7 +209,7 @@ class Feed:
         **options: Any,
     ) -> None:
         self.unanswered: dict[int, int] = {}
-        """Stamps of the frames that are sent, or about to be, and real times of that (ns)."""
+        """Stamps of frames sent or about to be, with the real times of sending (ns)."""
         self.why_gone = ""
         self._hold, self._story, self._skips, self._processes = hold, story, skips, processes
         self._initialised = self._closed = False
@@ -266,7 +264,7 @@ class Feed:
         self._hold.answer(answer.stamp, answer if useful else None, says)
 
     def _lose(self, why: str) -> None:
-        """Take note that the program is gone, and of another that takes its place."""
+        """Report the loss of the program, and wait for another in its place."""
         self.why_gone = why
         self._hold.gone(self._story(why))
         while not self._closed:

@@ -1,4 +1,4 @@
-"""ROS 2 over Zenoh, as rmw_zenoh_cpp uses it; no ROS needs to be installed here.
+"""ROS 2 over Zenoh, compatible with rmw_zenoh_cpp; no installation of ROS needed.
 
 Read in this order: `settings`, `keys` (how topics are named on Zenoh, and what goes with messages),
 `session` (the only import of zenoh), `incoming_topic` (between messages and events, by settings of

@@ -1,4 +1,4 @@
-"""Estimators in ROS 2 that owe an answer to each image: what they are sent, and what they say.
+"""Estimators in ROS 2 with an answer owed to each image: messages and answers.
 
 They get all messages of the node, complete and in the order of its events: an image after the IMU
 and the ``/clock`` of the time at which it arrived. Their answers are read in the thread that takes
@@ -30,22 +30,22 @@ from runtime.channels.hold import Hold, Owed
 from runtime.errors import MissingAnswerError, suggest
 
 WAITING = 64
-"""Messages that may wait to be published in real time; with so many, images are dropped."""
+"""Messages waiting to be published in real time; beyond this, images are dropped."""
 
 SETTLED = 0.3
-"""Real seconds without a further subscription, after those that are needed, until it begins."""
+"""Real seconds without a new subscription, after all needed ones, until publishing begins."""
 
 CLOSING = 2.0
-"""Real seconds that the end of the run waits for what is still to be published."""
+"""Real seconds for the remaining messages at the end of the run."""
 
 _LOOK = 0.01
-"""Real seconds between two looks at who has subscribed."""
+"""Real seconds between two polls of the subscriptions."""
 
 
 class HeldEstimator:
-    """One estimator: whether it is there, to which images it owes answers, and what it answers.
+    """An estimator in ROS 2: its presence, the images owed an answer, and its answers.
 
-    Its `topics` are that of its estimates, and the one that says what it is done with, if any.
+    Its `topics` are that of its estimates, and the ``done`` topic, if any.
     """
 
     def __init__(
@@ -70,13 +70,13 @@ class HeldEstimator:
         self._answerers: set[bytes] = set()  # GIDs
 
     def follow(self, session: Session) -> None:
-        """Take its answers from now on, and note when it comes and goes; may wait."""
+        """Subscribe to the answers, and watch the estimator's publishers; may block."""
         takes = [(each.topic, functools.partial(self._take, each)) for each in self._topics]
         session.subscribe_in_order(takes)
         session.watch(self._topics[0].topic.name, "MP", self._changed)
 
     def missing(self, matched: Sequence[str]) -> str:
-        """Return what is not there of it, in words, given the topics that are subscribed to."""
+        """Return the missing publisher or subscriptions in words, given the matched topics."""
         found = [] if self._there else [f"a publisher of {self._topics[0].topic.name}"]
         if lacking := [each for each in self._needs if each not in matched]:
             found.append(f"a subscription to {' and '.join(lacking)}")
@@ -86,7 +86,7 @@ class HeldEstimator:
         return " and ".join(found)
 
     def owe(self, image: Event, matched: Callable[[], Sequence[str]]) -> Owed[Event] | None:
-        """Return the answer that is owed to an image which goes out now; `None` if none is.
+        """Return the answer owed to an image about to go out; `None` if none is.
 
         Of several images of one exposure, it is owed to the first.
         """
@@ -113,7 +113,7 @@ class HeldEstimator:
             self.hold.fail(error)
 
     def _is_next(self, incoming: IncomingTopic, message: Message) -> bool:
-        """Tell whether a message is a new one; if some are missing before it, the run ends."""
+        """Return False for a repeated message; raise `MissingAnswerError` after a gap."""
         if (attached := message.attachment) is None:
             return True
         number = attached.sequence
@@ -134,7 +134,7 @@ class HeldEstimator:
         return True
 
     def _changed(self, there: bool, token: Token) -> None:
-        """Take note that a publisher of its estimates has come or gone, in any thread."""
+        """Record the coming or going of a publisher of estimates; called in any thread."""
         if there:
             self._there[token.key] = None
             return
@@ -147,7 +147,7 @@ class HeldEstimator:
 def held_estimators(
     node: Node[Ros2BridgeConfig], incoming: Sequence[IncomingTopic], stamps: Callable[[], Stamps]
 ) -> list[HeldEstimator]:
-    """Return the estimators among a node's subscriptions that owe answers, each with its hold."""
+    """Return the estimators of a node's subscriptions with owed answers, each with its hold."""
     found = []
     for each in incoming:
         given = each.subscription
@@ -159,14 +159,13 @@ def held_estimators(
 
 
 class HeldLine:
-    """Publishes in a thread, one message after the other, in the order of asking.
+    """Thread to publish messages in the order of the calls.
 
-    In lockstep nothing is dropped: what is to be published before the estimators are there waits
-    for them, as does simulated time. In real time that is left out, and so are images when too many
-    messages wait.
+    In lockstep nothing is dropped: messages wait until the estimators are there, as does simulated
+    time. In real time these messages are left out, and so are images when too many messages wait.
 
     Args:
-        session: Whose publishers are made complete: reliable, and waiting for who reads slowly.
+        session: Declares the publishers, as complete: reliable, and waiting for slow readers.
         deliver: Sends the event of an answer, at its time.
 
     Attributes:
@@ -223,7 +222,7 @@ class HeldLine:
     def publish_image(
         self, image: Event, put: Callable[[Any], object], clock: Callable[[int], object]
     ) -> None:
-        """Put an image or a point cloud in its turn, and the time before it; hold for its answers.
+        """Put the time, then an image or a point cloud, in turn; hold for the answers.
 
         Args:
             clock: Puts the time (ns).
@@ -231,7 +230,7 @@ class HeldLine:
         self._once_there(self._publish_image, image, put, clock)
 
     async def close(self) -> None:
-        """Publish what is still to be, unless a peer that does not read keeps it for `CLOSING`."""
+        """Publish the remaining messages; give up after `CLOSING` if a peer does not read."""
         self._closed.set()
         self._waiting.put(None)
         if self._thread.is_alive():
@@ -278,7 +277,7 @@ class HeldLine:
                     each.hold.fail(error)
 
     def _wait(self) -> str:
-        """Return, in words, who is not there in time; wait until no further subscription comes."""
+        """Wait for the estimators and their last subscription; return the missing ones in words."""
         begin = since = time.monotonic()
         end = begin + max(each.subscription.timeout for each in self._estimators)
         matched: list[str] = []
@@ -292,11 +291,11 @@ class HeldLine:
                 return f"{missing or 'no further subscriptions'} within {end - begin:g} s"
 
     def _matched(self) -> list[str]:
-        """Return the topics that somebody subscribes to."""
+        """Return the topics with a subscriber."""
         return [each.topic.name for each in self._publishers if each.matched()]
 
     def _note(self, publisher: Publisher, message: bytearray) -> None:
-        """Take what was put into the digest of what estimators are sent."""
+        """Add a message to the digest of each hold; raise if a subscriber does not read."""
         name = publisher.topic.name
         for each in self._estimators:
             each.hold.sent(name, message)

@@ -40,7 +40,7 @@ from runtime import Stream
 
 
 class IncomingTopic:
-    """Makes the events of one subscription.
+    """Reader of a subscription's messages as events.
 
     Args:
         node: The bridge's name, for the events' source.
@@ -111,14 +111,14 @@ class IncomingTopic:
         return found
 
     def event(self, data: bytes, now: int, stamps: Stamps) -> Event | None:
-        """Return what a message becomes; `None` if it is refused, or of no use."""
+        """Return the event of a message; `None` if refused or of no use."""
         message = self._message(data)
         return None if message is None else self._event(message, now, stamps)
 
     def answer(self, data: bytes, stamps: Stamps) -> tuple[int, Event | None] | None:
-        """Return the stamp of the image that a message answers (ns), and what the message becomes.
+        """Return the stamp of the image answered by a message (ns), and the message's event.
 
-        Its content may be refused, or of no use: `None`, and yet an answer. In any thread.
+        The event is `None` if refused or of no use: still an answer. In any thread.
         """
         message = self._message(data)
         if message is None:
@@ -161,7 +161,7 @@ class IncomingTopic:
 
 
 def topic(store: TypeStore, name: str, type_: str, qos: Qos) -> Topic:
-    """Return a topic as the file has it.
+    """Return a topic with the hash of its type.
 
     Raises:
         ValueError: The type is not known.
@@ -173,18 +173,18 @@ def topic(store: TypeStore, name: str, type_: str, qos: Qos) -> Topic:
 
 
 BUDGET = 0.0005
-"""Seconds for which one turn of the loop may be held."""
+"""Longest turn of the loop, seconds."""
 
 
 class Inbox:
-    """What waits to be read on one topic.
+    """Unread messages of a topic.
 
     Args:
-        deliver: Called there with the bytes of each; must not raise.
-        depth: How many wait at most; the oldest is dropped.
+        deliver: Called on the loop with the bytes of each; must not raise.
+        depth: Messages that wait at most; the oldest is dropped.
         max_rate: Messages a second at most; a burst of `depth` may come at once.
         max_size: Bytes of a message at most.
-        complain: Called, in the thread that reads, with why a message is dropped.
+        complain: Called, in the thread that reads, with the reason of a drop.
         now: Real seconds.
     """
 
@@ -235,7 +235,7 @@ class Inbox:
                 self._loop.call_soon_threadsafe(self._drain)
 
     def _within_rate(self) -> bool:
-        """Tell whether one more message fits; every second allows for `max_rate` more."""
+        """Tell whether another message fits; each second allows for `max_rate` more."""
         with self._lock:
             now = self._now()
             more = (now - self._asked) * self._max_rate
@@ -261,7 +261,7 @@ class Inbox:
 
 
 class OutgoingTopic:
-    """Makes the messages of one publication.
+    """Writer of a publication's messages.
 
     Attributes:
         waiting: Events that wait to be published.
@@ -296,7 +296,7 @@ class OutgoingTopic:
         )
 
     def put(self, builder: MessageBuilder, event: Event) -> None:
-        """Put the message of an event, if there is one."""
+        """Put the message of an event, if any."""
         if self.publisher is not None and (message := self.message(event, builder)) is not None:
             self.publisher.put(message)
 

@@ -1,4 +1,4 @@
-"""Names, attachments and complaints: what goes with messages on Zenoh, as rmw_zenoh_cpp has it.
+"""Names, attachments and complaints of messages on Zenoh, as in rmw_zenoh_cpp.
 
 Data keys, liveliness tokens and QoS as text are those of rmw_zenoh's docs/design.md and
 liveliness_utils.cpp; zenoh-plugin-ros2dds names topics otherwise (`ros2dds_key`). With every
@@ -42,15 +42,15 @@ class NodeName(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Token(msgspec.Struct, frozen=True, kw_only=True):
-    """What a liveliness token says of a node or of one of its endpoints.
+    """Contents of a node's or endpoint's liveliness token.
 
     Attributes:
         key: The token itself; `attachment.gid` of it stands in its owner's messages.
-        kind: What it is of.
-        node: Whose.
+        kind: Kind of its owner.
+        node: Node of its owner.
         zid: The session's id as text.
         topic: The name of its topic or service; empty for a node.
-        extra: What follows; newer releases say there which buffers an endpoint can share.
+        extra: The rest; newer releases say there which buffers an endpoint can share.
     """
 
     key: str
@@ -85,17 +85,17 @@ def parse_token(key: str) -> Token:
 
 
 def mangle(name: str) -> str:
-    """Return a name as one component of a key: ``/`` becomes ``%``, nothing becomes ``%``."""
+    """Return a name as a component of a key: ``/`` becomes ``%``, and so does nothing."""
     return name.replace("/", "%") or "%"
 
 
 def data_key(domain_id: int, topic: Topic) -> str:
-    """Return the key on which a topic's messages are put."""
+    """Return the key of a topic's messages."""
     return f"{domain_id}/{topic.name.strip('/')}/{dds_type(topic.type)}/{topic.hash}"
 
 
 def ros2dds_key(topic: Topic) -> str:
-    """Return the key that zenoh-plugin-ros2dds uses; its payload has no attachment."""
+    """Return a topic's key in zenoh-plugin-ros2dds; the payload there has no attachment."""
     return topic.name.strip("/")
 
 
@@ -118,7 +118,7 @@ def endpoint_token(
 
 
 def endpoints_key(domain_id: int, kind: Kind, topic_name: str) -> str:
-    """Return the key expression that the tokens of a topic's endpoints match, and no others."""
+    """Return the key expression of the tokens of a topic's endpoints, and no others."""
     return f"{ADMIN_SPACE}/{domain_id}/*/*/*/{kind}/*/*/*/{mangle(topic_name)}/**"
 
 
@@ -135,7 +135,7 @@ SIZE = _LAYOUT.size
 
 
 class Attachment(NamedTuple):
-    """What an attachment says.
+    """Contents of a message's attachment.
 
     Attributes:
         sequence: Number of the message from its publisher, from 1.
@@ -149,12 +149,12 @@ class Attachment(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message that has come; its bytes are not copied before they are asked for.
+    """A received message; its bytes are copied only on request.
 
     Attributes:
         size: Bytes.
-        read: Returns them.
-        attached: Returns what becomes those of its attachment, if there is one.
+        read: Returns the bytes.
+        attached: Returns the attachment, to convert to bytes; `None` if there is none.
     """
 
     size: int
@@ -163,7 +163,7 @@ class Message(NamedTuple):
 
     @property
     def attachment(self) -> Attachment | None:
-        """Return its attachment; ``None`` if there is none, or what came is none."""
+        """Return the attachment; ``None`` if missing or malformed."""
         try:
             return unpack(bytes(self.attached() or b""))
         except ValueError:
@@ -171,7 +171,7 @@ class Message(NamedTuple):
 
 
 def gid(token: str) -> bytes:
-    """Return the GID of the owner of a liveliness token, as rmw_zenoh_cpp makes it.
+    """Return the GID of the owner of a liveliness token, as in rmw_zenoh_cpp.
 
     It is the token's XXH3 hash of 128 bits, its low 64 bits first, little endian.
     """
@@ -206,7 +206,7 @@ LOG_INTERVAL = 5.0
 
 
 class Complaints:
-    """Counts of what went wrong, by topic and kind. For any thread.
+    """Counts of refusals and errors, by topic and kind. For any thread.
 
     Args:
         now: Real seconds.
@@ -222,10 +222,10 @@ class Complaints:
         self._lock = threading.Lock()
 
     def add(self, where: str, kind: str, detail: str = "") -> None:
-        """Count something; log it if nothing like it was logged for `LOG_INTERVAL`.
+        """Count an error; log once per `LOG_INTERVAL`, topic and kind.
 
         Args:
-            kind: Of trouble, in few words; there are only a few.
+            kind: In few words; there are only a few.
         """
         with self._lock:
             key, now = (where, kind), self._now()

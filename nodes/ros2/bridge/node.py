@@ -43,7 +43,7 @@ from runtime.channels.ports import Handles
 from runtime.errors import FatalError, UncheckableError
 
 WAITING = 8
-"""Images of one kind that wait to be published; the oldest is dropped, and counted."""
+"""Images of a kind waiting to be published; the oldest is dropped, and counted."""
 
 
 class Ros2Bridge(Node[Ros2BridgeConfig]):
@@ -82,7 +82,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     fixes = Output(NavSatFix)
     commands = Output(Command)
     mapped_events = Output(Event)
-    """What mappings of the user's own make."""
+    """Events of the user's own mappings."""
 
     def __init__(self) -> None:
         self._session: Session | None = None
@@ -93,7 +93,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         }
         self._incoming: list[IncomingTopic] = []
         self._unread: list[Stream[bytes]] = []
-        """Images from ROS that wait to be read."""
+        """Unread images from ROS."""
         self._outgoing: list[OutgoingTopic] = []
         self._cameras: list[CameraAnnouncement] = []
         self._vehicles: list[str] = []
@@ -101,7 +101,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self._stamps: Stamps | None = None
         self._open = False
         self._line: HeldLine | None = None
-        """On which all is published, in order, if there are such estimators."""
+        """Publishes everything in order, if estimators are held."""
         self._rates: dict[str, float] = {}
         """Of announced cameras and lidars."""
         if self.config.publications:
@@ -112,7 +112,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self.deterministic = not steered  # type: ignore[misc]
 
     async def on_startup(self) -> None:
-        """Join the network, and wait for the cameras that ROS has.
+        """Join the network, and wait for the cameras of ROS.
 
         Raises:
             MissingDependencyError: rosbags is not installed.
@@ -174,13 +174,13 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             raise
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the estimators, cameras and pilots that are in ROS."""
+        """Announce the estimators, cameras and pilots in ROS."""
         yield from self._cameras
         for incoming in self._incoming:
             yield from incoming.announce()
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Declare the topics of what is announced."""
+        """Declare the topics of an announcement."""
         ours = {incoming.source for incoming in self._incoming}
         if isinstance(announcement, CameraAnnouncement | LidarAnnouncement):
             self._rates[announcement.source] = announcement.rate
@@ -259,18 +259,18 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     @on(*SMALL)
     def measurements(self, event: Event) -> None:
-        """Publish what is small, at once."""
+        """Publish small messages at once."""
         if self._publishing is not None:
             self._publish(self._publishing.put, event)
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Answer who asked a vehicle for what it now says is done."""
+        """Answer the requests of a vehicle's action, now done."""
         if self._services is not None:
             self._services.told(event)
 
     def publications(self, event: Event) -> None:
-        """Publish, beside the loop, what a mapping of the user's own makes of an event."""
+        """Publish, beside the loop, the messages of the user's own mappings."""
         for outgoing in self._outgoing:
             if outgoing.wants(event):
                 if self._line is None or self._publishing is None:
@@ -286,10 +286,10 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             self._publish(self._publishing.clock, self.clock.now())
 
     def _declare_mapped_events(self) -> None:
-        """Have `publications` called with the events that the file's publications are of.
+        """Have `publications` called with the events of the file's publications.
 
         Raises:
-            FatalError: One is of no type of event.
+            FatalError: A publication has no type of event.
         """
         try:
             events = tuple({event_type(each) for each in self.config.publications})
@@ -304,7 +304,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         )
 
     def _publish(self, put: Callable[[Any], None], what: Any) -> None:
-        """Publish what is small, at once or in its turn."""
+        """Publish a small message, at once or in its turn."""
         if self._line is None:
             put(what)
         else:
@@ -347,13 +347,13 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         )
 
     def _send(self, event: Event) -> None:
-        """Send an event by the first output that is for its type."""
+        """Send an event by the first output of its type."""
         outputs = self.declared.outputs.items()
         port = next(port for port, output in outputs if isinstance(event, output.event))
         getattr(self, port).send(event)
 
     async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
-        """Wait for a camera's calibration, and remember to announce it."""
+        """Wait for a camera's calibration, and keep the announcement."""
         timeout, most = incoming.subscription.timeout, self.config.max_message_size
         kinds = {"image": "rgb", "depth": "depth"}
         uses = [each.subscription.use for each in self._incoming if each.source == incoming.source]
@@ -369,7 +369,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             found.cancel()
 
     def _fix_time(self) -> Stamps:
-        """Return how stamps become times in messages, which is fixed with the first message."""
+        """Return the conversion of stamps to times of messages, fixed with the first message."""
         if self._stamps is None:
             wall = self.config.time == "wall"
             self._stamps = Stamps(time.time_ns() - self.clock.now() if wall else 0)

@@ -1,4 +1,4 @@
-"""Services and one action that ROS 2 may call: requests come as Zenoh's queries.
+"""ROS 2 services and an action of a run: requests come as Zenoh's queries.
 
 `ServiceServer` takes them, and answers beside the run. simulation_interfaces 2.1
 (https://github.com/ros-simulation/simulation_interfaces) shows and sets whether simulated time
@@ -48,11 +48,11 @@ Serve = Callable[[Any], Awaitable[dict[str, Any]]]
 Finish = Callable[[bytearray | str], None]
 
 WAITING = 64
-"""Requests that wait to be answered, at most."""
+"""Unanswered requests, at most."""
 
 
 class ServiceServer:
-    """Answers requests for one bridge."""
+    """Server of ROS 2 requests for a bridge."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class ServiceServer:
         self._session.serve(service, functools.partial(self._take, service, serve))
 
     def publisher(self, name: str, type_: str, qos: Qos) -> Callable[..., None]:
-        """Declare a topic, and return what publishes messages of given fields, in their turn."""
+        """Declare a topic; return a function to publish messages of given fields, in order."""
         self.store.serialize(self.store.zero(type_))  # the first takes milliseconds
         name = topic_name(self.node.config.namespace, name)
         topic = Topic(name=name, type=type_, hash=self.store.hash(type_), qos=qos)
@@ -99,7 +99,7 @@ class ServiceServer:
         self.node.log.info("%d requests answered", self._answered)
 
     def _take(self, service: Topic, serve: Serve, message: Message, answer: Answer) -> None:
-        """Read a request, in a thread of Zenoh's, and hand it to the loop."""
+        """Read a request in a thread of Zenoh's, and hand the request to the loop."""
         wrong, request, attachment = "", None, message.attachment
         most = self.node.config.max_message_size
         with self._lock:
@@ -165,17 +165,17 @@ FEATURE_UNSUPPORTED, OK, OPERATION_FAILED = 0, 1, 4
 ALREADY_IN_TARGET_STATE, INCORRECT_TRANSITION = 101, 103
 
 LONGEST = 86_400 * SECOND
-"""Nanoseconds of the run's clock that one request may step."""
+"""Longest step of a single request, nanoseconds of the run's clock."""
 
 
 class SimulationServices:
-    """Lets ROS see and set whether simulated time runs, and step it."""
+    """Services to show and set whether simulated time runs, and to step time."""
 
     def __init__(self, server: ServiceServer) -> None:
         self._server = server
         self._stepping = server.node.stepping
         self.step = round(server.node.config.step * SECOND)
-        """Nanoseconds of one step."""
+        """Length of a step, nanoseconds."""
 
     def declare(self) -> None:
         """Declare the services; called in any thread."""
@@ -200,7 +200,7 @@ class SimulationServices:
         return None
 
     def result(self, result: int, message: str = "") -> dict[str, Any]:
-        """Return the field of a response that says how it went."""
+        """Return the ``result`` field of a response."""
         return {"result": self._make("Result", result=result, error_message=message)}
 
     async def _features(self, _: Any) -> dict[str, Any]:
@@ -262,7 +262,7 @@ KEPT, PERIOD = 16, 0.2
 
 
 class _Goal:
-    """Steps that a client wants from simulated time `begin` (ns); `info` is its GoalInfo."""
+    """A client's goal: steps from simulated time `begin` (ns); `info` is its GoalInfo."""
 
     def __init__(self, info: Any, steps: int, begin: int) -> None:
         self.info, self.steps, self.begin = info, steps, begin
@@ -270,14 +270,14 @@ class _Goal:
 
 
 class SimulateSteps:
-    """Steps time for one goal at a time."""
+    """Action ``simulate_steps``: steps simulated time for a single goal at a time."""
 
     def __init__(self, server: ServiceServer, simulation: SimulationServices) -> None:
         self._server, self._simulation = server, simulation
         self._clock, self._stepping = server.node.clock, server.node.stepping
         self._message = server.store.message
         self._goals: dict[bytes, _Goal] = {}
-        """By id, the oldest first; at most one is not over."""
+        """Goals by id, the oldest first; at most a single goal is not over."""
 
     def declare(self) -> None:
         """Declare topics and services; called in any thread."""
@@ -317,7 +317,7 @@ class SimulateSteps:
                 self._server.loop.call_soon_threadsafe(self._tell, goal, gone)
 
     def _tell(self, goal: _Goal, gone: int) -> int:
-        """Publish how many steps are done after `gone` ns, and return that."""
+        """Publish and return the number of steps done after `gone` ns."""
         done = min(gone // self._simulation.step, goal.steps)
         if not goal.over.is_set():
             counts = {"completed_steps": done, "remaining_steps": goal.steps - done}
@@ -371,9 +371,9 @@ class SimulateSteps:
 
 
 class _Order(NamedTuple):
-    """What is sent, what the vehicle says when it is done, and within how many seconds.
+    """A command, the event of its completion, and a time limit in seconds.
 
-    It is superfluous if the vehicle is armed (true), or if it is not (false).
+    Superfluous if the vehicle is armed (true), or if not armed (false).
     """
 
     command: type[Command]
@@ -398,7 +398,7 @@ class VehicleServices:
         self._node = server.node
         self._send = send
         self._armed: dict[str, bool] = {}
-        """Of vehicles of which it is known."""
+        """Whether a vehicle is armed, by name, where known."""
         self._waiting: set[tuple[str, type[VehicleEvent], asyncio.Future[None]]] = set()
 
     def declare(self, vehicle: str) -> None:
@@ -414,7 +414,7 @@ class VehicleServices:
             self._server.declare(f"{ros_name(vehicle)}/{name}", TRIGGER, serve)
 
     def told(self, event: VehicleEvent) -> None:
-        """Note what a vehicle says has happened."""
+        """Record a vehicle's event, and complete the requests waiting for its type."""
         if isinstance(event, events.Armed | events.Disarmed):
             self._armed[event.source] = isinstance(event, events.Armed)
         for vehicle, done, waiter in self._waiting:
@@ -422,7 +422,7 @@ class VehicleServices:
                 waiter.set_result(None)
 
     async def _give(self, vehicle: str, order: _Order) -> tuple[bool, str]:
-        """Return whether a command was carried out, and what there is to say of it."""
+        """Send a command; return whether the vehicle completed the command, and a message."""
         if self._armed.get(vehicle) is order.superfluous is not None:
             return True, f"{vehicle} is {'armed' if order.superfluous else 'disarmed'} already"
         waiter = asyncio.get_running_loop().create_future()
@@ -444,7 +444,7 @@ class VehicleServices:
 
 
 class Services(ServiceServer):
-    """The services of one bridge; of vehicles they send commands by `send`."""
+    """Services of a bridge; commands to vehicles go by `send`."""
 
     def __init__(self, send: Callable[[Command], None], *server: Any) -> None:
         super().__init__(*server)
@@ -452,7 +452,7 @@ class Services(ServiceServer):
         self.told = self._vehicles.told
 
     def offer(self, vehicles: Iterable[str]) -> None:
-        """Declare all that are wanted, of these vehicles; called in a thread."""
+        """Declare all services of the settings, for these vehicles; called in a thread."""
         for type_, definition in DEFINITIONS.items():
             self.store.add(type_, definition)
         if "simulation" in self.node.config.services:

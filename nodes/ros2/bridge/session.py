@@ -1,4 +1,4 @@
-"""A Zenoh session as a ROS 2 node, and its publishers: the only module that imports zenoh.
+"""Zenoh session as a ROS 2 node, and its publishers: the only import of zenoh.
 
 Zenoh has threads of its own and no asyncio: what it calls runs there, and must not wait.
 """
@@ -105,13 +105,13 @@ Answer = Callable[[bytearray | str, bytes], None]
 """Answers a request, in any thread: with a message and its attachment, or with an error."""
 
 WAIT_BEFORE_DROP = 300
-"""Microseconds that a put waits for a peer that does not read; Zenoh's default is 1000."""
+"""Microseconds for a put to wait for a peer not reading; Zenoh's default is 1000."""
 
 WAITING = 64
-"""Messages that Zenoh keeps until they are read; it lets the sender wait when there are more."""
+"""Unread messages kept by Zenoh; with more, the sender has to wait."""
 
 PAUSE = 0.001
-"""Seconds between two looks at what has come: what comes faster is taken in handfuls."""
+"""Seconds between two polls for messages; faster messages are taken in batches."""
 
 CLOSING = 3.0
 """Seconds."""
@@ -127,11 +127,11 @@ _OURS: dict[str, Any] = {
     "connect/exit_on_failure": False,  # but beside the run; and again if a router goes
     f"{_QUEUE}/drop/wait_before_drop": WAIT_BEFORE_DROP,
 }
-"""Instead of Zenoh's own defaults, which are to listen on all addresses, and to use multicast."""
+"""Replacements of Zenoh's defaults, such as listening on all addresses, and multicast."""
 
 _IN_ZENOH = re.compile(r" at /\S+\.rs:\d+\.?")
 _IN_FILE = re.compile(r'Message \{ msg: "(.*)", location: .*line: (\d+), column: (\d+).*')
-"""Where in Zenoh an error arose; how Rust shows one of JSON5, and where that is."""
+"""Location of an error in Zenoh; an error of JSON5 as shown by Rust, and its location."""
 
 
 class SessionError(Exception):
@@ -139,7 +139,7 @@ class SessionError(Exception):
 
 
 class Session:
-    """A session with one ROS node.
+    """Zenoh session of a single ROS node.
 
     Args:
         keys: How topics are named.
@@ -182,7 +182,7 @@ class Session:
             self._keep(node_token(node, self.zid, 0))
 
     def publisher(self, topic: Topic, *, held: bool = False) -> Publisher:
-        """Declare a publisher, and show it to ROS.
+        """Declare a publisher, visible to ROS.
 
         Args:
             held: Whether every message must arrive: it is reliable, keeps all, and a put waits
@@ -224,7 +224,7 @@ class Session:
         return publisher
 
     def subscribe(self, topic: Topic, take: Take, *, late: bool = False) -> None:
-        """Declare a subscription, and show it to ROS.
+        """Declare a subscription, visible to ROS.
 
         With `late`, messages that were sent before and are kept come too, as for transient local.
         """
@@ -251,10 +251,10 @@ class Session:
         self._show(topic, "MS")
 
     def subscribe_in_order(self, takes: Sequence[tuple[Topic, Take]]) -> None:
-        """Subscribe to topics whose messages are taken one by one, in the order in which they came.
+        """Subscribe to topics with a common order: messages are taken in the order of arrival.
 
-        So what a process says on one of them after another is taken after it. They are read as they
-        come, and cost the loop more than with `subscribe`.
+        So what a process says on one of them after another is taken after it. This costs the loop
+        more than `subscribe`.
         """
         came: queue.Queue[tuple[Take, zenoh.Sample] | None] = queue.Queue(WAITING)
 
@@ -274,9 +274,9 @@ class Session:
         threading.Thread(target=read, name=f"reads {takes[0][0].name}", daemon=True).start()
 
     def watch(self, topic_name: str, kind: Kind, changed: Callable[[bool, Token], None]) -> None:
-        """Be told which endpoints of other sessions a topic has, now and whenever that changes.
+        """Report the endpoints of other sessions on a topic, now and at each change.
 
-        Those of a process that is killed disappear at once; tokens that make no sense are left out.
+        Those of a process that is killed disappear at once; invalid tokens are left out.
 
         Args:
             kind: Of the endpoints: ``MP`` for publishers, ``MS`` for subscriptions.
@@ -296,7 +296,7 @@ class Session:
         self._kept.append(liveliness.declare_subscriber(key, tell, history=True))
 
     def serve(self, service: Topic, take: Callable[[Message, Answer], None]) -> None:
-        """Declare a service, and show it to ROS.
+        """Declare a service, visible to ROS.
 
         Args:
             service: Its name, type, hash and quality of service.
@@ -318,7 +318,7 @@ class Session:
         self._show(service, "SS")
 
     def close(self) -> bool:
-        """Leave, and tell whether that was done within `CLOSING`.
+        """Close the session; return whether done within `CLOSING`.
 
         A peer that stands still can keep Zenoh waiting for longer (10 s). Then a thread goes
         on with it, and the process ends after that: to end before would crash in Zenoh.
@@ -346,7 +346,7 @@ class Session:
 
 
 def _answer(publisher: Publisher, key: str, query: zenoh.Query) -> None:
-    """Answer who joins late and asks for the topic's key, as those do that know no `@adv`."""
+    """Send the kept messages to a late joiner asking for the topic's key, without `@adv`."""
     for message, attachment in tuple(publisher.kept):
         with contextlib.suppress(zenoh.ZError):  # whoever asked may have gone
             query.reply(key, message, attachment=attachment)
@@ -375,7 +375,7 @@ def _message(sample: zenoh.Sample | zenoh.Query) -> Message:
 def _configuration(
     connect: tuple[str, ...] | None, listen: tuple[str, ...] | None, file: str
 ) -> zenoh.Config:
-    """Return the configuration of a peer as rmw_zenoh_cpp opens it, or as `file` says."""
+    """Return the configuration of a peer as in rmw_zenoh_cpp, or as in `file`."""
     plain, configuration = zenoh.Config(), zenoh.Config()
     if file:
         if not Path(file).is_file():

@@ -32,11 +32,11 @@ ServiceGroup = Literal["simulation", "vehicle"]
 
 
 class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A topic to subscribe to, and what its messages become.
+    """Settings of a subscription: a topic of ROS, and the events from its messages.
 
     Attributes:
         topic: Relative to the namespace, or with a leading slash.
-        type: ``geometry_msgs/msg/PoseStamped``.
+        type: Type of the messages: ``geometry_msgs/msg/PoseStamped``.
         use: ``as`` in the file: what a message becomes. ``estimate`` (from PoseStamped,
             PoseWithCovarianceStamped, Odometry or the end of a Path), ``odometry`` (Odometry),
             ``velocity`` (Twist, TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``,
@@ -44,26 +44,24 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             ``magnetic_field`` (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the
             run waits for the first one, and a camera is announced), ``done`` (Header or Time: an
             estimator will say no more about the image of this stamp).
-        mapping: Instead: ``module:function``, which takes a message and a `MessageContext` and
-            returns an event, or None.
-        source: Of the events; if empty, the node's name and the topic.
-        vehicle: Which vehicle a ``velocity``, ``position`` or ``pose`` is for; empty for the only
-            one.
-        frame_id: If set, the frame that events name, whatever the message says.
-        scale_free: Whether an estimate's unit of length is its own.
+        mapping: Instead of `use`: ``module:function``, called with a message and a
+            `MessageContext`; returns an event, or None.
+        source: Source of the events; if empty, the node's name and the topic.
+        vehicle: Vehicle for a ``velocity``, ``position`` or ``pose``; empty for the only one.
+        frame_id: Frame of the events; if empty, the message's.
+        scale_free: Whether an estimate's unit of length is arbitrary.
         reliable: Quality of service, as ROS shows it.
-        depth: How many messages wait at most.
-        max_rate: Messages a second at most; what comes faster is dropped.
+        depth: Messages that wait at most.
+        max_rate: Messages a second at most; the rest is dropped.
         transient_local: Whether to get messages that were published before, and are kept
             (``/map``, ``/tf_static``); a ``camera`` always does.
         timeout: Seconds that the run's start waits for a ``camera``, or for the estimator that
             `answers_to` images.
         answers_to: Source of the images whose stamps the messages of an ``estimate`` or ``done``
-            bear. Each image is then owed an answer, for which simulated time waits, and nothing
-            between the two is dropped; `depth` and `max_rate` do not apply. See
-            `runtime.channels.hold`.
+            bear. Simulated time waits for the answer to each image, and nothing between the two
+            is dropped; `depth` and `max_rate` do not apply. See `runtime.channels.hold`.
         latency: Time on the run's clock from the arrival of an image to its answer's event.
-        hold: How long is waited for an answer, and what if none comes.
+        hold: How long to wait for an answer, and what follows if none comes.
         needs: Topics of this node that the estimator must have subscribed to before the first
             image is sent; if empty, that of the images.
     """
@@ -123,7 +121,7 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
 
     def is_told_by(self, other: Subscription) -> bool:
-        """Tell whether this is an estimate of which another subscription says what is done."""
+        """Tell whether `other` has the ``done`` messages of this estimate."""
         return (
             (self.use, other.use) == ("estimate", "done")
             and self.answers_to == other.answers_to
@@ -132,18 +130,18 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A topic to publish beyond those that the bridge has by itself.
+    """Settings of a topic to publish besides the bridge's own.
 
     Attributes:
         topic: Relative to the namespace, or with a leading slash.
-        type: ``sensor_msgs/msg/BatteryState``.
-        event: ``module:Class`` of the events that become its messages; subclasses come too.
-        mapping: ``module:function``, which takes an event and a `MessageBuilder` and returns a
-            message of `type`, or None. It is called in a thread beside the loop.
+        type: Type of the messages: ``sensor_msgs/msg/BatteryState``.
+        event: Type of the events, ``module:Class``, with its subclasses.
+        mapping: ``module:function``, called with an event and a `MessageBuilder` in a thread
+            beside the loop; returns a message of `type`, or None.
         source: Take only events of this source or below it.
         reliable: Quality of service, as ROS shows it.
         transient_local: Whether late joiners get the last `depth` messages.
-        depth: How many messages are kept, and how many events wait at most.
+        depth: Messages that are kept, and events that wait, at most.
     """
 
     topic: str
@@ -173,28 +171,28 @@ def _importable(topic: str, what: str, form: str, found: str) -> None:
 
 
 class Ros2BridgeConfig(PublishingConfig):
-    """Settings of the bridge, beside those of what is published (`PublishingConfig`).
+    """Settings of the bridge, besides those of `PublishingConfig`.
 
     Attributes:
         domain_id: ROS_DOMAIN_ID.
         node_name: As ``ros2 node list`` shows it.
         distribution: Of ROS 2, on the other side.
         keys: ``rmw_zenoh``, or ``ros2dds`` for a bridge with zenoh-plugin-ros2dds.
-        connect: Zenoh endpoints; if not given, those of `zenoh_config`, or else
+        connect: Zenoh endpoints to connect to; if not given, those of `zenoh_config`, or else
             ``tcp/localhost:7447``, where ``rmw_zenohd`` listens.
         listen: The same for listening; or else any port of the loopback.
-        zenoh_config: A Zenoh configuration file (JSON5) for whatever else: TLS, access control,
+        zenoh_config: A Zenoh configuration file (JSON5) for other settings: TLS, access control,
             shared memory. What it leaves out is as without it: no multicast, for one.
         clock_rate: Messages a second on ``/clock``, on the run's clock.
-        max_message_size: Bytes of a message from outside at most.
-        definitions: Types that ROS 2 does not come with, and the ``.msg`` file of each.
+        max_message_size: Bytes of a message from outside, at most.
+        definitions: Message types missing in ROS 2, and the ``.msg`` file of each.
         subscriptions: Topics of ROS 2 whose messages become events.
         publications: Topics to publish by functions of the user's own.
         services: Groups of services to offer. ``simulation``: simulation_interfaces, by which ROS
             pauses, steps and ends the run. ``vehicle``: ``std_srvs/Trigger`` as ``arm``,
             ``disarm``, ``take_off`` and ``land`` below each vehicle's name.
         step: Simulated time of one step of ``step_simulation`` and ``simulate_steps``.
-        paused: Whether simulated time stands from the run's start until a service lets it go on.
+        paused: Whether simulated time stands from the run's start until a service resumes it.
     """
 
     domain_id: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
@@ -259,7 +257,7 @@ def import_mapping(topic: str, path: str) -> Callable[[Any, Any], Any]:
 
 
 def event_type(publication: OwnPublication) -> type[Event]:
-    """Return the type of the events that a publication is of.
+    """Return the type of a publication's events.
 
     Raises:
         ValueError: It cannot be imported, or is no event's.

@@ -66,11 +66,14 @@ _LENGTH = struct.Struct("<I")
 _NONE = np.zeros(0, np.uint8)
 
 POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
-"""A point of a cloud's PointCloud2: its colour is one field, ``rgb``, as PCL packs it."""
+"""Point of a cloud's PointCloud2: colour in a single field, ``rgb``, as PCL packs colours."""
 
 LIDAR_POINT = np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
-"""A point of a lidar's PointCloud2, with the fields that Velodyne's driver writes, and that LIO-SAM
-and FAST-LIO read: ``time`` is seconds after the message's stamp, which is that of the first ray."""
+"""Point of a lidar's PointCloud2, with the fields of Velodyne's driver.
+
+LIO-SAM and FAST-LIO read them; ``time`` is seconds after the message's stamp, that of the first
+ray.
+"""
 
 _FLOAT32, _UINT16 = 7, 4
 """Of sensor_msgs/msg/PointField."""
@@ -103,7 +106,7 @@ class ImageWriter:
         self._buffer = bytearray()
 
     def write(self, time: Time, data: npt.NDArray[Any]) -> bytearray:
-        """Return the message; it is overwritten by the next.
+        """Return the message; the next call overwrites its bytes.
 
         Args:
             time: Seconds and nanoseconds.
@@ -214,7 +217,7 @@ def depth_pixels(message: Any) -> npt.NDArray[np.float32]:
 
 
 def decoded_pixels(code: npt.NDArray[np.uint8]) -> npt.NDArray[Any]:
-    """Return the pixels of an encoded image, in RGB if it has colours.
+    """Return the pixels of an encoded image, RGB if in colours.
 
     Raises:
         ValueError: It is no image.
@@ -226,7 +229,7 @@ def decoded_pixels(code: npt.NDArray[np.uint8]) -> npt.NDArray[Any]:
 
 
 def _rows(message: Any, pixel: int) -> npt.NDArray[np.uint8]:
-    """Return an image's bytes, shape (height, width * pixel), without what fills up its rows."""
+    """Return an image's bytes without padding of rows, shape (height, width * pixel)."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data: npt.NDArray[np.uint8] = message.data
     if height < 1 or width < 1 or step < width * pixel or len(data) != height * step:
@@ -241,7 +244,7 @@ HEAD = struct.Struct("<iff")
 
 
 def inverse_depth(depth: npt.NDArray[np.float32], farthest: float, quantization: float) -> bytes:
-    """Return inverse depth as compressed_depth_image_transport has it.
+    """Return inverse depth as encoded by compressed_depth_image_transport.
 
     Args:
         depth: Metres, shape (height, width); ``inf`` where there is none.

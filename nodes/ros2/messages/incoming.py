@@ -1,4 +1,4 @@
-"""ROS messages to events, in our frames. What makes no sense is refused with a ValueError.
+"""Events from ROS messages, in our frames. Invalid messages raise ValueError.
 
 A function for each row of `mappings`; a mapping of the user's own is called alike. World ENU
 becomes NED, body FLU FRD; optical axes stay.
@@ -49,14 +49,14 @@ from nodes.ros2.messages.typestore import Stamps
 
 
 class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
-    """What a reader needs beside the message.
+    """Input of a reader besides the message.
 
     Attributes:
-        source: Of the event.
+        source: Source of the event.
         now: On the run's clock (ns).
         stamps: How times in messages become stamps.
-        frame_id: If set, stands in the place of the message's own.
-        vehicle: Which a set-point is for.
+        frame_id: If set, replaces the message's.
+        vehicle: Vehicle of a set-point.
     """
 
     source: str
@@ -74,7 +74,7 @@ class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
         return self.stamps.back(header.stamp.sec, header.stamp.nanosec, self.now)
 
     def frame(self, header: Any, default: str) -> str:
-        """Return the frame that an event is to name."""
+        """Return the frame for an event: `frame_id`, the header's, or else `default`."""
         return self.frame_id or header.frame_id or default
 
 
@@ -97,7 +97,7 @@ def estimate_with_covariance(message: Any, context: MessageContext) -> Event:
 
 
 def newest(message: Any, context: MessageContext) -> Event:
-    """Read the last pose of a Path, which each time holds all poses so far, as an estimate."""
+    """Read the last pose of a Path, whose messages repeat all poses so far, as an estimate."""
     if not message.poses:
         raise ValueError("poses: expected one or more, found none")
     pose = message.poses[-1]
@@ -171,7 +171,7 @@ def imu(message: Any, context: MessageContext) -> Event:
 
 
 def distance(message: Any, context: MessageContext) -> Event:
-    """Read a Range; what is not within its limits is out of reach."""
+    """Read a Range; a distance outside its limits is out of reach."""
     least, most, found = (
         float(value) for value in (message.min_range, message.max_range, message.range)
     )
@@ -282,12 +282,12 @@ def nothing(message: Any, context: MessageContext) -> None:
 def camera_announcement(
     message: Any, source: str, images: tuple[str, ...], frame_id: str = ""
 ) -> CameraAnnouncement:
-    """Return the announcement of a camera that looks ahead from the body's origin.
+    """Return the announcement of a camera looking ahead from the body's origin.
 
     Args:
         message: A ``sensor_msgs/msg/CameraInfo``.
-        images: Which kinds of them there are.
-        frame_id: If set, stands in the place of the message's own.
+        images: Kinds of its images.
+        frame_id: If set, replaces the message's.
 
     Raises:
         ValueError: The message is no calibration of a camera.

@@ -1,4 +1,4 @@
-"""The table of all mappings between events and ROS messages, and what follows from it.
+"""Table of all mappings between events and ROS messages, and lookups in the table.
 
 Bridge, recorder, replay, judge and viewers read it: who adds a mapping adds a row, and its function
 to `outgoing` or `incoming`.
@@ -71,7 +71,7 @@ _POSE, _TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped
 _COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 _SENSOR = Qos(depth=5, reliable=False)
-"""As rclcpp's ``SensorDataQoS``; the setting `sensor_qos` may have it reliable."""
+"""QoS of rclcpp's ``SensorDataQoS``; reliable if the setting `sensor_qos` says so."""
 
 _COLOURS, _DEPTH = ("rgb", "grey"), ("depth",)
 
@@ -89,23 +89,23 @@ def _always(_: PublishingConfig) -> bool:
 
 
 class Mapping(msgspec.Struct, frozen=True):
-    """Between events and one type of ROS message: how it is published, how it is read, or both.
+    """Mapping between events and a type of ROS message: published, read, or both.
 
     Attributes:
-        kind: Name of what is published.
+        kind: Name of the publication.
         topic: Its topic, `{}` standing for the source of the events.
         type: Of the messages.
-        group: To which it belongs in the setting ``publish``.
-        events: What becomes such messages; an event of several rows in the order of the table.
+        group: Its group in the setting ``publish``.
+        events: Published events; an event of several rows goes by the order of the table.
         write: Makes the message.
-        announced: By whom; its topic is then there from the start.
-        gives: Of what a camera says that it gives, one at least of these.
+        announced: Announcements for which the topic is there from the start.
+        gives: Kinds of image of which a camera has to give at least one.
         qos: Quality of service.
         large: Whether a message takes long to make.
         image: Whether an estimator may subscribe to it for its images.
-        source: Returns what `{}` stands for; `None` for an event that has no such message.
+        source: Returns the text for `{}`; `None` for an event without such a message.
         wanted: Whether settings let it be published, beside `group`.
-        use: What the messages become, as settings name it.
+        use: Use of the messages, as settings name it.
         read: Makes the event.
         becomes: Type of the events that are read, if it is not `events`.
         bags: Whether only replays of bags read it.
@@ -227,7 +227,7 @@ MAPPINGS = (
 # fmt: on
 
 PUBLISHED = tuple(row for row in MAPPINGS if row.kind)
-"""What is made of events."""
+"""Rows of the messages made of events."""
 
 READERS = {(row.type, row.use): row for row in MAPPINGS if row.use}
 """By type of message and use."""
@@ -235,23 +235,23 @@ READERS = {(row.type, row.use): row for row in MAPPINGS if row.use}
 LARGE: tuple[type[Event], ...] = tuple(
     dict.fromkeys(each for row in PUBLISHED if row.large for each in row.events)
 )
-"""Events whose messages take long to make: in threads, one for each of these types."""
+"""Events with slow messages: made in threads, a thread for each of these types."""
 
 SMALL: tuple[type[Event], ...] = (
     *dict.fromkeys(each for row in PUBLISHED if not row.large for each in row.events),
     TrackedFeatures,  # no message: it tells whose estimates an estimator's are
 )
-"""All other events of which messages are made, or made in another way."""
+"""All other events with messages, and events with an effect on messages."""
 
 
 @cache
 def rows_of(event: type[Event]) -> tuple[Mapping, ...]:
-    """Return the messages that events of a type become."""
+    """Return the rows of an event type's messages."""
     return tuple(row for row in PUBLISHED if issubclass(event, row.events))
 
 
 def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Topic | None:
-    """Return the topic for the events of a source; `None` if it is not to be published."""
+    """Return the topic for the events of a source; `None` if not published."""
     rows = (row for row in PUBLISHED if row.kind == kind and row.group in config.publish)
     row = next((row for row in rows if row.wanted(config)), None)
     if row is None:
@@ -270,7 +270,7 @@ def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Topic
 
 
 def announced_topics(announcement: Announcement) -> Iterator[tuple[TopicKind, str]]:
-    """Yield kind and source of the topics for what a node announced."""
+    """Yield kind and source of the topics for an announcement."""
     source, images = announcement.source, set[str]()
     if isinstance(announcement, CameraAnnouncement):
         images = {*announcement.images}

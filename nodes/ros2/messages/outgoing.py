@@ -51,20 +51,20 @@ from nodes.ros2.messages.typestore import Time, TypeStore
 
 _ZEROS_9, _ZEROS_36 = np.zeros(9), np.zeros(36)
 _UNKNOWN = np.array([-1.0, *[0.0] * 8])
-"""A covariance that says: this is not measured (sensor_msgs/Imu)."""
+"""Covariance of an unmeasured quantity (sensor_msgs/Imu)."""
 
 
 class Outgoing:
-    """What messages are made of beside the event: types, frames, settings, announcements.
+    """Context of outgoing messages: types, frames, settings, announcements.
 
     Args:
         time: Returns the time in messages of a stamp (ns).
 
     Attributes:
-        names: What ROS calls the frames of the run.
+        names: Names of the run's frames in ROS.
         cameras: By source.
-        bodies: Sources of what moves by itself.
-        sensors: What was announced of a topic, by its kind and source.
+        bodies: Sources of bodies that move by themselves.
+        sensors: Announcement of a topic, by its kind and source.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Outgoing:
         self._writers: dict[tuple[str, str, str], ImageWriter] = {}
 
     def announced(self, announcement: Announcement) -> None:
-        """Note what a node announced."""
+        """Register an announcement."""
         if isinstance(announcement, CameraAnnouncement):
             self.cameras[announcement.source] = announcement
         elif isinstance(announcement, BodyAnnouncement):
@@ -88,7 +88,7 @@ class Outgoing:
         self.transforms.announced(announcement)
 
     def make(self, type_: str, **fields: Any) -> Any:
-        """Return a message of which all fields are given."""
+        """Return a message from all of its fields."""
         return self.store.message(type_)(**fields)
 
     def header(self, event: Any, frame_id: str | None = None) -> Any:
@@ -97,7 +97,7 @@ class Outgoing:
         return self.store.header(self.time(event.stamp), frame)
 
     def image(self, event: Image | DepthImage | SegmentationImage, encoding: str) -> bytearray:
-        """Return a ``sensor_msgs/msg/Image``, by a writer that is kept for the next one."""
+        """Return a ``sensor_msgs/msg/Image``, by a writer kept for later images."""
         key = event.source, self.names.name(event.frame_id, event.source), encoding
         if key not in self._writers:
             self._writers[key] = ImageWriter(self.store, *key[1:])
@@ -173,7 +173,7 @@ def nothing(*_: Any) -> None:
 
 
 def camera_info(out: Outgoing, event: Image | DepthImage) -> Any:
-    """Return a sensor_msgs/CameraInfo: K, D, R (one) and P, with a stereo rig's baseline."""
+    """Return a sensor_msgs/CameraInfo: K, D, R (identity) and P, with a stereo baseline."""
     camera = out.cameras[event.source]
     info = camera.info
     none = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
@@ -292,17 +292,17 @@ def estimate_with_covariance(out: Outgoing, event: PoseEstimate) -> Any:
 def transforms(
     out: Outgoing, event: Odometry | PoseStamped | PoseEstimate | TransformStamped
 ) -> Any:
-    """Return a tf2_msgs/TFMessage of where an event puts frames that move."""
+    """Return a tf2_msgs/TFMessage of the moving frames in an event."""
     return out.tree(out.time(event.stamp), out.transforms.of(event))
 
 
 def fixed_transforms(out: Outgoing, _: Event | None) -> Any:
-    """Return a tf2_msgs/TFMessage of all frames that do not move."""
+    """Return a tf2_msgs/TFMessage of all fixed frames."""
     return out.tree(out.time(0), out.transforms.static())
 
 
 def path(out: Outgoing, event: Odometry | PoseEstimate) -> bytearray | None:
-    """Return a nav_msgs/Path of a source, if that is due."""
+    """Return a nav_msgs/Path of a source, if due."""
     return out.paths.message(event, out.time(event.stamp))
 
 
@@ -329,7 +329,7 @@ def imu(out: Outgoing, event: Imu) -> Any:
 
 
 def distance(out: Outgoing, event: Range) -> Any:
-    """Return a sensor_msgs/Range of a sensor that looks along its frame's x axis."""
+    """Return a sensor_msgs/Range of a sensor looking along its frame's x axis."""
     type_ = out.store.message("sensor_msgs/msg/Range")
     sensor, more = out.sensors.get(("range", event.source)), {}
     if "variance" in type_.__annotations__:  # since Iron; 0 says: not known

@@ -1,4 +1,4 @@
-"""The path of a vehicle, or of an estimate of it, as ``nav_msgs/msg/Path`` for RViz.
+"""Path of a vehicle, or of an estimate, as ``nav_msgs/msg/Path`` for RViz.
 
 A path is sent whole again and again, so its poses are kept as the bytes that they are sent as; the
 bytes are those that rosbags would make.
@@ -20,7 +20,7 @@ from runtime.time.schedule import SECOND
 
 _COUNT = struct.Struct("<I")
 _CDR = 4
-"""Bytes before a message, from which alignment is not counted."""
+"""Bytes before a message, excluded from alignment."""
 _POSE = 56
 """Seven float64: position, and the quaternion's x, y, z, w."""
 
@@ -38,10 +38,10 @@ class Paths:
         self._names = names
         self._config = config
         self._paths: dict[str, tuple[PathMessage, int]] = {}
-        """By source: the path, and when it is to be sent again (ns)."""
+        """Path and its next time of sending (ns), by source."""
 
     def message(self, event: Odometry | PoseEstimate, time: Time) -> bytearray | None:
-        """Add a pose to the path of its source; return the path if that is due.
+        """Add a pose to the path of its source; return the path if due.
 
         Args:
             time: Of its stamp, in messages: seconds and nanoseconds.
@@ -66,7 +66,7 @@ class Paths:
 
 
 class PathMessage:
-    """The message of a path: poses of one body in one frame.
+    """Message of a path: poses of a body in a frame.
 
     Args:
         frame: The poses' parent, as ROS calls it.
@@ -115,7 +115,7 @@ class PathMessage:
         self._kept, self._last = self._kept + 1, position
 
     def message(self, time: Time, position: Vector3, orientation: Quaternion) -> bytearray:
-        """Return the path up to a pose, which need not be kept.
+        """Return the path up to a pose, kept or not.
 
         Args:
             time: Seconds and nanoseconds.
@@ -135,7 +135,7 @@ class PathMessage:
         row["pose"] = (*position, x, y, z, w)
 
     def _first(self, time: Time) -> bytearray:
-        """Return a path of the first pose: after it, all poses are aligned alike."""
+        """Return a path of the first pose: all later poses are aligned alike."""
         make, row = self._store.message, self._rows[0]
         x, y, z, qx, qy, qz, qw = row["pose"].tolist()
         pose: Any = make("geometry_msgs/msg/Pose")(

@@ -35,7 +35,7 @@ Write = Callable[[Outgoing, Any], Any]
 
 
 class Publisher(Protocol):
-    """Takes the messages of one topic."""
+    """Protocol of a topic's publisher."""
 
     @property
     def topic(self) -> Topic:
@@ -91,11 +91,11 @@ class Publishing(Generic[P]):
 
     @property
     def publishers(self) -> list[P]:
-        """Return what was declared so far."""
+        """Return the publishers declared so far."""
         return [each for each in self._publishers.values() if each is not None]
 
     def announced(self, announcement: Announcement) -> None:
-        """Declare the topics of what a node announced."""
+        """Declare the topics of an announcement."""
         if isinstance(announcement, VehicleAnnouncement):
             self._vehicles.append(announcement.source)
         elif isinstance(announcement, EstimatorAnnouncement):
@@ -106,12 +106,12 @@ class Publishing(Generic[P]):
                 self._out.sensors[key] = announcement
 
     def warm_up(self) -> None:
-        """Make everything that a first message needs, while there is time."""
+        """Compute all type hashes for the first messages, while there is time."""
         for type_ in {row.type for row in PUBLISHED}:
             self._store.hash(type_)
 
     def unannounced(self) -> Iterator[str]:
-        """Yield a line for each setting that names what nobody announced."""
+        """Yield a line for each setting with an unannounced name."""
         config = self._config
         for setting, name, known, what in (
             ("vehicle", config.vehicle, self._vehicles, "a vehicle"),
@@ -124,14 +124,14 @@ class Publishing(Generic[P]):
                 )
 
     def unused(self) -> Iterator[str]:
-        """Yield a line for each new name that no topic got."""
+        """Yield a line for each new name in `topics` without a topic."""
         names = {each.topic.name for each in self.publishers}
         for given, name in self._config.topics.items():
             if topic_name(self._config.namespace, name) not in names:
                 yield f'topics: expected the name of a topic, found "{given}", which none has'
 
     def begin(self) -> None:
-        """Put what holds for the whole run: the frames that do not move."""
+        """Put the fixed transforms, for the whole run."""
         if self._out.transforms.static():
             self._put("tf_static", "", outgoing.fixed_transforms, None)
 
@@ -140,7 +140,7 @@ class Publishing(Generic[P]):
         self._put("clock", "", outgoing.clock, now)
 
     def put(self, event: Event) -> None:
-        """Put the messages of an event; those of `LARGE` ones in threads, one for each type."""
+        """Put the messages of an event; for `LARGE` events in threads, a thread per type."""
         if isinstance(event, TrackedFeatures):
             self.names.vehicles.tracked(event)
         if isinstance(event, TransformStamped) and self._out.transforms.add_static(event):
@@ -159,7 +159,7 @@ class Publishing(Generic[P]):
                 publisher.put(message if done else self._store.serialize(message))
 
     def _publisher(self, kind: TopicKind, source: str) -> P | None:
-        """Return a publisher that wants messages, declared now if nobody announced the source."""
+        """Return the source's publisher if in demand, declared now if new; else `None`."""
         try:
             publisher = self._publishers[kind, source]
         except KeyError:

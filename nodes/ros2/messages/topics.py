@@ -1,4 +1,4 @@
-"""Topics and frames: their names as ROS allows them, quality of service, and what is published.
+"""Topics and frames: names allowed by ROS, quality of service, and publishing settings.
 
 Frames and how their axes lie are those of REP 103 and REP 105. The definitions of services that
 rosbags does not come with are as in their packages' ``.srv`` files, without comments, constants and
@@ -19,14 +19,14 @@ from events.frames import Axes, axes_of
 from runtime import NodeConfig
 
 NO_HASH = "TypeHashNotSupported"
-"""What Humble says in the place of a type's hash."""
+"""Text of Humble in the place of a type's hash."""
 
 _DEFAULT_DEPTH = 42
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class Qos(msgspec.Struct, frozen=True, kw_only=True):
-    """Quality of service, as far as we use it.
+    """Quality of service, as far as used here.
 
     Attributes:
         reliable: Else best effort.
@@ -41,7 +41,7 @@ class Qos(msgspec.Struct, frozen=True, kw_only=True):
     keep_all: bool = False
 
     def text(self) -> str:
-        """Return what stands in a token; what is rmw_zenoh_cpp's default stays empty.
+        """Return the text in a token; defaults of rmw_zenoh_cpp stay empty.
 
         ``reliability:durability:history,depth:deadline s,ns:lifespan s,ns:liveliness,lease s,ns``
         """
@@ -53,7 +53,7 @@ class Qos(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Topic(msgspec.Struct, frozen=True, kw_only=True):
-    """A topic as one end of it sees it.
+    """A topic from the view of an endpoint.
 
     Attributes:
         name: With its leading slash.
@@ -82,7 +82,7 @@ def dds_type(type_: str) -> str:
 
 
 def topic_name(namespace: str, name: str) -> str:
-    """Return a topic's full name; a name that begins with a slash stands for itself.
+    """Return a topic's full name; a name with a leading slash is full already.
 
     Raises:
         ValueError: ROS would not allow the name.
@@ -97,7 +97,7 @@ def topic_name(namespace: str, name: str) -> str:
 
 
 def ros_name(source: str) -> str:
-    """Return what comes nearest to the name of a source of events that ROS allows."""
+    """Return the name allowed by ROS nearest to the name of a source."""
     parts = [re.sub(r"[^A-Za-z0-9_]", "_", part) for part in source.split("/") if part]
     return "/".join(f"_{part}" if part[0].isdigit() else part for part in parts) or "_"
 
@@ -131,17 +131,17 @@ Rate = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class PublishingConfig(NodeConfig):
-    """Settings of what is published.
+    """Settings of the published topics.
 
     Attributes:
-        namespace: Before all topics' names that do not begin with a slash.
-        publish: Which groups of topics are published.
-        topics: Other names for topics, by the name that they would have.
+        namespace: Prefix of all topic names without a leading slash.
+        publish: Groups of topics to publish.
+        topics: Other names for topics, by default name.
         time: ``simulated``: stamps count from the run's start, and ``/clock`` gives the time (set
             ``use_sim_time``). ``wall``: they are shifted to the wall clock, and there is no
             ``/clock``; with the real clock only.
-        vehicle: Whose truth ``/tf`` shows; if empty, that of all vehicles which are announced.
-            If there are several, their frames begin with the vehicle's name.
+        vehicle: Vehicle whose truth ``/tf`` shows; if empty, all announced vehicles. If there are
+            several, their frames begin with the vehicle's name.
         tf: ``truth``, or the source of the estimates that place ``base_link`` instead.
         path_rate: Messages a second, at most, of the path of a vehicle or of an estimate.
         path_step: Metres from one pose of a path to the next.
@@ -191,10 +191,10 @@ class PublishingConfig(NodeConfig):
 
 
 def check_name(where: str, name: str) -> None:
-    """Make sure that ROS allows a name.
+    """Check a name by the rules of ROS.
 
     Raises:
-        ValueError: It does not; the message begins with `where`.
+        ValueError: Not allowed; the message begins with `where`.
     """
     try:
         topic_name("/", name)
@@ -240,7 +240,7 @@ class CameraFrames(msgspec.Struct, frozen=True):
 
 
 class FrameNames:
-    """Our frames' names and axes, and what ROS calls them.
+    """Names and axes of the run's frames, and their names in ROS.
 
     Of one vehicle alone, frames have the names of REP 105 (``odom``, ``base_link``). Once there is
     a second, the vehicle's name stands before those of each: ``drone/odom``, ``drone/base_link``.
@@ -256,7 +256,7 @@ class FrameNames:
         """Whose frames are distinguished."""
 
     def add(self, camera: CameraAnnouncement) -> CameraFrames:
-        """Add a camera: its frames have its own name, or its vehicle's too if that is taken."""
+        """Add a camera: its frames have its own name, or its vehicle's too if taken."""
         self.vehicles.announced(camera)
         if camera.frame_id not in self._cameras:
             name = ros_name(camera.source.rpartition("/")[2])
@@ -268,7 +268,7 @@ class FrameNames:
         return found
 
     def camera(self, frame_id: str) -> CameraFrames | None:
-        """Return the frames of the camera with this optical frame, if there is one."""
+        """Return the frames of the camera with this optical frame, if any."""
         known = self._cameras.get(frame_id)
         if known is None:
             return None
@@ -279,7 +279,7 @@ class FrameNames:
         return CameraFrames(f"{prefix}{name}_link", f"{prefix}{name}_optical_frame")
 
     def name(self, frame_id: str, source: str = "") -> str:
-        """Return what ROS calls a frame that a source names."""
+        """Return the ROS name of a source's frame."""
         if frame_id == "map" or frame_id in self.own:
             return frame_id
         camera = self.camera(frame_id)

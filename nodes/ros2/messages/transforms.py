@@ -56,11 +56,12 @@ class Transforms:
         self._fixed: dict[tuple[str, str], tuple[str, Pose]] = {}
         """Vehicle (or sensor) and child to parent and pose; names are given when all are known."""
         self._mounted: dict[str, tuple[str, str, Pose] | None] = {}
-        """Optical frame of a camera to source, parent and pose; none if nothing carries it."""
+        """Source, parent and pose of a mounted camera, by optical frame; `None` for a free camera.
+        """
         self._free: dict[str, str] = {}
-        """Sources of cameras that nothing carries, to their optical frame."""
+        """Optical frame of each free camera, by source."""
         self._bodies: set[str] = set()
-        """Sources of what moves by itself; each is its frame, too."""
+        """Sources of self-moving bodies; each is also the name of a frame."""
 
     def announced(self, announcement: Announcement) -> None:
         """Add where a vehicle starts, or where a camera is mounted."""
@@ -88,7 +89,7 @@ class Transforms:
             self._bodies.add(announcement.source)
 
     def add_static(self, event: TransformStamped) -> bool:
-        """Add a transform that a node sent, if it is fixed; tell whether it is new."""
+        """Add a node's transform, if fixed; return whether the frame is new."""
         vehicle, child = self._names.vehicles.of(event.source), event.child_frame_id
         if not event.static or self._names.camera(child) or self._is_fixed(vehicle, child):
             return False
@@ -113,7 +114,7 @@ class Transforms:
     def of(
         self, event: Odometry | PoseEstimate | PoseStamped | TransformStamped
     ) -> list[Transform]:
-        """Return where an event puts frames that move."""
+        """Return the transforms of the moving frames in an event."""
         match event:
             case Odometry():
                 return self.odometry(event)
@@ -125,7 +126,7 @@ class Transforms:
                 return self.moving(event)
 
     def odometry(self, event: Odometry) -> list[Transform]:
-        """Return where a true pose puts a vehicle's body, or one that has a frame of its own."""
+        """Return the transform of a true pose: a vehicle's body, or a body with its own frame."""
         known = not self._starts or event.source in self._starts
         if not known and (self._only or event.child_frame_id == "base_link"):
             return []
@@ -138,7 +139,7 @@ class Transforms:
         return self._place(event) if event.source == self._body else []
 
     def pose(self, event: PoseStamped) -> list[Transform]:
-        """Return where a free camera is, or a body that moves by itself."""
+        """Return the transform of a free camera, or of a self-moving body."""
         if event.source in self._bodies:
             axes = self._names.axes(event.frame_id)
             rotation = convert_rotation(axes, "body", event.orientation)
@@ -151,7 +152,7 @@ class Transforms:
         return [self._link(event.frame_id, frame_id, pose, event.source)]
 
     def moving(self, event: TransformStamped) -> list[Transform]:
-        """Return a moving transform that a node sent."""
+        """Return a node's moving transform, unless the frame is placed otherwise."""
         child = event.child_frame_id
         fixed = self._is_fixed(self._names.vehicles.of(event.source), child)
         if fixed or self._names.camera(child) or child == "base_link":

@@ -1,4 +1,4 @@
-"""Message types, their hashes, CDR, and bags: the only module that imports rosbags.
+"""Message types, their hashes, CDR, and bags: the only import of rosbags.
 
 Messages are objects of the classes that rosbags makes from the types' definitions; their fields
 have the names in ROS's files. A mapping of the user's own is called with an event and a
@@ -31,7 +31,7 @@ Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 
 
 def _hash_as_ros_2_does() -> None:
-    """Have rosbags hash ``char`` as ROS 2 has it in message files: as ``uint8``.
+    """Have rosbags hash ``char`` like ROS 2 in message files: as ``uint8``.
 
     rosidl_adapter turns the one into the other before anything is hashed. rosbags takes it for
     IDL's char, so that keys of such types would meet nobody, and bags with them be refused.
@@ -42,11 +42,11 @@ def _hash_as_ros_2_does() -> None:
 
 
 class MessageError(ValueError):
-    """Bytes are not the message that they should be; the message says what is wrong."""
+    """Bytes do not hold the expected message; the error text has the reason."""
 
 
 class TypeStore:
-    """The message types of one distribution of ROS 2.
+    """Message types of a distribution of ROS 2.
 
     Args:
         distribution: Whose definitions hold; a few differ (``sensor_msgs/msg/Range``).
@@ -117,7 +117,7 @@ class TypeStore:
         self._store.register(types)
 
     def check(self, type_: str) -> None:
-        """Make sure that a type is known, and what it is made of.
+        """Check for a type, and for the types of its fields.
 
         Raises:
             ValueError: It is not known.
@@ -133,7 +133,7 @@ class TypeStore:
             raise ValueError(f"{type_}: expected a definition of {error} too, found none") from None
 
     def hash(self, type_: str) -> str:
-        """Return a type's hash as it stands in keys (REP 2011: ``RIHS01_`` and 64 digits).
+        """Return a type's hash for keys (REP 2011: ``RIHS01_`` and 64 digits).
 
         Raises:
             ValueError: The type is not known.
@@ -142,7 +142,7 @@ class TypeStore:
         return self._store.hash_rihs01(type_) if self._hashed else NO_HASH
 
     def definition(self, type_: str) -> str:
-        """Return a type's definition with those of what it is made of, as recordings have it.
+        """Return a type's definition with those of its fields' types, as in recordings.
 
         Raises:
             ValueError: The type is not known.
@@ -171,7 +171,7 @@ class TypeStore:
         return self._store.types[type_](**{name: self._zero(*each) for name, each in fields})
 
     def _zero(self, kind: Any, of: Any) -> Any:
-        """Return a field's zero, by what rosbags says of it."""
+        """Return a field's zero, by its description in rosbags."""
         if kind.name == "NAME":
             return self.zero(of)
         if kind.name == "BASE":
@@ -270,7 +270,7 @@ class Bag:
             raise ValueError(f"{self._path}: expected a readable bag, found: {error}") from error
 
     def close(self) -> None:
-        """Close it."""
+        """Close the bag."""
         self._reader.close()
 
 
@@ -295,7 +295,7 @@ class Stamps(msgspec.Struct, frozen=True):
         return divmod(stamp + self.offset, SECOND)
 
     def stamp(self, seconds: int, nanoseconds: int) -> int:
-        """Return a message's time on the run's clock (ns), whether it is one of the run or not."""
+        """Return a message's time on the run's clock (ns), inside or outside the run."""
         return int(seconds) * SECOND + int(nanoseconds) - self.offset
 
     def back(self, seconds: int, nanoseconds: int, now: int) -> int:
@@ -333,7 +333,7 @@ class MessageBuilder:
         self._time = time
 
     def make(self, type_: str, **fields: Any) -> Any:
-        """Return a message; fields that are not given are zero, empty or false.
+        """Return a message; fields not given are zero, empty or false.
 
         Raises:
             ValueError: There is no such type.

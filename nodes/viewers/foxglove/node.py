@@ -1,4 +1,4 @@
-"""The server as a node: which events it takes, and where they are passed on."""
+"""Foxglove server as a node: its events, and their way to the server."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _QUEUED = (Image, DepthImage, PointCloud, LidarScan, TrackedFeatures)
 """Events whose messages take long to make."""
 
 WAITING = 8
-"""Images of one kind that wait to be passed on; the oldest is dropped, and counted."""
+"""Images of a kind waiting to be passed on; the oldest is dropped, and counted."""
 
 _REFUSALS = 10
-"""Different ones that are logged."""
+"""Different refusals to log, at most."""
 
 
 class FoxgloveServer(Node[FoxgloveConfig]):
@@ -86,7 +86,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         self.log.info("open %s in Foxglove", server.address)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Declare the topics of what is announced."""
+        """Declare the topics of an announcement."""
         if self._publishing is not None:
             self._publishing.announced(announcement)
 
@@ -130,7 +130,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
 
     @on(*SMALL)
     def measurements(self, event: Event) -> None:
-        """Pass on what is small, at once."""
+        """Pass on small events at once."""
         if self._publishing is not None:
             self._publishing.put(event)
 

@@ -70,7 +70,7 @@ class Messages:
         self._m = types
 
     def features(self, event: TrackedFeatures) -> Any:
-        """Return an ImageAnnotations: what agrees in green, the rest in red."""
+        """Return an ImageAnnotations: inliers in green, the rest in red."""
         groups = [
             self._m.PointsAnnotation(
                 timestamp=self._time(event.stamp),
@@ -95,7 +95,7 @@ class Messages:
         )
 
     def scene(self, *entities: Any) -> Any:
-        """Return a SceneUpdate of what `line` and `body` return."""
+        """Return a SceneUpdate of entities from `line` and `body`."""
         return self._m.SceneUpdate(entities=list(entities))
 
     def line(self, trail: Trail, name: str, piece: list[Vector3]) -> Any:
@@ -109,7 +109,7 @@ class Messages:
         return self._m.SceneEntity(frame_id=trail.frame_id, id=name, lines=[strip])
 
     def body(self, name: str, frame_id: str, boxes: Sequence[Box] = VEHICLE) -> Any:
-        """Return a body as a SceneEntity that goes where its frame goes; by default a vehicle's."""
+        """Return a body as a SceneEntity fixed to its frame; by default a vehicle's."""
         vector = self._m.Vector3
         cubes = []
         for centre, (length, width, height), colour in boxes:
@@ -165,10 +165,10 @@ class RosTopics:
 
 
 class RosTopic:
-    """One of them.
+    """A topic of ROS messages.
 
-    Viewers that come later get the newest message of what ROS keeps for late joiners, and of a
-    cloud that is no sensor's: a map.
+    Later viewers get the newest message of a transient-local topic, and of a cloud that is no
+    sensor's: a map.
     """
 
     def __init__(self, topics: RosTopics, topic: Topic) -> None:
@@ -179,11 +179,11 @@ class RosTopic:
 
     @property
     def wanted(self) -> bool:
-        """Tell whether anybody looks, or may look later at what is kept."""
+        """Tell whether the topic has a viewer, or keeps messages for later viewers."""
         return self._kept or self._topics.server.wanted(self.topic.name)
 
     def put(self, message: bytearray) -> None:
-        """Send a message to those who look."""
+        """Send a message to the topic's viewers."""
         data, server, stamp = bytes(message), self._topics.server, self._topics.stamp
         if self._kept:
             server.latch(self.topic.name, lambda: data, stamp)
@@ -198,12 +198,11 @@ SMALL: tuple[type[Event], ...] = (
 """Events whose messages are made at once."""
 
 _LEFT_OUT = {"clock", "paths", "camera_poses", "body_poses", "segmentation_images"}
-"""Groups of ROS's topics that repeat what the protocol, the scene or transforms have, or that
-Foxglove cannot show."""
+"""Groups of ROS topics left out: shown in another way, or not at all by Foxglove."""
 
 
 class Publishing:
-    """Turns events into messages. To make one takes some tenths of a second: not on the loop."""
+    """Converter of events to messages. Takes tenths of a second to create: not on the loop."""
 
     def __init__(self, server: Server, config: FoxgloveConfig) -> None:
         self._server = server
@@ -231,13 +230,13 @@ class Publishing:
         self._truths: dict[str, RecentPoses] = {}  # by vehicle
         self._trails: dict[str, Trail] = {}
         self._bodies: dict[str, Callable[[], Any]] = {}
-        """What makes their entities, by source: their frames' names depend on who else there is."""
+        """Makers of the bodies' entities, by source: frame names depend on the other vehicles."""
         self._plan = PlanSelection()
         server.declare("/scene", "SceneUpdate")
         server.declare("/log", "Log")
 
     def announced(self, announcement: Announcement) -> None:
-        """Declare the topics of what is announced."""
+        """Declare the topics of an announcement."""
         source = announcement.source
         self._ros.announced(announcement)
         match announcement:
@@ -251,12 +250,12 @@ class Publishing:
                 )
 
     def begin(self) -> None:
-        """Put what holds for the whole run."""
+        """Put the messages for the whole run."""
         self._ros.begin()
         self._server.latch("/scene", self._whole_scene, 0)
 
     def features(self, event: TrackedFeatures) -> None:
-        """Put the features that an estimator tracks in an image; beside the loop."""
+        """Put an estimator's tracked features of an image; beside the loop."""
         if (camera := self._frames.get(event.frame_id)) is not None:
             topic = f"/{ros_name(camera)}/features/{ros_name(event.source)}"
             self._server.declare(topic, "ImageAnnotations")
@@ -264,7 +263,7 @@ class Publishing:
                 self._server.log(topic, self._make.features(event), event.stamp)
 
     def put(self, event: Event) -> None:
-        """Put the messages of an event: images and point clouds beside the loop, the rest on it."""
+        """Put an event's messages: of images and clouds beside the loop, of others on the loop."""
         match event:
             case PointCloud():  # in the frame of an estimator if it is that
                 frame = self._renamed.get(event.frame_id, event.frame_id)
@@ -292,7 +291,7 @@ class Publishing:
         self._extend(f"truth/{source}", event.frame_id, colour, event)
 
     def _estimate(self, event: PoseEstimate) -> None:
-        """Put an estimate, and the frame it places: ``<estimator>/<body>``.
+        """Put an estimate, and its body's frame: ``<estimator>/<body>``.
 
         Estimates that are not in ``map`` begin at the true pose of their time.
         """
@@ -314,7 +313,7 @@ class Publishing:
             )
 
     def _parent_of(self, event: PoseEstimate) -> str:
-        """Return the frame that an estimator works in, aligned with the truth if it is its own."""
+        """Return an estimator's parent frame; its own frame is first aligned with the truth."""
         if event.frame_id == "map":
             return "map"
         frame_id = f"{event.source}/{event.frame_id}"
@@ -361,7 +360,7 @@ class Publishing:
             self._server.log("/scene", self._make.scene(line), event.stamp)
 
     def _whole_scene(self) -> Any:
-        """Return all that is drawn, for a viewer that connects; in any thread."""
+        """Return the whole scene so far, for a new viewer; in any thread."""
         bodies = [make() for make in list(self._bodies.values())]
         lines = [
             self._make.line(trail, name, piece)

@@ -1,4 +1,4 @@
-"""The library, its server, and the door to it: the only module that imports foxglove.
+"""Foxglove's library and server, and a gate before them: the only import of foxglove.
 
 The server has threads of its own. To make and log a small message takes about 4 µs where nobody
 looks, and 30 µs where somebody does (most of it to wake such a thread): done on the loop.
@@ -27,16 +27,16 @@ from runtime.extras import install_command
 from runtime.tools.monitor.client import LONGEST_HEAD, HttpError, host_of, parse_head, response
 
 MOST = 64
-"""Viewers at a time, those included that have yet to send their request."""
+"""Viewers at a time, including those still to send their request."""
 
 _HEAD_TIMEOUT = 10.0
-"""Real seconds in which a viewer has to send its request."""
+"""Real seconds for a viewer to send its request."""
 
 _PART = 1 << 16
 
 
 def hidden_host() -> str:
-    """Return an address of this machine that no page can guess."""
+    """Return a random address of this machine, for no page to guess."""
     return str(ipaddress.IPv4Address((127 << 24) + 2 + secrets.randbelow((1 << 24) - 4)))
 
 
@@ -116,7 +116,7 @@ class Gate:
                 viewer.close()
 
     def _holds(self, connection: socket.socket) -> bool:
-        """Note a connection; tell whether there is room for it."""
+        """Register a connection; return False if there is no room."""
         with self._lock:
             if self._closed or len(self._open) >= 2 * MOST:
                 return False
@@ -155,7 +155,7 @@ class Gate:
 
 
 def _read_head(viewer: socket.socket) -> tuple[bytes, bytes]:
-    """Return a request up to its empty line, and what has come after it."""
+    """Return a request up to its empty line, and any bytes after."""
     data = b""
     while b"\r\n\r\n" not in data:
         if len(data) > LONGEST_HEAD:
@@ -169,7 +169,7 @@ def _read_head(viewer: socket.socket) -> tuple[bytes, bytes]:
 
 
 def _pass_on(source: socket.socket, target: socket.socket) -> None:
-    """Pass on what comes until either is at its end, and then end both."""
+    """Pass on bytes until either connection ends, then end both."""
     buffer = memoryview(bytearray(_PART))
     with contextlib.suppress(OSError):
         while count := source.recv_into(buffer):
@@ -214,7 +214,7 @@ Make = Callable[[], Any]
 """Returns a message."""
 
 _CLOSING = 2.0
-"""Real seconds that viewers have to go."""
+"""Real seconds for viewers to leave."""
 
 
 class Server:
@@ -273,7 +273,7 @@ class Server:
         self.address = f"ws://{host}:{self._gate.port}"
 
     def declare(self, topic: str, kind: str) -> None:
-        """Declare a topic of one of Foxglove's own types: ``CompressedImage``."""
+        """Declare a topic of a Foxglove type: ``CompressedImage``."""
         if topic not in self._channels:
             channel = getattr(self._typed, f"{kind}Channel")
             self._channels[topic] = channel(topic, context=self._context)
@@ -290,11 +290,11 @@ class Server:
         return bool(self._channels[topic].has_sinks())
 
     def log(self, topic: str, message: Any, stamp: int) -> None:
-        """Send a message to those who look; in any thread."""
+        """Send a message to the topic's viewers; in any thread."""
         self._channels[topic].log(message, log_time=stamp)
 
     def latch(self, topic: str, make: Make, stamp: int) -> None:
-        """Send what `make` returns now, and to whoever looks at the topic from now on."""
+        """Send the message of `make` now, and to every later viewer of the topic."""
         with self._lock:
             self._latched[topic] = make, stamp
         if self.wanted(topic):
@@ -329,7 +329,7 @@ class _Listener:
         self._subscribed = subscribed
 
     def on_subscribe(self, _: Any, channel: Any) -> None:
-        """Send the topic's newest message to a viewer that has subscribed."""
+        """Send the topic's newest message to a new viewer."""
         self._subscribed(channel.topic)
 
     def on_unsubscribe(self, _: Any, channel: Any) -> None:

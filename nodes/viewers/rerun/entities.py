@@ -1,4 +1,4 @@
-"""Where things stand in Rerun's tree of entities, which is also its tree of frames.
+"""Tree of entities in Rerun, also its tree of frames.
 
 map                        the world: x north, y east, z down
 map/<vehicle>              a vehicle's body, where it truly is
@@ -35,7 +35,7 @@ LOG = "log"
 
 
 def path(*names: str) -> str:
-    """Return an entity's path; slashes of sources divide it, what Rerun cannot read is escaped."""
+    """Return an entity's path: names divided at slashes, special characters escaped."""
     parts = [part for name in names for part in name.split("/") if part]
     return "/".join(re.sub(r"([^\w.-])", r"\\\1", part) for part in parts)
 
@@ -73,20 +73,20 @@ class EntityLog:
         stream.set_log_tick_enabled(False)
 
     def at(self, number: int, stamp: int) -> None:
-        """Set the time of what is put next: the event's number, and its stamp (ns)."""
+        """Set the time of the next entries: the event's number, and its stamp (ns)."""
         self.stream.set_time("event", sequence=number)
         self.stream.set_time("run", duration=np.timedelta64(stamp, "ns"))
 
     def put(self, entity: str, *what: Any) -> None:
-        """Log something at that time."""
+        """Log components of an entity at the set time."""
         self.stream.log(entity, *what)
 
     def static(self, entity: str, *what: Any) -> None:
-        """Log what holds for the whole run."""
+        """Log components for the whole run."""
         self.stream.log(entity, *what, static=True)
 
     def columns(self, entity: str, events: Sequence[Numbered[E]], columns: Iterable[Any]) -> None:
-        """Log rows at once, one for each event."""
+        """Log rows at once, a row for each event."""
         stamps = np.array([event.stamp for _, event in events], "timedelta64[ns]")
         numbers = np.array([number for number, _ in events], np.int64)
         self.stream.send_columns(
@@ -100,23 +100,23 @@ class EntityLog:
 
 
 Eye = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Where the eye is and what it looks at, metres in ``map``."""
+"""Position and target of the eye, metres in ``map``."""
 
 _SHOWN = 2
 """Cameras whose images have a place of their own; those of more share tabs."""
 
 
 _ABREAST = 4
-"""Plots that have a place of their own at most."""
+"""Plots with a place of their own, at most."""
 
 
 class Contents(msgspec.Struct):
-    """What there is to show.
+    """Contents of the layout.
 
     Attributes:
-        trails: Entities of which all that was logged is shown, up to the time that is shown.
+        trails: Entities shown with their whole past, up to the time that is shown.
         cameras: By entity: its images (``rgb``, ``grey``, ``depth``, ``segmentation``).
-        plots: By title: what it shows.
+        plots: By title: the entities plotted.
         eye: Where to look from; None leaves it to the viewer.
     """
 
@@ -195,4 +195,4 @@ def _camera(rrb: Any, entity: str, kinds: list[str]) -> tuple[str, list[Any]]:
 
 
 _DARK = (22, 25, 31)
-"""Behind the world, whatever the viewer's theme: the colours of paths are made for it."""
+"""Background of the world in every theme, matched to the colours of paths."""

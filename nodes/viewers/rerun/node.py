@@ -1,4 +1,4 @@
-"""The view as a node: which events it takes, how many of them, and when it passes them on."""
+"""Rerun view as a node: its events, their number, and the times of passing them on."""
 
 from __future__ import annotations
 
@@ -31,15 +31,18 @@ from nodes.viewers.rerun.sdk import RerunConfig
 from runtime import Node, Stream, on
 
 _LARGE, _SMALL = 256, 16384
-"""Events that wait to be passed on: images and clouds, and the rest. In lockstep time waits for the
-recorder, and nothing ever has to be dropped; in real time the oldest is, and counted."""
+"""Events waiting to be passed on: images and clouds, and the rest.
+
+In lockstep time waits for the recorder, and nothing ever has to be dropped; in real time the
+oldest is, and counted.
+"""
 
 _PACK = 2048
-"""Events that are passed on at once, at most."""
+"""Events passed on at once, at most."""
 
 
 class RerunView(Node[RerunConfig]):
-    """Shows a run in Rerun, or writes what Rerun can open.
+    """View of a run in Rerun, or a file for Rerun.
 
     ::
 
@@ -64,7 +67,7 @@ class RerunView(Node[RerunConfig]):
         self._small: Stream[Numbered[Event]] = Stream(f"{self.name}.small", _SMALL, "drop_oldest")
 
     async def on_startup(self) -> None:
-        """Start the process that logs."""
+        """Start the process of the recorder."""
         config, file = self.config, None
         if config.mode == "save":
             if self.out is None:
@@ -79,7 +82,7 @@ class RerunView(Node[RerunConfig]):
             self.log.info("open %s", page)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Note it for the recorder."""
+        """Store an announcement for the recorder."""
         self._announcements.append(announcement)
 
     @on(Image, DepthImage, SegmentationImage)
@@ -115,12 +118,12 @@ class RerunView(Node[RerunConfig]):
         *MEASURED,
     )
     def measurements(self, event: Event) -> None:
-        """Keep what is small."""
+        """Queue a small event."""
         self._received += 1
         self._small.offer((self._received, event))
 
     async def run(self) -> None:
-        """Pass on the events that have come, again and again.
+        """Pass on the waiting events, again and again.
 
         In lockstep the run goes on for one period while a batch is logged.
         """
@@ -159,7 +162,7 @@ class RerunView(Node[RerunConfig]):
             await self._recorder.call_for(0.0, Recorder.begin, self._announcements)
 
     def _take(self) -> list[Numbered[Event]]:
-        """Return what waits, in the order in which it came."""
+        """Return the waiting events, in the order of arrival."""
         batch = [
             stream.receive_nowait()
             for stream in (self._large, self._small)

@@ -47,7 +47,7 @@ GROUPS: dict[type[Event], str] = {
 """Parts of the tree of plots, by type of event."""
 
 _HANDY = {"rad": ("°", 180.0 / np.pi), "s": ("ms", 1000.0)}
-"""By unit of a score: what is plotted instead, and how many of it make one."""
+"""Unit to plot instead of a score's unit, and the factor."""
 
 PLOTS = {
     "position error (m)": "+ /scores/position_error/**",
@@ -60,7 +60,7 @@ PLOTS = {
     "satellite velocity (m/s)": "+ /fixes/velocity/**",
     "wind (m/s)": "+ /wind/velocity/**",
 }
-"""Which plots have a place in the layout, by title, and what they show."""
+"""Plots with a place in the layout, by title, and their entities."""
 
 _TITLED = ("position_error", "rotation_error")
 """Metrics whose plots have the unit in their title."""
@@ -75,7 +75,7 @@ class Plots:
         self._known: set[str] = set()
 
     def measurements(self, kind: type[Event], source: str, events: Sequence[Numbered[Any]]) -> None:
-        """Put measurements of one sensor."""
+        """Put the measurements of a sensor."""
         for field in fields_of(kind):
             entity = entities.path(GROUPS[kind], field, source)
             rows = np.array([numbers(event, field) for _, event in events])
@@ -136,7 +136,7 @@ class ColouredPoints(msgspec.Struct, frozen=True, eq=False):
 
 
 class ScenePoints:
-    """Makes points in the world of the depth and colours of one camera, at a bounded rate.
+    """Points in the world from a camera's depth and colours, at a bounded rate.
 
     Args:
         rate: Sets a second at most; 0: none.
@@ -158,7 +158,7 @@ class ScenePoints:
         self._poses: deque[PoseStamped] = deque(maxlen=REMEMBERED)
 
     def take(self, event: Image | DepthImage | PoseStamped) -> ColouredPoints | None:
-        """Take one of the three parts; return the points when all are there and a set is due."""
+        """Take an image, depth or pose; return the points when all are there and a set is due."""
         match event:
             case Image():
                 self._image = event

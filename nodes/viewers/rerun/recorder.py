@@ -46,14 +46,17 @@ from nodes.viewers.rerun.sdk import RerunConfig, Viewer, load
 from nodes.viewers.rerun.world import World
 
 _GATHERED = 500
-"""Events that are written into a file together."""
+"""Events written into a file together."""
 
 _TIMEOUT = 3.0
-"""Real seconds that a viewer has to take what was logged. If it takes longer, all that comes is
-left out until it has: the library would first fill hundreds of megabytes, and then stand still."""
+"""Real seconds for a viewer to take the logged data.
+
+If it takes longer, all that comes is left out until it has: the library would first fill hundreds
+of megabytes, and then stand still.
+"""
 
 _SECOND_TIMEOUT = 0.01
-"""Real seconds for the same, once it took longer."""
+"""Real seconds for the same, after a first timeout."""
 
 
 _NO_DISTORTION = (
@@ -63,7 +66,7 @@ _NO_DISTORTION = (
 
 
 class Recorder:
-    """One recording.
+    """Recording of a run.
 
     Args:
         name: Of the run, as the viewer lists it.
@@ -107,11 +110,11 @@ class Recorder:
         self._waiting: list[Numbered[Event]] = []
 
     def page(self) -> str:
-        """Return the address of the page that shows the run; empty if there is none."""
+        """Return the address of the run's page; empty if there is none."""
         return "" if self._viewer is None else self._viewer.page
 
     def begin(self, announcements: Iterable[Announcement]) -> None:
-        """Put what holds for the whole run."""
+        """Put the announced entities, for the whole run."""
         vehicles_first = sorted(announcements, key=lambda a: not isinstance(a, VehicleAnnouncement))
         for each in vehicles_first:
             match each:
@@ -131,7 +134,7 @@ class Recorder:
         self._show()
 
     def log(self, batch: Sequence[Numbered[Event]]) -> None:
-        """Put events, in the order in which they came.
+        """Put events, in the order of arrival.
 
         What goes into a file is gathered first: each entity's rows have a head of their own.
         """
@@ -167,7 +170,7 @@ class Recorder:
         return self._left_out
 
     def close(self) -> str:
-        """Write the rest, and end; return what went wrong with a viewer, or nothing.
+        """Write the rest, and end; return a viewer's trouble, or nothing.
 
         Raises:
             RuntimeError: The file could not be written.
@@ -191,7 +194,7 @@ class Recorder:
         return trouble
 
     def _taken(self) -> bool:
-        """Tell whether a viewer has taken what was logged; wait for that, but only once."""
+        """Return whether a viewer takes the logged data in time; if late before, wait briefly."""
         try:
             self._stream.flush(timeout_sec=_SECOND_TIMEOUT if self._behind else _TIMEOUT)
         except RuntimeError:
@@ -241,7 +244,7 @@ class Recorder:
         self._stream.send_blueprint(layout(self._rrb, contents))
 
     def _eye(self) -> Eye | None:
-        """Return an eye that sees all of the flight from above, from south-west."""
+        """Return an eye above the whole flight, from the south-west."""
         low, high = self._world.bounds
         if self._config.mode != "save" or not np.isfinite(low).all():
             return None

@@ -82,7 +82,7 @@ _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 """A terminal's codes for colours."""
 
 _PR_SET_PDEATHSIG = 1
-"""prctl(2): which signal a process gets when its parent ends."""
+"""prctl(2) option: signal to a process at its parent's end."""
 
 
 def load() -> Any:
@@ -102,7 +102,7 @@ def load() -> Any:
 
 
 def check_display() -> None:
-    """Make sure that there is a screen for a window.
+    """Check for a screen to show a window.
 
     Raises:
         MissingDependencyError: There is none.
@@ -115,7 +115,7 @@ def check_display() -> None:
 
 
 class Viewer:
-    """Rerun's program: a web server that ends with this process, or a window that stays.
+    """Rerun's program: a web server for the life of this process, or a lasting window.
 
     The library's own functions for either listen on all of the machine's addresses; the program
     has options for that.
@@ -161,7 +161,7 @@ class Viewer:
             raise
 
     def last_words(self) -> str:
-        """Return the last error that the program printed if it has ended, or nothing."""
+        """Return the program's last printed error after its end, or nothing."""
         if self._process.poll() is None:
             return ""
         self._output.seek(0)
@@ -194,7 +194,7 @@ class Viewer:
 
 
 def program() -> str:
-    """Return the path of the program that comes with the library."""
+    """Return the path of the program in Rerun's library."""
     found = importlib.util.find_spec("rerun_cli")
     if found is None or not found.submodule_search_locations:
         raise MissingDependencyError(f"the view needs Rerun's program: {install_command('rerun')}")
@@ -202,7 +202,7 @@ def program() -> str:
 
 
 def _check_free(setting: str, host: str, port: int) -> None:
-    """Refuse a port that another program has, to which we would otherwise talk."""
+    """Refuse a port of another program, lest the viewer's data go there."""
     try:
         family = socket.getaddrinfo(host, port)[0][0]
         with socket.socket(family) as probe:

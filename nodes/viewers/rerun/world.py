@@ -1,4 +1,4 @@
-"""What is in the world: vehicles, paths, estimates, cameras with their images, clouds."""
+"""Entities in the world: vehicles, paths, estimates, cameras with their images, clouds."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from nodes.viewers.rerun.plots import ScenePoints
 from nodes.viewers.rerun.sdk import RerunConfig
 
 CENTIMETRES = 100.0
-"""Steps of a depth image per metre. Finer ones would show noise, which makes files large."""
+"""Steps of a depth image per metre. Finer steps would show noise and make files large."""
 
 _WIND_PERIOD = 100_000_000
 """Nanoseconds between two arrows of a vehicle's wind."""
@@ -59,7 +59,7 @@ _THICK, _THIN = 0.02, 0.01
 
 
 class World:
-    """Writes what has a place."""
+    """Writer of the entities with a place in the world."""
 
     def __init__(self, log: EntityLog, config: RerunConfig) -> None:
         self._to = log
@@ -83,7 +83,7 @@ class World:
         self.images: dict[str, list[str]] = {}
         """Kinds of images there are, by camera's entity."""
         self.trails: list[str] = []
-        """Entities of which all that was logged is to be shown."""
+        """Entities to show with all logged data."""
         self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
         """Where vehicles have been: lowest and highest coordinates, metres in ``map``."""
         log.static(entities.WORLD, self._rr.ViewCoordinates.FRD)
@@ -111,14 +111,14 @@ class World:
         self._path(entities.world("truth", source), colour, _THICK)
 
     def estimator(self, source: str) -> None:
-        """Prepare an estimator's path, and give it a colour."""
+        """Prepare an estimator's path and colour."""
         if source in self.colours:
             return
         self.colours[source] = estimate_colour(len(self.colours))
         self._path(entities.world("estimates", source, "path"), self.colours[source], _THIN)
 
     def camera(self, announced: CameraAnnouncement) -> None:
-        """Prepare a camera: where it sits, and how it sees."""
+        """Prepare a camera: mounting, and projection of its images."""
         config, info = self._config, announced.info
         self._cameras[announced.source] = announced
         self.vehicles.announced(announced)
@@ -142,13 +142,13 @@ class World:
             self.trails.append(entities.world("points", announced.source))
 
     def sensor(self, announced: ImuAnnouncement | SensorAnnouncement) -> None:
-        """Prepare a sensor: where it sits on its vehicle."""
+        """Prepare a sensor: mounting on its vehicle."""
         entity = entities.world(announced.source)
         if announced.frame_id != announced.parent_frame_id:
             self._to.static(entity, self._transform(announced.position, announced.orientation))
 
     def moving_body(self, announced: BodyAnnouncement) -> None:
-        """Prepare a body that moves by itself, and its path."""
+        """Prepare a self-moving body, and its path."""
         box, entity = moving_body(announced.kind), entities.world(announced.source)
         shape = self._rr.Boxes3D(centers=[box.centre], sizes=[box.size], colors=[box.colour])
         self._to.static(f"{entity}/shape", shape)
@@ -158,7 +158,7 @@ class World:
     # What moves.
 
     def odometry(self, source: str, events: Sequence[Numbered[Odometry]]) -> None:
-        """Put true poses of one vehicle."""
+        """Put a vehicle's true poses."""
         self.vehicle(source)
         self._others.setdefault(events[0][1].child_frame_id, entities.world(source))
         truth = self._truth[source]
@@ -171,7 +171,7 @@ class World:
         self._poses(entities.world(source), events)
 
     def estimates(self, source: str, events: Sequence[Numbered[PoseEstimate]]) -> None:
-        """Put estimates of one estimator.
+        """Put an estimator's poses.
 
         Those that are not in ``map`` begin at the true pose of their time, as evaluation aligns
         them.
@@ -212,7 +212,7 @@ class World:
                 self._to.put(entities.world("wind", vehicle), arrow)
 
     def pose(self, number: int, event: PoseStamped) -> None:
-        """Put where a free camera is, or what moves by itself.
+        """Put the pose of a free camera or of a self-moving body.
 
         The pose of a vehicle's camera serves its depth images.
         """
@@ -254,12 +254,12 @@ class World:
         self._extend_scene(event)
 
     def segmentation(self, event: SegmentationImage) -> None:
-        """Put which objects are seen; nothing is object 0."""
+        """Put a segmentation image; class 0 is no object."""
         classes = np.clip(event.data + 1, 0, 65535).astype(np.uint16)
         self._to.put(self._place(event, "segmentation"), self._rr.SegmentationImage(classes))
 
     def features(self, event: TrackedFeatures) -> None:
-        """Put the features that an estimator tracks in an image."""
+        """Put an estimator's tracked features of an image."""
         if (camera := self._frames.get(event.frame_id)) is not None:
             colours = np.where(event.inliers[:, None], INLIER, OUTLIER).astype(np.uint8)
             centres = event.points + 0.5  # Rerun's pixels have their centres at halves
@@ -269,7 +269,7 @@ class World:
             self._to.put(f"{camera}/{kind}/{entity}", points)
 
     def cloud(self, event: PointCloud) -> None:
-        """Put a cloud, in the world or below what its frame belongs to."""
+        """Put a cloud, in the world or below the owner of its frame."""
         entity = entities.world("clouds", event.source)
         for frames in (self._others, self._frames):
             if (owner := frames.get(event.frame_id)) is not None:
@@ -285,13 +285,13 @@ class World:
         self._to.put(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
 
     def finish(self) -> None:
-        """Put what is left of the paths."""
+        """Put the remaining points of the paths."""
         for entity, (path, _, _) in self._paths.items():
             if (rest := path.rest()) is not None:
                 self._strip(entity, *self._latest[entity], rest)
 
     def _place(self, event: Image | DepthImage | SegmentationImage, kind: str) -> str:
-        """Return where an image belongs: to its camera, or by itself if nobody announced that."""
+        """Return an image's entity: below its camera, or by itself if the camera is unannounced."""
         camera = self._entities.get(event.source)
         if camera is None:  # grey images of a camera with colours, or nobody's
             camera = self._frames.setdefault(event.frame_id, entities.path("images", event.source))

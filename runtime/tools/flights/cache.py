@@ -29,7 +29,7 @@ LIMIT = 20.0
 
 
 class Kept(NamedTuple):
-    """A flight that is kept: its file, bytes, and when it was last used (s)."""
+    """A kept flight: its file, size (bytes), and time of last use (s)."""
 
     path: Path
     size: int
@@ -37,7 +37,7 @@ class Kept(NamedTuple):
 
 
 def recorded(config: Config, *, record: bool) -> dict[str, type[Node[Any]]]:
-    """Return nodes that play the flight of a file in the place of those that fly it.
+    """Return stand-ins for the flying nodes of a file, playing their recorded flight.
 
     Args:
         record: Whether to fly it, if it is not kept; this takes as long as the flight alone.
@@ -76,7 +76,7 @@ def home() -> Path:
 
 
 def kept() -> list[Kept]:
-    """Return the flights that are kept, the one used last first."""
+    """Return the kept flights, the last used first."""
     found = []
     for path in home().glob("[!.]*.flight"):
         with contextlib.suppress(OSError):  # removed meanwhile
@@ -86,7 +86,7 @@ def kept() -> list[Kept]:
 
 
 def remove_beyond(gigabytes: float) -> list[Kept]:
-    """Remove the flights that were not used for longest, and return them.
+    """Remove the least recently used flights beyond `gigabytes`, and return them.
 
     What a run has open stays there for it. One that is being flown just now is left alone.
     """
@@ -99,7 +99,7 @@ def remove_beyond(gigabytes: float) -> list[Kept]:
 
 
 def _remove(file: Path, flight: Path) -> bool:
-    """Remove a file of a flight, unless that is locked."""
+    """Remove a file of a flight, unless the flight is locked; tell whether removed."""
     with contextlib.suppress(OSError), _locked(flight, wait=False):
         file.unlink(missing_ok=True)
         return True
@@ -107,7 +107,7 @@ def _remove(file: Path, flight: Path) -> bool:
 
 
 def _write(part: Config, path: Path) -> None:
-    """Fly, and keep it if it can be used again or never can; nothing if it could not be flown."""
+    """Fly, and keep the file, also of an unfit flight; keep nothing if flying fails."""
     new = _unfinished(path)
     try:
         fly(part, new)
@@ -121,7 +121,7 @@ def _write(part: Config, path: Path) -> None:
 
 
 def _unfinished(path: Path) -> Path:
-    """Return the file that a flight is written to before it is whole."""
+    """Return the file of a flight still being written."""
     return path.with_name(f".{path.name}.new")
 
 

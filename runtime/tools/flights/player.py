@@ -1,4 +1,4 @@
-"""Nodes in the place of those that fly, which send what a flight's nodes have sent.
+"""Stand-ins for the nodes of a flight, to send its recorded events again.
 
 If another node ends the run before the flight is over, its ticks end there, but what the flight's
 nodes send while the run ends is what they sent at that time when their ticks went on.
@@ -45,7 +45,7 @@ _CHECKSUM = 16
 
 
 class Action(NamedTuple):
-    """One thing that a node of the flight did.
+    """An action of a node in a flight.
 
     Attributes:
         kind: ``send`` an event, say in a handler that it is ``handled``, ``stop`` the run; or set
@@ -71,7 +71,7 @@ class Action(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """One node of a flight.
+    """A node of a flight.
 
     Attributes:
         announcements: What it announced.
@@ -102,7 +102,7 @@ class Flight(NamedTuple):
 
 
 class Writer:
-    """Writes a flight into a file, which is complete when `end` returns."""
+    """Writer of a flight's file, complete when `end` returns."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -125,7 +125,7 @@ class Writer:
         return place, tuple(map(len, frames))
 
     def end(self, flight: Flight) -> None:
-        """Write the rest; of a flight that cannot be used, nothing else is kept."""
+        """Write the flight after its events; of an unusable flight, without any events."""
         if flight.unfit:
             self._file.seek(0)
             self._file.truncate()
@@ -142,7 +142,7 @@ class Writer:
 
 
 def opened(path: Path) -> tuple[Flight, memoryview] | None:
-    """Return a flight and its file's content; `None` if it cannot be read as it is."""
+    """Return a flight and its file's content; `None` if missing or not readable."""
     if not path.is_file():  # a pipe would wait for ever
         return None
     try:
@@ -176,7 +176,7 @@ def event_at(content: memoryview, sent: Action) -> Any:
 
 
 def prune(occasions: list[list[Action]]) -> None:
-    """Remove the actions that come to nothing."""
+    """Remove the actions leading only to empty occasions."""
     for actions in reversed(occasions):  # what is due later has a higher number
         _prune(actions, occasions)
 
@@ -192,7 +192,7 @@ _DONE.set_result(None)
 
 
 class StandIn(Node[Any]):
-    """Sends again what a node has sent; made for each node of a flight by `stand_ins`."""
+    """Node to repeat the events of a recorded node; made by `stand_ins` for each."""
 
     reads_truth = "recording"
     player: ClassVar[Player]
@@ -204,12 +204,12 @@ class StandIn(Node[Any]):
             self.every(hz, functools.partial(self._tick, ticks), what)
 
     def announce(self) -> list[Announcement]:
-        """Announce what the node did."""
+        """Return the announcements of the recorded node."""
         return self.flown.announcements
 
     @on(Event)
     def hear(self, event: Event) -> bool:
-        """Do what the node did on an event of the flight, in its place among the listeners."""
+        """Repeat the node's actions on an event, in its place among the listeners."""
         return self.player.heard(self.name, event)
 
     async def run(self) -> None:
@@ -218,7 +218,7 @@ class StandIn(Node[Any]):
             self.player.play(self.flown.start, 0)
 
     async def on_shutdown(self) -> None:
-        """End: what would come later does not."""
+        """End the playback of this node: later actions are left out."""
         self.player.leave(self)
 
     def _tick(self, ticks: dict[int, int], tick: Tick) -> None:
@@ -238,7 +238,7 @@ def stand_ins(config: Config, flight: Flight, content: memoryview) -> dict[str, 
 
 
 class Player:
-    """What the stand-ins of a flight have in common: where it stands."""
+    """Playback of a flight, shared by its stand-ins."""
 
     def __init__(self, flight: Flight, content: memoryview) -> None:
         self._flight = flight
@@ -248,7 +248,7 @@ class Player:
         self._delivering: list[tuple[Event, list[Action]]] = []
 
     def enter(self, node: Node[Any]) -> Flown:
-        """Let a node send, and return what there is of it."""
+        """Add a node as sender, and return its record."""
         if not self._nodes:
             for name, value in self._flight.environment.items():
                 node.note_environment(name, value)
@@ -257,11 +257,11 @@ class Player:
         return self._flight.nodes[node.name]
 
     def leave(self, node: Node[Any]) -> None:
-        """Let it send no more."""
+        """Remove a node as sender; its later actions are left out."""
         del self._nodes[node.name]
 
     def play(self, occasion: int, turn: int, first: int = 0) -> None:
-        """Do what was done on an occasion.
+        """Play the actions of an occasion.
 
         Args:
             turn: Up to which it is done now; the rest follows as the loop turns.
@@ -274,7 +274,7 @@ class Player:
             asyncio.get_running_loop().call_soon(self.play, occasion, turn + 1, first)
 
     def heard(self, node: str, event: Event) -> bool:
-        """Do what a node did while an event was delivered to it; return whether it ends there."""
+        """Play a node's actions on a delivered event; tell whether the delivery ends."""
         for sent, inner in reversed(self._delivering):
             if sent is event:
                 for action in [each for each in inner if each.node == node]:

@@ -1,6 +1,6 @@
-"""Notes a flight while it is flown, by looking on: an instrument, and hooks on the loop.
+"""Recorder of a flight while flown: an instrument, and hooks on the loop.
 
-Which nodes of a file fly, and by what a flight is known: settings, sources, files, machine.
+Also the flying nodes of a file, and a flight's key: settings, sources, files, machine.
 """
 
 from __future__ import annotations
@@ -38,17 +38,19 @@ from runtime.time.schedule import Once, Tick, Ticker
 from runtime.tools.flights.player import Action, Flight, Flown, Writer, prune
 
 _REST = 10.0
-"""Seconds of the clock for which a flight goes on without ticks: what is on its way at the end, as
-an image may be, arrives in a run whose estimator takes long to end."""
+"""Seconds of the clock for a flight to go on without ticks.
+
+Events on their way at the end, such as images, arrive in a run whose estimator ends late.
+"""
 
 
 def record(config: Config, path: Path) -> None:
-    """Fly, and write what there is to say of it into a file, which is complete when this returns.
+    """Fly, and write the flight into a file, complete on return.
 
     Raises:
-        VisnavError: Something went wrong in the flight.
+        VisnavError: The flight failed.
         KeyboardInterrupt: A signal ended it.
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     rest = NodeSpec(
         name="(rest)", type_name="", on_error="stop", inputs={}, links={}, node=_Rest,
@@ -91,7 +93,7 @@ class _Recorder(Instrument):
         yield
 
     def flight(self) -> Flight:
-        """Return what there is to say; called when it is over."""
+        """Return the flight; called after its end."""
         state = self._supervisor.state
         if state.stop_requested:  # whatever was to follow is not wanted either
             raise KeyboardInterrupt
@@ -120,7 +122,7 @@ class _Recorder(Instrument):
     # What nodes do.
 
     def wrap_call(self, node: str, what: str, call: Call) -> Call:
-        """Note what a node does in a call."""
+        """Note the actions of a node in a call."""
 
         def wrapped(given: Any) -> Any:
             within = None
@@ -215,7 +217,7 @@ class _Recorder(Instrument):
         patched._run_once = turned
 
     def _later(self, kind: str, due: float) -> int:
-        """Note that something is due later, and return that occasion."""
+        """Note an action due later, and return the number of its occasion."""
         occasion = self._new()
         self._act(kind, due=due, later=occasion)
         return occasion
@@ -236,13 +238,13 @@ _DRIVERS = (
 )
 _VARIABLES = re.compile("MUJOCO_|E?GL|_?_?E?GL[VX]?_|LIBGL_|GALLIUM_|MESA_|LP_")
 _PARSING = threading.Lock()
-"""Python 3.11's parser counts the depth of all threads in one place (cpython#106905)."""
+"""Lock for Python 3.11's parser: all threads share a depth counter (cpython#106905)."""
 _NAMED = re.compile(r'\bfile\w*\s*=\s*"([^"]+)"')
 _FOLDERS = re.compile(r'(?:mesh|texture|asset)dir\s*=\s*"([^"]+)"')
 
 
 def flight_of(config: Config) -> Config | None:
-    """Return the part of a file that flies; `None` if something else has an influence on it.
+    """Return the flying part of a file; `None` if anything else affects the flight.
 
     So does a node whose output a port of the flight takes, unless the port is narrowed to a source
     of the flight. Nodes that write files, or give no equal results, have to run themselves.
@@ -271,14 +273,14 @@ def _narrowed(spec: NodeSpec, port: str) -> str | None:
 
 
 def settings_key(flight: Config) -> str:
-    """Return what is equal for flights with equal settings."""
+    """Return a key, equal for flights with equal settings."""
     run = flight.run
     nodes = to_builtins(flight)["nodes"]
     return _hashed([json.dumps([run.seed, run.duration, nodes], default=str, sort_keys=True)])
 
 
 def content_key(flight: Config) -> str:
-    """Return a key of what a flight depends on: settings, sources, files, libraries, drivers."""
+    """Return the key of a flight: its settings, sources, files, libraries, drivers."""
     texts = [settings_key(flight), json.dumps(environment())]
     texts += [f"{k}={v}" for k, v in sorted(os.environ.items()) if _VARIABLES.match(k)]
     for pattern in _DRIVERS:
@@ -301,7 +303,7 @@ def _hashed(parts: Iterable[str | bytes]) -> str:
 
 
 def _sources(modules: Iterable[str]) -> Iterator[Path]:
-    """Yield the files of some modules and of what they import, but for what else is installed."""
+    """Yield the files of modules and their imports, without other installed packages."""
     todo = [*modules, "events"]
     roots = {name.partition(".")[0] for name in todo}
     seen = {""}
@@ -322,7 +324,7 @@ def _sources(modules: Iterable[str]) -> Iterator[Path]:
 
 
 def _imported(path: Path, package: str) -> Iterator[str]:
-    """Yield the modules that a file in a package imports anywhere, and what may be such.
+    """Yield the modules imported anywhere in a package's file, and possible modules.
 
     A file that is no Python names none.
     """
@@ -360,7 +362,7 @@ def _is_here(root: str) -> bool:
 
 
 def _paths(value: Any) -> Iterator[Path]:
-    """Yield the files that settings name; reading the file has made their paths absolute."""
+    """Yield the files named by settings; paths are absolute since the file was read."""
     if isinstance(value, str) and value.startswith("/") and Path(value).exists():
         yield Path(value)
     elif isinstance(value, dict | list):
@@ -369,7 +371,7 @@ def _paths(value: Any) -> Iterator[Path]:
 
 
 def _read_by(path: Path) -> set[Path]:
-    """Return a file and what a model of MuJoCo's includes, or what a folder holds."""
+    """Return a file and all files included by a MuJoCo model, or the files in a folder."""
     if path.is_dir():
         return {each for each in path.rglob("*") if each.is_file()}
     found, todo, folders = {path}, [path], {path.parent}

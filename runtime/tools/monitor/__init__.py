@@ -1,4 +1,4 @@
-"""The monitor: shows a run from outside while it goes, and controls it.
+"""The monitor: observation and control of a live run from outside.
 
 `protocol` is the plain data that it exchanges with a run. `observer` makes snapshots and carries
 commands out; `server` is in the run and `client` anywhere else; `screen` and `web` show it. Nothing

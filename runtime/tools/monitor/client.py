@@ -37,7 +37,7 @@ from runtime.tools.monitor.protocol import (
 )
 
 ANSWER_TIMEOUT = 10.0
-"""Real seconds within which a run must answer a command."""
+"""Real seconds for a run to answer a command."""
 
 
 class Client:
@@ -99,7 +99,7 @@ class Client:
         return answer
 
     async def image(self, camera: str) -> bytes:
-        """Return the newest image of one of a snapshot's cameras, as JPEG.
+        """Return the newest image of a snapshot's camera, as JPEG.
 
         Raises:
             CommandError: There is none, or the run does not answer.
@@ -129,7 +129,7 @@ class Client:
 
 
 def ask(path: Path, command: Command) -> str:
-    """Send a command to a run, without an event loop, and return what was done.
+    """Send a command to a run, without an event loop, and return the answer.
 
     Raises:
         CommandError: No run listens there, or it refused.
@@ -183,7 +183,7 @@ def socket_of(run: str) -> Path:
 
 
 def runs() -> dict[str, Path]:
-    """Return the runs that listen now, by name; ``name-process`` where two have the same name."""
+    """Return the sockets of listening runs, by name; ``name-process`` for equal names."""
     listening = [path for path in sorted(user_folder().glob("*.sock")) if _answers(path)]
     names = [path.stem.rpartition("-")[0] for path in listening]
     return {
@@ -216,7 +216,7 @@ def find(run: str | None) -> Path:
 
 
 def _answers(path: Path) -> bool:
-    """Tell whether a run listens at a socket; remove one that a killed run has left."""
+    """Tell whether a run listens at a socket; remove the socket of a killed run."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(1.0)
         try:
@@ -236,7 +236,7 @@ LONGEST_BODY = 64 << 10
 
 
 class HttpError(Exception):
-    """A request that cannot be served."""
+    """Refusal of an HTTP request."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -255,7 +255,7 @@ class Request(NamedTuple):
 
 
 _ONCE = {"host", "origin", "content-length", "x-token"}
-"""Headers that say who asks, and for what: if there are two, nobody knows which one counts."""
+"""Headers to be given only once: with two, the valid origin or target would be unclear."""
 
 
 def parse_head(head: str) -> tuple[str, str, dict[str, str]]:
@@ -280,7 +280,7 @@ def parse_head(head: str) -> tuple[str, str, dict[str, str]]:
 
 
 def host_of(headers: dict[str, str]) -> str:
-    """Return the host that a request is for, without its port; empty if it names none."""
+    """Return the host named by a request, without its port; empty if none."""
     host = headers.get("host", "")
     if host.startswith("["):
         return host[1:].partition("]")[0]
@@ -288,10 +288,10 @@ def host_of(headers: dict[str, str]) -> str:
 
 
 async def read_request(reader: asyncio.StreamReader) -> Request:
-    """Read one request.
+    """Read a request.
 
     Raises:
-        HttpError: It is none, or too long.
+        HttpError: No request, or too long.
         EOFError: The other side went.
     """
     try:
@@ -315,7 +315,7 @@ async def read_request(reader: asyncio.StreamReader) -> Request:
 def response(
     status: int, content: bytes, kind: str = "text/plain; charset=utf-8", **headers: str
 ) -> bytes:
-    """Return a response, after which the connection is closed.
+    """Return a response, the last of its connection.
 
     Args:
         content: Its body.
@@ -325,12 +325,12 @@ def response(
 
 
 def event_stream() -> bytes:
-    """Return what begins a stream of server-sent events."""
+    """Return the head of a stream of server-sent events."""
     return _head(200, "text/event-stream", {})
 
 
 def server_sent(data: bytes) -> bytes:
-    """Return an event of a stream; `data` is one line."""
+    """Return an event of a stream; `data` is a single line."""
     return b"data: " + data + b"\n\n"
 
 

@@ -50,10 +50,10 @@ KEPT = 5
 
 
 class Amount(NamedTuple):
-    """Durations of one node or output, added up.
+    """Sum of durations of a node or output.
 
     Attributes:
-        times: How many they are.
+        times: Number of durations.
         total: Their sum, nanoseconds.
         longest: The longest, nanoseconds.
     """
@@ -64,7 +64,7 @@ class Amount(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Counters at one snapshot.
+    """Counters at a snapshot.
 
     Attributes:
         real: Seconds of `time.perf_counter`.
@@ -97,12 +97,12 @@ class RecentSamples:
 
     @property
     def real(self) -> float:
-        """Real seconds that the samples span."""
+        """Real seconds spanned by the samples."""
         return max(self._samples[-1].real - self._samples[0].real, 1e-9)
 
     @property
     def run(self) -> float:
-        """Seconds of the run's clock that the samples span."""
+        """Seconds of the run's clock spanned by the samples."""
         return (self._samples[-1].run - self._samples[0].run) / SECOND
 
     def rate(self, output: str) -> float:
@@ -138,7 +138,7 @@ class DurationSum:
         self.total = 0
         self.longest = 0
         self.last = 0
-        """When the last one ended, on the run's clock (ns); of outputs only."""
+        """End of the last duration, on the run's clock (ns); of outputs only."""
 
     def take(self) -> Amount:
         """Return the sum, and start again from zero."""
@@ -148,7 +148,7 @@ class DurationSum:
 
 
 class Meter(Instrument):
-    """An instrument that adds up durations, and keeps the newest images.
+    """An instrument to add up durations, and to keep the newest images.
 
     Attributes:
         nodes: Time each node took of the loop, by name, without the calls of other nodes in it.
@@ -162,11 +162,11 @@ class Meter(Instrument):
         self.images: dict[str, Image] = {}
         self._clock = clock
         self._inner = [0]
-        """Nanoseconds that the steps within the one that runs have taken."""
+        """Nanoseconds taken by the steps nested in the running step."""
         self.event_sent = self._tap
 
     def wrap_call(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
-        """Return a function that calls `call` and adds up how long it takes."""
+        """Return a function to call `call` and add up its durations."""
         inner, time_ns = self._inner, time.perf_counter_ns
         steps = self.nodes.setdefault(node, DurationSum())
 
@@ -207,7 +207,7 @@ RECORDS = 100
 
 
 class LastRecords(logging.Handler):
-    """A handler that keeps the last records; runs in the log's own thread."""
+    """A handler to keep the last log records; runs in the log's own thread."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -232,7 +232,7 @@ class LastRecords(logging.Handler):
 
 
 class Observer:
-    """Observes and controls one run."""
+    """Observer and control of a run."""
 
     def __init__(self, supervisor: Supervisor, config: Config, records: LastRecords) -> None:
         self._supervisor = supervisor
@@ -242,7 +242,7 @@ class Observer:
         self._meter: Meter | None = None
         self._recent = RecentSamples(self._sample())
         self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}
-        """Of each node, with their text, which seldom changes."""
+        """Settings of each node, with their text, cached as they seldom change."""
         self._number = 0
 
     def begin(self) -> None:
@@ -288,7 +288,7 @@ class Observer:
         )
 
     def image(self, camera: str) -> Image:
-        """Return the newest image of one of a snapshot's cameras.
+        """Return the newest image of a snapshot's camera.
 
         Raises:
             CommandError: It has sent no image, or nobody watches.
@@ -301,7 +301,7 @@ class Observer:
         return images[camera]
 
     def _sample(self) -> Sample:
-        """Return the counters, with what was measured since the last sample."""
+        """Return the counters, with the durations since the last sample."""
         sent: Counter[str] = Counter()
         for node in self._state.all_nodes:
             for sender in senders(node).values():
@@ -408,7 +408,7 @@ class Observer:
     # Commands.
 
     def execute(self, command: Command) -> str:
-        """Carry a command out, and return what was done.
+        """Carry a command out, and return a text about its effect.
 
         Raises:
             VisnavError: It cannot be carried out; the message says why.

@@ -1,4 +1,4 @@
-"""Snapshots of a run and commands to it: plain data, one JSON object per line.
+"""Snapshots of a run and commands for a run: plain data, a JSON object per line.
 
 The run's observer makes the rows of a snapshot's tables; terminal and page show them as they are.
 """
@@ -39,7 +39,7 @@ _WORDS = {"condition", "event", "value"}
 
 
 def is_number(table: str, column: int) -> bool:
-    """Tell whether a column holds numbers, which are aligned right."""
+    """Tell whether a column holds numbers, to be aligned right."""
     return column > 0 and COLUMNS[table][column] not in _WORDS
 
 
@@ -70,7 +70,7 @@ class ClockState(_Data, frozen=True):
 
     @property
     def pace(self) -> str:
-        """The speed of time, and the speed that was asked for, in words."""
+        """The actual and the requested speed of time, in words."""
         speed = f"{self.speed:.2f} × real time"
         if self.kind == "real":
             return f"{speed} (real)"
@@ -79,14 +79,14 @@ class ClockState(_Data, frozen=True):
 
     @property
     def aim(self) -> float:
-        """The speed that faster and slower start from: the one asked for, or the present one."""
+        """Base for faster and slower: the requested speed, or else the present."""
         return (
             self.target_speed if self.target_speed is not None else max(round(self.speed, 1), 1.0)
         )
 
 
 class LogLine(_Data, frozen=True):
-    """One record of the log.
+    """A record of the log.
 
     Attributes:
         number: Counts the run's records, from 0.
@@ -104,7 +104,7 @@ class LogLine(_Data, frozen=True):
 
 
 class Snapshot(_Data, frozen=True, tag="snapshot"):
-    """A run at one moment.
+    """State of a run at a moment.
 
     Attributes:
         run: Its name.
@@ -152,7 +152,7 @@ class Resume(_Command, frozen=True, tag="resume"):
 
 
 class Step(_Command, frozen=True, tag="step"):
-    """Run for some seconds and pause; without a number, up to what is due next."""
+    """Run for some seconds and pause; without a number, up to the next due time."""
 
     seconds: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
 
@@ -164,7 +164,7 @@ class Speed(_Command, frozen=True, tag="speed"):
 
 
 class Restart(_Command, frozen=True, tag="restart"):
-    """Shut a node down and start it again."""
+    """Restart a node: shut down, then start again."""
 
     node: str
 
@@ -190,7 +190,7 @@ class CommandRequest(msgspec.Struct, frozen=True, kw_only=True, tag="ask"):
 
 
 class ImageRequest(msgspec.Struct, frozen=True, kw_only=True, tag="image"):
-    """Asks for the newest image of one of a snapshot's cameras; answered while somebody watches."""
+    """Request for a snapshot camera's newest image; answered while somebody watches."""
 
     number: int
     camera: str
@@ -215,7 +215,7 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, tag="answer"):
 
 
 class EncodedImage(msgspec.Struct, frozen=True, kw_only=True, tag="jpeg"):
-    """The image that was asked for.
+    """Answer to an `ImageRequest`.
 
     Attributes:
         number: Of the request.
@@ -235,7 +235,7 @@ decode_from_run = msgspec.json.Decoder(FromRun).decode
 decode_command = msgspec.json.Decoder(Command).decode
 
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
-"""What decoding raises: invalid JSON, invalid UTF-8, another type, or too deep nesting."""
+"""Exceptions of decoding: invalid JSON or UTF-8, another type, too deep nesting."""
 
 LONGEST_COMMAND = 256 << 10
 """Bytes of a line to a run at most."""

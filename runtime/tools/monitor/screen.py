@@ -46,13 +46,13 @@ except ImportError:
     ) from None
 
 CONFIRM = 3.0
-"""Seconds within which the key that ends a run must be pressed again."""
+"""Seconds for pressing the key to end a run a second time."""
 
 _COLOURS = {"WARNING": "yellow", "ERROR": "red", "CRITICAL": "red bold"}
 
 
 class Connection(Protocol):
-    """A `runtime.tools.monitor.client.Client`, or a fake of it in a test."""
+    """A `runtime.tools.monitor.client.Client`, or a test's fake."""
 
     def snapshots(self) -> AsyncIterator[Snapshot]:
         """Yield snapshots until the run is over."""
@@ -155,7 +155,7 @@ class Screen(App[str]):
                 log.write(_log_line(line), expand=True)
 
     def _fill(self, name: str, snapshot: Snapshot) -> None:
-        """Update a table's rows in place, so that the cursor stays."""
+        """Update a table's rows in place, to keep the cursor."""
         table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
         found = snapshot.tables[name]
         table.set_class(not found, "none")
@@ -174,7 +174,7 @@ class Screen(App[str]):
     # Keys.
 
     def _ask(self, command: Command) -> None:
-        """Send a command; keys go on working before it is answered."""
+        """Send a command; keys keep working while the answer is awaited."""
         self.run_worker(self._send(command))
 
     async def _send(self, command: Command) -> None:
@@ -190,11 +190,11 @@ class Screen(App[str]):
             self._expect(paused=not paused)
 
     def action_step(self) -> None:
-        """Step to what is due next."""
+        """Step to the next due time."""
         self._ask(Step())
 
     def action_step_far(self) -> None:
-        """Step one second."""
+        """Step by 1 s."""
         self._ask(Step(seconds=1.0))
 
     def action_speed(self, factor: float) -> None:
@@ -205,12 +205,12 @@ class Screen(App[str]):
             self._expect(target_speed=asked)
 
     def action_fastest(self) -> None:
-        """Let time run as fast as it can."""
+        """Let time run as fast as possible."""
         self._ask(Speed(factor=None))
         self._expect(target_speed=None)
 
     def _expect(self, **changes: Any) -> None:
-        """Assume that it was done until the next snapshot, as the next key may come before it."""
+        """Assume a command's effect until the next snapshot, for keys pressed before."""
         if self.snapshot is not None and not self.snapshot.clock.fixed:
             clock = msgspec.structs.replace(self.snapshot.clock, **changes)
             self.snapshot = msgspec.structs.replace(self.snapshot, clock=clock)
@@ -249,7 +249,7 @@ class Screen(App[str]):
         self.query_one("#nodes").focus()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Set what was typed."""
+        """Set the typed setting."""
         self.action_leave_prompt()
         if event.value.strip():
             self._ask(Set(text=event.value))

@@ -46,13 +46,13 @@ PERIOD = 0.2
 """Real seconds between two snapshots."""
 
 CLOSING_TIMEOUT = 1.0
-"""Real seconds that clients have to receive the last snapshot."""
+"""Real seconds for clients to receive the last snapshot."""
 
 _LISTEN_TIMEOUT = 5.0
-"""Real seconds within which the socket must be ready."""
+"""Real seconds for the socket to become ready."""
 
 MAX_BACKLOG = 1 << 20
-"""Bytes that may wait for one client; a slower one misses snapshots."""
+"""Bytes queued for a client at most; a slower client misses snapshots."""
 
 
 MAX_SIDE = 480
@@ -66,7 +66,7 @@ QUALITY = 75
 
 
 class ImageEncoder:
-    """Encodes images beside the run's loop, at most one per camera and `IMAGE_PERIOD`."""
+    """Image encoder beside the run's loop, at most once per camera and `IMAGE_PERIOD`."""
 
     def __init__(self) -> None:
         self._encoded: dict[str, tuple[float, bytes]] = {}
@@ -108,7 +108,7 @@ def small_jpeg(data: npt.NDArray[np.uint8]) -> bytes:
 
 
 class Server:
-    """Serves the clients that watch and control a run.
+    """Server for the clients of a run's monitor.
 
     Args:
         observer: Makes snapshots of the run, and carries commands out.
@@ -129,7 +129,7 @@ class Server:
         self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
 
     def start(self) -> bool:
-        """Start to listen; tell whether that worked."""
+        """Start to listen; tell whether the socket is ready."""
         self._thread.start()
         return self._ready.wait(_LISTEN_TIMEOUT) and self._thread.is_alive()
 
@@ -181,9 +181,9 @@ class Server:
             self._path.unlink()
 
     def _listener(self) -> socket.socket:
-        """Return a socket that listens; it gets the name by which it is found only when it does.
+        """Return a listening socket, at its final path only once listening.
 
-        Before that, others would take it for one that a killed run has left, and remove it.
+        Before, others would take it for the socket of a killed run, and remove it.
         """
         listener = socket.socket(socket.AF_UNIX)
         new = self._path.with_suffix(".new")

@@ -47,14 +47,14 @@ from runtime.tools.monitor.protocol import (
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
 _HOSTS = {"127.0.0.1", "localhost"}
 _MAX_BACKLOG = 3
-"""Snapshots that may wait for a slow page."""
+"""Snapshots queued for a slow page at most."""
 
 
 class Page:
-    """Serves one run's page.
+    """Server of a run's page.
 
     Args:
-        token: That an address must have; random if not given.
+        token: Required in addresses; random if not given.
     """
 
     def __init__(self, client: Client, token: str | None = None) -> None:
@@ -67,7 +67,7 @@ class Page:
         self._end = "the run is over: it does not answer any more"
 
     async def listen(self) -> None:
-        """Send the run's snapshots to all pages until it is over."""
+        """Send the run's snapshots to all pages until the run is over."""
         try:
             async for snapshot in self._client.snapshots():
                 self._last = encode(page_data(snapshot))
@@ -87,7 +87,7 @@ class Page:
             page.put_nowait(data)
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve one connection."""
+        """Serve a connection."""
         try:
             request = await asyncio.wait_for(read_request(reader), 10.0)
             await self._respond(request, writer)
@@ -120,7 +120,7 @@ class Page:
                 raise HttpError(404, f"there is no {request.path}")
 
     def _authorize(self, request: Request) -> None:
-        """Check a request's token, and that it names this machine as host, against DNS rebinding.
+        """Check a request's token and, against DNS rebinding, its host: this machine.
 
         Raises:
             HttpError: It is not allowed.
@@ -191,7 +191,7 @@ class Page:
 
 
 def page_data(snapshot: Snapshot) -> dict[str, Any]:
-    """Return what the page shows of a snapshot."""
+    """Return the data of a snapshot for the page."""
     return {
         "headline": snapshot.headline,
         "paused": snapshot.clock.paused,

@@ -1,4 +1,4 @@
-"""Finds which event led to which: from a sensor's measurement, through nodes, to a set-point.
+"""Causes of events: from a sensor's measurement, through nodes, to a set-point.
 
 Nodes don't declare it, so it is inferred by three rules, the most reliable first:
 
@@ -30,12 +30,12 @@ How = Literal["begins", "follows", "holds"]
 
 
 class SentEvent(msgspec.Struct, eq=False):
-    """One event, and the event that it follows from.
+    """An event and its cause, an earlier event.
 
     Attributes:
         time: Of `time.perf_counter_ns`, when it was sent.
         run: The same on the run's clock (ns).
-        node: That sent it.
+        node: Sender.
         event: Its type.
         source: Its source.
         stamp: Its stamp.
@@ -55,7 +55,7 @@ class SentEvent(msgspec.Struct, eq=False):
     cause: SentEvent | None = None
 
     def path(self) -> list[SentEvent]:
-        """Return all events from the sensor's to this one."""
+        """Return all events from the sensor's event to this."""
         found: list[SentEvent] = []
         each: SentEvent | None = self
         while each is not None:
@@ -65,7 +65,7 @@ class SentEvent(msgspec.Struct, eq=False):
 
 
 class _HeardEvents:
-    """The events a node has received that come from a sensor."""
+    """The sensors' events, and events caused by these, received by a node."""
 
     def __init__(self) -> None:
         self.by_stamp: OrderedDict[int, list[SentEvent]] = OrderedDict()
@@ -86,7 +86,7 @@ class _HeardEvents:
 
 
 class Causes:
-    """Infers the cause of each event, one by one in the order of sending.
+    """Inference of each event's cause, event by event in the order of sending.
 
     Args:
         receivers: The nodes that receive events of a sender, type and source.
@@ -101,10 +101,10 @@ class Causes:
         self._receivers = receivers
         self._heard: dict[str, _HeardEvents] = {}
         self._by_identity: OrderedDict[int, tuple[SentEvent, tuple[str, ...]]] = OrderedDict()
-        """Events, and the nodes that received them."""
+        """Events with their receiving nodes, by `id`."""
 
     def add(self, note: EventNote) -> SentEvent:
-        """Add the next event and return it with its cause."""
+        """Add the next event, and return the event with its cause."""
         node, kind = note.sender.partition(".")[0], self._kinds[note.event]
         sent = SentEvent(note.time, note.run, node, note.event, note.source, note.stamp)
         # Another event may lie where one lay that has come from elsewhere.
@@ -147,5 +147,5 @@ class Causes:
 
 
 def _passes(sent: SentEvent, node: str) -> bool:
-    """Tell whether a path can go on to a node: it goes through none twice."""
+    """Tell whether a path can go on to a node: each node is on a path only once."""
     return all(each.node != node for each in sent.path())

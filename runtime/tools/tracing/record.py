@@ -1,4 +1,4 @@
-"""An instrument that notes a run's steps and events: no more than a tuple each on the loop."""
+"""An instrument to note a run's steps and events: no more than a tuple each on the loop."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ log = logging.getLogger("visnav.runtime")
 
 
 class TraceInstrument(Instrument):
-    """An instrument that notes what it sees, for a `Spool`.
+    """An instrument to note steps, events, thread and worker calls in a `Spool`.
 
     Each note is a tuple that begins with its kind::
 
@@ -53,11 +53,11 @@ class TraceInstrument(Instrument):
         self._notes: list[tuple[Any, ...]] = []
         self._cause = [0]
         self.beside: deque[tuple[Any, ...]] = spool.beside
-        """Notes of other threads, which must not touch the loop's list."""
+        """Notes of other threads, barred from the loop's list."""
         self.event_sent: Tap = self._make_tap()
 
     def wrap_call(self, node: str, what: str, call: Call) -> Call:
-        """Return a function that calls `call` and notes when it began and ended."""
+        """Return a function to call `call` and note its begin and end."""
         notes, add, current, now = self._notes, self._notes.append, self._cause, self._now
         time_ns, flush, identity = time.perf_counter_ns, self._flush, id
 
@@ -101,7 +101,7 @@ class TraceInstrument(Instrument):
         return tap
 
     def wrap_offload(self, node: str, call: Callable[[], Any], name: str) -> Callable[[], Any]:
-        """Return a function that calls `call` and notes when a thread runs it."""
+        """Return a function to call `call` and note its run in a thread."""
         submitted, note = time.perf_counter_ns(), self.beside.append
 
         def noting() -> Any:
@@ -117,14 +117,14 @@ class TraceInstrument(Instrument):
     def worker_called(
         self, process: str, method: str, answer: concurrent.futures.Future[Any]
     ) -> None:
-        """Note a worker's call once it is answered."""
+        """Note a worker's call once answered."""
         asked = time.perf_counter_ns()
         answer.add_done_callback(
             lambda _: self.beside.append(("worker", process, method, asked, time.perf_counter_ns()))
         )
 
     def close(self) -> None:
-        """Hand over what is left, while the run's clock still goes."""
+        """Hand over the remaining notes, while the run's clock still goes."""
         if isinstance(self._clock, RealClock):
             real, run, speed = time.perf_counter_ns(), self._clock.now(), self._clock.speed
             self._spool.rate = ClockRate(round(real - run / speed), speed)

@@ -1,4 +1,4 @@
-"""A file of notes, written while a run goes on, so that memory stays bounded.
+"""A file of notes, written during a run to bound the memory.
 
 A thread encodes a list of notes at a time, which is short enough not to be felt on the loop. What
 the notes mean is in `runtime.tools.tracing.record`.
@@ -22,13 +22,13 @@ from events import Category, Event, Image, Setpoint
 log = logging.getLogger("visnav.runtime")
 
 CHUNK = 1024
-"""Notes in a list, about; encoding one takes some tenths of a millisecond."""
+"""Notes per list, about; encoding a list takes some tenths of a millisecond."""
 
 _LENGTH_BYTES = 4
 
 
 class EventKind(msgspec.Struct, frozen=True):
-    """What a trace must know of a type of event.
+    """Properties of a type of event for traces.
 
     Attributes:
         measured: Whether it is a sensor's: a path may begin with it.
@@ -42,7 +42,7 @@ class EventKind(msgspec.Struct, frozen=True):
 
 
 class EventNote(NamedTuple):
-    """The note of an event, as it is read.
+    """The note of an event, as read from the spool.
 
     Attributes:
         time: Of sending, real time (ns).
@@ -77,7 +77,7 @@ class ClockRate(NamedTuple):
     speed: float
 
     def run(self, real: int) -> int:
-        """Return what the run's clock showed (ns); 0 before it began."""
+        """Return the time of the run's clock (ns) at a real time; 0 before its begin."""
         return max(round((real - self.origin) * self.speed), 0)
 
 
@@ -101,7 +101,7 @@ class Spool:
         self.kinds: dict[str, EventKind] = {}
         self.receivers: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.origin = time.perf_counter_ns()
-        """Before all that is noted."""
+        """Begin of the notes: `time.perf_counter_ns` before all of them."""
         self.failed: OSError | None = None
         """Why there can be no trace any more."""
         self._file = path.open("wb", buffering=0)
@@ -111,11 +111,11 @@ class Spool:
         self._thread.start()
 
     def put(self, notes: list[tuple[Any, ...]]) -> None:
-        """Take a list of notes, in the order in which they were made."""
+        """Take a list of notes, in the order of their making."""
         self._lists.put(notes)
 
     def close(self) -> None:
-        """Write what is left; nothing is taken afterwards."""
+        """Write the remaining notes; nothing is taken afterwards."""
         self._lists.put(None)
         self._thread.join()
         self._file.close()
@@ -125,7 +125,7 @@ class Spool:
         self.path.unlink(missing_ok=True)
 
     def read(self) -> Iterator[list[Any]]:
-        """Yield all notes in the order in which they were taken, and delete the file."""
+        """Yield all notes in the order of taking, and delete the file."""
         with self.path.open("rb") as file:
             while length := file.read(_LENGTH_BYTES):
                 yield from msgspec.msgpack.decode(file.read(int.from_bytes(length, "little")))
@@ -157,7 +157,7 @@ class Spool:
             rest = rest[self._file.write(rest) :]
 
     def _plain(self, note: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Return the note of an event in words and numbers, and remember who heard it."""
+        """Return the note of an event in words and numbers, and remember its receivers."""
         _, time, run, sender, event, source, stamp, identity, cause, listeners = note
         name = "run.announced" if sender is None else sender.name
         key = (name, event.__name__, source)

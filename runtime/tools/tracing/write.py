@@ -1,4 +1,4 @@
-"""Makes a trace of notes, and reads it: how long paths take, and which nodes load the loop.
+"""Traces: written from notes, and read for the latency of paths and the load of nodes.
 
 A trace is JSON trace events, which ui.perfetto.dev and chrome://tracing open. Format: "Trace Event
 Format", the Chromium project's document of 2016. Its time stamps are microseconds of real time; the
@@ -22,7 +22,7 @@ from runtime.tools.tracing.causes import Causes, SentEvent
 from runtime.tools.tracing.spool import ClockRate, EventNote, Spool
 
 MADE_BY = "python -m runtime run --trace"
-"""Marks a trace as one of ours."""
+"""Mark of a trace made by this project."""
 
 LOOP, THREADS, WORKERS, SENSORS = 1, 2, 3, 4
 """Process numbers of the trace's groups of tracks."""
@@ -34,8 +34,10 @@ _TITLES = {
     SENSORS: "exposures",
 }
 _MOMENT = 0.1
-"""Microseconds that the slice of an instant lasts, so that an arrow can begin there. It overlaps
-nothing: an event is delivered later than that, as the note itself is made in between."""
+"""Microseconds of the slice of an instant, for an arrow to begin there.
+
+It overlaps nothing: an event is delivered later, as the note itself is made in between.
+"""
 
 
 def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Iterable[str]) -> None:
@@ -64,7 +66,7 @@ def _open(path: Path, *, compress: bool) -> IO[bytes]:
 
 
 class _Writer:
-    """Turns notes into trace events, one by one."""
+    """Converter of notes into trace events."""
 
     def __init__(self, spool: Spool, nodes: Iterable[str]) -> None:
         self._spool = spool
@@ -146,7 +148,7 @@ class _Writer:
         return min(self._moments.of(sent.stamp, sent.time), sent.time)
 
     def _flow(self, path: list[SentEvent]) -> Iterator[dict[str, Any]]:
-        """Draw arrows from an exposure over all that was sent to a set-point."""
+        """Draw the arrows of a path: from an exposure over all events to a set-point."""
         self._flows += 1
         first = path[0]
         begin = self._exposure(first)
@@ -190,7 +192,7 @@ class _Writer:
 
 
 class _Moments:
-    """The real times at which the run's clock showed its times."""
+    """Real times at the readings of the run's clock."""
 
     KEPT = 100_000
 
@@ -200,7 +202,7 @@ class _Moments:
         self._times: list[int] = []
 
     def add(self, time: int, run: int) -> int:
-        """Note that the clock showed `run` at `time`; return what it really showed then."""
+        """Note the clock's `run` at real time `time`; return the true reading then."""
         if self._rate is not None:
             return self._rate.run(run)
         if not self._runs or run > self._runs[-1]:
@@ -211,7 +213,7 @@ class _Moments:
         return run
 
     def of(self, stamp: int, latest: int) -> int:
-        """Return when the clock showed `stamp`; `latest` if that is not known."""
+        """Return the real time (ns) of the clock's `stamp`; `latest` if unknown."""
         if self._rate is not None:
             return round(self._rate.origin + stamp / self._rate.speed)
         index = bisect.bisect_left(self._runs, stamp)
@@ -219,7 +221,7 @@ class _Moments:
 
 
 def describe(path: list[SentEvent]) -> str:
-    """Return a path as text: ``→`` where an event follows from another, ``⇢`` where it may."""
+    """Return a path as text: ``→`` where an event follows, ``⇢`` where this is a guess."""
     arrows = {"begins": "", "follows": " → ", "holds": " ⇢ "}
     return "".join(
         f"{arrows[s.how]}{s.source if s.how == 'begins' else s.node} {s.event}" for s in path
@@ -231,7 +233,7 @@ def _metadata(what: str, process: int, track: int, **args: Any) -> dict[str, Any
 
 
 class TraceEvent(msgspec.Struct):
-    """One event of a trace; see the format's description for the letters."""
+    """An event of a trace; see the format's description for the letters."""
 
     ph: str
     pid: int
@@ -250,7 +252,7 @@ class Trace(msgspec.Struct, rename={"events": "traceEvents", "about": "otherData
 
 
 class PathLatency(msgspec.Struct, frozen=True):
-    """How long one path from a sensor to a set-point took.
+    """Latency of a path from a sensor to a set-point.
 
     Attributes:
         path: The events on it.
@@ -264,7 +266,7 @@ class PathLatency(msgspec.Struct, frozen=True):
 
 
 class NodeLoad(msgspec.Struct, frozen=True):
-    """How much of the loop's time one node took.
+    """Load of a node on the loop.
 
     Attributes:
         node: Its name.
@@ -272,7 +274,7 @@ class NodeLoad(msgspec.Struct, frozen=True):
         busy_ms: Milliseconds in it, less those in others that it called.
         share: Of the time from the first step to the last.
         longest_ms: The longest step, less what it called.
-        longest: What that was.
+        longest: Name of that step.
     """
 
     node: str
@@ -339,13 +341,13 @@ def node_loads(trace: Trace) -> list[NodeLoad]:
 
 
 def quantile(values: list[float], q: float) -> float:
-    """Return the value that a share `q` of all values does not exceed."""
+    """Return the value not exceeded by a share `q` of all values."""
     ordered = sorted(values)
     return ordered[min(int(q * len(ordered)), len(ordered) - 1)]
 
 
 def _own_times(slices: list[TraceEvent]) -> list[float]:
-    """Return how long each slice took (µs) without those within it; sorted by beginning."""
+    """Return each slice's own time (µs), without nested slices; sorted by beginning."""
     alone = [each.dur for each in slices]
     open_: list[int] = []
     for index, each in enumerate(slices):

@@ -1,4 +1,4 @@
-"""A node in the place of the simulator, which feeds a run from a server of AirSim's."""
+"""Client node in place of the simulator: feeds a run from an AirSim server."""
 
 from sims.airsim.client.node import AirsimClient
 from sims.airsim.client.remote import AirsimClientConfig, RemoteCamera

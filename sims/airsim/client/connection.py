@@ -1,4 +1,4 @@
-"""Connections to a server of AirSim's: calls on the run's loop, and images beside it."""
+"""Connections to an AirSim server: calls on the run's loop, images beside the loop."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RpcCallError(Exception):
 
 
 class RpcClient(asyncio.Protocol):
-    """One connection, of which calls may overlap: replies find their calls by number."""
+    """Connection with overlapping calls: replies are matched to calls by number."""
 
     def __init__(self) -> None:
         self._decoder = wire.Decoder(wire.LONGEST_REPLY)
@@ -45,7 +45,7 @@ class RpcClient(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)  # uvloop's is of another class
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Fail all calls that wait."""
+        """Fail all pending calls."""
         self._lost = exc or ConnectionResetError("the server closed the connection")
         calls, self._calls = self._calls, {}
         for call in calls.values():
@@ -89,7 +89,7 @@ class RpcClient(asyncio.Protocol):
 
 
 class Connection:
-    """A connection that can be made anew, and whose calls have real time limits on either clock.
+    """Reconnectable connection whose calls have real time limits on either clock.
 
     In lockstep, simulated time waits for each reply, so that it comes at one simulated time in
     every run. An `OSError`, which a `TimeoutError` is, always means that the connection is gone.
@@ -103,7 +103,7 @@ class Connection:
         self._client: RpcClient | None = None
 
     async def connect(self, seconds: float) -> None:
-        """Connect, with as many attempts as it takes, and wait for a first reply.
+        """Connect, retrying as often as needed, and wait for a first reply.
 
         Raises:
             OSError: There is no server in so many real seconds.
@@ -170,7 +170,7 @@ class Connection:
 
 
 class ImageSet(NamedTuple):
-    """Images of one instant."""
+    """Images of a single instant."""
 
     stamp: int  # the server's, of the first response (ns)
     images: dict[Wanted, npt.NDArray[Any]]  # by camera and kind, arrays as the events hold them
@@ -179,7 +179,7 @@ class ImageSet(NamedTuple):
 
 
 def requests(wanted: Sequence[Wanted], vehicle: str, cosys: bool) -> tuple[Any, ...]:
-    """Return the arguments of ``simGetImages`` for images of one instant."""
+    """Return the arguments of ``simGetImages`` for images of a single instant."""
     asked = [ImageRequest(name, _TYPES[kind], kind == "depth", False) for name, kind in wanted]
     return (asked, vehicle) if cosys else (asked, vehicle, False)
 
@@ -229,14 +229,14 @@ def decode(responses: Any, wanted: Sequence[Wanted], bgr: bool) -> ImageSet:
 
 
 class ImageSource:
-    """A connection that only asks for images; made in a process of its own.
+    """Connection for images only; made in a process of its own.
 
     A float image comes as a list of numbers, which takes milliseconds to decode, of the loop's too
     if that were done in a thread.
 
     Args:
         cosys: Whether the server is one of Cosys-AirSim's.
-        wanted: What is asked for, in one request.
+        wanted: Images of each request.
         limit: Seconds after which a request is given up, and its connection closed.
     """
 

@@ -1,4 +1,4 @@
-"""The node in the simulator's place: when what is asked, sent and counted."""
+"""AirSim client node: timing of the requests, events and counts."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class AirsimClient(Node[AirsimClientConfig]):
         self._orders: Orders | None = None
 
     async def on_startup(self) -> None:
-        """Connect, ask what is there, and take a first set of images."""
+        """Connect, ask for the server's content, and take a first set of images."""
         if self.checking:
             raise UncheckableError("which cameras there are is known to the server only")
         try:
@@ -82,7 +82,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             raise
 
     async def _look(self) -> None:
-        """Ask for all that is announced; the first images of a server may take their time."""
+        """Ask for everything to announce; a server's first images may take longer."""
         config = self.config
         call = functools.partial(self._state.call, limit=float(config.start_timeout))
         self._remote = found = await ask(call, config, self.name, self.log.warning)
@@ -107,7 +107,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             yield "port: expected one AirsimClient for each server in lockstep, found several"
 
     async def run(self) -> None:
-        """Send the cameras' poses on the body, then what the server gives, until the end."""
+        """Send the cameras' poses on the body, then the server's data until the end."""
         for camera in self._remote.cameras.values():
             self.transforms.send(
                 ev.TransformStamped(
@@ -129,12 +129,12 @@ class AirsimClient(Node[AirsimClientConfig]):
 
     @on(ev.Command)
     def commands(self, event: ev.Command) -> None:
-        """Take a command that is for this vehicle, or log why it is refused."""
+        """Take a command for this vehicle, or log the reason for its refusal."""
         self._take(event, "commands")
 
     @on(ev.Setpoint)
     def setpoints(self, event: ev.Setpoint) -> None:
-        """Take a set-point that is for this vehicle, or log why it is refused."""
+        """Take a set-point for this vehicle, or log the reason for its refusal."""
         self._take(event, "setpoints")
 
     def _take(self, order: ev.Command | ev.Setpoint, port: str) -> None:
@@ -144,7 +144,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             self._report(f"{type(order).__name__} refused", refusal)
 
     async def _lead(self) -> None:
-        """Step the server's time, send what is measured after each step, and pass on the orders."""
+        """Step the server's time; after each step, send the data and pass on orders."""
         rate, period = self.config.imu_rate, round(SECOND / self.config.imu_rate)
         images = max(round(rate / self.config.image_rate), 1)
         control = max(round(rate / self.config.control_rate), 1)
@@ -166,7 +166,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             step += 1
 
     async def _repeat(self, rate: float, work: Callable[[], Awaitable[None]]) -> None:
-        """Do something at a rate, or as often as it can be done."""
+        """Repeat `work` at a rate (Hz), or as often as possible."""
         due, period = self.clock.now(), round(SECOND / rate)
         while True:
             await self._guarded(work)
@@ -194,7 +194,7 @@ class AirsimClient(Node[AirsimClientConfig]):
                 self.odometry.send(found)
 
     async def _follow(self, ahead: int) -> None:
-        """In lockstep, wait for the instant that the server has reached, so far ahead (ns)."""
+        """In lockstep, wait for the server's present instant, `ahead` ns from now."""
         if not -_NEW_CLOCK < ahead < _NEW_CLOCK:
             raise ConnectionResetError(f"the server's clock leaps by {ahead / SECOND:.3g} s")
         if not self._lockstep:
@@ -244,13 +244,13 @@ class AirsimClient(Node[AirsimClientConfig]):
                     self._report(pose.source, f"its {kind} images have another size now")
 
     async def _obey(self) -> None:
-        """Pass on orders, and tell what came of them."""
+        """Pass on orders, and send the resulting vehicle events."""
         if self._orders is not None and self._pose is not None:
             for event in await self._orders.obey(self.clock.now(), self._pose):
                 self.vehicle_events.send(event(stamp=self.clock.now(), source=self.name))
 
     async def _ask(self, method: str, kind: type[T], *arguments: Any) -> T | None:
-        """Call a method, and return what it gave; `None` if that cannot be used."""
+        """Call a method and return its converted result; `None` if unusable."""
         try:
             return msgspec.convert(await self._state.call(method, *arguments), kind)
         except (RpcCallError, msgspec.ValidationError) as error:
@@ -258,7 +258,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             return None
 
     def _made(self, kind: str, stamp: int, make: Callable[..., E], *arguments: Any) -> E | None:
-        """Return an event of the server's stamp; `None` if it is not a new one, or no right one."""
+        """Return an event with the server's stamp; `None` if not new or not valid."""
         stamp -= self._shift
         if stamp <= self._newest.get(kind, -1):
             self.counts[f"{kind}: not newer than the last"] += 1
@@ -273,13 +273,13 @@ class AirsimClient(Node[AirsimClientConfig]):
         return event
 
     def _report(self, what: str, why: str) -> None:
-        """Count something that went wrong, and log why the first time."""
+        """Count a fault, and log its reason the first time."""
         self.counts[what] += 1
         if self.counts[what] == 1:
             self.log.warning("%s: %s", what, why)
 
     async def _guarded(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Do something with the server; go on with new connections if one is lost meanwhile."""
+        """Do `work` with the server; reconnect if a connection is lost meanwhile."""
         before = self._connected
         try:
             await work()
@@ -311,7 +311,7 @@ class AirsimClient(Node[AirsimClientConfig]):
         self._connected += 1
 
     async def on_ready(self) -> None:
-        """Let the server's time stand in lockstep, relate it to ours, and take the vehicle over."""
+        """Pause the server in lockstep, relate the clocks, take over the vehicle."""
         config, call, vehicle = self.config, self._state.call, self._remote.vehicle
         if self._lockstep:
             paused = await call("simIsPaused") is True
@@ -334,7 +334,7 @@ class AirsimClient(Node[AirsimClientConfig]):
         )
 
     async def _relate(self) -> MultirotorState:
-        """Relate the server's clock to ours, so that no stamp is in the future."""
+        """Relate the server's clock to ours, with no stamp in the future."""
         before = self.clock.now()
         found = await self._state.call("getMultirotorState", self._remote.vehicle)
         state = msgspec.convert(found, MultirotorState)
@@ -344,7 +344,7 @@ class AirsimClient(Node[AirsimClientConfig]):
         return state
 
     async def on_shutdown(self) -> None:
-        """Give the vehicle back, let the server's time run again, and log what went wrong."""
+        """Release the vehicle, resume the server's time, and log the counts of faults."""
         for what, count in sorted(self.counts.items()):
             self.log.info("%s: %d times", what, count)
         with contextlib.suppress(OSError, RpcCallError):

@@ -1,4 +1,4 @@
-"""A server's vehicle: what is asked of it at the start, what it measures, and orders to it.
+"""Vehicle of an AirSim server: requests at the start, measurements, and orders.
 
 Events are made of AirSim's structures out of the vehicle's local NED, into ``map``; that raises
 `ValueError` if a number is not finite, or a rotation is none.
@@ -122,7 +122,7 @@ class AirsimClientConfig(NodeConfig):
 
 
 class Remote(NamedTuple):
-    """The server's vehicle, as a simulator would announce it."""
+    """The server's vehicle, in the form of a simulator's announcements."""
 
     vehicle: str  # its name on the server
     cosys: bool  # whether the server is Cosys-AirSim's
@@ -137,11 +137,11 @@ class Remote(NamedTuple):
 async def ask(
     call: Call, config: AirsimClientConfig, name: str, log: Callable[[str], None]
 ) -> Remote:
-    """Ask a server for all that a node of a name is to announce.
+    """Ask a server for everything a node of this name announces.
 
     Raises:
         RpcCallError: The server refused a call.
-        ValueError: There is no such vehicle, or an answer cannot be understood.
+        ValueError: There is no such vehicle, or an answer is invalid.
     """
     version = await call("getServerVersion")
     cosys = config.flavour == "cosys" or (config.flavour == "auto" and version >= 2)
@@ -215,7 +215,7 @@ async def ask(
 
 
 def _read(text: Any, log: Callable[[str], None]) -> dict[str, Any]:
-    """Return what the server's settings would be in a file of ours; nearly nothing if unusable."""
+    """Return the server's settings as a file of ours; nearly empty if unusable."""
     try:
         if text:
             return settings.read(str(text), "the server's settings", lambda _: None)
@@ -225,7 +225,7 @@ def _read(text: Any, log: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _noise(own: dict[str, Any]) -> dict[str, Any]:
-    """Return the noise of a vehicle's IMU: AirSim's usual one if nothing is known."""
+    """Return the noise of a vehicle's IMU; AirSim's default if unknown."""
     imu = own.get("imu") or settings.read("{}", "", lambda _: None)["nodes"][0]["imu"]
     sensors = ("gyroscope", "accelerometer")
     names = [f"{each}_{what}" for each in sensors for what in ("noise_density", "random_walk")]
@@ -256,7 +256,7 @@ async def _origin(
 
 
 def pose_of(found: Pose, origin: ev.Vector3 = (0.0, 0.0, 0.0)) -> tuple[ev.Vector3, ev.Quaternion]:
-    """Return a pose as events have it, in the frame in which its own frame's origin is given."""
+    """Return a pose in the types of events, translated by its frame's `origin`."""
     (x, y, z), turn = astuple(found.position), astuple(found.orientation)
     return (x + origin[0], y + origin[1], z + origin[2]), normalize(turn)
 
@@ -291,7 +291,7 @@ def camera_pose(stamp: int, source: str, found: Pose, origin: ev.Vector3) -> ev.
 def collision(
     stamp: int, source: str, found: CollisionInfo, origin: ev.Vector3, vehicle: ev.Odometry
 ) -> ev.Collision:
-    """Return a contact; its speed is that of the vehicle against the normal."""
+    """Return a collision; its speed is the vehicle's against the normal."""
     normal, place = astuple(found.normal), Pose(found.impact_point)
     velocity = rotate(vehicle.orientation, vehicle.linear_velocity)
     return ev.Collision(
@@ -305,7 +305,7 @@ def collision(
 
 
 class Orders:
-    """What a vehicle has been ordered to do, and how far it has come.
+    """Orders to a vehicle, and their progress.
 
     Phases and refusals are those of `sims.vehicle.Autopilot`, so that the same pilot flies both.
     A take-off is AirSim's, and then a climb to the altitude asked for. A set-point holds on the
@@ -316,7 +316,7 @@ class Orders:
         flying: Whether it is in the air already.
         timeout: Age at which set-points end, ns; those of position hold.
         period: Seconds between two calls of `obey`.
-        refused: Is told what the server refused.
+        refused: Called with each refusal of the server.
     """
 
     def __init__(
@@ -337,7 +337,7 @@ class Orders:
         """The take-off or landing whose reply is to come."""
 
     def take(self, order: ev.Command | ev.Setpoint) -> str:
-        """Take an order for the next `obey`, and return why it is refused; empty if it is not."""
+        """Take an order for the next `obey`; return the reason for refusal, else empty."""
         if isinstance(order, ev.Setpoint):
             allowed, then = {"armed", "flying"}, "flying"
         else:
@@ -355,13 +355,13 @@ class Orders:
         return ""
 
     def resume(self) -> None:
-        """Go on with a new connection: the reply to a task of the old one will not come."""
+        """Resume on a new connection, without the reply to a task sent before."""
         self._task = None
         if self.phase == "landing":
             self._queue.append(ev.Land(stamp=0, source=""))
 
     async def obey(self, now: int, pose: ev.Odometry) -> list[type[ev.VehicleEvent]]:
-        """Pass on what was ordered since the last call, and return what happened to the vehicle.
+        """Pass on the orders since the last call, and return the vehicle's new events.
 
         Raises:
             OSError: The connection is lost.
@@ -425,7 +425,7 @@ class Orders:
         return [ev.Armed if arm else ev.Disarmed]
 
     def _send(self, method: str, *arguments: Any) -> asyncio.Future[Any]:
-        """Send a task whose reply comes when it ends; an error of it is told, not dropped."""
+        """Send a task; its reply comes at its end, and an error goes to `refused`."""
         task = self._connection.send(method, *arguments, self._vehicle)
 
         def note(done: asyncio.Future[Any]) -> None:
@@ -437,7 +437,7 @@ class Orders:
 
 
 def move(setpoint: ev.Setpoint, pose: ev.Odometry, duration: float) -> tuple[Any, ...]:
-    """Return the call that makes a vehicle at a pose follow a set-point for some seconds.
+    """Return the call for a vehicle at a pose to follow a set-point for some seconds.
 
     Returns:
         The method and its arguments but for the vehicle's name.

@@ -1,4 +1,4 @@
-"""A server for scripts that are written for AirSim."""
+"""Server for scripts written for AirSim."""
 
 from sims.airsim.server.node import AirsimServer, AirsimServerConfig
 

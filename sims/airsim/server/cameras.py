@@ -1,4 +1,4 @@
-"""The cameras that clients know by name, and the images that they take of them.
+"""Cameras by their names for clients, and the images taken for clients.
 
 A change is the server's only: the cameras of the run's file, their images and announcements stay
 as they are. All images of one call show one state, at one time, from its true poses.
@@ -41,7 +41,7 @@ from sims.cameras.view import View
 from sims.world import SharedWorld
 
 DrawnState = Callable[[], tuple[int, npt.NDArray[np.float64]]]
-"""Gives the world's state as it is to be drawn now: see `Vehicles.drawn_state`."""
+"""Function for the world's state to draw now: see `Vehicles.drawn_state`."""
 
 FieldOfView = Annotated[float, msgspec.Meta(ge=1.0, le=170.0)]
 FARTHEST = 1e6  # metres from its vehicle up to which a client may put a camera
@@ -54,7 +54,7 @@ _RESPONSES = {"airsim": ImageResponse, "cosys": CosysImageResponse}
 
 
 class Capture(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a camera takes images of one type.
+    """Settings of a camera's images of a type.
 
     Attributes:
         image_type: AirSim's number of the type; see `sims.airsim.server.rendering`.
@@ -72,7 +72,7 @@ class Capture(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class ServedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A camera that clients may ask for images, and that renders only then.
+    """Camera for clients' image requests, rendered only on request.
 
     Attributes:
         name: Its name, unique on its vehicle.
@@ -81,7 +81,7 @@ class ServedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             AirSim's camera of this name, or the body's origin.
         orientation: Roll, pitch, yaw, degrees, applied yaw first; positive pitch is upwards. By
             default that of AirSim's camera of this name, or forward.
-        captures: How it takes each type of image; 256×144 pixels of 90° for others.
+        captures: Settings of each type of image; 256×144 pixels of 90° for others.
     """
 
     name: str
@@ -92,7 +92,7 @@ class ServedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Camera(msgspec.Struct):
-    """One camera as clients know it."""
+    """Camera as known to clients."""
 
     body: int  # number of the body that carries it
     mount: Mount  # where on it
@@ -100,18 +100,18 @@ class Camera(msgspec.Struct):
     specs: dict[int, CameraSpec]
 
     def eye(self, image_type: int) -> Eye:
-        """Return what an image of a type is drawn from."""
+        """Return the eye for images of a type."""
         return Eye(self.body, self.mount, self.specs.get(image_type, self.specs[-1]))
 
 
 class Cameras:
-    """All cameras of all vehicles, by their names, and the methods that read and change them.
+    """All vehicles' cameras by name, and the methods to read and change them.
 
     Attributes:
         largest: Width and height of a buffer in which each of their images can be drawn, pixels.
 
     Raises:
-        ValueError: A camera of the settings is of no vehicle, or is there twice.
+        ValueError: A camera of the settings has no such vehicle, or is there twice.
     """
 
     def __init__(
@@ -290,7 +290,7 @@ def _mount(position: Vector3, degrees: Vector3) -> Mount:
 
 
 class _Exposure(NamedTuple):
-    """The images of one call before they are drawn: the state that they show, and what is known."""
+    """Images of a call before rendering: the state to show, and the known responses."""
 
     stamp: int
     qpos: npt.NDArray[np.float64]
@@ -300,7 +300,7 @@ class _Exposure(NamedTuple):
 
 
 class Images:
-    """Takes images of what clients ask for.
+    """Images on clients' requests.
 
     Args:
         segmentation_ids: Gives the ID of each geom, and last that of nothing.
@@ -326,7 +326,7 @@ class Images:
         self._told = False
 
     async def start(self) -> None:
-        """Start what renders, unless that is done."""
+        """Start the renderer, unless already started."""
         async with self._starting:
             if self._renderer is None:
                 self._renderer = await self._node.worker(
@@ -348,7 +348,7 @@ class Images:
         vehicle: ServedVehicle,
         external: bool = False,
     ) -> Awaitable[list[ImageResponse]]:
-        """Return images of one instant, with one stamp, and the camera's true pose of then."""
+        """Return images of a single instant: a common stamp, and true camera poses."""
         return self.take(requests, vehicle, caller.flavour, external=external)
 
     @rpc("simGetImage")
@@ -360,7 +360,7 @@ class Images:
         vehicle: ServedVehicle,
         external: bool | str = "",
     ) -> Awaitable[bytes]:
-        """Return an image as PNG; it is empty if images of that type are not drawn."""
+        """Return an image as PNG; empty if images of this type are not drawn."""
         caller.flavour = "airsim" if isinstance(external, bool) else "cosys"
         self._cameras.find(vehicle, camera, external)
         requests = [ImageRequest(camera, image_type)]

@@ -30,7 +30,7 @@ SMALL, LARGE = 256, 2048
 
 
 class Incidents:
-    """Counts and logs what happens on all connections."""
+    """Counts and log messages of incidents on all connections."""
 
     def __init__(self, log: NodeLogger) -> None:
         self._log = log
@@ -38,7 +38,7 @@ class Incidents:
         self._logged: set[tuple[str, str]] = set()
 
     def refused(self, address: str, text: str) -> None:
-        """Log what a client was refused, once for each host and kind: texts equal but for numbers.
+        """Log a refused call, once for each host and kind: texts equal but for numbers.
 
         Scripts do not see the errors of calls that they do not join, so the log must tell them.
         """
@@ -51,7 +51,7 @@ class Incidents:
         (self._log.warning if is_new else self._log.debug)("%s: refused: %.400s", address, text)
 
     def failed(self, method: str, error: BaseException) -> None:
-        """Log an error that is the server's own, once for each method."""
+        """Log an internal error of the server, once for each method."""
         self.counts["failed"] += 1
         if ("", method) not in self._logged:
             self._logged.add(("", method))
@@ -65,7 +65,7 @@ class Incidents:
 
 
 class Connection:
-    """Serves one client.
+    """Connection of a client to the server.
 
     Args:
         on_close: Called once the connection is closed.
@@ -103,13 +103,13 @@ class Connection:
         self._loop.add_reader(client, self._read)
 
     def spare_for(self) -> float:
-        """Return for how many real seconds it could have made room; negative if it may stay."""
+        """Return the real seconds since the connection became spare; negative in use."""
         if self._open or self._unsent:
             return -1.0
         return time.monotonic() - self._heard - (IDLE if self._spoke else SILENT)
 
     def close(self, reason: str = "") -> None:
-        """Close the connection: what only it waits for ends, and a vehicle's task goes on.
+        """Close the connection and cancel its waiting calls; a vehicle's task goes on.
 
         Args:
             reason: Why, for the log; empty if the client closed it, or the run ends.
@@ -128,7 +128,7 @@ class Connection:
         self._on_close(self)
 
     def _read(self) -> None:
-        """Serve what the next bytes complete; more of them are for the next turn of the loop."""
+        """Serve the requests in the next bytes; leave further bytes to the next turn."""
         try:
             data = self._socket.recv(self._chunk)
         except (BlockingIOError, InterruptedError):
@@ -288,12 +288,12 @@ class Listener:
         self._connections: set[Connection] = set()
 
     def serve(self, table: Table, flavour: Flavour) -> None:
-        """Serve those who have connected, and those who will."""
+        """Serve the clients already connected and those to come."""
         self._table, self._flavour = table, flavour
         asyncio.get_running_loop().add_reader(self._socket, self._accept)
 
     def close(self) -> None:
-        """Close all connections, and log what was counted."""
+        """Close all connections, and log the counts."""
         self._on_change = lambda _: None
         asyncio.get_running_loop().remove_reader(self._socket)
         self._socket.close()

@@ -1,6 +1,6 @@
-"""Methods that take control of a vehicle, put it somewhere, and let it fly.
+"""Methods to take control of vehicles, to place them, and to fly them.
 
-Those that let it fly reply when their task has ended. Positions are of the vehicle's local frame.
+Methods to fly reply when their task has ended. Positions are of the vehicle's local frame.
 Durations and timeouts are simulated seconds; a task that reaches its timeout has failed.
 """
 
@@ -64,7 +64,7 @@ class Control:
 
     @rpc("enableApiControl")
     def enable_api_control(self, is_enabled: bool, vehicle: ServedVehicle) -> None:
-        """Let clients command a vehicle, or not; a vehicle that counts as armed is armed then."""
+        """Enable or disable clients' commands; enabling arms vehicles counted as armed."""
         vehicle.api_control = is_enabled
         if is_enabled and vehicle.armed:
             self._arm(vehicle)
@@ -103,9 +103,9 @@ class Control:
 
     @rpc("simSetVehiclePose")
     def set_vehicle_pose(self, pose: Pose, ignore_collision: bool, vehicle: ServedVehicle) -> None:  # noqa: ARG002
-        """Put a vehicle at rest into a pose, whatever is there; if it flies, it stays there.
+        """Set a vehicle's pose, at rest, despite obstacles; in flight, hold the place.
 
-        Numbers that are NaN keep what they stand for.
+        NaN keeps the present value.
         """
         self._put(vehicle, KinematicsState(pose.position, pose.orientation))
 
@@ -161,7 +161,7 @@ class Control:
 
 
 def _merged(vehicle: ServedVehicle, wanted: KinematicsState) -> State:
-    """Return a wanted state in ``map``; what of it is NaN is as the vehicle's present one."""
+    """Return a wanted state in ``map``; NaN is replaced by the vehicle's present state."""
     now = vehicle.state()
     orientation = astuple(wanted.orientation)
     return State(
@@ -327,7 +327,7 @@ class Flight:
 
     @rpc("cancelLastTask")
     def cancel(self, vehicle: ServedMultirotor) -> None:
-        """End the vehicle's task, whose reply is ``False``; it hovers 60 ms later."""
+        """End the vehicle's task with reply ``False``; the vehicle hovers 60 ms later."""
         self._cancel(vehicle)
 
     @rpc("moveToPosition")
@@ -344,7 +344,7 @@ class Flight:
         adaptive: Number,
         vehicle: Commanded,
     ) -> Reply:
-        """Fly straight to a position; ends within 0.5 m of it."""
+        """Fly straight to a position; end within 0.5 m of the position."""
         how = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle
         return self.on_path([Corner(x, y, z)], *how)
 
@@ -398,7 +398,7 @@ class Flight:
         adaptive: Number,
         vehicle: Commanded,
     ) -> Reply:
-        """Follow a point that runs ahead along a path; ends within 0.5 m of the last point."""
+        """Follow a point moving ahead along a path; end within 0.5 m of the last point."""
         if drivetrain == 1 and yaw_mode.is_rate:
             raise RpcError("Yaw cannot be specified as rate if drivetrain is ForwardOnly")
         ahead = lookahead_of(lookahead, adaptive, velocity)
@@ -411,7 +411,7 @@ class Flight:
 
     @rpc("rotateToYaw")
     def to_yaw(self, yaw: Number, timeout: Finite, margin: Number, vehicle: Commanded) -> Reply:
-        """Hold the place, and turn to a heading in degrees until it is met to a margin."""
+        """Hold the place, and turn to a heading in degrees, to within a margin."""
         place = vehicle.state().position
         return self.start(vehicle, moves.to_yaw(place, radians(yaw), radians(margin), timeout))
 
@@ -435,6 +435,6 @@ def _heading(yaw_mode: YawMode, drivetrain: int) -> moves.Heading:
 
 
 def _bounded(vehicle: ServedMultirotor, yaw_rate: float) -> float:
-    """Return a yaw rate that the vehicle reaches, so that the heading does not run away."""
+    """Return a yaw rate within the vehicle's limit, so the heading cannot run away."""
     limit: float = vehicle.config.limits.yaw_rate
     return min(max(yaw_rate, -limit), limit)

@@ -1,8 +1,8 @@
-"""What scripts measure, estimate and record.
+"""Readings, estimates and recordings of scripts.
 
-They read the newest sample that a vehicle's node has sent, as AirSim has it; publish poses that
-they have estimated, so that these are judged, by a method that AirSim does not have; and record
-images with the vehicles' true poses in AirSim's format, whose source is ``RecordingFile`` and
+Scripts read the newest sample that a vehicle's node has sent, as AirSim has it; publish poses that
+they have estimated, so that these are judged, by a method that AirSim lacks; and record images
+with the vehicles' true poses in AirSim's format, whose source is ``RecordingFile`` and
 ``FileSystem`` of AirSim 1.8.1.
 """
 
@@ -224,11 +224,11 @@ def _poses(physics: Any, sensor: Any, scan: Any) -> tuple[Any, Rotation]:
 
 
 class ScriptEstimator(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An estimator in a client's script, which publishes its poses by ``visnavPublishPose``.
+    """Estimator in a client's script, publishing its poses by ``visnavPublishPose``.
 
     Attributes:
         name: Its name, by which the client publishes; source of its estimates.
-        method: What it is, in a word or two, for the report.
+        method: Its method, in a word or two, for the report.
         vehicle: The vehicle whose pose it estimates; empty for the first one by name.
         camera: The camera whose poses the client publishes, with AirSim's axes (x forward, y
             right, z down); they become those of the vehicle. Empty: the vehicle's poses.
@@ -271,7 +271,7 @@ class Estimates:
                 raise ValueError(f"estimators: {each.name}: {error}") from None
 
     def announce(self) -> Iterable[EstimatorAnnouncement]:
-        """Announce the estimators that clients will be."""
+        """Announce the clients' estimators."""
         for each in self._estimators.values():
             yield EstimatorAnnouncement(
                 stamp=0,
@@ -284,7 +284,7 @@ class Estimates:
 
     @rpc("visnavPublishPose")
     def publish_pose(self, estimator: str, stamp: int, pose: Pose) -> None:
-        """Publish a pose that the script has estimated, at an image's stamp (ns), to be judged.
+        """Publish the script's estimated pose at an image's stamp (ns), to be judged.
 
         Raises:
             RpcError: There is no such estimator; the stamp is later than now, or not later than
@@ -316,7 +316,7 @@ class Estimates:
         )
 
     def _mount(self, estimator: ScriptEstimator) -> tuple[Vector3, Quaternion] | None:
-        """Return where on its vehicle the camera is whose poses are published, if one's are."""
+        """Return the mount of the estimator's camera; `None` for poses of the vehicle."""
         vehicle = self._vehicles.find(estimator.vehicle)
         if not estimator.camera:
             return None
@@ -341,13 +341,13 @@ def _sum(a: Vector3, b: Vector3, factor: float = 1.0) -> Vector3:
 
 
 class RecordedImage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An image that is taken at each instant of a recording.
+    """Image to take at each instant of a recording.
 
     Attributes:
         camera: Name of the camera.
         image_type: AirSim's number of the type.
-        pixels_as_float: Whether it is a PFM of one number a pixel.
-        compress: Whether it is a PNG, else a PPM.
+        pixels_as_float: Whether to write a PFM of one number a pixel.
+        compress: Whether to write a PNG, else a PPM.
         vehicle: The vehicle that carries the camera; empty for every vehicle.
     """
 
@@ -427,7 +427,7 @@ class Recording:
 
     @rpc("stopRecording")
     def stop(self) -> None:
-        """End the recording, or say why it has ended before."""
+        """End the recording; raise its error if the recording has failed before."""
         self._folder, failed, self._failed = None, self._failed, ""
         if failed:
             raise RpcError(failed)
@@ -453,7 +453,7 @@ class Recording:
             await clock.sleep_until(stamp)
 
     async def _record_vehicle(self, vehicle: ServedVehicle, folder: Path) -> None:
-        """Record a vehicle at this instant; simulated time waits for it."""
+        """Record a vehicle at this instant, while simulated time waits."""
         name, pose = vehicle.name, vehicle.pose()
         before = _numbers(self._last.get(name, Pose(Vector3r(math.inf))))
         if self._config.on_move and np.allclose(_numbers(pose), before, rtol=0.0, atol=STILL):
@@ -476,7 +476,7 @@ class Recording:
 
 
 def _make_folder(base: Path) -> Path:
-    """Make a folder named by the date, with an empty table, and return it."""
+    """Make a folder named by the date, with an empty table, and return its path."""
     date = time.strftime("%Y-%m-%d-%H-%M-%S")
     names = (date, *(f"{date}-{number}" for number in range(2, 1000)))
     folder = next(base / name for name in names if not (base / name).exists())
@@ -486,7 +486,7 @@ def _make_folder(base: Path) -> Path:
 
 
 def _write(folder: Path, vehicle: str, pose: Pose, images: list[ImageResponse]) -> None:
-    """Write images of one instant, and a row that names them."""
+    """Write the images of an instant, and a row with their names."""
     names = []
     for image in images:
         suffix = "pfm" if image.pixels_as_float else "png" if image.compress else "ppm"
@@ -505,7 +505,7 @@ def _numbers(pose: Pose) -> tuple[float, ...]:
 
 
 def _file(image: ImageResponse, suffix: str) -> bytes:
-    """Return an image as a file; a PFM has its rows from top to bottom, as AirSim writes it."""
+    """Return an image as file content; a PFM has rows from top to bottom, as AirSim's."""
     size = f"{image.width} {image.height}\n"
     if suffix == "pfm":
         numbers = np.array(msgspec.msgpack.decode(image.image_data_float), "<f4")

@@ -20,8 +20,9 @@ from runtime.logs import NodeLogger
 Flavour = Literal["airsim", "cosys"]
 
 Finite = Annotated[float, msgspec.Meta(ge=-3.5e38, le=3.5e38)]
-"""A number within those of AirSim's clients (float32) that is neither NaN nor infinite, for the
-parameters of handlers and for fields of structures: others are refused with the field's place."""
+"""Finite number in the float32 range of AirSim's clients, for parameters of handlers
+and fields of structures; others are refused with the field's place.
+"""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -61,8 +62,9 @@ WITHOUT_EFFECT = {
     "setPositionControllerGains": _GAINS,
     "simRunConsoleCommand": ("Return ``False``: there is no Unreal Engine.", "command"),
 }
-"""What each does, which begins with what it returns, and its arguments, which may be anything.
-Scripts only need these methods not to fail."""
+"""Description of each method, result first, and its arguments, of any type.
+Scripts only need these methods not to fail.
+"""
 
 _UNSUPPORTED = {
     r"sim\w*Detection\w*|simGetDetections": "make boxes of the segmentation image instead",
@@ -81,22 +83,22 @@ _UNSUPPORTED = {
 
 
 class RpcError(Exception):
-    """A call that cannot be served; the text is sent to the client."""
+    """Call refused by the server; the text is sent to the client."""
 
 
 EXPECTED_ERRORS = (RpcError, ValueError, msgspec.ValidationError, CommandError)
-"""Errors of handlers that are the client's to mend; any other is a bug of the server."""
+"""Errors of handlers caused by the client; any other error is a bug of the server."""
 
 
 class Caller(Protocol):
-    """The client that calls."""
+    """Client of a call."""
 
     address: str  # of the client, for messages
     flavour: Flavour  # whose structures it expects; a handler may set it
 
 
 class Named:
-    """Base of what handlers get in place of a name that clients send, as vehicles."""
+    """Base of handlers' arguments in place of clients' names, such as vehicles."""
 
 
 def rpc(name: str, *, cosys: int | None = None) -> Callable[[F], F]:
@@ -122,7 +124,7 @@ def rpc(name: str, *, cosys: int | None = None) -> Callable[[F], F]:
 
 
 class Method(NamedTuple):
-    """One method: a row of the table, and of the documentation."""
+    """Method: a row of the table, and of the documentation."""
 
     name: str  # on the wire
     call: Callable[..., Any]  # the handler
@@ -164,11 +166,11 @@ class Table:
         }
 
     def call(self, caller: Caller, name: str, arguments: list[Any]) -> Awaitable[Any] | Any:
-        """Call a method, and return its result or an awaitable of it.
+        """Call a method, and return its result or an awaitable of the result.
 
         Raises:
-            RpcError: There is no such method, or the arguments are not those it takes, or it
-                cannot be served; the text is that of rpclib.
+            RpcError: There is no such method, the arguments are wrong, or it cannot be served; the
+                text is that of rpclib.
         """
         method = self.methods.get(name)
         count = len(arguments)
@@ -206,7 +208,7 @@ class Table:
 
 
 def reason_unsupported(method: str) -> str:
-    """Return why a method is not there although AirSim has it; empty if AirSim has none either."""
+    """Return the reason for a missing AirSim method; empty if AirSim has none either."""
     for pattern, reason in _UNSUPPORTED.items():
         if re.fullmatch(pattern, method):
             return reason
@@ -222,7 +224,7 @@ def thrown(name: str, count: int, text: str) -> str:
 
 
 def constant_methods(note: Callable[[str], None] = lambda _: None) -> dict[str, Method]:
-    """Return the methods that always answer the same; `note` is told of calls without effect."""
+    """Return the methods with constant answers; `note` is told of calls without effect."""
     content = "with which the clients of AirSim and of Cosys-AirSim are content."
     rows: list[tuple[str, Callable[..., Any], str, str]] = [
         ("ping", lambda: True, "Answer ``True``.", ""),

@@ -1,4 +1,4 @@
-"""What of a world scripts may bring in, move and take out: settings, and bodies of the model.
+"""Movable parts of a world for scripts: settings, and bodies of the model.
 
 Each is a body with a free joint, so its pose is part of the world's state, which physics, cameras
 and lidars have anyway. A held body is heavy, has no weight, and is put back at each millisecond:
@@ -51,14 +51,13 @@ _COPIED = (
 
 
 class SpareObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of objects that ``simSpawnObject`` can bring into the world.
+    """Settings of spare objects for ``simSpawnObject``.
 
     Attributes:
-        asset: What they are: one of AirSim's shapes of 1 m about their middle (a cylinder and a
-            cone stand upright), or a ``person``, ``car``, ``door`` or ``box``, which stands on its
-            position.
-        scale: Factors on its length, width and height, which cannot be changed later.
-        count: How many of them there can be at a time.
+        asset: Kind: one of AirSim's shapes of 1 m about their middle (a cylinder and a cone stand
+            upright), or a ``person``, ``car``, ``door`` or ``box``, which stands on its position.
+        scale: Factors on length, width and height, which cannot be changed later.
+        count: Maximum number of them at a time.
         colour: Red, green and blue, 0 to 1; grey, or that of its kind, if left out. A cylinder is
             as wide as it is long.
     """
@@ -78,7 +77,7 @@ def spare_objects(node: str, specs: tuple[SpareObject, ...]) -> dict[str, SpareO
 def add_movables(
     scene: Scene, node: str, specs: tuple[SpareObject, ...], movable: tuple[str, ...]
 ) -> None:
-    """Put spare objects into a world, and free what of it is to be movable; all are held.
+    """Add spare objects to a world and free its movable parts, all of them held.
 
     Raises:
         ValueError: An expression matches nothing, or something that cannot be moved.
@@ -108,7 +107,7 @@ def movable_bodies(model: Any) -> dict[str, int]:
 
 
 def have_met(model: Any) -> None:
-    """Have vehicles and all else that physics move meet what is held."""
+    """Let vehicles and all other moving bodies collide with held bodies."""
     free = (model.body_weldid[model.geom_bodyid] != 0) & (model.geom_contype == WORLD)
     model.geom_conaffinity[free] |= MOVABLE
     for body in np.unique(model.geom_bodyid[free]):
@@ -116,7 +115,7 @@ def have_met(model: Any) -> None:
 
 
 def set_free(model: Any, body: int, free: bool) -> None:
-    """Have physics move a body (`free`), or make it one that can be held; after `have_met`."""
+    """Let physics move a body (`free`), or make the body holdable; after `have_met`."""
     dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + 6)
     geoms = (model.geom_bodyid == body) & (model.geom_contype != 0)
     model.body_gravcomp[body] = 0.0 if free else 1.0
@@ -137,7 +136,7 @@ class Holder:
 
     @classmethod
     def of(cls, simulation: Simulation) -> Holder:
-        """Return the one of a simulation, which gets one when this is first asked for."""
+        """Return the holder of a simulation, added at the first request."""
         found = [each for each in simulation.influences if isinstance(each, Holder)]
         if not found:
             found.append(cls())
@@ -150,7 +149,7 @@ class Holder:
         self._held = np.empty(0)
 
     def hold(self, model: Any, body: int, pose: Any) -> None:
-        """Hold a body at a pose of its free joint, shape (7,); `None` is not to hold it."""
+        """Hold a body at its free joint's pose, shape (7,); `None` releases the body."""
         self._poses.pop(body, None)
         if pose is not None:
             self._poses[body] = pose
@@ -188,7 +187,7 @@ def _add_spare(
 
 
 def _free(spec: Any, world: Any, expression: str) -> list[str]:
-    """Free geoms of the world itself, and bodies that stand in it, and return their names."""
+    """Free matching geoms and fixed bodies of the world, and return their names."""
     geoms = {geom.name: geom for geom in spec.worldbody.geoms if geom.name}
     bodies = {body.name: body for body in spec.worldbody.bodies if body.name}
     still = {name: body for name, body in bodies.items() if not body.joints and not body.mocap}
@@ -219,7 +218,7 @@ def _free(spec: Any, world: Any, expression: str) -> list[str]:
 
 
 def _pose(world: Any, geom: str) -> Any:
-    """Return the pose of a geom of the world itself as its file has it, shape (4, 4)."""
+    """Return the pose, in its file, of a geom of the world itself, shape (4, 4)."""
     number = world.geom(geom).id
     pose = _matrix(world.geom_pos[number], world.geom_quat[number])
     if world.geom_type[number] != mujoco.mjtGeom.mjGEOM_MESH:
@@ -247,7 +246,7 @@ def _held(spec: Any, name: str, **options: Any) -> Any:
 
 
 def whole_matches(expression: str, texts: Iterable[str], *, ignore_case: bool = False) -> list[str]:
-    """Return the texts that a client's regular expression matches from beginning to end.
+    """Return the texts matched by a client's regular expression from beginning to end.
 
     None may keep the run waiting. Python's own search goes back and tries again. What makes that
     long are repetitions: the time grows with the text's length to the power of their number, and

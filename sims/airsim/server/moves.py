@@ -1,4 +1,4 @@
-"""Tasks that clients give to vehicles: one each, 50 times a second of simulated time.
+"""Clients' tasks for vehicles: a single task each, 50 times a second of simulated time.
 
 A task is pure: time and state come in, set-points go out. Positions and velocities are of ``map``,
 angles in radians. The rules are AirSim's; what differs is in docs/reference/airsim.md. Which
@@ -40,11 +40,11 @@ from sims.vehicle import State, VehicleParameters
 RATE = 50  # updates of each task in a simulated second
 HOVER_AFTER = 60_000_000  # ns after a task's last order at which the vehicle holds its place
 HOVER_THROTTLE = 9.80665 / (4.0 * 4.18)
-"""Throttle at which AirSim's quadrotor hovers: 1 kg on four rotors of 4.18 N."""
+"""Hover throttle of AirSim's quadrotor: 1 kg on four rotors of 4.18 N."""
 
 Reply = asyncio.Future[bool]
 Order = Callable[..., Command | Setpoint]
-"""Makes what is sent to the vehicle of a stamp, a source and the vehicle's name."""
+"""Factory of an order, from a stamp, a source and the vehicle's name."""
 Thrust = Callable[[State], float]  # gives the thrust, 0 to 1 of what all motors can give together
 
 CLOSE = 0.5  # metres from the end within which a vehicle is not steered along the path any more
@@ -61,7 +61,7 @@ _FASTEST = 6.0  # m/s at which a height is gone to, as AirSim's controller limit
 
 
 class Task(NamedTuple):
-    """What a vehicle is to do; it is pure: time and state come in, an order goes out."""
+    """Task of a vehicle, pure: time and state come in, an order goes out."""
 
     # Called with the seconds since the start and the vehicle's state in ``map``; returns what to
     # send, `None` for nothing, or how the task has ended.
@@ -71,7 +71,7 @@ class Task(NamedTuple):
 
 
 class Tasks:
-    """The running task of each vehicle. A new one ends the older, whose result is `False`.
+    """Running task of each vehicle. A new task ends the older with result `False`.
 
     A task reaches its vehicle by set-points and commands only. After its last order has stood for
     `HOVER_AFTER`, the vehicle is told to hover. A task ends when its vehicle is disarmed: with
@@ -92,7 +92,7 @@ class Tasks:
         self._slots: dict[str, _Slot] = {}
 
     def order(self, vehicle: ServedVehicle, order: Order) -> None:
-        """Send a command or a set-point to a vehicle, which obeys it at once."""
+        """Send a command or a set-point to a vehicle, obeyed at once."""
         self._send(order(stamp=self._clock.now(), source=self._source, vehicle=vehicle.name))
 
     def start(self, vehicle: ServedMultirotor, task: Task) -> Reply:
@@ -116,12 +116,12 @@ class Tasks:
         return self._owed(result)
 
     def cancel(self, vehicle: ServedVehicle) -> None:
-        """End the task of a vehicle, if it has one; its result is `False`."""
+        """End the task of a vehicle, if any, with result `False`."""
         if slot := self._slots.get(vehicle.name):
             slot.finish(False)
 
     def note(self, vehicle: ServedMultirotor, event: VehicleEvent) -> None:
-        """Take notice of what happened to a vehicle."""
+        """Update the state of a vehicle's motors from an event."""
         if isinstance(event, Armed):
             vehicle.motors_on = True
         elif isinstance(event, Disarmed):  # its task ends with the next update, unless armed again
@@ -161,7 +161,7 @@ class Tasks:
 
 
 class _Slot:
-    """What is known of one vehicle's tasks."""
+    """State of a vehicle's tasks."""
 
     def __init__(self, vehicle: ServedMultirotor) -> None:
         self.vehicle = vehicle
@@ -173,14 +173,14 @@ class _Slot:
         self.is_landing = False
 
     def finish(self, succeeded: bool) -> None:
-        """End the task, if there is one."""
+        """End the task, if any."""
         if self.result is not None and not self.result.done():
             self.result.set_result(succeeded)
         self.task = self.result = None
 
 
 def lookahead_of(lookahead: float, adaptive: float, velocity: float) -> float:
-    """Return how far ahead the lookahead point is, metres; a negative one asks for the default.
+    """Return the look-ahead distance, metres; the default for a negative distance.
 
     Raises:
         ValueError: It is zero.
@@ -193,7 +193,7 @@ def lookahead_of(lookahead: float, adaptive: float, velocity: float) -> float:
 
 
 def braked(velocity: float, remaining: float) -> float:
-    """Return the speed (m/s) at which to fly with some metres to go.
+    """Return the speed (m/s) to fly at with some metres to go.
 
     Before the end it falls to 1 m/s, by 3 m/s². (AirSim brakes later, and only from above 3 m/s,
     and overshoots.)
@@ -202,7 +202,7 @@ def braked(velocity: float, remaining: float) -> float:
 
 
 class PathFollower:
-    """A vehicle's progress along a path, which never goes back, and the point that runs ahead.
+    """A vehicle's progress along a path, never backwards, and the point running ahead.
 
     The method is "pure pursuit" (R. C. Coulter, CMU-RI-TR-92-01, 1992); the rules of look-ahead
     and ending are those of AirSim's ``moveOnPath``.
@@ -289,7 +289,7 @@ class Heading:
         self._follows, self._is_rate, self._angle = follows, is_rate, angle
 
     def rate(self, state: State, x: float, y: float) -> float:
-        """Return the yaw rate (rad/s) for a vehicle that goes along (x, y)."""
+        """Return the yaw rate (rad/s) for a vehicle moving along (x, y)."""
         if self._is_rate:
             return self._angle
         if self._follows and math.hypot(x, y) <= CLOSE:
@@ -344,7 +344,7 @@ def along_path(
 
 
 def landing(timeout: float) -> Task:
-    """Go down at 0.2 m/s until something stops that for 0.2 s, and then stop the motors."""
+    """Descend at 0.2 m/s until stopped for 0.2 s, then stop the motors."""
     idle = 0
 
     def steer(_: float, state: State) -> Order | None:
@@ -358,7 +358,7 @@ def landing(timeout: float) -> Task:
 
 
 def to_yaw(place: Vector3, yaw: float, margin: float, timeout: float) -> Task:
-    """Hold a place (m), and turn to a yaw until it is met to a margin."""
+    """Hold a place (m), and turn to a yaw (rad), to within a margin (rad)."""
 
     def steer(_: float, state: State) -> Order | bool:
         error = abs(wrapped(yaw - yaw_of(state.orientation)))
@@ -396,7 +396,7 @@ def by_rates(rates: Vector3, thrust: Thrust, duration: float) -> Task:
 
 
 def at_height(parameters: VehicleParameters, height: float) -> Thrust:
-    """Return the thrust that brings a vehicle to a height (z, m), and holds it there."""
+    """Return the thrust function to bring a vehicle to a height (z, m), and hold there."""
 
     def thrust(state: State) -> float:
         down = _LIFT_GAIN * (_to_height(state, height) - state.velocity[2])
@@ -426,5 +426,5 @@ def _velocity(velocity: Vector3, yaw_rate: float) -> Order:
 
 
 def _to_height(state: State, height: float, fastest: float = _FASTEST) -> float:
-    """Return the vertical velocity (m/s, down) that brings a vehicle to a height (z, m)."""
+    """Return the vertical velocity (m/s, down) towards a height (z, m)."""
     return min(max(_GAIN * (height - state.position[2]), -fastest), fastest)

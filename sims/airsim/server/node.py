@@ -1,7 +1,7 @@
-"""A server for scripts that are written for AirSim: its node, and the time that it leads.
+"""Server for scripts written for AirSim: its node, and its control of time.
 
-It stands beside the vehicles in the run's world, reads their true state, and sends them commands
-and set-points as any pilot does.
+The node stands beside the vehicles in the run's world, reads their true state, and sends them
+commands and set-points as any pilot does.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from sims.worlds import Dynamics, Scene
 R = TypeVar("R")
 
 PORTS = "ports of AirSim servers"
-"""Name under which nodes of this process share where each server listens, by its name."""
+"""Name of the table of server ports shared in this process, by server name."""
 LONGEST_STEP = 1_000_000_000  # seconds, and frames, of a step that a client may ask for
 FRAMES_WITHOUT_CAMERAS = 60  # frames per second if no vehicle has a camera
 
@@ -114,7 +114,7 @@ class AirsimServerConfig(NodeConfig):
 
 
 class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
-    """Lets scripts that were written for AirSim fly the run's vehicles, unchanged.
+    """Server for unchanged AirSim scripts to fly the run's vehicles.
 
     It speaks msgpack-rpc on TCP with AirSim's methods; see docs/reference/airsim.md.
     """
@@ -193,17 +193,17 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self.share(PORTS, dict[str, int])[self.name] = self.port
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the estimators that clients will be."""
+        """Announce the clients' estimators."""
         return self.script_estimates.announce()
 
     def check(self) -> Iterable[str]:
-        """Return what is wrong with the vehicles that the settings name."""
+        """Return errors in the settings' names of vehicles."""
         default = self.config.default_vehicle
         if default and default not in self.vehicles:
             yield f'default_vehicle: expected one of {", ".join(self.vehicles)}, found "{default}"'
 
     async def run(self) -> None:
-        """Serve those who have connected and will; first, let time stand, if it is to."""
+        """Pause time, if so set; then serve clients, present and to come."""
         await self.time.begin()
         assert self._listener is not None  # a run that is only checked has no updates
         self._listener.serve(self.table, self.config.flavour)
@@ -243,7 +243,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Take notice of motors that start or stop, and of collisions."""
+        """Note the start and stop of motors, and collisions."""
         vehicle = self.vehicles.get(event.source)
         if isinstance(vehicle, ServedMultirotor):
             self.tasks.note(vehicle, event)
@@ -251,20 +251,20 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     @every(hz=RATE)
     def fly(self, tick: Tick) -> None:
-        """Let the vehicles' tasks steer, and look what the vehicles touch."""
+        """Let the vehicles' tasks steer, and check the vehicles' contacts."""
         self.tasks.update(tick.stamp)
         self.collisions.watch()
 
     @classmethod
     def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
-        """Put a camera into the world that is moved to where one is needed, and objects."""
+        """Add objects to the world, and a camera to be moved to each viewpoint."""
         add_movables(scene, name, config.objects, config.movable)
         scene.spec.worldbody.add_camera(name=f"{name}/camera")
         return Dynamics()
 
     @classmethod
     def sees(cls, config: Any) -> bool:  # noqa: ARG003
-        """Return that its clients may ask for images."""
+        """Return `True`: clients may ask for images."""
         return True
 
     def on_announcement(self, announcement: Announcement) -> None:
@@ -302,7 +302,7 @@ class Time:
         self._owed = 0
 
     async def begin(self) -> None:
-        """Let time stand from here on, unless it runs from the start; return once it does.
+        """Pause time, unless set to run from the start; return once time stands.
 
         Raises:
             CommandError: Time cannot be controlled.
@@ -354,7 +354,7 @@ class Time:
     def continue_for_time(
         self, seconds: Annotated[float, msgspec.Meta(ge=0.0, le=LONGEST_STEP)]
     ) -> Awaitable[None]:
-        """Let **simulated** time run for some seconds, and then stand; replies once it stands."""
+        """Let **simulated** time run for some seconds; reply once time stands."""
         return self._continue(round(seconds * SECOND))
 
     @rpc("simContinueForFrames")
@@ -385,7 +385,7 @@ class Time:
         return stepped()
 
     def _apply(self) -> None:
-        """Let time run if somebody waits for a vehicle, and else stand; a paused one stays."""
+        """Run time while a task's reply is owed, else pause; leave a client's pause."""
         if not self._awaited or self._paused:
             return
         if self._owed == 0:
@@ -395,7 +395,7 @@ class Time:
 
 
 def _copy(task: asyncio.Future[R], reply: asyncio.Future[R]) -> None:
-    """Give a reply the outcome of its task, unless nobody waits for it any more."""
+    """Copy a task's outcome to its reply, unless the reply is done."""
     if reply.done():
         return
     if task.cancelled():

@@ -47,7 +47,7 @@ HIDDEN = -1  # ID of an object that is left out of segmentation images: black, a
 _BODY = mujoco.mjtObj.mjOBJ_BODY
 
 UNKNOWN = Pose(Vector3r(NAN, NAN, NAN), Quaternionr(NAN, NAN, NAN, NAN))
-"""Pose of an object that is not there."""
+"""Pose of a missing object: all NaN."""
 
 
 def initial_id(name: str) -> int:
@@ -56,9 +56,9 @@ def initial_id(name: str) -> int:
 
 
 class Objects:
-    """The objects of the world, and which number, and so which colour, each has in images.
+    """Objects of the world, and their segmentation IDs, hence colours, in images.
 
-    Whatever changes them does so at the instant of the request.
+    Changes take effect at the instant of the request.
 
     Args:
         spares: The objects that can be brought in, by the names of their bodies.
@@ -120,9 +120,9 @@ class Objects:
         return self._still
 
     def identify(self, touched: str) -> tuple[str, int]:
-        """Return name and segmentation ID of the object that a geom or body of the model is of.
+        """Return name and segmentation ID of the object of a geom or body in the model.
 
-        A spare object that is in the world has another name than its body.
+        A spare object in the world has another name than its body.
         """
         model = self._world.model
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, touched)
@@ -132,7 +132,7 @@ class Objects:
         return name, self.segmentation_id(name)
 
     def segmentation_ids(self) -> npt.NDArray[np.uint8]:
-        """Return the ID of each geom as it is drawn, and last that of nothing, shape (n + 1,)."""
+        """Return the drawn ID of each geom, and last of nothing, shape (n + 1,)."""
         return np.maximum(self._ids, 0).astype(np.uint8)
 
     @rpc("simGetSegmentationObjectID")
@@ -155,12 +155,12 @@ class Objects:
 
     @rpc("simListSceneObjects")
     def names(self, expression: str) -> list[str]:
-        """Return the names of objects that a regular expression matches as a whole, sorted."""
+        """Return the object names matched entirely by a regular expression, sorted."""
         return whole_matches(expression, self.geoms)
 
     @rpc("simGetObjectPose", cosys=2)
     def pose(self, name: str, ned: bool = True) -> Pose:  # noqa: ARG002  # Cosys only
-        """Return an object's pose in the world's NED frame; NaN of one that is not known."""
+        """Return an object's pose in the world's NED frame; NaN if unknown."""
         if name not in self.geoms:
             return UNKNOWN
         model, data = self._world.model, self.data()
@@ -177,7 +177,7 @@ class Objects:
 
     @rpc("simSetObjectPose")
     def set_pose(self, name: str, pose: Pose, teleport: bool = True) -> bool:  # noqa: ARG002
-        """Put an object somewhere at once; ``False`` of one that the settings do not let move."""
+        """Set an object's pose at once; ``False`` if not movable by the settings."""
         qpos = _qpos(pose)
         if name not in self._bodies:
             self._warn("simSetObjectPose", f"{name!r:.80} is not in `movable` of the settings")
@@ -187,7 +187,7 @@ class Objects:
 
     @rpc("simListAssets")
     def assets(self) -> list[str]:
-        """Return what ``simSpawnObject`` can bring in, as the settings say."""
+        """Return the assets for ``simSpawnObject``, as given in the settings."""
         return sorted({each.asset for each in self._spares.values()})
 
     @rpc("simSpawnObject")
@@ -200,9 +200,9 @@ class Objects:
         physics: bool = False,
         blueprint: bool = False,  # noqa: ARG002
     ) -> str:
-        """Bring in a spare object of the settings, of this scale if there is one; return its name.
+        """Add a spare object of the settings, of this scale if any; return its name.
 
-        Of a name that is taken it is one with a number.
+        A name already taken gets a number.
         """
         if len(name) > LONGEST_NAME:
             raise RpcError(f"name: expected up to {LONGEST_NAME} characters, found {len(name)}")
@@ -230,7 +230,7 @@ class Objects:
 
     @rpc("simDestroyObject")
     def destroy(self, name: str) -> bool:
-        """Take an object out of the world; ``False`` of one that the settings do not let move."""
+        """Remove an object from the world; ``False`` if not movable by the settings."""
         if (body := self._bodies.get(name, -1)) not in self._held:
             return False
         del self._bodies[name], self.geoms[name]
@@ -242,7 +242,7 @@ class Objects:
 
     @rpc("simGetObjectScale")
     def scale(self, name: str) -> Vector3r:
-        """Return the scale of a spare object, 1 of all else, and 0 of what is not known."""
+        """Return the scale of a spare object; 1 for other objects, 0 if unknown."""
         if name not in self.geoms:
             return Vector3r()
         spare = self._spares.get(self._bodies.get(name, -1))
@@ -250,14 +250,14 @@ class Objects:
 
     @rpc("simSetObjectScale")
     def set_scale(self, name: str, scale: Vector3r) -> bool:
-        """Return whether an object has this scale: it cannot be changed."""
+        """Return whether an object has this scale: scales cannot be changed."""
         return name in self.geoms and self.scale(name) == scale
 
     def _number(self, name: str, object_id: int) -> None:
         self._ids[list(self.geoms[name])] = object_id
 
     def _warn(self, method: str, text: str) -> None:
-        """Log what a method does not do as asked, when it first happens."""
+        """Log a method's deviation from the request, the first time for each method."""
         if method not in self._warned:
             self._warned.add(method)
             self._log.warning("%s: %s", method, text)
@@ -267,7 +267,7 @@ class Objects:
         return self._at_start[2][begin : begin + 7].copy()
 
     def _put(self, body: int, qpos: Any, *, free: bool = False, keep: bool = False) -> None:
-        """Put a body somewhere, at rest: held, free, or as it was (`keep`)."""
+        """Put a body at rest into a pose: held, free, or as before (`keep`)."""
         model, simulation = self._world.model, self._world.simulation
         begin = int(model.jnt_qposadr[model.body_jntadr[body]])
         dof = int(model.body_dofadr[body])
@@ -309,7 +309,7 @@ class Scenery:
         self._blow(wind)
 
     def reset(self) -> None:
-        """Let the wind blow as before clients changed it."""
+        """Restore the wind from before clients' changes."""
         if self._wind_before is not None:
             self._blow(self._wind_before)
             self._wind_before = None
@@ -385,7 +385,7 @@ class Scenery:
 
 
 def _qpos(pose: Pose) -> Any:
-    """Return a pose as a free joint has it, shape (7,).
+    """Return a pose for a free joint, shape (7,).
 
     Raises:
         ValueError: It is not finite, or no pose, or beyond all worlds.

@@ -1,4 +1,4 @@
-"""AirSim's types of image, and the worker that draws what clients ask for in a process of its own.
+"""AirSim's types of image, and the worker process to draw clients' images.
 
 The types are made of what a camera sees: colours, depth and object numbers. As numbers, the types
 that are coloured give their red channel, 0 to 1. As colours, the types that are numbers are greys
@@ -37,7 +37,7 @@ BASELINE = 0.25  # metres between AirSim's default stereo cameras, to which disp
 
 
 class ImageType(IntEnum):
-    """The types that are drawn here, by AirSim's numbers.
+    """Image types drawn here, by AirSim's numbers.
 
     Attributes:
         SCENE: Colours.
@@ -66,7 +66,7 @@ OF_NUMBERS = frozenset({5, 7})  # types that are made of object numbers
 
 
 class Seen(NamedTuple):
-    """What a camera sees, and what is known of it."""
+    """View of a camera, with its calibration, IDs and orientation."""
 
     drawn: Drawn  # colours, depth and object numbers, as far as they are needed
     info: CameraInfo
@@ -92,7 +92,7 @@ _PALETTE = palette()
 
 
 def packed(kind: ImageType, seen: Seen, form: Form) -> npt.NDArray[np.uint8]:
-    """Return an image as it is sent.
+    """Return an image encoded for sending.
 
     Args:
         form: ``float``: an array of msgpack; ``rgb`` or ``bgr``: three bytes for each pixel, rows
@@ -160,9 +160,9 @@ def surface_normals(depth: Depths, info: CameraInfo) -> Depths:
 
 
 def _slope_along(values: Depths) -> Depths:
-    """Return the differences of each value in a row to the last or to the next one.
+    """Return the difference of each value in a row to the previous or the next value.
 
-    Of the two it is the one that changes less further on: at the edge of an object that is on the
+    Of the two, the one that changes less further on: at the edge of an object, that is on the
     side of the pixel's own surface.
     """
     if values.shape[1] < 2:
@@ -180,7 +180,7 @@ def _slopes(info: CameraInfo) -> tuple[Depths, Depths]:
 
 
 class Eye(NamedTuple):
-    """What an image is drawn from."""
+    """Source of an image: body, mount and camera settings."""
 
     body: int  # number in the model of the body that carries the camera
     mount: Mount  # where on it
@@ -188,7 +188,7 @@ class Eye(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """One image that is wanted: from where, of which type, and as what it is sent."""
+    """Requested image: eye, type, and form for sending."""
 
     eye: Eye
     kind: ImageType
@@ -222,9 +222,9 @@ class Renderer:
     def take(
         self, stamp: int, qpos: Floats, ids: npt.NDArray[np.uint8], wanted: Sequence[Wanted]
     ) -> list[npt.NDArray[np.uint8]]:
-        """Return images of one state, as they are sent, in the order in which they are wanted.
+        """Return images of a single state, encoded for sending, in the given order.
 
-        What several of them show from one place is drawn once.
+        The view from one place is drawn once for all of them.
 
         Args:
             ids: Segmentation ID of each object number, and last of nothing, shape (ngeom + 1,).

@@ -1,4 +1,4 @@
-"""The vehicles as clients see them: where they are, how they move, and what they touch.
+"""Vehicles as seen by clients: poses, motion, and contacts.
 
 There are two kinds: multirotors, and the free cameras of computer-vision mode.
 """
@@ -44,7 +44,7 @@ from sims.world import SharedWorld
 Floats = npt.NDArray[np.float64]
 
 FIRST: Any = ""
-"""Default of a vehicle in the parameters of handlers: the one that an empty name stands for."""
+"""Default vehicle in handlers' parameters: the vehicle for an empty name."""
 
 GAS_CONSTANT = 287.053  # of dry air, J/(kg K)
 LANDED_SPEED = 0.08  # as AirSim's: m/s and rad/s, of each component of the velocity of what stands
@@ -54,7 +54,7 @@ _ANYTHING: dict[str, int] = {"": 0}
 
 
 class ServedVehicle(Named, ABC):
-    """A vehicle of the run as AirSim's methods see it.
+    """Vehicle of the run, as seen by AirSim's methods.
 
     Its local frame has the axes of ``map`` and its origin where the vehicle is at the start.
 
@@ -80,13 +80,13 @@ class ServedVehicle(Named, ABC):
 
     @property
     def start(self) -> State:
-        """State at the start, in ``map``: at rest on the ground, if it starts there."""
+        """Start state, in ``map``; at rest on the ground for a start there."""
         return self.world.starts[self.name]
 
     @property
     @abstractmethod
     def stamp(self) -> int:
-        """Time of the state that was last asked for (ns)."""
+        """Time of the last requested state, ns."""
 
     @abstractmethod
     def state(self) -> State:
@@ -94,7 +94,7 @@ class ServedVehicle(Named, ABC):
 
     @abstractmethod
     def accelerations(self) -> tuple[Vector3, Vector3]:
-        """Return acceleration, m/s² NED, and angular acceleration, rad/s² FRD, in that state."""
+        """Return linear (m/s² NED) and angular (rad/s² FRD) acceleration at `stamp`."""
 
     @functools.cached_property
     def origin(self) -> Vector3:
@@ -117,7 +117,7 @@ class ServedVehicle(Named, ABC):
         return Pose(self.local(state.position), Quaternionr(*state.orientation))
 
     def kinematics(self) -> KinematicsState:
-        """Return how it moves now: as AirSim has it, angles in the body's frame, all else local."""
+        """Return the kinematics as AirSim's: angular rates in FRD, all else local."""
         state = self.state()
         acceleration, angular = self.accelerations()
         return KinematicsState(
@@ -149,14 +149,14 @@ class ServedMultirotor(ServedVehicle):
 
     @property
     def physics(self) -> Physics:
-        """View of the world's physics, of which there is another after one has diverged."""
+        """View of the world's physics, renewed after divergence."""
         if self._physics.simulation is not self.world.simulation:
             self._physics = self._look()
         return self._physics
 
     @property
     def stamp(self) -> int:
-        """Time of the state that was last asked for (ns)."""
+        """Time of the last requested state, ns."""
         return self.physics.time_ns
 
     def state(self) -> State:
@@ -165,11 +165,11 @@ class ServedMultirotor(ServedVehicle):
         return self.physics.state()
 
     def accelerations(self) -> tuple[Vector3, Vector3]:
-        """Return acceleration, m/s² NED, and angular acceleration, rad/s² FRD, in that state."""
+        """Return linear (m/s² NED) and angular (rad/s² FRD) acceleration at `stamp`."""
         return self.physics.accelerations()
 
     def landed(self) -> bool:
-        """Return whether it stood in that state: something else carried part of its weight."""
+        """Return whether the vehicle stood at `stamp`, its weight partly carried."""
         if sum(self.physics.thrusts.tolist()) >= self._carried:
             return False
         state = self.physics.state()
@@ -182,7 +182,7 @@ Commanded = Annotated[ServedMultirotor, "one that clients may command"]
 
 
 class ServedFreeCamera(ServedVehicle):
-    """A free camera: it has no physics, and is where it has been put."""
+    """Free camera: no physics, stays where last put."""
 
     stamp = 0
 
@@ -197,12 +197,11 @@ class ServedFreeCamera(ServedVehicle):
 
 
 class Vehicles(dict[str, ServedVehicle]):
-    """All vehicles of a run, by name, and the methods that tell of them.
+    """All vehicles of a run, by name, and the methods about vehicles.
 
     Args:
-        default: Name of the one that an empty name stands for; empty for the first by name.
-        settings: The settings.json that clients get: its text, or a file; empty for one that says
-            what runs.
+        default: Name that an empty name stands for; empty for the first by name.
+        settings: The settings.json for clients: its text, or a file; empty to describe the run.
     """
 
     def __init__(self, world: SharedWorld, default: str, settings: str, node: Node[Any]) -> None:
@@ -221,7 +220,7 @@ class Vehicles(dict[str, ServedVehicle]):
         return found
 
     def find_multirotor(self, name: str) -> ServedMultirotor:
-        """Return a multirotor; an empty name may stand for the first one, by name.
+        """Return a multirotor; an empty name may stand for the first by name.
 
         Raises:
             RpcError: There is none of that name.
@@ -233,7 +232,7 @@ class Vehicles(dict[str, ServedVehicle]):
         return found
 
     def find_commanded(self, name: str) -> ServedMultirotor:
-        """Return a multirotor that clients may command.
+        """Return a multirotor open to clients' commands.
 
         Raises:
             RpcError: They may not, where AirSim would do nothing, or wait for ever; or there is
@@ -249,7 +248,7 @@ class Vehicles(dict[str, ServedVehicle]):
         return vehicle
 
     def drawn_state(self, now: int) -> tuple[int, Floats]:
-        """Return the world's state as it is to be drawn now: time (ns), and positions.
+        """Return the world's state to draw now: time (ns), and positions.
 
         These are of the last whole millisecond, so exactly the state that methods tell of; in them
         free cameras are where they have been put, if only just now. Shape (nq,), a copy.
@@ -273,7 +272,7 @@ class Vehicles(dict[str, ServedVehicle]):
 
     @rpc("getSettingsString")
     def settings(self) -> Awaitable[str] | str:
-        """Return the settings.json of the server's settings, or else one that says what runs."""
+        """Return the settings.json of the settings, else a description of the run."""
         given = self._settings
         if not given:
             return json.dumps(self._described())
@@ -385,23 +384,23 @@ class Collisions:
 
     @rpc("simGetCollisionInfo")
     def collision_info(self, vehicle: ServedVehicle) -> CollisionInfo:
-        """Return a vehicle's last collision, and count it as read: ``has_collided`` is cleared."""
+        """Return a vehicle's last collision, and clear its ``has_collided``."""
         found = vehicle.collision
         vehicle.collision = msgspec.structs.replace(found, has_collided=False)
         return found
 
     def forget(self, vehicle: ServedVehicle) -> None:
-        """Forget a vehicle's collision, and take what it touches now as no new one."""
+        """Forget a vehicle's collision, and count its present contacts as known."""
         vehicle.collision = CollisionInfo()
         self._touched[vehicle.name] = _ANYTHING
 
     def note(self, vehicle: ServedMultirotor, event: VehicleEvent) -> None:
-        """Take notice of what a vehicle's node tells."""
+        """Record a collision from an event of the vehicle's node."""
         if isinstance(event, Collision):
             self._take(vehicle, [c for c in vehicle.physics.contacts() if c.other == event.other])
 
     def watch(self) -> None:
-        """Look what the vehicles touch; to be called 50 times a second."""
+        """Check the vehicles' contacts; to be called 50 times a second."""
         for vehicle in self._vehicles.values():
             if not isinstance(vehicle, ServedMultirotor):
                 continue
