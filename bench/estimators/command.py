@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from runtime.tools.cli.outcomes import Json, JUnit, of_rows, writing
+
 
 def suite(
     scenario: Annotated[
@@ -32,24 +34,29 @@ def suite(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Run everything, also what is finished already.")
     ] = False,
+    junit: JUnit = None,
+    json: Json = None,
 ) -> None:
-    """Judge all estimators that are installed in scenarios from easy to brutal.
+    """Judge all installed estimators in scenarios from easy to brutal.
 
-    Each scenario is flown once, and all estimators get that flight. The result is a page with one
-    table of all, their spread, and what the table does not show. Called again, only what is missing
-    or has failed is run. Ends as `sweep` does: a run that fails makes exit code 2, Ctrl-C 130.
+    Each scenario is flown once, and all estimators get the same flight. The result is a page with a
+    table of all, their spread, and what the table does not show. A second call runs only missing
+    and crashed runs. Exit codes: 2 after a crashed run, 130 after Ctrl-C, else 0, also if
+    estimators failed: their failures are what the page is about.
     """
     from bench.estimators.page import write_page
     from bench.estimators.plan import make_plan, read_suite
     from runtime.run.summarise import command_line
     from runtime.tools.cli.sweep import carry_out
 
-    chosen = (read_suite(file) if file else read_suite()).only(scenario or [], estimator or [])
-    plan = make_plan(chosen, out=out.absolute(), seeds=seeds, repeats=repeat)
-    rows = carry_out(plan, jobs=jobs, fresh=fresh)
+    with writing("suite", junit, json) as outcomes:
+        chosen = (read_suite(file) if file else read_suite()).only(scenario or [], estimator or [])
+        plan = make_plan(chosen, out=out.absolute(), seeds=seeds, repeats=repeat)
+        rows = carry_out(plan, jobs=jobs, fresh=fresh)
+        outcomes += of_rows(map(str, plan.jobs), rows)
     path = page or out / "SUITE.md"
     write_page(chosen, plan, rows, path, command_line())
     typer.echo(f"{len(rows)} runs   the page is {path}")
-    if failed := sum(bool(row["error"]) for row in rows):
-        typer.echo(f"error: {failed} of {len(rows)} runs failed", err=True)
+    if crashed := sum(bool(row["error"]) for row in rows):
+        typer.echo(f"error: {crashed} of {len(rows)} runs crashed", err=True)
         raise typer.Exit(2)

@@ -1,4 +1,4 @@
-"""``judge``: trajectories that somebody else computed, with a run's figures and report."""
+"""``judge`` command: a run's figures and report for trajectories from files and bags."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from runtime.tools.cli.outcomes import Json, JUnit, of_verdict, writing
 
 
 def judge(
@@ -36,26 +38,29 @@ def judge(
     ] = None,
     out: Annotated[str, typer.Option(help="Folder for results; judged/NAME if not given.")] = "",
     name: Annotated[str, typer.Option(help="Of the folder, and of the page.")] = "trajectories",
+    junit: JUnit = None,
+    json: Json = None,
 ) -> None:
-    """Judge trajectories that somebody else computed, as a run judges its estimators.
+    """Judge trajectories computed elsewhere, as a run judges its estimators.
 
-    Reads TUM, EuRoC, KITTI (with --times: seconds, a line each) and VSLAM-LAB files, and Path,
-    Odometry, PoseStamped and PoseWithCovarianceStamped of bags. Figures, report and thresholds are
-    those of a run; what poses alone do not tell, such as latencies, is absent. --frames is a
-    times.txt, rgb.txt, rgb.csv or cam0/data.csv; without it the flight is that of the truth.
+    Reads TUM, EuRoC, KITTI (with --times: seconds, one a line) and VSLAM-LAB files, and Path,
+    Odometry, PoseStamped and PoseWithCovarianceStamped topics of bags. Figures, report and
+    thresholds are those of a run, except for figures that need more than poses, such as latencies.
+    --frames is a times.txt, rgb.txt, rgb.csv or cam0/data.csv; without it the flight is that of the
+    truth.
 
-    --final NAME=FILE is the trajectory after loop closures of the estimate NAME: its figures stand
-    beside those of the poses that were said at the time.
+    --final NAME=FILE is the trajectory of the estimate NAME after loop closures: its figures stand
+    beside those of the poses sent at the time.
 
-    An estimate is laid on the truth by sim3 if it is --scale-free; if it names its frame, not at
-    all in map and else at its origin; otherwise by se3. World and body are NED and FRD in TUM's
-    files; z up, and the body as it is, in EuRoC's and VSLAM-LAB's (nwu); those of a camera that
-    looks ahead in KITTI's (optical); enu is ENU and FLU. --axes says so of other estimates. If
-    estimates are of a camera, --body-from-camera is where its optical frame sits in the truth's
-    body: "tx ty tz qx qy qz qw", a file of TUM's with one pose, or a camera of the truth's run.
+    Alignment is sim3 with --scale-free; otherwise none for an estimate in the frame map, origin for
+    one in another named frame, and se3 for all others. World and body are NED and FRD in TUM files;
+    z up, with the body as it is, in EuRoC and VSLAM-LAB files (nwu); those of a camera that looks
+    ahead in KITTI files (optical); enu is ENU and FLU. --axes sets the axes of other files. If
+    estimates are of a camera, --body-from-camera is its optical frame in the truth's body:
+    "tx ty tz qx qy qz qw", a TUM file with one pose, or a camera of the truth's run.
 
-    Ends with 0; with 1 if a threshold was missed (also by default: poses for 90 % of the flight);
-    with 2 if something cannot be read.
+    Exit codes: 0; 1 if a threshold is missed (by default also: poses for 90 % of the flight); 2 if
+    an input cannot be read.
     """
     from rich.console import Console
 
@@ -63,34 +68,38 @@ def judge(
     from runtime.config.messages import given
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
+    from runtime.tools.cli.brief import print_verdict
     from runtime.tools.cli.commands import warn
-    from runtime.tools.cli.run import print_verdict
     from runtime.tools.cli.tables import verdict_table
 
-    try:
-        said = {
-            "alignment": alignment,
-            "scale_free": scale_free,
-            "axes": axes or None,
-            "max_difference": max_difference,
-            "gap": gap,
-            "thresholds": {k: given(v) for k, _, v in (t.partition("=") for t in threshold or ())},
-        }
-        config = convert(said, judging.JudgeConfig, "judge")
-        true = sources.read_truth(truth, times)
-        camera = sources.read_mounting(body_from_camera, truth) if body_from_camera else None
-        found = [sources.read(each, config.axes, times, camera) for each in estimate]
-        stamps = sources.read_stamps(Path(frames)) if frames else None
-        corrected = [sources.read(each, config.axes, times, camera) for each in final or ()]
-        finals = {each.name: each.poses for each in corrected}
-        judgements, verdict, notes = judging.judge_all(true, found, stamps, config, finals)
-        page = judging.write(Path(out or f"judged/{name}"), true, judgements, verdict, notes)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
+    with writing(name, junit, json) as outcomes:
+        try:
+            said = {
+                "alignment": alignment,
+                "scale_free": scale_free,
+                "axes": axes or None,
+                "max_difference": max_difference,
+                "gap": gap,
+                "thresholds": {
+                    k: given(v) for k, _, v in (t.partition("=") for t in threshold or ())
+                },
+            }
+            config = convert(said, judging.JudgeConfig, "judge")
+            true = sources.read_truth(truth, times)
+            camera = sources.read_mounting(body_from_camera, truth) if body_from_camera else None
+            found = [sources.read(each, config.axes, times, camera) for each in estimate]
+            stamps = sources.read_stamps(Path(frames)) if frames else None
+            corrected = [sources.read(each, config.axes, times, camera) for each in final or ()]
+            finals = {each.name: each.poses for each in corrected}
+            judgements, verdict, notes = judging.judge_all(true, found, stamps, config, finals)
+            page = judging.write(Path(out or f"judged/{name}"), true, judgements, verdict, notes)
+            outcomes += of_verdict(name, verdict)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
     for note in notes:
         warn(note)
     console = Console()
     console.print(verdict_table(verdict))
-    print_verdict(console, verdict)
+    print_verdict(verdict)
     console.print(f"results in [bold]{page.parent}[/bold]: open {page.name}", highlight=False)
     raise typer.Exit(1 if verdict.passed is False else 0)

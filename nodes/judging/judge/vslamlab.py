@@ -21,7 +21,7 @@ import typer
 def arguments(
     sequence: Path, run: Path, mode: str, settings: str = "", *, dashes: bool = False
 ) -> list[str]:
-    """Return what a program gets: ``key:value``, or with `dashes` ``--key value``.
+    """Return a program's arguments: ``key:value``, or ``--key value`` with `dashes`.
 
     Args:
         run: Folder of the experiment, and in it the name of the run.
@@ -45,18 +45,18 @@ def arguments(
 
 
 def run_once(command: Sequence[str], run: Path, limit: float) -> Path:
-    """Run a program, and end it, with all that it has started, if it takes too long.
+    """Run a program; after `limit` seconds, end all its processes.
 
     Args:
-        command: With all its arguments. What it prints goes to ``system_output_<exp_id>.txt``.
+        command: Program and arguments. Its output goes to ``system_output_<exp_id>.txt``.
         run: As of `arguments`.
         limit: Real seconds.
 
     Returns:
-        The trajectory that it left.
+        The trajectory file.
 
     Raises:
-        ValueError: It left none, failed, or took too long; says so, and what it last printed.
+        ValueError: The program left no trajectory, failed (with its last output), or took too long.
     """
     from nodes.outside.process.program import Program
 
@@ -102,7 +102,7 @@ def vslamlab(
     from nodes.judging.judge import judging, sources
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
-    from runtime.tools.cli.run import print_verdict
+    from runtime.tools.cli.brief import print_verdict
     from runtime.tools.cli.tables import verdict_table
 
     sequence, runs = sequence.absolute(), out.absolute().with_name(f"{out.name}_runs")
@@ -141,6 +141,6 @@ def vslamlab(
     console = Console()
     console.print(verdict_table(verdict))
     console.print("\n".join(notes), highlight=False)
-    print_verdict(console, verdict)
+    print_verdict(verdict)
     console.print(f"results in [bold]{page.parent}[/bold]: open {page.name}", highlight=False)
     raise typer.Exit(1 if verdict.passed is False else 0)

@@ -27,7 +27,7 @@ app = typer.Typer(
 
 @app.callback()
 def _all() -> None:
-    """Fly a simulated vehicle, feed a visual-navigation system, and measure it."""
+    """Fly a simulated vehicle, to feed and to measure a visual-navigation system."""
 
 
 def main() -> None:
@@ -59,13 +59,13 @@ def main() -> None:
 
 
 def _unheard() -> NoReturn:
-    """End the process: whoever reads what it prints has heard enough."""
+    """End the process: the reader of its output has gone."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(2)
 
 
 def program() -> None:
-    """Be the program: run the command line, and end the process with all that Zenoh still does.
+    """Run the command line, and end the process even while Zenoh's threads still run.
 
     Python stops threads that call it while it ends, and one that it stops in Zenoh's code aborts
     the process.
@@ -89,7 +89,7 @@ def interrupted() -> NoReturn:
 
 
 def _described(error: Exception) -> str:
-    """Return an error as a line: one of ours says all; of others, type and place, too."""
+    """Return an error as a line: a `VisnavError`'s message; else with type and place."""
     from runtime.run.node_runner import with_place, wrap
 
     if isinstance(error, VisnavError):

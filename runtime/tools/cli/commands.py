@@ -1,4 +1,4 @@
-"""The commands that installed packages offer, each imported when it is used, and shared arguments.
+"""Commands of installed packages, each imported on use, and shared arguments.
 
 Help needs no imports: it takes the first sentence of a command's docstring from its source, so
 that it comes at once however much the packages import.
@@ -30,7 +30,7 @@ Overrides = Annotated[
     ),
 ]
 Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
+    bool, typer.Option("--quiet", "-q", help="No progress bar, and at the end only why it failed.")
 ]
 
 
@@ -49,7 +49,7 @@ class Commands(TyperGroup):
         return list(_commands())
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Return what help shows of a command; it cannot be called."""
+        """Return a command's stub for the help, not callable."""
         if cmd_name not in _commands():
             return None
         offer = _chosen(cmd_name)
@@ -57,7 +57,7 @@ class Commands(TyperGroup):
         return TyperCommand(cmd_name, help=_help(offer), rich_help_panel=panel)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ARG002
-        """Import and return the command that the arguments call.
+        """Import and return the command named by the arguments.
 
         Raises:
             ConfigError: There is no such command.
@@ -77,18 +77,18 @@ class Commands(TyperGroup):
             return super().make_context(*args, **options)
 
     def invoke(self, ctx: Any) -> Any:
-        """Read the command's arguments, and call it."""
+        """Parse the command's arguments, and call the command."""
         with _plain_errors():
             return super().invoke(ctx)
 
 
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
-"""Click's base of all that can be wrong with arguments, which Typer shows in a box."""
+"""Click's base class of usage errors, shown in a box by Typer."""
 
 
 @contextlib.contextmanager
 def _plain_errors() -> Iterator[None]:
-    """Turn errors about arguments into ours, which are one line.
+    """Turn errors about arguments into a `ConfigError` of a single line.
 
     Raises:
         ConfigError: An argument is wrong.
@@ -128,7 +128,7 @@ def load(offer: Offer) -> Any:
 
 @cache
 def _commands() -> dict[str, list[Offer]]:
-    """Return the offers of each command: of one package, unless others chose the same name."""
+    """Return the offers of each command: several if packages chose the same name."""
     found: dict[str, list[Offer]] = {}
     for offer in offers(COMMANDS):
         found.setdefault(offer.name, []).append(offer)
@@ -136,7 +136,7 @@ def _commands() -> dict[str, list[Offer]]:
 
 
 def _chosen(name: str) -> Offer:
-    """Return the offer that is used for a name; of several the first, with a warning."""
+    """Return the offer used for a name: the first of several, with a warning."""
     used, *others = _commands()[name]
     for other in others:
         warn(
@@ -147,7 +147,7 @@ def _chosen(name: str) -> Offer:
 
 
 def _help(offer: Offer) -> str:
-    """Return the help of a command, or why it cannot be used."""
+    """Return the help of a command, or why the command cannot be used."""
     module, _, name = offer.value.partition(":")
     source = _source(module)
     if source is not None:
@@ -162,7 +162,7 @@ def _help(offer: Offer) -> str:
 
 
 def _source(module: str) -> Path | None:
-    """Return the source file of a module, without importing the packages that it is in."""
+    """Return the source file of a module, without importing its parent packages."""
     search: Any = None
     spec = None
     parts = module.split(".")

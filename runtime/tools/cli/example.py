@@ -1,4 +1,4 @@
-"""``demo`` and ``example``: the files that come with the project, also in an installed wheel."""
+"""``demo`` and ``example``: the project's example files, also in an installed wheel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def demo(
     overrides: Overrides = None,
     quiet: Quiet = False,
 ) -> None:
-    """Fly the standard tour, and judge visual odometry on it (config.toml)."""
+    """Fly the standard tour, and judge visual odometry (config.toml)."""
     from runtime.tools.cli.run import run
 
     run(example_files()["config"], out=out, overrides=overrides, quiet=quiet)
@@ -32,7 +32,7 @@ def example(
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to copy it to.")] = Path(),
 ) -> None:
-    """List the examples, or copy one, with the files that it reads, to start from."""
+    """List the examples, or copy an example with its files, to start from."""
     import re
     import shutil
 
@@ -91,7 +91,7 @@ def _about(path: Path) -> str:
 
 
 def _read_by(path: Path) -> list[Path]:
-    """Return what an example names beside it: worlds, trajectories, modules of nodes, programs."""
+    """Return files named in an example: worlds, trajectories, node modules, programs."""
     text = path.read_text(encoding="utf-8")
     beside = (file for file in sorted(path.parent.iterdir()) if file.suffix != ".toml")
     return [

@@ -1,12 +1,12 @@
-"""The command ``check``: say what is wrong with a file before anything flies.
+"""The command ``check``: find errors in a file before anything flies.
 
-``graph``: which node sends what to which, as Mermaid text or as a drawing.
+``graph``: the events between nodes, as Mermaid text or as a drawing.
 
-``nodes``: what there is to put into a file.
+``nodes``: the types of node for a file.
 
-``settings``: what every file may hold, whatever its nodes.
+``settings``: the settings of every file, whatever its nodes.
 
-``schema``: what a file may hold, for editors that complete and check TOML.
+``schema``: a JSON schema of files, for editors that complete and check TOML.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def graph(
         typer.Option(help="Draw it into this PNG, SVG or PDF instead of printing Mermaid."),
     ] = None,
 ) -> None:
-    """Show which node sends which events to which."""
+    """Show the nodes, and the events sent between them."""
     from runtime.config.reading import load_configuration
     from runtime.run.graph import edges
 
@@ -90,7 +90,7 @@ def mermaid(names: list[str], edges: list[tuple[str, str, str, str, str]]) -> st
 
 
 def draw(names: list[str], edges: list[tuple[str, str, str, str, str]], out: Path) -> None:
-    """Draw the nodes in layers, senders to the left, with an arrow for each pair that talks."""
+    """Draw the nodes in layers, senders to the left, an arrow for each connected pair."""
     from matplotlib.figure import Figure
 
     pairs = _by_pair(edges)
@@ -132,7 +132,7 @@ def draw(names: list[str], edges: list[tuple[str, str, str, str, str]], out: Pat
 
 
 def layers(names: list[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]]:
-    """Put nodes into layers, so that most arrows go from one layer to a later one.
+    """Put nodes into layers, with most arrows going to a later layer.
 
     A node stands right of all that it listens to; an arrow that would close a circle, looked for
     in the order of the nodes, is left out of account.
@@ -163,7 +163,7 @@ def layers(names: list[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]
 
 
 def _by_pair(edges: list[tuple[str, str, str, str, str]]) -> dict[tuple[str, str], list[str]]:
-    """Return the types of event that pass between each pair of nodes."""
+    """Return the types of event sent, by pair of sender and receiver."""
     pairs: dict[tuple[str, str], dict[str, None]] = {}
     for sender, _, event, receiver, _ in edges:
         pairs.setdefault((sender, receiver), {})[event] = None
@@ -205,7 +205,7 @@ def nodes(
 
 
 def _tree(node: NodeDescription) -> Tree:
-    """Return a node as a tree: what it is, its ports, ticks and settings."""
+    """Return a node as a tree: its description, ports, ticks and settings."""
     from rich.markup import escape
     from rich.tree import Tree
 
@@ -229,7 +229,7 @@ def _branch(tree: Tree, title: str, content: Sequence[object]) -> Tree:
 
 
 def add_settings(tree: Tree, settings: Iterable[SettingDescription]) -> None:
-    """Add settings to a tree, and below each table those in it."""
+    """Add settings to a tree, with the settings of each table below."""
     from rich.markup import escape
 
     for setting in settings:
@@ -245,7 +245,7 @@ def add_settings(tree: Tree, settings: Iterable[SettingDescription]) -> None:
 
 
 def settings() -> None:
-    """Describe the settings that every file may have: of the run, its network, and any node."""
+    """Describe the settings common to all files: of the run, its network, and any node."""
     from rich.console import Console
     from rich.markup import escape
     from rich.tree import Tree

@@ -1,4 +1,4 @@
-"""Commands that look at a run while it goes, or at its trace: top, web, set and trace."""
+"""Commands for a live run, or for its trace: top, web, set and trace."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def top(
     run: Run = None,
     leave: Annotated[bool, typer.Option("--leave", help="Quit when the run ends.")] = False,
 ) -> None:
-    """Monitor a run in a terminal, and control it.
+    """Monitor and control a run in a terminal.
 
     It shows nodes, channels, clock, settings and log. Keys pause the run, step it, change its
     speed or a setting, restart a node and end the run. Quitting does not affect the run.
@@ -36,10 +36,10 @@ def top(
 
 
 def _check_terminal() -> None:
-    """Refuse what cannot show a screen.
+    """Check for a terminal able to show the screen.
 
     Raises:
-        CommandError: It is no terminal, or has not the characters.
+        CommandError: No terminal, or not in UTF-8.
     """
     import codecs
     import sys
@@ -179,7 +179,7 @@ def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
 
 
 def _for(encoding: str, text: str) -> str:
-    """Return a text in characters that an encoding has."""
+    """Return a text with all characters foreign to an encoding replaced."""
     try:
         text.encode(encoding)
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""``run``: from a file to a folder of results, with what observes the run meanwhile."""
+"""``run``: from a file to a folder of results, with observers of the run meanwhile."""
 
 from __future__ import annotations
 
@@ -17,30 +17,22 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from runtime.tools.cli.commands import ConfigFile, Overrides, Quiet, warn
+from runtime.tools.cli.outcomes import Json, JUnit, of_verdict, writing
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from runtime.config.model import Config
     from runtime.run.supervisor import Supervisor
-    from runtime.summary import Summary, Verdict
     from runtime.tools.monitor.observer import LastRecords
 
 Watch = Callable[["Supervisor"], contextlib.AbstractContextManager[None]]
-"""What `execute` takes as `watch`."""
-
-_STATES = {
-    True: "[green]passed[/green]",
-    False: "[red]failed[/red]",
-    None: "[yellow]not judged: no thresholds were given[/yellow]",
-}
+"""Type of `execute`'s `watch`: from a supervisor to a context around the run."""
 
 _LAST_WAIT = 1.0
-"""Real seconds that all threads together get to end by themselves."""
+"""Real seconds for all threads together to end by themselves."""
 
 
 class Log(Enum):
-    """What ``--log`` takes: a level, or ``events``."""
+    """Values of ``--log``: a level, or ``events``."""
 
     trace = "trace"
     debug = "debug"
@@ -68,6 +60,11 @@ def run(
         ),
     ] = None,
     quiet: Quiet = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Print all tables at the end, as `show` does.")
+    ] = False,
+    junit: JUnit = None,
+    json: Json = None,
     trace: Annotated[
         Path | None,
         typer.Option(help="Write a trace for ui.perfetto.dev; compressed if it ends with .gz."),
@@ -96,7 +93,7 @@ def run(
     Results go to runs/<name> (with --only, to runs/<name>-<first node>): summary.json, log.txt,
     the resolved config.toml, and whatever the nodes write. With the first update, an earlier run
     in that folder becomes runs/<name>.1, in the place of what was kept there; a start that fails
-    leaves it where it is.
+    leaves it where it is. Printed is who passed, and how well; --verbose and `show` print all else.
 
     Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
     immediate); with 1 if a threshold of the run was not met, or it was run twice and differed;
@@ -104,6 +101,7 @@ def run(
     """
     from runtime.config.reading import load_configuration
     from runtime.run.execute import execute
+    from runtime.tools.cli.brief import print_failures, print_lines, print_tables
     from runtime.tools.twice import run_twice
 
     if "VISNAV_LIFELINE" in os.environ:
@@ -113,28 +111,34 @@ def run(
     changes = list(overrides or [])
     if log is not None and log is not Log.events:
         changes.append(f"run.log={log.value}")
-    settings = load_configuration(config, changes)
-    nodes_here = chosen(settings, only)
-    look_at(settings, nodes_here)
-    name = "-".join([settings.run.name, *nodes_here[:1]])
-    folder = out or Path("runs") / name
-    stand_ins = {}
-    if flight:
-        from runtime.tools.flights.cache import recorded
+    with writing(config.stem, junit, json) as outcomes:
+        settings = load_configuration(config, changes)
+        nodes_here = chosen(settings, only)
+        look_at(settings, nodes_here)
+        name = "-".join([settings.run.name, *nodes_here[:1]])
+        folder = out or Path("runs") / name
+        stand_ins = {}
+        if flight:
+            from runtime.tools.flights.cache import recorded
 
-        stand_ins = recorded(settings, record=flight == "record")
-    handlers, watch = observed(settings, name, quiet=quiet, trace=trace, top=top, web=web)
-    summary = (run_twice if twice else execute)(
-        settings,
-        folder,
-        handlers=handlers,
-        log_events=log is Log.events,
-        watch=watch,
-        only=nodes_here,
-        stand_ins=stand_ins,
-    )
-    if not quiet:
-        report(summary, folder)
+            stand_ins = recorded(settings, record=flight == "record")
+        handlers, watch = observed(settings, name, quiet=quiet, trace=trace, top=top, web=web)
+        summary = (run_twice if twice else execute)(
+            settings,
+            folder,
+            handlers=handlers,
+            log_events=log is Log.events,
+            watch=watch,
+            only=nodes_here,
+            stand_ins=stand_ins,
+        )
+        outcomes += of_verdict(name, summary.verdict, summary.wall_seconds)
+    if verbose:
+        print_tables(summary)
+    if quiet:
+        print_failures(summary)
+    else:
+        print_lines(summary, folder)
     code = 1 if summary.verdict is not None and summary.verdict.passed is False else 0
     if summary.twice is not None and not summary.twice.repeats:
         code = 1
@@ -142,7 +146,7 @@ def run(
 
 
 def chosen(settings: Config, only: str | None) -> list[str]:
-    """Return the nodes that ``--only`` names, in file order; none if all run here.
+    """Return the nodes named by ``--only``, in file order; none if all run here.
 
     Raises:
         ConfigError: It names a node that there is not, or none.
@@ -165,7 +169,7 @@ def chosen(settings: Config, only: str | None) -> list[str]:
 
 
 def look_at(settings: Config, only: Collection[str] = ()) -> None:
-    """Print what a look at the file makes one warn of.
+    """Check the file before the run, and print the warnings.
 
     Raises:
         ConfigError: The run could not do what the file says.
@@ -180,48 +184,8 @@ def look_at(settings: Config, only: Collection[str] = ()) -> None:
         raise ConfigError("; ".join(found.errors))
 
 
-def report(summary: Summary, folder: Path) -> None:
-    """Print the table at the end of a run."""
-    from rich.console import Console
-
-    from runtime.tools.cli.tables import run_tables
-
-    console = Console()
-    for table in run_tables(summary):
-        console.print(table)
-    digest = summary.digest or "off"
-    if summary.digest and summary.not_deterministic:
-        digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
-    if summary.verdict is not None:
-        print_verdict(console, summary.verdict)
-    if (twice := summary.twice) is not None:
-        found = "[green]repeats[/green]" if twice.repeats else "[red]differs[/red]: "
-        console.print(f"run twice, it {found}{twice.first}", highlight=False)
-    page = ": open report.html" if (folder / "report.html").is_file() else ""
-    took = ""
-    if summary.clock == "lockstep":
-        speed = summary.sim_seconds / max(summary.wall_seconds, 1e-9)
-        took = f" in {summary.wall_seconds:.1f} s ({speed:.1f} × real time)"
-    console.print(
-        f"{summary.sim_seconds:.1f} s on the {summary.clock} clock{took}, "
-        f"ended by: {summary.reason}\n"
-        f"digest {digest}   results in [bold]{folder}[/bold]{page}",
-        highlight=False,
-    )
-
-
-def print_verdict(console: Console, verdict: Verdict) -> None:
-    """Print who passed, what those failed that did not, and why others were not judged."""
-    for name, figures in verdict.estimators.items():
-        passed = _STATES[figures["passed"]]
-        reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
-        if figures["passed"] is None:
-            reasons = str(figures.get("why") or "")
-        console.print(f"{name} {passed}{': ' + reasons if reasons else ''}", highlight=False)
-
-
 def leave_behind(code: int, last: str = "") -> NoReturn:
-    """End the process, even if work of a node never returns; Python would wait for it.
+    """End the process, even if work of a node never returns; Python would wait.
 
     Args:
         last: Printed at the end, to standard error.
@@ -312,7 +276,7 @@ def _monitored(
 
 @contextlib.contextmanager
 def _beside(*arguments: str) -> Iterator[None]:
-    """Run a command of ours in a process of its own, so that drawing does not hold up the run."""
+    """Run a `runtime` command in a separate process, to draw without delaying the run."""
     command = [sys.executable, "-m", "runtime", *arguments]
     # The screen has the terminal and gets its Ctrl-C; the page outlives one, to show the end.
     group = None if arguments[0] == "top" else 0

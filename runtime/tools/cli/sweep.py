@@ -1,6 +1,6 @@
-"""``sweep``: from a file and what to vary to tables and plots.
+"""``sweep``: from a file and varied settings to tables and plots.
 
-``flights``: what is kept of recorded flights.
+``flights``: the recorded flights.
 """
 
 from __future__ import annotations
@@ -8,13 +8,14 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from runtime.tools.cli.commands import ConfigFile, Overrides
+from runtime.tools.cli.outcomes import Json, JUnit, of_rows, writing
 
 if TYPE_CHECKING:
     from runtime.tools.sweep import Children, Plan, Row
@@ -66,6 +67,8 @@ def sweep(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Run everything, also what is finished already.")
     ] = False,
+    junit: JUnit = None,
+    json: Json = None,
 ) -> None:
     """Run a file with every combination of some settings, and compare the results.
 
@@ -74,8 +77,9 @@ def sweep(
     the command flights). Results go to
     sweeps/<name>: index.html shows all of them; table.csv, summary.csv, plots/, each run's folder
     in runs/, and, since they depend on the machine, timing.csv and what workers cost in costs.csv.
-    Called again, only what is missing or has failed is run. Ends with 0 if every run came to its
-    end, whether or not it met its thresholds; with 2 if one failed; with 130 after Ctrl-C.
+    Called again, only what is missing or has crashed is run. Ends with 0 if every run came to its
+    end and met its thresholds; with 1 if a threshold was missed; with 2 if a run crashed; with 130
+    after Ctrl-C.
     """
     from rich.console import Console
 
@@ -84,19 +88,21 @@ def sweep(
     from runtime.tools.cli.run import look_at
     from runtime.tools.sweep.console import summary_table
 
-    plan = sweeping.make_plan(
-        config,
-        vary or [],
-        overrides=overrides or [],
-        seeds=seeds,
-        repeats=repeat,
-        out=out,
-        fly=fly,
-        limit=_seconds(timeout),
-    )
-    changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
-    look_at(load_configuration(config, [*(overrides or []), *changes]))
-    rows = carry_out(plan, jobs=jobs, fresh=fresh)
+    with writing(config.stem, junit, json) as outcomes:
+        plan = sweeping.make_plan(
+            config,
+            vary or [],
+            overrides=overrides or [],
+            seeds=seeds,
+            repeats=repeat,
+            out=out,
+            fly=fly,
+            limit=_seconds(timeout),
+        )
+        changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
+        look_at(load_configuration(config, [*(overrides or []), *changes]))
+        rows = carry_out(plan, jobs=jobs, fresh=fresh)
+        outcomes += of_rows(map(str, plan.jobs), rows)
     sweeping.write_tables(plan, rows)
     sweeping.draw_plots(plan, rows)
     page = sweeping.write_page(plan, rows)
@@ -107,13 +113,25 @@ def sweep(
     console.print(
         f"{len(rows)} runs   results in [bold]{plan.out}[/bold]: open {page.name}", highlight=False
     )
-    if failed := sum(bool(row["error"]) for row in rows):
-        typer.echo(f"error: {failed} of {len(rows)} runs failed", err=True)
+    end(rows)
+
+
+def end(rows: Sequence[Row]) -> None:
+    """Print how many runs crashed or failed.
+
+    Raises:
+        typer.Exit: With 2 if a run crashed, with 1 if a threshold was missed.
+    """
+    if crashed := sum(bool(row["error"]) for row in rows):
+        typer.echo(f"error: {crashed} of {len(rows)} runs crashed", err=True)
         raise typer.Exit(2)
+    if failed := sum(row["passed"] is False for row in rows):
+        typer.echo(f"{failed} of {len(rows)} runs failed: thresholds were missed", err=True)
+        raise typer.Exit(1)
 
 
 def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> list[Row]:
-    """Run what a plan lacks on this machine, and show how it gets on.
+    """Run the missing jobs of a plan on this machine, and show the progress.
 
     Args:
         jobs: Runs at the same time; if not given, as many as there are cores if they share their
@@ -188,7 +206,7 @@ def flights(
     ] = None,
     clear: Annotated[bool, typer.Option("--clear", help="Remove all of them.")] = False,
 ) -> None:
-    """Show the flights that sweeps have recorded, or remove some.
+    """Show the flights recorded by sweeps, or remove some.
 
     A sweep flies once what several of its runs have in common, and keeps it for later ones: up to
     20 GB, or as many as VISNAV_FLIGHTS_GB says. What a flight depends on is a part of its name, so

@@ -1,4 +1,4 @@
-"""What commands show in the terminal: tables, and the progress bar.
+"""Output of commands in the terminal: tables, and the progress bar.
 
 The bar shows simulated time, speed and frames; a thread draws it, and the loop knows nothing.
 """
@@ -23,7 +23,7 @@ from runtime.time.schedule import SECOND
 
 
 def run_tables(summary: Summary) -> Iterator[Table]:
-    """Return what was sent and dropped, how late ticks were, what workers cost, and more."""
+    """Yield tables of events sent and dropped, tick lateness, worker costs, and more."""
     seconds = max(summary.sim_seconds, 1e-9)
     yield _table(
         "sent",
@@ -85,7 +85,7 @@ def run_tables(summary: Summary) -> Iterator[Table]:
 
 
 def verdict_table(verdict: Verdict) -> Table:
-    """Return the figures of those that were judged: one column each."""
+    """Return the figures of the judged estimators, a column each."""
     figures = dict.fromkeys(key for each in verdict.estimators.values() for key in each)
     rows = {
         figure: [each.get(figure, "") for each in verdict.estimators.values()] for figure in figures
@@ -135,7 +135,7 @@ _LINE_PERIOD = 10.0
 def progress(
     run: RunConfig, console: Console
 ) -> Callable[[Supervisor], contextlib.AbstractContextManager[None]]:
-    """Return what `execute` takes as `watch`.
+    """Return a progress bar as the `watch` of `execute`.
 
     Args:
         console: Where to draw. What else is printed there, such as log lines, appears above the

@@ -1,4 +1,4 @@
-"""A sweep: one file run with many settings and seeds, each run in a process of its own.
+"""A sweep: a file run with many settings and seeds, each run in a separate process.
 
     config.toml, --vary, --seeds, --repeat → Plan of Jobs → Executor → Rows → tables and plots
 

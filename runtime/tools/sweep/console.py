@@ -1,4 +1,4 @@
-"""All runs of a plan, on any executor, and what the terminal shows of them.
+"""All runs of a plan, on any executor, and their progress in the terminal.
 
 Runs that are finished already are not run again.
 """
@@ -19,20 +19,20 @@ from rich.text import Text
 from runtime.figures import IN_SWEEPS
 from runtime.tools.sweep.plan import Job, Plan
 from runtime.tools.sweep.process import Children, run_job
-from runtime.tools.sweep.tables import Combination, Row, Rows, failed
+from runtime.tools.sweep.tables import Combination, Row, Rows, crashed
 
 
 class Watch:
-    """Is told how a sweep gets on; this one does nothing."""
+    """Base of a sweep's observers: does nothing."""
 
     def begin(self, missing: Sequence[Job], finished: int) -> None:
-        """Hear what will be run, and how many runs are finished from earlier on."""
+        """Note the jobs to run, and the number of runs finished earlier."""
 
     def done(self, job: Job, row: Row) -> None:
-        """Hear that a run has ended, well or not."""
+        """Note the end of a run, successful or not."""
 
     def interrupted(self) -> None:
-        """Hear that the sweep ends as soon as what is running has ended; make that soon."""
+        """Note an interruption: the sweep ends after the running jobs; end them soon."""
 
 
 def sweep(
@@ -43,7 +43,7 @@ def sweep(
     watch: Watch | None = None,
     fresh: bool = False,
 ) -> list[Row]:
-    """Run what is missing, and what has failed before; called in one thread.
+    """Run the missing jobs, and those crashed before; called in a single thread.
 
     Each row is in ``rows.jsonl`` before the next one is looked at, so whatever ends a sweep, the
     next call takes up where it ended. A run that fails is a row with an error.
@@ -99,14 +99,14 @@ def _row(future: concurrent.futures.Future[Row], job: Job) -> Row:
     try:
         return future.result()
     except Exception as error:
-        return failed(job, f"{type(error).__name__}: {error}")
+        return crashed(job, f"{type(error).__name__}: {error}")
 
 
 class Display(Watch):
-    """A bar in a terminal, else a line for each run that has ended; a context manager."""
+    """A bar in a terminal, else a line per finished run; a context manager."""
 
     def __init__(self, children: Children, console: Console) -> None:
-        self.failed = 0
+        self.crashed = 0
         self.finished = 0
         self._children = children
         self._console = console
@@ -145,24 +145,24 @@ class Display(Watch):
         self._bar.update(self._task, total=len(missing))
 
     def done(self, job: Job, row: Row) -> None:
-        """Count a run; show it, unless there is a bar and it is finished."""
+        """Count a run; print failures, and without a bar every run."""
         self.finished += 1
-        self.failed += bool(row["error"])
+        self.crashed += bool(row["error"])
         self._last = time.monotonic()
         self._bar.update(self._task, completed=self.finished)
         if row["error"]:
-            self._print(f"{self._count()} {job}: failed: {row['error']}")
+            self._print(f"{self._count()} {job}: crashed: {row['error']}")
         elif not self._console.is_terminal:
             seconds = f"{row['wall_seconds']:.1f} s" if row["wall_seconds"] else "done"
-            missed = ", missed a threshold" if row["passed"] is False else ""
-            self._print(f"{self._count()} {job}: {seconds}{missed}, {self.state()}")
+            failed = ", failed" if row["passed"] is False else ""
+            self._print(f"{self._count()} {job}: {seconds}{failed}, {self.state()}")
 
     def interrupted(self) -> None:
-        """Say that this may take a while, and how it does not."""
+        """Print a notice: running jobs are awaited, Ctrl-C ends them at once."""
         self._print("ending the runs that are under way; Ctrl-C ends them at once")
 
     def state(self) -> str:
-        """Return what the count does not tell: failures, what runs now, and how long it takes."""
+        """Return failures, running jobs with processes and memory, and the time left."""
         left = "?"
         if self.finished:
             each = (self._last - self._begin) / self.finished
@@ -172,7 +172,7 @@ class Display(Watch):
             self._usage, self._looked = self._children.usage(), time.monotonic()
         processes, memory = self._usage
         using = f" ({processes} process{'es' * (processes > 1)}, {memory:.1f} GB)" * bool(processes)
-        return f"{self.failed} failed, {len(self._children)} running{using}, {left} left"
+        return f"{self.crashed} crashed, {len(self._children)} running{using}, {left} left"
 
     def _count(self) -> str:
         return f"{self.finished}/{self._missing}"
@@ -191,20 +191,20 @@ class _State(ProgressColumn):
 
 
 def summary_table(plan: Plan, combinations: Sequence[Combination]) -> Table:
-    """Return the main figures that there are; `write_tables` has their quartiles, too."""
+    """Return a table of the main figures; their quartiles are in `write_tables`, too."""
     names = [n for n in IN_SWEEPS if any(n in each.figures for each in combinations)]
     table = Table(title="median (least to most) of the runs", title_justify="left")
     for parameter in plan.parameters:
         table.add_column(parameter.path, overflow="fold")
     table.add_column("estimator")
     repeated = any(each.repeatable for each in combinations)
-    for name in ["runs", "failed", "missed", "passed", *names]:
+    for name in ["runs", "crashed", "failed", "passed", *names]:
         table.add_column(name.replace("_", " "), justify="right")
     if repeated:
         table.add_column("repeatable")
     for each in combinations:
         passed = "" if each.passed is None else f"{each.passed}"
-        counts = [f"{each.runs}", f"{each.failed}", f"{each.missed}", passed]
+        counts = [f"{each.runs}", f"{each.crashed}", f"{each.failed}", passed]
         figures = [str(each.figures.get(name, "")) for name in names]
         words = map(Text, [*each.settings, each.estimator])
         table.add_row(*words, *counts, *figures, *[each.repeatable] * repeated)

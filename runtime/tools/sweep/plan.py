@@ -1,6 +1,6 @@
-"""Which runs a sweep consists of, all of them checked before the first one starts.
+"""Runs of a sweep, all checked before the first starts.
 
-What ``--vary`` says: a setting and its values, and how these lie on an axis.
+Arguments of ``--vary``: a setting and its values, and their places on an axis.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _CLOSING = {"[": "]", "{": "}"}
 
 
 class Parameter(msgspec.Struct, frozen=True):
-    """A setting that a sweep varies.
+    """A setting varied by a sweep.
 
     Attributes:
         path: As in ``--set``: ``camera.rate``.
@@ -70,7 +70,7 @@ def parameter(change: str) -> Parameter:
 
 
 def split(text: str, where: str) -> tuple[str, ...]:
-    """Split values at the commas that stand outside brackets and quotes.
+    """Split values at commas outside brackets and quotes.
 
     A quote opens a text where a value begins; in the middle of a bare word it is a letter.
 
@@ -107,7 +107,7 @@ def split(text: str, where: str) -> tuple[str, ...]:
 
 
 def value(text: str) -> Any:
-    """Return what a text means: its value in TOML, or itself, as for ``--set``."""
+    """Return the TOML value of a text, or else the text itself, as for ``--set``."""
     try:
         return given(text)
     except ValueError:  # which reading the settings refuses
@@ -115,7 +115,7 @@ def value(text: str) -> Any:
 
 
 def axis(texts: Sequence[str]) -> Axis:
-    """Place values on an axis: numbers and durations by size, all else one after another."""
+    """Place values on an axis: numbers and durations by size, all else in sequence."""
     values = [value(text) for text in texts]
     if all(type(v) in {int, float} and math.isfinite(v) for v in values):
         return Axis(tuple(float(v) for v in values))
@@ -129,12 +129,14 @@ def axis(texts: Sequence[str]) -> Axis:
 
 
 LEAST_LIMIT, SLOWEST, USUAL = 600.0, 30.0, 120.0
-"""Real seconds that each run may take, and those for each second of its duration, and how long it
-is taken to be if it has none: what takes longer hangs."""
+"""Time limit of a run: base (real s), factor per second, default duration (s).
+
+A run beyond its limit hangs.
+"""
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
-    """One run, with all that another machine needs to know of it.
+    """A run of a sweep, with all data for another machine to run the job.
 
     Attributes:
         id: Of these settings, this seed and this repeat, in this sweep or any other.
@@ -163,7 +165,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     repeat: int = 1
 
     def __str__(self) -> str:
-        """Return what tells it from the others of its sweep."""
+        """Return settings, seed and repeat as a text, unique in the sweep."""
         words = [*(f"{path}={text}" for path, text in self.settings), f"seed={self.seed}"]
         return " ".join(words + [f"repeat={self.repeat}"] * (self.repeat > 1))
 
@@ -236,7 +238,7 @@ def make_plan(
 
 
 def sharing(jobs: Iterable[Job]) -> tuple[Job, ...]:
-    """Return jobs of which those record their flight that share it with another."""
+    """Return the jobs, with `record` set for jobs of a shared flight."""
     found = tuple(jobs)
     counts = Counter(job.flight for job in found)
     return tuple(
@@ -273,11 +275,11 @@ def make_job(
     out: Path,
     repeat: int = 1,
 ) -> Job:
-    """Make one run of a sweep.
+    """Make a job of a sweep.
 
     Args:
         config: Its settings, but for the seed.
-        settings: What tells it from the others, as pairs of name and value.
+        settings: Varied settings, as pairs of name and value.
         folder: Where modules of its nodes are looked for.
         out: Absolute path of the sweep's folder.
         repeat: The how manieth run with these settings and this seed.

@@ -1,4 +1,4 @@
-"""Accuracy against each varied parameter, one PNG a parameter.
+"""Plots of accuracy against each varied parameter, a PNG per parameter.
 
 A sweep as a page: ``index.html`` beside its tables, with links to each run's own report.
 """
@@ -20,17 +20,17 @@ from runtime.tools.sweep.plan import Parameter, Plan, axis
 from runtime.tools.sweep.tables import Row, Spread, in_order, numbers, summarise
 
 PLOTTED = {each.name: each.plot for each in FIGURES.values() if each.plot}
-"""Figure to what it is called on its axis."""
+"""Axis label of each plotted figure."""
 
 _SHARES = "failures (% of the runs)"
 _MOST_LINES = 8
 
 
 class Line(msgspec.Struct, frozen=True):
-    """One line of a plot: a figure at each value of a parameter that has any.
+    """A line of a plot: a figure at each value of a parameter with results.
 
     Attributes:
-        label: What tells it from the others; empty if it is the only one.
+        label: Its name among others; empty for a single line.
         texts: The values.
         spreads: Of the figure at each of them.
     """
@@ -44,7 +44,7 @@ def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
     """Draw a plot for each parameter into ``plots/``, if the runs have something to show.
 
     A line is the median, with the quartiles as its band, and bars from the least to the most; the
-    last panel has the share of the runs that came to nothing, and that missed a threshold.
+    last panel has the share of the runs crashed, and of those failed.
     """
     own = [row for _, row in in_order(plan, rows)]
     drawn = []
@@ -60,7 +60,7 @@ def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
 
 
 def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) -> list[Line]:
-    """Return what a figure did with a parameter.
+    """Return the lines of a figure over a parameter.
 
     One line for each combination of the other parameters and each estimator; if these are more
     than 8, one for each estimator.
@@ -96,13 +96,11 @@ def _line(label: str, found: dict[str, list[float]], parameter: Parameter) -> Li
 
 
 def _shares(parameter: Parameter, rows: Sequence[Row]) -> dict[str, list[float]]:
-    """Return the percentages of runs that failed and that missed, at each value; none if all 0."""
+    """Return the percentages of runs crashed and failed, at each value; none if all 0."""
     groups = [[r for r in rows if r["parameters"][parameter.path] == t] for t in parameter.texts]
     shares = {
-        "failed": [_percent(bool(row["error"]) for row in group) for group in groups],
-        "missed a threshold": [
-            _percent(row["passed"] is False for row in group) for group in groups
-        ],
+        "crashed": [_percent(bool(row["error"]) for row in group) for group in groups],
+        "failed": [_percent(row["passed"] is False for row in group) for group in groups],
     }
     return shares if any(map(any, shares.values())) else {}
 
@@ -182,7 +180,12 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
             for s in spreads
         ]
         judged = "" if each.passed is None else each.passed
-        counts = [each.runs, _share(each.failed, each.runs), _share(each.missed, each.runs), judged]
+        counts = [
+            each.runs,
+            _share(each.crashed, each.runs),
+            _share(each.failed, each.runs),
+            judged,
+        ]
         summary.append(([*each.settings, each.estimator], counts, cells, each.repeatable))
     runs, repeated = [], any(job.repeat > 1 for job in plan.jobs)
     for job, row in in_order(plan, rows):

@@ -1,4 +1,4 @@
-"""One run as a process of its own: started, waited for or interrupted, and read.
+"""A run as a separate process: started, waited for or interrupted, and read.
 
 What it prints goes to ``output.txt`` in the run's folder.
 """
@@ -21,10 +21,10 @@ from runtime.channels.digest import combined
 from runtime.run.results import clear
 from runtime.summary import Verdict
 from runtime.tools.sweep.plan import Job
-from runtime.tools.sweep.tables import Row, failed
+from runtime.tools.sweep.tables import Row, crashed
 
 _STOPPED = {"Ctrl-C", "SIGTERM", "SIGHUP"}
-"""Reasons for a run's end that are no end of its own; see `runtime.run.execute`."""
+"""Reasons of a run ended from outside; see `runtime.run.execute`."""
 
 _LONGEST_ERROR = 300
 
@@ -33,7 +33,7 @@ LIFELINE = "VISNAV_LIFELINE"
 
 
 class Ended(msgspec.Struct, frozen=True):
-    """What a sweep reads of a run's ``summary.json``."""
+    """Fields of a run's ``summary.json`` read by a sweep."""
 
     reason: str
     sim_seconds: float
@@ -54,7 +54,7 @@ def run_job(job: Job) -> Row:
 
 
 class Children:
-    """Runs of this process, from any number of threads, which can be ended together."""
+    """Processes of runs, from any number of threads; can be ended together."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()  # a signal may interrupt an interruption
@@ -80,7 +80,7 @@ class Children:
         with (out / "output.txt").open("wb") as output, os.fdopen(lifeline), os.fdopen(ours, "w"):
             with self._lock:
                 if self.ending:
-                    return failed(job, "not started")
+                    return crashed(job, "not started")
                 child = subprocess.Popen(  # noqa: S603
                     [*command, "--out", str(out), "--quiet"],
                     env={
@@ -100,7 +100,7 @@ class Children:
                 code = child.wait(job.limit)
             except subprocess.TimeoutExpired:
                 kill_tree(child.pid)
-                row = failed(job, f"timed out after {job.limit:g} s")
+                row = crashed(job, f"timed out after {job.limit:g} s")
                 row["exit_code"] = child.wait()
                 row["wall_seconds"] = round(time.monotonic() - begin, 6)
                 return row
@@ -137,7 +137,7 @@ class Children:
 
 
 def end_with_the_sweep() -> None:
-    """In a run of a sweep: end at once, with all that was started, when the sweep is gone."""
+    """End a sweep's run at once, with all its children, when the sweep is gone."""
     lifeline = os.environ.pop(LIFELINE, None)
     if lifeline is None:
         return
@@ -151,7 +151,7 @@ def end_with_the_sweep() -> None:
 
 
 def kill_tree(run: int) -> None:
-    """Kill a run, which leads a session, and all that it has started, whatever group that is in."""
+    """Kill a run, the leader of a session, and its descendants in any process group."""
     with contextlib.suppress(ProcessLookupError):
         if run != os.getpid():
             os.kill(run, signal.SIGSTOP)  # or it might start more
@@ -180,15 +180,15 @@ def _processes() -> dict[int, tuple[int, int]]:
 
 
 def read_results(job: Job, code: int, wall_seconds: float) -> Row:
-    """Put together the row of a process that has ended.
+    """Return the row of an ended process.
 
     Args:
-        code: Its exit code: 0, or 1 if it missed a threshold; all else is a failure, and so is
+        code: Its exit code: 0, or 1 if it missed a threshold; all else is a crash, and so is
             a 1 without a verdict, which is what Python ends with after an exception.
         wall_seconds: How long it took.
     """
     out = Path(job.out)
-    row = failed(job, "")
+    row = crashed(job, "")
     row["exit_code"], row["wall_seconds"] = code, round(wall_seconds, 6)
     ended, unread = None, ""
     try:
@@ -227,13 +227,13 @@ def _outputs_of(node: str, digests: dict[str, str]) -> dict[str, str]:
 
 
 def last_error(output: str) -> str:
-    """Return the last line that is an error, or else the last line, of what a run printed."""
+    """Return the last error line of a run's output, or else the last line."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("error: ")]
     return (errors or lines or [""])[-1].removeprefix("error: ")
 
 
 def _same_everywhere(error: str, job: Job) -> str:
-    """Take out of an error what differs between two sweeps that are equal."""
+    """Remove from an error the parts different between equal sweeps."""
     error = error.replace(job.out, f"runs/{job.id}")
     return re.sub(r"\b0x[0-9a-f]{6,}", "0x…", error)[:_LONGEST_ERROR]

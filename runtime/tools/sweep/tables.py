@@ -24,7 +24,7 @@ from runtime.tools.sweep.plan import Job, Plan
 
 
 class Row(TypedDict):
-    """One run. All of it goes through JSON, so figures that are no numbers become `None`.
+    """Results of a run. All go through JSON, so non-finite figures become `None`.
 
     Keys:
         id: Of the job.
@@ -60,8 +60,8 @@ class Row(TypedDict):
     workers: NotRequired[dict[str, dict[str, float | None]]]
 
 
-def failed(job: Job, error: str) -> Row:
-    """Return the row of a run that came to nothing."""
+def crashed(job: Job, error: str) -> Row:
+    """Return the row of a crashed run."""
     return Row(
         id=job.id,
         parameters=dict(job.settings),
@@ -120,11 +120,11 @@ class Rows:
         self._file.close()
 
     def get(self, job: Job) -> Row | None:
-        """Return a job's row, finished or failed, or `None`."""
+        """Return a job's row, finished or crashed, or `None`."""
         return self._rows.get(job.id)
 
     def add(self, row: Row) -> Row:
-        """Write a row, and return it as it will be read."""
+        """Write a row, and return the row as read back."""
         line = msgspec.json.encode(row)
         self._file.write(line + b"\n")
         self._file.flush()
@@ -134,7 +134,7 @@ class Rows:
 
 
 class Spread(msgspec.Struct, frozen=True):
-    """One figure over the runs that have it: median, first and third quartile, least and most."""
+    """A figure over several runs: median, first and third quartile, least and most."""
 
     median: float
     first: float
@@ -144,7 +144,7 @@ class Spread(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """Sum up at least one value; quartiles are interpolated between values."""
+        """Summarise a value or more; quartiles are interpolated between values."""
         first, median, third = (values[0],) * 3
         if len(values) > 1:
             first, median, third = statistics.quantiles(values, n=4, method="inclusive")
@@ -157,19 +157,19 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 SPREAD = {"median": "median", "q1": "first", "q3": "third", "min": "least", "max": "most"}
-"""What ``summary.csv`` has of each main figure, and which field of its `Spread` that is."""
+"""Column of each main figure in ``summary.csv`` to field of `Spread`."""
 
 
 class Combination(msgspec.Struct, frozen=True, kw_only=True):
-    """One combination of settings and one estimator, over all seeds and repeats.
+    """A combination of settings and an estimator, over all seeds and repeats.
 
     Attributes:
         settings: Values of the parameters, in their order.
         estimator: Its name; empty if no run has a verdict.
         runs: How many there were.
-        failed: How many of these came to nothing; no figure knows of them.
+        crashed: How many of these came to nothing; no figure knows of them.
         passed: How many met the estimator's thresholds; `None` if there are none.
-        missed: How many did not meet them.
+        failed: How many did not meet them.
         repeatable: Whether runs with equal settings and seed gave the same, in words; empty if
             there were no two of them.
         figures: Main figure to its spread.
@@ -178,9 +178,9 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[str, ...]
     estimator: str
     runs: int
-    failed: int
+    crashed: int
     passed: int | None
-    missed: int = 0
+    failed: int = 0
     repeatable: str = ""
     figures: dict[str, Spread]
 
@@ -206,11 +206,11 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     header = ["run", *paths, *seed, "worker", *keys]
     costs_of_all = [[*h, name, *(costs.get(k) for k in keys)] for h, name, costs in workers]
     _write(plan.out / "costs.csv", header, costs_of_all)
-    header = [*paths, "estimator", "runs", "failed", "missed", "passed", "repeatable"]
+    header = [*paths, "estimator", "runs", "crashed", "failed", "passed", "repeatable"]
     header += [f"{name}_{what}" for name in IN_SWEEPS for what in SPREAD]
     lines = []
     for each in summarise(plan, rows):
-        line: list[Any] = [*each.settings, each.estimator, each.runs, each.failed, each.missed]
+        line: list[Any] = [*each.settings, each.estimator, each.runs, each.crashed, each.failed]
         line += [each.passed, each.repeatable]
         for name in IN_SWEEPS:
             line += [getattr(each.figures.get(name), field, None) for field in SPREAD.values()]
@@ -239,7 +239,7 @@ def summarise(plan: Plan, rows: Iterable[Row]) -> list[Combination]:
 
 
 def numbers(values: Iterable[Any]) -> list[float]:
-    """Return those that are numbers."""
+    """Return the numbers among the values."""
     return [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
 
 
@@ -254,9 +254,9 @@ def _combination(settings: tuple[str, ...], name: str, group: Sequence[Row]) -> 
         settings=settings,
         estimator=name,
         runs=len(group),
-        failed=sum(bool(row["error"]) for row in group),
+        crashed=sum(bool(row["error"]) for row in group),
         passed=sum(passed) if passed else None,
-        missed=passed.count(False),
+        failed=passed.count(False),
         repeatable=_repeatable(name, group),
         figures=spreads,
     )
@@ -285,7 +285,7 @@ def _repeatable(name: str, group: Sequence[Row]) -> str:
 
 
 def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], list[list[Any]]]:
-    """Return header and lines: one a run and estimator, or one for a run that has none."""
+    """Return header and lines: a line per run and estimator, or per run without any."""
     header = ["run", *paths, *_seed(rows), "exit_code", "error", "passed", "sim_seconds", "digest"]
     found = {key for _, row in rows for f in row["estimators"].values() for key in f}
     figures = [name for name in IN_SWEEPS if name in found]
@@ -303,7 +303,7 @@ def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], li
 
 
 def _seed(rows: Sequence[tuple[Job, Row]]) -> list[str]:
-    """Return the columns that tell runs with equal settings apart."""
+    """Return the columns to tell runs with equal settings apart."""
     return ["seed", "repeat"] if any(job.repeat > 1 for job, _ in rows) else ["seed"]
 
 
@@ -321,7 +321,7 @@ def _write(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) ->
 
 
 def _cell(value: Any) -> str:
-    """Return a value as it stands in a table: like JSON, but texts without quotes."""
+    """Return a value as a table's cell: like JSON, but texts without quotes."""
     if value is None:
         return ""
     if isinstance(value, str):

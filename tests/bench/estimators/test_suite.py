@@ -12,7 +12,7 @@ import pytest
 from bench.estimators.page import cells, write_page
 from bench.estimators.plan import FOLDER, LEVELS, Suite, make_plan, read_suite
 from runtime.errors import CommandError, ConfigError
-from runtime.tools.sweep.tables import Row, failed
+from runtime.tools.sweep.tables import Row, crashed
 from tests.runtime.tools.samples_cli import command
 
 SMALL = """
@@ -125,7 +125,7 @@ def page_of(suite: Suite, tmp_path: Path, change: Any) -> str:
     rows: list[Row] = []
     for job in plan.jobs:
         name = dict(job.settings)["estimator"]
-        row = failed(job, "")
+        row = crashed(job, "")
         figures = {"held_ate_percent": 0.5 * job.repeat, "coverage_percent": 100.0}
         row |= {"passed": True, "estimators": {name: {"passed": True, **figures}}}
         rows.append(change(row) if name == "bad" else row)

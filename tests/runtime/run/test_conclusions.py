@@ -54,5 +54,5 @@ def test_the_exit_code_tells_whether_thresholds_were_met(
     command = [sys.executable, "-m", "runtime", "run", str(file), "--out", str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30)
     assert done.returncode == code, done.stderr
-    assert ("est passed" if code == 0 else "est failed") in done.stdout
+    assert ("est PASSED" if code == 0 else "est FAILED") in done.stdout
     assert "not promised, because of j" in done.stdout

@@ -40,8 +40,12 @@ def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) 
     path = config_file(tmp_path, "Noise", "Speaker", "Reader", run="duration = 2")
     done = command("run", path, folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "sent" in done.stdout
-    assert "2.0 s on the lockstep clock" in done.stdout
+    first, last = done.stdout.splitlines()
+    assert first.startswith("sample: 2.0 s on the lockstep clock, seed 0, in ")
+    assert last == "results in runs/sample   all figures: python -m runtime show runs/sample"
+    shown = command_here("show", "runs/sample", folder=tmp_path)
+    assert "speaker.pings" in shown.stdout
+    assert shown.stdout.endswith(done.stdout)
     results = tmp_path / "runs" / "sample"
     first = summary(results)
     assert set(first) == set(Summary.__struct_fields__)

@@ -15,7 +15,7 @@ from typing import Any
 from events import Event
 from runtime import Duration, Node, NodeConfig, Output, Tick, every
 from runtime.tools.sweep import Job, Plan, Row, make_plan
-from runtime.tools.sweep.tables import failed
+from runtime.tools.sweep.tables import crashed
 from tests.runtime.tools.samples_cli import ROOT
 
 
@@ -81,7 +81,7 @@ def plan_in(folder: Path, *vary: str, **options: Any) -> Plan:
 
 def pretend(job: Job) -> Row:
     """Make up a finished row without running anything; the rate is the error."""
-    row = failed(job, "")
+    row = crashed(job, "")
     settings = dict(job.settings)
     error = float(settings.get("judge.rate", 1.0)) + job.seed / 100
     figures = {"passed": error < 50, "ate_percent": error, "note": "made up"}

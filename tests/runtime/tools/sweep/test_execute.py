@@ -13,7 +13,7 @@ import pytest
 
 from runtime.errors import ConfigError
 from runtime.tools.sweep import Job, Row, Watch, sweep
-from runtime.tools.sweep.tables import Rows, failed
+from runtime.tools.sweep.tables import Rows, crashed
 from tests.runtime.tools.sweep.samples import die, plan_in, pretend, refuse
 
 
@@ -95,7 +95,7 @@ def test_what_failed_is_run_again_and_what_is_finished_is_not(tmp_path: Path) ->
         calls.append(str(job))
         if len(calls) == 2:
             raise OSError("disk full")
-        return pretend(job) if len(calls) != 3 else failed(job, "out of order")
+        return pretend(job) if len(calls) != 3 else crashed(job, "out of order")
 
     with ThreadPoolExecutor(1) as pool:
         rows = sweep(plan, pool, run=run)
@@ -140,7 +140,7 @@ def test_an_interruption_keeps_what_is_finished_and_waits_for_what_runs(
             return pretend(job)
         second.set()
         go_on.wait()
-        return pretend(job) if ends_well else failed(job, "interrupted")
+        return pretend(job) if ends_well else crashed(job, "interrupted")
 
     watch = Impatient(go_on)
     with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt):

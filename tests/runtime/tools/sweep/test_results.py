@@ -11,7 +11,7 @@ from msgspec.structs import astuple
 
 from runtime.tools.sweep import Row, draw_plots, summarise, write_page, write_tables
 from runtime.tools.sweep.plots import lines
-from runtime.tools.sweep.tables import Spread, failed
+from runtime.tools.sweep.tables import Spread, crashed
 from tests.runtime.tools.sweep.samples import plan_in, pretend
 
 
@@ -23,8 +23,10 @@ def read(path: Path) -> list[dict[str, str]]:
 def test_a_table_has_a_line_for_each_run_and_estimator(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.rate=5,60", seeds=2)
     rows = [pretend(job) for job in plan.jobs]
-    rows[0] = failed(plan.jobs[0], "out of order")
-    write_tables(plan, [*reversed(rows), failed(plan_in(tmp_path, seeds=9).jobs[-1], "of another")])
+    rows[0] = crashed(plan.jobs[0], "out of order")
+    write_tables(
+        plan, [*reversed(rows), crashed(plan_in(tmp_path, seeds=9).jobs[-1], "of another")]
+    )
     table = read(plan.out / "table.csv")
     assert [(line["judge.rate"], line["seed"], line["estimator"]) for line in table] == [
         ("5", "3", ""),
@@ -47,17 +49,17 @@ def test_a_table_has_a_line_for_each_run_and_estimator(tmp_path: Path) -> None:
 def test_a_summary_has_the_spread_over_the_seeds_and_counts_what_failed(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.rate=1,2", seeds=4)
     rows = [pretend(job) for job in plan.jobs]
-    rows[1] = failed(plan.jobs[1], "out of order")
+    rows[1] = crashed(plan.jobs[1], "out of order")
     for index in range(4, 8):
-        rows[index] = failed(plan.jobs[index], "out of order")
+        rows[index] = crashed(plan.jobs[index], "out of order")
     first, second, last = summarise(plan, rows)
     assert (first.settings, first.estimator, second.estimator) == (("1",), "vo", "slam")
-    assert (first.runs, first.failed, first.passed) == (4, 1, 3)
+    assert (first.runs, first.crashed, first.passed) == (4, 1, 3)
     expected = Spread(1.05, 1.04, 1.055, 1.03, 1.06)
     assert astuple(first.figures["ate_percent"]) == pytest.approx(astuple(expected))
     expected = Spread(0.525, 0.52, 0.5275, 0.515, 0.53)
     assert astuple(second.figures["ate_percent"]) == pytest.approx(astuple(expected))
-    assert (last.settings, last.estimator, last.failed) == (("2",), "", 4)
+    assert (last.settings, last.estimator, last.crashed) == (("2",), "", 4)
     assert (last.passed, last.figures) == (None, {})
     write_tables(plan, rows)
     line = read(plan.out / "summary.csv")[0]
@@ -69,7 +71,7 @@ def test_a_summary_has_the_spread_over_the_seeds_and_counts_what_failed(tmp_path
 def test_a_page_shows_figures_plots_and_runs_with_their_reports(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.rate=1,2", seeds=2)
     rows = [pretend(job) for job in plan.jobs]
-    rows[3] = failed(plan.jobs[3], "out <of> order")
+    rows[3] = crashed(plan.jobs[3], "out <of> order")
     folder = Path(plan.jobs[0].out)
     folder.mkdir(parents=True)
     (folder / "report.html").touch()
@@ -120,15 +122,15 @@ def test_many_combinations_become_one_line_with_quartiles(tmp_path: Path) -> Non
 def test_missed_and_failed_runs_are_two_counts(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.rate=60,5", seeds=4)
     rows = [pretend(job) for job in plan.jobs]
-    rows[0] = failed(plan.jobs[0], "out of order")
+    rows[0] = crashed(plan.jobs[0], "out of order")
     vo, *_ = summarise(plan, rows)
-    assert (vo.runs, vo.failed, vo.missed, vo.passed) == (4, 1, 3, 0)
+    assert (vo.runs, vo.crashed, vo.failed, vo.passed) == (4, 1, 3, 0)
     draw_plots(plan, rows)
     page = write_page(plan, rows).read_text(encoding="utf-8")
     assert '<td class="n">1 (25%)</td>' in page
     assert '<td class="n">3 (75%)</td>' in page
     write_tables(plan, rows)
-    assert read(plan.out / "summary.csv")[0]["missed"] == "3"
+    assert read(plan.out / "summary.csv")[0]["failed"] == "3"
 
 
 @pytest.mark.parametrize(
@@ -148,7 +150,7 @@ def test_what_is_said_of_an_estimator_that_is_run_again(
     for job, digest, error in zip(plan.jobs, digests, (1.0, 1.2, 1.1), strict=True):
         row = with_ate(pretend(job), vo=error)
         row["digests"] = {"vo": digest} if digest else {}
-        rows.append(row if digest else failed(job, "out of order"))
+        rows.append(row if digest else crashed(job, "out of order"))
     (vo,) = summarise(plan, rows)
     assert (vo.repeatable, vo.runs) == (found, 3)
     write_tables(plan, rows)
@@ -179,7 +181,7 @@ def test_a_plot_for_each_parameter(tmp_path: Path) -> None:
 
 def test_nothing_is_drawn_of_runs_without_figures(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.latency=0ms,80ms")
-    assert draw_plots(plan, [failed(job, "out of order") for job in plan.jobs]) == []
+    assert draw_plots(plan, [crashed(job, "out of order") for job in plan.jobs]) == []
     assert not (plan.out / "plots").exists()
 
 

@@ -54,10 +54,10 @@ def test_a_run_that_fails_is_a_row_and_the_sweep_goes_on(tmp_path: Path) -> None
     assert process.returncode == 2
     lines = err.splitlines()
     error = re.escape("judge: RuntimeError: out of order (sweep/samples.py:") + r"\d+ in run\)"
-    assert re.fullmatch(f"1/2 judge.fail=true seed=3: failed: {error}", lines[0])
+    assert re.fullmatch(f"1/2 judge.fail=true seed=3: crashed: {error}", lines[0])
     assert lines[1].startswith("2/2 judge.fail=false seed=3: ")
-    assert lines[1].endswith(" s, 1 failed, 0 running, 0:00:00 left")
-    assert lines[2:] == ["error: 1 of 2 runs failed"]
+    assert lines[1].endswith(" s, 1 crashed, 0 running, 0:00:00 left")
+    assert lines[2:] == ["error: 1 of 2 runs crashed"]
     assert "vo" in out
     assert f"2 runs   results in {tmp_path / 'out'}" in out
     table = (tmp_path / "out" / "table.csv").read_text(encoding="utf-8").splitlines()

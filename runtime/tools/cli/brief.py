@@ -1,0 +1,169 @@
+"""Results of a run in the terminal: a few lines by default, all tables on request."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from runtime.errors import ResultsError
+from runtime.summary import Summary, Verdict
+
+SLOWER = 1.5
+"""Ratio of measured to declared latency of a worker to be warned of, medians."""
+
+_WORDS = {
+    True: "[green]PASSED[/green]",
+    False: "[red]FAILED[/red]",
+    None: "[yellow]not judged[/yellow]",
+}
+
+
+def show(
+    folder: Annotated[Path, typer.Argument(help="Folder of the run, such as runs/tour.")],
+) -> None:
+    """Show all figures of a finished run: verdict, channels, ticks, workers, stalls."""
+    file = folder / "summary.json"
+    try:
+        summary = msgspec.json.decode(file.read_bytes(), type=Summary)
+    except OSError as error:
+        raise ResultsError(f"{file}: expected a run's summary, found: {error.strerror}") from None
+    except msgspec.MsgspecError as error:
+        raise ResultsError(f"{file}: expected a run's summary, found: {error}") from None
+    print_tables(summary)
+    print_lines(summary, folder)
+
+
+def print_tables(summary: Summary) -> None:
+    """Print the tables of a run, and its digest."""
+    from runtime.tools.cli.tables import run_tables
+
+    console = Console()
+    for table in run_tables(summary):
+        console.print(table)
+    digest = summary.digest or "off"
+    if summary.digest and summary.not_deterministic:
+        digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
+    console.print(f"digest {digest}", highlight=False)
+
+
+def print_lines(summary: Summary, folder: Path) -> None:
+    """Print the results of a run in a few lines, failures first."""
+    console = Console()
+    for line in lines(summary, folder):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def print_verdict(verdict: Verdict) -> None:
+    """Print each verdict, with its main figures, or the reasons for a failure."""
+    console = Console()
+    for name, figures in verdict.estimators.items():
+        reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
+        console.print(_heading(name, figures) + (f": {escape(reasons)}" if reasons else ""))
+        for line in _figures(figures):
+            console.print(f"  {escape(line)}", highlight=False, soft_wrap=True)
+
+
+def print_failures(summary: Summary) -> None:
+    """Print a line for each estimator that failed, and nothing else."""
+    console = Console()
+    for line in _failures(summary):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def lines(summary: Summary, folder: Path) -> Iterator[str]:
+    """Return the lines, with rich's markup."""
+    yield from _failures(summary)
+    took = ""
+    if summary.clock == "lockstep":
+        speed = summary.sim_seconds / max(summary.wall_seconds, 1e-9)
+        took = f" in {summary.wall_seconds:.1f} s ({speed:.1f} × real time)"
+    yield (
+        f"[bold]{escape(summary.name)}[/bold]: {summary.sim_seconds:.1f} s on the {summary.clock} "
+        f"clock, seed {summary.seed},{took or ' in real time'}, ended by: {escape(summary.reason)}"
+    )
+    if (twice := summary.twice) is not None:
+        found = "[green]repeats[/green]" if twice.repeats else f"[red]differs[/red]: {twice.first}"
+        yield f"run twice, it {found}"
+    if summary.not_deterministic:
+        yield f"repeating it is not promised, because of {', '.join(summary.not_deterministic)}"
+    estimators = summary.verdict.estimators if summary.verdict else {}
+    for name, figures in estimators.items():
+        yield _heading(name, figures)
+        yield from (f"  {escape(line)}" for line in _figures(figures))
+        yield from (f"  {escape(line)}" for line in _flow(name, figures, summary))
+    judged = {name.partition("/")[0] for name in estimators}
+    others = {k: s.dropped for k, s in summary.streams.items() if k.partition(".")[0] not in judged}
+    if dropped := [f"{port} {count}" for port, count in others.items() if count]:
+        yield f"inputs dropped by others: {', '.join(dropped)}"
+    program = "visnav" if Path(sys.argv[0]).name == "visnav" else "python -m runtime"
+    page = folder / "report.html"
+    left = f"report {page}" if page.is_file() else f"results in {folder}"
+    yield f"{escape(left)}   all figures: {program} show {escape(str(folder))}"
+
+
+def _heading(name: str, figures: Mapping[str, Any]) -> str:
+    why = ""
+    if figures["passed"] is None:
+        why = f": {escape(str(figures.get('why') or 'no thresholds were given'))}"
+    return f"[bold]{escape(name)}[/bold] {_WORDS[figures['passed']]}{why}"
+
+
+def _failures(summary: Summary) -> Iterator[str]:
+    if summary.verdict is None or summary.verdict.passed is not False:
+        return
+    failed = {k: v for k, v in summary.verdict.estimators.items() if v["passed"] is False}
+    for name, figures in failed.items():
+        reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
+        yield f"[red]{escape(name)} FAILED[/red]{escape(': ' + reasons if reasons else '')}"
+    if not failed:
+        yield "[red]FAILED[/red]: thresholds were given, and no estimator announced itself"
+
+
+def _figures(figures: Mapping[str, Any]) -> Iterator[str]:
+    """Return the line of errors, if there are any."""
+    if figures.get("ate_rmse_m") is None:
+        return
+    shown = [f"ATE {figures['ate_rmse_m']:.3g} m"]
+    if figures.get("ate_percent") is not None:
+        shown[0] += f" ({figures['ate_percent']:.2g} %)"
+    for name, text in (
+        ("ate_max_m", "max {:.3g} m"),
+        ("rot_rmse_deg", "rotation {:.2g}°"),
+        ("rpe_trans_percent", "RPE {:.2g} %"),
+    ):
+        if figures.get(name) is not None:
+            shown.append(text.format(figures[name]))
+    if figures.get("lost_count") and figures.get("held_ate_percent") is not None:
+        shown.append(f"with lost time {figures['held_ate_percent']:.2g} %")
+    yield f"{', '.join(shown)}   alignment: {figures.get('alignment', 'none')}"
+
+
+def _flow(name: str, figures: Mapping[str, Any], summary: Summary) -> Iterator[str]:
+    """Return the lines of what came, when, and what was lost on the way."""
+    shown = [f"{figures.get('estimates', 0)} poses"]
+    if figures.get("frame_coverage_percent") is not None:
+        shown[0] += f", for {figures['frame_coverage_percent']:.4g} % of the images"
+    lost = figures.get("lost_count")
+    if lost is not None:
+        times = "never lost" if not lost else f"lost {lost} × ({figures['lost_seconds']:.3g} s)"
+        shown.append(times)
+    if figures.get("latency_p50_ms") is not None:
+        shown.append(f"latency {figures['latency_p50_ms']:.3g} ms")
+    node = name.partition("/")[0]
+    dropped = sum(s.dropped for port, s in summary.streams.items() if port.startswith(f"{node}."))
+    shown.append(f"{dropped} inputs dropped" if dropped else "nothing dropped")
+    yield "   ".join(shown)
+    for worker, costs in summary.workers.items():
+        declared, measured = costs.latency_ms, costs.wall_p50_ms
+        if worker.startswith(f"{node}.") and declared and measured:
+            text = f"each call takes {measured:.3g} ms here; declared are {declared:.3g} ms"
+            if measured > SLOWER * declared:
+                text = f"warning: {text}: results are those of a quicker machine"
+            yield text
