@@ -243,10 +243,11 @@ def sweep(
 
     from runtime.tools import sweep as sweeping
     from runtime.tools.cli.sweep import at_once
+    from runtime.tools.sweep.plan import value
 
     plan = sweeping.make_plan(
         Path(config),
-        [f"{path}={','.join(_toml(value) for value in values)}" for path, values in vary.items()],
+        [f"{path}={','.join(map(_toml, values))}" for path, values in vary.items()],
         overrides=_changes(set or {}),
         seeds=seeds,
         repeats=repeat,
@@ -262,7 +263,7 @@ def sweep(
     sweeping.write_page(plan, rows)
     table = [
         {
-            **{path: _value(text) for path, text in row["parameters"].items()},
+            **{path: value(text) for path, text in row["parameters"].items()},
             "seed": row["seed"],
             "repeat": row.get("repeat", 1),
             "estimator": name,
@@ -433,12 +434,6 @@ def _toml(value: Any) -> str:
     from runtime.config.parameters import toml
 
     return toml(_plain(value))
-
-
-def _value(text: str) -> Any:
-    from runtime.tools.sweep.plan import value
-
-    return value(text)
 
 
 def _plain(value: Any) -> Any:

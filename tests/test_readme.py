@@ -25,6 +25,7 @@ SHORTER = {
         *("--set", "drone.camera_processes=1"),
     ],
     "sweep": ["--set", "run.duration=1s", "--set", "report.figures=[]"],
+    "compare": ["--set", "run.duration=1s", "--set", "report.figures=[]", "--seeds", "1"],
     "selftest": ["--standing", "10s"],
     "bench": ["--help"],
 }
@@ -49,9 +50,9 @@ def done(words: str, tmp_path: Path, a_run: Path | None = None) -> CompletedProc
     parts = [str(tmp_path / part) if part.endswith(".png") else part for part in parts]
     parts = [str(a_run) if part == A_RUN else part for part in parts]
     parts += SHORTER.get(parts[0], [])
-    if parts[0] in {"run", "sweep", "export", "selftest"}:
+    if parts[0] in {"run", "sweep", "compare", "export", "selftest"}:
         parts += ["--out", str(tmp_path)]
-    if parts[0] in {"run", "sweep", "selftest"}:
+    if parts[0] in {"run", "sweep", "compare", "selftest"}:
         return command(*parts, folder=ROOT, limit=500)
     return command_here(*parts, folder=ROOT)
 

@@ -1,0 +1,430 @@
+"""``compare``: is B better than A? Paired over flights, with an interval and a verdict in words.
+
+Both sides get the same recorded flights, so the difference of a pair has no part in how hard its
+flight was. The test is Wilcoxon's signed-rank test (F. Wilcoxon, Individual comparisons by ranking
+methods, 1945), exact, ties included, by the distribution under random signs; the interval is that
+of Hodges and Lehmann's estimate (pseudo-median of the differences), by inverting the test. Ranks
+know of "worst": a run that crashed, or an estimator without the figure, loses its pair by more than
+any other pair differs, and is never left out.
+
+A figure that is positive in all pairs is compared by its ratio, in percent, others by their
+difference. Of several figures or estimators each gets its share of the error (Bonferroni), and so
+does each look where flights are added until the answer is sure.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import typer
+
+from runtime.errors import ConfigError
+from runtime.figures import FIGURES, figure
+from runtime.tools.cli.commands import Overrides
+
+if TYPE_CHECKING:
+    from runtime.tools.sweep import Row
+
+Floats = npt.NDArray[np.float64]
+Key = tuple[str, int]
+"""Flight of a pair: scenario and seed."""
+
+USUAL = ("held_ate_percent", "rpe_trans_percent", "rot_rmse_deg", "frame_coverage_percent")
+"""Figures compared by default: errors with lost time as drift, drift, rotation, coverage."""
+
+ERROR = 0.05
+"""Share of comparisons without a difference in which one may be found, of all figures together."""
+
+Word = Literal["better", "worse", "no difference", "not enough runs"]
+
+
+class Comparison(msgspec.Struct, frozen=True, kw_only=True):
+    """Comparison of a figure of an estimator.
+
+    Attributes:
+        a: Median over the flights, of those with the figure.
+        b: The same of the other side.
+        change: Pseudo-median of B less A: percent if `relative`, else in the figure's unit;
+            infinite if most pairs were lost by a failure.
+        low: Lower end of the interval for it.
+        high: Upper end.
+        p: Share of random signs with a result as extreme.
+        pairs: Number of flights.
+        failures: Flights without the figure, in A and in B.
+        more: Flights that would probably tell, for a verdict of "not enough runs".
+        flights: Values of A and B by scenario and seed; `None` where there is none.
+    """
+
+    estimator: str
+    figure: str
+    a: float | None
+    b: float | None
+    change: float
+    low: float
+    high: float
+    relative: bool
+    p: float
+    pairs: int
+    failures: tuple[int, int]
+    verdict: Word
+    more: int = 0
+    flights: dict[str, tuple[float | None, float | None]] = {}
+
+    @property
+    def unit(self) -> str:
+        """Of the change and its interval."""
+        return "%" if self.relative else figure(self.figure).unit
+
+    def inferior(self, margin: float) -> bool:
+        """Return whether B may be worse than A by more than a margin."""
+        if figure(self.figure).limit == "least":
+            return bool(self.low < -margin)
+        return bool(self.high > margin)
+
+
+def compare_values(
+    estimator: str,
+    name: str,
+    pairs: Mapping[Key, tuple[float | None, float | None]],
+    *,
+    margin: float = 0.0,
+    error: float = ERROR,
+) -> Comparison:
+    """Compare a figure over flights.
+
+    Args:
+        pairs: Values of A and B by flight; `None` for a failure, which is worse than any value.
+        margin: Largest change that does not matter, as `Comparison.change`.
+        error: Probability of a difference found where there is none.
+    """
+    sign = -1.0 if figure(name).limit == "least" else 1.0  # of a change for the worse
+    known = [(a, b) for a, b in pairs.values() if a is not None and b is not None]
+    relative = bool(known) and all(a > 0 and b > 0 for a, b in known)
+    found = np.array([math.log(b / a) if relative else b - a for a, b in known])
+    # Farther than any average of two differences: the sign of a failure's pair is all that counts.
+    worst = 1e3 * (abs(found).max(initial=0.0) + 1.0)
+    lost = [(a is None, b is None) for a, b in pairs.values() if a is None or b is None]
+    differences = np.concatenate([found, [sign * worst * (b - a) for a, b in map(_ints, lost)]])
+    p, change, low, high = signed_rank(differences, error)
+
+    def told(value: float) -> float:
+        if abs(value) > worst / 4:
+            return math.copysign(math.inf, value)
+        return 100.0 * math.expm1(value) if relative else value
+
+    change, low, high = told(change), told(low), told(high)
+    verdict: Word = "not enough runs"
+    more = 0
+    if p <= error and (low > 0 or high < 0):
+        verdict = "worse" if (low > 0) == (sign > 0) else "better"
+    elif margin > 0 and -margin <= low and high <= margin:
+        verdict = "no difference"
+    else:
+        more = _more(len(differences), change, low, high, margin, error)
+    values = np.array(known).reshape(-1, 2)
+    return Comparison(
+        estimator=estimator,
+        figure=name,
+        a=float(np.median([a for a, _ in known])) if known else None,
+        b=float(np.median(values[:, 1])) if known else None,
+        change=change,
+        low=low,
+        high=high,
+        relative=relative,
+        p=p,
+        pairs=len(pairs),
+        failures=(sum(a for a, _ in lost), sum(b for _, b in lost)),
+        verdict=verdict,
+        more=more,
+        flights={f"{scenario}, seed {seed}": pair for (scenario, seed), pair in pairs.items()},
+    )
+
+
+def _ints(pair: tuple[bool, bool]) -> tuple[int, int]:
+    return int(pair[0]), int(pair[1])
+
+
+def signed_rank(differences: Floats, error: float) -> tuple[float, float, float, float]:
+    """Return p-value, pseudo-median and the ends of its interval (1 - error).
+
+    The ends are infinite where there are too few differences for any. Differences of 0 are ranked,
+    and count for neither side (Pratt, 1959).
+    """
+    from scipy.stats import rankdata
+
+    n = len(differences)
+    if not n:
+        return 1.0, 0.0, -math.inf, math.inf
+    ranks = np.round(2 * rankdata(abs(differences))).astype(int)
+    signed = ranks[differences != 0]
+    sums = _sums(signed)
+    found = int(ranks[differences > 0].sum())
+    p = min(2 * min(sums[: found + 1].sum(), sums[found:].sum()), 1.0)
+    averages = np.sort(
+        ((differences[:, None] + differences) / 2)[np.triu_indices(n)], kind="stable"
+    )
+    # Averages beyond the interval at each end: of the plain ranks, which no ties can spoil.
+    tail = np.cumsum(_sums(np.arange(1, n + 1)))
+    beyond = int(np.searchsorted(tail, error / 2, side="right"))
+    change = float(np.median(averages))
+    if not beyond:
+        return float(p), change, -math.inf, math.inf
+    return float(p), change, float(averages[beyond - 1]), float(averages[-beyond])
+
+
+def _sums(ranks: npt.NDArray[np.int_]) -> Floats:
+    """Return the probability of each sum of ranks, each taken or not with probability 1/2."""
+    sums = np.zeros(int(ranks.sum()) + 1)
+    sums[0] = 1.0
+    for rank in ranks.tolist():
+        sums[rank:] = (sums[rank:] + sums[: len(sums) - rank]) / 2
+        sums[:rank] /= 2
+    return sums
+
+
+def _more(n: int, change: float, low: float, high: float, margin: float, error: float) -> int:
+    """Return how many more flights would probably tell: intervals shrink as 1 / √n."""
+    least = math.ceil(math.log2(2 / error))  # fewer cannot tell, whatever they show
+    if not all(map(math.isfinite, (change, low, high))):
+        return max(least - n, 1)
+    half = (high - low) / 2
+    goals = [goal for goal in (abs(change), margin - abs(change)) if goal > 0]
+    needed = n * (half / max(goals)) ** 2 if goals else math.inf
+    return max(least - n, math.ceil(min(needed, 1e4)) - n, 1)
+
+
+def compare_rows(
+    a: Mapping[Key, Sequence[Row]],
+    b: Mapping[Key, Sequence[Row]],
+    *,
+    figures: Sequence[str] = USUAL,
+    margin: float = 0.0,
+    error: float = ERROR,
+) -> list[Comparison]:
+    """Compare runs, paired by flight; repeats of a flight are averaged.
+
+    Raises:
+        ConfigError: They have no flight or no estimator in common.
+    """
+    common = [key for key in a if key in b]
+    if not common:
+        raise ConfigError(
+            "compare: expected runs of the same scenarios and seeds, found none in common: "
+            f"{_some(a)}; {_some(b)}"
+        )
+    ours, theirs = ([*_estimators(side.values())] for side in (a, b))
+    names = [(each, each) for each in ours if each in theirs]
+    if not names and len(ours) == len(theirs) == 1:  # two systems of different names
+        names = [(ours[0], theirs[0])]
+    if not names:
+        raise ConfigError(f"compare: expected an estimator in both, found {ours} and {theirs}")
+    wanted = [
+        (name, other, each)
+        for name, other in names
+        for each in figures
+        if any(_value(a[k], name, each) is not None for k in common)
+        or any(_value(b[k], other, each) is not None for k in common)
+    ]
+    return [
+        compare_values(
+            name if name == other else f"{name} / {other}",
+            each,
+            {key: (_value(a[key], name, each), _value(b[key], other, each)) for key in common},
+            margin=margin,
+            error=error / len(wanted),
+        )
+        for name, other, each in wanted
+    ]
+
+
+def _some(side: Mapping[Key, object]) -> str:
+    return ", ".join(f"{scenario} {seed}" for scenario, seed in [*side][:3]) or "none"
+
+
+def _estimators(sides: Iterable[Sequence[Row]]) -> dict[str, None]:
+    return {name: None for rows in sides for row in rows for name in row["estimators"]}
+
+
+def _value(rows: Sequence[Row], estimator: str, name: str) -> float | None:
+    """Return the mean over repeats; `None` if any of them has failed to have it."""
+    values = [
+        None if row["error"] else row["estimators"].get(estimator, {}).get(name) for row in rows
+    ]
+    if not values or any(value is None for value in values):
+        return None
+    return float(np.mean([float(value) for value in values if value is not None]))
+
+
+def read_folder(folder: Path) -> dict[Key, list[Row]]:
+    """Read the rows of a finished sweep, or of a single run, by flight.
+
+    Raises:
+        ConfigError: It is neither.
+    """
+    from runtime.tools.sweep.process import Ended
+    from runtime.tools.sweep.tables import Row
+
+    found: dict[Key, list[Row]] = {}
+    if (folder / "rows.jsonl").is_file():
+        rows: dict[str, Row] = {}
+        for line in (folder / "rows.jsonl").read_bytes().splitlines():
+            row = msgspec.json.decode(line, type=Row)
+            rows[row["id"]] = row
+        for row in rows.values():
+            settings = " ".join(f"{path}={text}" for path, text in row["parameters"].items())
+            found.setdefault((settings or "run", row["seed"]), []).append(row)
+        return found
+    try:
+        data = (folder / "summary.json").read_bytes()
+        ended = msgspec.json.decode(data, type=Ended)
+        head = msgspec.json.decode(data)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise ConfigError(
+            f"{folder}: expected the folder of a sweep (rows.jsonl) or of a run, found: {error}"
+        ) from None
+    verdict = ended.verdict
+    row = Row(
+        id="",
+        parameters={},
+        seed=head["seed"],
+        exit_code=0,
+        error=head.get("error") or "",
+        passed=verdict.passed if verdict else None,
+        digest=None,
+        sim_seconds=ended.sim_seconds,
+        run_seconds=None,
+        wall_seconds=None,
+        estimators=verdict.estimators if verdict else {},
+    )
+    return {("run", head["seed"]): [row]}
+
+
+def compare(
+    what: Annotated[
+        list[Path],
+        typer.Argument(help="Files to fly, one a scenario; or two folders of finished sweeps."),
+    ],
+    a: Annotated[
+        list[str] | None,
+        typer.Option("--a", metavar="NODE.KEY=VALUE", help="Setting of A. May be repeated."),
+    ] = None,
+    b: Annotated[
+        list[str] | None,
+        typer.Option("--b", metavar="NODE.KEY=VALUE", help="Setting of B. May be repeated."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Flights of each file, at most.")] = 12,
+    repeat: Annotated[int, typer.Option(min=1, help="Runs with each flight, averaged.")] = 1,
+    name: Annotated[
+        list[str] | None, typer.Option("--figure", help="Figure to compare. May be repeated.")
+    ] = None,
+    margin: Annotated[
+        float,
+        typer.Option(min=0, help="Change that does not matter, in percent (or the figure's unit)."),
+    ] = 0.0,
+    overrides: Overrides = None,
+    out: Annotated[Path, typer.Option(help="Folder for runs and page.")] = Path("compared"),
+    jobs: Annotated[int | None, typer.Option(min=1, help="Runs at the same time.")] = None,
+    json: Annotated[
+        Path | None, typer.Option("--json", help="Write the comparisons as JSON.")
+    ] = None,
+) -> None:
+    """Tell whether B is better than A, over equal flights, with confidence.
+
+    A and B are settings of the same files: `--a odometry.corners=300 --b odometry.corners=500`, or
+    two builds of a program: `--a 'slam.command=["./old"]' --b 'slam.command=["./new"]'`. Each
+    flight is recorded once, and both get it. Half of the flights are looked at first; if all
+    figures are decided then, the others are not flown. Or A and B are two folders of finished
+    sweeps.
+
+    Each figure is *better*, *worse*, *no difference* larger than the margin, or *not enough runs*.
+    Crashes and lost estimators count as worst. Ends with 0; with 1 if a figure is worse, or with
+    --margin also if it may be worse by more than that; with 130 after Ctrl-C.
+    """
+    from runtime.tools.compare_page import print_table, write_page
+
+    for each in name or ():
+        if each not in FIGURES:
+            raise ConfigError(f"--figure {each}: expected one of {', '.join(FIGURES)}")
+    options: dict[str, Any] = {"figures": name or USUAL, "margin": margin}
+    if all(path.is_dir() for path in what):
+        if len(what) != 2 or a or b:
+            raise ConfigError("compare: expected two folders, without --a and --b")
+        sides = tuple(map(read_folder, what))
+        found = compare_rows(*sides, **options)
+    else:
+        if not (a or b):
+            raise ConfigError("compare: expected --a or --b: in what the two sides differ")
+        found = fly(
+            what, a or [], b or [], seeds, repeat, overrides or [], out.absolute(), jobs, options
+        )
+    page = write_page(found, out, a or [str(what[0])], b or [str(what[-1])])
+    print_table(found, page)
+    if json is not None:
+        from runtime.run.results import write
+
+        text = msgspec.json.encode(found)
+        write(json, msgspec.json.format(text, indent=2) + b"\n")
+    if any(each.verdict == "worse" or (margin and each.inferior(margin)) for each in found):
+        raise typer.Exit(1)
+
+
+def fly(
+    files: Sequence[Path],
+    a: Sequence[str],
+    b: Sequence[str],
+    seeds: int,
+    repeats: int,
+    overrides: Sequence[str],
+    out: Path,
+    jobs: int | None,
+    options: Mapping[str, Any],
+) -> list[Comparison]:
+    """Fly until all figures are decided: half of the seeds, and then the rest.
+
+    Raises:
+        ConfigError: A file or a setting is wrong.
+    """
+    from runtime.config.reading import load_configuration
+    from runtime.tools.cli.sweep import carry_out
+    from runtime.tools.sweep import Plan, make_job, sharing
+    from runtime.tools.sweep.plan import Parameter
+
+    sides = {"A": a, "B": b}
+    first: dict[Path, int] = {}
+    planned = []
+    for file, (side, changes) in itertools.product(files, sides.items()):
+        config = load_configuration(file, [*overrides, *changes])
+        first.setdefault(file, config.run.seed)
+        settings = (("side", side), ("scenario", file.stem))
+        numbers = range(first[file], first[file] + seeds), range(1, repeats + 1)
+        for seed, number in itertools.product(*numbers):
+            planned.append(make_job(config, settings, seed, file.resolve().parent, out, number))
+    begin = {file.stem: seed for file, seed in first.items()}
+    looks = sorted({math.ceil(seeds / 2), seeds})
+    found: list[Comparison] = []
+    for look in looks:
+        now = [
+            job
+            for job in sharing(planned)
+            if job.seed < begin[dict(job.settings)["scenario"]] + look
+        ]
+        parameters = (
+            Parameter(path="side", texts=tuple(sides)),
+            Parameter(path="scenario", texts=tuple(begin)),
+        )
+        rows = carry_out(Plan(parameters=parameters, jobs=tuple(now), out=out), jobs=jobs)
+        flights: dict[str, dict[Key, list[Row]]] = {side: {} for side in sides}
+        for job, row in zip(now, rows, strict=True):
+            (_, side), (_, scenario) = job.settings
+            flights[side].setdefault((scenario, job.seed), []).append(row)
+        found = compare_rows(flights["A"], flights["B"], error=ERROR / len(looks), **options)
+        if all(each.verdict != "not enough runs" for each in found):
+            break
+    return found

@@ -1,0 +1,259 @@
+"""Is B better than A: found where it is, not found where it is not, failures never left out."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import wilcoxon
+
+from runtime.errors import ConfigError
+from runtime.node import Node, NodeConfig
+from runtime.tools.compare import (
+    Comparison,
+    Key,
+    compare_rows,
+    compare_values,
+    read_folder,
+    signed_rank,
+)
+from runtime.tools.sweep import Row
+from tests.runtime.tools.samples_cli import ROOT, command_here
+
+Pairs = Mapping[Key, tuple[float | None, float | None]]
+
+
+def flights(count: int, factor: float, seed: int = 0, noise: float = 0.1) -> Pairs:
+    """Return errors whose size depends on the flight much more than on the side."""
+    rng = np.random.default_rng(seed)
+    hard = np.exp(rng.normal(0, 1.0, count))
+    a, b = np.exp(rng.normal(0, noise, (2, count)))
+    return {("tour", n): (hard[n] * a[n], hard[n] * b[n] * factor) for n in range(count)}
+
+
+def ate(pairs: Pairs, **options: Any) -> Comparison:
+    return compare_values("vo", "ate_percent", pairs, **options)
+
+
+def test_equal_sides_differ_in_at_most_one_of_twenty_comparisons() -> None:
+    found = [ate(flights(12, 1.0, seed)).verdict for seed in range(400)]
+    wrong = sum(each in {"better", "worse"} for each in found)
+    assert wrong <= 400 * 0.05 + 2 * math.sqrt(400 * 0.05 * 0.95)
+    assert wrong > 0  # as many as asked for: it is not blind either
+
+
+def test_several_figures_together_err_no_more_often() -> None:
+    def rows(values: np.ndarray) -> dict[Key, list[Row]]:
+        names = ("held_ate_percent", "rpe_trans_percent", "rot_rmse_deg")
+        return {
+            ("tour", n): [row(seed=n, **dict(zip(names, each, strict=True)))]
+            for n, each in enumerate(values.tolist())
+        }
+
+    rng = np.random.default_rng(1)
+    wrong = 0
+    for _ in range(200):
+        a, b = np.exp(rng.normal(0, 0.1, (2, 12, 3)))
+        found = compare_rows(rows(a), rows(b))
+        assert len(found) == 3
+        wrong += any(each.verdict in {"better", "worse"} for each in found)
+    assert wrong <= 200 * 0.05 + 2 * math.sqrt(200 * 0.05 * 0.95)
+
+
+def test_a_small_worsening_is_found_with_enough_flights_and_asked_for_with_few() -> None:
+    few = ate(flights(6, 1.1, noise=0.15))
+    assert (few.verdict, few.relative) == ("not enough runs", True)
+    assert few.more > 0
+    many = ate(flights(60, 1.1, noise=0.15))
+    assert many.verdict == "worse"
+    assert many.low < 10 < many.high
+    assert many.low > 0
+    assert ate(flights(60, 1 / 1.1, noise=0.15)).verdict == "better"
+
+
+def test_fewer_flights_than_can_tell_are_said_so_however_clear_it_looks() -> None:
+    clear = ate({("tour", n): (1.0, 2.0 + n / 10) for n in range(4)})
+    assert (clear.verdict, clear.low) == ("not enough runs", -math.inf)
+    assert clear.more == 2  # of 6 flights, equal signs have p = 2 / 2^6 < 0.05
+    assert ate({("tour", n): (1.0, 2.0 + n / 10) for n in range(6)}).verdict == "worse"
+
+
+def test_within_the_margin_there_is_no_difference() -> None:
+    pairs = flights(60, 1.01, noise=0.02)
+    assert ate(pairs, margin=5).verdict == "no difference"
+    assert ate(flights(60, 1.0, noise=0.5), margin=5).verdict == "not enough runs"
+    assert ate(flights(60, 1.0, noise=0.5), margin=5).inferior(5)
+    assert not ate(pairs, margin=5).inferior(5)
+
+
+def test_a_failure_is_worse_than_any_error_and_never_left_out() -> None:
+    pairs = dict(flights(12, 0.5))  # B is twice as good, where it does not fail
+    assert ate(pairs).verdict == "better"
+    for n in range(9):
+        pairs["tour", n] = (pairs["tour", n][0], None)
+    found = ate(pairs)
+    assert (found.failures, found.change, found.pairs) == ((0, 9), math.inf, 12)
+    assert found.verdict != "better"
+    assert ate({("tour", n): (1.0, None) for n in range(8)}).verdict == "worse"
+    assert ate({("tour", n): (None, 1.0) for n in range(8)}).verdict == "better"
+    both = ate({("tour", n): (None, None) for n in range(8)})
+    assert (both.verdict, both.change, both.p) == ("not enough runs", 0.0, 1.0)
+
+
+def test_where_more_is_better_less_is_worse() -> None:
+    pairs = {("tour", n): (99.0 - n, 90.0 - n) for n in range(10)}
+    found = compare_values("vo", "frame_coverage_percent", pairs)
+    assert (found.verdict, found.inferior(1.0)) == ("worse", True)
+    lost: Pairs = {("tour", n): (99.0, None) for n in range(10)}
+    assert compare_values("vo", "frame_coverage_percent", lost).verdict == "worse"
+
+
+def test_zeros_are_compared_by_difference() -> None:
+    found = compare_values("vo", "lost_seconds", {("t", n): (0.0, n / 2) for n in range(10)})
+    assert (found.relative, found.unit, found.verdict) == (False, "s", "worse")
+    same = compare_values("vo", "lost_seconds", {("t", n): (0.0, 0.0) for n in range(10)}, margin=1)
+    assert (same.verdict, same.p) == ("no difference", 1.0)
+
+
+VALUES = st.floats(-100, 100).filter(lambda x: abs(x) > 1e-6)
+
+
+@given(st.lists(VALUES, min_size=6, max_size=25, unique_by=abs))
+def test_the_test_is_scipys_where_that_is_exact(values: list[float]) -> None:
+    p, _, low, high = signed_rank(np.array(values), 0.05)
+    assert p == pytest.approx(wilcoxon(values, method="exact").pvalue, rel=1e-9)
+    assert (p <= 0.05) == (low > 0 or high < 0)
+
+
+@given(st.lists(st.integers(-3, 3), min_size=1, max_size=12))
+def test_with_ties_it_is_the_share_of_random_signs(values: list[int]) -> None:
+    differences = np.array(values, float)
+    p, change, low, high = signed_rank(differences, 0.05)
+    ranks = wilcoxon_ranks(differences)
+    signs = np.array([*itertools.product([0, 1], repeat=len(ranks))])
+    sums = signs @ ranks
+    found = ranks[differences[differences != 0] > 0].sum()
+    expected = min(2 * min((sums <= found).mean(), (sums >= found).mean()), 1.0)
+    assert p == pytest.approx(expected)
+    assert low <= change <= high
+
+
+def wilcoxon_ranks(differences: np.ndarray) -> np.ndarray:
+    from scipy.stats import rankdata
+
+    return np.array(rankdata(abs(differences))[differences != 0], float)
+
+
+def row(seed: int, error: str = "", name: str = "vo", **figures: float) -> Row:
+    return Row(
+        id=f"{seed}{name}",
+        parameters={},
+        seed=seed,
+        exit_code=0,
+        error=error,
+        passed=None,
+        digest=None,
+        sim_seconds=1.0,
+        run_seconds=1.0,
+        wall_seconds=1.0,
+        estimators={} if error else {name: figures},
+    )
+
+
+def test_crashed_runs_repeats_and_other_names() -> None:
+    a = {("t", n): [row(n, ate_percent=1.0), row(n, ate_percent=3.0)] for n in range(8)}
+    b = {("t", n): [row(n, name="other", ate_percent=1.0)] for n in range(8)}
+    b["t", 3] = [row(3, "out of order")]
+    (found,) = compare_rows(a, b, figures=["ate_percent"])
+    assert (found.estimator, found.a, found.b) == ("vo / other", 2.0, 1.0)
+    assert (found.failures, found.pairs) == ((0, 1), 8)
+    with pytest.raises(ConfigError, match="found none in common: t 0; u 0"):
+        compare_rows({("t", 0): [row(0)]}, {("u", 0): [row(0)]})
+    with pytest.raises(ConfigError, match=r"an estimator in both, found \['vo'\] and \[\]"):
+        compare_rows({("t", 0): [row(0, x=1)]}, {("t", 0): [row(0, "crashed")]})
+
+
+class JudgeConfig(NodeConfig):
+    """How well an estimator does: its error, times a number of the seed."""
+
+    error: float = 1.0
+    spread: float = 0.1
+    crash: bool = False
+
+
+class Judge(Node[JudgeConfig]):
+    """Concludes a verdict, or crashes."""
+
+    async def run(self) -> None:
+        if self.config.crash:
+            raise RuntimeError("out of order")
+
+    async def on_shutdown(self) -> None:
+        error = self.config.error * float(np.exp(self.rng.normal(0, self.config.spread)))
+        self.conclude("vo", {"ate_percent": error, "frame_coverage_percent": 100.0})
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    path = tmp_path / "c.toml"
+    path.write_text(
+        '[run]\nname = "tour"\nduration = 1\n'
+        f'[[nodes]]\nname = "judge"\ntype = "{__name__}:Judge"\n'
+    )
+    return path
+
+
+@pytest.mark.slow
+def test_settings_are_flown_and_compared(file: Path, tmp_path: Path) -> None:
+    options = ["--seeds", "8", "--figure", "ate_percent", "--json", "c.json"]
+    change = ["--b", "judge.error=2"]
+    done = command_here("compare", file, *change, *options, folder=tmp_path)
+    assert (done.returncode, "worse" in done.stdout) == (1, True), done.stderr
+    (found,) = json.loads((tmp_path / "c.json").read_bytes())
+    assert (found["verdict"], found["pairs"], found["figure"]) == ("worse", 8, "ate_percent")
+    assert found["change"] == pytest.approx(100, abs=40)
+    page = (tmp_path / "compared" / "compare.html").read_text(encoding="utf-8")
+    assert '<td class="worse"><b>worse</b></td>' in page
+    assert "judge.error=2" in page
+    # The other way around it is better; and what was flown is not flown again.
+    done = command_here("compare", file, "--a", "judge.error=2", *options, folder=tmp_path)
+    assert (done.returncode, "better" in done.stdout) == (0, True), done.stderr
+
+
+@pytest.mark.slow
+def test_finished_sweeps_are_compared(file: Path, tmp_path: Path) -> None:
+    for name, change in (("old", "judge.error=1"), ("new", "judge.error=0.3")):
+        options = ["--seeds", "7", "--set", change, "--out", name]
+        assert command_here("sweep", file, *options, folder=tmp_path).returncode == 0
+    done = command_here("compare", "old", "new", "--figure", "ate_percent", folder=tmp_path)
+    assert (done.returncode, "better" in done.stdout) == (0, True), done.stdout
+    runs = sorted((tmp_path / "old" / "runs").iterdir())
+    assert len(read_folder(runs[0])) == 1
+    done = command_here("compare", runs[0], runs[0], "--margin", "5", folder=tmp_path)
+    assert "not enough runs: 5 more may tell" in done.stdout
+    assert done.returncode == 1  # with a margin, what is not shown counts as inferior
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["c.toml"], "expected --a or --b: in what the two sides differ"),
+        (["c.toml", "--b", "judge.eror=1"], "found unknown key 'eror'"),
+        (["c.toml", "--b", "judge.error=1", "--figure", "ate"], "--figure ate: expected one of"),
+        (["."], "expected two folders, without --a and --b"),
+        ([".", "."], "expected the folder of a sweep (rows.jsonl) or of a run, found: "),
+    ],
+)
+def test_nonsense_is_a_sentence(file: Path, tmp_path: Path, words: list[str], message: str) -> None:
+    done = command_here("compare", *words, folder=file.parent)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert message in done.stderr
