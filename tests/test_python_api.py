@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -219,6 +221,30 @@ def test_a_judgement_of_nonsense_is_a_sentence(tmp_path: Path) -> None:
         visnav.judge(tmp_path / "nowhere.txt", curve())
     with pytest.raises(VisnavError, match="alignment"):
         visnav.judge(curve(), curve(), alignment="best")
+
+
+@pytest.mark.slow
+async def test_the_notebook_runs(tmp_path: Path) -> None:
+    """Cell by cell, in a loop that runs, as a notebook's does; what a cell ends with is shown."""
+    page = ROOT / "docs" / "tutorial" / "fly-look-judge.ipynb"
+    shown: list[Any] = []
+    names: dict[str, Any] = {}
+    shutil.copy(ROOT / "config.toml", tmp_path)
+    for cell in json.loads(page.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == []
+            tree = ast.parse("".join(cell["source"]))
+            last = tree.body.pop()
+            assert isinstance(last, ast.Expr)
+            exec(compile(tree, str(page), "exec"), names)
+            shown.append(eval(compile(ast.Expression(last.value), str(page), "eval"), names))
+    run, (error, coverage), drawn, distance, judged = shown
+    assert run.passed is not None
+    assert len(drawn) == 2
+    assert error < 0.05
+    assert coverage == 100
+    assert distance < 0.1
+    assert [judged.figures[name]["passed"] for name in ("all", "third")] == [True, False]
 
 
 def test_the_fixture_runs_in_the_tests_folder(tmp_path: Path) -> None:
