@@ -154,6 +154,7 @@ def circles(graph: Mapping[str, Iterable[str]]) -> list[set[str]]:
     return groups
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", MAY_IMPORT)
 def test_no_arrow_points_up(where: str) -> None:
     others = {*MAY_IMPORT, "tests", "examples"} - MAY_IMPORT[where]
@@ -174,6 +175,7 @@ def test_no_string_points_up(where: str) -> None:
     assert upwards == {}
 
 
+@pytest.mark.slow
 def test_no_circle_closes() -> None:
     graph = {
         name: {each for target in found if (each := module_of(target))} - {name}

@@ -39,6 +39,7 @@ def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     assert not [t for t in threading.enumerate() if t.name.startswith("run ")]
 
 
+@pytest.mark.slow
 def test_a_run_is_that_of_the_command(tmp_path: Path) -> None:
     file = config_file(tmp_path, "Noise", "Reader", run="duration = 1")
     run = visnav.run(file, set={"run.seed": 3}, quiet=True)
@@ -55,6 +56,7 @@ def test_a_run_is_that_of_the_command(tmp_path: Path) -> None:
     assert Path("runs/sample.1").is_dir()
 
 
+@pytest.mark.slow
 async def test_a_loop_may_be_running_here_as_in_a_notebook() -> None:
     ticks = 0
 
@@ -79,6 +81,7 @@ def test_a_table_may_have_classes_paths_and_arrays(tmp_path: Path) -> None:
     assert "name" in TABLE["nodes"][0]  # it was left as it is
 
 
+@pytest.mark.slow
 def test_threads_run_side_by_side() -> None:
     found: dict[int, visnav.Run] = {}
 
@@ -110,6 +113,7 @@ def test_what_is_wrong_is_raised_here(tmp_path: Path) -> None:
     assert failed.summary["outputs"]["noise.pings"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["running", "starting"])
 def test_ctrl_c_ends_the_run_in_order_and_then_the_script(when: str, tmp_path: Path) -> None:
     node = {"running": "Lively", "starting": "SlowStart"}[when]
@@ -134,6 +138,7 @@ def test_ctrl_c_ends_the_run_in_order_and_then_the_script(when: str, tmp_path: P
     assert summary_of(tmp_path / "out")["reason"] == "Ctrl-C"
 
 
+@pytest.mark.slow
 def test_a_sweep_is_a_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pandas")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
@@ -164,6 +169,7 @@ def rows_of(trajectory: Trajectory) -> np.ndarray:
     return np.column_stack([trajectory.stamps / 1e9, trajectory.positions, quaternions])
 
 
+@pytest.mark.slow
 def test_arrays_trajectories_and_files_get_the_same_figures(tmp_path: Path) -> None:
     truth, estimate = curve(), curve(wrong=0.02)
     write_tum(tmp_path / "truth.txt", truth)
@@ -247,6 +253,7 @@ async def test_the_notebook_runs(tmp_path: Path) -> None:
     assert [judged.figures[name]["passed"] for name in ("all", "third")] == [True, False]
 
 
+@pytest.mark.slow
 def test_the_fixture_runs_in_the_tests_folder(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text(
         "from tests.runtime.samples import Noise\n"

@@ -374,7 +374,7 @@ def patience_left(patience: float, image: float, now: float) -> float:
 
 
 class Vit(Estimator[VitConfig]):
-    """Estimates the pose of a camera or a stereo rig with an IMU by such a library.
+    """Estimates the pose of a camera or a stereo rig with an IMU by a library of VIT's interface.
 
     Each image goes to it after all samples of the IMU up to that image, and simulated time waits
     at the latency until the pose has come. The library's threads may make it vary.

@@ -174,8 +174,8 @@ class Handshakes:
                 soon(self._membership.joined, member)
             elif before is None:
                 soon(self._greet_one, sender, contact.nonce, hello.nonce)
-            elif hello.session == before.sealing.tag:
-                pass  # all is well, or it is an old one
+            elif hello.session == before.sealing.tag:  # all is well, or it is an old one
+                contact.nonce = secrets.token_bytes(NONCE)  # answers on their way end no session
             elif hello.nonce == before.sealing.seen:  # ours did not get there
                 mine = before.sealing
                 soon(self._greet_one, sender, mine.nonce, mine.seen, mine.tag)

@@ -65,12 +65,18 @@ def texture(
     file = f"{world}-{seed}-{name}"
     with contextlib.suppress(OSError, RuntimeError, ValueError):
         return _read(folder() / file)
+    _say_once(world)
     drawn = to_bytes(draw(random))
     try:
         _write(folder() / file, drawn)
     except (OSError, RuntimeError) as error:
         _LOG.debug("expected a folder for textures, found: %s", error)
     return drawn
+
+
+@functools.cache
+def _say_once(world: str) -> None:
+    _LOG.info("drawing the textures of %s, to be kept for the next runs", world)
 
 
 def folder() -> Path:

@@ -106,6 +106,7 @@ def test_the_page_says_first_what_its_numbers_do_not_show(tmp_path: Path) -> Non
     assert text.rstrip().endswith("- trio channels: not installed")
 
 
+@pytest.mark.slow
 def test_the_plots_on_the_page_exist(tmp_path: Path) -> None:
     """Links lead from the page to plots in another folder."""
     out = tmp_path / "results"
@@ -131,6 +132,7 @@ def test_each_plot_stands_once_under_its_own_case(tmp_path: Path) -> None:
     assert not any("large-shared" in line for line in lines[:shared] if line.startswith("!["))
 
 
+@pytest.mark.slow
 def test_what_crosses_to_another_process_is_held_against_zenoh(tmp_path: Path) -> None:
     """As a ratio with its mark, and as a table."""
     write(results(), tmp_path, tmp_path / "RESULTS.md")

@@ -88,6 +88,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> NodeResult:
     )
 
 
+@pytest.mark.slow
 def test_a_restarted_estimator_speaks_in_a_frame_that_begins_where_it_is(
     flight: NodeResult,
 ) -> None:

@@ -52,6 +52,7 @@ def fly(folder: Path, out: str, *settings: str) -> str:
     return str(summary(folder / out)["digest"])
 
 
+@pytest.mark.slow
 def test_a_short_flight_leaves_everything(tmp_path: Path) -> None:
     fly(tmp_path, "out", *SHORT)
     out = tmp_path / "out"

@@ -58,6 +58,7 @@ def test_records_carry_the_runs_clock_and_the_node(tmp_path: Path) -> None:
     assert said == [(k / 4, "chatty", f"tick {k}") for k in range(4)]
 
 
+@pytest.mark.slow
 def test_the_file_is_complete_when_the_run_is_over(tmp_path: Path) -> None:
     chat(tmp_path, 5000)
     lines = (tmp_path / "log.txt").read_text(encoding="utf-8").splitlines()

@@ -289,6 +289,7 @@ def test_the_same_seed_gives_the_same_flight_and_another_another() -> None:
     assert measured(1) != measured(2)
 
 
+@pytest.mark.slow
 def test_it_runs_in_real_time() -> None:
     """At 400 Hz, whatever else the machine does: late ticks are counted, not lost."""
     outcome = supervise([spec(Multirotor, "drone", {"world": world})], clock="real", duration=1.0)
@@ -303,6 +304,7 @@ def test_it_runs_in_real_time() -> None:
     assert 0.9 * SECOND < stamps[-1] <= end
 
 
+@pytest.mark.slow
 def test_cameras_announce_themselves_and_deliver(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     camera = {"name": "front", "width": 32, "height": 24, "rate": 20, "latency": "40ms"}

@@ -74,6 +74,7 @@ def places(result: NodeResult, name: str) -> np.ndarray[Any, Any]:
     return np.array([e.position for e in result.of(Odometry) if e.source == name])
 
 
+@pytest.mark.slow
 def test_they_collide_and_each_is_told_whom_it_met(world: str) -> None:
     orders = [takeoff("a"), takeoff("b"), place("a", 3 * SECOND, 3.0)]
     result = fly(drone("a", 0.0, world), drone("b", 3.0, world), inputs=orders, duration=7.0)
@@ -87,6 +88,7 @@ def test_they_collide_and_each_is_told_whom_it_met(world: str) -> None:
     assert abs(places(result, "b")[-1][1] - 3.0) > 0.01  # it was pushed
 
 
+@pytest.mark.slow
 def test_each_obeys_only_what_names_it(world: str) -> None:
     """Sabotage: orders for one, for nobody, and for a vehicle that does not exist."""
     orders = [
@@ -206,6 +208,7 @@ def test_they_see_each_other_and_a_free_camera_sees_them(world: str) -> None:
     assert len({e.stamp for e in result.of(SegmentationImage)}) == 15
 
 
+@pytest.mark.slow
 def test_the_order_of_the_file_changes_nothing_that_any_of_them_does(world: str) -> None:
     """Not bit for bit, since MuJoCo then adds in another order; to a micrometre."""
     orders = [takeoff("a"), takeoff("b", altitude=2.0), place("a", 2 * SECOND, -2.0)]
@@ -220,6 +223,7 @@ def test_the_order_of_the_file_changes_nothing_that_any_of_them_does(world: str)
         np.testing.assert_allclose(places(one, name), places(other, name), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_is_brought_up_again_is_where_it_was_left(world: str) -> None:
     class Fragile(Multirotor):
         @every(hz="control_rate")
@@ -295,6 +299,7 @@ def test_bodies_are_announced_and_their_poses_are_sent(world: str) -> None:
     assert result.of(Wind) == []
 
 
+@pytest.mark.slow
 def test_wind_is_announced_sent_and_felt_alike_by_all(world: str) -> None:
     orders = [takeoff("a"), takeoff("b"), place("b", 3 * SECOND, 4.0)]
     nodes = (drone("a", 0.0, world), drone("b", 3.0, world), surroundings(world, wind=WIND))
@@ -326,6 +331,7 @@ def test_a_world_without_wind_and_bodies_changes_no_bit_of_a_flight(world: str) 
         assert plain.of(event) == beside.of(event)
 
 
+@pytest.mark.slow
 def test_a_body_that_comes_along_pushes_a_vehicle(world: str) -> None:
     crate = {
         "name": "crate",

@@ -40,6 +40,42 @@ def show(
     print_lines(summary, folder)
 
 
+def runs(
+    folder: Annotated[Path, typer.Argument(help="Folder of runs.")] = Path("runs"),
+) -> None:
+    """List the runs in a folder, the newest first: when, how long, and who passed."""
+    from datetime import datetime
+
+    from rich.table import Table
+
+    files = sorted(folder.glob("*/summary.json"), key=lambda file: -file.stat().st_mtime)
+    if not files:
+        raise ResultsError(f"{folder}: expected folders of runs in it, found none")
+    table = Table("run", "ended", "s", "seed", "state", "estimators", box=None, pad_edge=False)
+    for file in files:
+        ended = datetime.fromtimestamp(file.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
+        try:
+            summary = msgspec.json.decode(file.read_bytes(), type=Summary)
+        except (OSError, msgspec.MsgspecError):
+            table.add_row(escape(file.parent.name), ended, "", "", "[red]unreadable[/red]", "")
+            continue
+        state = "[red]crashed[/red]" if summary.error else _WORDS[_passed(summary)]
+        judged = summary.verdict.estimators if summary.verdict else {}
+        errors = (
+            f"{name} {figures['ate_percent']:.2g} %" if figures.get("ate_percent") else name
+            for name, figures in judged.items()
+        )
+        seconds, seed = f"{summary.sim_seconds:.1f}", f"{summary.seed}"
+        table.add_row(
+            escape(file.parent.name), ended, seconds, seed, state, escape(", ".join(errors))
+        )
+    Console().print(table, soft_wrap=True)
+
+
+def _passed(summary: Summary) -> bool | None:
+    return summary.verdict.passed if summary.verdict else None
+
+
 def print_tables(summary: Summary) -> None:
     """Print the tables of a run, and its digest."""
     from runtime.tools.cli.tables import run_tables

@@ -172,15 +172,20 @@ def _by_pair(edges: list[tuple[str, str, str, str, str]]) -> dict[tuple[str, str
 
 def nodes(
     which: Annotated[
-        str | None, typer.Argument(help='Only this one: a part of its name, or "module:Class".')
+        str | None, typer.Argument(help='A part of its name, or "module:Class".')
     ] = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Describe all nodes as one is described.")
+    ] = False,
 ) -> None:
-    """Describe nodes: their ports, and their settings with meaning, range and default.
+    """List nodes, or describe one: its ports, and its settings with meaning, range and default.
 
-    Without an argument these are all that installed packages offer. Settings that every file may
-    have, whatever its nodes, are listed by "python -m runtime settings".
+    The list is of all that installed packages offer. Settings that every file may have, whatever
+    its nodes, are listed by "python -m runtime settings".
     """
     from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
 
     from runtime.config.reading import find_modules_in, find_node, find_nodes
     from runtime.errors import ConfigError, suggest
@@ -200,6 +205,12 @@ def nodes(
             f"expected the name of a node, found {which!r}" + suggest(str(which), found)
         )
     console = Console()
+    if which is None and not every:
+        table = Table("node", "", box=None, pad_edge=False, show_header=False)
+        for name, cls in shown.items():
+            table.add_row(f"[bold]{name}[/bold]", escape(describe(cls, name).doc.splitlines()[0]))
+        console.print(table)
+        return
     for name, cls in shown.items():
         console.print(_tree(describe(cls, name)), highlight=False)
 

@@ -175,7 +175,9 @@ def _print(run: RunConfig, supervisor: Supervisor, console: Console, end: thread
 
 def _state(run: RunConfig, supervisor: Supervisor) -> tuple[float, str]:
     if supervisor.state.first_update is None:
-        return 0.0, "starting"
+        runners = list(supervisor.state.runners.values())
+        busy = [f"{each.spec.name} ({each.phase})" for each in runners if each.phase]
+        return 0.0, " ".join(["starting", *busy[:1]])
     seconds = supervisor.state.clock.now() / SECOND
     speed = seconds / max(time.monotonic() - supervisor.state.first_update, 1e-9)
     limit = f" of {run.duration:g}" if run.duration else ""

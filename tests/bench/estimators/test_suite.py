@@ -72,6 +72,7 @@ def small(tmp_path: Path) -> Path:
     return tmp_path / "suite.toml"
 
 
+@pytest.mark.slow
 def test_the_projects_own_suite_is_right() -> None:
     """Every scenario's and estimator's settings exist; the scenarios rise from easy to brutal."""
     suite = read_suite()
@@ -138,6 +139,7 @@ def line_of(page: str, name: str) -> str:
     return next(line for line in page.splitlines() if line.startswith(f"| {name} |"))
 
 
+@pytest.mark.slow
 def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
     """A missed threshold, a crash and silence: in the table of all, and in that of the scenario."""
 

@@ -97,6 +97,7 @@ def cases() -> list[Any]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", cases())
 def test_it_passes_the_suite_and_equal_input_gives_equal_output(case: Case) -> None:
     record = run(case)

@@ -103,6 +103,7 @@ def made(*cameras: CameraAnnouncement) -> Rectification:
         raise
 
 
+@pytest.mark.slow
 @given(lenses(), st.integers(0, 2**32 - 1))
 def test_what_the_lens_sees_falls_on_the_pinholes_pixel(info: CameraInfo, seed: int) -> None:
     rectified = made(seen(info))
@@ -116,6 +117,7 @@ def test_what_the_lens_sees_falls_on_the_pinholes_pixel(info: CameraInfo, seed: 
     assert ((there > -1e-6) & (there < (WIDTH - 1 + 1e-6, HEIGHT - 1 + 1e-6))).all(), "no black"
 
 
+@pytest.mark.slow
 @given(lenses(), lenses(), st.lists(share(0.06), min_size=6, max_size=6), st.floats(0.03, 0.5))
 def test_both_eyes_show_a_point_on_one_row(
     left: CameraInfo, right: CameraInfo, turns: list[float], baseline: float
@@ -156,6 +158,7 @@ def test_the_middle_keeps_its_resolution(info: CameraInfo, focal: float, across:
     assert 2 * math.atan((info.width - 1) / 2 / pinhole.fx) <= WIDEST + 1e-9
 
 
+@pytest.mark.slow
 def test_a_drawn_image_and_its_depth_become_the_pinholes() -> None:
     """A ramp of brightness and two depths, which must not be mixed."""
     rectified = Rectification([seen(EUROC)])

@@ -82,6 +82,7 @@ def test_an_estimate_is_late_by_the_latency() -> None:
     assert len(result(rate=20, latency="200ms").of(PoseEstimate)) == 16
 
 
+@pytest.mark.slow
 def test_noise_has_the_size_that_the_settings_say() -> None:
     errors = [
         np.subtract(said.position, truth.position)

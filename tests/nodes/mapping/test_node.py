@@ -112,6 +112,7 @@ def planes(cloud: PointCloud) -> list[float]:
     return sorted({round(float(north), 3) for north in cloud.points[:, 0]})
 
 
+@pytest.mark.slow
 def test_the_cloud_is_sent_and_written_at_the_end(tmp_path: Path) -> None:
     """In map, with its colours, and the same in both; frames too soon after another are left
     out, and so is what has no partner of its stamp."""

@@ -185,6 +185,7 @@ def test_what_is_no_data_has_no_digest(extra: Any) -> None:
         taken(None, measured(np.zeros(1), extra))
 
 
+@pytest.mark.slow
 def test_a_node_that_sends_what_is_no_data_is_told_so(tmp_path: Path) -> None:
     class Vague(Node):
         out_ = Output(Measured)

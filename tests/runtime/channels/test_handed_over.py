@@ -147,6 +147,7 @@ def test_what_links_lost_before_a_restart_is_counted(tmp_path: Path) -> None:
     assert 20 <= found.links["weak.pings"].lost <= 24
 
 
+@pytest.mark.slow
 def test_a_run_in_real_time_takes_as_long_on_both_clocks(tmp_path: Path) -> None:
     class Lingering(Node):
         async def on_shutdown(self) -> None:

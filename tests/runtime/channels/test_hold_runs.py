@@ -80,6 +80,7 @@ def run(out: Path, on_error: OnError = "stop", **config: Any) -> Summary:
     return execute(Config(run=settings, nodes=(spec(Speaker, "speaker"), outside)), out)
 
 
+@pytest.mark.slow
 def test_a_run_has_the_same_digest_whatever_its_answers_take(tmp_path: Path) -> None:
     quick = run(tmp_path / "quick")
     slow = run(tmp_path / "slow", pause=0.02)
@@ -100,6 +101,7 @@ def test_a_run_has_the_same_digest_whatever_its_answers_take(tmp_path: Path) -> 
     assert other.wall_p50_ms >= 20.0
 
 
+@pytest.mark.slow
 def test_what_became_of_each_frame_stands_in_a_file_that_can_be_replayed(tmp_path: Path) -> None:
     run(tmp_path / "first", pause=0.01)
     file = tmp_path / "first" / "answers" / "slam.csv"

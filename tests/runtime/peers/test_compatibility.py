@@ -50,6 +50,7 @@ def test_a_process_that_does_not_fit_is_told_why(other: Hello, said: str) -> Non
     assert said in str(raised.value)
 
 
+@pytest.mark.slow
 def test_a_run_that_waits_in_vain_says_for_whom() -> None:
     config = settings(*TWO, wait=0.3)
     process = Process(config, "asker").done()
@@ -58,6 +59,7 @@ def test_a_run_that_waits_in_vain_says_for_whom() -> None:
     assert "--only one" in str(process.error)
 
 
+@pytest.mark.slow
 def test_another_file_is_refused_and_the_right_one_still_welcome() -> None:
     right = settings(*TWO)
     wrong = settings(TWO[0], ("one", "Answerer", {"takes": 0.5}), meet=right.network.meet)
@@ -68,6 +70,7 @@ def test_another_file_is_refused_and_the_right_one_still_welcome() -> None:
     assert first.ended().outputs["one.answers"] > 0
 
 
+@pytest.mark.slow
 def test_both_are_told_in_what_their_files_differ(caplog: pytest.LogCaptureFixture) -> None:
     first, second = (
         settings(*TWO, wait=3.0),

@@ -138,8 +138,16 @@ CROSSED: list[tuple[str, Any]] = [
 """Of two greetings that cross, each end begins a session with another one."""
 
 
+ANSWERED: list[tuple[str, Any]] = [
+    *[("meet", "asker"), ("again", 0), ("deliver", "asker"), ("meet", "asker"), ("again", 3)],
+    ("lose", "asker"),
+]
+"""An answer to a greeting from before the session is still on its way when there is one."""
+
+
 @given(OPS)
 @example(CROSSED)
+@example(ANSWERED)
 def test_both_end_in_one_session_that_nothing_old_can_end(ops: list[tuple[str, Any]]) -> None:
     async def main() -> None:
         pair = Pair()

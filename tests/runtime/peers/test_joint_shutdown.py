@@ -63,6 +63,7 @@ def test_what_fails_in_one_process_ends_both_with_its_reason(clock: str, when: s
         assert f"wrong world in {when}" in str(process.error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 @pytest.mark.parametrize("who", ["asker", "one"])
 def test_an_end_between_readiness_and_the_first_update_ends_both(
@@ -83,6 +84,7 @@ def test_an_end_between_readiness_and_the_first_update_ends_both(
         assert "of this" in str(process.done(SOON).error), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 def test_one_that_never_hears_that_the_run_has_begun_ends_all(
     clock: str, monkeypatch: pytest.MonkeyPatch

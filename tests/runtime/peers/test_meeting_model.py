@@ -193,6 +193,7 @@ def check(wire: Wire) -> None:
         assert all(wanted.values()), f"{node} does not know what others want"
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(STEPS, OPS)
 @example((3, 3, 3), [("kill", "one", "one")])

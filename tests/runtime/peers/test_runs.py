@@ -45,6 +45,7 @@ def test_in_lockstep_the_digest_is_that_of_one_process(onlys: tuple[str, ...]) -
         ]
 
 
+@pytest.mark.slow
 def test_time_is_held_in_all_processes_for_a_system_outside_of_one() -> None:
     config = settings(
         ("asker", "Asker", {}), ("one", "Answerer", {}), ("slam", "Outside", {"takes": 0.03})
@@ -56,6 +57,7 @@ def test_time_is_held_in_all_processes_for_a_system_outside_of_one() -> None:
         assert summary.outside["slam"].reproducible
 
 
+@pytest.mark.slow
 def test_in_real_time_everything_crosses_too() -> None:
     config = settings(*THREE, clock="real", duration=0.6)
     one, other = apart(config, "asker", "one,other")
@@ -67,6 +69,7 @@ def test_in_real_time_everything_crosses_too() -> None:
         assert trips.count(None) < len(trips) or summary.processes[0].clock_offset_ms is None
 
 
+@pytest.mark.slow
 def test_nobody_leaves_before_all_have_heard_what_it_had_to_say(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -87,6 +90,7 @@ def test_nobody_leaves_before_all_have_heard_what_it_had_to_say(
     assert len(one.processes) == len(other.processes) == 2
 
 
+@pytest.mark.slow
 def test_handled_ends_the_delivery_in_its_own_process_only() -> None:
     """Both answerers hear the question though the first one handles it."""
     config = settings(
@@ -105,6 +109,7 @@ def test_an_error_in_one_process_ends_all_and_says_whose_it_is() -> None:
     assert "at refuser: refuser: no more" in str(here.error)
 
 
+@pytest.mark.slow
 def test_simulated_time_does_not_pass_while_processes_wait_for_one_another() -> None:
     """What is due meanwhile, as in a task that a node has begun, waits for the first update."""
     config = settings(("asker", "Restless", {}), ("one", "SlowAnswerer", {}), duration=0.2)

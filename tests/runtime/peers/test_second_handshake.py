@@ -100,6 +100,7 @@ def cases(**last: str) -> Iterator[Any]:
                     yield pytest.param(clock, who, point, marks=[] if quick else pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("clock", "who", "point"), [*cases(asker="Ready", one="Subscriptions")])
 def test_who_dies_before_the_first_update_and_comes_back_changes_nothing(
     once: Any, clock: str, who: str, point: str
@@ -122,6 +123,7 @@ def test_who_dies_before_the_first_update_and_comes_back_changes_nothing(
             assert summary.digest == execute(config).digest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("clock", "who", "point"), [*cases(asker="heard", one="heard")])
 def test_links_that_fail_before_the_first_update_change_nothing(
     once: Any, clock: str, who: str, point: str
@@ -139,6 +141,7 @@ def test_links_that_fail_before_the_first_update_change_nothing(
             assert summary.digest == execute(config).digest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("who", WHO)
 def test_who_does_not_come_back_is_named_after_the_limit(
@@ -172,6 +175,7 @@ def test_who_does_not_come_back_is_named_after_the_limit(
         )
 
 
+@pytest.mark.slow
 def test_who_comes_back_with_other_announcements_ends_the_run(
     once: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,6 +207,7 @@ def test_who_comes_back_with_other_announcements_ends_the_run(
         )
 
 
+@pytest.mark.slow
 def test_who_begins_while_the_one_that_listens_ends_is_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -159,6 +159,7 @@ def test_a_line_without_room_there_sends_the_frame_itself(monkeypatch: pytest.Mo
     assert said == [(EventMessage("a.b"), packed.frame())]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [True, False])
 def test_images_pass_through_it_if_the_file_says_so(
     shared: bool, monkeypatch: pytest.MonkeyPatch

@@ -84,6 +84,7 @@ def test_it_listens_at_the_named_address_only(host: str) -> None:
     assert {each[:2] for each in found} <= {("tcp", ip) for ip in (address, "127.0.0.1")}
 
 
+@pytest.mark.slow
 def test_it_tells_whether_anybody_listens_where_processes_meet(tmp_path: Path) -> None:
     network = NetworkConfig(meet=f"tcp/127.0.0.1:{free_port()}")
     first, second = (Session("test", network, b"secret") for _ in range(2))

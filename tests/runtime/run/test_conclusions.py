@@ -43,6 +43,7 @@ def test_a_verdict_stands_in_the_summary_and_is_there_after_the_run(tmp_path: Pa
     assert seen["not_deterministic"] == ["judge"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("passed", "code"), [("true", 0), ("false", 1)])
 def test_the_exit_code_tells_whether_thresholds_were_met(
     tmp_path: Path, passed: str, code: int

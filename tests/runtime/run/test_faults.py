@@ -264,6 +264,7 @@ def test_a_node_that_waits_for_its_restart_stays_away_once_the_run_ends() -> Non
     assert (outcome.error, lives) == (None, [0])
 
 
+@pytest.mark.slow
 def test_restart_works_on_the_real_clock() -> None:
     outcome = treat("tick", "restart", duration=1.7, clock="real")
     assert outcome.error is None

@@ -79,6 +79,7 @@ def flights(folder: Path) -> dict[str, int]:
     return {each.name: summary(each)["seed"] for each in sorted(folder.iterdir())}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("link", [False, True])
 def test_a_start_that_fails_takes_nothing_away(link: bool, tmp_path: Path) -> None:
     real = tmp_path / "real"

@@ -143,6 +143,7 @@ def check(folder: Path, modes: list[tuple[str, str, str, str]]) -> None:
     assert wrong == {}
 
 
+@pytest.mark.slow
 def test_a_run_survives_what_a_node_raises(tmp_path: Path) -> None:
     check(tmp_path, QUICK)
 

@@ -64,6 +64,7 @@ def test_a_signal_ends_a_run_in_order(
     assert all(line.endswith("\n") for line in lines)
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_as_fast_as_it_can_hears_ctrl_c(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Lively", settings="rate = 1000")
     with running(tmp_path, path, "running") as process:
@@ -72,6 +73,7 @@ def test_a_run_that_goes_as_fast_as_it_can_hears_ctrl_c(tmp_path: Path) -> None:
     assert summary(tmp_path / "runs" / "sample")["reason"] == "Ctrl-C"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_ctrl_c_during_a_slow_start_ends_in_order(clock: str, tmp_path: Path) -> None:
     path = config_file(tmp_path, "Speaker", "SlowStart", run=PACED[clock])
@@ -82,6 +84,7 @@ def test_ctrl_c_during_a_slow_start_ends_in_order(clock: str, tmp_path: Path) ->
     assert (found["reason"], found["sim_seconds"]) == ("Ctrl-C", 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_a_second_ctrl_c_ends_at_once(clock: str, tmp_path: Path) -> None:
     path = config_file(tmp_path, "SlowEnd", run=PACED[clock] + "\nshutdown_limit = 100")

@@ -67,6 +67,7 @@ def test_a_failed_run_leaves_its_summary(tmp_path: Path) -> None:
     assert found.events["Ping"] in {5, 6}  # one is due as it fails
 
 
+@pytest.mark.slow
 def test_what_no_run_has_made_is_never_removed(tmp_path: Path) -> None:
     """An earlier run is moved whole, and removed two runs later if all in it is its own."""
     out = tmp_path / "run"
@@ -104,6 +105,7 @@ def test_the_tables_show_every_output_input_and_tick(tmp_path: Path) -> None:
     assert {"speaker.pings", "10.0", "lazy.some", "6", "speaker.speak"} <= cells
 
 
+@pytest.mark.slow
 def test_the_digest_is_of_what_was_said(tmp_path: Path) -> None:
     one, two = run(tmp_path, Speaker), run(tmp_path, Speaker)
     assert one.digest == two.digest

@@ -74,6 +74,7 @@ def burn() -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", "while True: pass"])
 
 
+@pytest.mark.slow
 def test_a_stepped_run_has_the_digest_of_one_that_was_never_paused(tmp_path: Path) -> None:
     file = tmp_path / "all.toml"
     file.write_text(FILE.format(samples="tests.runtime.samples_everything"), encoding="utf-8")

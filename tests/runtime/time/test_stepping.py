@@ -214,6 +214,7 @@ def test_a_step_that_is_cut_short_says_how_far_it_went() -> None:
     assert run_in_lockstep(main()) == [3 * MS, 3 * MS, 4 * MS]
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.sampled_from([1, 7, 2_500, MS, 13 * MS, None, "pause", "resume", "wait"]), max_size=12

@@ -36,6 +36,7 @@ def test_help_imports_no_package_that_takes_long(monkeypatch: pytest.MonkeyPatch
     assert not imported & HEAVY
 
 
+@pytest.mark.slow
 def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Noise", "Speaker", "Reader", run="duration = 2")
     done = command("run", path, folder=tmp_path)
@@ -70,6 +71,7 @@ def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) 
     assert summary(results)["digest"] != first["digest"]
 
 
+@pytest.mark.slow
 def test_the_results_of_an_earlier_run_are_kept_once(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Noise", run="duration = 1")
     runs = tmp_path / "runs"
@@ -143,6 +145,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
         assert line in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("node", ["Fatal", "FailsLast"])
 def test_an_error_is_printed_once(node: str, tmp_path: Path) -> None:
     text = f"[[nodes]]\nname = 'n'\ntype = '{__name__}:{node}'\n[run]\nduration = 0.1\n"

@@ -17,7 +17,7 @@ from scipy.stats import wilcoxon
 
 from runtime.errors import ConfigError
 from runtime.node import Node, NodeConfig
-from runtime.tools.compare import (
+from runtime.tools.comparison import (
     Comparison,
     Key,
     compare_rows,

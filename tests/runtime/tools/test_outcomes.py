@@ -148,6 +148,16 @@ def test_a_verdict_is_shown_in_a_few_lines(file: Path, tmp_path: Path) -> None:
     assert len(tables.splitlines()) > 8
     bad = command_here("run", file, "--set", "judge.error=7", folder=tmp_path)
     assert bad.stdout.splitlines()[0] == "vo FAILED: ate_percent: expected at most 1"
+    command_here("run", file, "--set", "judge.crash=true", "--out", "runs/bad", folder=tmp_path)
+    (tmp_path / "runs" / "torn").mkdir()
+    (tmp_path / "runs" / "torn" / "summary.json").write_text("{")
+    listed = command_here("runs", folder=tmp_path).stdout.splitlines()
+    rows = {line.split()[0]: line.split()[3:] for line in listed[1:]}
+    assert rows["torn"] == ["unreadable"]
+    assert rows["bad"][2:] == ["crashed", "vo", "0.5", "%"]
+    assert rows["tour"] == ["1.0", "0", "FAILED", "vo", "7", "%"]
+    assert rows["tour.1"] == ["1.0", "0", "PASSED", "vo", "0.5", "%"]
+    assert command_here("runs", "nowhere", folder=tmp_path).returncode == 2
     nothing = command_here("show", tmp_path, folder=tmp_path)
     assert nothing.returncode == 2
     assert "expected a run's summary, found: No such file" in nothing.stderr

@@ -64,6 +64,7 @@ def test_what_repeats_is_said_to(tmp_path: Path) -> None:
     assert (found.repeats, found.first, found.outputs) == (True, "", [])
 
 
+@pytest.mark.slow
 def test_the_rig_that_differs_is_named_with_when_and_by_how_much(tmp_path: Path) -> None:
     vehicles = spec(Drift, "a", {"differs_at": 3}), spec(Drift, "b", {"differs_at": 2})
     found = twice(tmp_path, *vehicles).twice
@@ -74,6 +75,7 @@ def test_the_rig_that_differs_is_named_with_when_and_by_how_much(tmp_path: Path)
     assert found.outputs == ["a.poses", "b.poses"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unsteady", [False, True])
 def test_a_system_is_unknown_until_it_was_run_twice(unsteady: bool, tmp_path: Path) -> None:
     node = program(*(["unsteady"] if unsteady else []))
@@ -105,6 +107,7 @@ type = "tests.runtime.tools.test_twice:Drift"
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("differs_at", "code", "said"),
     [(1000, 0, "run twice, it repeats"), (2, 1, "run twice, it differs: the rig, drone, in")],

@@ -60,6 +60,7 @@ async def test_a_call_that_fails_is_counted_and_making_the_object_is_not() -> No
         assert (plant.costs.calls, plant.costs.processes) == (1, 2)
 
 
+@pytest.mark.slow
 async def test_memory_is_that_of_the_process_at_its_fullest() -> None:
     async with worker() as plant:
         before = plant.costs.peak

@@ -228,6 +228,7 @@ async def test_a_death_while_idle_is_told() -> None:
     assert "killed by signal 15" in str(deaths[0])
 
 
+@pytest.mark.slow
 async def test_a_process_that_hangs_is_killed_within_its_limit() -> None:
     async with worker() as plant:
         pid = await plant.call(Plant.pid)
@@ -258,6 +259,7 @@ async def test_close_ends_the_processes_and_fails_what_waits() -> None:
     assert not any(alive(pid) for pid in pids)
 
 
+@pytest.mark.slow
 async def test_arrays_come_back_as_they_went() -> None:
     async with worker() as plant:
         for size in (1, 100, 5000, 3_000_000):
@@ -276,6 +278,7 @@ def alive(pid: int) -> bool:
     return True
 
 
+@pytest.mark.slow
 async def test_in_real_time_a_core_is_left_to_the_loop() -> None:
     """On the real clock a worker keeps off one core; in lockstep it may use them all."""
     cores = os.sched_getaffinity(0)

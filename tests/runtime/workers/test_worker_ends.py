@@ -111,6 +111,7 @@ async def test_a_program_that_a_worker_has_started_ends_with_it() -> None:
     assert ends(pid)
 
 
+@pytest.mark.slow
 async def test_an_end_beside_a_fork_is_noticed() -> None:
     async with worker() as plant:
         with pytest.raises(WorkerDiedError, match="ended with exit code 7") as caught:
@@ -157,6 +158,7 @@ class Misleading:
         return (open, ("/nowhere/at/all",))
 
 
+@pytest.mark.slow
 async def test_an_argument_that_cannot_be_made_there_fails_only_its_call() -> None:
     async with worker() as plant:
         with pytest.raises(FileNotFoundError, match="/nowhere/at/all"):

@@ -85,12 +85,14 @@ def test_what_is_no_json_is_refused_with_its_place(text: str, expected: str) -> 
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.text(), VALUES, max_size=4), st.integers(0, 3))
 def test_strict_json_is_read_as_it_is(table: dict[str, object], indent: int) -> None:
     text = json.dumps(table, indent=indent or None, ensure_ascii=False)
     assert parse(text, "settings.json") == (table, text, [])
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.text(), VALUES, max_size=4))
 def test_comments_and_commas_put_into_strict_json_change_nothing(table: dict[str, object]) -> None:
     text = json.dumps(table, indent=1)

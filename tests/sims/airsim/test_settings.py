@@ -357,6 +357,7 @@ SETTINGS = st.fixed_dictionaries(
 ).flatmap(lambda known: objects(JSON).map(lambda more: more | known))
 
 
+@pytest.mark.slow
 @given(SETTINGS | JSON)
 def test_any_settings_are_refused_or_load(settings: Any) -> None:
     try:

@@ -92,6 +92,7 @@ def test_whole_numbers_are_taken_for_floats_but_not_the_reverse() -> None:
         msgspec.convert([1.5], tuple[int])
 
 
+@pytest.mark.slow
 @given(st.lists(REQUESTS, max_size=4), st.data())
 def test_what_is_encoded_is_decoded_however_the_stream_is_split(
     requests: list[tuple[int, str, list[Any]]], data: st.DataObject

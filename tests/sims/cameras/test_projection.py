@@ -269,6 +269,7 @@ def test_depth_lies_on_the_true_surfaces(world: tuple[Scene, CameraRenderer, str
     assert error.max() < 0.005
 
 
+@pytest.mark.slow
 def test_nothing_hit_is_infinite_and_has_no_number(
     world: tuple[Scene, CameraRenderer, str],
 ) -> None:

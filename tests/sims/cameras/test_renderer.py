@@ -58,6 +58,7 @@ def elsewhere(packed: bytes, prefix: str) -> str:
         made.close()
 
 
+@pytest.mark.slow
 def test_same_state_same_bits(renderer: CameraRenderer) -> None:
     """What was drawn in between leaves no trace."""
     first = digest(renderer.render(7, QPOS, NAMES))
@@ -131,6 +132,7 @@ def test_rows_run_down_and_columns_right() -> None:
     assert blue[2] > blue[0] + 50
 
 
+@pytest.mark.slow
 def test_wrong_arguments_are_named(renderer: CameraRenderer) -> None:
     """A state of the wrong length, an unknown camera and a closed renderer are told apart."""
     built = scene("hall")
@@ -159,6 +161,7 @@ def test_missing_libraries_are_named_with_their_packages(monkeypatch: pytest.Mon
         graphics.open_context(8, 8, 1)
 
 
+@pytest.mark.slow
 def test_importing_changes_no_environment() -> None:
     """Neither MUJOCO_GL nor LP_NUM_THREADS is touched before a renderer is made."""
     names = ("MUJOCO_GL", "LP_NUM_THREADS", "PYOPENGL_PLATFORM")

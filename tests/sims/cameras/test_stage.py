@@ -57,6 +57,7 @@ def views(name: str) -> Iterator[tuple[Stage, int, Floats]]:
 WORLDS = ["glass", "hall", pytest.param("yard", marks=pytest.mark.slow)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", WORLDS)
 def test_depth_alone_is_that_beside_colours(world: str) -> None:
     """It is drawn without textures, lights and sky, and stays the same to the bit."""

@@ -126,6 +126,7 @@ def test_settings_that_cannot_be_are_refused_with_the_file(
         spec(Multirotor, "drone", config)
 
 
+@pytest.mark.slow
 def test_lidars_send_turns_with_the_stamp_of_their_first_ray_when_they_are_over() -> None:
     lidar = {"name": "top", "rate": 20, "columns": 90, "channels": 4, "latency": "13ms"}
     flash = {"name": "front", "pattern": "solid_state", "channels": 1, "azimuths": [-30, 30]}

@@ -160,6 +160,7 @@ def test_a_ball_comes_to_rest_on_the_floor_and_steps_are_cheap(probe: tuple[str,
     assert data.qpos[2] == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EACH)
 def test_sizes_are_modest(name: str) -> None:
     """The model with all its textures stays below 40 MB."""

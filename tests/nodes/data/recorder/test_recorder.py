@@ -42,6 +42,7 @@ def big(stamp: int) -> Image:
     return Image(stamp=stamp, source="drone/front", frame_id="f", data=data)
 
 
+@pytest.mark.slow
 def test_a_run_is_recorded_to_its_end(tmp_path: Path) -> None:
     """All that was said is there, when it was said; so is the time at which the run ended."""
     (tmp_path / "config.toml").write_text("[run]\n")

@@ -191,6 +191,7 @@ def flight(seed: int) -> Iterator[tuple[InertialFilter, Floats, float]]:
 H = np.array([0.05 - 1e-4, 0.05 + 1e-4])
 
 
+@pytest.mark.slow
 def test_a_start_in_motion_with_gravity_20_degrees_off_converges_and_knows_its_error() -> None:
     consistent = []
     for seed in range(6):

@@ -120,6 +120,7 @@ def test_a_pair_that_may_not_be_rectified_is_refused_before_it_flies(stub: None)
         run_nodes([node], inputs=pair(position=(0.25, 0.1, 0.0)), duration=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "inputs", "given"),
     [

@@ -102,6 +102,7 @@ def flight(vocabulary: Path) -> Flight:
     return Flight("rgbd", vocabulary, views(48, blank=range(30, 36)))
 
 
+@pytest.mark.slow
 def test_the_pose_is_the_camera_in_its_first_frame_in_metres(flight: Flight) -> None:
     first, last = flight.tracked[0], flight.tracked[29]
     assert not any(t.lost for t in flight.tracked[:30])
@@ -230,6 +231,7 @@ def test_a_missing_library_is_an_error_that_says_what_to_install(
         OrbSlam3Process(make_settings("rgbd", [CAMERA]), vocabulary)
 
 
+@pytest.mark.slow
 def test_importing_the_module_does_not_import_the_library() -> None:
     """In a fresh interpreter, since other tests of this process may have used it."""
     code = (

@@ -97,6 +97,7 @@ def test_the_command_leaves_orb_slam3_out_and_puts_the_file_where_it_looks(
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_the_command_writes_where_it_is_told(
     tmp_path: Path, config: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -71,6 +71,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(STUB))  # which a worker takes over
 
 
+@pytest.mark.slow
 def test_it_says_where_the_body_went_and_when_it_was_lost() -> None:
     inputs = [camera(PINHOLE), *images(0, 9, 9, 9, 0, 9, 9)]
     result = run_node(Svo, inputs=inputs, duration=0.6, name="svo")

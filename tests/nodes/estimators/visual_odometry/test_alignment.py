@@ -68,6 +68,7 @@ def off(result: TrackingResult, true: Floats) -> float:
     return float(np.linalg.norm(result.pose[:3, 3] - true[:3, 3]))
 
 
+@pytest.mark.slow
 def test_a_room_without_corners_of_its_own_is_enough() -> None:
     said = follow(ROOM, PATH)
     assert not any(each.lost for each in said)

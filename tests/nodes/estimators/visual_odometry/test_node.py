@@ -96,6 +96,7 @@ def test_whatever_it_is_shown_the_run_goes_on(node: type[Node[Any]]) -> None:
         assert [each.stamp // MS // 33 for each in result.of(TrackingLost)] == [0, 7]
 
 
+@pytest.mark.slow
 def test_shown_nothing_it_says_nothing() -> None:
     seen = camera("drone/front", "grey", "depth", info=INFO)
     result = run_nodes([spec(VisualOdometry, "est")], inputs=[vehicle(), seen], duration=1.0)

@@ -146,6 +146,7 @@ def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
     assert 0.2 < x < 0.5  # the pose goes on as it moved, and ever more slowly
 
 
+@pytest.mark.slow
 def test_a_dense_map_at_a_guessed_pose_has_a_number_of_its_own() -> None:
     tracker = DenseTracker(INFO, DenseSettings(reset_timeout=0.0))
     assert follow(tracker, RIGHT)[-1].map == 0

@@ -199,6 +199,7 @@ def test_other_stamps_are_an_error_that_names_the_row(function: Any) -> None:
         function(truth, late.take(slice(0, 4)))
 
 
+@pytest.mark.slow
 @given(seed=SEEDS)
 @settings(max_examples=8, deadline=None)
 def test_errors_over_shares_of_the_path_are_the_means_of_evos(seed: int) -> None:

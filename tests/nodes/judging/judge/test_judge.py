@@ -113,6 +113,7 @@ def test_a_runs_own_trajectories_get_its_figures(
     assert found["odo"]["failed"] == ["coverage_percent: expected at least 90, found 87.42"]
 
 
+@pytest.mark.slow
 def test_every_exported_format_gives_the_same_figures(
     run: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:

@@ -142,6 +142,7 @@ def test_what_cannot_be_compared_passes_nothing(sequence: Path, behaviour: str) 
     assert "Traceback" not in result.output
 
 
+@pytest.mark.slow
 def test_a_run_that_hangs_is_ended_with_all_that_it_started(sequence: Path) -> None:
     begin = time.monotonic()
     result, verdict = judged(sequence, "hang", "--limit", "2")

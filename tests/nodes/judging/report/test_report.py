@@ -90,6 +90,7 @@ def page(run: Path) -> Page:
     return Page(run / "report.html")
 
 
+@pytest.mark.slow
 def test_the_figures_are_there_with_thresholds_and_what_was_missed(run: Path, page: Page) -> None:
     verdict = msgspec.json.decode((run / "evaluation" / "verdict.json").read_bytes())
     vo = verdict["estimators"]["vo"]

@@ -61,6 +61,7 @@ def quick(known: Iterable[str], *names: str) -> list[Any]:
     return [each if each in names else pytest.param(each, marks=pytest.mark.slow) for each in known]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("behaviour", quick(BEHAVIOURS, "out of order", "skips", "loses track"))
 def test_what_it_is_sent_depends_on_nothing_that_it_does(
     behaviour: str, plain: Summary, tmp_path: Path
@@ -95,6 +96,7 @@ def test_one_that_contradicts_itself_gets_the_same_but_is_not_called_reproducibl
     assert log.count("slam: expected one answer to the frame of 0.033333 s, found a second") == 1
 
 
+@pytest.mark.slow
 def test_as_a_worker_it_gives_the_same_estimates_at_the_same_times(
     plain: Summary, tmp_path: Path
 ) -> None:
@@ -134,6 +136,7 @@ def test_a_program_finds_no_truth_before_the_end_and_then_it_is_there(tmp_path: 
     assert len((out / "trajectories" / "truth.tum").read_text().splitlines()) == 1 + 6
 
 
+@pytest.mark.slow
 def test_what_a_program_costs_is_measured_from_outside(plain: Summary, tmp_path: Path) -> None:
     """By a shell that starts it, too: what counts is all that was started."""
     shell = f"{sys.executable} {STUB} burns=0.02; true"
@@ -254,6 +257,7 @@ def test_a_program_that_is_killed_is_missed_within_a_second(policy: str, tmp_pat
     assert ("restarts in 0.5 s" in str(heard.said)) == (policy == "restart")
 
 
+@pytest.mark.slow
 def test_one_that_died_is_started_again_and_begins_anew(tmp_path: Path) -> None:
     first, second = (
         fly(program("dies=5", on_error="restart"), tmp_path / name, 1.5) for name in "ab"
@@ -264,6 +268,7 @@ def test_one_that_died_is_started_again_and_begins_anew(tmp_path: Path) -> None:
     assert first.outside["slam"].inputs == second.outside["slam"].inputs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", quick(["deaf", "plain"], "deaf"))
 def test_no_child_of_it_stays(mode: str, tmp_path: Path) -> None:
     file = tmp_path / "pid"
@@ -376,6 +381,7 @@ def test_variables_stand_in_commands_and_a_shell_keeps_its_own(tmp_path: Path) -
         fly(program(command=words), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_mistake_in_a_template_is_told_with_its_line(tmp_path: Path) -> None:
     template = tmp_path / "settings.jinja"
     for text, message in (("a\n{{ camera.fx }}", "'camera' is undefined"), ("{% if %}", "line 1")):
@@ -385,6 +391,7 @@ def test_a_mistake_in_a_template_is_told_with_its_line(tmp_path: Path) -> None:
             fly(program(files=files), tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_build_comes_first_and_its_failure_ends_the_run(tmp_path: Path) -> None:
     made = tmp_path / "made"
     summary = fly(program(build=["touch", str(made)]), tmp_path / "out", 0.1)
@@ -394,6 +401,7 @@ def test_a_build_comes_first_and_its_failure_ends_the_run(tmp_path: Path) -> Non
         fly(program(build=["sh", "-c", "echo no compiler; exit 2"]), tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_what_an_earlier_run_has_left_is_not_there_any_more(tmp_path: Path) -> None:
     folder = tmp_path / "programs" / "slam"
     fly(program(), tmp_path, 0.1)
@@ -450,6 +458,7 @@ def test_one_that_is_started_by_hand_may_go_and_come_back(tmp_path: Path) -> Non
     assert not any(alive(pid) for pid in pids)
 
 
+@pytest.mark.slow
 def test_one_that_a_bridge_feeds_is_told_where_and_its_end_is_the_bridges_to_judge(
     tmp_path: Path,
 ) -> None:

@@ -190,6 +190,7 @@ time.sleep(600)
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_leaves_nothing_behind() -> None:
     with subprocess.Popen([sys.executable, "-c", RUN, FORKS], stdout=subprocess.PIPE) as run:
         assert run.stdout is not None
@@ -265,6 +266,7 @@ def test_what_controls_no_terminal_is_told_as_it_is(lines: list[str]) -> None:
     assert found == [line.rstrip() for line in lines]
 
 
+@pytest.mark.slow
 def test_a_line_without_end_takes_no_more_memory_than_a_long_one() -> None:
     found: list[str] = []
     output = Output(found.append)

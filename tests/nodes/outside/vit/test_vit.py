@@ -104,6 +104,7 @@ def test_before_the_first_pose_nothing_is_owed(tmp_path: Path) -> None:
     assert not record.of(TrackingLost)
 
 
+@pytest.mark.slow
 def test_what_comes_after_its_patience_is_told(tmp_path: Path) -> None:
     given = case("delay 120")
     result = run_nodes(

@@ -88,6 +88,7 @@ def watch(session: Session, kind: Kind = "MS", topic: Topic = PLAIN) -> Told:
     return told
 
 
+@pytest.mark.slow
 def test_a_subscriber_that_loses_a_kept_message_gets_it_all_the_same() -> None:
     """The plain one of the same process shows that it was lost."""
     with listening() as (session, locator), peer(locator, KEPT.name) as (process, lines):
@@ -219,6 +220,7 @@ def test_endpoints_are_told_of_when_they_appear_and_when_their_process_is_killed
         assert told.empty()
 
 
+@pytest.mark.slow
 def test_tokens_of_two_hundred_peers_are_told_of_and_no_others() -> None:
     others = [
         *("@ros2_lv/3/a/0/1/MS/%/%/n/%a%b", "@ros2_lv/3/a/0/1/MS/%/%/n/%a%b/t/h/::,1:,:,:"),

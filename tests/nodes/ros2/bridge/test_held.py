@@ -173,12 +173,14 @@ def test_an_answer_that_never_comes_ends_the_run_at_once(
         fly(behaviour, hold=hold)
 
 
+@pytest.mark.slow
 def test_frames_of_an_estimator_that_died_are_lost_and_counted() -> None:
     result, _ = fly("dies", hold={"max_wait": 60.0, "on_missing": "lost"})
     assert estimates(result) == ALL[:4]
     assert dict(result.outside["slam"].counts) == {"answered": 4, "lost": 8}
 
 
+@pytest.mark.slow
 def test_an_estimator_that_stops_is_gone_on_without() -> None:
     result, _ = fly("stops", hold={"max_wait": 0.3, "on_missing": "continue"})
     assert estimates(result) == ALL[:5]
@@ -196,6 +198,7 @@ class Pace(Node):
             await self.offload(time.sleep, 0.033)  # what is waited for is in threads of Zenoh
 
 
+@pytest.mark.slow
 def test_an_estimator_that_comes_back_is_held_for_again() -> None:
     with stub("comes_back") as (outside, port):
         Pace.outside = outside
@@ -212,6 +215,7 @@ def test_an_estimator_that_comes_back_is_held_for_again() -> None:
     assert estimates(result)[-1] == (299 * PERIOD, 299 % 256)
 
 
+@pytest.mark.slow
 def test_images_before_it_has_initialised_are_no_losses(reference: NodeResult) -> None:
     result, _ = fly("initialises", hold={"initialise": "1s"})
     answers = result.outside["slam"]
@@ -220,6 +224,7 @@ def test_images_before_it_has_initialised_are_no_losses(reference: NodeResult) -
     assert answers.counts["lost"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("needs", "missing"),
     [
@@ -272,6 +277,7 @@ def test_settings_that_make_no_sense_are_refused(changes: dict[str, Any], messag
         run_node(Ros2Bridge, config=settings(1, **changes))
 
 
+@pytest.mark.slow
 def test_only_what_is_not_held_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
     with stub("at_once") as (_, port):
         config = settings(port)
@@ -284,6 +290,7 @@ def test_only_what_is_not_held_is_warned_of(caplog: pytest.LogCaptureFixture) ->
     assert "messages of ROS on /cmd_vel come at their own time" in caplog.text
 
 
+@pytest.mark.slow
 def test_all_that_is_sent_arrives_in_the_order_of_its_events_after_its_time() -> None:
     """IMU, images and the time come from publishers of their own, and yet in one order."""
     _, outside = fly("slowly")

@@ -118,6 +118,7 @@ NUMBERS = st.integers(0, 2**31)
 EXTRA = st.lists(st.text("abc:,=;%.0", min_size=1), max_size=2).map(tuple)
 
 
+@pytest.mark.slow
 @given(NODES, st.from_regex(r"[0-9a-f]{1,32}", fullmatch=True), NUMBERS, NUMBERS, TOPICS, EXTRA)
 def test_a_token_is_read_as_it_was_written_and_what_follows_it_is_kept(
     node: NodeName, zid: str, node_id: int, id_: int, topic: Topic, extra: tuple[str, ...]
@@ -173,6 +174,7 @@ def test_a_token_with_something_missing_or_else_is_refused(wrong: str) -> None:
         parse_token(wrong)
 
 
+@pytest.mark.slow
 @given(TOPICS, EXTRA)
 def test_the_key_of_a_topic_s_endpoints_matches_theirs_only(
     topic: Topic, extra: tuple[str, ...]

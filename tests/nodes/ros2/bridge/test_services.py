@@ -217,6 +217,7 @@ def test_time_is_paused_stepped_and_resumed_by_services() -> None:
     assert driven(drive, step="2ms").reason == "ended by ROS"
 
 
+@pytest.mark.slow
 def test_time_that_is_real_is_neither_paused_nor_stepped() -> None:
     def drive(client: Client) -> None:
         features = client.call("/get_simulator_features", f"{SIMULATION}/GetSimulatorFeatures")
@@ -232,6 +233,7 @@ def test_time_that_is_real_is_neither_paused_nor_stepped() -> None:
     assert driven(drive, run=run, paused=False) == "ended by ROS"
 
 
+@pytest.mark.slow
 def test_a_step_ends_at_exactly_its_time() -> None:
     def drive(client: Client) -> None:
         assert client.trigger("/drone/arm") == (True, "Arm is sent; time stands")
@@ -276,6 +278,7 @@ def test_a_vehicle_that_does_not_obey_is_told_of() -> None:
     driven(drive, Deaf, paused=False)
 
 
+@pytest.mark.slow
 def test_what_is_no_request_gets_an_error_and_is_counted(caplog: pytest.LogCaptureFixture) -> None:
     good = pack(Attachment(1, 2, GID))
     step = bytes(STORE.serialize(STORE.message(f"{SIMULATION}/StepSimulation_Request")(steps=1)))
@@ -303,6 +306,7 @@ def test_what_is_no_request_gets_an_error_and_is_counted(caplog: pytest.LogCaptu
     assert f"{len(wrong)} refused or dropped" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_flood_of_requests_is_refused_beyond_some_and_all_get_a_reply() -> None:
     def drive(client: Client) -> None:
         assert client.set_state(1) == 1
@@ -330,6 +334,7 @@ def test_a_flood_of_requests_is_refused_beyond_some_and_all_get_a_reply() -> Non
     driven(drive)
 
 
+@pytest.mark.slow
 def test_who_waits_when_the_run_ends_is_told_so() -> None:
     paused = threading.Event()
     replies: list[Any] = []

@@ -127,6 +127,7 @@ def test_a_goal_steps_time_and_tells_how_far_it_is() -> None:
     assert result.seconds == 0.502
 
 
+@pytest.mark.slow
 def test_feedback_comes_while_steps_go_on_and_cancel_lets_time_stand() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, FOREVER)
@@ -229,6 +230,7 @@ def test_the_end_of_the_run_aborts_a_goal() -> None:
     assert acted(drive).reason == "ended by ROS"
 
 
+@pytest.mark.slow
 def test_real_time_aborts_and_says_that_it_cannot_be_stepped() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, 1)

@@ -76,6 +76,7 @@ def test_a_pose_lands_where_it_was_said_on_both_time_lines(tmp_path: Path) -> No
     assert found.values("map/drone", QUATERNION)[0, 0] == pytest.approx([0.1, 0.7, 0.5, 0.5])
 
 
+@pytest.mark.slow
 def test_the_world_points_north_east_down(tmp_path: Path) -> None:
     found = record(tmp_path)
     forward, right, down = 5, 3, 2  # rerun.components.ViewCoordinates

@@ -54,6 +54,7 @@ def shared(display: Display) -> Iterator[Run]:
         yield run
 
 
+@pytest.mark.slow
 def test_keys_held_together_are_both_down_until_each_comes_up(shared: Run) -> None:
     """Two keys at once are two presses, and one coming up leaves the other held."""
     shared.heard.clear()
@@ -153,6 +154,7 @@ def test_an_image_that_cannot_be_shown_is_an_error(display: Display) -> None:
     assert "found uint8 of shape (80, 160, 4)" in error
 
 
+@pytest.mark.slow
 def test_letters_are_those_of_the_layout(begin: Begin, display: Display) -> None:
     """On a German keyboard z is the key marked z, and ü goes by its place."""
     display.call("setxkbmap", "de")

@@ -89,6 +89,7 @@ class Starting(Node):
             time.sleep(0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("starved", [False, True])
 def test_a_start_is_reported_only_if_it_had_a_processor(
     starved: bool, monkeypatch: pytest.MonkeyPatch
@@ -115,6 +116,7 @@ class Endless(Node):
             time.sleep(0.01)  # that is the fault
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interrupted", [False, True])
 def test_a_node_that_blocks_the_start_up_is_named_and_a_first_ctrl_c_is_heard(
     interrupted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -59,6 +59,7 @@ def assert_equal_when_played(
     assert {name: each.calls for name, each in again.ticks.items()} == ticks
 
 
+@pytest.mark.slow
 @settings(
     max_examples=5,
     deadline=None,
@@ -79,16 +80,19 @@ def test_a_played_flight_is_equal_to_the_event_and_in_their_order(
     assert_equal_when_played(tmp_path, *others, flight=flight)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", ["duration = '0.5s'", "duration = '3s'", "seed = 4"])
 def test_it_ends_as_it_did(tmp_path: Path, run: str) -> None:
     run = run if "duration" in run else "duration = '2s'"
     assert_equal_when_played(tmp_path, run=run)
 
 
+@pytest.mark.slow
 def test_it_ends_earlier_if_another_node_ends_the_run(tmp_path: Path) -> None:
     assert_equal_when_played(tmp_path, "guesser.end=0.4")
 
 
+@pytest.mark.slow
 def test_links_before_nodes_of_the_flight_and_others_are_the_same(tmp_path: Path) -> None:
     links = ("captain.links.felt.delay=7ms", "captain.links.seen.delay=13ms")
     assert_equal_when_played(tmp_path, "guesser.links.pairs.loss=0.2", flight=links)
@@ -110,6 +114,7 @@ def test_what_else_has_an_influence_is_not_recorded(tmp_path: Path) -> None:
     assert [spec.name for spec in tour.nodes] == ["drone", "pilot"]
 
 
+@pytest.mark.slow
 def test_flights_are_told_apart_by_what_they_depend_on(tmp_path: Path) -> None:
     def keys(*overrides: str) -> tuple[str, str]:
         part = flight_of(flown(tmp_path, *overrides))
@@ -121,6 +126,7 @@ def test_flights_are_told_apart_by_what_they_depend_on(tmp_path: Path) -> None:
     assert len({*different, keys()}) == 4
 
 
+@pytest.mark.slow
 def test_the_key_knows_what_a_world_includes(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     mesh, part = tmp_path / "meshes" / "rock.obj", tmp_path / "part.xml"
@@ -140,6 +146,7 @@ def test_the_key_knows_what_a_world_includes(tmp_path: Path) -> None:
     assert len(keys) == 4
 
 
+@pytest.mark.slow
 def test_the_key_knows_modules_beside_a_node_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,6 +218,7 @@ def test_what_has_a_name_of_the_cache_neither_hangs_nor_fails_a_run(
 _OTHER_CODE = b"cevents\nNoLongerThere\n."  # a pickle that only other code can read
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["cut", "gone", "empty", "first", "middle", "last", "other code"])
 def test_what_is_damaged_or_of_other_code_is_flown_again(tmp_path: Path, what: str) -> None:
     config = flown(tmp_path, "captain.end=0.2")
@@ -232,6 +240,7 @@ def test_what_is_damaged_or_of_other_code_is_flown_again(tmp_path: Path, what: s
     assert flight.path.read_bytes() == content
 
 
+@pytest.mark.slow
 def test_an_event_that_other_code_has_written_is_flown_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -292,6 +301,7 @@ def test_a_signal_during_the_flight_ends_what_was_to_follow(tmp_path: Path) -> N
     assert kept() == []
 
 
+@pytest.mark.slow
 def test_one_flies_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = flown(tmp_path, "captain.end=0.2")
     flights = []
@@ -314,6 +324,7 @@ def test_one_flies_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(flights) == 1
 
 
+@pytest.mark.slow
 def test_those_not_used_for_longest_go_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -41,6 +41,7 @@ def text(screen: Screen, name: str) -> str:
     return str(screen.query_one(f"#{name}", Static).content)
 
 
+@pytest.mark.slow
 async def test_it_shows_what_there_is_and_keeps_the_cursor() -> None:
     stand = FakeClient(snapshot())
     async with shown(stand) as (screen, pilot):

@@ -168,6 +168,7 @@ def test_other_seeds_are_not_expected_to_be_equal(tmp_path: Path) -> None:
     assert summarise(plan, rows)[0].repeatable == "4 of 4 equal"
 
 
+@pytest.mark.slow
 def test_a_plot_for_each_parameter(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.latency=0ms,80ms", "judge.method=flow,depth", seeds=2)
     rows = [pretend(job) for job in plan.jobs]

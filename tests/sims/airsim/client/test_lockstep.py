@@ -47,6 +47,7 @@ def server() -> Any:
         yield server
 
 
+@pytest.mark.slow
 def test_images_depth_pose_imu_and_truth_are_of_one_instant(server: FakeServer) -> None:
     server.velocity = Vector3r(1.0, 2.0, 3.0)
     found = fly(server, image_rate=20, imu_rate=100)
@@ -71,6 +72,7 @@ def test_images_depth_pose_imu_and_truth_are_of_one_instant(server: FakeServer) 
     assert [call[0] for call in server.made("simContinueForTime")] == [0.01] * 10
 
 
+@pytest.mark.slow
 def test_what_a_simulator_announces_is_announced(server: FakeServer) -> None:
     found = fly(server, imu_rate=200, image_rate=10)
     (camera,) = found.of(CameraAnnouncement)
@@ -86,6 +88,7 @@ def test_what_a_simulator_announces_is_announced(server: FakeServer) -> None:
     assert imu.rate == 200
 
 
+@pytest.mark.slow
 def test_cameras_and_noise_are_those_of_the_servers_settings(server: FakeServer) -> None:
     text = """{"SettingsVersion": 1.2, "SimMode": "Multirotor", "Vehicles": {"Alpha": {
         "VehicleType": "SimpleFlight", "X": 3, "Y": -4, "Z": 0,
@@ -107,6 +110,7 @@ def test_cameras_and_noise_are_those_of_the_servers_settings(server: FakeServer)
     assert found.of(SegmentationImage)[0].data.tolist() == [[8] * 8] * 4
 
 
+@pytest.mark.slow
 def test_cosys_takes_other_arguments_and_sends_other_colours(server: FakeServer) -> None:
     server.methods["getServerVersion"] = lambda: 4
     found = fly(server)
@@ -116,6 +120,7 @@ def test_cosys_takes_other_arguments_and_sends_other_colours(server: FakeServer)
     assert server.made("simGetObjectPose") == [["Alpha", True]]
 
 
+@pytest.mark.slow
 def test_depth_of_another_size_is_resampled(server: FakeServer) -> None:
     whole = server.images
 
@@ -133,6 +138,7 @@ def test_depth_of_another_size_is_resampled(server: FakeServer) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_server_that_steps_inexactly_is_followed_and_no_digest_promised(
     server: FakeServer,
 ) -> None:
@@ -144,12 +150,14 @@ def test_a_server_that_steps_inexactly_is_followed_and_no_digest_promised(
     assert [e.stamp for e in found.of(Odometry)] == [n * 13_000_000 for n in range(8)]
 
 
+@pytest.mark.slow
 def test_a_repeated_sample_is_dropped_and_a_gap_survived(server: FakeServer) -> None:
     server.methods["getImuData"] = lambda *_: ImuData(server.time // 30_000_000 * 30_000_000)
     stamps = [e.stamp for e in fly(server, 0.1, imu_rate=100).of(Imu)]
     assert len(stamps) == len(set(stamps)) < 6
 
 
+@pytest.mark.slow
 def test_bad_answers_are_survived(server: FakeServer) -> None:
     colours: dict[str, Any] = {"width": 1, "height": 1, "image_data_uint8": b"123"}
     depth: dict[str, Any] = {"width": 1, "height": 1, "image_data_float": [1.0]}
@@ -204,18 +212,21 @@ def test_a_server_that_is_absent_is_an_error_after_a_while() -> None:
         fly(server, start_timeout=0.3)
 
 
+@pytest.mark.slow
 def test_a_lost_connection_ends_the_run_if_it_is_to(server: FakeServer) -> None:
     server.methods["simContinueForTime"] = _always(HangUp)
     with pytest.raises(FatalError, match=r"the connection to 127.0.0.1:\d+ is lost"):
         fly(server)
 
 
+@pytest.mark.slow
 def test_a_hung_call_ends_at_its_limit(server: FakeServer) -> None:
     server.methods["simContinueForTime"] = _always(NoReply)
     with pytest.raises(FatalError, match=r"simContinueForTime: no reply in 0.3 s"):
         fly(server)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", [HangUp, NoReply])
 def test_lost_connections_are_replaced(server: FakeServer, what: type[Exception]) -> None:
     steps = 0
@@ -235,6 +246,7 @@ def test_lost_connections_are_replaced(server: FakeServer, what: type[Exception]
     assert len(server.made("enableApiControl")) == 3  # twice at a start, once at the end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", [HangUp, NoReply])
 def test_a_hung_request_for_images_costs_one_set_of_them(
     server: FakeServer, what: type[Exception]
@@ -255,6 +267,7 @@ def test_a_hung_request_for_images_costs_one_set_of_them(
     assert len(found.of(Odometry)) == 11
 
 
+@pytest.mark.slow
 def test_a_server_that_starts_anew_has_another_clock(server: FakeServer) -> None:
     def state(name: str) -> MultirotorState:
         if server.time == START + 30_000_000:
@@ -269,6 +282,7 @@ def test_a_server_that_starts_anew_has_another_clock(server: FakeServer) -> None
     assert stamps[-1] >= 90_000_000
 
 
+@pytest.mark.slow
 def test_a_clock_that_leaps_moves_no_stamps(server: FakeServer) -> None:
     def state(name: str) -> MultirotorState:
         if server.time == START + 30_000_000:
@@ -285,12 +299,14 @@ def test_a_clock_that_leaps_moves_no_stamps(server: FakeServer) -> None:
         fly(server)
 
 
+@pytest.mark.slow
 def test_two_clients_cannot_lead_one_server(server: FakeServer) -> None:
     nodes = [spec(AirsimClient, name, settings(server, vehicle=name)) for name in ("Alpha", "Beta")]
     with pytest.raises(VisnavError, match="one AirsimClient for each server in lockstep"):
         run_nodes(nodes)
 
 
+@pytest.mark.slow
 def test_time_runs_on_after_the_run_if_it_ran_before(server: FakeServer) -> None:
     fly(server)
     assert server.made("simPause") == [[True], [False]]

@@ -106,6 +106,7 @@ def test_default_names_are_always_there_and_given_ones_are_those_given(
     assert len({id(camera) for camera in found.values()}) <= len(own | entries) + unnamed
 
 
+@pytest.mark.slow
 def test_in_computer_vision_mode_the_cameras_are_at_the_body(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -249,6 +250,7 @@ def pixels(response: Any) -> Any:
     return image[..., :3]
 
 
+@pytest.mark.slow
 def test_each_type_shows_what_is_there(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -291,6 +293,7 @@ def test_each_type_shows_what_is_there(tiny_world: str) -> None:
     assert found["one"] == found["png"][5]["image_data_uint8"]
 
 
+@pytest.mark.slow
 def test_cosys_gets_red_first_and_its_own_fields(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -307,6 +310,7 @@ def test_cosys_gets_red_first_and_its_own_fields(tiny_world: str) -> None:
     assert found["one"].startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_vehicles_see_each_other_and_fly_on_unchanged(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -343,6 +347,7 @@ def test_vehicles_see_each_other_and_fly_on_unchanged(tiny_world: str) -> None:
     assert flown.sent == without.sent
 
 
+@pytest.mark.slow
 def test_a_free_camera_shows_at_once_where_it_has_been_put(tiny_world: str) -> None:
     found: list[Any] = []
 
@@ -360,6 +365,7 @@ def test_a_free_camera_shows_at_once_where_it_has_been_put(tiny_world: str) -> N
         assert pixels(response)[10, 16] == pytest.approx(AHEAD - north, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_segmentation_ids_are_set_and_told(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -391,6 +397,7 @@ def test_segmentation_ids_are_set_and_told(tiny_world: str) -> None:
     assert found["hidden"] == {0, floor}
 
 
+@pytest.mark.slow
 def test_any_list_of_requests_is_answered_in_order(tiny_world: str) -> None:
     names = st.sampled_from(["eye", "0", "", "bottom_center", "camera"])
     requests = st.builds(
@@ -418,6 +425,7 @@ def test_any_list_of_requests_is_answered_in_order(tiny_world: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_what_cannot_be_drawn_is_refused_before_anything_is(tiny_world: str) -> None:
     def script(call: Caller) -> None:
         for kind in (-1, 8, 9, 10, 11, 12, 1 << 40):
@@ -438,6 +446,7 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is(tiny_world: str) -> 
     with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
 
 
+@pytest.mark.slow
 def test_clients_may_leave_and_the_next_one_is_served(tiny_world: str) -> None:
     def script(call: Caller) -> None:
         for _ in range(15):
@@ -460,6 +469,7 @@ def test_clients_may_leave_and_the_next_one_is_served(tiny_world: str) -> None:
     with_script(script, [drone(world=tiny_world)], cameras=[*CAMERAS, large])
 
 
+@pytest.mark.slow
 def test_without_gl_all_else_is_served(tiny_world: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")  # in the worker
 

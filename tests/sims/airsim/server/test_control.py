@@ -37,6 +37,7 @@ def free_camera(world: str, name: str = "camera", **config: Any) -> NodeSpec:
     return spec(FreeCamera, name, {"world": world, "cameras": [camera], **config})
 
 
+@pytest.mark.slow
 def test_a_drone_is_put_where_it_is_said_and_held_there_if_it_flies(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -103,6 +104,7 @@ def test_where_no_drone_can_be_is_refused_and_it_stays(tiny_world: str) -> None:
     with_script(script, [drone(world=tiny_world)])
 
 
+@pytest.mark.slow
 def test_reset_brings_the_start_back_and_the_drone_flies_again(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -199,6 +201,7 @@ def test_reset_calms_the_wind_of_a_client(tiny_world: str) -> None:
     assert min(norths[1::2]) > 1.0
 
 
+@pytest.mark.slow
 def test_a_free_camera_is_where_it_is_put_at_once(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -261,6 +264,7 @@ def test_a_default_vehicle_that_is_not_there_is_refused(tiny_world: str) -> None
         with_script(lambda _: None, [drone(world=tiny_world)], default_vehicle="x")
 
 
+@pytest.mark.slow
 def test_beside_a_free_camera_an_empty_name_still_flies_the_drone(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -279,6 +283,7 @@ SPEEDS = st.tuples(*[st.floats(-50.0, 50.0)] * 3)
 TURNS = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 0.1)
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(places=st.lists(st.tuples(POSITIONS, TURNS, SPEEDS, SPEEDS), min_size=1, max_size=4))
 def test_wherever_a_drone_is_put_it_is_there_and_what_follows_is_the_same_twice(

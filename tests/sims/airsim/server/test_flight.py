@@ -61,6 +61,7 @@ def to(x: float, y: float, z: float, velocity: float, timeout: float = FOREVER) 
     return (x, y, z, velocity, timeout, 0, NO_TURN, -1, 1, "")
 
 
+@pytest.mark.slow
 def test_the_usual_flight(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         assert caller("takeoff", 20, "") is True
@@ -84,6 +85,7 @@ def test_the_usual_flight(tiny_world: str) -> None:
     assert sum(isinstance(each, Disarmed) for each in sent) == 1
 
 
+@pytest.mark.slow
 def test_moves_by_velocity_last_as_long_as_they_say(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         caller("takeoff", 20, "")
@@ -107,6 +109,7 @@ def test_moves_by_velocity_last_as_long_as_they_say(tiny_world: str) -> None:
     fly(tiny_world, script)
 
 
+@pytest.mark.slow
 def test_yaw_modes_turn_or_look_ahead(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         caller("takeoff", 20, "")
@@ -132,6 +135,7 @@ def test_yaw_modes_turn_or_look_ahead(tiny_world: str) -> None:
     fly(tiny_world, script)
 
 
+@pytest.mark.slow
 def test_attitudes_rates_and_motors(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         caller("takeoff", 20, "")
@@ -168,6 +172,7 @@ def test_attitudes_rates_and_motors(tiny_world: str) -> None:
     fly(tiny_world, script)
 
 
+@pytest.mark.slow
 def test_paths_and_places_on_the_earth(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         home = caller("getMultirotorState", "")["gps_location"]
@@ -186,6 +191,7 @@ def test_paths_and_places_on_the_earth(tiny_world: str) -> None:
     fly(tiny_world, script)
 
 
+@pytest.mark.slow
 def test_a_move_that_comes_too_late_or_ends_at_a_wall_has_failed(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         assert caller("takeoff", 1, "") is False
@@ -268,6 +274,7 @@ def test_sixty_milliseconds_after_its_last_order_a_vehicle_hovers(tiny_world: st
     assert hover == setpoints[-1] + 60_000_000
 
 
+@pytest.mark.slow
 def test_two_vehicles_fly_at_once(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         both = [caller.send("takeoff", 20, name) for name in ("a", "b")]
@@ -363,6 +370,7 @@ def test_no_number_that_is_none_reaches_a_vehicle(tiny_world: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_reset_ends_the_task_and_the_vehicle_takes_off_again(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         id_ = caller.send("takeoff", 20, "")
@@ -388,6 +396,7 @@ def test_without_api_control_a_move_is_refused_instead_of_hanging(tiny_world: st
     with_script(script, [drone(world=tiny_world)])
 
 
+@pytest.mark.slow
 def test_equal_scripts_give_equal_flights(tiny_world: str) -> None:
     def waiting(caller: Caller) -> None:
         caller("takeoff", 1.0, "")

@@ -117,6 +117,7 @@ def turning() -> list[Event]:
     return orders
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frame", "flavour"), [("VehicleInertialFrame", "airsim"), ("SensorLocalFrame", "cosys")]
 )
@@ -301,6 +302,7 @@ def recorded(
     )
 
 
+@pytest.mark.slow
 def test_a_recording_is_read_back_as_airsims(tiny_world: str, tmp_path: Path) -> None:
     taken: list[Any] = []
 
@@ -337,6 +339,7 @@ def test_a_recording_is_read_back_as_airsims(tiny_world: str, tmp_path: Path) ->
     )
 
 
+@pytest.mark.slow
 def test_each_row_has_the_pose_of_its_images_instant(tiny_world: str, tmp_path: Path) -> None:
     poses: dict[str, float] = {}
 
@@ -356,6 +359,7 @@ def test_each_row_has_the_pose_of_its_images_instant(tiny_world: str, tmp_path: 
         assert rows[stamp] == pytest.approx(height, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_stands_is_left_out_if_asked(tiny_world: str, tmp_path: Path) -> None:
     vehicles = [
         drone("falls", world=tiny_world, height=3.0, position=(2.0, 0.0)),
@@ -371,6 +375,7 @@ def test_a_vehicle_that_stands_is_left_out_if_asked(tiny_world: str, tmp_path: P
     assert [row["VehicleName"] for row in rows].count("stands") < 5
 
 
+@pytest.mark.slow
 def test_two_recordings_at_a_time_are_one_and_two_in_turn_are_two(
     tiny_world: str, tmp_path: Path
 ) -> None:
@@ -386,6 +391,7 @@ def test_two_recordings_at_a_time_are_one_and_two_in_turn_are_two(
     assert len(list(tmp_path.glob("recording/*/airsim_rec.txt"))) == 2
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_lost_ends_the_recording_and_not_the_run(
     tiny_world: str, tmp_path: Path
 ) -> None:
@@ -404,6 +410,7 @@ def test_a_folder_that_is_lost_ends_the_recording_and_not_the_run(
     recorded(script, tiny_world, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("images", "error"),
     [
@@ -431,6 +438,7 @@ def test_without_a_folder_for_results_nothing_is_recorded(tiny_world: str) -> No
     with_script(script, [drone(world=tiny_world)], recording={"enabled": True})
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_made_is_told(tiny_world: str, tmp_path: Path) -> None:
     (tmp_path / "recording").write_text("in the way")
 

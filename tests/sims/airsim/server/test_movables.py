@@ -217,6 +217,7 @@ def test_what_cannot_move_is_named(expression: str) -> None:
         add_movables(scene, "airsim", (), (expression,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["free camera", "drone"])
 def test_images_show_what_is_moved(kind: str, tiny_world: str) -> None:
     camera = {"name": "eye", "width": 32, "height": 24, "rate": 1}

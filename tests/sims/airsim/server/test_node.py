@@ -105,6 +105,7 @@ def test_a_pause_holds_awaited_time_until_it_is_lifted(tiny_world: str) -> None:
     with_script(script, [drone(world=tiny_world)], time="awaited")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rates", "rate"), [((), 60), ((10, 25), 25)])
 def test_a_frame_is_an_image_of_the_fastest_camera(
     rates: tuple[int, ...], rate: int, tiny_world: str
@@ -131,6 +132,7 @@ def test_steps_that_make_no_sense_are_refused(tiny_world: str) -> None:
     with_script(script, [drone(world=tiny_world)])
 
 
+@pytest.mark.slow
 def test_running_time_is_paused_stepped_and_resumed(tiny_world: str) -> None:
     def script(airsim: Caller) -> None:
         airsim("simPause", True)
@@ -150,6 +152,7 @@ def test_a_run_in_real_time_has_no_time_that_stands(tiny_world: str) -> None:
     assert 'time: expected "running", found "paused": the run is in real time' in str(error)
 
 
+@pytest.mark.slow
 def test_a_client_cannot_pause_a_run_in_real_time(tiny_world: str) -> None:
     refused: list[str] = []
 
@@ -179,6 +182,7 @@ def test_a_client_cannot_pause_a_run_in_real_time(tiny_world: str) -> None:
     assert len(refused) == 2
 
 
+@pytest.mark.slow
 def test_clients_that_flood_the_server_do_not_stop_time(tiny_world: str) -> None:
     count = 1000
 
@@ -201,6 +205,7 @@ def test_clients_that_flood_the_server_do_not_stop_time(tiny_world: str) -> None
     with_script(script, [drone(world=tiny_world)], time="running", duration=1e6)
 
 
+@pytest.mark.slow
 def test_a_run_that_a_client_left_standing_ends(caplog: pytest.LogCaptureFixture) -> None:
     """It would stand for ever, since `duration` is simulated. The limit is real: 0.1 s here."""
 
@@ -255,6 +260,7 @@ def step(airsim: Caller) -> list[Any]:
     return replies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("flight", "setting"), [(fly, "awaited"), (step, "paused")])
 def test_equal_scripts_give_equal_runs_and_replies(
     flight: Callable[[Caller], list[Any]],

@@ -42,6 +42,7 @@ def test_what_cannot_be_served_is_refused(tiny_world: str) -> None:
     with_script(script, [drone(world=tiny_world)])
 
 
+@pytest.mark.slow
 def test_settings_are_handed_out_as_given_or_say_what_runs(tiny_world: str, tmp_path: Path) -> None:
     camera = {"name": "eye", "width": 320, "height": 200, "fov": 60.0}
 
@@ -129,6 +130,7 @@ def test_the_air_is_that_of_the_standard_atmosphere_at_its_altitude(tiny_world: 
     assert found["home"]["altitude"] == pytest.approx(122.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_rotors_carry_the_weight_of_what_hovers(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
@@ -177,6 +179,7 @@ def fly(call: Caller, seconds: float, method: str, *arguments: Any) -> None:
     call.join(task)
 
 
+@pytest.mark.slow
 def test_a_wall_is_hit_and_reading_it_clears_it(tiny_world: str) -> None:
     found: list[Any] = []
 
@@ -207,6 +210,7 @@ def test_a_wall_is_hit_and_reading_it_clears_it(tiny_world: str) -> None:
     assert read_again == read | {"has_collided": False}
 
 
+@pytest.mark.slow
 def test_landing_counts_since_the_ground_does_with_airsim(tiny_world: str) -> None:
     found: list[Any] = []
 

@@ -1,4 +1,4 @@
-"""``compare``: is B better than A? Paired over flights, with an interval and a verdict in words.
+"""Is B better than A? Comparison paired over flights, with an interval and a verdict in words.
 
 Both sides get the same recorded flights, so the difference of a pair has no part in how hard its
 flight was. The test is Wilcoxon's signed-rank test (F. Wilcoxon, Individual comparisons by ranking
@@ -14,20 +14,17 @@ does each look where flights are added until the answer is sure.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import typer
 
 from runtime.errors import ConfigError
-from runtime.figures import FIGURES, figure
-from runtime.tools.cli.commands import Overrides
+from runtime.figures import figure
 
 if TYPE_CHECKING:
     from runtime.tools.sweep import Row
@@ -304,127 +301,3 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
         estimators=verdict.estimators if verdict else {},
     )
     return {("run", head["seed"]): [row]}
-
-
-def compare(
-    what: Annotated[
-        list[Path],
-        typer.Argument(help="Files to fly, one a scenario; or two folders of finished sweeps."),
-    ],
-    a: Annotated[
-        list[str] | None,
-        typer.Option("--a", metavar="NODE.KEY=VALUE", help="Setting of A. May be repeated."),
-    ] = None,
-    b: Annotated[
-        list[str] | None,
-        typer.Option("--b", metavar="NODE.KEY=VALUE", help="Setting of B. May be repeated."),
-    ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Flights of each file, at most.")] = 12,
-    repeat: Annotated[int, typer.Option(min=1, help="Runs with each flight, averaged.")] = 1,
-    name: Annotated[
-        list[str] | None, typer.Option("--figure", help="Figure to compare. May be repeated.")
-    ] = None,
-    margin: Annotated[
-        float,
-        typer.Option(min=0, help="Change that does not matter, in percent (or the figure's unit)."),
-    ] = 0.0,
-    overrides: Overrides = None,
-    out: Annotated[Path, typer.Option(help="Folder for runs and page.")] = Path("compared"),
-    jobs: Annotated[int | None, typer.Option(min=1, help="Runs at the same time.")] = None,
-    json: Annotated[
-        Path | None, typer.Option("--json", help="Write the comparisons as JSON.")
-    ] = None,
-) -> None:
-    """Tell whether B is better than A, over equal flights, with confidence.
-
-    A and B are settings of the same files: `--a odometry.corners=300 --b odometry.corners=500`, or
-    two builds of a program: `--a 'slam.command=["./old"]' --b 'slam.command=["./new"]'`. Each
-    flight is recorded once, and both get it. Half of the flights are looked at first; if all
-    figures are decided then, the others are not flown. Or A and B are two folders of finished
-    sweeps.
-
-    Each figure is *better*, *worse*, *no difference* larger than the margin, or *not enough runs*.
-    Crashes and lost estimators count as worst. Ends with 0; with 1 if a figure is worse, or with
-    --margin also if it may be worse by more than that; with 130 after Ctrl-C.
-    """
-    from runtime.tools.compare_page import print_table, write_page
-
-    for each in name or ():
-        if each not in FIGURES:
-            raise ConfigError(f"--figure {each}: expected one of {', '.join(FIGURES)}")
-    options: dict[str, Any] = {"figures": name or USUAL, "margin": margin}
-    if all(path.is_dir() for path in what):
-        if len(what) != 2 or a or b:
-            raise ConfigError("compare: expected two folders, without --a and --b")
-        sides = tuple(map(read_folder, what))
-        found = compare_rows(*sides, **options)
-    else:
-        if not (a or b):
-            raise ConfigError("compare: expected --a or --b: in what the two sides differ")
-        found = fly(
-            what, a or [], b or [], seeds, repeat, overrides or [], out.absolute(), jobs, options
-        )
-    page = write_page(found, out, a or [str(what[0])], b or [str(what[-1])])
-    print_table(found, page)
-    if json is not None:
-        from runtime.run.results import write
-
-        text = msgspec.json.encode(found)
-        write(json, msgspec.json.format(text, indent=2) + b"\n")
-    if any(each.verdict == "worse" or (margin and each.inferior(margin)) for each in found):
-        raise typer.Exit(1)
-
-
-def fly(
-    files: Sequence[Path],
-    a: Sequence[str],
-    b: Sequence[str],
-    seeds: int,
-    repeats: int,
-    overrides: Sequence[str],
-    out: Path,
-    jobs: int | None,
-    options: Mapping[str, Any],
-) -> list[Comparison]:
-    """Fly until all figures are decided: half of the seeds, and then the rest.
-
-    Raises:
-        ConfigError: A file or a setting is wrong.
-    """
-    from runtime.config.reading import load_configuration
-    from runtime.tools.cli.sweep import carry_out
-    from runtime.tools.sweep import Plan, make_job, sharing
-    from runtime.tools.sweep.plan import Parameter
-
-    sides = {"A": a, "B": b}
-    first: dict[Path, int] = {}
-    planned = []
-    for file, (side, changes) in itertools.product(files, sides.items()):
-        config = load_configuration(file, [*overrides, *changes])
-        first.setdefault(file, config.run.seed)
-        settings = (("side", side), ("scenario", file.stem))
-        numbers = range(first[file], first[file] + seeds), range(1, repeats + 1)
-        for seed, number in itertools.product(*numbers):
-            planned.append(make_job(config, settings, seed, file.resolve().parent, out, number))
-    begin = {file.stem: seed for file, seed in first.items()}
-    looks = sorted({math.ceil(seeds / 2), seeds})
-    found: list[Comparison] = []
-    for look in looks:
-        now = [
-            job
-            for job in sharing(planned)
-            if job.seed < begin[dict(job.settings)["scenario"]] + look
-        ]
-        parameters = (
-            Parameter(path="side", texts=tuple(sides)),
-            Parameter(path="scenario", texts=tuple(begin)),
-        )
-        rows = carry_out(Plan(parameters=parameters, jobs=tuple(now), out=out), jobs=jobs)
-        flights: dict[str, dict[Key, list[Row]]] = {side: {} for side in sides}
-        for job, row in zip(now, rows, strict=True):
-            (_, side), (_, scenario) = job.settings
-            flights[side].setdefault((scenario, job.seed), []).append(row)
-        found = compare_rows(flights["A"], flights["B"], error=ERROR / len(looks), **options)
-        if all(each.verdict != "not enough runs" for each in found):
-            break
-    return found
