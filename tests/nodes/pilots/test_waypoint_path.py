@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from events import PositionSetpoint
@@ -147,6 +147,7 @@ def flown(path: WaypointPath) -> tuple[Floats, Floats, float]:
 
 @settings(deadline=None, max_examples=60)
 @given(st.floats(3, 30), st.floats(0.01, 2), st.floats(0.01, 2), st.floats(0, 180))
+@example(duration=3.0, amplitude=2.0, frequency=0.0625, yaw=0.0)
 def test_an_excitation_stays_within_its_amplitude_and_ends_where_it_began(
     duration: float, amplitude: float, frequency: float, yaw: float
 ) -> None:
@@ -160,7 +161,7 @@ def test_an_excitation_stays_within_its_amplitude_and_ends_where_it_began(
     assert np.abs(np.degrees(path.yaw - 0.5)).max() <= yaw + 1e-9
     for row in (0, -1):
         assert np.linalg.norm(moved[row]) < 1e-9
-        assert np.linalg.norm(path.velocity[row]) < 0.01
+        assert np.linalg.norm(path.velocity[row]) < 0.02  # of differences over a step; ∝ step²
 
 
 def test_an_excitation_that_no_vehicle_follows_is_refused() -> None:
