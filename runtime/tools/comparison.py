@@ -266,15 +266,11 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
         ConfigError: It is neither.
     """
     from runtime.tools.sweep.process import Ended
-    from runtime.tools.sweep.tables import Row
+    from runtime.tools.sweep.tables import Row, decode_rows
 
     found: dict[Key, list[Row]] = {}
     if (folder / "rows.jsonl").is_file():
-        rows: dict[str, Row] = {}
-        for line in (folder / "rows.jsonl").read_bytes().splitlines():
-            row = msgspec.json.decode(line, type=Row)
-            rows[row["id"]] = row
-        for row in rows.values():
+        for row in decode_rows((folder / "rows.jsonl").read_bytes()).values():
             settings = " ".join(f"{path}={text}" for path, text in row["parameters"].items())
             found.setdefault((settings or "run", row["seed"]), []).append(row)
         return found

@@ -14,6 +14,7 @@ from rich.markup import escape
 
 from runtime.errors import ResultsError
 from runtime.summary import Summary, Verdict
+from runtime.tools.cli.outcomes import NOBODY
 
 SLOWER = 1.5
 """Ratio of measured to declared latency of a worker to be warned of, medians."""
@@ -159,7 +160,7 @@ def _failures(summary: Summary) -> Iterator[str]:
         reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
         yield f"[red]{escape(name)} FAILED[/red]{escape(': ' + reasons if reasons else '')}"
     if not failed:
-        yield "[red]FAILED[/red]: thresholds were given, and no estimator announced itself"
+        yield f"[red]FAILED[/red]: {NOBODY}"
 
 
 def _figures(figures: Mapping[str, Any]) -> Iterator[str]:

@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import jinja2
 import msgspec
 import typer
 
@@ -213,6 +212,8 @@ def print_table(found: Sequence[Comparison], page: Path) -> None:
 def write_page(found: Sequence[Comparison], out: Path, a: Sequence[str], b: Sequence[str]) -> Path:
     """Write ``compare.html`` into a folder, made if missing; return its path."""
     out.mkdir(parents=True, exist_ok=True)
+    from runtime.tools.sweep.plots import template
+
     kinds = {"better": "better", "worse": "worse", "not enough runs": "unknown"}
     rows = []
     for each in found:
@@ -223,11 +224,7 @@ def write_page(found: Sequence[Comparison], out: Path, a: Sequence[str], b: Sequ
         )
         cells = [each.estimator, row.meaning, *a_and_b, change(each), f"{each.p:.2g}"]
         rows.append((cells, kinds.get(each.verdict, ""), words(each)))
-    template = Path(__file__).with_name("compare.html.jinja")
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    page = environment.from_string(template.read_text(encoding="utf-8")).render(
+    page = template(Path(__file__).with_name("compare.html.jinja")).render(
         sides=[(side, " ".join(said)) for side, said in (("A", a), ("B", b)) if said],
         flights=max((each.pairs for each in found), default=0),
         rows=rows,

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 from xml.etree import ElementTree as ET
@@ -31,6 +32,10 @@ Json = Annotated[
 State = Literal["passed", "failed", "crashed", "not judged"]
 
 _STATES: dict[bool | None, State] = {True: "passed", False: "failed", None: "not judged"}
+
+
+NOBODY = "thresholds were given, and no estimator announced itself or sent a pose"
+"""Reason for the failure of a run without estimators."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -55,8 +60,8 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 def of_verdict(run: str, verdict: Verdict | None, seconds: float | None = None) -> list[Outcome]:
     """Return the outcomes of a run that came to an end."""
     if verdict is None or not verdict.estimators:
-        reasons = [*getattr(verdict, "failed", ())]
         state = _STATES[verdict.passed if verdict else None]
+        reasons = [NOBODY] if state == "failed" else []
         return [Outcome(run=run, state=state, reasons=reasons, seconds=seconds)]
     return [
         Outcome(
@@ -116,15 +121,9 @@ def writing(name: str, junit: Path | None, json: Path | None) -> Iterator[list[O
             _write(json, msgspec.json.format(text, indent=2) + b"\n")
 
 
-def counts(outcomes: Sequence[Outcome]) -> Mapping[str, int]:
-    """Return how many outcomes there are of each state."""
-    states = [each.state for each in outcomes]
-    return {state: states.count(state) for state in ("passed", "failed", "crashed", "not judged")}
-
-
 def to_junit(name: str, outcomes: Sequence[Outcome]) -> bytes:
     """Return JUnit's XML (github.com/testmoapp/junitxml describes it)."""
-    number = counts(outcomes)
+    number = Counter(each.state for each in outcomes)
     total = {
         "name": _printable(name),
         "tests": str(len(outcomes)),

@@ -195,7 +195,7 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
         settings = [text for _, text in job.settings]
         own = [job.seed, *[job.repeat] * repeated]
         runs.append(([*settings, *own], row["error"] or state, link, bool(row["error"])))
-    page = _template().render(
+    page = template(Path(__file__).with_name("page.html.jinja")).render(
         name=plan.out.name,
         parameters=[parameter.path for parameter in plan.parameters],
         figures=[name.replace("_", " ") for name in figures],
@@ -213,8 +213,9 @@ def _share(count: int, runs: int) -> str:
     return f"{count} ({count / runs:.0%})" if count else "0"
 
 
-def _template() -> jinja2.Template:
-    text = (Path(__file__).parent / "page.html.jinja").read_text(encoding="utf-8")
+def template(path: Path) -> jinja2.Template:
+    """Return a page's template, escaping all values."""
+    text = path.read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

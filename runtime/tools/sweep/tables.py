@@ -8,6 +8,7 @@ What is remembered of each run: ``rows.jsonl``, one line a run, added when the r
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import fcntl
 import json
@@ -78,6 +79,16 @@ def crashed(job: Job, error: str) -> Row:
     )
 
 
+def decode_rows(text: bytes) -> dict[str, Row]:
+    """Return the rows of a ``rows.jsonl`` by job; lines cut short are left out."""
+    rows = {}
+    for line in text.splitlines():
+        with contextlib.suppress(msgspec.MsgspecError):
+            row = msgspec.json.decode(line, type=Row)
+            rows[row["id"]] = row
+    return rows
+
+
 class Rows:
     """A file of rows, open for adding; a context manager.
 
@@ -102,14 +113,8 @@ class Rows:
         if fresh:
             self._file.truncate(0)
         self._file.seek(0)
-        self._rows: dict[str, Row] = {}
         text = self._file.read()
-        for line in text.splitlines():
-            try:
-                row = msgspec.json.decode(line, type=Row)
-            except msgspec.MsgspecError:
-                continue
-            self._rows[row["id"]] = row
+        self._rows = decode_rows(text)
         if text and not text.endswith(b"\n"):
             self._file.write(b"\n")
 

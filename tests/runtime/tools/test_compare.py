@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -179,6 +180,12 @@ def test_crashed_runs_repeats_and_other_names() -> None:
         compare_rows({("t", 0): [row(0)]}, {("u", 0): [row(0)]})
     with pytest.raises(ConfigError, match=r"an estimator in both, found \['vo'\] and \[\]"):
         compare_rows({("t", 0): [row(0, x=1)]}, {("t", 0): [row(0, "crashed")]})
+
+
+def test_a_row_cut_short_by_a_full_disk_is_left_out(tmp_path: Path) -> None:
+    line = msgspec.json.encode(row(3, ate_percent=1.0))
+    (tmp_path / "rows.jsonl").write_bytes(line + b"\n" + line[:40])
+    assert read_folder(tmp_path) == {("run", 3): [row(3, ate_percent=1.0)]}
 
 
 class JudgeConfig(NodeConfig):

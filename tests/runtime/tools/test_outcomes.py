@@ -11,7 +11,7 @@ import pytest
 
 from runtime.node import Node, NodeConfig
 from runtime.summary import Verdict
-from runtime.tools.cli.outcomes import Outcome, of_verdict, to_junit, writing
+from runtime.tools.cli.outcomes import NOBODY, Outcome, of_verdict, to_junit, writing
 from tests.runtime.tools.samples_cli import command_here
 
 
@@ -114,7 +114,8 @@ def test_a_sweep_fails_where_a_run_does(file: Path, tmp_path: Path) -> None:
 
 def test_nobody_judged_is_skipped_and_nobody_to_judge_has_failed() -> None:
     assert of_verdict("tour", None) == [Outcome(run="tour", state="not judged")]
-    assert of_verdict("tour", Verdict(False, {}))[0].state == "failed"
+    (nobody,) = of_verdict("tour", Verdict(False, {}))
+    assert (nobody.state, nobody.reasons) == ("failed", [NOBODY])
     unasked = Verdict(None, {"vo": {"passed": None}})
     assert [each.state for each in of_verdict("tour", unasked)] == ["not judged"]
 
