@@ -27,6 +27,8 @@ class Figure(msgspec.Struct, frozen=True):
         report: ``head`` and ``main`` stand at the top of a report, in this order.
         sweep: Column among the main figures of a sweep; 0 if it is none of them.
         plot: Title of its panel in the plots of a sweep; "" if there is none.
+        of_flight: Whether it says how the vehicle flew; a missed threshold fails the flight, and
+            not the estimators.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Figure(msgspec.Struct, frozen=True):
     report: Literal["head", "main", ""] = "main"
     sweep: int = 0
     plot: str = ""
+    of_flight: bool = False
 
     @property
     def unit(self) -> str:
@@ -77,11 +80,8 @@ _UNITS = {
     "_deg": "°",
     "_ms": "ms",
     "_hz": "Hz",
-    "_m2": "m²",
     "_m": "m",
-    "_s": "s",
     "_seconds": "s",
-    "early_end": "s",
 }
 """Units by the end of a figure's name."""
 
@@ -102,13 +102,33 @@ def _detail(name: str, meaning: str) -> Figure:
     return Figure(name, meaning, report="")
 
 
-_LENGTHS = [f"{share} % of the path" for share in (1, 2, 5, 10, 20)]
+SHARES, KITTI_LENGTHS = (1, 2, 5, 10, 20), range(100, 900, 100)
+"""Lengths of stretches for relative errors: percent of the path; metres."""
+
+
+def _segments() -> list[Figure]:
+    """Return the relative errors over stretches, as the KITTI benchmark has them."""
+    both = (("trans_percent", "position"), ("rot_deg_per_m", "rotation"))
+    lengths = {f"{share}pct": f"{share} % of the path" for share in SHARES}
+    lengths |= {f"{metres}m": f"{metres} m" for metres in KITTI_LENGTHS}
+    means = {"mean": "1 to 20 % of the path", "kitti": "100 to 800 m"}
+    each = [
+        _detail(f"rpe_{k}_{end}", f"RPE over {text}, {what}, mean")
+        for k, text in lengths.items()
+        for end, what in both
+    ]
+    return each + [
+        Figure(f"rpe_{k}_{end}", f"RPE, mean over stretches of {text}, {what}")
+        for k, text in means.items()
+        for end, what in both
+    ]
+
 
 _TABLE = (
     _detail("method", "what the estimator says that it is"),
     _detail("vehicle", "vehicle by which it was judged"),
     _detail("alignment", "how it was laid on the truth"),
-    _detail("scale", "true length of its unit in metres"),
+    _detail("scale", "by what Sim(3) multiplies its lengths; 1 is right if they are in metres"),
     _detail("estimates", "poses that count"),
     _detail("compared", "poses within the truth's time"),
     _detail("path_m", "length of the true path in the flight"),
@@ -123,10 +143,11 @@ _TABLE = (
     _detail("ate_north_rmse_m", "error along north, RMS"),
     _detail("ate_east_rmse_m", "error along east, RMS"),
     _detail("ate_down_rmse_m", "error along down, RMS"),
-    _detail("mse_m2", "mean square of the distances to the truth"),
-    _detail("held_ate_rmse_m", "ATE over the whole flight, lost time as 100 % drift, RMS"),
+    _detail("ate_se3_rmse_m", "ATE if aligned as a whole (SE3), RMS"),
+    _detail("ate_sim3_rmse_m", "ATE if aligned as a whole with scale (Sim3), RMS"),
+    _detail("flight_ate_rmse_m", "ATE over the whole flight, lost time as 100 % drift, RMS"),
     _error(
-        "held_ate_percent", "ATE over the whole flight, lost time as 100 % drift", report="head",
+        "flight_ate_percent", "ATE over the whole flight, lost time as 100 % drift", report="head",
         sweep=3,
     ),
     _detail("final_poses", "poses of the trajectory after loop closures"),
@@ -135,33 +156,29 @@ _TABLE = (
         "final_ate_percent", "ATE after loop closures, in percent of the path", report="head"
     ),
     _detail("final_rot_rmse_deg", "rotation error after loop closures, RMS"),
-    _detail("final_held_ate_rmse_m", "ATE after loop closures over the whole flight, RMS"),
-    Figure("final_held_ate_percent", "the same over the whole flight", report="head"),
+    _detail("final_flight_ate_rmse_m", "ATE after loop closures over the whole flight, RMS"),
+    Figure("final_flight_ate_percent", "the same over the whole flight", report="head"),
     _detail("why_not_final", "why the trajectory after loop closures was not judged"),
     _error("ate_max_m", "greatest position error"),
     _error("rot_rmse_deg", "rotation error, RMS"),
-    _error("rpe_trans_percent", "relative pose error (RPE), position", sweep=4),
-    _error("rpe_rot_deg_per_m", "relative pose error (RPE), rotation", sweep=5),
-    *(_detail(f"rpe_{length.split()[0]}_{end}", f"RPE over {length}, {what}") for length in _LENGTHS
-      for end, what in (("trans_percent", "position"), ("rot_deg_per_m", "rotation"))),
-    Figure("rpe_mean_trans_percent", "RPE, mean over 1 to 20 % of the path, position"),
-    Figure("rpe_mean_rot_deg_per_m", "the same, rotation"),
-    _error("drift_percent", "drift at the end, in percent of the path"),
-    _detail("drift_m_per_s", "drift at the end by time"),
-    Figure("scale_error_percent", "error of the scale"),
+    _error("rpe_1m_trans_percent", "relative pose error (RPE) over 1 m, position, RMS", sweep=4),
+    _error("rpe_1m_rot_deg_per_m", "relative pose error (RPE) over 1 m, rotation, RMS", sweep=5),
+    *_segments(),
+    _error("end_error_percent", "error of the last pose seen from the first, % of the path"),
     _error("lost_seconds", "time without a pose", sweep=7, plot="lost (s)"),
     Figure("lost_count", "times lost"),
     _error("initialization_seconds", "time before the first pose"),
     _detail("relocalization_p50_seconds", "time to have a pose again, median"),
     Figure("relocalization_max_seconds", "longest time to have a pose again"),
+    _detail("latency", "whether latencies are declared by the file, or measured"),
     Figure("latency_p50_ms", "latency, median", sweep=9),
     _error("latency_p99_ms", "latency, 99th percentile"),
     _error(
-        "available_rmse_m", "error of the newest pose at control ticks, RMS", sweep=10,
+        "newest_pose_rmse_m", "error of the newest pose at control ticks, RMS", sweep=10,
         plot="error of the newest pose (m)",
     ),
-    Figure("available_rot_rmse_deg", "rotation error of the same, RMS"),
-    _error("available_age_ms", "age of the newest pose at control ticks, mean", report=""),
+    Figure("newest_pose_rot_rmse_deg", "rotation error of the same, RMS"),
+    _error("newest_pose_age_ms", "age of the newest pose at control ticks, mean", report=""),
     _error("velocity_rmse_m_per_s", "velocity error, RMS", optional=True),
     Figure("heading_rmse_deg", "heading error, RMS"),
     _error("nees_position", "NEES of the position, 3 if consistent", optional=True),
@@ -174,9 +191,9 @@ _TABLE = (
     ),
     _error(
         "plan_rmse_m", "distance of the flight from its plan, RMS",
-        plot="distance of the flight from its plan (m)",
+        plot="distance of the flight from its plan (m)", of_flight=True,
     ),
-    Figure("plan_max_m", "greatest distance of the flight from its plan"),
+    Figure("plan_max_m", "greatest distance of the flight from its plan", of_flight=True),
     _share(
         "coverage_percent", "share of the flight with poses", default=90.0, report="head", sweep=6
     ),
@@ -189,10 +206,12 @@ _TABLE = (
     _count("future_stamps", "poses and losses of a time that had not come"),
     _count("not_causal", "poses so late that later images may be in them", None),
     _count("other_bodies", "poses of another body than the truth's"),
-    _error("early_end", "time that the run ended before its plan", default=0.0, optional=True),
+    _error(
+        "early_end_seconds", "time that the run ended before its plan", default=0.0, optional=True
+    ),
     Figure("ended_by", "who ended the run"),
     Figure("reads_truth", "whether it reads the truth"),
-    _count("collisions", "collisions of the vehicle"),
+    _count("collisions", "collisions of the vehicle", of_flight=True),
     Figure("rate_hz", "estimates a second"),
     _detail("why", "why it, or a part of it, could not be judged"),
 )  # fmt: skip

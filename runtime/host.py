@@ -108,7 +108,9 @@ class Host(Protocol):
     def stop(self, node: Any, reason: str) -> None:
         """End the run in order, for a reason of a node's."""
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
+    def conclude(
+        self, subject: str, figures: Mapping[str, Any], passed: bool | None, flight: bool
+    ) -> None:
         """Put a verdict into the summary."""
 
     def note_environment(self, name: str, value: str) -> None:

@@ -318,7 +318,12 @@ class Node(Generic[C]):
         return self._host.run_end
 
     def conclude(
-        self, subject: str, figures: Mapping[str, Any], *, passed: bool | None = True
+        self,
+        subject: str,
+        figures: Mapping[str, Any],
+        *,
+        passed: bool | None = True,
+        flight: bool = False,
     ) -> None:
         """Put a verdict about something into the run's summary.
 
@@ -327,6 +332,7 @@ class Node(Generic[C]):
         Args:
             subject: What was judged: the source of an estimator.
             passed: Whether it met its thresholds; `None` if nothing was asked of it.
+            flight: Whether a vehicle's flight was judged, and the subject is the vehicle.
 
         Raises:
             TypeError: A figure is nothing that JSON knows (numpy's numbers and arrays are made
@@ -339,7 +345,8 @@ class Node(Generic[C]):
                 f"found {passed!r:.80} ({type(passed).__name__})"
             )
         found = {str(name): plain(each, f"{where}: {name}") for name, each in figures.items()}
-        self._host.conclude(str(subject), found, None if passed is None else bool(passed))
+        known = None if passed is None else bool(passed)
+        self._host.conclude(str(subject), found, known, flight)
 
     def note_environment(self, name: str, value: str) -> None:
         """Record a machine property relevant to figures, beside the summary's versions."""

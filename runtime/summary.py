@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, get_args
 
 import msgspec
@@ -57,6 +57,10 @@ class LinkSummary(msgspec.Struct, frozen=True):
     thinned: int
 
 
+SLOWER = 1.5
+"""Ratio of measured to declared latency of a worker to be warned of, medians."""
+
+
 class WorkerSummary(msgspec.Struct, frozen=True):
     """Cost of a worker's calls on this machine.
 
@@ -99,6 +103,16 @@ class WorkerSummary(msgspec.Struct, frozen=True):
             cpu_max_ms=costs.cpu.maximum / 1e6,
             peak_rss_mb=costs.peak / 1e6 or None,
             processes=costs.processes,
+        )
+
+    @property
+    def slower(self) -> str:
+        """Sentence if calls take longer than declared, "" if not; by the medians, `SLOWER`."""
+        if not self.latency_ms or self.wall_p50_ms <= SLOWER * self.latency_ms:
+            return ""
+        return (
+            f"each call takes {self.wall_p50_ms:.3g} ms here; declared are {self.latency_ms:.3g} "
+            "ms: results are those of a quicker machine"
         )
 
     def row(self) -> list[str]:
@@ -240,10 +254,12 @@ class Verdict(msgspec.Struct, frozen=True):
     Attributes:
         passed: Whether all met their thresholds; `None` if none failed and one was not judged.
         estimators: By source: ``passed``, and figures such as ``ate_rmse_m``.
+        flights: By vehicle: ``passed``, ``failed`` (sentences), and figures such as ``collisions``.
     """
 
     passed: bool | None
     estimators: dict[str, dict[str, Any]]
+    flights: dict[str, dict[str, Any]] = {}
 
 
 class ProcessSummary(msgspec.Struct, frozen=True):
@@ -331,17 +347,28 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     twice: TwiceSummary | None = None
 
 
-def verdict_of(found: dict[str, dict[str, Any]]) -> Verdict | None:
+def verdict_of(
+    found: dict[str, dict[str, Any]], flights: dict[str, dict[str, Any]]
+) -> Verdict | None:
     """Return the joint verdict of several conclusions; `None` if there are none."""
-    if not found:
+    if not found and not flights:
         return None
-    return Verdict(overall(each["passed"] for each in found.values()), found)
+    return Verdict(overall(found.values(), flights.values()), found, flights)
 
 
-def overall(passed: Iterable[bool | None]) -> bool | None:
-    """Return the joint result of verdicts: failed before not judged before passed."""
-    each = set(passed)
-    return False if False in each else None if None in each else True
+def overall(
+    found: Iterable[Mapping[str, Any]], flights: Iterable[Mapping[str, Any]] = ()
+) -> bool | None:
+    """Return the joint result of verdicts: failed before not judged before passed.
+
+    A flight of which nothing was asked counts only if there is no estimator.
+    """
+    each = {one["passed"] for one in found}
+    flown = {one["passed"] for one in flights}
+    if False in each | flown:
+        return False
+    each = each or flown
+    return None if None in each or not each else True
 
 
 def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
@@ -366,7 +393,10 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
         digest=combined(digests) if all(part.digest for part in parts) else None,
         digests=dict(sorted(digests.items())),
         not_deterministic=sorted({node for part in parts for node in part.not_deterministic}),
-        verdict=verdict_of({k: f for v in verdicts for k, f in v.estimators.items()}),
+        verdict=verdict_of(
+            {k: f for v in verdicts for k, f in v.estimators.items()},
+            {k: f for v in verdicts for k, f in v.flights.items()},
+        ),
         events=dict(sorted(events.items())),
         stalls=dict(stalls),
         longest_stalls=of_all("longest_stalls"),

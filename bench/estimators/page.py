@@ -20,10 +20,10 @@ from runtime.tools.sweep.plan import Plan
 from runtime.tools.sweep.tables import Row, Spread, in_order, numbers, summarise
 
 COLUMNS = {
-    "held_ate_percent": "error, whole flight, %",
+    "flight_ate_percent": "error, whole flight, %",
     "ate_percent": "ATE as said, %",
     "final_ate_percent": "ATE final, %",
-    "rpe_trans_percent": "RPE of 1 m, %",
+    "rpe_1m_trans_percent": "RPE of 1 m, %",
     "coverage_percent": "coverage, %",
     "lost_seconds": "lost, s",
     "initialization_seconds": "first pose, s",
@@ -32,7 +32,7 @@ COLUMNS = {
 }
 """Figure to the head of its column."""
 
-RANKED = "held_ate_percent"
+RANKED = "flight_ate_percent"
 """Figure to compare estimators by: ATE over the whole flight, lost time as 100 % drift."""
 
 

@@ -173,9 +173,12 @@ class NodeHost:
         """Add a property of the run's environment to the summary."""
         self.state.environment[name] = value
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
+    def conclude(
+        self, subject: str, figures: Mapping[str, Any], passed: bool | None, flight: bool
+    ) -> None:
         """Note a verdict for the summary."""
-        self.state.conclusions[subject] = {"passed": passed, **figures}
+        found = self.state.flights if flight else self.state.conclusions
+        found[subject] = {"passed": passed, **figures}
 
     def after_run(self, call: Callable[[Path], Any]) -> None:
         """Have a function called once the summary is written."""

@@ -61,7 +61,8 @@ class RunState:
         all_nodes: All nodes there have been, those restarted or dropped included.
         tickers: By ``node.method``.
         links: All links of the nodes that there are, by ``node.port``.
-        conclusions: What nodes concluded, by what they judged.
+        conclusions: What nodes concluded of estimators, by source.
+        flights: What they concluded of flights, by vehicle.
         environment: What nodes found of the machine on which figures depend.
         costs: What workers cost, by ``node.Factory``.
         outside: What became of the frames for systems outside the process, by their names.
@@ -88,6 +89,7 @@ class RunState:
     tickers: dict[str, Ticker] = field(default_factory=dict)
     links: dict[str, Link] = field(default_factory=dict)
     conclusions: dict[str, dict[str, Any]] = field(default_factory=dict)
+    flights: dict[str, dict[str, Any]] = field(default_factory=dict)
     environment: dict[str, str] = field(default_factory=dict)
     costs: dict[str, Costs] = field(default_factory=dict)
     outside: dict[str, Answers] = field(default_factory=dict)

@@ -152,7 +152,7 @@ def summarise(
         digest=digest.hexdigest() if digest else None,
         digests=digest.outputs() if digest else {},
         not_deterministic=_not_deterministic(state),
-        verdict=verdict_of(state.conclusions | _losses(state.outside)),
+        verdict=verdict_of(state.conclusions | _losses(state.outside), state.flights),
         events=dict(sorted(by_type.items())),
         outputs=dict(by_output),
         drops={port: s.dropped for port, s in by_input.items()},

@@ -33,7 +33,7 @@ Floats = npt.NDArray[np.float64]
 Key = tuple[str, int]
 """Flight of a pair: scenario and seed."""
 
-USUAL = ("held_ate_percent", "rpe_trans_percent", "rot_rmse_deg", "frame_coverage_percent")
+USUAL = ("flight_ate_percent", "rpe_1m_trans_percent", "rot_rmse_deg", "frame_coverage_percent")
 """Figures compared by default: errors with lost time as drift, drift, rotation, coverage."""
 
 ERROR = 0.05

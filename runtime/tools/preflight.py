@@ -219,7 +219,9 @@ class _DryHost:
     def note_environment(self, name: str, value: str) -> None:
         pass
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
+    def conclude(
+        self, subject: str, figures: Mapping[str, Any], passed: bool | None, flight: bool
+    ) -> None:
         pass
 
     def after_run(self, call: Callable[[Path], Any]) -> None:

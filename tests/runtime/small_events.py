@@ -82,7 +82,9 @@ class NoHost:
     def stop(self, node: Node[Any], reason: str) -> None:
         raise NotImplementedError
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
+    def conclude(
+        self, subject: str, figures: Mapping[str, Any], passed: bool | None, flight: bool
+    ) -> None:
         raise NotImplementedError
 
     def note_environment(self, name: str, value: str) -> None:

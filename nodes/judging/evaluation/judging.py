@@ -36,15 +36,14 @@ from nodes.judging.evaluation.metrics import (
     absolute_errors,
     align,
     consistency,
-    drift_percent,
+    end_error_percent,
     interpolated,
     path_errors,
     position_errors,
     rms,
     rotation_errors,
-    share_errors,
+    segment_errors,
     transform,
-    umeyama,
 )
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.trajectory import PoseRows, RecentPoses, Trajectory, associate
@@ -178,7 +177,6 @@ def judge(
     body: str = "base_link",
     alignment: How | Literal["auto"] = "auto",
     rate: float = 400.0,
-    delta: float = 1.0,
     gap: float = 0.5,
 ) -> Judgement:
     """Judge an estimator against the truth.
@@ -195,7 +193,6 @@ def judge(
         body: Frame of the truth's body, whose pose is to be estimated.
         alignment: How the two frames are brought together; see `choose_alignment`.
         rate: Control ticks a second.
-        delta: Metres of path over which relative errors are taken.
         gap: Seconds of silence that count as lost.
     """
     end = int(truth.stamps[-1]) if end is None else end
@@ -266,13 +263,12 @@ def judge(
         figures |= {**without(), "why": str(error)}
         return judgement
     moved = aligned.trajectory
-    figures |= {"scale": aligned.scale, **absolute_errors(there, moved)}
+    figures |= absolute_errors(there, moved) | _aligned_as_a_whole(there, kept)
     figures["ate_percent"] = 100.0 * figures["ate_rmse_m"] / path if path > 0 else None
     try:
-        figures["drift_percent"] = drift_percent(there, moved)
-        figures["drift_m_per_s"] = figures["drift_percent"] * there.length() / 100 / there.seconds
-        figures |= share_errors(there, moved, path)
-        figures |= path_errors(there, moved, delta)
+        figures["end_error_percent"] = end_error_percent(there, moved)
+        figures |= segment_errors(there, moved, path)
+        figures |= path_errors(there, moved)
     except ValueError as error:  # it did not get that far
         figures["why"] = str(error)
     inside = truth.covers(poses)
@@ -284,10 +280,6 @@ def judge(
     )
     held = held_errors(truth, due, there.stamps, of_images.position, coverage.lost)
     figures |= _held(held, path) | _said_with_poses(record, truth, there, aligned)
-    if not record.scale_free:
-        with contextlib.suppress(ValueError):  # on one line
-            scale = umeyama(moved.positions, there.positions, with_scale=True)[2]
-            figures["scale_error_percent"] = 100.0 * abs(scale - 1.0)
     whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
     of_ticks = None
     if len(arrivals):
@@ -296,12 +288,24 @@ def judge(
     return Judgement(figures, estimate, moved, of_images, of_ticks, coverage.lost, final)
 
 
+def _aligned_as_a_whole(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
+    """Return the ATE after each alignment as a whole, and the scale; nothing for a line."""
+    found: dict[str, float] = {}
+    wholes: tuple[How, How] = ("se3", "sim3")
+    with contextlib.suppress(ValueError):
+        for how in wholes:
+            laid = align(estimate, truth, how)
+            errors = position_errors(truth.positions, laid.trajectory.positions)
+            found |= {f"ate_{how}_rmse_m": rms(errors), "scale": laid.scale}
+    return found
+
+
 def _held(errors: Floats, path: float, prefix: str = "") -> dict[str, float | None]:
     """Return the figures of errors over the whole flight."""
     known = len(errors) > 0
     return {
-        f"{prefix}held_ate_rmse_m": rms(errors) if known else None,
-        f"{prefix}held_ate_percent": 100.0 * rms(errors) / path if known and path > 0 else None,
+        f"{prefix}flight_ate_rmse_m": rms(errors) if known else None,
+        f"{prefix}flight_ate_percent": 100.0 * rms(errors) / path if known and path > 0 else None,
     }
 
 
@@ -421,9 +425,9 @@ def errors_at_ticks(
         kept.append([each[::step] for each in (now, since, position, rotation)])
     square, turned, age = (sums / len(ticks)).tolist()
     return Errors(*map(np.concatenate, zip(*kept, strict=True))), {
-        "available_rmse_m": math.sqrt(square),
-        "available_rot_rmse_deg": math.degrees(math.sqrt(turned)),
-        "available_age_ms": age / MILLISECOND,
+        "newest_pose_rmse_m": math.sqrt(square),
+        "newest_pose_rot_rmse_deg": math.degrees(math.sqrt(turned)),
+        "newest_pose_age_ms": age / MILLISECOND,
     }
 
 

@@ -17,12 +17,10 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from nodes.trajectory import Trajectory
+from runtime.figures import KITTI_LENGTHS, SHARES
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-
-SHARES = (1, 2, 5, 10, 20)
-"""Path lengths of relative errors, percent of the flight's path; see `share_errors`."""
 
 
 def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
@@ -30,9 +28,9 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
 
     Returns:
         By name, with the unit at its end: root mean square, mean, median, standard deviation,
-        maximum and mean square of the distances; root mean squares along x (north), y (east) and
-        z (down) of the truth's frame; root mean square of the angles between the orientations,
-        and of the differences of the headings: where the body's x axis points, seen along z.
+        and maximum of the distances; root mean squares along x (north), y (east) and z (down) of
+        the truth's frame; root mean square of the angles between the orientations, and of the
+        differences of the headings: where the body's x axis points, seen along z.
 
     Raises:
         ValueError: The stamps of the two differ.
@@ -51,7 +49,6 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
         "ate_north_rmse_m": rms(x),
         "ate_east_rmse_m": rms(y),
         "ate_down_rmse_m": rms(z),
-        "mse_m2": float(np.mean(errors**2)),
         "rot_rmse_deg": rms(np.degrees(angles)),
         "heading_rmse_deg": rms(np.angle(said * ahead.conj(), deg=True)),
     }
@@ -82,20 +79,19 @@ def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> 
         )
     shifts, angles = relative_errors(truth, estimate, first, last)
     return {
-        "rpe_trans_percent": 100.0 * rms(shifts) / delta,
-        "rpe_rot_deg_per_m": rms(np.degrees(angles)) / delta,
+        f"rpe_{delta:g}m_trans_percent": 100.0 * rms(shifts) / delta,
+        f"rpe_{delta:g}m_rot_deg_per_m": rms(np.degrees(angles)) / delta,
     }
 
 
-def share_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict[str, float | None]:
-    """Return the relative errors over 1, 2, 5, 10 and 20 % of a flight's path, and their mean.
+def segment_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict[str, float | None]:
+    """Return the relative errors over stretches of a flight: shares of its path, and KITTI's.
 
     As the development kit of KITTI's odometry benchmark has it (A. Geiger, P. Lenz, R. Urtasun,
     CVPR 2012; ``evaluate_odometry.cpp``): the mean, not the root mean square, of the errors of all
     stretches of a length, divided by the length; and the mean over the stretches of all lengths.
-    Three things differ: the lengths are shares of the path instead of 100 to 800 m, every pose
-    begins a stretch and not every tenth, and it ends at the pose that is nearest to its length
-    (`path_pairs`), not at the first one beyond.
+    Two things differ: every pose begins a stretch and not every tenth, and it ends at the pose that
+    is nearest to its length, and within a tenth of it (`path_pairs`), not at the first one beyond.
 
     Args:
         truth: The true poses.
@@ -103,26 +99,31 @@ def share_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict[s
         path: Metres of the whole flight, above 0.
 
     Returns:
-        By name; `None` for a length that no stretch has.
+        By name, over 1, 2, 5, 10 and 20 % of `path` and their ``mean``, `None` for a length that no
+        stretch has; of paths over 100 m over 100, 200, … 800 m, and ``kitti``, their mean.
 
     Raises:
         ValueError: The stamps of the two differ.
     """
     same_stamps(truth, estimate)
     distances = truth.distances()
+    shares = {f"{share}pct": share / 100.0 * path for share in SHARES}
+    metres = {f"{metres}m": float(metres) for metres in KITTI_LENGTHS if metres < path}
     found: dict[str, float | None] = {}
-    everything: list[tuple[Floats, Floats]] = []
-    for share in SHARES:
-        length = share / 100.0 * path
-        shifts, angles = relative_errors(truth, estimate, *path_pairs(distances, length))
-        each = 100.0 * shifts / length, np.degrees(angles) / length
-        everything.append(each)
-        found |= dict(zip(_share_names(str(share)), map(_mean, each), strict=True))
-    all_of = (np.concatenate(values) for values in zip(*everything, strict=True))
-    return found | dict(zip(_share_names("mean"), map(_mean, all_of), strict=True))
+    for lengths, mean in ((shares, "mean"), (metres, "kitti")):
+        everything: list[tuple[Floats, Floats]] = []
+        for name, length in lengths.items():
+            shifts, angles = relative_errors(truth, estimate, *path_pairs(distances, length))
+            each = 100.0 * shifts / length, np.degrees(angles) / length
+            everything.append(each)
+            found |= dict(zip(_segment_names(name), map(_mean, each), strict=True))
+        if everything:
+            all_of = (np.concatenate(values) for values in zip(*everything, strict=True))
+            found |= dict(zip(_segment_names(mean), map(_mean, all_of), strict=True))
+    return found
 
 
-def _share_names(which: str) -> tuple[str, str]:
+def _segment_names(which: str) -> tuple[str, str]:
     return f"rpe_{which}_trans_percent", f"rpe_{which}_rot_deg_per_m"
 
 
@@ -130,8 +131,8 @@ def _mean(values: Floats) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def drift_percent(truth: Trajectory, estimate: Trajectory) -> float:
-    """Return how far off the last pose is, seen from the first, in percent of the true path.
+def end_error_percent(truth: Trajectory, estimate: Trajectory) -> float:
+    """Return the error of the last pose seen from the first, in percent of the true path.
 
     As if the estimate had been aligned at its first pose: no alignment but that of the scale
     changes it.
@@ -142,7 +143,7 @@ def drift_percent(truth: Trajectory, estimate: Trajectory) -> float:
     same_stamps(truth, estimate)
     length = truth.length()
     if not length > 0.0:
-        raise ValueError(f"drift: expected a path longer than 0 m, found {len(truth)} poses on it")
+        raise ValueError(f"end: expected a path longer than 0 m, found {len(truth)} poses on it")
     ends = np.array([0]), np.array([len(truth) - 1])
     shifts, _ = relative_errors(truth, estimate, *ends)
     return 100.0 * float(shifts[0]) / length

@@ -39,6 +39,7 @@ from nodes.trajectory.formats import tum_row
 from nodes.trajectory.table import GrowingFile
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
+from runtime.figures import FIGURES
 from runtime.paths import source_file
 
 
@@ -75,33 +76,78 @@ class LiveErrors:
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
+Laid = Literal["auto", "none", "origin", "se3", "sim3"]
+
+
+class OwnConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of an evaluation for a single estimator; anything not given is as for all.
+
+    Attributes:
+        alignment: As `EvaluationConfig.alignment`.
+        thresholds: Thresholds by figure; ``inf`` for none.
+    """
+
+    alignment: Laid | None = None
+    thresholds: dict[str, float] = {}
+
+
 class EvaluationConfig(NodeConfig):
     """Settings of an evaluation.
 
     Attributes:
         alignment: How an estimate is laid on the truth: ``none``, ``origin`` (first pose on first
             pose), ``se3``, ``sim3``; ``auto`` is ``sim3`` for scale-free estimators, ``none`` for
-            estimates in ``map``, and ``origin`` for all others.
+            estimates in ``map``, and ``origin`` for all others. Whatever it is, the verdict has
+            the trajectory errors after ``se3`` and ``sim3``, too.
         vehicle: Name of the vehicle whose truth all estimates are held against; if empty, each
             estimator's is that which its source names or which carries the camera that it follows,
             or else the first.
         control_rate: Hertz of the controller for which the newest pose is judged.
-        delta: Metres of path over which relative errors are taken.
         gap: Silence of an estimator that counts as lost.
         thresholds: What the figures may be; if one is missed, the run's exit code is 1. Without
             any, an estimator is not judged, unless it misses what is asked of everybody (it was
             there for nine tenths of the flight, in one frame, with stamps that rise; its vehicle
             hit nothing; the run came to its planned end). With some, there must be an estimator.
+            ``collisions`` and ``plan_*`` are thresholds of the flight, and fail no estimator.
+        estimators: Other settings for single estimators, by their sources.
         image_count: Sample images with features to keep of each estimator; 0 for none.
     """
 
-    alignment: Literal["auto", "none", "origin", "se3", "sim3"] = "auto"
+    alignment: Laid = "auto"
     vehicle: str = ""
     control_rate: Positive = 400
-    delta: Positive = 1.0
     gap: Duration = Duration(0.5)  # immutable
     thresholds: Thresholds = Thresholds()
+    estimators: dict[str, OwnConfig] = msgspec.field(default_factory=dict)
     image_count: Annotated[int, msgspec.Meta(ge=0, le=100)] = 12
+
+    def __post_init__(self) -> None:
+        """Check the thresholds of single estimators.
+
+        Raises:
+            ValueError: One has no such name, or is a flight's.
+        """
+        for name, own in self.estimators.items():
+            for each in own.thresholds:
+                known = [k for k in self.thresholds.__struct_fields__ if not FIGURES[k].of_flight]
+                if each not in known:
+                    raise ValueError(
+                        f"estimators.{name}.thresholds: expected the name of a figure of an "
+                        f"estimator, found {each}{suggest(each, known)}"
+                    )
+
+    def alignment_of(self, estimator: str) -> Laid:
+        """Return how an estimator's poses are laid on the truth."""
+        own = self.estimators.get(estimator)
+        return (own and own.alignment) or self.alignment
+
+    def own_thresholds(self) -> dict[str, Thresholds]:
+        """Return the thresholds of estimators with other ones, those of all included."""
+        return {
+            name: msgspec.structs.replace(self.thresholds, **own.thresholds)
+            for name, own in self.estimators.items()
+            if own.thresholds
+        }
 
 
 class Evaluation(Node[EvaluationConfig]):
@@ -141,10 +187,18 @@ class Evaluation(Node[EvaluationConfig]):
 
     def check(self) -> Iterable[str]:
         """Say if there is no such vehicle as the file names, or nobody to judge."""
-        asked = self.config.thresholds.given
+        config = self.config
+        asked = any(each.given for each in (config.thresholds, *config.own_thresholds().values()))
         if asked and not (self._records or self.senders_of(PoseEstimate, TrajectoryEstimate)):
             yield "thresholds: expected an estimator to judge, found none"
-        if (name := self.config.vehicle) and name not in (names := self._vehicles.names):
+        sources = [*self._records, *self.senders_of(PoseEstimate, TrajectoryEstimate)]
+        for name in config.estimators:
+            if name not in sources:
+                yield (
+                    f"estimators.{name}: expected one of those that send poses "
+                    f"({', '.join(dict.fromkeys(sources)) or 'none'}){suggest(name, sources)}"
+                )
+        if (name := config.vehicle) and name not in (names := self._vehicles.names):
             yield (
                 f"vehicle: expected one that is announced ({', '.join(names) or 'none'}), "
                 f'found "{name}"{suggest(name, names)}'
@@ -242,6 +296,9 @@ class Evaluation(Node[EvaluationConfig]):
             self.conclude(name, rest, passed=figures["passed"])
             if figures.get("why"):
                 self.log.warning("%s: %s", name, figures["why"])
+        for vehicle, figures in verdict["flights"].items():
+            rest = {k: v for k, v in figures.items() if k != "passed"}
+            self.conclude(vehicle, rest, passed=figures["passed"], flight=True)
         if not judgements and "failed" in verdict:
             self.conclude(self.name, {"failed": verdict["failed"]}, passed=verdict["passed"])
 
@@ -257,6 +314,7 @@ class Evaluation(Node[EvaluationConfig]):
             seen = self._seen(vehicle, sensors)
             body = self._flights.get(vehicle, Flight()).body
             judgement = self._judge(
+                name,
                 record,
                 truths.get(vehicle),
                 cameras=seen,
@@ -265,6 +323,9 @@ class Evaluation(Node[EvaluationConfig]):
                 body=body,
             )
             judgement.figures.update(flown.get(vehicle, {}))
+            if "latency_p50_ms" in judgement.figures:
+                declared_here = self.clock.kind == "lockstep"
+                judgement.figures["latency"] = "declared" if declared_here else "measured"
             if len(self._vehicles.names) > 1:
                 judgement.figures["vehicle"] = vehicle
             judgements[name] = judgement
@@ -275,7 +336,15 @@ class Evaluation(Node[EvaluationConfig]):
         figures = {name: judgement.figures for name, judgement in judgements.items()}
         faults = [restarted] if self.restarts else []
         declared = [name for name, record in self._records.items() if "truth" in record.reads]
-        verdict = conclude(figures, config.thresholds, faults, how, declared)
+        verdict = conclude(
+            figures,
+            config.thresholds,
+            faults,
+            how,
+            declared,
+            flights={vehicle: each for vehicle, each in flown.items() if vehicle},
+            own=config.own_thresholds(),
+        )
         if self.out is not None:
             plans = {self._named("plan", v): f.plan() for v, f in self._flights.items()}
             write_results(self.out, plans, judgements, verdict)
@@ -285,7 +354,9 @@ class Evaluation(Node[EvaluationConfig]):
             self._album.write(self.out / "frames")
         return judgements, verdict
 
-    def _judge(self, record: EstimatorRecord, truth: Trajectory | None, **seen: Any) -> Judgement:
+    def _judge(
+        self, name: str, record: EstimatorRecord, truth: Trajectory | None, **seen: Any
+    ) -> Judgement:
         """Judge an estimator; invalid data do not affect the judgement of others."""
         if truth is None:
             why = "expected a truth to hold it against, found no odometry"
@@ -296,9 +367,8 @@ class Evaluation(Node[EvaluationConfig]):
                 record,
                 truth,
                 **seen,
-                alignment=config.alignment,
+                alignment=config.alignment_of(name),
                 rate=config.control_rate,
-                delta=config.delta,
                 gap=config.gap,
             )
         except Exception as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -16,15 +17,26 @@ from runtime.time.schedule import SECOND
 class _Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def given(self) -> bool:
-        """Whether any threshold differs from its default."""
-        return self != type(self)()
+        """Whether any threshold of an estimator differs from its default."""
+        return self._given(of_flight=False)
 
-    def missed(self, figures: Mapping[str, Any]) -> list[str]:
-        """Return a sentence for each missed threshold."""
-        asked = {name: getattr(self, name) for name in self.__struct_fields__}
-        found = (FIGURES[k].missed(limit, figures.get(k)) for k, limit in asked.items())
+    @property
+    def flight_given(self) -> bool:
+        """Whether any threshold of a flight differs from its default."""
+        return self._given(of_flight=True)
+
+    def _given(self, *, of_flight: bool) -> bool:
+        asked = (each for each in _ASKED if each.of_flight == of_flight)
+        return any(getattr(self, each.name) != each.default for each in asked)
+
+    def missed(self, figures: Mapping[str, Any], *, of_flight: bool = False) -> list[str]:
+        """Return a sentence for each missed threshold of an estimator, or else of the flight."""
+        asked = (each for each in _ASKED if each.of_flight == of_flight)
+        found = (each.missed(getattr(self, each.name), figures.get(each.name)) for each in asked)
         return [*filter(None, found)]
 
+
+_ASKED = [each for each in FIGURES.values() if each.limit]
 
 if TYPE_CHECKING:
 
@@ -34,7 +46,6 @@ if TYPE_CHECKING:
         def __init__(self, **limits: float | None) -> None: ...
 
 else:
-    _ASKED = [each for each in FIGURES.values() if each.limit]
     Thresholds = msgspec.defstruct(
         "Thresholds",
         [
@@ -65,6 +76,8 @@ def conclude(
     faults: Sequence[str] = (),
     end: RunEnd | None = None,
     declared: Collection[str] = (),
+    flights: Mapping[str, dict[str, Any]] = MappingProxyType({}),
+    own: Mapping[str, Thresholds] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the verdict on figures by estimator, for ``evaluation/verdict.json``.
 
@@ -74,10 +87,12 @@ def conclude(
         faults: Further reasons why all have failed.
         end: How the run ended, if there was one.
         declared: Those who announced that they read the truth.
+        flights: Figures of the flights themselves, by vehicle.
+        own: Thresholds of estimators with other ones.
 
     Returns:
-        ``passed``, ``estimators``, ``thresholds``; and in ``failed`` why nobody has passed, if
-        thresholds were given and nobody was there to meet them.
+        ``passed``, ``estimators``, ``flights``, ``thresholds``; and in ``failed`` why nobody has
+        passed, if thresholds were given and nobody was there to meet them.
     """
     stopped = ""  # by the user, before the plan was flown
     if end is not None and end.by == "user" and not end.planned:
@@ -89,30 +104,39 @@ def conclude(
         if figures.get("ate_rmse_m") is None:
             failed.append(figures.get("why", "expected estimates, found none"))
         known = {**figures, **of_run}
-        missed = thresholds.missed(known) if "coverage_percent" in figures else []
+        asked = own.get(name, thresholds)
+        missed = asked.missed(known) if "coverage_percent" in figures else []
         if end is not None:
             by = end.by or "the clock"
             who = f" ({by} ended the run: {end.reason})"
-            missed = [text + who * text.startswith("early_end") for text in missed]
-            if of_run["early_end"] is None:
+            missed = [text + who * text.startswith("early_end_seconds") for text in missed]
+            if of_run["early_end_seconds"] is None:
                 unknown = f"ended early (by {by}: {end.reason}); the planned end is not known"
-                failed.append(f"early_end: {unknown}")
+                failed.append(f"early_end_seconds: {unknown}")
             if end.error and node_of(name, [end.by]):
                 failed.append(f"ended_by: expected no error of its own, found: {end.error}")
         failed += missed
         if of_run.get("reads_truth") == "undeclared":
             failed.append(UNDECLARED)
         failed += faults
-        passed = not failed if failed or thresholds.given else None
+        passed = not failed if failed or asked.given else None
         if stopped:
             passed, failed = None, []
             of_run["why"] = stopped
         estimators[name] = {"passed": passed, **figures, **of_run, "failed": failed}
+    flown = {}
+    for vehicle, figures in flights.items():
+        failed = [] if stopped else thresholds.missed(figures, of_flight=True)
+        passed = not failed if failed or (thresholds.flight_given and not stopped) else None
+        flown[vehicle] = {"passed": passed, **figures, "failed": failed}
     verdict = {
-        "passed": overall(figures["passed"] for figures in estimators.values()),
+        "passed": overall(estimators.values(), flown.values()),
         "estimators": estimators,
+        "flights": flown,
         "thresholds": msgspec.to_builtins(thresholds),
     }
+    if own:
+        verdict["own_thresholds"] = msgspec.to_builtins(own)
     if not found and thresholds.given:
         why = "expected an estimator to judge, found none that announced itself or sent a pose"
         verdict |= {"passed": None if stopped else False, "failed": [stopped or why, *faults]}
@@ -132,7 +156,7 @@ def _of_run(name: str, figures: Mapping[str, Any], end: RunEnd, declared: bool) 
     if not end.planned:  # of a run that has no planned duration nobody knows how much is missing
         planned = end.duration
         missing = None if planned is None else max(planned - end.stamp / SECOND, 0.0)
-    found: dict[str, Any] = {"early_end": missing, "ended_by": end.by or "duration"}
+    found: dict[str, Any] = {"early_end_seconds": missing, "ended_by": end.by or "duration"}
     again = end.restarts.get(node_of(name, end.restarts), 0)
     if again or "restarts" in figures:  # who restarts in a new frame has it in both
         found["restarts"] = max(figures.get("restarts", 0), again)

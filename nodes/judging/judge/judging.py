@@ -91,7 +91,6 @@ def judge_all(
             truth.poses,
             cameras=None if frames is None else {"": frames},
             alignment=usual if config.alignment == "auto" else config.alignment,
-            delta=config.delta,
             gap=config.gap,
         )
         unknown = {"restarts", "repeated_stamps", "future_stamps", "other_bodies"}

@@ -150,7 +150,11 @@ def embedded(plot: Plot, folder: Path, formats: Sequence[str] = ()) -> dict[str,
 def _judged(run: Run) -> list[tuple[str, dict[str, Any], str]]:
     """Return name, figures and colour of each estimator and of all other judged sources."""
     found = [(each.name, each.figures, each.color) for each in run.estimators]
-    summary = {} if run.facts.verdict is None else run.facts.verdict.estimators
+    verdict = run.facts.verdict
+    summary = {} if verdict is None else dict(verdict.estimators)
+    for vehicle, each in (verdict.flights if verdict else {}).items():
+        if each["passed"] is not None:
+            summary[f"flight of {vehicle}"] = each
     known = {name for name, _, _ in found}
     return found + [(name, each, "inherit") for name, each in summary.items() if name not in known]
 

@@ -231,6 +231,7 @@ def facts(run: Run) -> list[tuple[str, str]]:
         (f"link {port}", f"{link.lost} lost, {link.thinned} left out")
         for port, link in f.links.items()
     ]
+    rows += [(f"{name} is slow", each.slower) for name, each in f.workers.items() if each.slower]
     rows += [(f"loop stood still in {node}", f"{count} times") for node, count in f.stalls.items()]
     if f.clock is not None and not any(s.dropped or s.missed for s in f.streams.values()):
         rows.append(("dropped or unmatched", "nothing"))

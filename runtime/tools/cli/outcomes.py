@@ -39,11 +39,11 @@ NOBODY = "thresholds were given, and no estimator announced itself or sent a pos
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcome of a run for one of its estimators.
+    """Outcome of a run for one of its estimators, or of a flight of which something was asked.
 
     Attributes:
         run: Name of the run, or settings, seed and repeat within a sweep.
-        estimator: Its source; empty for a run without one.
+        estimator: Its source, or ``flight of`` a vehicle; empty for a run without any.
         reasons: Sentences on a failure or crash.
         seconds: Real time of the whole run.
         figures: All figures, as in ``evaluation/verdict.json``.
@@ -59,7 +59,11 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 
 def of_verdict(run: str, verdict: Verdict | None, seconds: float | None = None) -> list[Outcome]:
     """Return the outcomes of a run that came to an end."""
-    if verdict is None or not verdict.estimators:
+    judged = dict(verdict.estimators) if verdict else {}
+    for vehicle, figures in (verdict.flights if verdict else {}).items():
+        if figures["passed"] is not None:
+            judged[f"flight of {vehicle}"] = figures
+    if verdict is None or not judged:
         state = _STATES[verdict.passed if verdict else None]
         reasons = [NOBODY] if state == "failed" else []
         return [Outcome(run=run, state=state, reasons=reasons, seconds=seconds)]
@@ -72,7 +76,7 @@ def of_verdict(run: str, verdict: Verdict | None, seconds: float | None = None) 
             seconds=seconds,
             figures=figures,
         )
-        for name, figures in verdict.estimators.items()
+        for name, figures in judged.items()
     ]
 
 
@@ -92,7 +96,7 @@ def of_rows(names: Iterable[str], rows: Iterable[Row]) -> list[Outcome]:
             )
             found.append(crashed)
         else:
-            verdict = Verdict(row["passed"], row["estimators"])
+            verdict = Verdict(row["passed"], row["estimators"], row.get("flights", {}))
             found += of_verdict(name, verdict, row["wall_seconds"])
     return found
 

@@ -110,7 +110,7 @@ class _Recorder(Instrument):
         for name, ticker in state.tickers.items():
             node, _, what = name.partition(".")
             nodes[node].tickers[what] = ticker.hz, self._ticks.get(name, {})
-        if state.conclusions or state.outside or state.after_run:
+        if state.conclusions or state.flights or state.outside or state.after_run:
             self._unfit = "a node of the flight concludes, writes or asks something"
         elif len(state.all_nodes) > len(state.runners):
             self._unfit = "a node of the flight was restarted"

@@ -214,6 +214,7 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
     if verdict and not row["error"]:
         assert ended is not None
         row["passed"], row["estimators"] = verdict.passed, verdict.estimators
+        row["flights"] = verdict.flights
         row["digests"] = {
             name: combined(own)
             for name in verdict.estimators

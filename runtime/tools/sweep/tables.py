@@ -42,6 +42,7 @@ class Row(TypedDict):
         run_seconds: Real seconds from the first update to the end.
         wall_seconds: Real seconds of the whole process.
         estimators: Name to figures, as the run's verdict has them.
+        flights: Vehicle to figures of its flight, as the run's verdict has them.
         workers: Name to what its calls cost, as the run's summary has it.
     """
 
@@ -58,6 +59,7 @@ class Row(TypedDict):
     estimators: dict[str, dict[str, Any]]
     repeat: NotRequired[int]
     digests: NotRequired[dict[str, str]]
+    flights: NotRequired[dict[str, dict[str, Any]]]
     workers: NotRequired[dict[str, dict[str, float | None]]]
 
 

@@ -127,7 +127,7 @@ def page_of(suite: Suite, tmp_path: Path, change: Any) -> str:
     for job in plan.jobs:
         name = dict(job.settings)["estimator"]
         row = crashed(job, "")
-        figures = {"held_ate_percent": 0.5 * job.repeat, "coverage_percent": 100.0}
+        figures = {"flight_ate_percent": 0.5 * job.repeat, "coverage_percent": 100.0}
         row |= {"passed": True, "estimators": {name: {"passed": True, **figures}}}
         rows.append(change(row) if name == "bad" else row)
     write_page(suite, plan, rows, tmp_path / "SUITE.md", "runtime suite")
@@ -144,7 +144,7 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
     """A missed threshold, a crash and silence: in the table of all, and in that of the scenario."""
 
     def missed(row: Row) -> Row:
-        row["estimators"]["bad"] |= {"held_ate_percent": 40.0, "failed": ["lost: for 9 s"]}
+        row["estimators"]["bad"] |= {"flight_ate_percent": 40.0, "failed": ["lost: for 9 s"]}
         return row | {"passed": False}
 
     def crashed(row: Row) -> Row:

@@ -39,6 +39,7 @@ def test_a_verdict_stands_in_the_summary_and_is_there_after_the_run(tmp_path: Pa
     assert seen["verdict"] == {
         "passed": False,
         "estimators": {"est": {"passed": False, "ate_rmse_m": 0.25}},
+        "flights": {},
     }
     assert seen["not_deterministic"] == ["judge"]
 

@@ -53,7 +53,7 @@ def test_equal_sides_differ_in_at_most_one_of_twenty_comparisons() -> None:
 
 def test_several_figures_together_err_no_more_often() -> None:
     def rows(values: np.ndarray) -> dict[Key, list[Row]]:
-        names = ("held_ate_percent", "rpe_trans_percent", "rot_rmse_deg")
+        names = ("flight_ate_percent", "rpe_1m_trans_percent", "rot_rmse_deg")
         return {
             ("tour", n): [row(seed=n, **dict(zip(names, each, strict=True)))]
             for n, each in enumerate(values.tolist())

@@ -196,7 +196,7 @@ def test_evos_commands_take_the_files_as_they_are_and_find_our_figures(run: Path
         assert found["rmse"] == pytest.approx(ape["ate_rmse_m"], abs=2e-6)  # it prints six decimals
         assert found["max"] == pytest.approx(ape["ate_max_m"], abs=2e-6)
         found = evo(run / "export", "rpe", form, *names, *pairs)
-        assert found["rmse"] * 100 == pytest.approx(rpe["rpe_trans_percent"], abs=2e-4)
+        assert found["rmse"] * 100 == pytest.approx(rpe["rpe_1m_trans_percent"], abs=2e-4)
 
 
 def test_of_several_vehicles_each_estimate_goes_with_its_own(run: Path) -> None:

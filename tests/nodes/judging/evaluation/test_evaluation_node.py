@@ -28,7 +28,7 @@ from events import (
 from nodes.judging.evaluation import Evaluation
 from nodes.judging.evaluation.results import read_errors
 from nodes.trajectory.formats import read_tum
-from runtime.errors import NodeError
+from runtime.errors import ConfigError, NodeError
 from runtime.paths import source_file
 from runtime.testing import run_node
 from tests.nodes.judging.evaluation.flights import (
@@ -68,10 +68,9 @@ def test_a_constant_error_is_found_everywhere(tmp_path: Path) -> None:
     assert figures["alignment"] == "none"
     assert figures["ate_rmse_m"] == pytest.approx(0.5)
     assert figures["ate_max_m"] == pytest.approx(0.5)
-    assert figures["mse_m2"] == pytest.approx(0.25)
     assert figures["path_m"] == pytest.approx(4 * math.pi, rel=1e-3)
     assert figures["ate_percent"] == pytest.approx(50 / (4 * math.pi), rel=1e-3)
-    assert figures["rpe_trans_percent"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["rpe_1m_trans_percent"] == pytest.approx(0.0, abs=1e-9)
     assert figures["lost_seconds"] == 0.0
     assert figures["estimates"] == 101
     assert figures["rate_hz"] == pytest.approx(10.0)
@@ -113,8 +112,8 @@ def test_the_pose_there_was_is_worse_by_its_age(tmp_path: Path) -> None:
     assert found["latency_p50_ms"] == pytest.approx(80.0)
     # The pose is 80 to 180 ms old, at 4π m in 10 s: the root mean square of a uniform age.
     age = math.sqrt((0.18**3 - 0.08**3) / (3 * 0.1))
-    assert found["available_rmse_m"] == pytest.approx(4 * math.pi / 10 * age, rel=0.02)
-    assert found["available_age_ms"] == pytest.approx(130.0, rel=0.03)
+    assert found["newest_pose_rmse_m"] == pytest.approx(4 * math.pi / 10 * age, rel=0.02)
+    assert found["newest_pose_age_ms"] == pytest.approx(130.0, rel=0.03)
 
 
 def test_lost_time_is_by_word_and_by_silence(tmp_path: Path) -> None:
@@ -172,7 +171,8 @@ def test_the_flight_is_held_against_its_plan(tmp_path: Path) -> None:
     rmse = math.sqrt((100 * 0.25 + 4.0) / 101)
     assert figures["plan_rmse_m"] == pytest.approx(rmse, abs=1e-6)
     assert figures["plan_max_m"] == pytest.approx(2.0, abs=1e-6)
-    assert figures["failed"] == [f"plan_rmse_m: expected at most 0.1, found {rmse:.4g}"]
+    expected = [f"plan_rmse_m: expected at most 0.1, found {rmse:.4g}"]
+    assert verdict["flights"]["drone"]["failed"] == expected
 
 
 def test_files_hold_what_was_said(tmp_path: Path) -> None:
@@ -334,6 +334,45 @@ def test_the_file_may_say_which_vehicle_is_meant(tmp_path: Path) -> None:
     assert figures["vehicle"] == "drone"
     assert figures["ate_rmse_m"] == pytest.approx(math.sqrt(35.0))
     assert figures["collisions"] == 2
+
+
+def test_settings_of_single_estimators_hold_for_those_only(tmp_path: Path) -> None:
+    verdict = judged(
+        tmp_path,
+        two_flights(),
+        vehicle="drone",
+        thresholds={"ate_percent": 1e9},
+        estimators={"est": {"alignment": "se3", "thresholds": {"ate_max_m": 1e9}}},
+    )
+    figures = verdict["estimators"]["est"]
+    assert figures["alignment"] == "se3"
+    assert figures["ate_rmse_m"] == pytest.approx(figures["ate_se3_rmse_m"])
+    assert (
+        verdict["own_thresholds"]["est"] | {"ate_percent": 1e9, "ate_max_m": 1e9}
+        == (verdict["own_thresholds"]["est"])
+    )
+    assert verdict["thresholds"]["ate_max_m"] is None
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        (
+            {"estt": {}},
+            r"estimators\.estt: expected one of those that send poses",
+        ),
+        (
+            {"est": {"thresholds": {"ate_percentt": 1.0}}},
+            r"estimators.est.thresholds: expected the name of a figure .* mean .ate_percent",
+        ),
+        ({"est": {"thresholds": {"collisions": 1.0}}}, "figure of an estimator, found collisions"),
+    ],
+)
+def test_wrong_settings_of_single_estimators_are_refused(
+    tmp_path: Path, own: dict[str, Any], said: str
+) -> None:
+    with pytest.raises((NodeError, ConfigError), match=said):
+        judged(tmp_path, two_flights(), estimators=own)
 
 
 def test_a_vehicle_that_is_not_there_is_refused() -> None:

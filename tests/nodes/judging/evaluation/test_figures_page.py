@@ -20,7 +20,7 @@ def test_every_figure_is_in_the_table_and_on_the_page() -> None:
     record = recorded(truth, silent=(5.0, 6.0), velocity=(1.0, 0.0, 0.0), covariance=(0.1,) * 36)
     record.final, record.final_frame_id = truth, "map"
     figures = {*judge(record, truth).figures} | {"plan_rmse_m", "plan_max_m", "collisions"}
-    figures |= {"early_end", "ended_by", "reads_truth"}
+    figures |= {"early_end_seconds", "ended_by", "reads_truth"}
     assert {"relocalization_p50_seconds", "nees_pose", "final_ate_percent"} <= figures
     assert figures <= {*FIGURES}
     assert "<!-- all figures" in PAGE  # `tools.docs_pages` puts the table there

@@ -18,18 +18,18 @@ from scipy.spatial.transform import Rotation
 from events.frames import angle_between
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.metrics import (
-    SHARES,
     absolute_errors,
     align,
-    drift_percent,
+    end_error_percent,
     path_errors,
     path_pairs,
     rotation_errors,
-    share_errors,
+    segment_errors,
 )
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory, associate
 from nodes.trajectory.formats import read_tum
+from runtime.figures import KITTI_LENGTHS, SHARES
 from tests.nodes.trajectory.samples import as_evo, moved, noisy, walk
 
 ROOT = Path(__file__).parents[4]
@@ -57,7 +57,6 @@ def test_absolute_errorss_are_evos(seed: int, n: int) -> None:
     shifts = ape(truth, estimate, evo.PoseRelation.translation_part)
     for name in ("rmse", "mean", "median", "std", "max"):
         assert ours[f"ate_{name}_m"] == pytest.approx(shifts[name], abs=1e-9)
-    assert ours["mse_m2"] == pytest.approx(shifts["sse"] / n, abs=1e-9)
     turns = ape(truth, estimate, evo.PoseRelation.rotation_angle_deg)
     assert ours["rot_rmse_deg"] == pytest.approx(turns["rmse"], abs=1e-9)
 
@@ -71,7 +70,7 @@ def test_relative_errors_are_evos(seed: int, n: int, delta: float) -> None:
     options = (delta, Unit.meters, 0.1, True, True)
     shifts = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
     turns = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
-    found = ours["rpe_trans_percent"] / 100, ours["rpe_rot_deg_per_m"]
+    found = ours[f"rpe_{delta:g}m_trans_percent"] / 100, ours[f"rpe_{delta:g}m_rot_deg_per_m"]
     for metric, rmse in zip((shifts, turns), found, strict=True):
         assert rmse * delta == pytest.approx(metric.get_all_statistics()["rmse"], abs=1e-9)
 
@@ -98,10 +97,10 @@ def test_a_real_flights_errors_are_evos() -> None:
     relative = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
     assert len(relative.error) > 300
     rmse = relative.get_all_statistics()["rmse"]
-    assert found["rpe_trans_percent"] / 100 == pytest.approx(rmse, abs=1e-9)
+    assert found["rpe_1m_trans_percent"] / 100 == pytest.approx(rmse, abs=1e-9)
     relative = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
     rmse = relative.get_all_statistics()["rmse"]
-    assert found["rpe_rot_deg_per_m"] == pytest.approx(rmse, abs=1e-9)
+    assert found["rpe_1m_rot_deg_per_m"] == pytest.approx(rmse, abs=1e-9)
 
 
 steps = st.lists(st.sampled_from([0.0, 0.0, 0.1, 0.25, 0.5, 2.0]), min_size=1, max_size=40)
@@ -143,7 +142,7 @@ def test_relative_errors_and_drift_do_not_depend_on_the_frame() -> None:
     truth = walk()
     estimate = noisy(truth)
     elsewhere = moved(estimate)
-    assert drift_percent(truth, elsewhere) == pytest.approx(drift_percent(truth, estimate))
+    assert end_error_percent(truth, elsewhere) == pytest.approx(end_error_percent(truth, estimate))
     ours, other = path_errors(truth, estimate), path_errors(truth, elsewhere)
     assert other == pytest.approx(ours)
 
@@ -153,9 +152,9 @@ def test_drift_is_the_error_at_the_end_over_the_true_path() -> None:
     positions = truth.positions.copy()
     positions[-1] += [0.0, 0.3, 0.4]
     estimate = Trajectory(truth.stamps, positions, truth.orientations)
-    assert drift_percent(truth, estimate) == pytest.approx(5.0)
+    assert end_error_percent(truth, estimate) == pytest.approx(5.0)
     with pytest.raises(ValueError, match="expected a path longer than 0 m"):
-        drift_percent(truth.take(slice(0, 1)), estimate.take(slice(0, 1)))
+        end_error_percent(truth.take(slice(0, 1)), estimate.take(slice(0, 1)))
 
 
 def test_a_perfect_estimate_has_no_errors() -> None:
@@ -163,8 +162,8 @@ def test_a_perfect_estimate_has_no_errors() -> None:
     found = absolute_errors(truth, truth)
     assert found["ate_max_m"] == 0.0
     assert found["rot_rmse_deg"] < 1e-12
-    assert path_errors(truth, truth)["rpe_trans_percent"] < 1e-12
-    assert drift_percent(truth, truth) < 1e-12
+    assert path_errors(truth, truth)["rpe_1m_trans_percent"] < 1e-12
+    assert end_error_percent(truth, truth) < 1e-12
 
 
 @given(seed=SEEDS, radians=st.floats(0.0, math.pi))
@@ -186,10 +185,10 @@ def test_errors_by_axis_are_those_of_the_axis_that_is_off() -> None:
     found = absolute_errors(truth, estimate)
     axes = [found[f"ate_{axis}_rmse_m"] for axis in ("north", "east", "down")]
     assert axes == pytest.approx([0.0, 0.2, 0.1], abs=1e-12)
-    assert sum(value**2 for value in axes) == pytest.approx(found["mse_m2"])
+    assert sum(value**2 for value in axes) == pytest.approx(found["ate_rmse_m"] ** 2)
 
 
-@pytest.mark.parametrize("function", [absolute_errors, path_errors, drift_percent])
+@pytest.mark.parametrize("function", [absolute_errors, path_errors, end_error_percent])
 def test_other_stamps_are_an_error_that_names_the_row(function: Any) -> None:
     truth = walk(5)
     late = Trajectory(truth.stamps + np.array([0, 0, 1, 1, 1]), truth.positions, truth.orientations)
@@ -206,7 +205,7 @@ def test_errors_over_shares_of_the_path_are_the_means_of_evos(seed: int) -> None
     truth = walk(300, seed)
     estimate = noisy(truth, metres=0.005, seed=seed + 1)
     path = truth.length()
-    found = share_errors(truth, estimate, path)
+    found = segment_errors(truth, estimate, path)
     sums, count = 0.0, 0
     for share in SHARES:
         length = share / 100 * path
@@ -214,9 +213,9 @@ def test_errors_over_shares_of_the_path_are_the_means_of_evos(seed: int) -> None
         shifts = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
         turns = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
         mean = 100 * shifts.get_all_statistics()["mean"] / length
-        assert found[f"rpe_{share}_trans_percent"] == pytest.approx(mean)
+        assert found[f"rpe_{share}pct_trans_percent"] == pytest.approx(mean)
         mean = turns.get_all_statistics()["mean"] / length
-        assert found[f"rpe_{share}_rot_deg_per_m"] == pytest.approx(mean)
+        assert found[f"rpe_{share}pct_rot_deg_per_m"] == pytest.approx(mean)
         sums, count = sums + 100 * shifts.error.sum() / length, count + len(shifts.error)
     assert found["rpe_mean_trans_percent"] == pytest.approx(sums / count)
 
@@ -244,30 +243,51 @@ def test_the_mean_over_shares_is_about_kittis() -> None:
     estimate = noisy(truth, metres=0.002)
     lengths = [share / 100 * truth.length() for share in SHARES]
     expected = as_kitti_has_it(truth, estimate, lengths)
-    found = share_errors(truth, estimate, truth.length())["rpe_mean_trans_percent"]
-    assert found == pytest.approx(expected, rel=0.02)
+    found = segment_errors(truth, estimate, truth.length())
+    assert found["rpe_mean_trans_percent"] == pytest.approx(expected, rel=0.02)
+    assert not {name for name in found if "kitti" in name or "0m" in name}  # the path is too short
+
+
+def test_the_errors_over_kittis_lengths_are_kittis() -> None:
+    truth = walk(1200, step=0.3)
+    estimate = noisy(truth, metres=0.02)
+    assert 300.0 < truth.length() < 400.0
+    found = segment_errors(truth, estimate, truth.length())
+    for length in KITTI_LENGTHS[:3]:
+        expected = as_kitti_has_it(truth, estimate, [float(length)])
+        assert found[f"rpe_{length}m_trans_percent"] == pytest.approx(expected, rel=0.15)
+    expected = as_kitti_has_it(truth, estimate, [100.0, 200.0, 300.0])
+    assert found["rpe_kitti_trans_percent"] == pytest.approx(expected, rel=0.15)
+    assert "rpe_400m_trans_percent" not in found
 
 
 def test_a_scale_that_is_wrong_is_as_wrong_over_every_share() -> None:
     truth = walk(600)
     large = Trajectory(truth.stamps, 1.1 * truth.positions, truth.orientations)
-    found = share_errors(truth, large, truth.length())
+    found = segment_errors(truth, large, truth.length())
     for share in SHARES:
-        value = found[f"rpe_{share}_trans_percent"]
+        value = found[f"rpe_{share}pct_trans_percent"]
         assert value is not None
         # Of the chord, which is shorter than the path.
         assert (7.0 if share == 1 else 1.0) < value < 10.001
-        assert found[f"rpe_{share}_rot_deg_per_m"] == pytest.approx(0.0, abs=1e-9)
-    figures = judge(EstimatorRecord.of(large), truth, alignment="se3").figures
-    assert figures["scale_error_percent"] == pytest.approx(100 - 100 / 1.1, rel=1e-6)
+        assert found[f"rpe_{share}pct_rot_deg_per_m"] == pytest.approx(0.0, abs=1e-9)
+    for how, scale_free in (("se3", False), ("sim3", True)):
+        record = EstimatorRecord(scale_free)
+        record.rows = EstimatorRecord.of(large).rows
+        figures = judge(record, truth, alignment="auto" if scale_free else "se3").figures
+        assert figures["alignment"] == how
+        assert figures["scale"] == pytest.approx(1 / 1.1, rel=1e-6)
+        assert figures["ate_sim3_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+        assert figures["ate_se3_rmse_m"] > 0.01
+        assert figures["ate_rmse_m"] == pytest.approx(figures[f"ate_{how}_rmse_m"], abs=1e-9)
 
 
 def test_a_stretch_that_nobody_covers_has_no_error() -> None:
     truth = walk(600)
     start = slice(0, 30)
-    found = share_errors(truth.take(start), truth.take(start), truth.length())
-    assert found["rpe_2_trans_percent"] == pytest.approx(0.0, abs=1e-9)
-    assert found["rpe_20_trans_percent"] is None
+    found = segment_errors(truth.take(start), truth.take(start), truth.length())
+    assert found["rpe_2pct_trans_percent"] == pytest.approx(0.0, abs=1e-9)
+    assert found["rpe_20pct_trans_percent"] is None
 
 
 @given(degrees=st.floats(-179.0, 179.0), seed=SEEDS)

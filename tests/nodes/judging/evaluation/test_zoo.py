@@ -161,10 +161,15 @@ def test_one_that_raises_fails_and_the_good_one_beside_it_is_judged_as_if_alone(
         (
             "stops",
             "stop",
-            "early_end: expected at most 0, found 3.067 (est ended the run: it",
-            ["early_end"],
+            "early_end_seconds: expected at most 0, found 3.067 (est ended the run: it",
+            ["early_end_seconds"],
         ),
-        ("crashes", "stop", "ended_by: expected no error of its own, found: ", ["early_end"]),
+        (
+            "crashes",
+            "stop",
+            "ended_by: expected no error of its own, found: ",
+            ["early_end_seconds"],
+        ),
         ("crashes", "restart", "restarts: expected at most 0, found 1", []),
     ],
 )
@@ -181,21 +186,21 @@ def test_who_ends_the_run_or_begins_anew_has_failed(
         assert estimators["other"]["coverage_percent"] == pytest.approx(50.0, abs=1.0)
 
 
-@pytest.mark.parametrize(("limits", "passed"), [({"ate_percent": 1.0}, False), ({}, True)])
+@pytest.mark.parametrize(("limits", "passed"), [({"ate_percent": 1.0}, False), ({}, None)])
 def test_thresholds_that_nobody_is_there_to_meet_are_missed(
-    tmp_path: Path, limits: dict[str, float], passed: bool
+    tmp_path: Path, limits: dict[str, float], passed: bool | None
 ) -> None:
     found = flown(tmp_path, {}, limits=limits)
     assert found["passed"] is passed
-    assert ("expected an estimator" in str(found.get("failed"))) is not passed
+    assert ("expected an estimator" in str(found.get("failed"))) == (passed is False)
 
 
 def test_nobody_invents_by_how_much_an_end_was_early() -> None:
     animal = BAD["asks for it where no end is planned"]
-    found = conclude({"est": judged(animal)}, Thresholds(early_end=9.0), (), animal.end)
+    found = conclude({"est": judged(animal)}, Thresholds(early_end_seconds=9.0), (), animal.end)
     figures = found["estimators"]["est"]
-    assert figures["early_end"] is None
-    unknown = "early_end: ended early (by est: dark); the planned end is not known"
+    assert figures["early_end_seconds"] is None
+    unknown = "early_end_seconds: ended early (by est: dark); the planned end is not known"
     assert figures["failed"] == [unknown]
 
 
@@ -207,11 +212,35 @@ def test_what_the_user_ended_is_not_judged() -> None:
         assert "the user ended the run" in str(verdict)
 
 
-def test_a_vehicle_that_hits_something_fails(tmp_path: Path) -> None:
+def test_a_vehicle_that_hits_something_fails_its_flight_and_no_estimator(tmp_path: Path) -> None:
     where: dict[str, Any] = {"position": (0.0, 0.0, 0.0), "normal": (1.0, 0.0, 0.0)}
     hits = [
         Collision(stamp=k * SECOND, source="drone", other="wall", speed=1.0, **where)
         for k in (3, 4)
     ]
-    figures = flown(tmp_path, {"good": "good"}, *hits)["estimators"]["good"]
-    assert figures["failed"] == ["collisions: expected at most 0, found 2"]
+    verdict = flown(tmp_path, {"good": "good"}, *hits)
+    assert verdict["estimators"]["good"]["failed"] == []
+    assert verdict["flights"]["drone"]["failed"] == ["collisions: expected at most 0, found 2"]
+    assert verdict["passed"] is verdict["flights"]["drone"]["passed"] is False
+
+
+def test_a_flight_is_judged_without_an_estimator() -> None:
+    near, far = {"plan_rmse_m": 0.1, "collisions": 0}, {"plan_rmse_m": 0.3, "collisions": 0}
+    limits = Thresholds(plan_rmse_m=0.2)
+    assert conclude({}, limits, flights={"drone": near})["passed"] is True
+    verdict = conclude({}, limits, flights={"drone": near, "other": far})
+    assert verdict["passed"] is False
+    assert verdict["flights"]["other"]["failed"] == ["plan_rmse_m: expected at most 0.2, found 0.3"]
+    assert conclude({}, Thresholds(), flights={"drone": near})["passed"] is None
+    good = {"est": judged(next(iter(GOOD.values()))) | far}
+    assert conclude(good, limits, flights={"drone": far})["estimators"]["est"]["passed"] is None
+
+
+def test_an_estimator_may_have_thresholds_of_its_own() -> None:
+    figures = judged(next(iter(GOOD.values()))) | {"ate_percent": 3.0}
+    found = dict.fromkeys(("vo", "mono"), figures)
+    limits = Thresholds(ate_percent=1.0)
+    verdict = conclude(found, limits, own={"mono": Thresholds(ate_percent=5.0)})
+    assert verdict["estimators"]["mono"]["passed"] is True
+    assert verdict["estimators"]["vo"]["failed"] == ["ate_percent: expected at most 1, found 3"]
+    assert verdict["own_thresholds"]["mono"]["ate_percent"] == 5.0
