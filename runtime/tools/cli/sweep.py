@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from runtime.tools.sweep import Children, Plan, Row
 from datetime import datetime
 
-_WIDTH = 240
-"""Of the table where there is no terminal, in letters; 80 would break its words."""
-
 
 def sweep(
     config: ConfigFile,
@@ -86,7 +83,7 @@ def sweep(
     from runtime.config.reading import load_configuration
     from runtime.tools import sweep as sweeping
     from runtime.tools.cli.run import look_at
-    from runtime.tools.sweep.console import summary_table
+    from runtime.tools.sweep.console import print_summary
 
     with writing(config.stem, junit, json) as outcomes:
         plan = sweeping.make_plan(
@@ -107,11 +104,11 @@ def sweep(
     sweeping.draw_plots(plan, rows)
     page = sweeping.write_page(plan, rows)
     console = Console()
-    if not console.is_terminal:
-        console.width = _WIDTH
-    console.print(summary_table(plan, sweeping.summarise(plan, rows)))
+    print_summary(console, plan, sweeping.summarise(plan, rows))
     console.print(
-        f"{len(rows)} runs   results in [bold]{plan.out}[/bold]: open {page.name}", highlight=False
+        f"{len(rows)} runs   results in [bold]{plan.out}[/bold]: open {page.name}",
+        highlight=False,
+        soft_wrap=True,
     )
     end(rows)
 

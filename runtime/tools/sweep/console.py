@@ -1,4 +1,4 @@
-"""All runs of a plan, on any executor, and their progress in the terminal.
+"""All runs of a plan, on any executor, with their progress and summary in the terminal.
 
 Runs that are finished already are not run again.
 """
@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import concurrent.futures
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any
 
+import msgspec
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from runtime.figures import IN_SWEEPS
+from runtime.figures import figure
 from runtime.tools.sweep.plan import Job, Plan
 from runtime.tools.sweep.process import Children, run_job
-from runtime.tools.sweep.tables import Combination, Row, Rows, crashed
+from runtime.tools.sweep.tables import MAIN, Combination, Row, Rows, crashed
 
 
 class Watch:
@@ -190,24 +192,77 @@ class _State(ProgressColumn):
         return Text(self._display.state())
 
 
-def summary_table(plan: Plan, combinations: Sequence[Combination]) -> Table:
-    """Return a table of the main figures; their quartiles are in `write_tables`, too."""
-    names = [n for n in IN_SWEEPS if any(n in each.figures for each in combinations)]
-    table = Table(title="median (least to most) of the runs", title_justify="left")
-    for parameter in plan.parameters:
-        table.add_column(parameter.path, overflow="fold")
-    table.add_column("estimator")
-    repeated = any(each.repeatable for each in combinations)
-    for name in ["runs", "crashed", "failed", "passed", *names]:
-        table.add_column(name.replace("_", " "), justify="right")
-    if repeated:
-        table.add_column("repeatable")
-    for each in combinations:
-        passed = "" if each.passed is None else f"{each.passed}"
-        counts = [f"{each.runs}", f"{each.crashed}", f"{each.failed}", passed]
-        figures = [str(each.figures.get(name, "")) for name in names]
-        words = map(Text, [*each.settings, each.estimator])
-        table.add_row(*words, *counts, *figures, *[each.repeatable] * repeated)
+WIDTH = 100
+"""Of a table in a terminal, in letters, at most."""
+
+
+class Column(msgspec.Struct, frozen=True):
+    """Column of the summary: its heading, a text for each line, and the unit of a figure."""
+
+    heading: str
+    texts: tuple[str, ...]
+    unit: str | None = None
+
+    def __str__(self) -> str:
+        """Return heading, the text that all lines share, and unit."""
+        return " ".join(filter(None, (self.heading, self.texts[0], self.unit)))
+
+
+def print_summary(console: Console, plan: Plan, combinations: Sequence[Combination]) -> None:
+    """Print medians with their ends: as many of the main figures as fit without a broken number.
+
+    What is equal in all lines stands above the table in a line of its own; what is left out, and
+    the quartiles, are in `write_tables`.
+    """
+    width = console.width = min(WIDTH, console.width) if console.is_terminal else WIDTH
+    shown = [column for column in _columns(plan, combinations) if any(column.texts)]
+    if len(combinations) > 1:
+        same = [column for column in shown if len(set(column.texts)) == 1]
+        shown = [column for column in shown if column not in same]
+        console.print("all: " + ", ".join(map(str, same)), markup=False, highlight=False)
+    endless = console.options.update(max_width=10_000)
+    left_out: list[str] = []
+    while figures := [column for column in shown if column.unit is not None]:
+        if console.measure(_table(shown), options=endless).maximum <= width:
+            break
+        shown.remove(figures[-1])
+        left_out.insert(0, figures[-1].heading)
+    console.print(_table(shown))
+    if left_out:
+        said = f"also in table.csv and the page: {', '.join(left_out)}"
+        console.print(said, highlight=False)
+    if len({each.alignment for each in combinations}) > 1:
+        console.print(
+            "Errors after different alignments are different things: compare those of one only.",
+            style="yellow",
+        )
+
+
+def _columns(plan: Plan, combinations: Sequence[Combination]) -> Iterator[Column]:
+    """Yield all columns; figures last, and beside their alignment."""
+    for index, parameter in enumerate(plan.parameters):
+        yield Column(parameter.path, tuple(each.settings[index] for each in combinations))
+    passed = ["" if c.passed is None else f"{c.passed} of {c.runs}" for c in combinations]
+    for name in ("estimator", "runs", "crashed", "passed", "repeatable", "alignment"):
+        found = passed if name == "passed" else [str(getattr(c, name)) for c in combinations]
+        yield Column(name, tuple(found))
+    for name in MAIN:
+        texts = tuple(str(c.figures.get(name, "")) for c in combinations)
+        yield Column(name, texts, figure(name).unit)
+
+
+def _table(columns: Sequence[Column]) -> Table:
+    table = Table(
+        title="median (least–most) of the runs", title_justify="left", box=box.SIMPLE_HEAD
+    )
+    for each in columns:
+        number = each.unit is not None
+        heading = each.heading.replace("_", "\n").replace(".", ".\n")
+        table.add_column(
+            Text(heading), justify="right" if number else "left", no_wrap=number, overflow="fold"
+        )
+    for texts in zip(*(each.texts for each in columns), strict=True):
+        table.add_row(*map(Text, texts))
     return table
 
 

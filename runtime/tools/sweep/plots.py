@@ -5,7 +5,9 @@ A sweep as a page: ``index.html`` beside its tables, with links to each run's ow
 
 from __future__ import annotations
 
+import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,16 +16,21 @@ import jinja2
 import msgspec
 import numpy as np
 
-from runtime.figures import FIGURES, IN_SWEEPS
+from runtime.figures import FIGURES
 from runtime.run.results import write
 from runtime.tools.sweep.plan import Parameter, Plan, axis
-from runtime.tools.sweep.tables import Row, Spread, in_order, numbers, summarise
+from runtime.tools.sweep.tables import MAIN, Row, Spread, in_order, numbers, summarise
 
 PLOTTED = {each.name: each.plot for each in FIGURES.values() if each.plot}
 """Axis label of each plotted figure."""
 
 _SHARES = "failures (% of the runs)"
 _MOST_LINES = 8
+_MARKS = "os^Dv*Xp"
+_ACROSS = 2
+"""Panels side by side: as many as a page has room for at full size."""
+_LETTERS = 70
+"""Letters of a legend below one panel."""
 
 
 class Line(msgspec.Struct, frozen=True):
@@ -44,14 +51,15 @@ def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
     """Draw a plot for each parameter into ``plots/``, if the runs have something to show.
 
     A line is the median, with the quartiles as its band, and bars from the least to the most; the
-    last panel has the share of the runs crashed, and of those failed.
+    last panel has the share of the runs crashed, and of those failed. A figure that is 0
+    throughout has no panel, and a parameter with a single value no plot.
     """
     own = [row for _, row in in_order(plan, rows)]
     drawn = []
     for parameter in plan.parameters:
         found = {name: lines(plan, own, parameter, name) for name in PLOTTED}
-        found = {name: each for name, each in found.items() if each}
-        if found:
+        found = {name: each for name, each in found.items() if any(map(_seen, each))}
+        if found and len(parameter.texts) > 1:
             path = plan.out / "plots" / (re.sub(r"[^\w.-]", "_", parameter.path) + ".png")
             path.parent.mkdir(parents=True, exist_ok=True)
             _draw(parameter, found, _shares(parameter, own), path)
@@ -63,31 +71,44 @@ def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) ->
     """Return the lines of a figure over a parameter.
 
     One line for each combination of the other parameters and each estimator; if these are more
-    than 8, one for each estimator.
+    than 8, one for each estimator. Errors after different alignments are never in one line.
     """
+    verdicts = [each for row in rows for each in row["estimators"].values()]
+    aligned = len({each.get("alignment") for each in verdicts}) > 1
+    short = _short([other.path for other in plan.parameters])
     points: dict[tuple[str, tuple[str, ...]], dict[str, list[float]]] = {}
     for job, row in in_order(plan, rows):
         settings = dict(job.settings)
         here = settings.pop(parameter.path)
-        others = tuple(f"{path}={text}" for path, text in settings.items())
+        others = tuple(f"{short[path]}={text}" for path, text in settings.items())
         for estimator, figures in row["estimators"].items():
+            name = f"{estimator} ({figures.get('alignment', 'none')})" if aligned else estimator
             for number in numbers([figures.get(figure)]):
-                line = points.setdefault((estimator, others), {})
+                line = points.setdefault((name, others), {})
                 line.setdefault(here, []).append(number)
     if len(points) <= _MOST_LINES:
-        several = len({estimator for estimator, _ in points}) > 1
+        several = len({name for name, _ in points}) > 1
         return [
-            _line(", ".join([estimator] * several + [*others]), line, parameter)
-            for (estimator, others), line in points.items()
+            _line(", ".join([name] * several + [*others]), line, parameter)
+            for (name, others), line in points.items()
         ]
     merged: dict[str, dict[str, list[float]]] = {}
-    for (estimator, _), line in points.items():
+    for (name, _), line in points.items():
         for text, found in line.items():
-            merged.setdefault(estimator, {}).setdefault(text, []).extend(found)
+            merged.setdefault(name, {}).setdefault(text, []).extend(found)
     return [
-        _line(f"{estimator}, all others".lstrip(", "), line, parameter)
-        for estimator, line in merged.items()
+        _line(f"{name}, all others".lstrip(", "), line, parameter) for name, line in merged.items()
     ]
+
+
+def _short(paths: Sequence[str]) -> dict[str, str]:
+    """Return the last word of each path, or the path where another ends the same."""
+    ends = Counter(path.rpartition(".")[2] for path in paths)
+    return {path: end if ends[end := path.rpartition(".")[2]] == 1 else path for path in paths}
+
+
+def _seen(line: Line) -> bool:
+    return any(spread.most != 0 or spread.least != 0 for spread in line.spreads)
 
 
 def _line(label: str, found: dict[str, list[float]], parameter: Parameter) -> Line:
@@ -121,12 +142,13 @@ def _draw(
     scale = axis(parameter.texts)
     place = dict(zip(parameter.texts, scale.places, strict=True))
     panels = len(found) + bool(shares)
-    figure = Figure(figsize=(4.6 * panels, 4.4), layout="constrained")
+    columns, rows = min(panels, _ACROSS), math.ceil(panels / _ACROSS)
+    figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
     labels = list(dict.fromkeys(line.label for own in found.values() for line in own))
     colours = {label: f"C{index}" for index, label in enumerate(labels)}
     handles: dict[str, Any] = {}
     for index, (name, own) in enumerate([*found.items(), *[("", [])] * bool(shares)], 1):
-        axes: Any = figure.add_subplot(1, panels, index)
+        axes: Any = figure.add_subplot(rows, columns, index)
         for line in own:
             points = sorted(
                 (place[text], (s.median, s.first, s.third, s.least, s.most))
@@ -134,32 +156,46 @@ def _draw(
             )
             middle, first, third, least, most = np.array([spread for _, spread in points]).T
             x = np.array([at for at, _ in points])
-            colour = colours[line.label]
-            handles[line.label], *_ = axes.plot(x, middle, "o-", color=colour)
+            colour, mark = colours[line.label], _MARKS[labels.index(line.label) % len(_MARKS)]
+            handles[line.label], *_ = axes.plot(x, middle, f"{mark}-", color=colour)
             axes.fill_between(x, first, third, color=colour, alpha=0.2, lw=0)
             axes.errorbar(
                 x, middle, (middle - least, most - middle), fmt="none", ecolor=colour, capsize=3
             )
+        highest = max((s.most for line in own for s in line.spreads), default=100.0)
         if not own:
             for style, (label, percent) in zip(("s-", "^--"), shares.items(), strict=True):
                 x, y = np.array(sorted(zip(scale.places, percent, strict=True))).T
                 axes.plot(x, y, style, color="#b00020", label=label)
-            axes.legend(fontsize=8)
-            axes.set_ylim(top=105)
+            axes.set_ylim(-4, 125)  # with room for the legend
+            axes.set_yticks(range(0, 101, 20))
+            axes.legend(fontsize=8, loc="upper left", ncols=2)
+        elif _decades([v for line in own for s in line.spreads for v in (s.least, s.most)]):
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
+        else:
+            axes.set_ylim(-0.03 * highest, 1.06 * highest)
         if scale.words:
             axes.set_xticks(scale.places, parameter.texts)
             axes.set_xlim(-0.5, len(scale.places) - 0.5)
-        axes.set(
-            xlabel=parameter.path + f" ({scale.unit})" * bool(scale.unit),
-            title=PLOTTED.get(name, _SHARES),
-        )
-        axes.set_ylim(bottom=0)
+        elif _decades(scale.places):
+            axes.set_xscale("log")
+            axes.set_xticks(scale.places, [f"{at:g}" for at in scale.places])
+            axes.minorticks_off()
+        axes.set_xlabel(parameter.path + f" ({scale.unit})" * bool(scale.unit))
+        axes.set_title(PLOTTED.get(name, _SHARES), fontsize=10)
         axes.grid(alpha=0.3)
     if any(labels):
+        across = max(int(_LETTERS * columns / (max(map(len, labels)) + 6)), 1)
         figure.legend(
-            list(handles.values()), labels, loc="outside lower center", fontsize=8, ncols=2
+            list(handles.values()), labels, loc="outside lower center", fontsize=8, ncols=across
         )
     figure.savefig(path, dpi=120)
+
+
+def _decades(values: Sequence[float]) -> bool:
+    """Return whether values span more than a decade, all of them above 0."""
+    return min(values) > 0 and max(values) > 10 * min(values)
 
 
 def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
@@ -169,24 +205,19 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
         The page.
     """
     combinations = summarise(plan, rows)
-    figures = [n for n in IN_SWEEPS if any(n in each.figures for each in combinations)]
+    figures = [n for n in MAIN if any(n in each.figures for each in combinations)]
+    aligned = Counter(each.alignment for each in combinations if each.alignment)
     summary = []
     for each in combinations:
-        spreads = [each.figures.get(name) for name in figures]
-        cells = [
-            (f"{s.median:.4g}", f"{s.first:.4g} to {s.third:.4g}", f"{s.least:.4g} to {s.most:.4g}")
-            if s
-            else ("", "", "")
-            for s in spreads
-        ]
-        judged = "" if each.passed is None else each.passed
-        counts = [
-            each.runs,
-            _share(each.crashed, each.runs),
-            _share(each.failed, each.runs),
-            judged,
-        ]
-        summary.append(([*each.settings, each.estimator], counts, cells, each.repeatable))
+        counts = {
+            "runs": each.runs,
+            "crashed": _share(each.crashed, each.runs),
+            "failed": _share(each.failed, each.runs),
+            "passed": "" if each.passed is None else each.passed,
+        }
+        cells = [_cell(each.figures.get(name)) for name in figures]
+        words = [*each.settings, each.estimator]
+        summary.append((words, counts.values(), each.repeatable, each.alignment, cells))
     runs, repeated = [], any(job.repeat > 1 for job in plan.jobs)
     for job, row in in_order(plan, rows):
         report = Path(job.out) / "report.html"
@@ -198,7 +229,9 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
     page = template(Path(__file__).with_name("page.html.jinja")).render(
         name=plan.out.name,
         parameters=[parameter.path for parameter in plan.parameters],
+        counts=["runs", "crashed", "failed", "passed"],
         figures=[name.replace("_", " ") for name in figures],
+        alignments=[name for name, _ in aligned.most_common()],
         summary=summary,
         repeated=repeated,
         runs=runs,
@@ -209,14 +242,30 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
     return path
 
 
+def _cell(spread: Spread | None) -> tuple[str, ...]:
+    """Return the lines of a cell: median, quartiles, ends; nothing for no figure."""
+    if spread is None:
+        return ()
+    if spread.least == spread.most:
+        return (f"{spread.median:.3g}", "", "")
+    return (
+        f"{spread.median:.3g}",
+        f"{spread.first:.3g} to {spread.third:.3g}",
+        f"{spread.least:.3g} to {spread.most:.3g}",
+    )
+
+
 def _share(count: int, runs: int) -> str:
     return f"{count} ({count / runs:.0%})" if count else "0"
 
 
 def template(path: Path) -> jinja2.Template:
-    """Return a page's template, escaping all values."""
-    text = path.read_text(encoding="utf-8")
+    """Return a page's template, escaping all values; it may extend ``base.html.jinja``, here."""
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FileSystemLoader([path.parent, Path(__file__).parent]),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    return environment.from_string(text)
+    return environment.get_template(path.name)

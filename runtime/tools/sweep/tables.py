@@ -20,7 +20,7 @@ from typing import IO, Any, NotRequired, TypedDict
 import msgspec
 
 from runtime.errors import ConfigError
-from runtime.figures import IN_SWEEPS
+from runtime.figures import IN_SWEEPS, figure
 from runtime.tools.sweep.plan import Job, Plan
 
 
@@ -159,12 +159,16 @@ class Spread(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         """Return the median and, if they differ, the least and the most."""
-        ends = f" ({self.least:.4g} to {self.most:.4g})" * (self.least < self.most)
-        return f"{self.median:.4g}{ends}"
+        ends = f" ({self.least:.3g}–{self.most:.3g})" * (self.least < self.most)
+        return f"{self.median:.3g}{ends}"
 
 
 SPREAD = {"median": "median", "q1": "first", "q3": "third", "min": "least", "max": "most"}
 """Column of each main figure in ``summary.csv`` to field of `Spread`."""
+
+
+MAIN = tuple(sorted(IN_SWEEPS, key=lambda name: figure(name).unit != "%"))
+"""Main figures for readers: first the relative ones."""
 
 
 class Combination(msgspec.Struct, frozen=True, kw_only=True):
@@ -179,11 +183,14 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
         failed: How many did not meet them.
         repeatable: Whether runs with equal settings and seed gave the same, in words; empty if
             there were no two of them.
+        alignment: How its trajectories were laid on the truth, ``origin``; ``origin or sim3`` if
+            the runs differ in it. Errors after different alignments are different things.
         figures: Main figure to its spread.
     """
 
     settings: tuple[str, ...]
     estimator: str
+    alignment: str = ""
     runs: int
     crashed: int
     passed: int | None
@@ -213,12 +220,12 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     header = ["run", *paths, *seed, "worker", *keys]
     costs_of_all = [[*h, name, *(costs.get(k) for k in keys)] for h, name, costs in workers]
     _write(plan.out / "costs.csv", header, costs_of_all)
-    header = [*paths, "estimator", "runs", "crashed", "failed", "passed", "repeatable"]
+    header = [*paths, "estimator", "alignment", "runs", "crashed", "failed", "passed", "repeatable"]
     header += [f"{name}_{what}" for name in IN_SWEEPS for what in SPREAD]
     lines = []
     for each in summarise(plan, rows):
-        line: list[Any] = [*each.settings, each.estimator, each.runs, each.crashed, each.failed]
-        line += [each.passed, each.repeatable]
+        line: list[Any] = [*each.settings, each.estimator, each.alignment, each.runs]
+        line += [each.crashed, each.failed, each.passed, each.repeatable]
         for name in IN_SWEEPS:
             line += [getattr(each.figures.get(name), field, None) for field in SPREAD.values()]
         lines.append(line)
@@ -260,6 +267,7 @@ def _combination(settings: tuple[str, ...], name: str, group: Sequence[Row]) -> 
     return Combination(
         settings=settings,
         estimator=name,
+        alignment=" or ".join(sorted({f["alignment"] for f in figures if f.get("alignment")})),
         runs=len(group),
         crashed=sum(bool(row["error"]) for row in group),
         passed=sum(passed) if passed else None,
@@ -295,14 +303,14 @@ def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], li
     """Return header and lines: a line per run and estimator, or per run without any."""
     header = ["run", *paths, *_seed(rows), "exit_code", "error", "passed", "sim_seconds", "digest"]
     found = {key for _, row in rows for f in row["estimators"].values() for key in f}
-    figures = [name for name in IN_SWEEPS if name in found]
+    figures = [name for name in ("alignment", *IN_SWEEPS) if name in found]
     figures += sorted(found - {*figures})
     lines = []
     for job, row in rows:
         head = [*_head(job, _seed(rows)), row["exit_code"], row["error"], row["passed"]]
         head += [row["sim_seconds"], row["digest"]]
         for name, own in (row["estimators"] or {"": {}}).items():
-            lines.append([*head, name, *(own.get(figure) for figure in figures)])
+            lines.append([*head, name, *(own.get(each) for each in figures)])
     taken = {*header, "estimator"}
     header.append("estimator")
     header += [f"estimator_{name}" if name in taken else name for name in figures]

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import csv
+import io
+import re
 from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
 from msgspec.structs import astuple
+from rich.console import Console
 
-from runtime.tools.sweep import Row, draw_plots, summarise, write_page, write_tables
+from runtime.figures import IN_SWEEPS
+from runtime.tools.sweep import Plan, Row, draw_plots, summarise, write_page, write_tables
+from runtime.tools.sweep.console import print_summary
 from runtime.tools.sweep.plots import lines
 from runtime.tools.sweep.tables import Spread, crashed
 from tests.runtime.tools.sweep.samples import plan_in, pretend
@@ -79,8 +84,7 @@ def test_a_page_shows_figures_plots_and_runs_with_their_reports(tmp_path: Path) 
     page = write_page(plan, rows).read_text(encoding="utf-8")
     assert "<th>judge.rate</th>" in page
     assert (
-        '<td class="n">1.035<br><span class="soft">1.032 to 1.038<br>1.03 to 1.04</span></td>'
-        in page
+        '<td class="n">1.04<br><span class="soft">1.03 to 1.04<br>1.03 to 1.04</span></td>' in page
     )
     assert '<img src="plots/judge.rate.png"' in page
     assert page.count(">open</a>") == 1
@@ -101,12 +105,12 @@ def test_a_line_for_each_combination_of_the_others(tmp_path: Path) -> None:
         ate = None if (rate, method) == ("20", "depth") else float(rate) + job.seed**2
         with_ate(row, vo=ate)
     flow, depth = lines(plan, rows, plan.parameters[0], "ate_percent")
-    assert (flow.label, depth.label) == ("judge.method=flow", "judge.method=depth")
+    assert (flow.label, depth.label) == ("method=flow", "method=depth")
     assert (flow.texts, depth.texts) == (("20", "10"), ("10",))
     assert flow.spreads == (Spread(36, 32.5, 40.5, 29, 45), Spread(26, 22.5, 30.5, 19, 35))
     assert lines(plan, rows, plan.parameters[0], "lost_seconds") == []
     labels = [line.label for line in lines(plan, rows, plan.parameters[1], "ate_percent")]
-    assert labels == ["judge.rate=20", "judge.rate=10"]
+    assert labels == ["rate=20", "rate=10"]
 
 
 def test_many_combinations_become_one_line_with_quartiles(tmp_path: Path) -> None:
@@ -117,6 +121,71 @@ def test_many_combinations_become_one_line_with_quartiles(tmp_path: Path) -> Non
     assert (vo.label, other.label) == ("vo, all others", "b, all others")
     assert (vo.texts, vo.spreads) == (("flow", "depth"), (Spread(3, 2, 4, 1, 5),) * 2)
     assert len(lines(plan, rows, plan.parameters[1], "ate_percent")) == 4
+
+
+def aligned(plan: Plan) -> list[Row]:
+    """Return rows of two estimators, of which one loses its scale to the alignment."""
+    rows = [pretend(job) for job in plan.jobs]
+    for row in rows:
+        row["estimators"]["vo"] |= {"alignment": "origin", "coverage_percent": 100}
+        row["estimators"]["slam"] |= {"alignment": "sim3", "coverage_percent": 100}
+    return rows
+
+
+def test_errors_after_different_alignments_are_marked_and_never_in_one_line(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.rate=1,2", seeds=2)
+    rows = aligned(plan)
+    found = lines(plan, rows, plan.parameters[0], "ate_percent")
+    assert [line.label for line in found] == ["vo (origin)", "slam (sim3)"]
+    assert "different alignments" in summary_text(plan, rows)
+    write_tables(plan, rows)
+    page = write_page(plan, rows).read_text(encoding="utf-8")
+    assert "<b>Errors after different alignments" in page
+    assert page.count('<td class="doubt">sim3</td>') == 2
+    assert page.count("<td>origin</td>") == 2
+    rows[0]["estimators"]["vo"]["alignment"] = "se3"  # of one seed of two
+    vo, *_ = summarise(plan, rows)
+    assert vo.alignment == "origin or se3"
+    found = lines(plan, rows, plan.parameters[0], "ate_percent")
+    assert [len(line.texts) for line in found] == [1, 2, 2]
+    write_tables(plan, rows)
+    table = read(plan.out / "table.csv")
+    assert list(table[0]).index("alignment") == list(table[0]).index("ate_percent") - 1
+    assert read(plan.out / "summary.csv")[0]["alignment"] == "origin or se3"
+    for row in rows:
+        del row["estimators"]["slam"]
+    rows[0]["estimators"]["vo"]["alignment"] = "origin"
+    assert "different alignments" not in write_page(plan, rows).read_text(encoding="utf-8")
+    assert "different alignments" not in summary_text(plan, rows)
+
+
+def summary_text(plan: Plan, rows: list[Row], width: int = 200) -> str:
+    """Return what a terminal shows."""
+    out = io.StringIO()
+    console = Console(file=out, width=width, force_terminal=True, no_color=True)
+    print_summary(console, plan, summarise(plan, rows))
+    return re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue())
+
+
+@pytest.mark.parametrize("width", [60, 80, 200])
+def test_a_terminal_shows_whole_numbers_in_at_most_100_columns(tmp_path: Path, width: int) -> None:
+    plan = plan_in(tmp_path, "judge.rate=1,2,3", "judge.method=flow,depth", seeds=3)
+    rows = aligned(plan)
+    for index, row in enumerate(rows):
+        for figures in row["estimators"].values():
+            figures |= dict.fromkeys(IN_SWEEPS[3:], 1.23456789e-7 * (index + 1))
+            figures["coverage_percent"] = 100
+    text = summary_text(plan, rows, width)
+    assert max(map(len, text.splitlines())) <= min(width, 100)
+    assert " ".join(text.split()).startswith(
+        "all: runs 3, crashed 0, passed 3 of 3, coverage_percent 100 % median"
+    )
+    assert "also in table.csv and the page: " in text
+    assert "latency_p50_ms" in text
+    line = next(line for line in text.splitlines() if "flow" in line)
+    assert re.search(r" 1\.04 \(1\.03–1\.05\)( |$)", line) or width < 80
+    one = plan_in(tmp_path)
+    assert "all:" not in summary_text(one, [pretend(job) for job in one.jobs][:0])
 
 
 def test_missed_and_failed_runs_are_two_counts(tmp_path: Path) -> None:
@@ -183,6 +252,9 @@ def test_a_plot_for_each_parameter(tmp_path: Path) -> None:
 def test_nothing_is_drawn_of_runs_without_figures(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.latency=0ms,80ms")
     assert draw_plots(plan, [crashed(job, "out of order") for job in plan.jobs]) == []
+    assert draw_plots(plan, [with_ate(pretend(job), vo=0.0) for job in plan.jobs]) == []
+    single = plan_in(tmp_path, "judge.latency=0ms")
+    assert draw_plots(single, [pretend(job) for job in single.jobs]) == []
     assert not (plan.out / "plots").exists()
 
 
