@@ -164,6 +164,8 @@ _TABLE = (
     _error("rpe_1m_trans_percent", "relative pose error (RPE) over 1 m, position, RMS", sweep=4),
     _error("rpe_1m_rot_deg_per_m", "relative pose error (RPE) over 1 m, rotation, RMS", sweep=5),
     *_segments(),
+    _detail("rpe_frame_trans_m", "RPE from each pose to the next, position, RMS"),
+    _detail("rpe_frame_rot_deg", "RPE from each pose to the next, rotation, RMS"),
     _error("end_error_percent", "error of the last pose seen from the first, % of the path"),
     _error("lost_seconds", "time without a pose", sweep=7, plot="lost (s)"),
     Figure("lost_count", "times lost"),

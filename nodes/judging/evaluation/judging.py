@@ -37,6 +37,7 @@ from nodes.judging.evaluation.metrics import (
     align,
     consistency,
     end_error_percent,
+    frame_errors,
     interpolated,
     path_errors,
     position_errors,
@@ -267,7 +268,7 @@ def judge(
     figures["ate_percent"] = 100.0 * figures["ate_rmse_m"] / path if path > 0 else None
     try:
         figures["end_error_percent"] = end_error_percent(there, moved)
-        figures |= segment_errors(there, moved, path)
+        figures |= frame_errors(there, moved) | segment_errors(there, moved, path)
         figures |= path_errors(there, moved)
     except ValueError as error:  # it did not get that far
         figures["why"] = str(error)

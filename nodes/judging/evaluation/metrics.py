@@ -84,6 +84,20 @@ def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> 
     }
 
 
+def frame_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
+    """Return the relative errors from each pose to the next: evo's default, ``evo_rpe``.
+
+    Raises:
+        ValueError: The stamps of the two differ, or there are less than two poses.
+    """
+    same_stamps(truth, estimate)
+    if len(truth) < 2:
+        raise ValueError(f"relative error: expected two poses, found {len(truth)}")
+    first = np.arange(len(truth) - 1)
+    shifts, angles = relative_errors(truth, estimate, first, first + 1)
+    return {"rpe_frame_trans_m": rms(shifts), "rpe_frame_rot_deg": rms(np.degrees(angles))}
+
+
 def segment_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict[str, float | None]:
     """Return the relative errors over stretches of a flight: shares of its path, and KITTI's.
 

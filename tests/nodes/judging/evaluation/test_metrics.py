@@ -21,6 +21,7 @@ from nodes.judging.evaluation.metrics import (
     absolute_errors,
     align,
     end_error_percent,
+    frame_errors,
     path_errors,
     path_pairs,
     rotation_errors,
@@ -73,6 +74,18 @@ def test_relative_errors_are_evos(seed: int, n: int, delta: float) -> None:
     found = ours[f"rpe_{delta:g}m_trans_percent"] / 100, ours[f"rpe_{delta:g}m_rot_deg_per_m"]
     for metric, rmse in zip((shifts, turns), found, strict=True):
         assert rmse * delta == pytest.approx(metric.get_all_statistics()["rmse"], abs=1e-9)
+
+
+@given(seed=SEEDS, n=st.integers(2, 80))
+@settings(max_examples=10, deadline=None)
+def test_errors_from_pose_to_pose_are_those_of_evos_default(seed: int, n: int) -> None:
+    truth = walk(n, seed)
+    estimate = noisy(truth, seed=seed + 1)
+    ours = frame_errors(truth, estimate)
+    shifts = rpe(truth, estimate, evo.PoseRelation.translation_part)
+    turns = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg)
+    assert ours["rpe_frame_trans_m"] == pytest.approx(shifts.get_all_statistics()["rmse"], abs=1e-9)
+    assert ours["rpe_frame_rot_deg"] == pytest.approx(turns.get_all_statistics()["rmse"], abs=1e-9)
 
 
 def test_a_real_flights_errors_are_evos() -> None:
