@@ -127,7 +127,7 @@ def _segments() -> list[Figure]:
 _TABLE = (
     _detail("method", "what the estimator says that it is"),
     _detail("vehicle", "vehicle by which it was judged"),
-    _detail("alignment", "how it was laid on the truth"),
+    Figure("alignment", "how it was laid on the truth", report="head"),
     _detail("scale", "by what Sim(3) multiplies its lengths; 1 is right if they are in metres"),
     _detail("estimates", "poses that count"),
     _detail("compared", "poses within the truth's time"),

@@ -116,6 +116,10 @@ class Node(Generic[C]):
     """Purpose of receiving true poses, if not flying or estimating: ``judging``, ``recording``,
     ``showing``. All others that do are named in the summary.
     """
+    doing: str = ""
+    """Slow work of the moment, in words, such as "building the world hall". A node that sets it
+    tells whoever waits for the run, and sets it to "" when it is done.
+    """
     files: ClassVar[tuple[str, ...]] = ()
     """Files written into the run's folder, besides those in settings of type `OutputPath`."""
     declared: ClassVar[Declared]

@@ -96,8 +96,9 @@ class SharedWorld:
         """Build the world, unless built already with its physics still finite."""
         async with self._building:
             if not self._built or (self.simulation and self.simulation.diverged):
+                node.doing = f"building the world {self.name}"
                 await node.offload(self._build)
-                self._built = True
+                self._built, node.doing = True, ""
 
     @functools.cached_property
     def model_bytes(self) -> bytes:

@@ -79,6 +79,14 @@ class NodeRunner:
         self.first_error = False
         """Whether an error in a step of the end is the run's error, to be printed then."""
 
+    @property
+    def doing(self) -> str:
+        """Work of the node in its own words; in a phase without any, the phase; or "".
+
+        May be read in any thread.
+        """
+        return (self.node.doing if self.node is not None else "") or self.phase
+
     def awaited(self) -> list[asyncio.Task[Any]]:
         """Return the tasks awaited by the run in this phase."""
         return [self.phase_task] if self.phase_task is not None else list(self.tasks)

@@ -28,6 +28,7 @@ from typing import Any
 from runtime import code_location
 from runtime.code_location import frame_of
 from runtime.errors import NodeTimeoutError
+from runtime.run.node_runner import NodeRunner
 from runtime.run.run_state import RunState
 from runtime.summary import Stall
 from runtime.time import lockstep
@@ -246,8 +247,7 @@ class ProgressWatchdog:
         waiting = [runner for runner in run.runners.values() if runner.phase]
         if waiting:
             return "; ".join(
-                f"{runner.spec.name}: {runner.phase}{_at(runner.awaited())}"
-                for runner in waiting[:_MOST_NAMED]
+                f"{runner.spec.name}: {_doing(runner)}" for runner in waiting[:_MOST_NAMED]
             )
         if run.first_update is None or run.stopped is not None:
             return "the other processes of the run" if run.several_processes else ""
@@ -287,6 +287,13 @@ class ProgressWatchdog:
         error.place = line
         self._state.interruption = error
         signal.pthread_kill(self._thread_id, signal.SIGUSR2)
+
+
+def _doing(runner: NodeRunner) -> str:
+    """Return what a node that the run waits for does: in its own words, or its phase and line."""
+    if runner.doing != runner.phase:
+        return runner.doing
+    return f"{runner.phase}{_at(runner.awaited())}"
 
 
 def _explain_time(loop: LockstepLoop, run: RunState) -> str:

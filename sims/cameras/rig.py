@@ -122,6 +122,7 @@ class CameraRig:
         if not self._specs:
             return
         self._seed = int(self._node.rng.integers(1 << 31))
+        self._node.doing = "starting the renderer of its cameras"
         self._renderer = await self._node.worker(
             CameraRenderer,
             await self._node.offload(lambda: world.model_bytes),
@@ -132,6 +133,7 @@ class CameraRig:
             world.dynamics,
             processes=self._processes,
         )
+        self._node.doing = ""
         if self._node.checking:
             return
         graphics = await self._renderer.call_for(0.0, CameraRenderer.graphics)

@@ -174,9 +174,9 @@ def _print(run: RunConfig, supervisor: Supervisor, console: Console, end: thread
 
 
 def _state(run: RunConfig, supervisor: Supervisor) -> tuple[float, str]:
+    runners = list(supervisor.state.runners.values())
+    busy = [f"{each.spec.name}: {each.doing}" for each in runners if each.doing]
     if supervisor.state.first_update is None:
-        runners = list(supervisor.state.runners.values())
-        busy = [f"{each.spec.name} ({each.phase})" for each in runners if each.phase]
         return 0.0, " ".join(["starting", *busy[:1]])
     seconds = supervisor.state.clock.now() / SECOND
     speed = seconds / max(time.monotonic() - supervisor.state.first_update, 1e-9)
@@ -185,4 +185,5 @@ def _state(run: RunConfig, supervisor: Supervisor) -> tuple[float, str]:
         frames = count_events(supervisor.state)[0]["Image"]
     except RuntimeError:  # a table of counts grew while this thread read it
         frames = 0
-    return seconds, f"{seconds:5.1f}{limit} s  {speed:.1f} × real time  {frames} frames"
+    text = f"{seconds:5.1f}{limit} s  {speed:.1f} × real time  {frames} frames"
+    return seconds, "  ".join([text, *busy[:1]])

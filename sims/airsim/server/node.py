@@ -206,6 +206,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         """Pause time, if so set; then serve clients, present and to come."""
         await self.time.begin()
         assert self._listener is not None  # a run that is only checked has no updates
+        self.doing = f"waiting for a client on {self.config.host}:{self.port}"
         self._listener.serve(self.table, self.config.flavour)
         self.log.info("AirSim's clients may connect to %s:%d", self.config.host, self.port)
         await self.recording.begin()
@@ -218,6 +219,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     def _attended(self, is_anybody: bool) -> None:
         """Take note of whether any client is there, without whom time might stand for ever."""
+        self.doing = ""
         if self._waiting is not None:
             self._waiting.cancel()
             self._waiting = None

@@ -79,6 +79,25 @@ def test_a_run_that_stands_still_names_the_node_and_the_line(node: type[Node], w
     assert any(re.search(Told.wanted, line) for line in Told.lines), Told.lines
 
 
+class Speaking(Node):
+    async def on_startup(self) -> None:
+        self.doing = "drawing"
+        await self.offload(self.wait_to_be_told)
+        self.doing = ""
+
+    def wait_to_be_told(self) -> None:
+        while Told.awaited():
+            time.sleep(0.01)
+
+
+def test_a_node_says_in_its_own_words_what_the_start_waits_for() -> None:
+    Told.lines.clear()
+    Told.wanted = "the run has waited for speaking: drawing$"
+    run = RunConfig(duration=Duration(0.1), progress_limit=Duration(0.2), stall=Duration(0))
+    execute(Config(run=run, nodes=(spec(Speaking, "speaking"),)), handlers=[Told(logging.WARNING)])
+    assert any(re.search(Told.wanted, line) for line in Told.lines), Told.lines
+
+
 class Starting(Node):
     async def on_startup(self) -> None:
         await self.offload(self.wait_to_be_told)
