@@ -1,8 +1,7 @@
-"""The README is true: its commands run, its files exist, its node is the one in `examples/`."""
+"""The README is true: commands, file and class run, files exist, the table is the suite's."""
 
 from __future__ import annotations
 
-import ast
 import re
 import shlex
 from pathlib import Path
@@ -10,10 +9,11 @@ from subprocess import CompletedProcess
 
 import pytest
 
-from tests.runtime.tools.samples_cli import command, command_here
+from tests.runtime.tools.samples_cli import command, command_here, summary
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+SUITE = (ROOT / "bench" / "SUITE.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    python -m runtime (.*?)(?: +#.*)?$", README, re.MULTILINE)
 FLIGHTS = [command for command in COMMANDS if command.startswith("run ")]
 TARGETS = sorted(set(re.findall(r"(?:^    |`)make ([a-z -]+?)(?:`|  +#|$)", README, re.MULTILINE)))
@@ -102,24 +102,49 @@ def test_it_is_short() -> None:
 
 
 def test_each_example_and_linked_file_exists() -> None:
-    """Files that the README names are there, and all examples are named."""
-    rows = re.findall(r"^\| (`\w+\.toml`.*?) \|", README, re.MULTILINE)
-    examples = {name for row in rows for name in re.findall(r"\w+\.toml", row)}
-    assert examples == {path.name for path in (ROOT / "examples").glob("*.toml")}
+    """Files that the README names are there."""
+    examples = set(re.findall(r"`(\w+\.toml)`", README.partition("## Examples")[2]))
+    assert len(examples) > 10
+    assert examples <= {path.name for path in (ROOT / "examples").glob("*.toml")}
     for link in re.findall(r"\[[^]]*\]\(([^)]+)\)", README):
         assert (ROOT / link).is_file(), link
 
 
-def test_the_node_is_the_one_of_the_examples() -> None:
-    """But for docstrings, which the README says it leaves out."""
+def shown(language: str) -> str:
+    """Return the first block in this language."""
+    return README.split(f"```{language}\n")[1].split("```")[0]
 
-    def without_docstrings(text: str) -> str:
-        (node,) = [n for n in ast.parse(text).body if isinstance(n, ast.ClassDef)]
-        for inner in ast.walk(node):
-            if isinstance(inner, ast.ClassDef | ast.AsyncFunctionDef) and ast.get_docstring(inner):
-                inner.body = inner.body[1:]
-        return ast.dump(node)
 
-    shown = README.split("```python\n")[1].split("```")[0]
-    example = (ROOT / "examples" / "brightness.py").read_text(encoding="utf-8")
-    assert without_docstrings(shown) == without_docstrings(example)
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("mine", [False, True], ids=["its odometry", "its class"])
+def test_the_file_flies_judges_and_ends(mine: bool, tmp_path: Path) -> None:
+    """As it is, and with the class below it, whose tracker takes the camera to stand still."""
+    file = shown("toml")
+    if mine:
+        stub = "class MySlam:\n    def __init__(self, matrix): pass\n"
+        stub += "    def track(self, image, depth): return np.eye(4)\n"
+        text = f"import numpy as np\n{shown('python')}\n{stub}"
+        (tmp_path / "my_module.py").write_text(text, encoding="utf-8")
+        file = file.replace('"VisualOdometry"', '"my_module:MyEstimator"')
+    (tmp_path / "config.toml").write_text(file, encoding="utf-8")
+    ended = command("run", "config.toml", "--out", "out", "--quiet", folder=tmp_path, limit=500)
+    assert ended.returncode == (MISSED if mine else 0), ended.stderr
+    assert summary(tmp_path / "out")["ended_by"] == "pilot"
+    figures = summary(tmp_path / "out")["verdict"]["estimators"]["odometry"]
+    assert figures["coverage_percent"] == 100.0
+    assert figures["passed"] != mine
+
+
+def test_the_table_is_the_suites() -> None:
+    """Each estimator's errors, to two digits, and who failed."""
+    rows = [row.strip("| ").split(" | ") for row in SUITE.splitlines() if row.startswith("| ")]
+    rows = [[cell.strip() for cell in row] for row in rows if len(row) == 7][1:]
+    assert len(rows) == 10
+    for name, reads, *cells in rows:
+        (line,) = (each for each in README.splitlines() if each.startswith(f"| {name} |"))
+        here = line.strip("| ").split(" | ")
+        assert here[1] == reads
+        for cell, short in zip(cells, here[2:], strict=True):
+            assert ("failed" in cell) == ("**" in short), line
+            assert float(short.strip("*")) == pytest.approx(float(cell.split()[0]), rel=0.05)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import venv
@@ -16,6 +17,7 @@ from runtime.config.reading import load
 from tests.runtime.tools.samples_cli import command_here
 
 ROOT = Path(__file__).parents[1]
+SCHEMA = json.loads((ROOT / "docs/reference/config.schema.json").read_text(encoding="utf-8"))
 EXAMPLES = sorted([ROOT / "config.toml", *(ROOT / "examples").glob("*.toml")])
 
 
@@ -73,6 +75,9 @@ def test_a_copied_example_is_whole(path: Path, tmp_path: Path) -> None:
     done = command_here("example", path.stem, "--out", str(tmp_path), folder=ROOT)
     assert done.returncode == 0, done.stderr
     assert load(tmp_path / path.name).nodes
+    named = re.match(r"#:schema (.*)\n", (tmp_path / path.name).read_text(encoding="utf-8"))
+    assert named
+    assert json.loads((tmp_path / named[1]).read_text(encoding="utf-8")) == SCHEMA
     beside = {"brightness": "brightness.py", "plain": "plain_room.xml"}
     beside |= {"computer_vision": "orbit.tum", "outside_cpp": "outside_cpp/odometry.cpp"}
     if path.stem in beside:

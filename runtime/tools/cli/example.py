@@ -9,6 +9,7 @@ import typer
 
 from runtime.tools.cli.commands import Overrides, Quiet
 
+SCHEMA = "config.schema.json"
 INSTALLED = Path(__file__).parents[1] / "example_files"
 CHECKOUT = Path(__file__).parents[3]
 
@@ -32,11 +33,15 @@ def example(
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to copy it to.")] = Path(),
 ) -> None:
-    """List the examples, or copy an example with its files, to start from."""
+    """List the examples, or copy an example with its files, to start from.
+
+    The schema of configuration files is written beside it, for editors that complete and check.
+    """
     import re
     import shutil
 
     from runtime.errors import CommandError, ConfigError, suggest
+    from runtime.tools.cli.inspect import schema
 
     examples = example_files()
     if name is None:
@@ -54,10 +59,13 @@ def example(
     out.mkdir(parents=True, exist_ok=True)
     for file, target in zip(files, targets, strict=True):
         (shutil.copytree if file.is_dir() else shutil.copyfile)(file, target)
-        if file.suffix == ".toml":  # the schema lies elsewhere; the command `schema` writes one
+        if file.suffix == ".toml":
             text = file.read_text(encoding="utf-8")
-            target.write_text(re.sub(r"\A#:schema .*\n", "", text), encoding="utf-8")
+            target.write_text(
+                re.sub(r"\A#:schema .*", f"#:schema {SCHEMA}", text), encoding="utf-8"
+            )
         print(target)
+    schema(out / SCHEMA)  # of the nodes installed now: one from before is replaced
 
 
 def example_files() -> dict[str, Path]:

@@ -1,0 +1,82 @@
+"""A stranger's session is true: its files, typed and run in order in an empty folder, say as much."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs/tutorial/thirty-minutes.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r'^```(\w+)(?: title="(.*)")?\n(.*?)^```$', PAGE, re.MULTILINE | re.DOTALL)
+NUMBER = r"-?\d+(?:\.\d+)?"
+OF_THIS_MACHINE = rf"in {NUMBER} s \({NUMBER} × real time\)|takes {NUMBER} ms here"
+"""What differs from machine to machine."""
+
+FAILS = "FAILED"
+"""Stands in what a page shows of a command that ends with exit code 1."""
+
+
+def typed(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Type a line into a shell where the project is installed."""
+    scripts = Path(sys.executable).parent
+    environment = {**os.environ, "PATH": f"{scripts}:{os.environ['PATH']}", "NO_COLOR": "1"}
+    environment |= {"COLUMNS": "120"}
+    return subprocess.run(
+        line, shell=True, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def assert_shows(printed: str, shown: str) -> None:
+    """Assert that each shown line is printed, in order; numbers may differ by half."""
+    rest = iter(printed.splitlines())
+    for line in shown.splitlines():
+        wanted = re.sub(OF_THIS_MACHINE, "", line)
+        pattern = re.sub(rf"\\?{NUMBER}", f"({NUMBER})", re.escape(wanted).replace(r"\.", "."))
+        for found in rest:
+            if match := re.fullmatch(pattern, re.sub(OF_THIS_MACHINE, "", found).rstrip()):
+                numbers = [float(each) for each in re.findall(NUMBER, wanted)]
+                found_numbers = [float(each) for each in match.groups()]
+                assert found_numbers == pytest.approx(numbers, rel=0.5), f"{line}: {found}"
+                break
+        else:
+            raise AssertionError(f"expected {line!r} in:\n{printed}")
+
+
+def test_what_is_shown_and_not_printed_is_found() -> None:
+    printed = "tour: 59.1 s, in 22.8 s (2.6 × real time)\nodometry PASSED\n  ATE 0.0053 m (0.01 %)"
+    assert_shows(printed, "tour: 59.1 s, in 7.0 s (9 × real time)\n  ATE 0.006 m (0.01 %)")
+    for wrong in ("odometry FAILED", "  ATE 0.053 m (0.01 %)", "odometry PASSED\ntour: 59.1 s, "):
+        with pytest.raises(AssertionError):
+            assert_shows(printed, wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_strangers_session(tmp_path: Path) -> None:
+    """Each file is written and each command run as the page says, and prints what it shows."""
+    printed, commands = "", 0
+    for index, (language, title, text) in enumerate(BLOCKS):
+        follows = BLOCKS[index + 1] if index + 1 < len(BLOCKS) else ("", "", "")
+        if title:
+            (tmp_path / title).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / title).write_text(text, encoding="utf-8")
+        lines = text.splitlines() if language == "sh" else []
+        if language == "yaml":
+            lines = re.findall(r"run: (visnav .*)", text)
+        for line in lines:
+            done = typed(line, tmp_path)
+            commands += 1
+            printed = done.stdout + done.stderr
+            fails = follows[0] == "text" and FAILS in follows[2]
+            assert done.returncode == fails, f"{line}: {printed}"
+        if language == "sh" and follows[0] == "text":
+            assert_shows(printed, follows[2])
+    assert commands >= 6
+    assert (tmp_path / "results" / "flight.xml").is_file()
+    for path in re.findall(r"`((?:runs|compared)/[\w./-]+)`", PAGE):
+        assert (tmp_path / path).exists(), path
