@@ -51,7 +51,7 @@ class Block(NamedTuple):
 
 
 def blocks(*languages: str) -> list[Block]:
-    """Return the fenced blocks of all pages in these languages, with included files put in."""
+    """Return the fenced blocks of all pages in these languages."""
     found = []
     for page in PAGES:
         for match in re.finditer(
@@ -60,14 +60,9 @@ def blocks(*languages: str) -> list[Block]:
             re.MULTILINE | re.DOTALL,
         ):
             language, title, text = match.groups()
-            text = re.sub(r'^--8<-- "(.*)"$', lambda m: included(m[1]), text, flags=re.MULTILINE)
             if language in languages:
                 found.append(Block(page, language, title or "", text))
     return found
-
-
-def included(path: str) -> str:
-    return (ROOT / path).read_text(encoding="utf-8")
 
 
 def commands() -> list[str]:
@@ -113,6 +108,20 @@ def test_toml_keeps_to_the_schema(block: Block) -> None:
     if set(table) <= {"run", "network", "nodes"}:
         whole = {"nodes": [{"name": "any", "type": "any:Any"}], **table}
         jsonschema.validate(whole, SCHEMA)
+
+
+def test_a_file_is_shown_as_it_is() -> None:
+    """A block whose title is one of the project's files; pages are also read as plain files."""
+    languages = ("python", "toml", "xml")
+    shown = [
+        each
+        for each in blocks(*languages)
+        if each.title and each.title not in ABOUT_FILES and (ROOT / each.title).is_file()
+    ]
+    assert len(shown) >= 5
+    for block in shown:
+        assert block.text == (ROOT / block.title).read_text(encoding="utf-8"), block
+    assert not [page for page in PAGES if "--8<--" in page.read_text(encoding="utf-8")]
 
 
 @pytest.mark.parametrize("words", sorted(set(commands())))

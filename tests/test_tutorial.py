@@ -1,4 +1,4 @@
-"""A stranger's session is true: its files, typed and run in order in an empty folder, say as much."""
+"""The session of docs/tutorial/thirty-minutes.md is true, typed in order in an empty folder."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/tutorial/thirty-minutes.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r'^```(\w+)(?: title="(.*)")?\n(.*?)^```$', PAGE, re.MULTILINE | re.DOTALL)
+BLOCKS = re.findall(r'^```(\w+)(?: title="([^"\n]*)")?\n(.*?)^```$', PAGE, re.MULTILINE | re.DOTALL)
 NUMBER = r"-?\d+(?:\.\d+)?"
 OF_THIS_MACHINE = rf"in {NUMBER} s \({NUMBER} × real time\)|takes {NUMBER} ms here"
 """What differs from machine to machine."""

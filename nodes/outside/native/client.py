@@ -3,7 +3,7 @@
 This file may be copied; it needs numpy, and nothing else of the project::
 
     with Link("my_slam") as link:               # connects to the socket that $VISNAV_SOCKET names
-        camera = link.description["cameras"][0]
+        camera = link.description["cameras"][0]["info"]
         slam = MySlam(camera["fx"], camera["fy"], camera["cx"], camera["cy"])
         link.ready()
         for frame in link:                      # until the run ends

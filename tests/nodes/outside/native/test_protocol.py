@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import mmap
 import os
+import re
 import socket
 import struct
 import threading
@@ -19,7 +21,7 @@ from hypothesis import strategies as st
 
 from nodes.outside.native import LinkError
 from nodes.outside.native.answers import read_done, read_pose
-from nodes.outside.native.client import SAMPLE, Link, ProtocolError
+from nodes.outside.native.client import SAMPLE, Frame, Link, ProtocolError
 from tests.nodes.outside.native.samples_link import (
     LIMIT,
     Raw,
@@ -29,6 +31,7 @@ from tests.nodes.outside.native.samples_link import (
     program,
 )
 
+ROOT = Path(__file__).parents[4]
 QUICK = settings(
     max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
 )
@@ -266,3 +269,28 @@ def test_no_run_breaks_a_client(tmp_path: Path, messages: list[tuple[int, bytes]
     with here, contextlib.suppress(ProtocolError):
         for frame in link:
             assert all(image.data.nbytes <= 4096 for image in frame.images)
+
+
+def test_the_page_has_all_functions() -> None:
+    """Whatever is public in either client stands on the page as it is declared."""
+    page = (ROOT / "docs/reference/link.md").read_text(encoding="utf-8").partition("## All")[2]
+    header = (ROOT / "nodes/outside/native/visnav_link.hpp").read_text(encoding="utf-8")
+    header = re.sub(r"\nprivate:.*?\n};", "\n};", header, flags=re.DOTALL)
+    shown, declared = (
+        " ".join(re.sub(r"//.*", "", text).split())
+        for text in (page.partition("```cpp\n")[2].partition("```")[0], header)
+    )
+    functions = re.findall(r"(?<=[;{}] )(?:explicit )?[\w:<>&* ]+\((?:[^;{}]|\{\})*(?=;)", shown)
+    for function in functions:
+        assert f" {function} " in declared, function
+    public = set(re.findall(r"^    (?! |explicit D)[\w:<>&* ]*?\b(\w+)\(", header, re.MULTILINE))
+    assert {"Link", "row", "from_quaternion", "pose", "done"} <= public
+    for name in public:
+        assert any(f" {name}(" in each for each in functions), name
+    text = page.partition("```text\n")[2].partition("```")[0]
+    methods = inspect.getmembers(Link, inspect.isfunction)
+    for name, method in (*methods, ("image", Frame.image)):
+        if not name.startswith("_"):
+            given_ = list(inspect.signature(method).parameters.values())[1:]
+            plain = [each.replace(annotation=inspect.Parameter.empty) for each in given_]
+            assert f".{name}{inspect.Signature(plain)}".replace("'", '"') in text, name
