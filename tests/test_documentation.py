@@ -34,6 +34,9 @@ PAGES = sorted(
 ABOUT_FILES = {"pyproject.toml"}
 """Titles of blocks in TOML that are no configuration."""
 
+SESSION = "thirty-minutes.md"
+"""The page whose blocks make sense in order only; tests/test_tutorial.py runs it."""
+
 ELSEWHERE = "import cosysairsim"
 """Marks a script for AirSim's client, which tests/examples/test_airsim.py runs."""
 
@@ -67,7 +70,8 @@ def blocks(*languages: str) -> list[Block]:
 
 def commands() -> list[str]:
     """Return what the pages tell to type, without the name of the program."""
-    lines = [line for block in blocks("sh") for line in block.text.splitlines()]
+    pages = [block for block in blocks("sh") if block.page.name != SESSION]
+    lines = [line for block in pages for line in block.text.splitlines()]
     starts = r"^(?:visnav|python -m runtime) (.*?)(?: +#.*)?$"
     return [match[1] for line in lines if (match := re.match(starts, line))]
 
@@ -89,7 +93,9 @@ def test_every_block_says_its_language() -> None:
 
 
 @pytest.mark.parametrize(
-    "block", [each for each in blocks("python") if ELSEWHERE not in each.text], ids=str
+    "block",
+    [each for each in blocks("python") if ELSEWHERE not in each.text and each.page.name != SESSION],
+    ids=str,
 )
 def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a module of its own: an assertion in it is one of ours."""

@@ -76,7 +76,7 @@ def test_the_run_leaves_a_summary(a_run: Path) -> None:
     "words",
     [
         pytest.param(c, marks=[pytest.mark.slow, pytest.mark.timeout(600)])
-        if c.startswith(("sweep", "selftest")) or c in FLIGHTS or A_RUN in c
+        if c.startswith(("sweep", "compare", "selftest")) or c in FLIGHTS or A_RUN in c
         else c
         for c in COMMANDS
         if c != FLIGHTS[0]
