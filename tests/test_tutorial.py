@@ -36,7 +36,8 @@ def assert_shows(printed: str, shown: str) -> None:
     rest = iter(printed.splitlines())
     for line in shown.splitlines():
         wanted = re.sub(OF_THIS_MACHINE, "", line).rstrip()
-        pattern = re.sub(rf"\\?{NUMBER}", f"({NUMBER})", re.escape(wanted).replace(r"\.", "."))
+        plain = re.escape(wanted).replace(r"\.", ".").replace(r"\-", "-")
+        pattern = re.sub(NUMBER, lambda _: f"({NUMBER})", plain)
         for found in rest:
             if match := re.fullmatch(pattern, re.sub(OF_THIS_MACHINE, "", found).rstrip()):
                 numbers = [float(each) for each in re.findall(NUMBER, wanted)]
