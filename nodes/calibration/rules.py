@@ -117,10 +117,13 @@ def monotonic(config: Config, announced: Announced) -> Iterator[Finding]:  # noq
 
 
 def latency(config: Config, announced: Announced) -> Iterator[Finding]:
-    """Images are skipped by an estimator with a latency above the image period."""
+    """Estimators take time on a vehicle, and with more than an image period skip images."""
     rate = max((camera.rate for camera in cameras(announced)), default=0.0)
     for spec in estimators(config, announced):
-        taken = float(getattr(spec.config, "latency", 0.0))
+        taken = float(getattr(spec.config, "latency", -1.0))
+        if taken == 0.0 and config.run.clock == "lockstep":
+            found = "its estimates take no time on the run's clock"
+            yield Finding(spec.name, found, "give it the latency of the vehicle, as 15ms")
         if rate and taken > 1.0 / rate * (1.0 + 1e-9):
             yield Finding(
                 spec.name,

@@ -37,6 +37,7 @@ from runtime.channels.ports import MAX_HZ
 from runtime.config.messages import explain, override, show
 from runtime.config.model import Config, NetworkConfig, NodeSpec, OnError, RunConfig
 from runtime.config.plugins import CONFIGURATIONS, NODES, offers
+from runtime.config.presets import expanded
 from runtime.errors import ConfigError, DeclarationError, VisnavError, suggest
 from runtime.node import Node
 from runtime.paths import resolve, unmarked
@@ -300,12 +301,13 @@ def is_base(cls: type[Node[Any]]) -> bool:
 
 
 def convert(value: Any, type_: type[S], where: str) -> S:
-    """Turn a table into a struct.
+    """Turn a table into a struct, with its presets put in.
 
     Raises:
-        ConfigError: A key is unknown or missing, or a value is of the wrong type or size, or not
-            finite. (A run's `speed` may be infinite.)
+        ConfigError: A key or a preset is unknown, a key is missing, or a value is of the wrong type
+            or size, or not finite. (A run's `speed` may be infinite.)
     """
+    value = expanded(value, type_, where)
     for path, number in _not_finite(value):
         if type_ is not RunConfig or math.isnan(number):
             text = f"expected a finite number, found {number} - at `${path}`"

@@ -18,6 +18,7 @@ from msgspec import inspect as types
 
 from runtime.config.model import OnError
 from runtime.config.parameters import is_marked
+from runtime.config.presets import by_name_alone, presets_in
 from runtime.node import Node
 from runtime.run.graph import input_types
 from runtime.units import Duration, Latency, plain
@@ -270,9 +271,10 @@ def _type(info: types.Type) -> str:
     """Return the name of a type in plain words."""
     match info:
         case types.Metadata():
-            return _type(info.type)
+            names = presets_in(info.extra)
+            return " or ".join(map(json.dumps, names)) if names else _type(info.type)
         case types.StructType():
-            return "table"
+            return "table or the name of a preset" if by_name_alone(info.cls) else "table"
         case types.CustomType() if issubclass(info.cls, Duration):
             return "duration"
         case types.UnionType():

@@ -18,6 +18,7 @@ from msgspec import inspect as types
 from runtime.channels.links import LinkConfig
 from runtime.config.model import NetworkConfig, OnError, RunConfig
 from runtime.config.parameters import is_marked
+from runtime.config.presets import by_name_alone, presets_in
 from runtime.node import Node
 from runtime.tools.describe import TYPE_DOC, attribute_docs, summary
 from runtime.units import Duration, plain
@@ -146,9 +147,12 @@ class _Maker:
         """Return the schema of a type described by msgspec."""
         match info:
             case types.Metadata():
-                return self._of(info.type)
+                names = list(presets_in(info.extra))
+                return {"enum": names} if names else self._of(info.type)
             case types.StructType():
-                return self.struct(info.cls)
+                names = list(by_name_alone(info.cls))
+                table = self.struct(info.cls)
+                return {"anyOf": [{"enum": names}, table]} if names else table
             case types.CustomType() if issubclass(info.cls, Duration):
                 return {"anyOf": [{"type": "number", "minimum": 0}, _text(_DURATION)]}
             case types.UnionType():

@@ -34,11 +34,13 @@ from runtime.paths import NameOrPath
 from runtime.units import Latency
 from sims.cameras.lens import Intrinsics, Lens, intrinsics
 from sims.cameras.response import AutoExposure, noise_at, read_response
+from sims.presets import CAMERAS, DEPTH_SENSORS
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=8192)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+_SIZES = dict.fromkeys(("width", "height", "fov"), "intrinsics")
 
 
 class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -49,6 +51,7 @@ class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     model says, too dark or without texture.
 
     Attributes:
+        preset: Real sensor with its figures as defaults; keys beside it override them.
         model: ``structured_light``: a projector; dark surfaces return too little of its light.
             ``stereo``: a second camera; surfaces without texture cannot be matched, nor can the
             band at the left which is out of its view.
@@ -67,6 +70,7 @@ class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         min_contrast: ``stereo``: least standard deviation of 7×7 pixels, grey levels. 0: any.
     """
 
+    preset: Annotated[str | None, msgspec.Meta(extra={"presets": DEPTH_SENSORS})] = None
     model: Literal["structured_light", "stereo"] = "structured_light"
     baseline: Positive = 0.075
     focal: NonNegative = 0.0
@@ -117,6 +121,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     Attributes:
         name: Name of the camera, unique on its body.
+        preset: Real sensor with its figures as defaults; keys beside it override them.
         images: Kinds of image that it gives.
         width: Width of its images, pixels.
         height: Height of its images, pixels.
@@ -171,6 +176,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1, pattern="^[A-Za-z0-9_]+$")]
+    preset: Annotated[str | None, msgspec.Meta(extra={"presets": CAMERAS, "needed": _SIZES})] = None
     images: tuple[ImageKind, ...] = ("rgb", "depth")
     width: Pixels = 512
     height: Pixels = 512

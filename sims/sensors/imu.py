@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from math import sqrt
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from events import ImuAnnouncement, Quaternion, Vector3
 from events.frames import cross, inverse, multiply, rotate, rotate_inverse, slerp
+from sims.presets import IMUS
 from sims.sensors.sensor import Mount, NonNegative
 
 _BLOCK = 512
@@ -44,6 +45,9 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Errors of an IMU, named as in `events.ImuAnnouncement`; by default the noise of a usual MEMS.
 
     Attributes:
+        preset: Real sensor with its figures as defaults; keys beside it override them.
+        rate: Samples per second, and of the ground truth, in the place of the vehicle's `imu_rate`;
+            0: as that says.
         gyroscope_noise_density: White noise of the angular velocity, rad/s/√Hz (AirSim:
             ``AngularRandomWalk``, in °/√h).
         gyroscope_random_walk: Random walk of its bias, rad/s²/√Hz (AirSim: ``GyroBiasStability``
@@ -71,6 +75,8 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
             the sample before, as of IMUs that give delta angles and delta velocities.
     """
 
+    preset: Annotated[str | None, msgspec.Meta(extra={"presets": IMUS})] = None
+    rate: Annotated[float, msgspec.Meta(ge=0.0, le=1000.0)] = 0.0
     gyroscope_noise_density: NonNegative = 1.7e-4
     gyroscope_random_walk: NonNegative = 2e-5
     accelerometer_noise_density: NonNegative = 2e-3
@@ -249,6 +255,7 @@ class ImuModel:
         same = {name: getattr(p, name) for name in fields if hasattr(p, name)}
         gyroscope, accelerometer = (tuple(matrix.ravel().tolist()) for matrix in self.matrices)
         special = {
+            "rate": self._rate,
             "gyroscope_matrix": gyroscope,
             "accelerometer_matrix": accelerometer,
             "vibration": p.vibration.amplitude,
@@ -257,7 +264,7 @@ class ImuModel:
             "parent_frame_id": body,
             "frame_id": source if p.mounted else body,
         }
-        return ImuAnnouncement(**{**same, **special}, stamp=stamp, source=source, rate=self._rate)
+        return ImuAnnouncement(**{**same, **special}, stamp=stamp, source=source)
 
     def _shake(self, rates: Vector3, force: Vector3, thrusts: Any) -> tuple[Vector3, Vector3]:
         """Add the vibration of the rotors, and turn them on."""

@@ -23,6 +23,7 @@ from sims.cameras.renderer import model_from_bytes
 from sims.cameras.response import generator
 from sims.cameras.rig import DrawnWorld
 from sims.cameras.stage import LOOK
+from sims.presets import LIDARS
 from sims.sensors.rays import Floats, Rays
 from sims.sensors.sensor import Mounted, Name, NonNegative, Positive, SensorSpec, generator_of
 from sims.vehicle import TIMESTEP_NS, Physics
@@ -42,6 +43,7 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     Attributes:
         name: Name of the sensor, unique on its body.
+        preset: Real sensor with its figures as defaults; keys beside it override them.
         rate: Turns per second (AirSim: ``RotationsPerSecond``).
         pattern: ``spinning``: rings, column by column, clockwise seen from above. ``solid_state``:
             a rosette in the field of view that does not repeat, as two turning prisms draw it.
@@ -62,6 +64,7 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
 
     name: Name
+    preset: Annotated[str | None, msgspec.Meta(extra={"presets": LIDARS})] = None
     rate: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 10.0
     pattern: Literal["spinning", "solid_state"] = "spinning"
     channels: Annotated[int, msgspec.Meta(ge=1, le=256)] = 16

@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import msgspec
 import mujoco
 
 from events import Announcement, Event, Imu, ImuAnnouncement, TransformStamped
@@ -28,6 +29,8 @@ from sims.simulator import SimulatorConfig
 from sims.vehicle import Physics, State
 from sims.world import Rate
 
+_RATE = 200
+
 
 class SensorsConfig(SimulatorConfig):
     """Settings of a vehicle's sensors.
@@ -35,7 +38,7 @@ class SensorsConfig(SimulatorConfig):
     Attributes:
         imu_rate: Rate of the IMU and of the ground truth (`odometry`), Hz. The ground truth is also
             sent at each exposure.
-        imu: Noise of the IMU.
+        imu: Noise of the IMU, or the name of a preset.
         barometer: The barometer; none if it is not set. ``{}`` is one with all its defaults.
         gnss: The satellite receiver; none if it is not set.
         magnetometer: The magnetometer; none if it is not set.
@@ -43,7 +46,7 @@ class SensorsConfig(SimulatorConfig):
         lidars: The lidars.
     """
 
-    imu_rate: Rate = 200
+    imu_rate: Rate = _RATE
     imu: ImuParameters = ImuParameters()
     barometer: BarometerSpec | None = None
     gnss: GnssSpec | None = None
@@ -52,6 +55,13 @@ class SensorsConfig(SimulatorConfig):
     lidars: tuple[LidarSpec, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.imu.rate:
+            if self.imu_rate not in (_RATE, self.imu.rate):
+                raise ValueError(
+                    f"imu.rate: expected imu_rate or this, found {self.imu_rate:g} and "
+                    f"{self.imu.rate:g} Hz"
+                )
+            msgspec.structs.force_setattr(self, "imu_rate", self.imu.rate)
         names = {"imu", "barometer", "gnss", "magnetometer"}
         for field in ("cameras", "range_finders", "lidars"):
             for spec in getattr(self, field):

@@ -90,6 +90,7 @@ ODD: list[tuple[str, Config, list[Announcement], str]] = [
     ),
     ("monotonic", file(), [square(info=wide())], "of its image's rim shows nothing"),
     ("latency", file(latency="80ms"), [square(), ESTIMATES], "its latency is 80 ms"),
+    ("latency", file(latency="0ms"), [square(), ESTIMATES], "its estimates take no time"),
     ("zero-noise", file(), [square(noise=0.0), ESTIMATES], "its images have no noise"),
     (
         "zero-noise",

@@ -1,0 +1,111 @@
+"""Presets: tables of settings by name, which a table of the file takes and overrides key by key.
+
+    imu = "bmi088"                                      # all of a preset
+    imu = { preset = "bmi088", g_sensitivity = 0.0 }    # all but one setting
+
+A settings class offers them by a field ``preset``, whose type holds them::
+
+    class ImuParameters(...):
+        preset: Annotated[str | None, msgspec.Meta(extra={"presets": IMUS})] = None
+
+Beside ``"presets"``, ``"needed": {"width": "intrinsics"}`` says that who overrides a preset's width
+has to override its intrinsics, if it has any.
+
+They are put in where a file is read: `preset` is unset in the settings that result, which hold all
+figures, so that they stay what they are if a later version changes the preset.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, get_origin
+
+import msgspec
+
+from runtime.config.messages import show, struct_in
+from runtime.errors import ConfigError, suggest
+
+Presets = Mapping[str, Mapping[str, Any]]
+
+
+def presets_in(extra: Mapping[str, Any] | None) -> Presets:
+    """Return the presets in the `extra` of a type's `Meta`."""
+    found: Presets = (extra or {}).get("presets", {})
+    return found
+
+
+@functools.cache
+def by_name_alone(table: type[msgspec.Struct]) -> tuple[str, ...]:
+    """Return the presets whose name may stand in the place of the whole table."""
+    required = any(field.required for field in msgspec.structs.fields(table))
+    return () if required else tuple(presets_in(_extra(table)))
+
+
+def expanded(value: Any, type_: Any, where: str, path: Sequence[str] = ()) -> Any:
+    """Return settings of the file with their presets put in, at any depth.
+
+    Args:
+        type_: The type of the settings.
+        where: Begins the message of an error.
+
+    Raises:
+        ConfigError: There is no such preset, or a setting is overridden without another which
+            belongs to it.
+    """
+    table = None if get_origin(type_) is dict else struct_in(type_)
+    if table is None:
+        return value
+    if isinstance(value, list):
+        at, last = path[:-1], path[-1] if path else ""
+        return [expanded(v, table, where, (*at, f"{last}[{i}]")) for i, v in enumerate(value)]
+    extra = _extra(table)
+    if isinstance(value, str) and extra:
+        value = {"preset": value}
+    if not isinstance(value, Mapping):
+        return value
+    if isinstance(value.get("preset"), str) and extra:
+        value = _put_in(value, extra, f"{where}: {'.'.join((*path, 'preset'))}")
+    types = _types(table)
+    return {k: expanded(v, types.get(k), where, (*path, k)) for k, v in value.items()}
+
+
+def _put_in(value: Mapping[str, Any], extra: Mapping[str, Any], where: str) -> dict[str, Any]:
+    presets, name = presets_in(extra), value["preset"]
+    if name not in presets:
+        raise ConfigError(
+            f"{where}: expected one of {', '.join(presets)}, found {show(name)}"
+            + suggest(name, presets)
+        )
+    preset = presets[name]
+    for key, other in extra.get("needed", {}).items():
+        changed = key in value and value[key] != preset.get(key)
+        if changed and other in preset and other not in value:
+            raise ConfigError(
+                f"{where}: expected {other} beside {key}, since that of {name} belongs to its own "
+                f"{key}, found none"
+            )
+    return _merged(preset, {key: each for key, each in value.items() if key != "preset"})
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Return two tables in one: the values of `above`, tables merged with those of `below`."""
+    both = {
+        key: _merged(below[key], value)
+        if isinstance(value, Mapping) and isinstance(below.get(key), Mapping)
+        else value
+        for key, value in above.items()
+    }
+    return {**below, **both}
+
+
+@functools.cache
+def _extra(table: type[msgspec.Struct]) -> Mapping[str, Any]:
+    """Return what the type of a settings class's field ``preset`` holds; nothing without one."""
+    marks = getattr(_types(table).get("preset"), "__metadata__", ())
+    return next((mark.extra for mark in marks if presets_in(mark.extra)), {})
+
+
+@functools.cache  # reading annotations takes some tenths of a millisecond
+def _types(table: type[msgspec.Struct]) -> dict[str, Any]:
+    return {field.encode_name: field.type for field in msgspec.structs.fields(table)}
