@@ -90,13 +90,12 @@ def _put_in(value: Mapping[str, Any], extra: Mapping[str, Any], where: str) -> d
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """Return two tables in one: the values of `above`, tables merged with those of `below`."""
-    both = {
-        key: _merged(below[key], value)
-        if isinstance(value, Mapping) and isinstance(below.get(key), Mapping)
-        else value
-        for key, value in above.items()
-    }
-    return {**below, **both}
+    both = {**below, **above}
+    for key in below.keys() & above.keys():
+        old, new = below[key], above[key]
+        if isinstance(old, Mapping) and isinstance(new, Mapping) and "preset" not in new:
+            both[key] = _merged(old, new)
+    return both
 
 
 @functools.cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -91,7 +91,7 @@ def test_the_rules_of_lint_object_to_no_preset() -> None:
     config = read(f'trigger = "imu"\nimu_rate = 600\nimu = "bmi088"\n{cameras}')
     said = [
         announcement(spec, source=f"drone/{spec.name}", prefix="", parent_frame_id="base_link")
-        for spec in config.nodes[0].config.cameras
+        for spec in cast("MultirotorConfig", config.nodes[0].config).cameras
     ]
     assert {each.rule for each in lint(config, said)} <= {"no-end", "idle"}
 
@@ -148,7 +148,9 @@ def test_a_mistake_is_told_with_the_names(text: str, said: str) -> None:
 
 def test_settings_of_the_results_are_those_of_the_run_without_a_preset() -> None:
     """So a run repeats from them, also where a preset has changed since."""
-    config = read('[imu]\npreset = "adis16448"\n[[cameras]]\nname = "z"\npreset = "zed2"\n')
+    config = read(
+        '[imu]\npreset = "adis16448"\nrate = 400\n[[cameras]]\nname = "z"\npreset = "zed2"\n'
+    )
     table = to_builtins(config)
     assert "preset" not in toml(flat(table["nodes"]))
     assert parse(table, "config.toml") == config
