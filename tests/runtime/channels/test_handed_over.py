@@ -46,7 +46,7 @@ def test_numbers_and_arrays_of_numpy_are_written_as_numbers_and_lists(tmp_path: 
     found = run(tmp_path, Numpy)
     written = json.loads((tmp_path / "summary.json").read_text())
     expected = {"passed": True, "rmse": 0.5, "count": 3, "all": [0, 1, 2], "at": {"1": 2}}
-    assert written["verdict"] == {"passed": True, "estimators": {"vo": expected}}
+    assert written["verdict"] == {"passed": True, "estimators": {"vo": expected}, "flights": {}}
     assert found.announcements[0]["values"] == [[1.0, 0.0], [0.0, 1.0]]
 
 
