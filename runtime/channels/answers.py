@@ -9,12 +9,12 @@ import bisect
 import csv
 import math
 import threading
-from array import array
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
+import msgspec
 import xxhash
 from typing_extensions import Buffer
 
@@ -34,6 +34,25 @@ Wrong = Literal["late", "repeated", "contradicting", "unknown"]
 
 COLUMNS = ("stamp_ns", "outcome", "latency_ms")
 FOLDER = "answers"
+
+
+class Settled(msgspec.Struct, frozen=True, gc=False):
+    """A frame whose outcome is known.
+
+    Attributes:
+        stamp: Of the frame (ns).
+        due: When its answer was due (ns).
+        latency: Real seconds that its answer took.
+        digest: Of its answer; `None` if it is known only that there is none.
+        says_lost: Whether the answer reports lost tracking.
+    """
+
+    stamp: int
+    due: int
+    outcome: Outcome
+    latency: float = math.nan
+    digest: int | None = None
+    says_lost: bool = False
 
 
 class Answers:
@@ -59,12 +78,7 @@ class Answers:
         self.why_not: dict[str, None] = {}
         self.costs = Costs()
         self._lock = threading.Lock()
-        self._stamps = array("q")
-        self._latencies = array("d")
-        self._outcomes: list[Outcome] = []
-        self._dues = array("q")
-        self._digests = array("Q")
-        self._says_lost = array("b")
+        self._settled: list[Settled] = []
         self._first: int | None = None
         self._initialised: int | None = None
         self._inputs: dict[str, xxhash.xxh3_128] = {}
@@ -79,34 +93,15 @@ class Answers:
     @property
     def says_lost(self) -> int:
         """Number of answers reporting lost tracking."""
-        return sum(self._says_lost)
+        return sum(each.says_lost for each in self._settled)
 
-    def settled(
-        self,
-        stamp: int,
-        due: int,
-        outcome: Outcome,
-        latency: float = math.nan,
-        digest: int = 0,
-        says_lost: bool = False,
-    ) -> None:
-        """Record the outcome of a frame.
-
-        Args:
-            stamp: Of the frame (ns).
-            due: When its answer is due (ns).
-            latency: Real seconds that its answer took.
-        """
+    def settled(self, frame: Settled) -> None:
+        """Record the outcome of a frame."""
         with self._lock:
-            self.counts[outcome] += 1
-            self._stamps.append(stamp)
-            self._latencies.append(latency)
-            self._outcomes.append(outcome)
-            self._dues.append(due)
-            self._digests.append(digest)
-            self._says_lost.append(says_lost)
-            if outcome == "answered" and self._initialised is None:
-                self._initialised = stamp
+            self.counts[frame.outcome] += 1
+            self._settled.append(frame)
+            if frame.outcome == "answered" and self._initialised is None:
+                self._initialised = frame.stamp
 
     def end(self, now: int) -> None:
         """Forget the outcomes of frames not due by now (ns): nobody has received them.
@@ -114,14 +109,8 @@ class Answers:
         Whether they were answered by now was up to real time, and no figure is.
         """
         with self._lock:
-            kept = [n for n, due in enumerate(self._dues) if due <= now]
-            for name in ("_stamps", "_latencies", "_dues", "_digests", "_says_lost"):
-                column = getattr(self, name)
-                setattr(self, name, array(column.typecode, [column[n] for n in kept]))
-            self._outcomes = [self._outcomes[n] for n in kept]
-            for outcome in get_args(Outcome):
-                self.counts[outcome] = self._outcomes.count(outcome)
-            self.counts = +self.counts
+            self.counts -= Counter(each.outcome for each in self._settled if each.due > now)
+            self._settled = [each for each in self._settled if each.due <= now]
 
     def wrong(self, kind: Wrong) -> None:
         """Count an answer without a waiting frame."""
@@ -164,12 +153,12 @@ class Answers:
     def outputs(self) -> str | None:
         """Return the digest of all answers, by their frames' stamps; `None` if there were none."""
         with self._lock:
-            rows = sorted(zip(self._stamps, self._outcomes, self._digests, strict=True))
+            rows = sorted((each.stamp, each.outcome, each.digest or 0) for each in self._settled)
         return f"{fingerprint(rows):016x}" if rows else None
 
     def latency_quantiles(self, *quantiles: float) -> list[float | None]:
         """Return quantiles of the real seconds to an answer; `None` without answers."""
-        known = sorted(each for each in self._latencies if not math.isnan(each))
+        known = sorted(s.latency for s in self._settled if not math.isnan(s.latency))
         return [
             known[min(int(q * len(known)), len(known) - 1)] if known else None for q in quantiles
         ]
@@ -185,11 +174,9 @@ class Answers:
         with file.open("w", newline="", encoding="utf-8") as out:
             rows = csv.writer(out)
             rows.writerow(COLUMNS)
-            for stamp, outcome, latency in zip(
-                self._stamps, self._outcomes, self._latencies, strict=True
-            ):
-                known = "" if math.isnan(latency) else f"{latency * 1e3:.6f}"
-                rows.writerow((stamp, outcome, known))
+            for each in self._settled:
+                known = "" if math.isnan(each.latency) else f"{each.latency * 1e3:.6f}"
+                rows.writerow((each.stamp, each.outcome, known))
 
 
 def read_latencies(path: Path, factor: float = 1.0) -> Callable[[int], float]:

@@ -31,7 +31,7 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 import msgspec
 from typing_extensions import Buffer
 
-from runtime.channels.answers import Answers, Outcome, Wrong, read_latencies
+from runtime.channels.answers import Answers, Outcome, Settled, Wrong, read_latencies
 from runtime.channels.digest import fingerprint
 from runtime.errors import MissingAnswerError
 from runtime.paths import InputPath
@@ -170,7 +170,7 @@ class Hold(Generic[T]):
             self.answers.why_not["the clock is real"] = None
         self._changed = threading.Condition()
         self._owed: dict[int, Owed[T]] = {}  # by stamp, in the order of sending
-        self._settled: dict[int, tuple[Outcome, int | None]] = {}  # and digest of the answer
+        self._settled: dict[int, Settled] = {}  # by stamp
         self._last: tuple[int, int] | None = None  # stamp and due of the newest frame
         self._began: tuple[int, float] | None = None  # stamp and real time of the first frame
         self._heard: float | None = None  # when it last answered anything
@@ -254,17 +254,15 @@ class Hold(Generic[T]):
             owed = self._match(stamp)
             if owed is None:
                 known = _nearest(stamp, self._settled, self.config.tolerance_ns)
-                before, earlier = (None, None) if known is None else self._settled[known]
-                kind: Wrong = "unknown"
-                if earlier is not None:
-                    same = value is None or digest == earlier  # no more to come, or the same
+                before = None if known is None else self._settled[known]
+                kind: Wrong = "unknown" if before is None else "late"
+                if before is not None and before.digest is not None:
+                    same = value is None or digest == before.digest  # no more to come, or the same
                     kind = "repeated" if same else "contradicting"
-                elif before is not None:
-                    kind = "late"
                 self.answers.wrong(kind)
                 if kind == "contradicting":
                     self._contradicted(stamp)
-                elif before == "initialising":
+                elif before is not None and before.outcome == "initialising":
                     self.doubt("its first answer came too late to be held for")
             if self._let_go:
                 self._log(f"{self.name}: it answers again")
@@ -279,8 +277,7 @@ class Hold(Generic[T]):
             outcome: Outcome = "empty" if value is None else "answered"
             if says == "initialising":
                 outcome, value = "initialising", None
-            lost = says == "lost"
-            self._settle(owed, outcome, value, now - owed.since, digest, says_lost=lost)
+            self._settle(owed, outcome, value, now - owed.since, digest, says == "lost")
 
     def gone(self, why: str) -> None:
         """Report the loss of the system, effective at once.
@@ -367,21 +364,19 @@ class Hold(Generic[T]):
         return None if near is None else self._owed[near]
 
     def _settle(
-        self,
-        owed: Owed[T],
-        outcome: Outcome,
-        value: T | None = None,
-        seconds: float = float("nan"),
-        digest: int | None = None,
-        *,
-        says_lost: bool = False,
+        self, owed: Owed[T], outcome: Outcome, value: T | None = None, *answer: Any
     ) -> None:
+        """Settle a frame.
+
+        Args:
+            answer: Of what came: latency, digest, and whether it says lost; see `Settled`.
+        """
         del self._owed[owed.stamp]
-        self._settled[owed.stamp] = outcome, digest
+        settled = Settled(owed.stamp, owed.due, outcome, *answer)
+        self._settled[owed.stamp] = settled
         while len(self._settled) > _REMEMBERED:
             del self._settled[next(iter(self._settled))]
-        found = digest or 0
-        self.answers.settled(owed.stamp, owed.due, outcome, seconds, found, says_lost)
+        self.answers.settled(settled)
         (owed.work if owed.later is None else owed.later).set_result(value)
 
     def _release(self, owed: Owed[T]) -> None:

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.channels.answers import Answers
+from runtime.channels.answers import Answers, Settled
 from runtime.channels.hold import BEHIND, IN_A_ROW, Hold, HoldConfig
 from runtime.errors import MissingAnswerError
 from runtime.summary import OUTSIDE_COLUMNS, OutsideSummary
@@ -381,8 +381,8 @@ class TestLatencies:
     ) -> None:
         answers = Answers()
         for number, milliseconds in enumerate([10.0, 50.0, 5.0]):
-            answers.settled(number * PERIOD, 0, "answered", milliseconds / 1e3)
-        answers.settled(3 * PERIOD, 0, "lost")
+            answers.settled(Settled(number * PERIOD, 0, "answered", milliseconds / 1e3))
+        answers.settled(Settled(3 * PERIOD, 0, "lost"))
         answers.write(tmp_path, "slam")
         file = tmp_path / "answers" / "slam.csv"
         came, hold = fly(answer_all, latencies=str(file), latency_factor=2.0)

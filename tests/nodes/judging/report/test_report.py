@@ -20,7 +20,7 @@ from nodes.judging.report.folder import read_run
 from nodes.judging.report.page import report, write_report
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
-from runtime.channels.answers import Answers
+from runtime.channels.answers import Answers, Settled
 from runtime.errors import ConfigError
 from runtime.summary import OutsideSummary
 from tests.nodes.judging.report.folders import evaluated, frame, ply, recorded, summary, walk
@@ -217,7 +217,7 @@ def test_a_system_that_lost_frames_is_told_at_the_top_and_in_a_table(tmp_path: P
     for stamp in range(3):
         answers.owed(stamp)
         answers.took_in("images", bytes([stamp]))
-        answers.settled(stamp, stamp, "lost" if stamp == 1 else "answered", 0.004)
+        answers.settled(Settled(stamp, stamp, "lost" if stamp == 1 else "answered", 0.004))
     answers.why_not["frames were lost after 10 s of real time"] = None
     truth = walk(2)
     verdict = evaluated(tmp_path, truth, {"slam": recorded(truth)}, Thresholds(), truth)
