@@ -1,4 +1,4 @@
-"""Runs, sweeps and judgements from Python; and the console command ``visnav``.
+"""Runs, sweeps, comparisons and judgements from Python; and the console command ``visnav``.
 
     import visnav
 
@@ -9,6 +9,7 @@
 
     old = visnav.load("runs/tour")
     table = visnav.sweep("config.toml", {"camera.rate": [10, 30]}, seeds=3)
+    compared = visnav.compare("config.toml", b={"odometry.corners": 500}, margin=5)
     judged = visnav.judge("groundtruth.txt", {"mine": "estimate.txt"}, alignment="se3")
 
 A run has a thread and an event loop of its own, so it may be started from a notebook, whose own
@@ -20,14 +21,12 @@ This module stands outside the packages, so that it can tell when `runtime` is a
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import copy
 import importlib.util
 import sys
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,9 +39,9 @@ if TYPE_CHECKING:
     from nodes.judging.report.tables import Verdict
     from nodes.trajectory import Trajectory
     from runtime.config.model import Config
-    from runtime.run.supervisor import Supervisor
+    from runtime.tools.comparison import Compared
 
-__all__ = ["Run", "judge", "load", "run", "sweep"]
+__all__ = ["Run", "compare", "judge", "load", "run", "sweep"]
 
 
 class Run:
@@ -169,6 +168,8 @@ def run(
     """
     _check_runtime()
     from runtime.errors import ConfigError
+    from runtime.run.threaded import ThreadedRun
+    from runtime.tools.cli.run import observed
     from runtime.tools.preflight import of_file
 
     changes = dict(set or {})
@@ -181,9 +182,12 @@ def run(
     for warning in found.warnings:
         warnings.warn(warning, stacklevel=2)
     folder = Path(out) if out is not None else Path("runs") / settings.run.name
-    flight = _Flight(settings, folder, quiet)
-    flight.start()
-    flight.wait()
+    handlers, watch = observed(
+        settings, settings.run.name, quiet=quiet, trace=None, top=False, web=None
+    )
+    thread = ThreadedRun(settings, folder, handlers, watch)
+    thread.start()
+    thread.wait()
     return load(folder)
 
 
@@ -239,11 +243,7 @@ def sweep(
             are kept.
     """
     _check_runtime()
-    from concurrent.futures import ThreadPoolExecutor
-
     from runtime.tools import sweep as sweeping
-    from runtime.tools.cli.sweep import at_once
-    from runtime.tools.sweep.plan import value
 
     plan = sweeping.make_plan(
         Path(config),
@@ -253,32 +253,70 @@ def sweep(
         repeats=repeat,
         out=None if out is None else Path(out),
     )
-    children = sweeping.Children()
-    with ThreadPoolExecutor(jobs or at_once(plan), "run") as executor:
-        watch = sweeping.Watch()
-        watch.interrupted = children.interrupt  # type: ignore[method-assign]
-        rows = sweeping.sweep(plan, executor, run=children.run, watch=watch, fresh=fresh)
+    rows = sweeping.run_here(plan, jobs=jobs, fresh=fresh)
     sweeping.write_tables(plan, rows)
     sweeping.draw_plots(plan, rows)
     sweeping.write_page(plan, rows)
-    table = [
-        {
-            **{path: value(text) for path, text in row["parameters"].items()},
-            "seed": row["seed"],
-            "repeat": row.get("repeat", 1),
-            "estimator": name,
-            "error": row["error"],
-            "passed": row["passed"],
-            **figures,
-        }
-        for row in rows
-        for name, figures in (row["estimators"] or {"": {}}).items()
-    ]
+    table = sweeping.records(rows)
     try:
         import pandas as pd
     except ImportError:
         return table
     return pd.DataFrame(table)
+
+
+def compare(
+    *what: str | Path,
+    a: Mapping[str, Any] | None = None,
+    b: Mapping[str, Any] | None = None,
+    seeds: int = 12,
+    repeat: int = 1,
+    figures: Sequence[str] = (),
+    margin: float = 0.0,
+    set: Mapping[str, Any] | None = None,  # noqa: A002  # as the command's --set
+    out: str | Path = "compared",
+    jobs: int | None = None,
+) -> Compared:
+    """Compare two versions over equal flights: is B better than A? See the command ``compare``.
+
+    Args:
+        what: Files, one a scenario; or two folders of finished sweeps or runs, A and B.
+        a: Settings of A: ``{"odometry.corners": 300}``; the files as they are, if not given.
+        b: Settings of B.
+        seeds: Flights of each file, at most: half of them may be enough.
+        repeat: Runs with each flight, averaged.
+        figures: What to compare; if not given, errors, rotation and coverage.
+        margin: Change that does not matter, in percent, or in the figure's unit where it may be 0.
+        set: Settings to change in both.
+        out: Folder for runs and page.
+        jobs: Runs at the same time; by default, as many as fit on the cores.
+
+    Returns:
+        `rows`, one a figure of an estimator, with `change`, `low`, `high`, `p` and the verdict in
+        `words`; `worse`, with which the command ends with 1; and the `page`.
+
+    Raises:
+        ConfigError: A file, a folder, a setting or a figure is wrong, or nothing is in common.
+        KeyboardInterrupt: After Ctrl-C, once all runs have ended; the next call goes on.
+    """
+    _check_runtime()
+    import functools
+
+    from runtime.tools import comparison
+    from runtime.tools import sweep as sweeping
+
+    return comparison.compare(
+        [Path(each) for each in what],
+        _changes(a or {}),
+        _changes(b or {}),
+        seeds=seeds,
+        repeats=repeat,
+        figures=figures,
+        margin=margin,
+        overrides=_changes(set or {}),
+        out=Path(out),
+        fly=functools.partial(sweeping.run_here, jobs=jobs),
+    )
 
 
 def judge(
@@ -351,66 +389,6 @@ def judge(
         judging.write(Path(out), true, judgements, verdict, notes)
         return load(out)
     return Run(judging.in_memory(true, judgements, verdict, notes), None)
-
-
-class _Flight(threading.Thread):
-    """One run in a thread and an event loop of its own."""
-
-    def __init__(self, config: Config, folder: Path, quiet: bool) -> None:
-        super().__init__(name=f"run {config.run.name}", daemon=True)
-        self._config = config
-        self._folder = folder
-        self._quiet = quiet
-        self._stop: Callable[[], object] | None = None
-        self._interrupted = False
-        self._error: BaseException | None = None
-        self._over = threading.Event()
-
-    def run(self) -> None:
-        from runtime.run.execute import execute
-        from runtime.tools.cli.run import observed
-
-        try:
-            handlers, watch = observed(
-                self._config,
-                self._config.run.name,
-                quiet=self._quiet,
-                trace=None,
-                top=False,
-                web=None,
-            )
-
-            @contextlib.contextmanager
-            def watching(supervisor: Supervisor) -> Iterator[None]:
-                loop = asyncio.get_running_loop()
-                self._stop = lambda: loop.call_soon_threadsafe(supervisor.stop, "Ctrl-C")
-                if self._interrupted:
-                    self._stop()
-                with watch(supervisor):
-                    yield
-
-            execute(self._config, self._folder, handlers=handlers, watch=watching)
-        except BaseException as error:
-            self._error = error
-        finally:
-            self._over.set()
-
-    def wait(self) -> None:
-        """Wait for the end; raise what went wrong.
-
-        A Ctrl-C ends the run first; a second one is raised at once.
-        """
-        try:
-            self._over.wait()
-        except BaseException:
-            self._interrupted = True
-            if self._stop is not None:
-                with contextlib.suppress(RuntimeError):  # the loop is closed
-                    self._stop()
-            self._over.wait()
-            raise
-        if self._error is not None:
-            raise self._error
 
 
 def _settings(config: str | Path | Mapping[str, Any], changes: Mapping[str, Any]) -> Config:

@@ -47,7 +47,7 @@ def suite(
     from bench.estimators.page import write_page
     from bench.estimators.plan import make_plan, read_suite
     from runtime.run.summarise import command_line
-    from runtime.tools.cli.sweep import carry_out
+    from runtime.tools.cli.sweep import carry_out, end
 
     with writing("suite", junit, json) as outcomes:
         chosen = (read_suite(file) if file else read_suite()).only(scenario or [], estimator or [])
@@ -57,6 +57,4 @@ def suite(
     path = page or out / "SUITE.md"
     write_page(chosen, plan, rows, path, command_line())
     typer.echo(f"{len(rows)} runs   the page is {path}")
-    if crashed := sum(bool(row["error"]) for row in rows):
-        typer.echo(f"error: {crashed} of {len(rows)} runs crashed", err=True)
-        raise typer.Exit(2)
+    end(rows, judged=False)

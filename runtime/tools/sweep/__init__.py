@@ -23,11 +23,11 @@ found at the same paths on every machine, and a run's folder of results stays on
 ran it unless the sweep's folder is shared. The rows come back in any case.
 """
 
-from runtime.tools.sweep.console import Watch, sweep
+from runtime.tools.sweep.console import Watch, run_here, sweep
 from runtime.tools.sweep.plan import Job, Plan, make_job, make_plan, sharing
 from runtime.tools.sweep.plots import draw_plots, write_page
 from runtime.tools.sweep.process import Children, run_job
-from runtime.tools.sweep.tables import Row, summarise, write_tables
+from runtime.tools.sweep.tables import Row, records, summarise, write_tables
 
 __all__ = [
     "Children",
@@ -38,6 +38,8 @@ __all__ = [
     "draw_plots",
     "make_job",
     "make_plan",
+    "records",
+    "run_here",
     "run_job",
     "sharing",
     "summarise",

@@ -6,6 +6,7 @@ Runs that are finished already are not run again.
 from __future__ import annotations
 
 import concurrent.futures
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
@@ -84,6 +85,25 @@ def sweep(
                     rows.add(row)
             raise
         return [row for job in plan.jobs if (row := rows.get(job)) is not None]
+
+
+def run_here(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> list[Row]:
+    """Run the missing jobs of a plan on this machine, and show nothing; see `sweep`.
+
+    Args:
+        jobs: Runs at the same time; `at_once` if not given.
+    """
+    children = Children()
+    watch = Watch()
+    watch.interrupted = children.interrupt  # type: ignore[method-assign]
+    with concurrent.futures.ThreadPoolExecutor(jobs or at_once(plan), "run") as executor:
+        return sweep(plan, executor, run=children.run, watch=watch, fresh=fresh)
+
+
+def at_once(plan: Plan) -> int:
+    """Return how many runs fit on the cores: rendering takes one of its own."""
+    cores = len(os.sched_getaffinity(0))
+    return cores if all(job.record for job in plan.jobs) else max(cores // 2, 1)
 
 
 def _submit(

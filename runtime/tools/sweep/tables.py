@@ -21,7 +21,7 @@ import msgspec
 
 from runtime.errors import ConfigError
 from runtime.figures import IN_SWEEPS, figure
-from runtime.tools.sweep.plan import Job, Plan
+from runtime.tools.sweep.plan import Job, Plan, value
 
 
 class Row(TypedDict):
@@ -230,6 +230,23 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
             line += [getattr(each.figures.get(name), field, None) for field in SPREAD.values()]
         lines.append(line)
     _write(plan.out / "summary.csv", header, lines)
+
+
+def records(rows: Iterable[Row]) -> list[dict[str, Any]]:
+    """Return a record for each run and estimator: what was varied, and all figures."""
+    return [
+        {
+            **{path: value(text) for path, text in row["parameters"].items()},
+            "seed": row["seed"],
+            "repeat": row.get("repeat", 1),
+            "estimator": name,
+            "error": row["error"],
+            "passed": row["passed"],
+            **figures,
+        }
+        for row in rows
+        for name, figures in (row["estimators"] or {"": {}}).items()
+    ]
 
 
 def in_order(plan: Plan, rows: Iterable[Row]) -> list[tuple[Job, Row]]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import msgspec
 import numpy as np
@@ -16,17 +18,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import wilcoxon
 
+import visnav
 from runtime.errors import ConfigError
 from runtime.node import Node, NodeConfig
-from runtime.tools.comparison import (
-    Comparison,
-    Key,
-    compare_rows,
-    compare_values,
-    read_folder,
-    signed_rank,
-)
+from runtime.tools.cli.compare import of_comparison
+from runtime.tools.comparison import Comparison, Key, compare_rows, compare_values, read_folder
+from runtime.tools.comparison.statistics import compare_until_sure, signed_rank
 from runtime.tools.sweep import Row
+from tests.nodes.outside.process.rig import STUB
 from tests.runtime.tools.samples_cli import ROOT, command_here
 
 Pairs = Mapping[Key, tuple[float | None, float | None]]
@@ -69,6 +68,58 @@ def test_several_figures_together_err_no_more_often() -> None:
     assert wrong <= 200 * 0.05 + 2 * math.sqrt(200 * 0.05 * 0.95)
 
 
+def sequential(seed: int, calls: list[int], shares: bool = True) -> bool:
+    """Return whether calls with more and more equal flights find a difference, sooner or later."""
+    whole = flights(max(calls), 1.0, seed)
+    looked: list[int] = []
+
+    def compare(count: int, error: float) -> list[Comparison]:
+        pairs = {key: pair for key, pair in whole.items() if key[1] < count}
+        return [ate(pairs, error=error if shares else 0.05)]
+
+    found = [compare_until_sure(compare, most, looked)[0].verdict for most in calls]
+    assert looked == sorted(set(looked))
+    return any(each in {"better", "worse"} for each in found)
+
+
+@pytest.mark.slow
+def test_whoever_adds_flights_until_there_is_a_difference_finds_none_more_often() -> None:
+    calls, trials = [8, 12, 16, 24, 40, 64], 300
+    wrong = sum(sequential(seed, calls) for seed in range(trials))
+    naive = sum(sequential(seed, calls, shares=False) for seed in range(trials))
+    limit = trials * 0.05 + 2 * math.sqrt(trials * 0.05 * 0.95)
+    assert 0 < wrong <= limit < naive  # which proves that these calls could
+
+
+def test_a_look_has_half_the_error_of_the_one_before_and_keeps_it() -> None:
+    asked: list[tuple[int, float]] = []
+
+    def compare(count: int, error: float) -> list[Comparison]:
+        asked.append((count, error))
+        return [ate(flights(count, 1.0), error=error)]
+
+    looked: list[int] = []
+    for most in (12, 24, 24, 30):
+        compare_until_sure(compare, most, looked)
+    # Six flights cannot tell, whatever they show, and so take nothing from the others.
+    assert asked == [
+        *((6, 0.025), (12, 0.025)),
+        *((12, 0.025), (24, 0.0125)),
+        *((12, 0.025), (24, 0.0125)),
+        (30, 0.00625),
+    ]
+    assert looked == [12, 24, 30]
+    asked.clear()
+    clear = flights(40, 3.0)
+
+    def decided(count: int, error: float) -> list[Comparison]:
+        asked.append((count, error))
+        return [ate({key: pair for key, pair in clear.items() if key[1] < count}, error=error)]
+
+    compare_until_sure(decided, 40, [])
+    assert asked == [(20, 0.025)]
+
+
 def test_a_small_worsening_is_found_with_enough_flights_and_asked_for_with_few() -> None:
     few = ate(flights(6, 1.1, noise=0.15))
     assert (few.verdict, few.relative) == ("not enough runs", True)
@@ -93,6 +144,52 @@ def test_within_the_margin_there_is_no_difference() -> None:
     assert ate(flights(60, 1.0, noise=0.5), margin=5).verdict == "not enough runs"
     assert ate(flights(60, 1.0, noise=0.5), margin=5).inferior(5)
     assert not ate(pairs, margin=5).inferior(5)
+
+
+def test_a_margin_forgives_what_is_within_it_however_sure() -> None:
+    pairs = {("tour", n): (1.0, 1.02 + n / 1e4) for n in range(20)}
+    assert (ate(pairs).verdict, ate(pairs).fails(0)) == ("worse", True)
+    found = ate(pairs, margin=5)
+    assert (found.verdict, found.fails(5), found.fails(1)) == ("no difference", False, True)
+
+
+def test_errors_after_different_alignments_are_not_comparable() -> None:
+    def rows(factor: float, alignment: str) -> dict[Key, list[Row]]:
+        found = {("t", n): [row(n, ate_percent=factor + n / 100)] for n in range(12)}
+        for (each,) in found.values():
+            each["estimators"]["vo"] |= {
+                "alignment": alignment,
+                "frame_coverage_percent": 90 + factor,
+            }
+        return found
+
+    names = ["ate_percent", "frame_coverage_percent"]
+    error, share = compare_rows(rows(2, "origin"), rows(1, "sim3"), figures=names)
+    assert (error.verdict, share.verdict) == ("not comparable", "worse")
+    assert error.words == "not comparable: after origin and sim3"
+    assert (error.fails(0), error.fails(5)) == (False, True)
+    assert [each.state for each in of_comparison(error, 0)] == ["not judged"]
+    error, _ = compare_rows(rows(2, "origin"), rows(1, "origin"), figures=names)
+    assert error.verdict == "better"
+
+
+def test_a_scenario_fails_where_the_figure_does_and_most_of_its_flights_are_worse() -> None:
+    pairs: dict[Key, tuple[float | None, float | None]] = {}
+    for n in range(12):
+        pairs["hall", n], pairs["yard", n] = (1.0, 2.0 + n / 10), (1.0, 0.99)
+    pairs["hall", 3] = (1.0, None)
+    found = ate(pairs)
+    assert (found.verdict, found.by_scenario()) == (
+        "worse",
+        {"hall": (12, 0, 12), "yard": (0, 12, 12)},
+    )
+    hall, yard = of_comparison(found, 0)
+    assert (hall.run, hall.estimator, hall.state) == ("hall", "vo ate_percent", "failed")
+    assert (yard.state, yard.reasons) == ("passed", [])
+    assert hall.reasons[0].endswith("in all; worse in 12 of 12 flights here")
+    doubtful = ate({("hall", n): (1.0, 1.0) for n in range(3)}, margin=5)
+    assert [each.state for each in of_comparison(doubtful, 5)] == ["failed"]  # as the command does
+    assert [each.state for each in of_comparison(doubtful, 0)] == ["not judged"]
 
 
 def test_a_failure_is_worse_than_any_error_and_never_left_out() -> None:
@@ -178,6 +275,8 @@ def test_crashed_runs_repeats_and_other_names() -> None:
     assert (found.failures, found.pairs) == ((0, 1), 8)
     with pytest.raises(ConfigError, match="found none in common: t 0; u 0"):
         compare_rows({("t", 0): [row(0)]}, {("u", 0): [row(0)]})
+    with pytest.raises(ConfigError, match="expected ate_max_m, found none of them in any run"):
+        compare_rows(a, b, figures=["ate_max_m"])
     with pytest.raises(ConfigError, match=r"an estimator in both, found \['vo'\] and \[\]"):
         compare_rows({("t", 0): [row(0, x=1)]}, {("t", 0): [row(0, "crashed")]})
 
@@ -220,23 +319,94 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-def test_settings_are_flown_and_compared(file: Path, tmp_path: Path) -> None:
-    options = ["--seeds", "8", "--figure", "ate_percent", "--json", "c.json"]
+@pytest.mark.timeout(240)
+def test_settings_are_flown_and_compared(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ["--seeds", "8", "--figure", "ate_percent", "--json", "c.json", "--junit", "c.xml"]
     change = ["--b", "judge.error=2"]
     done = command_here("compare", file, *change, *options, folder=tmp_path)
     assert (done.returncode, "worse" in done.stdout) == (1, True), done.stderr
     (found,) = json.loads((tmp_path / "c.json").read_bytes())
     assert (found["verdict"], found["pairs"], found["figure"]) == ("worse", 8, "ate_percent")
     assert found["change"] == pytest.approx(100, abs=40)
+    (case,) = ET.parse(tmp_path / "c.xml").getroot().iter("testcase")
+    assert (case.attrib["classname"], case.attrib["name"]) == ("c", "vo ate_percent")
+    assert [each.tag for each in case] == ["failure"]
     page = (tmp_path / "compared" / "compare.html").read_text(encoding="utf-8")
-    assert '<td class="worse"><b>worse</b></td>' in page
+    assert '<td class="bad"><b>worse</b></td>' in page
     assert "judge.error=2" in page
     # The other way around it is better; and what was flown is not flown again.
     done = command_here("compare", file, "--a", "judge.error=2", *options, folder=tmp_path)
     assert (done.returncode, "better" in done.stdout) == (0, True), done.stderr
+    assert "16 runs are finished already, 0 to do" in done.stderr
+    # From Python it is the same.
+    monkeypatch.chdir(tmp_path)
+    compared = visnav.compare(
+        file, b={"judge.error": 2}, seeds=8, figures=["ate_percent"], margin=5
+    )
+    (one,) = compared.rows
+    assert (one.words, one.pairs) == ("worse", 8)
+    assert one.change == pytest.approx(found["change"])
+    assert 5 < one.low < one.change < one.high
+    assert compared.worse
+    assert compared.page.samefile(tmp_path / "compared" / "compare.html")
+    assert repr(compared).startswith("vo ate_percent: +")
+    with pytest.raises(ConfigError, match="unknown key 'eror'"):
+        visnav.compare(file, b={"judge.eror": 2})
+
+
+PROGRAM = """
+[run]
+name = "rig"
+duration = 1
+[[nodes]]
+name = "eyes"
+type = "tests.nodes.outside.process.rig:Eyes"
+truth = true
+[[nodes]]
+name = "slam"
+type = "Process"
+folder = "builds"
+command = []
+images = ["rgb", "depth"]
+environment = {PYTHONPATH = "$VISNAV_INCLUDE"}
+[[nodes]]
+name = "evaluation"
+type = "Evaluation"
+"""
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(240)
+def test_two_builds_of_a_program_are_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of them is lost in a quarter of the images; both lie beside the file."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    file = tmp_path / "rig.toml"
+    file.write_text(PROGRAM, encoding="utf-8")
+    (tmp_path / "builds").mkdir()
+    shutil.copy(STUB, tmp_path / "builds" / "new")
+    text = Path(STUB).read_text(encoding="utf-8")
+    old = text.replace('"loses" in modes', "True")
+    assert old != text
+    (tmp_path / "builds" / "old").write_text(old, encoding="utf-8")
+    sides = {
+        f"--{side}": f'slam.command=["$VISNAV_PYTHON", "{name}"]'
+        for side, name in (("a", "old"), ("b", "new"))
+    }
+    options = ["--seeds", "1", "--figure", "frame_coverage_percent", "--json", "c.json"]
+    words = [word for pair in sides.items() for word in pair]
+    done = command_here("compare", file, *words, *options, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (found,) = json.loads((tmp_path / "c.json").read_bytes())
+    assert (found["failures"], found["b"]) == ([0, 0], 100)
+    assert found["a"] == pytest.approx(75, abs=5)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
 def test_finished_sweeps_are_compared(file: Path, tmp_path: Path) -> None:
     for name, change in (("old", "judge.error=1"), ("new", "judge.error=0.3")):
         options = ["--seeds", "7", "--set", change, "--out", name]

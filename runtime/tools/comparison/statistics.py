@@ -1,4 +1,4 @@
-"""Is B better than A? Comparison paired over flights, with an interval and a verdict in words.
+"""Comparison paired over flights, with an interval and a verdict in words.
 
 Both sides get the same recorded flights, so the difference of a pair has no part in how hard its
 flight was. The test is Wilcoxon's signed-rank test (F. Wilcoxon, Individual comparisons by ranking
@@ -9,14 +9,14 @@ any other pair differs, and is never left out.
 
 A figure that is positive in all pairs is compared by its ratio, in percent, others by their
 difference. Of several figures or estimators each gets its share of the error (Bonferroni), and so
-does each look where flights are added until the answer is sure.
+does each look where flights are added until the answer is sure: half of it the first, a quarter the
+second, and so on, so that all looks ever made have no more than the whole.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import msgspec
@@ -39,7 +39,7 @@ USUAL = ("flight_ate_percent", "rpe_1m_trans_percent", "rot_rmse_deg", "frame_co
 ERROR = 0.05
 """Share of comparisons without a difference in which one may be found, of all figures together."""
 
-Word = Literal["better", "worse", "no difference", "not enough runs"]
+Word = Literal["better", "worse", "no difference", "not enough runs", "not comparable"]
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
@@ -55,7 +55,9 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
         p: Share of random signs with a result as extreme.
         pairs: Number of flights.
         failures: Flights without the figure, in A and in B.
+        verdict: "not comparable" for an error after different alignments in A and B.
         more: Flights that would probably tell, for a verdict of "not enough runs".
+        alignments: The different alignments of a pair, if "not comparable".
         flights: Values of A and B by scenario and seed; `None` where there is none.
     """
 
@@ -72,6 +74,7 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     failures: tuple[int, int]
     verdict: Word
     more: int = 0
+    alignments: tuple[str, ...] = ()
     flights: dict[str, tuple[float | None, float | None]] = {}
 
     @property
@@ -79,11 +82,39 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
         """Of the change and its interval."""
         return "%" if self.relative else figure(self.figure).unit
 
+    @property
+    def words(self) -> str:
+        """Verdict as a reader wants it: "not enough runs: 5 more may tell"."""
+        if self.verdict == "not enough runs":
+            return f"not enough runs: {self.more} more may tell"
+        if self.verdict == "not comparable":
+            return f"not comparable: after {' and '.join(self.alignments)}"
+        return self.verdict
+
+    def by_scenario(self) -> dict[str, tuple[int, int, int]]:
+        """Return the flights of each scenario: where B is worse, where it is better, and all."""
+        sign = -1.0 if figure(self.figure).limit == "least" else 1.0
+        found: dict[str, tuple[int, int, int]] = {}
+        for name, pair in self.flights.items():
+            a, b = (math.inf if value is None else sign * value for value in pair)
+            worse, better, flights = found.get(scenario := name.rpartition(",")[0], (0, 0, 0))
+            found[scenario] = worse + (b > a), better + (b < a), flights + 1
+        return found
+
     def inferior(self, margin: float) -> bool:
         """Return whether B may be worse than A by more than a margin."""
+        if self.verdict == "not comparable":
+            return True
         if figure(self.figure).limit == "least":
             return bool(self.low < -margin)
         return bool(self.high > margin)
+
+    def fails(self, margin: float) -> bool:
+        """Return whether B is not good enough.
+
+        Without a margin if it is worse; with one, unless it was shown to be no worse than that.
+        """
+        return self.inferior(margin) if margin else self.verdict == "worse"
 
 
 def compare_values(
@@ -119,10 +150,10 @@ def compare_values(
     change, low, high = told(change), told(low), told(high)
     verdict: Word = "not enough runs"
     more = 0
-    if p <= error and (low > 0 or high < 0):
-        verdict = "worse" if (low > 0) == (sign > 0) else "better"
-    elif margin > 0 and -margin <= low and high <= margin:
+    if margin > 0 and -margin <= low and high <= margin:
         verdict = "no difference"
+    elif p <= error and (low > 0 or high < 0):
+        verdict = "worse" if (low > 0) == (sign > 0) else "better"
     else:
         more = _more(len(differences), change, low, high, margin, error)
     values = np.array(known).reshape(-1, 2)
@@ -188,13 +219,46 @@ def _sums(ranks: npt.NDArray[np.int_]) -> Floats:
 
 def _more(n: int, change: float, low: float, high: float, margin: float, error: float) -> int:
     """Return how many more flights would probably tell: intervals shrink as 1 / √n."""
-    least = math.ceil(math.log2(2 / error))  # fewer cannot tell, whatever they show
+    least = _least(error)
     if not all(map(math.isfinite, (change, low, high))):
         return max(least - n, 1)
     half = (high - low) / 2
     goals = [goal for goal in (abs(change), margin - abs(change)) if goal > 0]
     needed = n * (half / max(goals)) ** 2 if goals else math.inf
     return max(least - n, math.ceil(min(needed, 1e4)) - n, 1)
+
+
+def _least(error: float) -> int:
+    """Return the number of flights of which fewer cannot tell, whatever they show."""
+    return math.ceil(math.log2(2 / error))
+
+
+def compare_until_sure(
+    compare: Callable[[int, float], list[Comparison]], most: int, looked: list[int]
+) -> list[Comparison]:
+    """Compare with half of the flights, and with all if not every figure is decided then.
+
+    The k-th look, also one of an earlier call, has 1/2^k of the error; a look with too few flights
+    to find anything, whatever they show, is none. (Bonferroni over a number of looks that nobody
+    knows beforehand; the shares of group-sequential designs ask for that number.)
+
+    Args:
+        compare: Compares so many flights, with so much error.
+        most: Number of flights.
+        looked: Numbers of flights that were looked at earlier; extended.
+    """
+    half = math.ceil(most / 2)
+    looks = {half, most} if half in looked or half > max(looked, default=0) else {most}
+    found: list[Comparison] = []
+    for look in sorted(looks):
+        number = looked.index(look) if look in looked else len(looked)
+        error = ERROR / 2 ** (number + 1)
+        found = compare(look, error)
+        if look not in looked and max(each.pairs for each in found) >= _least(error / len(found)):
+            looked.append(look)
+        if all(each.verdict != "not enough runs" for each in found):
+            break
+    return found
 
 
 def compare_rows(
@@ -208,7 +272,7 @@ def compare_rows(
     """Compare runs, paired by flight; repeats of a flight are averaged.
 
     Raises:
-        ConfigError: They have no flight or no estimator in common.
+        ConfigError: They have no flight, no estimator or no figure in common.
     """
     common = [key for key in a if key in b]
     if not common:
@@ -229,16 +293,37 @@ def compare_rows(
         if any(_value(a[k], name, each) is not None for k in common)
         or any(_value(b[k], other, each) is not None for k in common)
     ]
-    return [
-        compare_values(
-            name if name == other else f"{name} / {other}",
-            each,
-            {key: (_value(a[key], name, each), _value(b[key], other, each)) for key in common},
-            margin=margin,
-            error=error / len(wanted),
-        )
-        for name, other, each in wanted
-    ]
+    if not wanted:
+        raise ConfigError(f"compare: expected {', '.join(figures)}, found none of them in any run")
+    found = []
+    for name, other, each in wanted:
+        pairs = {key: (_value(a[key], name, each), _value(b[key], other, each)) for key in common}
+        label = name if name == other else f"{name} / {other}"
+        one = compare_values(label, each, pairs, margin=margin, error=error / len(wanted))
+        laid = [(_alignments(a[key], name), _alignments(b[key], other)) for key in common]
+        differing = sorted({text for x, y in laid if x and y and x != y for text in x | y})
+        if differing and _after_alignment(each):
+            one = msgspec.structs.replace(
+                one, verdict="not comparable", more=0, alignments=tuple(differing)
+            )
+        found.append(one)
+    return found
+
+
+def _alignments(rows: Sequence[Row], estimator: str) -> set[str]:
+    verdicts = (row["estimators"].get(estimator, {}) for row in rows)
+    return {str(each["alignment"]) for each in verdicts if each.get("alignment")}
+
+
+def _after_alignment(name: str) -> bool:
+    """Return whether a figure is an error after the alignment that the verdict names.
+
+    Shares, times, the flight's own figures, and those whose name has an alignment are not.
+    """
+    row = figure(name)
+    if row.of_flight or {"se3", "sim3"} & set(name.split("_")):
+        return False
+    return row.unit in {"m", "m²", "°", "°/m", "m/s"} or (row.unit == "%" and row.limit != "least")
 
 
 def _some(side: Mapping[Key, object]) -> str:
@@ -257,43 +342,3 @@ def _value(rows: Sequence[Row], estimator: str, name: str) -> float | None:
     if not values or any(value is None for value in values):
         return None
     return float(np.mean([float(value) for value in values if value is not None]))
-
-
-def read_folder(folder: Path) -> dict[Key, list[Row]]:
-    """Read the rows of a finished sweep, or of a single run, by flight.
-
-    Raises:
-        ConfigError: It is neither.
-    """
-    from runtime.tools.sweep.process import Ended
-    from runtime.tools.sweep.tables import Row, decode_rows
-
-    found: dict[Key, list[Row]] = {}
-    if (folder / "rows.jsonl").is_file():
-        for row in decode_rows((folder / "rows.jsonl").read_bytes()).values():
-            settings = " ".join(f"{path}={text}" for path, text in row["parameters"].items())
-            found.setdefault((settings or "run", row["seed"]), []).append(row)
-        return found
-    try:
-        data = (folder / "summary.json").read_bytes()
-        ended = msgspec.json.decode(data, type=Ended)
-        head = msgspec.json.decode(data)
-    except (OSError, msgspec.MsgspecError) as error:
-        raise ConfigError(
-            f"{folder}: expected the folder of a sweep (rows.jsonl) or of a run, found: {error}"
-        ) from None
-    verdict = ended.verdict
-    row = Row(
-        id="",
-        parameters={},
-        seed=head["seed"],
-        exit_code=0,
-        error=head.get("error") or "",
-        passed=verdict.passed if verdict else None,
-        digest=None,
-        sim_seconds=ended.sim_seconds,
-        run_seconds=None,
-        wall_seconds=None,
-        estimators=verdict.estimators if verdict else {},
-    )
-    return {("run", head["seed"]): [row]}

@@ -1,0 +1,27 @@
+"""Is B better than A? Two versions compared over equal flights.
+
+Read in this order: `statistics` (pairs, the test, the interval and the verdict), `flying` (which
+flights, and when they are enough), `page`. The command is `runtime.tools.cli.compare`.
+"""
+
+from runtime.tools.comparison.flying import Compared, compare, read_folder
+from runtime.tools.comparison.statistics import (
+    ERROR,
+    USUAL,
+    Comparison,
+    Key,
+    compare_rows,
+    compare_values,
+)
+
+__all__ = [
+    "ERROR",
+    "USUAL",
+    "Compared",
+    "Comparison",
+    "Key",
+    "compare",
+    "compare_rows",
+    "compare_values",
+    "read_folder",
+]
