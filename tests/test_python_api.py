@@ -40,6 +40,17 @@ def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 
 
 @pytest.mark.slow
+def test_importing_it_imports_next_to_nothing() -> None:
+    """So that it can tell whose `runtime` is there, and costs nothing before the first call."""
+    code = "import sys, visnav; print(*{name.partition('.')[0] for name in sys.modules})"
+    words = [sys.executable, "-c", code]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+    heavy = {"numpy", "msgspec", "rich", "typer", "matplotlib", "asyncio", "runtime", "events"}
+    assert heavy & set(done.stdout.split()) == set()
+
+
+@pytest.mark.slow
 def test_a_run_is_that_of_the_command(tmp_path: Path) -> None:
     file = config_file(tmp_path, "Noise", "Reader", run="duration = 1")
     run = visnav.run(file, set={"run.seed": 3}, quiet=True)
