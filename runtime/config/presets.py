@@ -11,14 +11,14 @@ A settings class offers them by a field ``preset``, whose type holds them::
 Beside ``"presets"``, ``"needed": {"width": "intrinsics"}`` says that who overrides a preset's width
 has to override its intrinsics, if it has any.
 
-They are put in where a file is read: `preset` is unset in the settings that result, which hold all
-figures, so that they stay what they are if a later version changes the preset.
+They are put in where a file is read. The settings hold all figures then, and no `preset`, so that a
+run repeats from them where a later version changes it.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, get_origin
 
 import msgspec
@@ -35,39 +35,32 @@ def presets_in(extra: Mapping[str, Any] | None) -> Presets:
     return found
 
 
-@functools.cache
-def by_name_alone(table: type[msgspec.Struct]) -> tuple[str, ...]:
+def by_name_alone(table: type[msgspec.Struct]) -> list[str]:
     """Return the presets whose name may stand in the place of the whole table."""
     required = any(field.required for field in msgspec.structs.fields(table))
-    return () if required else tuple(presets_in(_extra(table)))
+    return [] if required else [*presets_in(_extra(table))]
 
 
-def expanded(value: Any, type_: Any, where: str, path: Sequence[str] = ()) -> Any:
+def expanded(value: Any, type_: Any, where: str, at: str = "") -> Any:
     """Return settings of the file with their presets put in, at any depth.
 
-    Args:
-        type_: The type of the settings.
-        where: Begins the message of an error.
-
     Raises:
-        ConfigError: There is no such preset, or a setting is overridden without another which
-            belongs to it.
+        ConfigError: There is no such preset, or a setting is overridden without one it belongs to.
     """
     table = None if get_origin(type_) is dict else struct_in(type_)
     if table is None:
         return value
     if isinstance(value, list):
-        at, last = path[:-1], path[-1] if path else ""
-        return [expanded(v, table, where, (*at, f"{last}[{i}]")) for i, v in enumerate(value)]
+        return [expanded(each, table, where, f"{at}[{i}]") for i, each in enumerate(value)]
     extra = _extra(table)
     if isinstance(value, str) and extra:
         value = {"preset": value}
     if not isinstance(value, Mapping):
         return value
     if isinstance(value.get("preset"), str) and extra:
-        value = _put_in(value, extra, f"{where}: {'.'.join((*path, 'preset'))}")
+        value = _put_in(value, extra, f"{where}: {f'{at}.preset'[1:]}")
     types = _types(table)
-    return {k: expanded(v, types.get(k), where, (*path, k)) for k, v in value.items()}
+    return {k: expanded(v, types.get(k), where, f"{at}.{k}") for k, v in value.items()}
 
 
 def _put_in(value: Mapping[str, Any], extra: Mapping[str, Any], where: str) -> dict[str, Any]:

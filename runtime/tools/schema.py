@@ -150,8 +150,7 @@ class _Maker:
                 names = list(presets_in(info.extra))
                 return {"enum": names} if names else self._of(info.type)
             case types.StructType():
-                names = list(by_name_alone(info.cls))
-                table = self.struct(info.cls)
+                names, table = by_name_alone(info.cls), self.struct(info.cls)
                 return {"anyOf": [{"enum": names}, table]} if names else table
             case types.CustomType() if issubclass(info.cls, Duration):
                 return {"anyOf": [{"type": "number", "minimum": 0}, _text(_DURATION)]}

@@ -57,10 +57,8 @@ class SensorsConfig(SimulatorConfig):
     def __post_init__(self) -> None:
         if self.imu.rate:
             if self.imu_rate not in (_RATE, self.imu.rate):
-                raise ValueError(
-                    f"imu.rate: expected imu_rate or this, found {self.imu_rate:g} and "
-                    f"{self.imu.rate:g} Hz"
-                )
+                found = f"{self.imu_rate:g} and {self.imu.rate:g} Hz"
+                raise ValueError(f"imu.rate: expected imu_rate or this, found {found}")
             msgspec.structs.force_setattr(self, "imu_rate", self.imu.rate)
         names = {"imu", "barometer", "gnss", "magnetometer"}
         for field in ("cameras", "range_finders", "lidars"):
