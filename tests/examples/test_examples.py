@@ -110,7 +110,7 @@ def test_the_figure_eight_is_flown_and_followed(tmp_path: Path) -> None:
 @pytest.mark.timeout(900)
 def test_the_rig_of_euroc_is_followed_by_both_eyes_and_its_imu(tmp_path: Path) -> None:
     """`euroc_rig` passes its thresholds, with lenses, mounting and bias of a real rig."""
-    summary = run("euroc_rig", tmp_path, "pilot.excitation.duration=2s", "report.figures=[]")
+    summary = run("euroc_rig", tmp_path, "report.figures=[]")
     figures = summary["verdict"]["estimators"]["odometry"]
     assert figures["passed"]
     assert figures["coverage_percent"] == 100.0
