@@ -18,9 +18,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs" / "images"
-SIZE = (150, 44)
+SIZE = (150, 46)
 """Columns and lines of the terminal."""
-FLYING = 8.0
+FLYING = 20.0
 """Seconds of the run before the images are made."""
 
 
@@ -47,34 +47,34 @@ async def _look(folder: Path, browser: str) -> None:
     from runtime.tools.monitor.protocol import Set
     from runtime.tools.monitor.screen import Screen
 
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 120
     while not (found := runs()):
         if time.monotonic() > deadline:
-            sys.exit("expected the run to begin within a minute")
+            sys.exit("expected the run to begin within two minutes")
         await asyncio.sleep(0.2)
     path = found["closed_loop"]
-    client = await Client.connect(path)
+    client = Client(path)
     screen = Screen(client)
     async with screen.run_test(size=SIZE) as pilot:
-        while screen.snapshot is None or screen.snapshot.clock.now < FLYING:
+        while screen.snapshot is None or screen.snapshot.now < FLYING:
             await pilot.pause(0.2)
         await client.ask(Set(text="pilot.gain=0.8"))
         await pilot.pause(1.0)
         svg = screen.export_screenshot(title="python -m runtime top")
-    svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)  # of a server elsewhere
-    (folder / "screen.svg").write_text(svg, encoding="utf-8")
-    width, height = (round(float(n)) for n in re.findall(r'viewBox="0 0 (\S+) (\S+)"', svg)[0])
-    _draw(browser, f"file://{folder}/screen.svg", DOCS / "monitor.png", width, height)
-    web = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "runtime", "web", str(path), "--port", "0",
-        cwd=ROOT, stdout=asyncio.subprocess.PIPE,
-    )  # fmt: skip
-    assert web.stdout is not None
-    url = (await web.stdout.readline()).decode().split()[-1]
-    await asyncio.sleep(2.0)  # there should be something to show at once
-    await asyncio.to_thread(_draw, browser, url, DOCS / "web.png", 1360, 1080)
-    web.terminate()
-    await web.wait()
+        svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)  # of a server elsewhere
+        (folder / "screen.svg").write_text(svg, encoding="utf-8")
+        width, height = (round(float(n)) for n in re.findall(r'viewBox="0 0 (\S+) (\S+)"', svg)[0])
+        _draw(browser, f"file://{folder}/screen.svg", DOCS / "monitor.png", width, height)
+        # The screen still watches: the page shows at once what was seen since.
+        web = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "runtime", "web", str(path), "--port", "0",
+            cwd=ROOT, stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        assert web.stdout is not None
+        url = (await web.stdout.readline()).decode().split()[-1]
+        await asyncio.to_thread(_draw, browser, url, DOCS / "web.png", 1360, 1180)
+        web.terminate()
+        await web.wait()
 
 
 def _draw(browser: str, url: str, image: Path, width: int, height: int) -> None:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Collision, Odometry, PlannedPose, PositionSetpoint
+from events import Collision, Odometry, PlannedPose, PositionSetpoint, Vector3
 from events.frames import from_yaw
 from nodes.judging.evaluation.coverage import (
     Interval,
@@ -438,6 +438,7 @@ class Flight:
     Attributes:
         truth: Its true poses.
         recent: The last of them.
+        path: Length of the path through them, metres.
         body: Frame of its body.
         collisions: In the order in which they came.
     """
@@ -445,6 +446,8 @@ class Flight:
     def __init__(self) -> None:
         self.truth = PoseRows()
         self.recent = RecentPoses()
+        self.path = 0.0
+        self._position: Vector3 | None = None
         self.body = "base_link"
         self.collisions: list[Collision] = []
         self._plan = PoseRows()
@@ -453,6 +456,8 @@ class Flight:
     def add(self, event: Odometry) -> None:
         """Add a true pose."""
         self.body = event.child_frame_id
+        self.path += math.dist(self._position or event.position, event.position)
+        self._position = event.position
         self.truth.add(event.stamp, event.position, event.orientation)
         self.recent.add(event.stamp, event.position, event.orientation)
 

@@ -68,9 +68,9 @@ class LiveErrors:
         return distance, angle_between(truth[1], orientation)
 
     @property
-    def mean_square(self) -> float:
-        """Mean square of the position errors so far, square metres."""
-        return self.sum_of_squares / self.count if self.count else 0.0
+    def rmse(self) -> float:
+        """Root mean square of the position errors so far, metres."""
+        return math.sqrt(self.sum_of_squares / self.count) if self.count else 0.0
 
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -234,14 +234,17 @@ class Evaluation(Node[EvaluationConfig]):
             return
         self._append(source_file(name), event)
         self._score(event, "latency", (now - event.stamp) / 1e9, "s")
-        truth = self._flight_of(name).recent.at(event.stamp)
+        flight = self._flight_of(name)
+        truth = flight.recent.at(event.stamp)
         if truth is None or record.scale_free:
             return
         live = self._live.setdefault(name, LiveErrors())
         distance, angle = live.of(event, truth)
         self._score(event, "position_error", distance, "m")
         self._score(event, "rotation_error", angle, "rad")
-        self._score(event, "mean_square_error", live.mean_square, "m^2")
+        self._score(event, "ate_rmse", live.rmse, "m")
+        if flight.path > 0:
+            self._score(event, "ate_percent", 100.0 * live.rmse / flight.path, "%")
 
     @on(TrackingEvent)
     def tracking_events(self, event: TrackingEvent) -> None:

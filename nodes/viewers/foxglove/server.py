@@ -17,6 +17,7 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable, Collection
+from http import HTTPStatus
 from typing import Annotated, Any
 
 import msgspec
@@ -24,7 +25,6 @@ import msgspec
 from runtime import NodeConfig
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.extras import install_command
-from runtime.tools.monitor.client import LONGEST_HEAD, HttpError, host_of, parse_head, response
 
 MOST = 64
 """Viewers at a time, including those still to send their request."""
@@ -32,12 +32,19 @@ MOST = 64
 _HEAD_TIMEOUT = 10.0
 """Real seconds for a viewer to send its request."""
 
+_LONGEST_HEAD = 16 << 10
+"""Bytes of that request at most."""
+
 _PART = 1 << 16
 
 
 def hidden_host() -> str:
     """Return a random address of this machine, for no page to guess."""
     return str(ipaddress.IPv4Address((127 << 24) + 2 + secrets.randbelow((1 << 24) - 4)))
+
+
+class HttpError(Exception):
+    """Refusal of a request: a status, and a text."""
 
 
 class Gate:
@@ -86,8 +93,18 @@ class Gate:
         Raises:
             HttpError: It may not come in; the text says why.
         """
-        _, _, headers = parse_head(head)
-        host = host_of(headers)
+        first, _, fields = head.partition("\r\n")
+        if len(first.split(" ")) != 3 or " HTTP/1." not in first:
+            raise HttpError(400, "expected a request of HTTP/1.1")
+        headers: dict[str, str] = {}
+        for line in fields.split("\r\n"):
+            name, _, value = line.partition(":")
+            name = name.strip().lower()
+            if name in headers and name in {"host", "origin"}:  # which of them counts is unclear
+                raise HttpError(400, f"expected one header {name}, found two")
+            headers[name] = value.strip()
+        address = headers.get("host", "")
+        host = address[1:].partition("]")[0] if address[:1] == "[" else address.partition(":")[0]
         try:
             ipaddress.ip_address(host)
         except ValueError:
@@ -131,8 +148,10 @@ class Gate:
                 head, rest = _read_head(viewer)
                 self.check(head.decode("latin-1"))
             except HttpError as error:
-                self._refused(error.text)
-                viewer.sendall(response(error.status, f"{error.text}\n".encode()))
+                status, text = error.args
+                self._refused(text)
+                reply = f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\nconnection: close\r\n"
+                viewer.sendall(f"{reply}content-type: text/plain\r\n\r\n{text}\n".encode())
                 return
             viewer.settimeout(None)
             if not self._holds(server):
@@ -158,7 +177,7 @@ def _read_head(viewer: socket.socket) -> tuple[bytes, bytes]:
     """Return a request up to its empty line, and any bytes after."""
     data = b""
     while b"\r\n\r\n" not in data:
-        if len(data) > LONGEST_HEAD:
+        if len(data) > _LONGEST_HEAD:
             raise HttpError(413, "expected a shorter request")
         part = viewer.recv(_PART)
         if not part:

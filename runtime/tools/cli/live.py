@@ -24,15 +24,15 @@ def top(
 ) -> None:
     """Monitor and control a run in a terminal.
 
-    It shows nodes, channels, clock, settings and log. Keys pause the run, step it, change its
-    speed or a setting, restart a node and end the run. Quitting does not affect the run.
+    It shows estimators with their errors so far, their paths from above, nodes, channels, clock,
+    settings and log. Keys pause the run, step it, change its speed or a setting, restart a node
+    and end the run. Quitting does not affect the run.
     """
-    import asyncio
-
-    from runtime.tools.monitor.client import find
+    from runtime.tools.monitor.client import Client, find
+    from runtime.tools.monitor.screen import Screen
 
     _check_terminal()
-    asyncio.run(_show(find(run), leave))
+    Screen(Client(find(run)), leave).run()
 
 
 def _check_terminal() -> None:
@@ -55,13 +55,6 @@ def _check_terminal() -> None:
         )
 
 
-async def _show(path: Path, leave: bool) -> None:
-    from runtime.tools.monitor.client import Client
-    from runtime.tools.monitor.screen import Screen
-
-    await Screen(await Client.connect(path), leave).run_async()
-
-
 def web(
     run: Run = None,
     port: Annotated[
@@ -70,30 +63,24 @@ def web(
     token: Annotated[
         str | None, typer.Option(help="What the address must hold; made up if not given.")
     ] = None,
-    leave: Annotated[bool, typer.Option("--leave", help="End with the run.")] = False,
 ) -> None:
-    """Monitor a run on a live page, with the same figures and commands as top.
+    """Monitor a run on a live page, with the same figures and commands as top, and its images.
 
-    The page is served on this machine only, and only to those who have the address that is printed.
+    The page is served on this machine only, only to those who have the address that is printed,
+    and until the run ends.
     """
-    import asyncio
-
-    from runtime.tools.monitor.client import find
-
-    asyncio.run(_serve(find(run), port, token, leave))
-
-
-async def _serve(path: Path, port: int, token: str | None, leave: bool) -> None:
     from runtime.errors import CommandError
-    from runtime.tools.monitor.client import Client
-    from runtime.tools.monitor.web import serve
+    from runtime.tools.monitor.client import find
+    from runtime.tools.monitor.web import PageServer, serve
 
+    path = find(run)
     try:
-        await serve(await Client.connect(path), port, token, leave)
+        server = PageServer(port, path, token)
     except OSError as error:
         raise CommandError(
             f"--port {port}: expected a port that is free, found: {error.strerror}"
         ) from None
+    serve(server)
 
 
 def set_(

@@ -270,7 +270,7 @@ def _monitored(
         if path is not None and top:
             screens.enter_context(_beside("top", str(path), "--leave"))
         if path is not None and web is not None:
-            screens.enter_context(_beside("web", str(path), "--leave", "--port", str(web)))
+            screens.enter_context(_beside("web", str(path), "--port", str(web)))
         yield
 
 

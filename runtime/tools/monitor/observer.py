@@ -10,15 +10,14 @@ from __future__ import annotations
 import collections
 import itertools
 import logging
-import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import msgspec
 
-from events import Event, Image
+from events import Event, Image, TrackedFeatures
 from runtime.channels.sender import Sender
 from runtime.config.model import Config
 from runtime.config.parameters import settings
@@ -30,8 +29,8 @@ from runtime.run.summarise import count_drops
 from runtime.run.supervisor import Supervisor
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND
+from runtime.tools.monitor.estimators import Measured
 from runtime.tools.monitor.protocol import (
-    ClockState,
     Command,
     LogLine,
     Pause,
@@ -49,18 +48,19 @@ KEPT = 5
 """How many intervals between snapshots figures cover."""
 
 
-class Amount(NamedTuple):
-    """Sum of durations of a node or output.
-
-    Attributes:
-        times: Number of durations.
-        total: Their sum, nanoseconds.
-        longest: The longest, nanoseconds.
-    """
+class Amount(msgspec.Struct):
+    """Durations of a node's steps or of an output's events: number, sum and longest (ns)."""
 
     times: int = 0
     total: int = 0
     longest: int = 0
+
+    def add(self, total: int, longest: int, times: int = 1) -> None:
+        """Add durations."""
+        self.times += times
+        self.total += total
+        if longest > self.longest:
+            self.longest = longest
 
 
 class Sample(NamedTuple):
@@ -70,30 +70,21 @@ class Sample(NamedTuple):
         real: Seconds of `time.perf_counter`.
         run: Nanoseconds of the run's clock.
         sent: Events sent since the run began, by output.
-        nodes: Time that each node took of the loop since the sample before.
-        outputs: Times from stamp to delivery since then.
+        amounts: What a `Meter` added up since the sample before.
     """
 
     real: float
     run: int
     sent: Mapping[str, int]
-    nodes: Mapping[str, Amount]
-    outputs: Mapping[str, Amount]
+    amounts: Mapping[str, Amount]
 
 
 class RecentSamples:
-    """The last samples.
-
-    Args:
-        first: Only its times and its count of sent events are used.
-    """
+    """The last samples; of the first, only its times and its count of sent events are used."""
 
     def __init__(self, first: Sample) -> None:
         self._samples = collections.deque([first], maxlen=KEPT + 1)
-
-    def add(self, sample: Sample) -> None:
-        """Add a sample and forget the oldest."""
-        self._samples.append(sample)
+        self.add = self._samples.append
 
     @property
     def real(self) -> float:
@@ -110,97 +101,68 @@ class RecentSamples:
         sent = self._samples[-1].sent.get(output, 0) - self._samples[0].sent.get(output, 0)
         return sent / self.run if self.run > 0 else 0.0
 
-    def node(self, name: str) -> Amount:
-        """Return how much of the loop's time a node took."""
-        return _added(sample.nodes.get(name) for sample in [*self._samples][1:])
-
-    def output(self, name: str) -> Amount:
-        """Return the times from the stamps of an output's events to their delivery."""
-        return _added(sample.outputs.get(name) for sample in [*self._samples][1:])
-
-
-def _added(amounts: Iterable[Amount | None]) -> Amount:
-    known = [amount for amount in amounts if amount is not None]
-    return Amount(
-        sum(amount.times for amount in known),
-        sum(amount.total for amount in known),
-        max((amount.longest for amount in known), default=0),
-    )
-
-
-class DurationSum:
-    """Durations since the last snapshot, nanoseconds."""
-
-    __slots__ = ("count", "last", "longest", "total")
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.total = 0
-        self.longest = 0
-        self.last = 0
-        """End of the last duration, on the run's clock (ns); of outputs only."""
-
-    def take(self) -> Amount:
-        """Return the sum, and start again from zero."""
-        amount = Amount(self.count, self.total, self.longest)
-        self.count = self.total = self.longest = 0
-        return amount
+    def amount(self, name: str) -> Amount:
+        """Return the durations of a node or an output."""
+        found = Amount()
+        for sample in itertools.islice(self._samples, 1, None):
+            if (each := sample.amounts.get(name)) is not None:
+                found.add(each.total, each.longest, each.times)
+        return found
 
 
 class Meter(Instrument):
-    """An instrument to add up durations, and to keep the newest images.
+    """An instrument to add up durations.
+
+    Args:
+        measured: Gets the events that it follows, too.
 
     Attributes:
-        nodes: Time each node took of the loop, by name, without the calls of other nodes in it.
-        outputs: Times from stamp to delivery of each output's events, by ``node.port``.
-        images: The newest image of each camera, by ``node.port: source``.
+        last: When each output's last event was sent, on the run's clock (ns), by ``node.port``.
     """
 
-    def __init__(self, clock: Clock) -> None:
-        self.nodes: dict[str, DurationSum] = {}
-        self.outputs: dict[str, DurationSum] = {}
-        self.images: dict[str, Image] = {}
+    def __init__(self, clock: Clock, measured: Measured) -> None:
+        self.last: dict[str, int] = {}
+        self._amounts: dict[str, Amount] = collections.defaultdict(Amount)
+        self._follow = measured.follow
         self._clock = clock
-        self._inner = [0]
+        self._inner = 0
         """Nanoseconds taken by the steps nested in the running step."""
         self.event_sent = self._tap
 
+    def take(self) -> Mapping[str, Amount]:
+        """Return the sums, and start again from zero.
+
+        They are the time that each node took of the loop, without the calls of other nodes in it,
+        and the times from stamp to delivery of each output's events, by ``node.port``.
+        """
+        taken, self._amounts = self._amounts, collections.defaultdict(Amount)
+        return taken
+
     def wrap_call(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
         """Return a function to call `call` and add up its durations."""
-        inner, time_ns = self._inner, time.perf_counter_ns
-        steps = self.nodes.setdefault(node, DurationSum())
+        time_ns = time.perf_counter_ns
 
         def metering(argument: Any) -> Any:
-            outer = inner[0]
-            inner[0] = 0
+            outer, self._inner = self._inner, 0
             begin = time_ns()
             try:
                 return call(argument)
             finally:
                 took = time_ns() - begin
-                own = took - inner[0]
-                inner[0] = outer + took
-                steps.total += own
-                steps.count += 1
-                if own > steps.longest:
-                    steps.longest = own
+                own = took - self._inner
+                self._inner = outer + took
+                self._amounts[node].add(own, own)
 
         return metering
 
     def _tap(self, sender: Sender[Any] | None, event: Event) -> None:
         name = "run.announced" if sender is None else sender.name
-        flow = self.outputs.get(name)
-        if flow is None:
-            flow = self.outputs[name] = DurationSum()
-        now = self._clock.now()
+        self.last[name] = now = self._clock.now()
         latency = now - event.stamp
-        flow.count += 1
-        flow.total += latency
-        flow.last = now
-        if latency > flow.longest:
-            flow.longest = latency
-        if isinstance(event, Image):
-            self.images[f"{name}: {event.source}"] = event
+        self._amounts[name].add(latency, latency)
+        follow = self._follow.get(type(event))
+        if follow is not None:
+            follow(name, event)
 
 
 RECORDS = 100
@@ -216,13 +178,13 @@ class LastRecords(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a record."""
+        seconds = getattr(record, "seconds", 0.0)
+        name = getattr(record, "logger_name", record.name)
         self._lines.append(
             LogLine(
                 number=next(self._numbers),
-                seconds=getattr(record, "seconds", 0.0),
                 level=record.levelname,
-                logger_name=getattr(record, "logger_name", record.name),
-                text=record.getMessage(),
+                text=f"{seconds:10.3f} {record.levelname:8} {name}: {record.getMessage()}",
             )
         )
 
@@ -239,66 +201,65 @@ class Observer:
         self._state = supervisor.state
         self._config = config
         self._records = records
-        self._meter: Meter | None = None
-        self._recent = RecentSamples(self._sample())
         self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}
         """Settings of each node, with their text, cached as they seldom change."""
-        self._number = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._measured = Measured(self._state)
+        self._meter = Meter(self._state.clock, self._measured)
+        self._recent = RecentSamples(self._sample())
 
     def begin(self) -> None:
         """Begin to measure: somebody watches."""
-        if self._meter is None:
-            self._meter = Meter(self._state.clock)
+        if self._meter not in self._supervisor.instruments.attached:
+            self._forget()
             self._supervisor.instruments.attach(self._meter)
-            self._recent = RecentSamples(self._sample())
 
     def end(self) -> None:
         """Stop measuring: nobody watches."""
-        if self._meter is not None:
+        if self._meter in self._supervisor.instruments.attached:
             self._supervisor.instruments.detach(self._meter)
-            self._meter = None
-            self._recent = RecentSamples(self._sample())
+            self._forget()
 
     # Snapshots.
 
     def take(self) -> Snapshot:
         """Return a snapshot of now and of the last second or so."""
-        state = self._state
-        self._number += 1
         sample = self._sample()
         self._recent.add(sample)
-        now = sample.run
+        stepping, clock = self._supervisor.stepping, self._state.clock
+        now, target = sample.run / SECOND, stepping.target_speed
+        present = self._recent.run / self._recent.real
+        asked = "as fast as it can" if target is None else f"asked: {target:g}"
+        duration = float(self._config.run.duration)
+        ended, paused = self._state.reason, stepping.state != "running"
+        headline = (
+            self._config.run.name,
+            f"{now:.3f}{f' of {duration:g}' if duration else ''} s",
+            f"{present:.2f} × real time ({'real' if clock.kind == 'real' else asked})",
+            f"ends: {ended}" if ended else "paused" if paused else "runs",
+        )
         return Snapshot(
-            run=self._config.run.name,
-            pid=os.getpid(),
-            number=self._number,
-            ended=state.reason,
-            clock=ClockState(
-                kind=state.clock.kind,
-                now=now / SECOND,
-                duration=float(self._config.run.duration),
-                speed=self._recent.run / self._recent.real,
-                target_speed=self._supervisor.stepping.target_speed,
-                paused=self._supervisor.stepping.state != "running",
-                fixed=self._supervisor.stepping.fixed(),
-            ),
+            headline="   ".join(headline),
+            now=now,
+            ended=ended,
+            paused=paused,
+            fixed=stepping.fixed(),
+            speed=max(round(present, 1), 1.0) if target is None else target,
             tables=self._tables(sample),
-            cameras=sorted(self._meter.images) if self._meter is not None else [],
+            paths=self._measured.paths(),
+            cameras=self._measured.cameras(),
             log=self._records.lines(),
         )
 
-    def image(self, camera: str) -> Image:
-        """Return the newest image of a snapshot's camera.
+    def image(self, camera: str) -> tuple[Image, list[TrackedFeatures]]:
+        """Return the newest image of a snapshot's camera, and features tracked in it.
 
         Raises:
             CommandError: It has sent no image, or nobody watches.
         """
-        images = self._meter.images if self._meter is not None else {}
-        if camera not in images:
-            raise CommandError(
-                f"expected a camera that has sent images, found {camera!r}{suggest(camera, images)}"
-            )
-        return images[camera]
+        return self._measured.image(camera)
 
     def _sample(self) -> Sample:
         """Return the counters, with the durations since the last sample."""
@@ -306,18 +267,12 @@ class Observer:
         for node in self._state.all_nodes:
             for sender in senders(node).values():
                 sent[sender.name] += sender.sent().total()
-        meter = self._meter
-        return Sample(
-            time.perf_counter(),
-            self._state.clock.now(),
-            sent,
-            {} if meter is None else {name: sum_.take() for name, sum_ in meter.nodes.items()},
-            {} if meter is None else {name: sum_.take() for name, sum_ in meter.outputs.items()},
-        )
+        return Sample(time.perf_counter(), self._state.clock.now(), sent, self._meter.take())
 
     def _tables(self, sample: Sample) -> dict[str, Rows]:
         state, runners = self._state, self._state.runners
         return {
+            "estimators": self._measured.rows(),
             "nodes": [self._node(runner) for runner in runners.values()],
             "outputs": self._outputs(sample),
             "inputs": self._inputs(),
@@ -343,7 +298,7 @@ class Observer:
         }
 
     def _node(self, runner: NodeRunner) -> tuple[str, ...]:
-        steps, real = self._recent.node(runner.spec.name), self._recent.real
+        steps, real = self._recent.amount(runner.spec.name), self._recent.real
         calls = sum(worker.outstanding() for worker in runner.workers)
         return (
             runner.spec.name,
@@ -378,17 +333,17 @@ class Observer:
             for node in self._state.all_nodes
             for sender in senders(node).values()
         }
-        last = self._meter.outputs if self._meter is not None else {}
+        last = self._meter.last
         found: Rows = []
         for name, event in events.items():
-            flow = self._recent.output(name)
+            flow = self._recent.amount(name)
             found.append(
                 (
                     name,
                     event,
                     f"{sample.sent[name]}",
                     f"{self._recent.rate(name):.1f}",
-                    f"{(sample.run - last[name].last) / SECOND:.2f}" if name in last else "",
+                    f"{(sample.run - last[name]) / SECOND:.2f}" if name in last else "",
                     f"{flow.total / flow.times / 1e6:.2f}" if flow.times else "",
                     f"{flow.longest / 1e6:.2f}" if flow.times else "",
                 )

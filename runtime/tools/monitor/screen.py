@@ -5,25 +5,25 @@ The only module that imports it.
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import AsyncIterator
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import msgspec
+import numpy as np
 from rich.text import Text
 
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.extras import install_command
+from runtime.tools.monitor.client import Client
 from runtime.tools.monitor.protocol import (
     COLUMNS,
-    LEFT,
     QUICKEST,
-    RIGHT,
     SLOWEST,
-    Answer,
+    STACKS,
     Command,
-    LogLine,
     Pause,
+    Points,
     Restart,
     Resume,
     Set,
@@ -49,16 +49,7 @@ CONFIRM = 3.0
 """Seconds for pressing the key to end a run a second time."""
 
 _COLOURS = {"WARNING": "yellow", "ERROR": "red", "CRITICAL": "red bold"}
-
-
-class Connection(Protocol):
-    """A `runtime.tools.monitor.client.Client`, or a test's fake."""
-
-    def snapshots(self) -> AsyncIterator[Snapshot]:
-        """Yield snapshots until the run is over."""
-
-    async def ask(self, command: Command) -> Answer:
-        """Send a command to the run."""
+_PATHS = ("white", "bright_magenta", "bright_cyan", "bright_yellow", "bright_green", "bright_red")
 
 
 class Screen(App[str]):
@@ -73,11 +64,14 @@ class Screen(App[str]):
     #tables { height: 1fr; }
     #left { width: 5fr; }
     #right { width: 7fr; }
-    DataTable, RichLog { border: round $primary-darken-2; scrollbar-size: 1 1; }
+    DataTable, RichLog, #paths { border: round $primary-darken-2; scrollbar-size: 1 1; }
     DataTable { height: auto; max-height: 50%; }
+    DataTable#estimators { max-height: 25%; }
     DataTable#outputs { height: 1fr; max-height: 100%; }
-    DataTable.none { display: none; }
-    RichLog { height: 30%; }
+    .none { display: none; }
+    #below { height: 30%; min-height: 12; }
+    #paths { width: 5fr; height: 100%; }
+    RichLog { width: 7fr; height: 100%; }
     #prompt { display: none; }
     #prompt.asking { display: block; }
     """
@@ -96,7 +90,7 @@ class Screen(App[str]):
     ]
     ENABLE_COMMAND_PALETTE = False
 
-    def __init__(self, connection: Connection, leave: bool = False) -> None:
+    def __init__(self, connection: Client, leave: bool = False) -> None:
         super().__init__()
         self._connection = connection
         self._leave = leave
@@ -107,20 +101,23 @@ class Screen(App[str]):
     def compose(self) -> ComposeResult:
         """Lay the screen out."""
         yield Static(Text("waiting for the run …"), id="head")
+        above, left, right = STACKS
+        yield from map(_table, above)
         with Horizontal(id="tables"):
             with Vertical(id="left"):
-                for name in LEFT:
-                    yield _table(name)
+                yield from map(_table, left)
             with Vertical(id="right"):
-                for name in RIGHT:
-                    yield _table(name)
-        yield RichLog(id="log", max_lines=1000, wrap=True)
+                yield from map(_table, right)
+        with Horizontal(id="below"):
+            yield Static(id="paths", classes="none")
+            yield RichLog(id="log", max_lines=1000, wrap=True)
         yield Input(id="prompt", placeholder="node.key=value", select_on_focus=False)
         yield Footer()
 
     def on_mount(self) -> None:
         """Begin to listen to the run."""
         self.query_one("#log").border_title = "log"
+        self.query_one("#paths").border_title = "from above, north is up"
         for name in COLUMNS:
             table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
             table.border_title = name
@@ -148,11 +145,14 @@ class Screen(App[str]):
         self.query_one("#head", Static).update(Text(snapshot.headline))
         for name in COLUMNS:
             self._fill(name, snapshot)
+        paths = self.query_one("#paths", Static)
+        paths.set_class(not snapshot.paths, "none")
+        paths.update(drawn(snapshot.paths, paths.content_size.width, paths.content_size.height))
         log = self.query_one("#log", RichLog)
         for line in snapshot.log:
             if line.number > self._shown:
                 self._shown = line.number
-                log.write(_log_line(line), expand=True)
+                log.write(Text(line.text, style=_COLOURS.get(line.level, "")), expand=True)
 
     def _fill(self, name: str, snapshot: Snapshot) -> None:
         """Update a table's rows in place, to keep the cursor."""
@@ -185,7 +185,7 @@ class Screen(App[str]):
     def action_pause(self) -> None:
         """Pause or resume time."""
         if self.snapshot is not None:
-            paused = self.snapshot.clock.paused
+            paused = self.snapshot.paused
             self._ask(Resume() if paused else Pause())
             self._expect(paused=not paused)
 
@@ -200,20 +200,18 @@ class Screen(App[str]):
     def action_speed(self, factor: float) -> None:
         """Multiply the speed of time."""
         if self.snapshot is not None:
-            asked = min(max(self.snapshot.clock.aim * factor, SLOWEST), QUICKEST)
+            asked = min(max(self.snapshot.speed * factor, SLOWEST), QUICKEST)
             self._ask(Speed(factor=asked))
-            self._expect(target_speed=asked)
+            self._expect(speed=asked)
 
     def action_fastest(self) -> None:
         """Let time run as fast as possible."""
         self._ask(Speed(factor=None))
-        self._expect(target_speed=None)
 
     def _expect(self, **changes: Any) -> None:
         """Assume a command's effect until the next snapshot, for keys pressed before."""
-        if self.snapshot is not None and not self.snapshot.clock.fixed:
-            clock = msgspec.structs.replace(self.snapshot.clock, **changes)
-            self.snapshot = msgspec.structs.replace(self.snapshot, clock=clock)
+        if self.snapshot is not None and not self.snapshot.fixed:
+            self.snapshot = msgspec.structs.replace(self.snapshot, **changes)
 
     def action_restart(self) -> None:
         """Restart the node under the cursor."""
@@ -270,6 +268,36 @@ def _cell(table: str, column: int, text: str) -> Text:
     return Text(text, justify="right" if is_number(table, column) else "left")
 
 
-def _log_line(line: LogLine) -> Text:
-    text = f"{line.seconds:10.3f} {line.level:8} {line.logger_name}: {line.text}"
-    return Text(text, style=_COLOURS.get(line.level, ""))
+def drawn(paths: dict[str, Points], width: int, height: int) -> Text:
+    """Return paths in Braille dots, two by four to a character, and a line with their names.
+
+    Args:
+        paths: East and north of their places, metres; of two that cross, the later is above.
+        width: Characters.
+        height: Lines, that of the names included.
+    """
+    text = Text(no_wrap=True, overflow="ellipsis")
+    colours = dict(zip(paths, itertools.cycle(_PATHS), strict=False))
+    for name, colour in colours.items():
+        text.append(f"━ {name}  ", colour)
+    places = np.array([place for path in paths.values() for place in path])
+    dots = np.array([2 * width, 4 * (height - 1)]) - 1
+    if not len(places) or dots.min() <= 0:
+        return text
+    low, high = places.min(0), places.max(0)
+    metres = max(((high - low) / dots).max(), 0.02)  # by dot; of who stands still, no noise
+    corner = (low + high - metres * dots) / 2
+    cells: dict[tuple[int, int], tuple[int, str]] = {}
+    for name, path in paths.items():
+        at = (np.array(path).reshape(-1, 2) - corner) / metres
+        for begin, end in zip(at[:1].tolist() + at[:-1].tolist(), at.tolist(), strict=True):
+            for x, y in np.rint(np.linspace(begin, end, 2 + int(np.ptp([begin, end], 0).max()))):
+                column, line, dot = int(x) // 2, int(dots[1] - y) // 4, int(dots[1] - y) % 4
+                bit = (1, 2, 4, 64, 8, 16, 32, 128)[int(x) % 2 * 4 + dot]
+                cells[line, column] = (cells.get((line, column), (0, ""))[0] | bit, colours[name])
+    for line in range(height - 1):
+        text.append("\n")
+        for column in range(width):
+            bits, colour = cells.get((line, column), (0, ""))
+            text.append(chr(0x2800 + bits) if bits else " ", colour)
+    return text

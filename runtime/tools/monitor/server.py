@@ -1,27 +1,28 @@
-"""The server of a run's monitor: a Unix socket, served by a thread of its own.
+"""The server of a run's monitor: a Unix socket, and a thread for each client.
 
-The run's loop does nothing but make a snapshot or carry a command out, when the thread asks it to;
-the thread encodes and sends, and keeps the rhythm, because time on the run's loop may be simulated.
-Images are made small JPEGs in another thread, and only when a page asks.
+The run's loop does nothing but make a snapshot or carry a command out, when a thread asks it to;
+the threads encode and send, and keep the rhythm, because time on the run's loop may be simulated.
+Images are made small JPEGs there, and only when a page asks. While nobody connects, one thread
+waits for somebody.
 """
 
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import contextlib
 import logging
 import socket
 import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError, Future
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from events import Image
+from events import TrackedFeatures
 from runtime.errors import CommandError, VisnavError
 from runtime.tools.monitor.client import socket_of
 from runtime.tools.monitor.observer import Observer, describe
@@ -29,12 +30,11 @@ from runtime.tools.monitor.protocol import (
     LONGEST_COMMAND,
     UNREADABLE,
     Answer,
-    CommandRequest,
-    EncodedImage,
-    ImageRequest,
+    Command,
+    Look,
     Set,
-    WatchRequest,
-    decode_from_client,
+    Watch,
+    decode_request,
     encode,
 )
 
@@ -45,66 +45,35 @@ log = logging.getLogger("visnav.runtime")
 PERIOD = 0.2
 """Real seconds between two snapshots."""
 
+IMAGE_PERIOD = 0.5
+"""Real seconds between two encoded images of a camera at least, however many pages ask."""
+
 CLOSING_TIMEOUT = 1.0
 """Real seconds for clients to receive the last snapshot."""
 
-_LISTEN_TIMEOUT = 5.0
-"""Real seconds for the socket to become ready."""
-
-MAX_BACKLOG = 1 << 20
-"""Bytes queued for a client at most; a slower client misses snapshots."""
-
-
 MAX_SIDE = 480
 """Pixels of an encoded image's longer side at most."""
-
-IMAGE_PERIOD = 0.25
-"""Real seconds between two encoded images of a camera at least, however many pages ask."""
 
 QUALITY = 75
 """Quality of the JPEG, of 100."""
 
 
-class ImageEncoder:
-    """Image encoder beside the run's loop, at most once per camera and `IMAGE_PERIOD`."""
+class Kept:
+    """The last result of each of some slow functions, shared by all who ask within its period."""
 
     def __init__(self) -> None:
-        self._encoded: dict[str, tuple[float, bytes]] = {}
-        self._lock = asyncio.Lock()
+        self._made: dict[str, tuple[float, bytes]] = {}
+        self._lock = threading.Lock()
 
-    async def encode(self, camera: str, newest: Callable[[], Awaitable[Image]]) -> bytes:
-        """Return the JPEG of a camera's newest image.
-
-        Args:
-            newest: Gets its newest image; not called if the last JPEG is young enough.
-        """
-        async with self._lock:
+    def get(self, key: str, period: float, make: Callable[[], bytes]) -> bytes:
+        """Return the last result of `make`, or a new one if that is as old as the period (s)."""
+        with self._lock:
             now = time.monotonic()
-            made, jpeg = self._encoded.get(camera, (-np.inf, b""))
-            if now - made >= IMAGE_PERIOD:
-                image = await newest()
-                jpeg = await asyncio.to_thread(small_jpeg, image.data)
-                self._encoded[camera] = now, jpeg
-            return jpeg
-
-
-def small_jpeg(data: npt.NDArray[np.uint8]) -> bytes:
-    """Return an image as JPEG, made smaller where a side is longer than `MAX_SIDE` pixels.
-
-    Args:
-        data: Pixels, shape (height, width, 3) in RGB, or (height, width) in grey.
-    """
-    import cv2  # not before somebody asks for an image
-
-    pixels: Any = data
-    height, width = data.shape[:2]
-    scale = MAX_SIDE / max(height, width)
-    if scale < 1.0:
-        size = max(round(width * scale), 1), max(round(height * scale), 1)
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    if data.ndim == 3:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+            made, result = self._made.get(key, (-np.inf, b""))
+            if now - made >= period:
+                result = make()
+                self._made[key] = now, result
+            return result
 
 
 class Server:
@@ -113,168 +82,147 @@ class Server:
     Args:
         observer: Makes snapshots of the run, and carries commands out.
         loop: The run's loop, on which the observer is called.
+        path: Where to listen.
+
+    Raises:
+        OSError: There can be no socket.
     """
 
     def __init__(self, observer: Observer, loop: asyncio.AbstractEventLoop, path: Path) -> None:
         self._observer = observer
         self._run_loop = loop
         self._path = path
-        self._watching: set[asyncio.StreamWriter] = set()
-        self._clients: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
-        self._ready = threading.Event()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._end = asyncio.Event()
+        self._clients: dict[threading.Thread, socket.socket] = {}
+        self._calls: set[Future[Any]] = set()
+        """Calls that the run's loop has not made yet."""
+        self._watching = 0
+        self._changing = threading.Lock()
+        self._end = threading.Event()
         self._last = b""
-        self._encoder = ImageEncoder()
-        self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
-
-    def start(self) -> bool:
-        """Start to listen; tell whether the socket is ready."""
-        self._thread.start()
-        return self._ready.wait(_LISTEN_TIMEOUT) and self._thread.is_alive()
+        self._kept = Kept()
+        self._failed = False
+        # At its final path only once it listens: else others would remove it as a killed run's.
+        self._listener = socket.socket(socket.AF_UNIX)
+        new = path.with_suffix(".new")
+        new.unlink(missing_ok=True)
+        self._listener.bind(str(new))
+        new.chmod(0o600)
+        self._listener.listen(100)
+        new.rename(path)
+        threading.Thread(target=self._listen, name="monitor", daemon=True).start()
 
     def stop(self) -> None:
-        """Send the last snapshot to all clients, and stop listening; called on the run's loop."""
+        """Send the last snapshot to all who watch, and stop listening; called on the run's loop."""
         try:
             if self._watching:
                 self._last = encode(self._observer.take()) + b"\n"
             self._observer.end()
         except Exception:  # a monitor must not spoil a run's end
             log.exception("the monitor failed")
-        with contextlib.suppress(RuntimeError):  # its loop is closed: it could not listen
-            if self._loop is not None:
-                self._loop.call_soon_threadsafe(self._end.set)
-        self._thread.join(5.0)
+        self._end.set()
+        self._path.unlink(missing_ok=True)
+        _shut(self._listener, socket.SHUT_RDWR)
+        for call in list(self._calls):
+            call.cancel()
+        clients = list(self._clients.items())
+        for _, client in clients:
+            _shut(client, socket.SHUT_RD)  # who has not asked yet need not ask any more
+        deadline = time.monotonic() + CLOSING_TIMEOUT
+        for thread, client in clients:
+            thread.join(max(deadline - time.monotonic(), 0.0))
+            _shut(client, socket.SHUT_RDWR)
 
-    def _run(self) -> None:
+    def _listen(self) -> None:
+        with self._listener:
+            while not self._end.is_set():
+                try:
+                    client, _ = self._listener.accept()
+                except OSError:  # the end, or too many open files
+                    self._end.wait(0.1)
+                    continue
+                thread = threading.Thread(target=self._serve, args=(client,), daemon=True)
+                self._clients[thread] = client
+                thread.start()
+
+    def _serve(self, client: socket.socket) -> None:
+        with client, contextlib.suppress(OSError, CancelledError):
+            lines = client.makefile("rb")
+            while not self._end.is_set() and (line := lines.readline(LONGEST_COMMAND)):
+                try:
+                    request = decode_request(line)
+                except UNREADABLE as error:
+                    answer = Answer(done=False, text=f"expected a command: {error}")
+                else:
+                    if isinstance(request, Watch):
+                        self._watch(client)
+                        break
+                    answer = self._answer(request)
+                client.sendall(encode(answer) + b"\n")
+        self._clients.pop(threading.current_thread(), None)
+
+    def _watch(self, client: socket.socket) -> None:
+        """Send snapshots until the client goes or the run ends."""
+        self._count(1)
         try:
-            asyncio.run(self._serve())
-        except OSError as error:
-            log.warning(
-                "no monitor can connect to this run: no socket at %s: %s", self._path, error
-            )
+            while not self._end.wait(PERIOD):
+                try:
+                    line = self._kept.get("", PERIOD / 2, self._snapshot)
+                except CancelledError:
+                    break
+                client.sendall(line)
         finally:
-            self._ready.set()
+            if not self._end.is_set():
+                self._count(-1)
+        client.sendall(self._last)
 
-    async def _serve(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        listener = self._listener()
-        server = await asyncio.start_unix_server(self._accept, sock=listener, limit=LONGEST_COMMAND)
-        self._ready.set()
-        publishing = asyncio.create_task(self._publish())
-        await self._end.wait()
-        publishing.cancel()
-        server.close()
-        for writer in self._watching:
-            writer.write(self._last)
-        writers = list(self._clients.values())
-        for task, writer in self._clients.items():
-            task.cancel()
-            writer.close()
-        closing = asyncio.gather(*(w.wait_closed() for w in writers), return_exceptions=True)
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(closing, CLOSING_TIMEOUT)  # what was written still goes out
-        for writer in writers:
-            writer.transport.abort()
-        await asyncio.sleep(0)  # they let go of their sockets
-        with contextlib.suppress(OSError):
-            self._path.unlink()
+    def _count(self, change: int) -> None:
+        """Count who watches: the first has the observer measure, the last one ends it."""
+        with self._changing:
+            self._watching += change
+            if self._watching == max(change, 0):
+                self._on_run_loop(self._observer.begin if change > 0 else self._observer.end)
 
-    def _listener(self) -> socket.socket:
-        """Return a listening socket, at its final path only once listening.
-
-        Before, others would take it for the socket of a killed run, and remove it.
-        """
-        listener = socket.socket(socket.AF_UNIX)
-        new = self._path.with_suffix(".new")
-        new.unlink(missing_ok=True)
-        listener.bind(str(new))
-        new.chmod(0o600)
-        listener.listen(100)
-        new.rename(self._path)
-        return listener
-
-    async def _publish(self) -> None:
-        """Measure and send snapshots while somebody watches."""
-        measuring = failed = False
-        while True:
-            await asyncio.sleep(PERIOD)
-            try:
-                if measuring != bool(self._watching):
-                    measuring = not measuring
-                    change = self._observer.begin if measuring else self._observer.end
-                    await self._on_run_loop(change)
-                elif measuring:
-                    line = encode(await self._on_run_loop(self._observer.take)) + b"\n"
-                    for writer in self._watching:
-                        if writer.transport.get_write_buffer_size() < MAX_BACKLOG:
-                            writer.write(line)
-            except Exception:
-                if not failed:
-                    log.exception("the monitor failed")
-                failed = True
-
-    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._end.is_set():
-            writer.transport.abort()
-            return
-        task = asyncio.create_task(self._serve_client(reader, writer))
-        self._clients[task] = writer  # not in the task, which may be cancelled before it begins
-        task.add_done_callback(self._clients.pop)
-
-    async def _serve_client(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
+    def _snapshot(self) -> bytes:
         try:
-            async for line in reader:
-                await self._handle_line(line, writer)
-                await writer.drain()  # a client that reads no answers has to wait
-        except (OSError, ValueError):  # gone, or a line without an end
-            pass
-        except asyncio.CancelledError:  # the run is over
-            pass
-        finally:
-            self._watching.discard(writer)
-            writer.close()
+            return encode(self._on_run_loop(self._observer.take)) + b"\n"
+        except CancelledError:
+            raise
+        except Exception:
+            if not self._failed:
+                log.exception("the monitor failed")
+            self._failed = True
+            return b""
 
-    async def _handle_line(self, line: bytes, writer: asyncio.StreamWriter) -> None:
+    def _answer(self, request: Command | Look) -> Answer:
         try:
-            message = decode_from_client(line)
-        except UNREADABLE as error:
-            answer = Answer(number=-1, done=False, text=f"expected a command: {error}")
-            writer.write(encode(answer) + b"\n")
-            return
-        match message:
-            case WatchRequest():
-                self._watching.add(writer)
-            case CommandRequest() | ImageRequest():
-                writer.write(encode(await self._answer(message)) + b"\n")
-
-    async def _answer(self, request: CommandRequest | ImageRequest) -> Answer | EncodedImage:
-        try:
-            if isinstance(request, ImageRequest):
-                return await self._image(request)
-            text = await self._on_run_loop(lambda: self._observer.execute(request.command))
+            if isinstance(request, Look):
+                jpeg = self._kept.get(
+                    request.camera, IMAGE_PERIOD, lambda: self._image(request.camera)
+                )
+                return Answer(done=True, text=request.camera, jpeg=jpeg)
+            text = self._on_run_loop(lambda: self._observer.execute(request))
         except VisnavError as error:
-            return Answer(number=request.number, done=False, text=str(error))
+            return Answer(done=False, text=str(error))
+        except CancelledError:
+            return Answer(done=False, text="the run is over")
         except Exception:
             log.exception("the monitor failed")
-            text = "the run could not do it, and its log says why"
-            return Answer(number=request.number, done=False, text=text)
-        if not isinstance(request.command, Set):  # which logs it itself
-            log.info("asked by hand: %s", describe(request.command))
-        return Answer(number=request.number, done=True, text=text)
+            return Answer(done=False, text="the run could not do it, and its log says why")
+        if not isinstance(request, Set):  # which logs it itself
+            log.info("asked by hand: %s", describe(request))
+        return Answer(done=True, text=text)
 
-    async def _image(self, request: ImageRequest) -> EncodedImage:
-        jpeg = await self._encoder.encode(
-            request.camera,
-            lambda: self._on_run_loop(lambda: self._observer.image(request.camera)),
-        )
-        return EncodedImage(number=request.number, jpeg=jpeg)
+    def _image(self, camera: str) -> bytes:
+        image, features = self._on_run_loop(lambda: self._observer.image(camera))
+        return small_jpeg(image.data, features)
 
-    async def _on_run_loop(self, call: Callable[[], R]) -> R:
-        """Have a function called on the run's loop, and return its result."""
-        done: concurrent.futures.Future[R] = concurrent.futures.Future()
+    def _on_run_loop(self, call: Callable[[], R]) -> R:
+        """Have a function called on the run's loop, and return its result.
+
+        Raises:
+            CancelledError: The run ended before.
+        """
+        done: Future[R] = Future()
 
         def do() -> None:
             if not done.set_running_or_notify_cancel():
@@ -284,8 +232,45 @@ class Server:
             except Exception as error:
                 done.set_exception(error)
 
-        self._run_loop.call_soon_threadsafe(do)
-        return await asyncio.wrap_future(done)
+        self._calls.add(done)
+        try:
+            if self._end.is_set():  # or else who sets it sees the call
+                raise CancelledError
+            self._run_loop.call_soon_threadsafe(do)
+            return done.result()
+        finally:
+            self._calls.discard(done)
+
+
+def _shut(connection: socket.socket, how: int) -> None:
+    with contextlib.suppress(OSError):
+        connection.shutdown(how)
+
+
+def small_jpeg(data: npt.NDArray[np.uint8], features: Sequence[TrackedFeatures] = ()) -> bytes:
+    """Return an image as JPEG, made smaller where a side is longer than `MAX_SIDE` pixels.
+
+    Args:
+        data: Pixels, shape (height, width, 3) in RGB, or (height, width) in grey.
+        features: Drawn in it: inliers green, all others red.
+    """
+    import cv2  # not before somebody asks for an image
+
+    pixels: Any = data
+    height, width = data.shape[:2]
+    scale = min(MAX_SIDE / max(height, width), 1.0)
+    if scale < 1.0:
+        size = max(round(width * scale), 1), max(round(height * scale), 1)
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    if data.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    elif features:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
+    for each in features:
+        places = np.rint((each.points + 0.5) * scale - 0.5).astype(int).tolist()
+        for place, inlier in zip(places, each.inliers.tolist(), strict=True):
+            cv2.circle(pixels, place, 2, (60, 220, 60) if inlier else (60, 60, 230), 1, cv2.LINE_AA)
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
 
 @contextlib.contextmanager
@@ -297,12 +282,12 @@ def serving(observer: Observer, run: str) -> Iterator[Path | None]:
     """
     try:
         path = socket_of(run)
+        server = Server(observer, asyncio.get_running_loop(), path)
     except (CommandError, OSError) as error:
         log.warning("no monitor can connect to this run: %s", error)
         yield None
         return
-    server = Server(observer, asyncio.get_running_loop(), path)
     try:
-        yield path if server.start() else None
+        yield path
     finally:
         server.stop()

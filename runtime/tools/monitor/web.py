@@ -1,8 +1,8 @@
-"""The monitor as a page: the same tables and commands as in a terminal, and a camera's images.
+"""The monitor as a page: what the terminal shows, the same commands, and a camera's images.
 
-Served on this machine only. The token in the address allows commands: other users of the machine
-do not know it, and other pages in the browser can neither read it nor send the header that a
-command needs.
+Served on this machine only, each page with a connection of its own to the run. The token in the
+address allows commands: other users of the machine do not know it, and other pages in the browser
+can neither read it nor send the header that a command needs.
 """
 
 from __future__ import annotations
@@ -10,230 +10,199 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import secrets
-from collections.abc import AsyncIterator
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
-from urllib.parse import quote
+from urllib.parse import parse_qs, quote, urlsplit
 
 import jinja2
 import msgspec
 
-from runtime.errors import CommandError, VisnavError
-from runtime.tools.monitor.client import (
-    LONGEST_HEAD,
-    Client,
-    HttpError,
-    Request,
-    event_stream,
-    host_of,
-    read_request,
-    response,
-    server_sent,
-)
+from runtime.tools.monitor.client import request
 from runtime.tools.monitor.protocol import (
     COLUMNS,
-    LEFT,
     QUICKEST,
-    RIGHT,
     SLOWEST,
-    UNREADABLE,
+    STACKS,
     Answer,
-    Snapshot,
-    decode_command,
+    Look,
+    Watch,
     encode,
     is_number,
 )
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
+LONGEST_BODY = 64 << 10
+"""Bytes of a command at most."""
+
 _HOSTS = {"127.0.0.1", "localhost"}
-_MAX_BACKLOG = 3
-"""Snapshots queued for a slow page at most."""
+_ONCE = ("host", "origin", "content-length", TOKEN_HEADER)
+"""Headers to be given only once: with two, the valid host or token would be unclear."""
 
 
-class Page:
-    """Server of a run's page.
+class HttpError(Exception):
+    """Refusal of a request: a status, and a text."""
+
+
+class PageServer(ThreadingHTTPServer):
+    """Server of a run's page, a thread for each connection.
 
     Args:
+        port: On 127.0.0.1; 0 for any that is free.
+        run: The socket at which the run listens.
         token: Required in addresses; random if not given.
+
+    Raises:
+        OSError: The port is taken.
     """
 
-    def __init__(self, client: Client, token: str | None = None) -> None:
+    def __init__(self, port: int, run: Path, token: str | None = None) -> None:
+        self.run = run
         self.token = token or secrets.token_urlsafe(16)
-        self.over = asyncio.Event()
-        """Set when the run is over."""
-        self._client = client
-        self._pages: set[asyncio.Queue[bytes | None]] = set()
-        self._last: bytes | None = None
-        self._end = "the run is over: it does not answer any more"
+        super().__init__(("127.0.0.1", port), _Handler)
+        self.address = f"http://127.0.0.1:{self.server_port}/?token={quote(self.token, safe='')}"
 
-    async def listen(self) -> None:
-        """Send the run's snapshots to all pages until the run is over."""
+
+class _Handler(BaseHTTPRequestHandler):
+    """Handler of a connection's one request."""
+
+    server: PageServer
+    timeout = 10.0  # seconds for the request to come, and for a page to take what it is sent
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the base's name
+        """Log no requests."""
+
+    def _handle(self) -> None:
         try:
-            async for snapshot in self._client.snapshots():
-                self._last = encode(page_data(snapshot))
-                self._offer(self._last)
-                if snapshot.ended:
-                    self._end = f"the run is over: {snapshot.ended}"
-        except VisnavError as error:
-            self._end = str(error)
-        finally:
-            self._offer(None)
-            self.over.set()
-
-    def _offer(self, data: bytes | None) -> None:
-        for page in self._pages:
-            if page.full():
-                page.get_nowait()
-            page.put_nowait(data)
-
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve a connection."""
-        try:
-            request = await asyncio.wait_for(read_request(reader), 10.0)
-            await self._respond(request, writer)
-            await writer.drain()
+            self._respond()
         except HttpError as error:
-            writer.write(response(error.status, f"{error.text}\n".encode()))
-        except (OSError, EOFError, TimeoutError):
+            status, text = error.args
+            self._send(status, f"{text}\n".encode())
+        except OSError:  # the page has gone
             pass
-        finally:
-            writer.close()
 
-    async def _respond(self, request: Request, writer: asyncio.StreamWriter) -> None:
-        self._authorize(request)
-        match request.method, request.path:
+    do_GET = do_POST = _handle  # noqa: N815  # the base's names
+
+    def _respond(self) -> None:
+        try:
+            url = urlsplit(self.path)
+        except ValueError as error:
+            raise HttpError(400, f"expected an address: {error}") from None
+        query = {key: values[0] for key, values in parse_qs(url.query).items()}
+        self._authorize(query.get("token", ""))
+        match self.command, url.path:
             case "GET", "/":
-                writer.write(self._page())
+                self._page()
             case "GET", "/events":
-                writer.write(event_stream())
-                async for data in self._events():
-                    writer.write(data)
-                    await writer.drain()
+                self._events()
             case "GET", "/image":
-                writer.write(response(200, await self._image(request), "image/jpeg"))
+                answer = self._ask(encode(Look(camera=query.get("camera", ""))))
+                if not answer.done:
+                    raise HttpError(404, answer.text)
+                self._send(200, answer.jpeg, "image/jpeg")
             case "POST", "/command":
-                answer = await self._command(request)
-                writer.write(response(200, encode(answer), "application/json"))
+                answer = self._ask(self._body())
+                self._send(200, encode(answer), "application/json")
             case _, "/" | "/events" | "/image" | "/command":
-                raise HttpError(405, f"{request.path} takes no {request.method}")
+                raise HttpError(405, f"{url.path} takes no {self.command}")
             case _:
-                raise HttpError(404, f"there is no {request.path}")
+                raise HttpError(404, f"there is no {url.path}")
 
-    def _authorize(self, request: Request) -> None:
+    def _authorize(self, token: str) -> None:
         """Check a request's token and, against DNS rebinding, its host: this machine.
 
         Raises:
             HttpError: It is not allowed.
         """
-        host = host_of(request.headers)
+        for name in _ONCE:
+            if len(self.headers.get_all(name, ())) > 1:
+                raise HttpError(400, f"expected one header {name}, found two")
+        host = self.headers.get("host", "").partition(":")[0]
         if host not in _HOSTS:
             raise HttpError(403, f"expected a request to 127.0.0.1, found {host!r}")
-        given = (
-            request.headers.get(TOKEN_HEADER, "")
-            if request.method == "POST"
-            else request.query.get("token", "")
-        )
-        if not secrets.compare_digest(given.encode(), self.token.encode()):
+        given = self.headers.get(TOKEN_HEADER, "") if self.command == "POST" else token
+        if not secrets.compare_digest(given.encode(), self.server.token.encode()):
             raise HttpError(403, "expected the address that was printed, token included")
 
-    def _page(self) -> bytes:
+    def _body(self) -> bytes:
+        length = self.headers.get("content-length", "0")
+        if not length.isascii() or not length.isdigit():
+            raise HttpError(400, "expected a length")
+        if len(length) > 9 or int(length) > LONGEST_BODY:
+            raise HttpError(413, f"expected at most {LONGEST_BODY} bytes")
+        return self.rfile.read(int(length)).replace(b"\n", b" ")
+
+    def _ask(self, line: bytes) -> Answer:
+        return asyncio.run(request(self.server.run, line))
+
+    def _page(self) -> None:
         nonce = secrets.token_urlsafe(16)
-        text = _template().render(
+        text = (Path(__file__).parent / "page.html.jinja").read_text(encoding="utf-8")
+        page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+        content = page.from_string(text).render(
             nonce=nonce,
             slowest=SLOWEST,
             quickest=QUICKEST,
-            token=self.token,
-            first=None if self._last is None else msgspec.json.decode(self._last),
-            stacks=[
-                {
-                    name: [(title, is_number(name, n)) for n, title in enumerate(COLUMNS[name])]
-                    for name in stack
-                }
-                for stack in (LEFT, RIGHT)
-            ],
+            token=self.server.token,
+            stacks=STACKS,
+            columns=COLUMNS,
+            first=msgspec.json.decode(next(self._snapshots(), b"null")),
+            is_number=is_number,
         )
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
             "connect-src 'self'; img-src 'self'; frame-ancestors 'none'; base-uri 'none'; "
             "form-action 'none'"
         )
-        return response(
-            200, text.encode(), "text/html; charset=utf-8", content_security_policy=policy
-        )
+        self._send(200, content.encode(), "text/html; charset=utf-8", policy)
 
-    async def _events(self) -> AsyncIterator[bytes]:
-        page: asyncio.Queue[bytes | None] = asyncio.Queue(_MAX_BACKLOG)
-        self._pages.add(page)
-        try:
-            if self._last is not None:
-                yield server_sent(self._last)
-            if not self.over.is_set():
-                while (data := await page.get()) is not None:
-                    yield server_sent(data)
-            yield server_sent(encode({"over": self._end}))
-        finally:
-            self._pages.discard(page)
+    def _events(self) -> None:
+        """Send the run's snapshots as events, each a line; and ``null`` when it is over."""
+        self._head(200, "text/event-stream")
+        for line in self._snapshots():
+            self.wfile.write(b"data: " + line + b"\n")
+        self.wfile.write(b"data: null\n\n")
 
-    async def _image(self, request: Request) -> bytes:
-        try:
-            return await self._client.image(request.query.get("camera", ""))
-        except CommandError as error:
-            raise HttpError(404, str(error)) from None
+    def _snapshots(self) -> Iterator[bytes]:
+        with (
+            contextlib.suppress(ConnectionError, FileNotFoundError),
+            connected(self.server.run) as run,
+        ):
+            run.sendall(encode(Watch()) + b"\n")
+            yield from run.makefile("rb")
 
-    async def _command(self, request: Request) -> Answer:
-        try:
-            command = decode_command(request.body)
-        except UNREADABLE as error:
-            raise HttpError(400, f"expected a command: {error}") from None
-        if self.over.is_set():
-            return Answer(number=-1, done=False, text="the run is over")
-        return await self._client.ask(command)
+    def _send(
+        self, status: int, content: bytes, kind: str = "text/plain; charset=utf-8", policy: str = ""
+    ) -> None:
+        self._head(status, kind, policy)
+        self.wfile.write(content)
 
-
-def page_data(snapshot: Snapshot) -> dict[str, Any]:
-    """Return the data of a snapshot for the page."""
-    return {
-        "headline": snapshot.headline,
-        "paused": snapshot.clock.paused,
-        "speed": snapshot.clock.aim,
-        "fixed": snapshot.clock.fixed,
-        "cameras": snapshot.cameras,
-        "tables": snapshot.tables,
-        "log": [msgspec.to_builtins(line) for line in snapshot.log],
-    }
+    def _head(self, status: int, kind: str, policy: str = "") -> None:
+        self.send_response(status)
+        self.send_header("content-type", kind)
+        self.send_header("cache-control", "no-store")
+        self.send_header("x-content-type-options", "nosniff")
+        self.send_header("referrer-policy", "no-referrer")
+        if policy:
+            self.send_header("content-security-policy", policy)
+        self.end_headers()
 
 
-async def serve(client: Client, port: int, token: str | None = None, leave: bool = False) -> None:
-    """Serve a run's page until Ctrl-C, or until the run is over.
-
-    Args:
-        port: On 127.0.0.1; 0 for any that is free.
-        token: See `Page`.
-
-    Raises:
-        OSError: The port is taken.
-    """
-    page = Page(client, token)
-    server = await asyncio.start_server(page.serve, "127.0.0.1", port, limit=LONGEST_HEAD)
-    number = server.sockets[0].getsockname()[1]
-    print(
-        f"the monitor is at http://127.0.0.1:{number}/?token={quote(page.token, safe='')}",
-        flush=True,
-    )
-    listening = asyncio.create_task(page.listen())
-    try:
-        if leave:
-            await listening
-            await asyncio.sleep(0.5)  # the pages receive the end
-        else:
-            await asyncio.get_running_loop().create_future()
-    finally:
-        listening.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await listening
-        server.close()
+def serve(server: PageServer) -> None:
+    """Serve a run's page until the run is over."""
+    with server, contextlib.suppress(OSError), connected(server.run) as run:
+        print(f"the monitor is at {server.address}", flush=True)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        run.recv(1)  # nothing comes but the end
+        time.sleep(0.5)  # the pages receive the end
 
 
-def _template() -> jinja2.Template:
-    text = (Path(__file__).parent / "page.html.jinja").read_text(encoding="utf-8")
-    return jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(text)
+@contextlib.contextmanager
+def connected(path: Path) -> Iterator[socket.socket]:
+    """Hold a connection to a run."""
+    with socket.socket(socket.AF_UNIX) as run:
+        run.connect(str(path))
+        yield run

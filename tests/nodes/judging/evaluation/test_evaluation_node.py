@@ -98,9 +98,12 @@ def test_scores_come_with_each_estimate(tmp_path: Path) -> None:
     ]
     scores = run(tmp_path, announced(), truth(1), estimates)
     errors = [s.value for s in scores if s.metric == "position_error"]
-    squares = [s.value for s in scores if s.metric == "mean_square_error"]
+    so_far = [s.value for s in scores if s.metric == "ate_rmse"]
+    percent = [s.value for s in scores if s.metric == "ate_percent"]
     assert errors == pytest.approx([0.1, 0.2, 0.3])
-    assert squares == pytest.approx([0.01, 0.05 / 2, 0.14 / 3])
+    assert so_far == pytest.approx([0.1, math.sqrt(0.05 / 2), math.sqrt(0.14 / 3)])
+    flown = [4 * math.pi / 10 * s / SECOND for s in FRAMES[1:3]]
+    assert percent == pytest.approx([100 * so_far[1] / flown[0], 100 * so_far[2] / flown[1]], 1e-3)
     assert {s.subject for s in scores} == {"est"}
 
 

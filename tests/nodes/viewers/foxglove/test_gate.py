@@ -13,8 +13,7 @@ from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
 from nodes.viewers.foxglove import server as gate
-from nodes.viewers.foxglove.server import FoxgloveConfig, Gate, Server, hidden_host
-from runtime.tools.monitor.client import HttpError
+from nodes.viewers.foxglove.server import FoxgloveConfig, Gate, HttpError, Server, hidden_host
 from tests.nodes.viewers.foxglove.client import Viewer
 
 PROTOCOL = [Subprotocol("foxglove.sdk.v1")]
@@ -84,7 +83,7 @@ def test_names_that_a_page_gave_to_this_machine_are_refused(
         return
     with pytest.raises(HttpError) as refused:
         server._gate.check(request(*headers))
-    assert refused.value.status == status
+    assert refused.value.args[0] == status
 
 
 def test_the_library_listens_where_no_page_can_find_it(server: Server) -> None:

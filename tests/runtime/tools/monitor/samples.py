@@ -8,29 +8,20 @@ from typing import Any
 
 import msgspec
 
-from runtime.errors import CommandError
-from runtime.tools.monitor.protocol import Answer, ClockState, Command, LogLine, Snapshot
+from runtime.tools.monitor.protocol import Answer, Command, LogLine, Snapshot
 
 
 def snapshot(**changes: Any) -> Snapshot:
-    """Return a snapshot of a run with a drone and a pilot; `clock_…` changes its clock."""
-    clock = ClockState(
-        kind="lockstep",
+    """Return a snapshot of a run with a drone, an estimator and a pilot."""
+    found = Snapshot(
+        headline="sample   1.500 of 60 s   2.00 × real time (as fast as it can)   runs",
         now=1.5,
-        duration=60.0,
-        speed=2.0,
-        target_speed=None,
+        ended="",
         paused=False,
         fixed="",
-    )
-    of_clock = {k.removeprefix("clock_"): v for k, v in changes.items() if k.startswith("clock_")}
-    found = Snapshot(
-        run="sample",
-        pid=1,
-        number=1,
-        ended="",
-        clock=msgspec.structs.replace(clock, **of_clock),
+        speed=2.0,
         tables={
+            "estimators": [("vo", "tracking", "0.012", "0.31", "55.0")],
             "nodes": [
                 ("drone", "running", "25.0%", "400", "1.25", "2"),
                 ("pilot", "running", "25.0%", "400", "1.25", ""),
@@ -41,13 +32,11 @@ def snapshot(**changes: Any) -> Snapshot:
             "ticks": [("drone.control", "400", "600", "0", "12", "90")],
             "settings": [("pilot.gain", "1.0"), ("pilot.patience", "0.5")],
         },
+        paths={"drone: truth": [(0.0, 0.0), (10.0, 0.0)], "vo": [(0.0, 0.0), (0.0, 5.0)]},
         cameras=["drone.images: drone/front"],
-        log=[
-            LogLine(number=0, seconds=0.5, level="WARNING", logger_name="pilot", text="[b]wind[/b]")
-        ],
+        log=[LogLine(number=0, level="WARNING", text="     0.500 WARNING  pilot: [b]wind[/b]")],
     )
-    rest = {k: v for k, v in changes.items() if not k.startswith("clock_")}
-    return msgspec.structs.replace(found, **rest)
+    return msgspec.structs.replace(found, **changes)
 
 
 class FakeClient:
@@ -67,10 +56,4 @@ class FakeClient:
     async def ask(self, command: Command) -> Answer:
         """Remember a command."""
         self.asked.append(command)
-        return Answer(number=0, done=True, text="done")
-
-    async def image(self, camera: str) -> bytes:
-        """Return something for the one camera there is."""
-        if camera != "drone.images: drone/front":
-            raise CommandError(f"found {camera!r}")
-        return b"\xff\xd8 a JPEG"
+        return Answer(done=True, text="done")

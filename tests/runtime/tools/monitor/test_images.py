@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
-import threading
-
 import cv2
 import numpy as np
 import pytest
 
-from events import Image
+from events import TrackedFeatures
 from runtime.errors import VisnavError
 from runtime.run.supervisor import Supervisor
-from runtime.tools.monitor import server as images
 from runtime.tools.monitor.observer import Observer
-from runtime.tools.monitor.server import MAX_SIDE, ImageEncoder, small_jpeg
+from runtime.tools.monitor.server import IMAGE_PERIOD, MAX_SIDE, Kept, small_jpeg
 from tests.runtime.tools.monitor.test_observer import observe
 
 CAMERA = "drone.images: drone/front"
@@ -49,40 +45,36 @@ def test_red_stays_red() -> None:
     assert blue_green_red[0] < 10
 
 
-def image(stamp: int) -> Image:
-    data = np.full((16, 16), stamp, np.uint8)
-    return Image(stamp=stamp, source="drone/front", frame_id="front", encoding="mono8", data=data)
+def test_features_are_drawn_where_they_are_in_the_small_image() -> None:
+    points = np.array([[300.0, 600.0], [900.0, 200.0]], np.float32)
+    features = TrackedFeatures(
+        stamp=0, source="vo", frame_id="front", points=points, inliers=np.array([True, False])
+    )
+    grey = np.zeros((800, 2 * MAX_SIDE), np.uint8)
+    pixels = decoded(small_jpeg(grey, [features])).astype(int)  # half as large
+    inlier, outlier = pixels[296:305, 146:155].sum((0, 1)), pixels[96:105, 446:455].sum((0, 1))
+    assert inlier[1] > 2 * inlier[2]  # green
+    assert outlier[2] > 2 * outlier[1]  # red
+    assert pixels.sum() < 1.2 * (inlier + outlier).sum()
+    assert not grey.any()  # what others have is as it was
 
 
-async def test_images_are_encoded_in_a_thread_and_no_oftener_than_said(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_images_are_made_no_oftener_than_said(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr("runtime.tools.monitor.server.time.monotonic", lambda: now)
-    threads: list[threading.Thread] = []
-    encode = small_jpeg
+    made: list[str] = []
 
-    def noting(data: np.ndarray) -> bytes:
-        threads.append(threading.current_thread())
-        return encode(data)
+    def make(name: str) -> bytes:
+        made.append(name)
+        return name.encode()
 
-    monkeypatch.setattr(images, "small_jpeg", noting)
-    asked: list[int] = []
-
-    async def newest() -> Image:
-        asked.append(len(asked) * 50)
-        return image(asked[-1])
-
-    encoder = ImageEncoder()
-    same = await asyncio.gather(*(encoder.encode("a", newest) for _ in range(5)))
-    assert len(set(same)) == 1
-    assert asked == [0]
-    await encoder.encode("b", newest)
-    assert asked == [0, 50]
-    now += images.IMAGE_PERIOD
-    assert decoded(await encoder.encode("a", newest)).mean() == pytest.approx(100, abs=3)
-    assert len(threads) == 3
-    assert threading.main_thread() not in threads
+    kept = Kept()
+    assert {kept.get("a", IMAGE_PERIOD, lambda: make("a")) for _ in range(5)} == {b"a"}
+    kept.get("b", IMAGE_PERIOD, lambda: make("b"))
+    now += IMAGE_PERIOD
+    kept.get("a", IMAGE_PERIOD, lambda: make("a"))
+    assert made == ["a", "b", "a"]
+    assert IMAGE_PERIOD >= 0.5
 
 
 def test_the_newest_image_is_known_while_somebody_looks() -> None:
@@ -95,7 +87,7 @@ def test_the_newest_image_is_known_while_somebody_looks() -> None:
         for newest in (0.3, 0.4):
             await supervisor.state.clock.sleep(0.1)
             assert observer.take().cameras == [CAMERA]
-            assert observer.image(CAMERA).stamp == round(newest * 1e9)
+            assert observer.image(CAMERA)[0].stamp == round(newest * 1e9)
         with pytest.raises(VisnavError, match=f"did you mean {CAMERA!r}"):
             observer.image("drone.images: drone/frond")
         observer.end()

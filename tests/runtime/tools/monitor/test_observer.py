@@ -5,6 +5,7 @@ from __future__ import annotations
 import types
 from collections.abc import Callable, Coroutine
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -15,6 +16,7 @@ from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.time.lockstep import LockstepClock, LockstepLoop
 from runtime.tools.monitor import observer
+from runtime.tools.monitor.estimators import Measured
 from runtime.tools.monitor.observer import (
     KEPT,
     Amount,
@@ -72,8 +74,9 @@ def test_a_snapshot_tells_what_there_was_lately() -> None:
 
     observe(script)
     first, second = taken
-    assert (first.number, second.number) == (1, 2)
-    assert (first.run, first.clock.kind, first.clock.now) == ("sample", "lockstep", 0.35)
+    assert (first.now, second.now) == (0.35, 0.7)
+    assert first.headline.startswith("sample   0.350 of 1 s   ")
+    assert first.headline.endswith(" × real time (as fast as it can)   runs")
     assert second.tables.keys() == COLUMNS.keys()
     images = ("drone.images", "Image", "7", "10.0", "0.08", "20.00", "20.00")
     assert tuple(row(second, "outputs", "drone.images").values()) == images
@@ -139,8 +142,16 @@ def test_commands_end_the_run_and_change_settings() -> None:
         await supervisor.state.clock.sleep(0.1)
         assert observer.execute(Set(text="pilot.gain=2")) == "gain = 2.0"
         assert observer.execute(Set(text="pilot.gain=2")) == "as it was"
+        observer.execute(Pause())
+        paused = observer.take()
+        assert paused.paused
+        assert paused.headline.endswith("   paused")
+        observer.execute(Speed(factor=0.5))
+        assert "(asked: 0.5)" in observer.take().headline
+        assert observer.take().speed == 0.5
         assert observer.execute(Stop()) == "ends"
         assert observer.take().ended == "stopped by hand"
+        assert observer.take().headline.endswith("   ends: stopped by hand")
 
     assert observe(script).supervisor.state.reason == "stopped by hand"
     assert describe(Step(seconds=0.5)) == "step 0.5"
@@ -175,7 +186,7 @@ def test_real_time_takes_no_orders(command: Any) -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         with pytest.raises(VisnavError, match="in real time, which cannot be stopped"):
             observer.execute(command)
-        assert "sensors do not wait" in observer.take().clock.fixed
+        assert "sensors do not wait" in observer.take().fixed
 
     observe(script, clock="real", duration=0.02)
 
@@ -186,8 +197,7 @@ def sample(n: int) -> Sample:
         n / 5,
         n * 10**9 * 2 // 5,
         {"a.out": n * n},
-        {"a": Amount(1, 10 * n, 10 * n)},
-        {"a.out": Amount(2, n, n)},
+        {"a": Amount(1, 10 * n, 10 * n), "a.out": Amount(2, n, n)},
     )
 
 
@@ -199,15 +209,15 @@ def test_it_spans_the_last_samples_and_adds_up_what_lies_between() -> None:
     assert recent.real == pytest.approx(1.0)
     assert recent.run == 2.0
     assert recent.rate("a.out") == (100 - 25) / 2
-    assert recent.node("a") == Amount(5, 10 * (6 + 7 + 8 + 9 + 10), 100)
-    assert recent.output("a.out") == Amount(10, 40, 10)
+    assert recent.amount("a") == Amount(5, 10 * (6 + 7 + 8 + 9 + 10), 100)
+    assert recent.amount("a.out") == Amount(10, 40, 10)
 
 
 def test_there_is_nothing_before_the_second_sample_and_of_strangers() -> None:
     recent = RecentSamples(sample(3))
-    assert (recent.run, recent.rate("a.out"), recent.node("a")) == (0.0, 0.0, Amount())
+    assert (recent.run, recent.rate("a.out"), recent.amount("a")) == (0.0, 0.0, Amount())
     recent.add(sample(4))
-    assert (recent.node("b"), recent.rate("b.out")) == (Amount(), 0.0)
+    assert (recent.amount("b"), recent.rate("b.out")) == (Amount(), 0.0)
 
 
 def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,7 +229,7 @@ def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(observer, "time", types.SimpleNamespace(perf_counter_ns=lambda: now[0]))
     loop = LockstepLoop()
     try:
-        found = Meter(LockstepClock(loop))
+        found = Meter(LockstepClock(loop), Measured(Mock()))
 
         def fail(_: Any) -> None:
             work(5)
@@ -240,7 +250,5 @@ def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) 
         found.wrap_call("a", "tick", work)(7)
     finally:
         loop.close()
-    assert found.nodes["a"].take() == Amount(2, 37, 30)
-    assert found.nodes["b"].take() == Amount(2, 300, 200)
-    assert found.nodes["c"].take() == Amount(1, 5, 5)
-    assert found.nodes["a"].take() == Amount()
+    assert found.take() == {"a": Amount(2, 37, 30), "b": Amount(2, 300, 200), "c": Amount(1, 5, 5)}
+    assert found.take() == {}

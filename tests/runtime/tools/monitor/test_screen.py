@@ -17,6 +17,7 @@ from runtime.tools.monitor.protocol import (
     Answer,
     Command,
     Pause,
+    Points,
     Restart,
     Resume,
     Set,
@@ -25,13 +26,13 @@ from runtime.tools.monitor.protocol import (
     Step,
     Stop,
 )
-from runtime.tools.monitor.screen import Screen
+from runtime.tools.monitor.screen import Screen, drawn
 from tests.runtime.tools.monitor.samples import FakeClient, snapshot
 
 
 @asynccontextmanager
 async def shown(stand: FakeClient, **options: Any) -> AsyncIterator[tuple[Screen, Pilot[Any]]]:
-    screen = Screen(stand, **options)
+    screen = Screen(stand, **options)  # type: ignore[arg-type]  # it stands for a client
     async with screen.run_test(size=(140, 40)) as pilot:
         await pilot.pause()
         yield screen, pilot
@@ -49,12 +50,21 @@ async def test_it_shows_what_there_is_and_keeps_the_cursor() -> None:
         nodes: DataTable[Any] = screen.query_one("#nodes", DataTable)
         assert [str(cell) for cell in nodes.get_row("drone")][:3] == ["drone", "running", "25.0%"]
         await pilot.press("down")
-        stand.coming.put_nowait(snapshot(clock_now=2.0))
+        stand.coming.put_nowait(snapshot(headline="sample   2.000 of 60 s"))
         await pilot.pause()
         assert "2.000" in text(screen, "head")
         assert nodes.cursor_row == 1
         image = screen.export_screenshot()
-        for words in ("drone.images", "vo.images", "drone.control", "[b]wind[/b]", "quit"):
+        for words in (
+            "tracking",
+            "0.31",
+            "drone: truth",
+            "drone.images",
+            "vo.images",
+            "drone.control",
+            "[b]wind[/b]",
+            "quit",
+        ):
             assert words in image.replace("&#160;", " ")
         stand.coming.put_nowait(snapshot(tables=snapshot().tables | {"links": []}))
         await pilot.pause()
@@ -81,7 +91,7 @@ async def test_keys_ask_the_run() -> None:
             await pilot.pause()
             assert stand.asked == commands
         stand.asked.clear()
-        stand.coming.put_nowait(snapshot(clock_paused=True, clock_target_speed=SLOWEST))
+        stand.coming.put_nowait(snapshot(paused=True, speed=SLOWEST))
         await pilot.pause()
         await pilot.press("minus", "space", "space")
         await pilot.pause()
@@ -136,3 +146,13 @@ async def test_it_says_when_the_run_is_over_and_leaves_if_it_should() -> None:
     async with shown(stand, leave=True) as (screen, pilot):
         await pilot.pause()
         assert not screen.is_running
+
+
+def test_paths_are_drawn_to_scale_with_north_up() -> None:
+    east: Points = [(0.0, 0.0), (8.0, 0.0)]
+    north: Points = [(8.0, 0.0), (8.0, 4.0)]
+    names, *lines = drawn({"truth": east, "vo": north}, 9, 4).plain.split("\n")
+    assert names == "━ truth  ━ vo  "
+    assert lines == ["        ⢰", "        ⢸", "⠤⠤⠤⠤⠤⠤⠤⠤⠼"]
+    assert drawn({"truth": []}, 9, 4).plain == "━ truth  "
+    assert set("".join(drawn({"truth": [(3.0, 3.0)]}, 9, 4).plain.split("\n")[1:])) == {" ", "⠄"}

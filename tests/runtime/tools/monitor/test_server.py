@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest.mock import AsyncMock, Mock
+from unittest.mock import Mock
 
 import pytest
 
@@ -17,12 +18,12 @@ from runtime.errors import VisnavError
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.monitor import client, server
-from runtime.tools.monitor.client import Client, ask, find, runs
+from runtime.tools.monitor.client import Client, ask, find, request, runs, socket_of
 from runtime.tools.monitor.observer import LastRecords, Observer
 from runtime.tools.monitor.protocol import (
-    Answer,
     Command,
     LogLine,
+    Look,
     Pause,
     Resume,
     Set,
@@ -32,7 +33,6 @@ from runtime.tools.monitor.protocol import (
     encode,
 )
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
-from tests.runtime.tools.monitor.samples import snapshot
 
 NODES = [spec(Camera, "drone"), spec(Estimator, "vo"), spec(Pilot, "pilot")]
 
@@ -60,7 +60,7 @@ def served(outside: Callable[[], Any], clock: str = "lockstep") -> Looked:
 
 async def attached(*commands: Command) -> tuple[list[Snapshot], list[Any]]:
     """Attach, ask for some things, and return what was seen and answered."""
-    connection = await Client.connect(find("sample"))
+    connection = Client(find("sample"))
     seen: list[Snapshot] = []
     asking: asyncio.Task[Any] | None = None
 
@@ -71,7 +71,6 @@ async def attached(*commands: Command) -> tuple[list[Snapshot], list[Any]]:
         seen.append(found)
         asking = asking or asyncio.create_task(ask_all())
         if len(seen) >= 3 and asking.done():
-            connection.close()
             break
     assert asking is not None
     return seen, await asking
@@ -81,8 +80,8 @@ async def attached(*commands: Command) -> tuple[list[Snapshot], list[Any]]:
 def test_snapshots_come_and_commands_are_answered(clock: str) -> None:
     def outside() -> None:
         seen, answers = asyncio.run(attached(Set(text="pilot.gain=3"), Speed(factor=5.0)))
-        numbers = [each.number for each in seen]
-        assert numbers == list(range(1, len(seen) + 1))
+        times = [each.now for each in seen]
+        assert times == sorted(times)
         assert [node[0] for node in seen[0].tables["nodes"]] == ["drone", "vo", "pilot"]
         changed, paced = answers
         assert (changed.done, changed.text) == (True, "gain = 3.0")
@@ -95,13 +94,12 @@ def test_snapshots_come_and_commands_are_answered(clock: str) -> None:
 
 def test_images_come_to_those_who_watch_and_ask() -> None:
     async def looking() -> None:
-        connection = await Client.connect(find("sample"))
+        connection = Client(find("sample"))
         asked: asyncio.Task[Any] | None = None
         async for found in connection.snapshots():
             if asked is None and found.cameras:
-                asked = asyncio.create_task(_images(connection, found.cameras))
+                asked = asyncio.create_task(_images(found.cameras))
             elif asked is not None and asked.done():
-                connection.close()
                 break
         assert asked is not None
         asked.result()
@@ -110,12 +108,13 @@ def test_images_come_to_those_who_watch_and_ask() -> None:
     assert looked.supervisor.instruments.attached == ()
 
 
-async def _images(connection: Client, cameras: list[str]) -> None:
+async def _images(cameras: list[str]) -> None:
     assert cameras == ["drone.images: drone/front"]
-    jpeg = await connection.image(cameras[0])
-    assert jpeg[:2] == b"\xff\xd8"
-    with pytest.raises(VisnavError, match="expected a camera that has sent images"):
-        await connection.image("drone.images: drone/rear")
+    found = await request(find(None), encode(Look(camera=cameras[0])))
+    assert found.jpeg[:2] == b"\xff\xd8"
+    refused = await request(find(None), encode(Look(camera="drone.images: drone/rear")))
+    assert not refused.done
+    assert refused.text.startswith("expected a camera that has sent images")
 
 
 def test_a_command_needs_no_more_than_a_line(sockets: Path) -> None:
@@ -134,7 +133,7 @@ def test_a_command_needs_no_more_than_a_line(sockets: Path) -> None:
 
 def test_nonsense_is_answered_and_does_no_harm() -> None:
     def outside() -> None:
-        for nonsense in (b"\xff\x00\n", b'{"type":"ask"}\n', b'{"a":' * 5000 + b"\n", b"no end"):
+        for nonsense in (b"\xff\x00\n", b'{"do":"ask"}\n', b'{"a":' * 5000 + b"\n", b"no end"):
             with socket.socket(socket.AF_UNIX) as connection:
                 connection.connect(str(find(None)))
                 connection.sendall(nonsense)
@@ -148,7 +147,7 @@ def test_nonsense_is_answered_and_does_no_harm() -> None:
 def test_who_looks_sees_the_end() -> None:
     def outside() -> None:
         async def until_the_end() -> list[Snapshot]:
-            connection = await Client.connect(find(None))
+            connection = Client(find(None))
             seen = []
             async for found in connection.snapshots():
                 seen.append(found)
@@ -189,7 +188,7 @@ def test_a_monitor_that_fails_leaves_the_run_alone(monkeypatch: pytest.MonkeyPat
     def outside() -> None:
         with socket.socket(socket.AF_UNIX) as connection:
             connection.connect(str(find(None)))
-            connection.sendall(b'{"type":"watch"}\n')
+            connection.sendall(b'{"do":"watch"}\n')
             assert ask(find(None), Set(text="pilot.gain=2")) == "gain = 2.0"
 
     assert served(outside).supervisor.state.reason == "seen enough"
@@ -199,16 +198,17 @@ def test_those_who_read_nothing_do_not_hold_up_the_end(
     monkeypatch: pytest.MonkeyPatch, sockets: Path
 ) -> None:
     monkeypatch.setattr(server, "CLOSING_TIMEOUT", 0.1)
-    long = LogLine(number=0, seconds=0.0, level="INFO", logger_name="x", text="x" * 400_000)
+    long = LogLine(number=0, level="INFO", text="x" * 400_000)
     monkeypatch.setattr(LastRecords, "lines", lambda _: [long])
     enough = threading.Event()
     take = Observer.take
+    taken: list[Snapshot] = []
 
     def counted(observer: Observer) -> Snapshot:
-        found = take(observer)
-        if found.number > 3:
+        taken.append(take(observer))
+        if len(taken) > 3:
             enough.set()
-        return found
+        return taken[-1]
 
     monkeypatch.setattr(Observer, "take", counted)
     watching = [socket.socket(socket.AF_UNIX) for _ in range(8)]
@@ -216,7 +216,7 @@ def test_those_who_read_nothing_do_not_hold_up_the_end(
     def outside() -> None:
         for each in watching:
             each.connect(str(find(None)))
-            each.sendall(b'{"type":"watch"}\n')
+            each.sendall(b'{"do":"watch"}\n')
         assert enough.wait(10)
 
     try:
@@ -227,68 +227,50 @@ def test_those_who_read_nothing_do_not_hold_up_the_end(
             each.close()
 
 
-async def test_who_reads_no_answers_is_asked_for_no_more() -> None:
-    class Stuck:
-        """A writer whose other side reads nothing."""
+def test_who_reads_no_answers_is_asked_for_no_more() -> None:
+    def outside() -> None:
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(str(find(None)))
+            connection.settimeout(0.3)
+            with pytest.raises(TimeoutError):
+                connection.sendall(b"nonsense\n" * 1_000_000)
 
-        written = 0
-
-        def write(self, _: bytes) -> None:
-            self.written += 1
-
-        async def drain(self) -> None:
-            await asyncio.Event().wait()
-
-        def close(self) -> None: ...
-
-    reader, stuck = asyncio.StreamReader(), Stuck()
-    reader.feed_data(b"nonsense\n" * 100)
-    serving: Any = server.Server(None, asyncio.get_running_loop(), Path())  # type: ignore[arg-type]
-    task = asyncio.create_task(serving._serve_client(reader, stuck))
-    for _ in range(300):
-        await asyncio.sleep(0)
-    assert stuck.written == 1
-    task.cancel()
-    await task
+    assert served(outside).supervisor.state.reason == "seen enough"
 
 
-async def test_measuring_begins_and_ends_with_those_who_watch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(server, "PERIOD", 0)
+def test_measuring_begins_and_ends_with_those_who_watch(monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
+    begin, end = Observer.begin, Observer.end
 
-    class Noting:
-        def begin(self) -> None:
-            done.append("begin")
+    def noted(name: str, do: Callable[[Observer], None]) -> Callable[[Observer], None]:
+        def noting(observer: Observer) -> None:
+            done.append(name)
+            do(observer)
 
-        def end(self) -> None:
-            done.append("end")
+        return noting
 
-        def take(self) -> Snapshot:
-            done.append("take")
-            return snapshot()
+    monkeypatch.setattr(Observer, "begin", noted("begin", begin))
+    monkeypatch.setattr(Observer, "end", noted("end", end))
 
-    loop = asyncio.get_running_loop()
-    serving: Any = server.Server(Noting(), loop, Path())  # type: ignore[arg-type]
-    one, other = Mock(), Mock()
-    for writer in (one, other):
-        writer.transport.get_write_buffer_size.return_value = 0
-        writer.drain = AsyncMock()
-    watch = asyncio.StreamReader()
-    watch.feed_data(b'{"type":"watch"}\n')
-    watch.feed_eof()
-    publishing = asyncio.create_task(serving._publish())
-    await serving._serve_client(watch, one)  # and is gone
-    await serving._handle_line(b'{"type":"watch"}', other)
-    for _ in range(100):
-        await asyncio.sleep(0)
-    serving._watching.clear()
-    for _ in range(100):
-        await asyncio.sleep(0)
-    publishing.cancel()
-    assert [what for what in done if what != "take"] == ["begin", "end"]
-    assert other.write.called
+    def outside() -> None:
+        watching = [socket.socket(socket.AF_UNIX) for _ in range(2)]
+        for each in watching:
+            each.connect(str(find(None)))
+            each.sendall(b'{"do":"watch"}\n')
+            assert each.makefile("rb").readline()
+        one, other = watching
+        one.close()
+        other.makefile("rb").readline()
+        assert done == ["begin"]
+        other.close()
+        for _ in range(1000):
+            if done == ["begin", "end"]:
+                break
+            time.sleep(0.01)  # for threads, which have no clock of ours
+        assert done == ["begin", "end"]
+
+    looked = served(outside)
+    assert looked.supervisor.instruments.attached == ()
 
 
 def test_who_looks_for_runs_does_no_harm_to_one_that_begins(
@@ -317,40 +299,40 @@ def test_an_error_of_the_monitors_own_is_an_answer(monkeypatch: pytest.MonkeyPat
     assert served(outside).supervisor.state.reason == "seen enough"
 
 
-async def test_a_late_answer_and_the_end_disturb_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client, "ANSWER_TIMEOUT", 0.0)
-    reader = asyncio.StreamReader()
-    connection = Client(reader, Mock())
-    assert (await connection.ask(Stop())).text == "the run does not answer"
-    reader.feed_data(encode(Answer(number=0, done=True, text="at last")) + b"\n")
-    reader.feed_data(encode(snapshot()) + b"\n")
-    reader.feed_eof()
-    assert [seen.run async for seen in connection.snapshots()] == ["sample"]
-    monkeypatch.setattr(client, "ANSWER_TIMEOUT", 60.0)
-    assert (await connection.ask(Stop())).text == "the run is over"
-    with pytest.raises(VisnavError, match="the run is over"):
-        await connection.image("drone.images: drone/front")
+async def test_who_does_not_answer_is_not_waited_for_for_ever(
+    monkeypatch: pytest.MonkeyPatch, sockets: Path
+) -> None:
+    monkeypatch.setattr(client, "ANSWER_TIMEOUT", 0.01)
+    with socket.socket(socket.AF_UNIX) as silent:
+        path = socket_of("silent")
+        silent.bind(str(path))
+        silent.listen()
+        assert (await Client(path).ask(Stop())).text == "the run does not answer"
+    assert (await Client(path).ask(Stop())).text.startswith("expected a run that listens at")
 
 
-@pytest.mark.parametrize("line", [b"nonsense\n", b'{"type":"snapshot","run":1}\n', b"\xff\n"])
-async def test_another_version_at_the_other_end_is_an_error(line: bytes) -> None:
-    reader = asyncio.StreamReader()
-    reader.feed_data(line)
-    with pytest.raises(VisnavError, match="expected a run of this version: "):
-        await anext(Client(reader, Mock()).snapshots())
+@pytest.mark.parametrize("line", [b"nonsense\n", b'{"headline":1}\n', b"\xff\n"])
+async def test_another_version_at_the_other_end_is_an_error(line: bytes, sockets: Path) -> None:
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(line)
+        writer.close()
+
+    path = socket_of("other")
+    async with await asyncio.start_unix_server(answer, path):
+        with pytest.raises(VisnavError, match="expected a run of this version: "):
+            await anext(Client(path).snapshots())
 
 
-async def test_who_comes_in_the_last_moment_is_let_go() -> None:
-    """Also one whose task has not begun when all are cancelled."""
-    serving: Any = server.Server(Mock(), asyncio.get_running_loop(), Path())
-    early, late = Mock(), Mock()
-    serving._accept(asyncio.StreamReader(), early)
-    ((task, writer),) = serving._clients.items()
-    assert writer is early  # so the end closes it
-    task.cancel()
-    await asyncio.wait([task])
-    assert not serving._clients
-    serving._end.set()
-    serving._accept(asyncio.StreamReader(), late)
-    assert late.transport.abort.called
-    assert not serving._clients
+async def test_who_has_said_nothing_does_not_hold_up_the_end(sockets: Path) -> None:
+    path = socket_of("tour")
+    serving = server.Server(Mock(), asyncio.get_running_loop(), path)
+    with socket.socket(socket.AF_UNIX) as other:
+        other.connect(str(path))
+        begin = time.monotonic()
+        serving.stop()
+        assert time.monotonic() - begin < server.CLOSING_TIMEOUT
+        other.settimeout(5.0)
+        assert other.recv(1) == b""
+    with pytest.raises(OSError), socket.socket(socket.AF_UNIX) as late:  # noqa: PT011
+        late.connect(str(path))

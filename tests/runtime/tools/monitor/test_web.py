@@ -4,34 +4,81 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from runtime.tools.monitor.protocol import Pause, Set
-from runtime.tools.monitor.web import Page, page_data
-from tests.runtime.tools.monitor.samples import FakeClient, snapshot
+from runtime.tools.monitor import web
+from runtime.tools.monitor.client import socket_of
+from runtime.tools.monitor.protocol import (
+    Answer,
+    Look,
+    Pause,
+    Request,
+    Set,
+    Snapshot,
+    Watch,
+    decode_request,
+    encode,
+)
+from runtime.tools.monitor.web import PageServer
+from tests.runtime.tools.monitor.samples import snapshot
 
 TOKEN = "abc"
+JPEG = b"\xff\xd8 a JPEG"
+
+
+class FakeRun:
+    """Answers as a run does: each who watches gets the snapshots, and the end after `None`."""
+
+    def __init__(self, *snapshots: Snapshot | None) -> None:
+        self.asked: list[Request] = []
+        self.snapshots = snapshots
+        self.goes_on = asyncio.Event()
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with closing(writer):
+            try:
+                request = decode_request(await reader.readline())
+            except ValueError:
+                writer.write(encode(Answer(done=False, text="expected a command")) + b"\n")
+                return
+            self.asked.append(request)
+            if isinstance(request, Watch):
+                for each in self.snapshots:
+                    writer.write(encode(each) + b"\n" if each is not None else b"")
+                if None not in self.snapshots:
+                    await self.goes_on.wait()
+            elif isinstance(request, Look) and request.camera != "drone.images: drone/front":
+                writer.write(encode(Answer(done=False, text="expected a camera")) + b"\n")
+            else:
+                jpeg = JPEG if isinstance(request, Look) else b""
+                writer.write(encode(Answer(done=True, text="done", jpeg=jpeg)) + b"\n")
 
 
 @asynccontextmanager
-async def serving(stand: FakeClient) -> AsyncIterator[int]:
-    page = Page(stand, TOKEN)  # type: ignore[arg-type]  # it stands for a client
-    server = await asyncio.start_server(page.serve, "127.0.0.1", 0)
-    listening = asyncio.create_task(page.listen())
-    try:
-        yield server.sockets[0].getsockname()[1]
-    finally:
-        stand.coming.put_nowait(None)
-        await listening
-        server.close()
-        await server.wait_closed()
+async def serving(run: FakeRun) -> AsyncIterator[int]:
+    path = socket_of("sample")
+    async with await asyncio.start_unix_server(run.serve, path):
+        with PageServer(0, path, TOKEN) as server:
+            thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+            thread.start()
+            try:
+                yield server.server_port
+            finally:
+                run.goes_on.set()
+                await asyncio.to_thread(server.shutdown)
+                thread.join()
+
+
+@pytest.fixture(autouse=True)
+def _sockets(sockets: Path) -> None: ...
 
 
 async def say(port: int, request: str, body: str = "") -> str:
@@ -46,18 +93,18 @@ def get(path: str, host: str = "127.0.0.1:PORT") -> str:
     return f"GET {path} HTTP/1.1\r\nHost: {host}"
 
 
-def post(body: str, token: str = TOKEN) -> str:
+def post(body: str, token: str = TOKEN, length: str = "") -> str:
     return (
         f"POST /command HTTP/1.1\r\nHost: localhost:PORT\r\nX-Token: {token}\r\n"
-        f"Content-Length: {len(body)}"
+        f"Content-Length: {length or len(body)}"
     )
 
 
 async def test_the_page_comes_with_the_token_and_runs_no_script_but_its_own() -> None:
-    async with serving(FakeClient()) as port:
+    async with serving(FakeRun(snapshot())) as port:
         page = await say(port, get(f"/?token={TOKEN}"))
     head, _, content = page.partition("\r\n\r\n")
-    assert head.startswith("HTTP/1.1 200")
+    assert head.startswith("HTTP/1.0 200")
     assert "script-src 'nonce-" in head
     assert '<section id="outputs"' in content
     assert "http://" not in content
@@ -74,104 +121,96 @@ async def test_the_page_comes_with_the_token_and_runs_no_script_but_its_own() ->
         (get(f"/?token={TOKEN}") + "\r\nHost: evil.example", 400),
         (get(f"/?token={TOKEN}", host="evil.example") + "\r\nHost: localhost", 400),
         (get(f"/nothing?token={TOKEN}"), 404),
-        (f"PUT /?token={TOKEN} HTTP/1.1\r\nHost: localhost", 405),
+        (f"PUT /?token={TOKEN} HTTP/1.1\r\nHost: localhost", 501),
         ("nonsense", 400),
         ("GET http://[ HTTP/1.1\r\nHost: localhost", 400),
         (get("/image"), 403),
         (get(f"/image?token={TOKEN}"), 404),
         (get(f"/image?token={TOKEN}&camera=drone.depth"), 404),
-        (get("/") + "\r\nContent-Length: many", 400),
-        (get("/") + "\r\nContent-Length: 9999999", 413),
-        (get("/") + "\r\nContent-Length: " + "9" * 5000, 413),
-        (get("/") + "\r\nX: " + "x" * 100_000, 413),
+        (post("", length="many"), 400),
+        (post("", length="9999999"), 413),
+        (post("", length="9" * 5000), 413),
+        (get(f"/command?token={TOKEN}"), 405),
+        (get("/") + "\r\nX: " + "x" * 100_000, 431),
     ],
 )
 async def test_whoever_should_not_is_sent_away(request_: str, status: int) -> None:
-    async with serving(FakeClient()) as port:
-        assert (await say(port, request_)).startswith(f"HTTP/1.1 {status} ")
+    async with serving(FakeRun(snapshot())) as port:
+        assert (await say(port, request_)).startswith(f"HTTP/1.0 {status} ")
 
 
 async def test_the_page_shows_at_once_what_is_known() -> None:
-    stand = FakeClient(snapshot())
-    async with serving(stand) as port:
-        await say(port, get(f"/?token={TOKEN}"))
+    async with serving(FakeRun(snapshot())) as port:
         page = await say(port, get(f"/?token={TOKEN}"))
-    assert (
-        'const first = {"cameras": ["drone.images: drone/front"], "fixed": "", "headline": "sample '
-        in page
-    )
+    assert 'const first = {"cameras": ["drone.images: drone/front"], "ended": "", ' in page
     assert "[b]wind[/b]" in page
 
 
 async def test_the_image_of_the_chosen_camera_is_served() -> None:
-    async with serving(FakeClient(snapshot())) as port:
+    async with serving(FakeRun(snapshot())) as port:
         camera = "drone.images:%20drone/front"
         head, _, jpeg = (await say(port, get(f"/image?token={TOKEN}&camera={camera}"))).partition(
             "\r\n\r\n"
         )
-    assert head.startswith("HTTP/1.1 200")
+    assert head.startswith("HTTP/1.0 200")
     assert "content-type: image/jpeg" in head
     assert "cache-control: no-store" in head
     assert jpeg.endswith("a JPEG")
 
 
 async def test_commands_go_to_the_run_if_they_bear_the_token() -> None:
-    stand = FakeClient()
-    async with serving(stand) as port:
+    run = FakeRun()
+    async with serving(run) as port:
         for body in ('{"do":"pause"}', '{"do":"set","text":"pilot.gain=2"}'):
             answer = (await say(port, post(body), body)).partition("\r\n\r\n")[2]
             assert json.loads(answer)["text"] == "done"
         assert "403" in await say(port, post('{"do":"stop"}', token="x"), '{"do":"stop"}')
-        refused = await say(port, post('{"do":"explode"}'), '{"do":"explode"}')
-        assert refused.startswith("HTTP/1.1 400")
-        assert "expected a command" in refused
-    assert stand.asked == [Pause(), Set(text="pilot.gain=2")]
+        for body in ('{"do":"explode"}', '{"do":\n"pause"}\n{"do":"stop"}'):
+            assert "expected a command" in await say(port, post(body), body)
+    assert run.asked == [Pause(), Set(text="pilot.gain=2")]
 
 
 async def test_snapshots_come_as_events_and_so_does_the_end() -> None:
-    stand = FakeClient(snapshot())
-    async with serving(stand) as port:
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        writer.write(f"{get(f'/events?token={TOKEN}')}\r\n\r\n".replace("PORT", "1").encode())
-
-        async def event() -> Any:
-            line = await reader.readuntil(b"\n\n")
-            return json.loads(line.partition(b"data: ")[2])
-
-        assert b"text/event-stream" in await reader.readuntil(b"\r\n\r\n")
-        first = await event()
-        stand.coming.put_nowait(snapshot(clock_now=2.0))
-        second = await event()
-        stand.coming.put_nowait(None)
-        assert await event() == {"over": "the run is over: it does not answer any more"}
-        assert await reader.read() == b""
-        writer.close()
-    assert first["headline"].startswith("sample   1.500")
-    assert second["headline"].startswith("sample   2.000")
-    assert second["tables"]["nodes"][0][0] == "drone"
-    assert second["cameras"] == ["drone.images: drone/front"]
-    settings = [["pilot.gain", "1.0"], ["pilot.patience", "0.5"]]
-    assert second["tables"]["settings"] == settings
+    run = FakeRun(snapshot(), snapshot(ended="duration"), None)
+    async with serving(run) as port:
+        head, _, body = (await say(port, get(f"/events?token={TOKEN}"))).partition("\r\n\r\n")
+    assert "content-type: text/event-stream" in head
+    events = [json.loads(each.removeprefix("data: ")) for each in body.strip().split("\n\n")]
+    assert events == [
+        json.loads(encode(snapshot())),
+        json.loads(encode(snapshot(ended="duration"))),
+        None,
+    ]
+    assert run.asked == [Watch()]
 
 
-async def test_a_page_that_is_slow_still_sees_how_it_ended() -> None:
-    page = Page(FakeClient(*(snapshot() for _ in range(9)), snapshot(ended="duration"), None))  # type: ignore[arg-type]
-
-    async def look() -> list[bytes]:
-        return [event async for event in page._events()]
-
-    looking = asyncio.create_task(look())
-    await asyncio.sleep(0)
-    await page.listen()
-    seen = await looking
-    told = [json.loads(each.removeprefix(b"data: ")) for each in seen]
-    assert told[-2]["headline"].endswith("ends: duration")
-    assert told[-1] == {"over": "the run is over: duration"}
+async def test_a_page_of_a_run_that_is_over_says_so(sockets: Path) -> None:
+    run = FakeRun()
+    async with serving(run) as port:
+        socket_of("sample").unlink()
+        assert "data: null" in await say(port, get(f"/events?token={TOKEN}"))
+        answer = await say(port, post('{"do":"pause"}'), '{"do":"pause"}')
+    assert "expected a run that listens at" in answer
 
 
-def test_faster_starts_from_a_speed_even_when_time_stands() -> None:
-    assert page_data(snapshot(clock_paused=True, clock_speed=0.0))["speed"] == 1.0
-    assert page_data(snapshot(clock_target_speed=0.5))["speed"] == 0.5
+async def test_nobody_watches_a_run_whose_page_is_not_open() -> None:
+    run = FakeRun(snapshot())
+    async with serving(run):
+        pass
+    assert run.asked == []
+
+
+def test_a_page_is_served_until_the_run_is_over(
+    sockets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("runtime.tools.monitor.web.time.sleep", lambda _: None)
+    path = socket_of("sample")
+    with socket.socket(socket.AF_UNIX) as run:
+        run.bind(str(path))
+        run.listen()
+        threading.Thread(target=lambda: run.accept()[0].close()).start()
+        web.serve(PageServer(0, path, TOKEN))
+    assert "the monitor is at http://127.0.0.1:" in capsys.readouterr().out
 
 
 def test_the_page_needs_no_textual() -> None:

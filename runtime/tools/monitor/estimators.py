@@ -1,0 +1,249 @@
+"""What is measured in a run: estimators and their errors, paths, and images with features.
+
+Taken from the events that pass while somebody watches; errors are those that a node sends as
+`Score`, and nothing is judged here.
+"""
+
+from __future__ import annotations
+
+import collections
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from events import (
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    Odometry,
+    PoseEstimate,
+    Score,
+    TrackedFeatures,
+    TrackingLost,
+    TrackingRegained,
+)
+from events.announcements import Vehicles
+from events.frames import rotate
+from events.geometry import Pose, relative
+from runtime.errors import CommandError, suggest
+from runtime.run.run_state import RunState
+from runtime.time.schedule import SECOND
+from runtime.tools.monitor.protocol import Points, Rows
+
+GAP = SECOND // 2
+"""Silence that counts as lost, nanoseconds; as an evaluation's, if its file sets no other."""
+
+MOST_POINTS = 500
+"""Points of a path at most."""
+
+_RECENT = 1000
+"""True poses of a vehicle that are kept, for estimates that come late."""
+
+_IMAGES = 4
+"""Newest images of a camera that are kept, for features that come late."""
+
+
+class Path:
+    """Places passed; the more they become, the farther apart in time are those that are kept."""
+
+    def __init__(self) -> None:
+        self.points: Points = []
+        self._spacing, self._next = SECOND // 20, 0
+
+    def due(self, stamp: int) -> bool:
+        """Tell whether a place of this stamp (ns) is to be kept."""
+        return stamp >= self._next
+
+    def add(self, stamp: int, *place: float) -> None:
+        """Keep a place, rounded to millimetres."""
+        self.points.append(tuple(round(each, 3) for each in place))
+        if len(self.points) > MOST_POINTS:
+            del self.points[1::2]
+            self._spacing *= 2
+        self._next = stamp + self._spacing
+
+
+class Estimator:
+    """Estimator as seen since somebody watches.
+
+    Attributes:
+        lost: Why it has lost track, by its own word; `None` if it has not.
+        heard: When its last estimate came, on the run's clock (ns); `None` if none did.
+        latency: Of that estimate, nanoseconds.
+    """
+
+    def __init__(self, scale_free: bool) -> None:
+        self.lost: str | None = None
+        self.heard: int | None = None
+        self.latency = 0
+        self.path = Path()
+        self.scale_free = scale_free
+        self._origin: tuple[Pose, Pose] | None = None
+        """The true pose at the first estimate, and that estimate."""
+
+    def tracking(self, now: int) -> str:
+        """Return in words whether it has lost track, by its word or by silence."""
+        if self.lost is not None:
+            return f"lost: {self.lost}" if self.lost else "lost"
+        if self.heard is None:
+            return "silent"
+        silent = now - self.heard
+        return f"lost: silent for {silent / SECOND:.1f} s" if silent > GAP else "tracking"
+
+    def add(self, event: PoseEstimate, truth: Pose | None) -> None:
+        """Keep an estimate's place, laid on the truth at the first if it is not in ``map``."""
+        north, east, _ = event.position
+        if self.scale_free:
+            if truth is not None:  # laid on the truth when it is shown
+                self.path.add(event.stamp, east, north, truth[0][1], truth[0][0])
+            return
+        if event.frame_id != "map" and truth is not None:
+            pose = event.position, event.orientation
+            base, first = self._origin = self._origin or (truth, pose)
+            moved = rotate(base[1], relative(first, pose)[0])
+            north, east = base[0][0] + moved[0], base[0][1] + moved[1]
+        self.path.add(event.stamp, east, north)
+
+    def shown(self) -> Points:
+        """Return its path; if free of scale, laid on the truth by the similarity that fits best."""
+        if not self.scale_free or not self.path.points:
+            return list(self.path.points)
+        said, true = (np.array(self.path.points) @ [[1, 0], [1j, 0], [0, 1], [0, 1j]]).T
+        centred = said - said.mean()
+        factor = np.vdot(centred, true) / max(np.vdot(centred, centred).real, 1e-12)
+        laid = factor * centred + true.mean()
+        return list(zip(laid.real.round(3).tolist(), laid.imag.round(3).tolist(), strict=True))
+
+
+class Measured:
+    """Estimators, vehicles and cameras of a run, since somebody watches.
+
+    Attributes:
+        follow: Functions to be called with events of some types, and the names of their outputs.
+    """
+
+    def __init__(self, state: RunState) -> None:
+        self._state = state
+        self._truths: dict[str, tuple[Path, collections.deque[Odometry]]] = {}  # by vehicle
+        self._estimators: dict[str, Estimator] = {}
+        self._scores: dict[tuple[str, str], float] = {}  # by estimator and metric
+        self._images: dict[str, collections.deque[Image]] = {}
+        self._features: dict[str, TrackedFeatures] = {}  # by estimator
+        self.follow: dict[type[Event], Callable[[str, Any], None]] = {
+            Image: self._image,
+            Odometry: self._odometry,
+            PoseEstimate: self._estimate,
+            Score: self._score,
+            TrackedFeatures: self._tracked,
+            TrackingLost: self._lost,
+            TrackingRegained: self._lost,
+        }
+
+    @functools.cached_property
+    def _vehicles(self) -> Vehicles:
+        """Vehicles, as announced before the first event that asks for them."""
+        vehicles = Vehicles()
+        for each in self._state.announcements:
+            vehicles.announced(each)
+            if isinstance(each, EstimatorAnnouncement):
+                self._estimators.setdefault(each.source, Estimator(each.scale_free))
+        return vehicles
+
+    def _odometry(self, _: str, event: Odometry) -> None:
+        names = self._vehicles.names
+        if names and event.source not in names:  # an estimate of others
+            return
+        known = self._truths.get(event.source)
+        if known is None:
+            self._vehicles.add(event.source)
+            known = self._truths[event.source] = Path(), collections.deque(maxlen=_RECENT)
+        path, recent = known
+        recent.append(event)
+        if path.due(event.stamp):
+            path.add(event.stamp, event.position[1], event.position[0])
+
+    def _estimator(self, name: str) -> Estimator:
+        _ = self._vehicles  # which knows those that are announced
+        return self._estimators.setdefault(name, Estimator(scale_free=False))
+
+    def _estimate(self, _: str, event: PoseEstimate) -> None:
+        estimator = self._estimator(event.source)
+        estimator.heard = now = self._state.clock.now()
+        estimator.latency = now - event.stamp
+        if estimator.path.due(event.stamp):
+            estimator.add(event, self._truth(event))
+
+    def _truth(self, event: PoseEstimate) -> Pose | None:
+        """Return the true pose of an estimate's vehicle at its stamp, if it is kept."""
+        truths = self._truths.get(self._vehicles.of(event.source))
+        for true in reversed(truths[1] if truths is not None else ()):
+            if true.stamp <= event.stamp:
+                return true.position, true.orientation
+        return None
+
+    def _lost(self, _: str, event: TrackingLost | TrackingRegained) -> None:
+        reason = event.reason if isinstance(event, TrackingLost) else None
+        self._estimator(event.source).lost = reason
+
+    def _score(self, _: str, event: Score) -> None:
+        self._scores[event.subject, event.metric] = event.value
+
+    def _tracked(self, _: str, event: TrackedFeatures) -> None:
+        self._vehicles.tracked(event)
+        self._features[event.source] = event
+
+    def _image(self, name: str, event: Image) -> None:
+        camera = f"{name}: {event.source}"
+        if camera not in self._images:
+            self._images[camera] = collections.deque(maxlen=_IMAGES)
+        self._images[camera].append(event)
+
+    # What a snapshot asks.
+
+    def rows(self) -> Rows:
+        """Return the rows of the estimators' table."""
+        _ = self._vehicles
+        now = self._state.clock.now()
+        return [
+            (
+                name,
+                each.tracking(now),
+                self._last(name, "ate_rmse", "{:.3f}"),
+                self._last(name, "ate_percent", "{:.2f}"),
+                "" if each.heard is None else f"{each.latency / 1e6:.1f}",
+            )
+            for name, each in self._estimators.items()
+        ]
+
+    def _last(self, estimator: str, metric: str, how: str) -> str:
+        value = self._scores.get((estimator, metric))
+        return "" if value is None else how.format(value)
+
+    def paths(self) -> dict[str, Points]:
+        """Return the paths of vehicles and estimators: metres east, metres north."""
+        true = {f"{name}: truth": list(path.points) for name, (path, _) in self._truths.items()}
+        return true | {name: each.shown() for name, each in self._estimators.items()}
+
+    def cameras(self) -> list[str]:
+        """Return the cameras that have sent images."""
+        return sorted(self._images)
+
+    def image(self, camera: str) -> tuple[Image, list[TrackedFeatures]]:
+        """Return the newest image with features that is kept, or else the newest, and its features.
+
+        Raises:
+            CommandError: The camera has sent no image.
+        """
+        if camera not in self._images:
+            raise CommandError(
+                f"expected a camera that has sent images, found {camera!r}"
+                f"{suggest(camera, self._images)}"
+            )
+        for image in reversed(self._images[camera]):
+            key = image.stamp, image.frame_id
+            found = [f for f in self._features.values() if (f.stamp, f.frame_id) == key]
+            if found:
+                return image, found
+        return self._images[camera][-1], []
