@@ -129,7 +129,8 @@ class Server:
             _shut(client, socket.SHUT_RD)  # who has not asked yet need not ask any more
         deadline = time.monotonic() + CLOSING_TIMEOUT
         for thread, client in clients:
-            thread.join(max(deadline - time.monotonic(), 0.0))
+            if thread.is_alive():  # or has not begun, and sees that this is the end
+                thread.join(max(deadline - time.monotonic(), 0.0))
             _shut(client, socket.SHUT_RDWR)
 
     def _listen(self) -> None:

@@ -11,11 +11,13 @@ import asyncio
 import contextlib
 import secrets
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 import jinja2
@@ -65,6 +67,11 @@ class PageServer(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", port), _Handler)
         self.address = f"http://127.0.0.1:{self.server_port}/?token={quote(self.token, safe='')}"
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Report an error, unless it is that a page has gone."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
 
 class _Handler(BaseHTTPRequestHandler):
     """Handler of a connection's one request."""
@@ -81,8 +88,6 @@ class _Handler(BaseHTTPRequestHandler):
         except HttpError as error:
             status, text = error.args
             self._send(status, f"{text}\n".encode())
-        except OSError:  # the page has gone
-            pass
 
     do_GET = do_POST = _handle  # noqa: N815  # the base's names
 
@@ -149,7 +154,7 @@ class _Handler(BaseHTTPRequestHandler):
             token=self.server.token,
             stacks=STACKS,
             columns=COLUMNS,
-            first=msgspec.json.decode(next(self._snapshots(), b"null")),
+            first=msgspec.json.decode(next(self._snapshots(timeout=2.0), b"null")),
             is_number=is_number,
         )
         policy = (
@@ -166,11 +171,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(b"data: " + line + b"\n")
         self.wfile.write(b"data: null\n\n")
 
-    def _snapshots(self) -> Iterator[bytes]:
-        with (
-            contextlib.suppress(ConnectionError, FileNotFoundError),
-            connected(self.server.run) as run,
-        ):
+    def _snapshots(self, timeout: float | None = None) -> Iterator[bytes]:
+        with contextlib.suppress(OSError), connected(self.server.run) as run:
+            run.settimeout(timeout)
             run.sendall(encode(Watch()) + b"\n")
             yield from run.makefile("rb")
 
@@ -195,9 +198,12 @@ def serve(server: PageServer) -> None:
     """Serve a run's page until the run is over."""
     with server, contextlib.suppress(OSError), connected(server.run) as run:
         print(f"the monitor is at {server.address}", flush=True)
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        run.recv(1)  # nothing comes but the end
-        time.sleep(0.5)  # the pages receive the end
+        threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True).start()
+        try:
+            run.recv(1)  # nothing comes but the end
+            time.sleep(0.5)  # the pages receive the end
+        finally:
+            server.shutdown()
 
 
 @contextlib.contextmanager
