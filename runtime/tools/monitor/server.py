@@ -146,8 +146,8 @@ class Server:
                 thread.start()
 
     def _serve(self, client: socket.socket) -> None:
-        with client, contextlib.suppress(OSError, CancelledError):
-            lines = client.makefile("rb")
+        ends = contextlib.suppress(OSError, CancelledError)
+        with client, client.makefile("rb") as lines, ends:
             while not self._end.is_set() and (line := lines.readline(LONGEST_COMMAND)):
                 try:
                     request = decode_request(line)

@@ -175,7 +175,8 @@ class _Handler(BaseHTTPRequestHandler):
         with contextlib.suppress(OSError), connected(self.server.run) as run:
             run.settimeout(timeout)
             run.sendall(encode(Watch()) + b"\n")
-            yield from run.makefile("rb")
+            with run.makefile("rb") as lines:
+                yield from lines
 
     def _send(
         self, status: int, content: bytes, kind: str = "text/plain; charset=utf-8", policy: str = ""

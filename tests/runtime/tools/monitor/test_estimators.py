@@ -125,7 +125,7 @@ def test_an_estimate_is_laid_on_the_truth(
     run.fly(3, shown, frame_id=frame_id)
     paths = run.measured.paths()
     assert [*paths] == ["drone: truth", "vo"]
-    assert np.array(paths["vo"]) == pytest.approx(np.array(paths["drone: truth"]), abs=2e-3)
+    assert np.array(paths["vo"]) == pytest.approx(np.array(paths["drone: truth"]), abs=5e-3)
     assert paths["drone: truth"][0] == (4.0, 5.0)  # east, north
 
 
@@ -146,7 +146,7 @@ def test_a_long_path_has_no_more_points_than_said() -> None:
     assert MOST_POINTS / 2 <= len(times) <= MOST_POINTS
     assert times[0] == 0.0
     assert times[-1] > 990
-    assert np.ptp(np.diff(times)) < 0.1
+    assert np.diff(times).max() < 2 * np.diff(times).min()
 
 
 def test_an_image_is_shown_with_the_features_of_its_own_time() -> None:

@@ -55,7 +55,7 @@ def test_features_are_drawn_where_they_are_in_the_small_image() -> None:
     inlier, outlier = pixels[296:305, 146:155].sum((0, 1)), pixels[96:105, 446:455].sum((0, 1))
     assert inlier[1] > 2 * inlier[2]  # green
     assert outlier[2] > 2 * outlier[1]  # red
-    assert pixels.sum() < 1.2 * (inlier + outlier).sum()
+    assert pixels.sum() < 1.5 * (inlier + outlier).sum()
     assert not grey.any()  # what others have is as it was
 
 

@@ -75,7 +75,7 @@ def test_a_snapshot_tells_what_there_was_lately() -> None:
     observe(script)
     first, second = taken
     assert (first.now, second.now) == (0.35, 0.7)
-    assert first.headline.startswith("sample   0.350 of 1 s   ")
+    assert first.headline.startswith("sample   0.350 s   ")
     assert first.headline.endswith(" × real time (as fast as it can)   runs")
     assert second.tables.keys() == COLUMNS.keys()
     images = ("drone.images", "Image", "7", "10.0", "0.08", "20.00", "20.00")
