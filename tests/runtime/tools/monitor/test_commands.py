@@ -102,7 +102,7 @@ def test_the_page_shows_a_run_in_a_browser(tmp_path: Path, sockets: Path) -> Non
     assert re.search(r"<td[^>]*>drone.images</td><td[^>]*>Image</td><td[^>]*>\d+</td>", shown)
     assert 'value="pilot.gain=1.0"' in shown
     assert '<option value="drone.images: drone/front">' in shown
-    image = re.search(r'<img id="image"[^>]*>', shown)
+    image = re.search(r'<img [^>]*id="image"[^>]*>', shown)
     assert image is not None
     assert 'src="/image?token=' in image[0]  # and is not hidden, so it was loaded
     assert "hidden" not in image[0]
