@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,16 @@ import numpy as np
 import pytest
 
 from events import (
+    Announcement,
     CameraAnnouncement,
     CameraInfo,
     Collision,
+    EstimatorAnnouncement,
     Event,
     Image,
     Odometry,
     PlannedPose,
+    PoseEstimate,
     PositionSetpoint,
     Score,
     TrackedFeatures,
@@ -28,9 +32,12 @@ from events import (
 from nodes.judging.evaluation import Evaluation
 from nodes.judging.evaluation.results import read_errors
 from nodes.trajectory.formats import read_tum
+from runtime import Duration, Node, Output
+from runtime.config.model import Config, RunConfig
 from runtime.errors import ConfigError, NodeError
 from runtime.paths import source_file
-from runtime.testing import run_node
+from runtime.run.execute import execute
+from runtime.testing import run_node, run_nodes, spec
 from tests.nodes.judging.evaluation.flights import (
     MS,
     SECOND,
@@ -51,8 +58,6 @@ def judged(out: Path, *groups: list[Event], late: int = 0, **config: Any) -> dic
 
 
 def run(out: Path, *groups: list[Event], late: int = 0, **config: Any) -> list[Score]:
-    from runtime.testing import run_nodes, spec
-
     links = {"estimates": {"delay": late / 1e9}, "tracking_events": {"delay": late / 1e9}}
     script = sorted((e for group in groups for e in group), key=lambda e: e.stamp)
     node = spec(Evaluation, "evaluation", config, links=links if late else {})
@@ -361,10 +366,6 @@ def test_settings_of_single_estimators_hold_for_those_only(tmp_path: Path) -> No
     ("own", "said"),
     [
         (
-            {"estt": {}},
-            r"estimators\.estt: expected one of those that send poses",
-        ),
-        (
             {"est": {"thresholds": {"ate_percentt": 1.0}}},
             r"estimators.est.thresholds: expected the name of a figure .* mean .ate_percent",
         ),
@@ -378,14 +379,31 @@ def test_wrong_settings_of_single_estimators_are_refused(
         judged(tmp_path, two_flights(), estimators=own)
 
 
+def test_settings_of_an_estimator_that_is_not_there_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """At once if all who send poses have announced theirs; else at the end."""
+    judged(tmp_path, two_flights(), estimators={"estt": {}})
+    assert "estimators.estt: expected poses from it, found none" in caplog.text
+
+    class Slam(Node):
+        estimates = Output(PoseEstimate)
+
+        def announce(self) -> Iterable[Announcement]:
+            yield EstimatorAnnouncement(stamp=0, source=self.name, method="")
+
+    nodes = spec(Slam, "slam"), spec(Evaluation, "judge", {"estimators": {"slamm": {}}})
+    said = r"estimators\.slamm: expected one of those that send poses \(slam\).*mean .slam"
+    with pytest.raises(NodeError, match=said):
+        execute(Config(run=RunConfig(duration=Duration(0.1)), nodes=nodes))
+
+
 def test_a_vehicle_that_is_not_there_is_refused() -> None:
     with pytest.raises(NodeError, match=r'announced \(drone\), found "drome".*mean .drone'):
         run_node(Evaluation, inputs=announced(), config={"vehicle": "drome"})
 
 
 def test_an_unknown_threshold_is_refused() -> None:
-    from runtime.errors import ConfigError
-
     with pytest.raises(ConfigError, match=r"thresholds.*unknown key 'ate'"):
         run_node(Evaluation, config={"thresholds": {"ate": 1}})
 
