@@ -157,8 +157,8 @@ def run(
             where ``type`` may be a class; one of a notebook, too.
         set: Settings to change, as ``{"pilot.speed": 1.5, "run.duration": "5s"}``.
         seed: Of the run's random numbers; short for ``run.seed``.
-        out: Folder for results; ``runs/<name>`` if not given. An earlier run there becomes
-            ``<name>.1``.
+        out: Folder for results; ``runs/<name>/<time>`` if not given. An earlier run there is
+            renamed to ``<out>.<its time>``.
         quiet: Whether to show no progress.
 
     Raises:
@@ -168,6 +168,7 @@ def run(
     """
     _check_runtime()
     from runtime.errors import ConfigError
+    from runtime.run.results import Folder
     from runtime.run.threaded import ThreadedRun
     from runtime.tools.cli.run import observed
     from runtime.tools.preflight import of_file
@@ -181,27 +182,31 @@ def run(
         raise ConfigError("; ".join(found.errors))
     for warning in found.warnings:
         warnings.warn(warning, stacklevel=2)
-    folder = Path(out) if out is not None else Path("runs") / settings.run.name
+    folder = Folder(Path(out or Path("runs") / settings.run.name), by_time=out is None)
     handlers, watch = observed(
         settings, settings.run.name, quiet=quiet, trace=None, top=False, web=None
     )
     thread = ThreadedRun(settings, folder, handlers, watch)
     thread.start()
     thread.wait()
-    return load(folder)
+    return load(folder.path)
 
 
 def load(folder: str | Path) -> Run:
     """Load the results of a run or of `judge`, also of a run that failed.
 
+    Args:
+        folder: Of the run; of ``runs/<name>``, the latest.
+
     Raises:
-        ValueError: The folder is not there, or is no run's.
+        ResultsError: The folder is not there, or is no run's.
     """
     import msgspec
 
     from nodes.judging.report.folder import read_run
+    from runtime.run.results import run_folder
 
-    folder = Path(folder)
+    folder = run_folder(Path(folder))
     found = read_run(folder)
     summary = folder / "summary.json"
     return Run(

@@ -29,6 +29,7 @@ from nodes.trajectory.formats import read_tum, write_euroc, write_kitti, write_t
 from nodes.trajectory.table import EPOCH, epoch_of
 from nodes.trajectory.trajectory import Trajectory, associate
 from runtime.paths import source_file
+from runtime.run.results import run_folder
 
 FORMATS = ("tum", "euroc", "kitti")
 
@@ -277,7 +278,7 @@ class Format(Enum):
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name>.")],
+    run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name> for the latest.")],
     form: Annotated[Format, typer.Option("--format", "-f", help="Format of the files.")],
     out: Annotated[
         Path | None,
@@ -313,6 +314,7 @@ def export(
     from nodes.calibration.formats import export_calibration
     from runtime.errors import ConfigError
 
+    run = run_folder(run)
     try:
         if form.value in FORMATS:
             written = export_trajectories(run, form.value, out, epoch)

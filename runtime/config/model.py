@@ -18,7 +18,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """The ``[run]`` table.
 
     Attributes:
-        name: Names the folder of results, ``runs/<name>``.
+        name: Names the folder of results, ``runs/<name>/<time>``.
         clock: ``lockstep`` (simulated time, reproducible) or ``real``.
         speed: Seconds of the clock per real second; ``max`` (lockstep only) is as fast as it can.
         seed: Of every random number in the run.

@@ -42,7 +42,7 @@ events_log = logging.getLogger("visnav.events")
 
 def execute(
     config: Config,
-    out: Path | None = None,
+    out: Path | results.Folder | None = None,
     *,
     handlers: list[logging.Handler] | None = None,
     log_events: bool = False,
@@ -55,7 +55,7 @@ def execute(
     """Run a configuration to its end.
 
     Args:
-        out: Folder for results, made if missing; `None` writes nothing.
+        out: Folder for results, or its path; `None` writes nothing.
         handlers: Where log records go, besides ``log.txt`` in `out`.
         watch: Given the supervisor, returns a context that lasts as long as the run: a progress
             bar, a monitor.
@@ -71,18 +71,21 @@ def execute(
     handlers = list(handlers or [])
     programs = any(spec.node.starts_programs for spec in config.nodes)
     with contextlib.ExitStack() as stack:
-        folder = None if out is None else stack.enter_context(results.Folder(out))
-        if out is not None:
-            results.write_config(out, config)
-            handlers.append(file_handler(out / "log.txt"))
-        run = _Run(config, out, folder, log_events, watch, only, stand_ins, digest)
+        folder = results.Folder(out) if isinstance(out, Path) else out
+        if folder is not None:
+            stack.enter_context(folder)
+            results.write_config(folder.path, config)
+            handlers.append(file_handler(folder.path / "log.txt"))
+        run = _Run(config, folder, log_events, watch, only, stand_ins, digest)
         stack.enter_context(logging_to(handlers, config.run.log, run.now))
+        if folder is not None and folder.earlier is not None:
+            log.info("the folder of the earlier run is now %s", folder.earlier)
         with contextlib.ExitStack() as private:
-            if out is not None and programs:
-                run.private = private.enter_context(private_results(out))
+            if folder is not None and programs:
+                run.private = private.enter_context(private_results(folder.path))
             summary = complete(event_loop.run_to_end(run.loop, run.main(), run.escaped))
-        if out is not None:
-            run.conclude(out, summary)
+        if folder is not None:
+            run.conclude(folder.path, summary)
     if run.supervisor.state.error is not None:
         raise run.supervisor.state.error
     return summary
@@ -125,7 +128,6 @@ class _Run:
     def __init__(
         self,
         config: Config,
-        out: Path | None,
         folder: results.Folder | None,
         log_events: bool,
         watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
@@ -136,7 +138,6 @@ class _Run:
         self.loop = make_loop(config.run)
         self._clock: Clock | None = None
         self._config = config
-        self._out = out
         self._folder = folder
         self._watch = watch or contextlib.nullcontext
         self._only = only
@@ -156,14 +157,15 @@ class _Run:
         loop, run = asyncio.get_running_loop(), self._config.run
         event_loop.install(loop)
         clock = self._clock = make_clock(run, loop)
+        out = None if self._folder is None else self._folder.path
         self.supervisor = supervisor = Supervisor(
             self._config,
             clock,
             self._taps,
-            self.private or self._out,
+            self.private or out,
             self._only,
             self._stand_ins,
-            self._out,
+            out,
         )
         if self._folder is not None:
             supervisor.state.before_first_update = self._folder.flown

@@ -1,8 +1,10 @@
-"""A run's folder: its owner, and files written as a whole or not at all.
+"""A run's folder: its name, its owner, and files written as a whole or not at all.
 
-A folder that the runtime has made has a marker in it, and only such a folder is ever moved or
-removed. The marker says which process uses it, when its first update was, and in the end which
-files it has made; that process holds a lock on it. Not here: what nodes write.
+Without a folder of the user's a run gets one by time, ``runs/NAME/20261123-154012``, and with its
+first update the link ``runs/NAME/latest`` names it. A folder that the runtime has made has a marker
+in it, which says what process uses it and when its first update was; that process holds a lock on
+it. Nobody's results are removed: where a run is given the folder of an earlier one, that one is
+renamed by its time. Not here: what nodes write.
 
 While a run has programs, its nodes write into a private folder, which no program is told of: truth,
 plan, recording. When all nodes are down, whatever ended the run, its files take their place in the
@@ -13,7 +15,6 @@ is no guard against a program that searches the whole machine.
 from __future__ import annotations
 
 import contextlib
-import datetime as dt
 import errno
 import fcntl
 import itertools
@@ -21,11 +22,10 @@ import logging
 import os
 import re
 import shutil
-import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import msgspec
@@ -38,103 +38,108 @@ from runtime.summary import Summary
 log = logging.getLogger("visnav.runtime")
 
 MARKER = ".visnav-run"
-_MARK = "A run made this folder; the next one that is given it moves it to NAME.1.\n"
-_SUMMARY_OF_OURS = {"clock", "seed", "reason", "digest", "sim_seconds", "announcements"}
+LATEST = "latest"
+SIGNS = ("summary.json", "config.toml", "log.txt", "trajectories", "evaluation")
+"""Files and folders of a run; any of them marks a run's folder."""
+
+_MARK = "A run made this folder; one that is given it by --out renames it to NAME.TIME.\n"
+_STARTED, _FLOWN = "process: ", "first update"
 
 
 class Folder:
-    """The folder of a run, locked against other runs.
-
-    An earlier run that is in it is put aside. With the first update it becomes ``NAME.1``, in the
-    place of what was kept there before; if there is none, it comes back, and the start that failed
-    goes to ``NAME.failed``.
+    """The folder of a run, made and locked against other runs while in its context.
 
     Args:
-        out: Of the run; made if missing.
+        path: New, empty, or an earlier run's, which is renamed: ``tour.20261123-154012``.
+        by_time: Whether to make a folder in `path`, and there the link ``latest``.
+
+    Attributes:
+        path: Of this run; by time only within the context.
+        earlier: Where the earlier run is now; `None` if there was none in the way.
 
     Raises:
-        ResultsError: Another run uses it, it holds what no run has made, or it cannot be written.
+        ResultsError: On entering: another run uses the folder, it holds what no run has made, or it
+            cannot be written.
     """
 
-    def __init__(self, out: Path) -> None:
-        with _readable(out):
-            if out.is_symlink() or out.name in {"", ".."}:
-                out = Path(os.path.realpath(out))
-            self._out, self._flown = out, False
-            self._aside = out.parent / f".{out.name}.earlier"
-            self._kept, self._failed = (out.parent / f"{out.name}.{end}" for end in ("1", "failed"))
-            out.mkdir(parents=True, exist_ok=True)
-            with _locked(out.parent):
-                self._marker = _mark(out)
-                try:
-                    self._take()
-                except BaseException:
-                    os.close(self._marker)
-                    raise
+    def __init__(self, path: Path, *, by_time: bool = False) -> None:
+        self.path = path
+        self.earlier: Path | None = None
+        self._by_time = by_time
 
     def __enter__(self) -> Folder:
+        path = self.path
+        with _readable(path):
+            if path.is_symlink() or path.name in {"", ".."}:
+                path = Path(os.path.realpath(path))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with _locked(path.parent):
+                if has_run(path):
+                    self.earlier = _new(path.parent, f"{path.name}.", time_of(path))
+                    with os.fdopen(_lock(path)):
+                        path.rename(self.earlier)
+                self.path = _new(path, "", time.time()) if self._by_time else path
+                claim(self.path)
+                self._marker = _lock(self.path)
+            os.write(self._marker, f"{_STARTED}{os.getpid()}\n".encode())
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        with _readable(self._out), _locked(self._out.parent):
-            made = (f"made: {file}\n" for file in sorted(_files(self._out)))
-            os.write(self._marker, "".join(made).encode(errors="surrogateescape"))
-            if not self._flown and self._aside.exists():
-                self._give_back()
-                print(
-                    f"warning: {self._out} is as it was: the start that failed is in "
-                    f"{self._failed}",
-                    file=sys.stderr,
-                )
-            os.close(self._marker)
+    def __exit__(self, *_: object) -> None:
+        os.close(self._marker)
 
     def flown(self) -> None:
-        """Note the first update: from here on the earlier run is ``NAME.1``.
+        """Note the first update: from here on ``latest`` is this run.
 
         Raises:
-            ResultsError: It cannot be moved there.
+            ResultsError: The note cannot be written.
         """
-        with _readable(self._out), _locked(self._out.parent):
-            if self._aside.exists():
-                _move(self._aside, self._kept)
-                log.info("the earlier run in %s is now %s", self._out, self._kept)
-            now = dt.datetime.now(dt.UTC).isoformat(timespec="seconds")
-            os.write(self._marker, f"first update: {now}\n".encode())
-            self._flown = True
+        with _readable(self.path):
+            os.write(self._marker, f"{_FLOWN}\n".encode())
+        if self._by_time:
+            _link(self.path.with_name(LATEST), self.path.name)
 
-    def _take(self) -> None:
-        """Move an earlier run aside, and write this process into the marker."""
-        if self._aside.exists():  # a start was killed
-            self._give_back()
-        for place in (self._kept, self._failed):
-            _check(place)
-        marked = _read(self._marker)
-        started = "process: " in marked
-        if "first update: " in marked or (not started and _has_summary_of_ours(self._out)):
-            self._move_away(self._aside)
-        elif started:
-            self._move_away(self._failed)
-        os.write(self._marker, f"process: {os.getpid()}\n".encode())
 
-    def _give_back(self) -> None:
-        """Restore the earlier run; the present content goes to ``NAME.failed``."""
-        if self._out.exists():
-            _move(self._out, self._failed)
-        self._aside.rename(self._out)
-        self._mark_anew()
+def run_folder(path: Path) -> Path:
+    """Return the run's folder meant by a path: itself, or the one that its ``latest`` links to.
 
-    def _move_away(self, place: Path) -> None:
-        _move(self._out, place)
-        self._mark_anew()
+    Raises:
+        ResultsError: There is neither.
+    """
+    found = newest(path)
+    if any((found / sign).exists() for sign in SIGNS):
+        return found
+    inside = "none"
+    if found != path:
+        inside = f"a link to {found.name}, which is none"
+    elif path.is_dir():
+        inside = ", ".join(sorted(each.name for each in path.iterdir())[:5]) or "nothing in it"
+    raise ResultsError(
+        f"{path}: expected the folder of a run, with {', '.join(SIGNS[:-1])} or {SIGNS[-1]} in it, "
+        f"or one with a link {LATEST} to such a folder, found {inside}"
+    )
 
-    def _mark_anew(self) -> None:
-        before, self._marker = self._marker, _mark(self._out)
-        os.close(before)
+
+def newest(path: Path) -> Path:
+    """Return the folder that ``latest`` in a folder links to; the path itself if it has none."""
+    link = path / LATEST
+    return path / link.readlink() if link.is_symlink() and not has_run(path) else path
+
+
+def has_run(folder: Path) -> bool:
+    """Tell whether a run has begun in a folder."""
+    return _STARTED in _marked(folder) or all((folder / sign).is_file() for sign in SIGNS[:3])
+
+
+def has_flown(folder: Path) -> bool:
+    """Tell whether the run in a folder has come to its first update."""
+    marked = _marked(folder)
+    return _FLOWN in marked or _STARTED not in marked
+
+
+def time_of(folder: Path) -> float:
+    """Return the time of a run's first update, or else of its start (Unix time, seconds)."""
+    marker = folder / MARKER
+    return (marker if marker.exists() else folder / SIGNS[0]).stat().st_mtime
 
 
 def clear(out: Path) -> None:
@@ -144,7 +149,8 @@ def clear(out: Path) -> None:
         ResultsError: A run uses the folder, or no run has made it.
         OSError: The folder cannot be made.
     """
-    os.close(_mark(out))
+    claim(out)
+    os.close(_lock(out))
     shutil.rmtree(out)
     claim(out)
 
@@ -157,39 +163,37 @@ def claim(out: Path) -> None:
         OSError: It cannot be made.
     """
     out.mkdir(parents=True, exist_ok=True)
-    _check(out)
     marker = out / MARKER
-    if not marker.is_file():
-        marker.write_text(_MARK, encoding="utf-8")
-
-
-def _check(out: Path) -> None:
-    """Raise `ResultsError` for a non-empty folder not made by a run."""
-    if not out.exists() or (out / MARKER).is_file() or _has_summary_of_ours(out):
+    if marker.is_file():
         return
-    found = next(iter(sorted(each.name for each in out.iterdir())), None)
-    if found is not None:
+    if found := sorted(each.name for each in out.iterdir()):
         raise ResultsError(
             f"{out}: expected a new or empty folder, or one that a run has made (with a "
-            f"{MARKER} in it), found {found!r}: name another with --out, or remove it"
+            f"{MARKER} in it), found {found[0]!r}: name another with --out, or remove it"
         )
+    marker.write_text(_MARK, encoding="utf-8")
 
 
-def _mark(out: Path) -> int:
-    """Claim a folder, and return its marker, open and locked.
+def _marked(folder: Path) -> str:
+    with contextlib.suppress(OSError):
+        return (folder / MARKER).read_text(encoding="utf-8", errors="replace")
+    return ""
+
+
+def _lock(folder: Path) -> int:
+    """Return the marker of a folder, open and locked.
 
     Raises:
-        ResultsError: A run uses it.
+        ResultsError: A run uses the folder.
     """
-    claim(out)
-    marker = os.open(out / MARKER, os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW)
+    marker = os.open(folder / MARKER, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        numbers = re.findall(r"process: (\d+)", _read(marker))
         os.close(marker)
+        numbers = re.findall(rf"{_STARTED}(\d+)", _marked(folder))
         raise ResultsError(
-            f"{out}: expected a folder that no other run uses, found that of process "
+            f"{folder}: expected a folder that no other run uses, found that of process "
             f"{numbers[-1] if numbers else '?'}, which still runs: name another with --out, or "
             "end that one first"
         ) from None
@@ -198,34 +202,23 @@ def _mark(out: Path) -> int:
     return marker
 
 
-def _read(marker: int) -> str:
-    return os.pread(marker, 1000, 0).decode(errors="replace")
+def _new(folder: Path, prefix: str, when: float) -> Path:
+    """Return a path that is not there yet, by local time: ``20261123-154012``, then ``…-2``."""
+    first = prefix + time.strftime("%Y%m%d-%H%M%S", time.localtime(when))
+    names = itertools.chain([first], (f"{first}-{number}" for number in itertools.count(2)))
+    return next(folder / name for name in names if not os.path.lexists(folder / name))
 
 
-def _move(source: Path, place: Path) -> None:
-    """Move a run's folder to `place`, and remove a folder of only a run's files there.
-
-    Else that one is kept, by the first free number from 2 on.
-    """
-    _check(place)
-    if place.exists():
-        marked = (place / MARKER).read_bytes().decode(errors="surrogateescape").splitlines()
-        made = {line.removeprefix("made: ") for line in marked}
-        if others := sorted(_files(place) - made):
-            numbers = itertools.count(2)
-            names = (place.with_name(f"{place.stem}.{number}") for number in numbers)
-            kept = next(name for name in names if not os.path.lexists(name))
-            place.rename(kept)
-            log.warning("%s is kept: its run is not known to have made %s", kept, others[0])
-        else:
-            shutil.rmtree(place)
-    source.rename(place)
-
-
-def _files(folder: Path) -> set[str]:
-    """Return the files in a run's folder, as relative paths, without the marker."""
-    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
-    return {str(path.relative_to(folder)) for path in found} - {MARKER}
+def _link(link: Path, name: str) -> None:
+    """Have a link lead to a folder beside it, in an instant; what is no link is left alone."""
+    try:
+        if os.path.lexists(link) and not link.is_symlink():
+            raise FileExistsError(errno.EEXIST, "it is no link")
+        new = link.with_name(f".{LATEST}.{name}")
+        new.symlink_to(name)
+        new.replace(link)
+    except OSError as error:
+        log.warning("%s does not lead to %s: %s", link, name, error.strerror)
 
 
 @contextlib.contextmanager
@@ -303,15 +296,6 @@ def write_summary(out: Path, summary: Summary) -> None:
         write(out / "summary.json", encoded + b"\n")
 
 
-def _has_summary_of_ours(out: Path) -> bool:
-    """Tell whether a folder has a ``summary.json`` written by a run."""
-    try:
-        found = msgspec.json.decode((out / "summary.json").read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(found, dict) and set(found) >= _SUMMARY_OF_OURS
-
-
 @contextlib.contextmanager
 def _readable(out: Path) -> Iterator[None]:
     try:
@@ -345,7 +329,7 @@ def private_results(out: Path) -> Iterator[Path]:
         if base.stat().st_dev != out.stat().st_dev:  # where moving would mean to copy
             base = out.parent / ".visnav-unfinished"
             base.mkdir(exist_ok=True, mode=0o700)
-        made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=base))
+        made = Path(tempfile.mkdtemp(prefix=f".{out.absolute().parent.name}-{out.name}-", dir=base))
         shutil.copy(out / "config.toml", made)  # which recordings have in them
     except OSError as error:
         raise ResultsError(f"{base}: expected to write a run's results, found: {error}") from error

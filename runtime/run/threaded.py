@@ -11,10 +11,10 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from pathlib import Path
 
 from runtime.config.model import Config
 from runtime.run.execute import execute
+from runtime.run.results import Folder
 from runtime.run.supervisor import Supervisor
 
 
@@ -27,7 +27,7 @@ class ThreadedRun(threading.Thread):
     def __init__(
         self,
         config: Config,
-        out: Path,
+        out: Folder,
         handlers: list[logging.Handler],
         watch: Callable[[Supervisor], AbstractContextManager[None]],
     ) -> None:

@@ -20,6 +20,7 @@ from runtime.channels.sender import Sender
 from runtime.config.model import Config
 from runtime.errors import ConfigError
 from runtime.run.execute import execute
+from runtime.run.results import Folder
 from runtime.summary import OutsideSummary, Summary, TwiceSummary
 
 log = logging.getLogger("visnav.runtime")
@@ -56,7 +57,9 @@ class Track(Digest):
             self.first = name, event, math.dist(place, was) if len(was) == 3 else math.nan
 
 
-def run_twice(config: Config, out: Path | None, only: Collection[str], **options: Any) -> Summary:
+def run_twice(
+    config: Config, out: Path | Folder | None, only: Collection[str], **options: Any
+) -> Summary:
     """Run a configuration twice, and compare.
 
     Args:

@@ -132,7 +132,7 @@ def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
 
 
 def recover(
-    file: Annotated[Path, typer.Argument(help="A recording: runs/<name>/recording.mcap.")],
+    file: Annotated[Path, typer.Argument(help="A recording: runs/<name>/latest/recording.mcap.")],
     out: Annotated[
         Path | None,
         typer.Option(help="A new file to write; if not given, the whole file replaces the torn."),

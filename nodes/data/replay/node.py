@@ -20,6 +20,7 @@ from events import Announcement, Event, Odometry, TrajectoryEstimate, VehicleAnn
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError, Timed
 from nodes.data.replay.recorded import Recorded, is_ours
 from runtime import Node, Output
+from runtime.run.results import newest
 from runtime.time.schedule import SECOND
 
 Batch = list[Timed]
@@ -134,7 +135,7 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
         ReplayError: There is nothing there that can be read.
         MissingDependencyError: A library is not installed.
     """
-    path = Path(config.file)
+    path = newest(Path(config.file))
     vehicle = config.vehicle or name
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
@@ -240,7 +241,7 @@ class Replay(Node[ReplayConfig]):
         [[nodes]]
         name = "replay"
         type = "Replay"
-        file = "../runs/record/recording.mcap"
+        file = "../runs/record/latest/recording.mcap"
 
     The run ends with the recording. While it goes on, ``python -m runtime set replay.paused=true``
     and ``replay.position=12s`` do what `pause` and `seek` do; these are for the loop's thread.

@@ -112,7 +112,7 @@ def write(
 ) -> Path:
     """Write a results folder like a run's, with figures and a report; return the report's path.
 
-    What an earlier judgement left there goes to ``NAME.1``.
+    An earlier judgement there is renamed by its time.
 
     Raises:
         ResultsError: There is something else in the folder, or it cannot be written.

@@ -32,6 +32,7 @@ from nodes.ros2.messages.typestore import Bag
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import read_euroc, read_kitti, read_tum, read_vslamlab
 from nodes.trajectory.table import Row, read_rows
+from runtime.run.results import newest, run_folder
 from runtime.time.schedule import SECOND
 
 _PATH, _POSE = "nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped"
@@ -132,7 +133,11 @@ def read_truth(text: str, times: str) -> Source:
     Raises:
         ValueError: It cannot be read; the message names file and line.
     """
-    own = Path(text) / "trajectories" / "truth.tum"
+    path = newest(Path(text))
+    own = path / "trajectories" / "truth.tum"
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        run_folder(path)  # raises, of a folder that is none
+        text = str(own)
     found = read(str(own) if own.is_file() else text, None, times)
     if odd := {name: count for name, count in found.counts.items() if count}:
         raise ValueError(f"{text}: expected one truth with stamps that rise, found {odd}")
@@ -156,9 +161,9 @@ def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = 
     if not equals or Path(text).exists():
         name, file = "", text
     bag, colon, topic = file.rpartition(":/")
-    path = Path(bag if colon and not Path(file).exists() else file)
+    path = newest(Path(bag if colon and not Path(file).exists() else file))
     if path.suffix in {".mcap", ".db3", ".bag"} or (path / "metadata.yaml").is_file():
-        topic = f"/{topic}" if path != Path(file) else ""
+        topic = f"/{topic}" if colon and not Path(file).exists() else ""
         poses, child, record = read_topic(path, topic)
         name, frame_id = name or topic.strip("/"), record.frame_id
         counts = {"restarts": record.restarts, "repeated_stamps": record.repeated}
@@ -195,7 +200,7 @@ def read_mounting(text: str, run: str) -> Floats:
         return np.asarray(read_tum(Path(text)).matrices()[0])
     row = Row("--body-from-camera", text.replace(",", " ").split())
     if len(row.fields) == 1 and Path(run).is_dir():
-        return mounting(Path(run), text)
+        return mounting(newest(Path(run)), text)
     if len(row.fields) != 7:
         row.wrong('"tx ty tz qx qy qz qw", a file, or a camera of the run that is the truth', text)
     values = np.array([row.numbers(0, 7)])

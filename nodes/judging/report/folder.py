@@ -24,6 +24,7 @@ from nodes.judging.report.tables import Estimator, Facts, Run, Verdict
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import read_tum
 from runtime.paths import source_file, source_of
+from runtime.run.results import run_folder
 from runtime.time.schedule import SECOND
 
 Floats = npt.NDArray[np.float64]
@@ -75,9 +76,6 @@ def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interva
 
 T = TypeVar("T")
 
-SIGNS = ("summary.json", "config.toml", "log.txt", "trajectories", "evaluation")
-"""Files and folders of a run; any of them marks a run's folder."""
-
 _LOG_LINES = 200
 _NO_ESTIMATES = {"truth", "plan"}
 _ABOUT = 0.25
@@ -89,17 +87,9 @@ def read_run(folder: Path) -> Run:
     """Read a run's folder.
 
     Raises:
-        ValueError: The folder is missing, or is no run's.
+        ResultsError: The folder is missing, or is no run's.
     """
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: expected the folder of a run, found none")
-    if not any((folder / sign).exists() for sign in SIGNS):
-        inside = ", ".join(sorted(p.name for p in folder.iterdir())[:5]) or "nothing"
-        raise ValueError(
-            f"{folder}: expected the folder of a run, with {', '.join(SIGNS[:-1])} "
-            f"or {SIGNS[-1]} in it, found {inside}"
-        )
-    return _Reader(folder).run()
+    return _Reader(run_folder(folder)).run()
 
 
 class _Reader:

@@ -26,6 +26,7 @@ from nodes.judging.report.style import Plot, drawing
 from nodes.judging.report.tables import Run
 from nodes.judging.report.trajectories import draw_frames, draw_trajectories
 from runtime import Node, NodeConfig
+from runtime.run.results import run_folder
 from runtime.summary import OUTSIDE_COLUMNS, WORKER_COLUMNS
 
 PAGE = "report.html"
@@ -64,7 +65,7 @@ def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:
         The page's path.
 
     Raises:
-        ValueError: The folder is not there, or is no run's.
+        ResultsError: The folder is not there, or is no run's.
         OSError: Something cannot be written.
     """
     run = read_run(out)
@@ -207,7 +208,7 @@ class Report(Node[ReportConfig]):
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name>.")],
+    run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name> for the latest.")],
 ) -> None:
     """Write a run's report.html and its figures (plots/*) anew.
 
@@ -216,6 +217,6 @@ def report(
     from runtime.errors import ConfigError
 
     try:
-        print(write_report(run))
+        print(write_report(run_folder(run)))
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None

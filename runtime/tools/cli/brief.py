@@ -24,9 +24,12 @@ _WORDS = {
 
 
 def show(
-    folder: Annotated[Path, typer.Argument(help="Folder of the run, such as runs/tour.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of the run: runs/tour for its latest.")],
 ) -> None:
     """Show all figures of a finished run: verdict, channels, ticks, workers, stalls."""
+    from runtime.run.results import run_folder
+
+    folder = run_folder(folder)
     file = folder / "summary.json"
     try:
         summary = msgspec.json.decode(file.read_bytes(), type=Summary)
@@ -41,37 +44,43 @@ def show(
 def runs(
     folder: Annotated[Path, typer.Argument(help="Folder of runs.")] = Path("runs"),
 ) -> None:
-    """List the runs in a folder, the newest first: when, how long, and who passed."""
+    """List the runs in a folder, the newest last: when, how long, and who passed."""
     from datetime import datetime
 
     from rich.table import Table
 
-    files = sorted(folder.glob("*/summary.json"), key=lambda file: -file.stat().st_mtime)
-    if not files:
+    from runtime.run.results import has_run, time_of
+
+    places = [*folder.glob("[!.]*"), *folder.glob("[!.]*/[!.]*")]
+    found = [each for each in places if not each.is_symlink() and has_run(each)]
+    if not found:
         raise ResultsError(f"{folder}: expected folders of runs in it, found none")
-    table = Table("run", "ended", "s", "seed", "state", "estimators", box=None, pad_edge=False)
-    for file in files:
-        ended = datetime.fromtimestamp(file.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
-        try:
-            summary = msgspec.json.decode(file.read_bytes(), type=Summary)
-        except (OSError, msgspec.MsgspecError):
-            table.add_row(escape(file.parent.name), ended, "", "", "[red]unreadable[/red]", "")
-            continue
-        state = "[red]crashed[/red]" if summary.error else _WORDS[_passed(summary)]
-        judged = summary.verdict.estimators if summary.verdict else {}
-        errors = (
-            f"{name} {figures['ate_percent']:.2g} %" if figures.get("ate_percent") else name
-            for name, figures in judged.items()
-        )
-        seconds, seed = f"{summary.sim_seconds:.1f}", f"{summary.seed}"
-        table.add_row(
-            escape(file.parent.name), ended, seconds, seed, state, escape(", ".join(errors))
-        )
+    table = Table("run", "time", "s", "seed", "state", "estimators", box=None, pad_edge=False)
+    for each in sorted(found, key=time_of):
+        when = datetime.fromtimestamp(time_of(each)).strftime("%Y-%m-%d %H:%M")
+        table.add_row(escape(str(each)), when, *_row(each))
     Console().print(table, soft_wrap=True)
 
 
-def _passed(summary: Summary) -> bool | None:
-    return summary.verdict.passed if summary.verdict else None
+def _row(folder: Path) -> tuple[str, str, str, str]:
+    """Return seconds, seed, state and estimators of the run in a folder."""
+    from runtime.run.results import has_flown
+
+    try:
+        summary = msgspec.json.decode((folder / "summary.json").read_bytes(), type=Summary)
+    except FileNotFoundError:
+        return "", "", "[yellow]no summary: killed, or not over[/yellow]", ""
+    except (OSError, msgspec.MsgspecError):
+        return "", "", "[red]unreadable[/red]", ""
+    state = _WORDS[summary.verdict.passed if summary.verdict else None]
+    if summary.error:
+        state = f"[red]{'crashed' if has_flown(folder) else 'did not start'}[/red]"
+    judged = summary.verdict.estimators if summary.verdict else {}
+    errors = (
+        f"{name} {figures['ate_percent']:.2g} %" if figures.get("ate_percent") else name
+        for name, figures in judged.items()
+    )
+    return f"{summary.sim_seconds:.1f}", f"{summary.seed}", state, escape(", ".join(errors))
 
 
 def print_tables(summary: Summary) -> None:

@@ -16,7 +16,7 @@ CHECKOUT = Path(__file__).parents[3]
 
 def demo(
     out: Annotated[
-        Path | None, typer.Option(help="Folder for results; runs/tour if not given.")
+        Path | None, typer.Option(help="Folder for results; runs/tour/<time> if not given.")
     ] = None,
     overrides: Overrides = None,
     quiet: Quiet = False,

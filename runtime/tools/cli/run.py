@@ -45,7 +45,7 @@ class Log(Enum):
 def run(
     config: ConfigFile,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for results; runs/<name> if not given.")
+        Path | None, typer.Option(help="Folder for results; runs/<name>/<time> if not given.")
     ] = None,
     overrides: Overrides = None,
     log: Annotated[
@@ -90,10 +90,11 @@ def run(
 ) -> None:
     """Run the nodes of a file until they, its duration or Ctrl-C end the run.
 
-    Results go to runs/<name> (with --only, to runs/<name>-<first node>): summary.json, log.txt,
-    the resolved config.toml, and whatever the nodes write. With the first update, an earlier run
-    in that folder becomes runs/<name>.1, in the place of what was kept there; a start that fails
-    leaves it where it is. Printed is who passed, and how well; --verbose and `show` print all else.
+    Results go to runs/<name>/<time> (with --only, runs/<name>-<first node>/<time>): summary.json,
+    log.txt, the resolved config.toml, and whatever the nodes write. The link runs/<name>/latest
+    leads to the newest run that had a first update. An earlier run in the folder given by --out is
+    renamed to FOLDER.<its time>. Printed is who passed, and how well; --verbose and `show` print
+    all else.
 
     Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
     immediate); with 1 if a threshold of the run was not met, or it was run twice and differed;
@@ -101,6 +102,7 @@ def run(
     """
     from runtime.config.reading import load_configuration
     from runtime.run.execute import execute
+    from runtime.run.results import Folder
     from runtime.tools.cli.brief import print_failures, print_lines, print_tables
     from runtime.tools.twice import run_twice
 
@@ -116,29 +118,34 @@ def run(
         nodes_here = chosen(settings, only)
         look_at(settings, nodes_here)
         name = "-".join([settings.run.name, *nodes_here[:1]])
-        folder = out or Path("runs") / name
+        folder = Folder(out or Path("runs") / name, by_time=out is None)
         stand_ins = {}
         if flight:
             from runtime.tools.flights.cache import recorded
 
             stand_ins = recorded(settings, record=flight == "record")
         handlers, watch = observed(settings, name, quiet=quiet, trace=trace, top=top, web=web)
-        summary = (run_twice if twice else execute)(
-            settings,
-            folder,
-            handlers=handlers,
-            log_events=log is Log.events,
-            watch=watch,
-            only=nodes_here,
-            stand_ins=stand_ins,
-        )
+        try:
+            summary = (run_twice if twice else execute)(
+                settings,
+                folder,
+                handlers=handlers,
+                log_events=log is Log.events,
+                watch=watch,
+                only=nodes_here,
+                stand_ins=stand_ins,
+            )
+        except Exception:
+            if out is None and (more := folder.path / "log.txt").is_file():
+                print(f"{more} says more", file=sys.stderr)
+            raise
         outcomes += of_verdict(name, summary.verdict, summary.wall_seconds)
     if verbose:
         print_tables(summary)
     if quiet:
         print_failures(summary)
     else:
-        print_lines(summary, folder)
+        print_lines(summary, folder.path)
     code = 1 if summary.verdict is not None and summary.verdict.passed is False else 0
     if summary.twice is not None and not summary.twice.repeats:
         code = 1

@@ -13,7 +13,7 @@ import msgspec
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
 from runtime.figures import FIGURES
-from runtime.run.results import write
+from runtime.run.results import newest, write
 from runtime.tools.comparison.page import change, write_page
 from runtime.tools.comparison.statistics import (
     USUAL,
@@ -148,7 +148,7 @@ def _fly(
 
 
 def read_folder(folder: Path) -> dict[Key, list[Row]]:
-    """Read the rows of a finished sweep, or of a single run, by flight.
+    """Read the rows of a finished sweep, or of a single run (or its ``latest``), by flight.
 
     Raises:
         ConfigError: It is neither.
@@ -160,7 +160,7 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
             found.setdefault((settings or "run", row["seed"]), []).append(row)
         return found
     try:
-        data = (folder / "summary.json").read_bytes()
+        data = (newest(folder) / "summary.json").read_bytes()
         ended = msgspec.json.decode(data, type=Ended)
         head = msgspec.json.decode(data)
     except (OSError, msgspec.MsgspecError) as error:
