@@ -31,7 +31,7 @@ $(READY): $(CORE)
 	$(BIN)/python -m pip install --quiet -e '.[dev,docs]'
 	@touch $@
 
-demo: $(CORE)  ## Fly the standard tour, judge visual odometry on it, and report in runs/tour.
+demo: $(CORE)  ## Fly the standard tour, judge visual odometry on it, and report in runs/tour/latest.
 	$(BIN)/python -m runtime run config.toml
 
 test: $(READY)  ## Run the quick tests.
@@ -96,7 +96,7 @@ images: demo $(READY)  ## Make the documentation's images (needs ORB-SLAM3, KISS
 	$(BIN)/python tools/readme_images.py
 	$(BIN)/python tools/gallery.py
 	$(BIN)/python -m runtime run examples/rerun.toml
-	$(BIN)/python tools/viewer_image.py runs/rerun/flight.rrd docs/images/rerun.png
+	$(BIN)/python tools/viewer_image.py runs/rerun/latest/flight.rrd docs/images/rerun.png
 	$(BIN)/python tools/monitor_images.py
 
 clean:  ## Remove the environment, results and caches.

@@ -21,7 +21,7 @@ from events.frames import from_rpy
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.worlds import load_scene
 
-TOUR, RUNS, DOCS = Path("runs/tour/plots"), Path("runs/office/runs"), Path("docs/images")
+TOUR, RUNS, DOCS = Path("runs/tour/latest/plots"), Path("runs/office/runs"), Path("docs/images")
 SYSTEMS = {  # the estimator's name in the suite: name, colour
     "features": ("ours, RGB-D", "#ffb000"),
     "orb_slam3_rgbd": ("ORB-SLAM3", "#ff4f8b"),

@@ -137,6 +137,8 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
     """
     path = newest(Path(config.file))
     vehicle = config.vehicle or name
+    if (path / "recording.mcap").is_file() and not config.topics:  # a run's folder
+        path /= "recording.mcap"
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             from nodes.data.replay.rosbag import RosBag

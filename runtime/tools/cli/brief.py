@@ -73,7 +73,7 @@ def _row(folder: Path) -> tuple[str, str, str, str]:
     except (OSError, msgspec.MsgspecError):
         return "", "", "[red]unreadable[/red]", ""
     state = _WORDS[summary.verdict.passed if summary.verdict else None]
-    if summary.error:
+    if summary.error or not has_flown(folder):
         state = f"[red]{'crashed' if has_flown(folder) else 'did not start'}[/red]"
     judged = summary.verdict.estimators if summary.verdict else {}
     errors = (

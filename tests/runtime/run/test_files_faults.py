@@ -5,13 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
-import shutil
 import stat
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,40 +17,16 @@ import pytest
 from nodes.estimators.orb_slam3.vocabulary import Vocabulary, write_vocabulary
 from nodes.mapping.cloud import write_ply
 from runtime.config.model import Config, RunConfig
-from runtime.errors import NodeError, ResultsError, VisnavError
-from runtime.node import Node
+from runtime.errors import VisnavError
 from runtime.run.execute import execute
-from runtime.run.results import MARKER, Folder, claim, clear, write
+from runtime.run.results import claim, write
 from runtime.testing import spec
 from runtime.tools.tracing.record import tracing
 from runtime.units import Duration
 from tests.runtime.samples import Speaker
-from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, summary
+from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, results, summary
 
 pytestmark = pytest.mark.timeout(180)
-
-
-class Refuser(Node):
-    """Fails in start-up, of which it leaves a trace."""
-
-    async def on_ready(self) -> None:
-        assert self.out is not None
-        (self.out / "half").touch()
-        raise ValueError("not today")
-
-
-class Rival(Node):
-    """Begins a run in the folder of its own, once that goes on."""
-
-    async def run(self) -> None:
-        assert self.out is not None
-        with pytest.raises(ResultsError, match=f"no other run uses.*of process {os.getpid()}, "):
-            Folder(self.out)
-
-
-def fly(out: Path, seed: int = 0, cls: type[Node[Any]] = Speaker) -> None:
-    run = RunConfig(duration=Duration(0.1), seed=seed)
-    execute(Config(run=run, nodes=(spec(cls, "node"),)), out)
 
 
 def write_ply_here(path: Path, _: bytes) -> None:
@@ -72,86 +46,6 @@ def trace_here(path: Path, _: bytes) -> None:
     run = RunConfig(duration=Duration(0.1))
     config = Config(run=run, nodes=(spec(Speaker, "node"),))
     execute(config, watch=lambda supervisor: tracing(supervisor, path, "x"))
-
-
-def flights(folder: Path) -> dict[str, int]:
-    """Return the seeds of the runs in a folder."""
-    return {each.name: summary(each)["seed"] for each in sorted(folder.iterdir())}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("link", [False, True])
-def test_a_start_that_fails_takes_nothing_away(link: bool, tmp_path: Path) -> None:
-    real = tmp_path / "real"
-    out = real / "out"
-    if link:
-        out.mkdir(parents=True)
-        out = tmp_path / "link"
-        out.symlink_to(real / "out")
-    fly(out, 1)
-    fly(out, 2)
-    assert flights(real) == {"out": 2, "out.1": 1}
-    for seed in (3, 4):
-        with pytest.raises(NodeError, match="not today"):
-            fly(out, seed, Refuser)
-        assert flights(real) == {"out": 2, "out.1": 1, "out.failed": seed}
-        assert (real / "out.failed" / "half").exists()
-    fly(out, 5)
-    assert flights(real) == {"out": 5, "out.1": 2, "out.failed": 4}
-
-
-def test_a_start_that_was_killed_takes_nothing_away(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    fly(out, 1)
-    killed = Folder(out)
-    (out / "half").touch()
-    os.close(killed._marker)  # as the kernel does
-    fly(out, 2)
-    assert [each.name for each in (tmp_path / "out.failed").iterdir()] == [MARKER, "half"]
-    shutil.rmtree(tmp_path / "out.failed")
-    assert flights(tmp_path) == {"out": 2, "out.1": 1}
-
-
-def test_two_runs_never_share_a_folder(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    fly(out, 1, Rival)
-    fly(out, 2, Rival)
-    assert flights(tmp_path) == {"out": 2, "out.1": 1}
-    with Folder(out), pytest.raises(ResultsError, match="no other run uses"):
-        clear(out)
-    clear(out)
-    assert [each.name for each in out.iterdir()] == [MARKER]
-
-
-def test_a_first_start_that_fails_is_where_one_looks_for_it(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    for seed in (1, 2):
-        with pytest.raises(NodeError, match="not today"):
-            fly(out, seed, Refuser)
-    assert flights(tmp_path) == {"out": 2, "out.failed": 1}
-
-
-def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
-    """Even if it holds a file of the runtime's names, as one's own settings."""
-    (tmp_path / "plots").mkdir()
-    mine = [tmp_path / "config.toml", tmp_path / "plots" / "mine.png"]
-    for file in mine:
-        file.write_text("mine", encoding="utf-8")
-    with pytest.raises(ResultsError, match=r"expected a new or empty folder.*found 'config\.toml'"):
-        fly(tmp_path)
-    assert [file.read_text(encoding="utf-8") for file in mine] == ["mine", "mine"]
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["config.toml", "plots"]
-
-
-def test_a_folder_of_a_run_of_an_earlier_version_is_known_by_its_summary(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    fly(out)
-    (out / MARKER).unlink()
-    fly(out)
-    (out / MARKER).unlink()
-    (out / "summary.json").write_text('{"name": "mine"}', encoding="utf-8")
-    with pytest.raises(ResultsError, match="expected a new or empty folder"):
-        fly(out)
 
 
 def test_a_file_is_written_as_a_whole_or_not_at_all(
@@ -248,7 +142,7 @@ def fails_in_one_line(done: subprocess.CompletedProcess[str], *words: str) -> No
     [
         ("x" * 300, ("expected to write a run's results", "File name too long")),
         ("sample.toml", ("expected to write a run's results", "File exists")),
-        ("sample.toml/below", ("expected to write a run's results", "Not a directory")),
+        ("sample.toml/below", ("expected to write a run's results", "File exists")),
         ("/proc/none", ("expected to write a run's results",)),
         ("/dev/null", ("expected to write a run's results",)),
         (".", ("expected a new or empty folder",)),
@@ -271,20 +165,20 @@ def test_a_full_disk_is_one_line_and_no_half_summary(size: int, tmp_path: Path) 
     config_file(tmp_path, "Speaker", "Reader", run="duration = 200")
     done = run_limited(tmp_path, limit=no_file_longer_than(size))
     fails_in_one_line(done, "File too large")
-    results = tmp_path / "runs" / "sample"
-    assert not (results / "summary.json").exists() or summary(results)["error"]
+    out = results(tmp_path)
+    assert not (out / "summary.json").exists() or summary(out)["error"]
 
 
 @pytest.mark.slow
 def test_a_full_disk_for_the_log_alone_loses_the_log_alone(tmp_path: Path) -> None:
     config_file(tmp_path, "Failing", run="duration = 2")
-    results = tmp_path / "runs" / "sample"
-    claim(results)
-    (results / "log.txt").symlink_to("/dev/full")
-    done = run_limited(tmp_path, "--out", "runs/sample")
+    out = tmp_path / "out"
+    claim(out)
+    (out / "log.txt").symlink_to("/dev/full")
+    done = run_limited(tmp_path, "--out", "out")
     fails_in_one_line(done, "failing: RuntimeError: out of order")
     assert "log.txt: cannot be written: No space left on device" in done.stderr
-    assert summary(results)["error"] == "failing: RuntimeError: out of order"
+    assert summary(out)["error"] == "failing: RuntimeError: out of order"
 
 
 @pytest.mark.slow
@@ -294,10 +188,9 @@ def test_a_folder_that_goes_in_mid_run_is_made_again(node: str, tmp_path: Path) 
     with path.open("a", encoding="utf-8") as file:
         file.write(f"[[nodes]]\nname = 'n'\ntype = 'tests.runtime.samples_faults:{node}'\n")
     done = run_limited(tmp_path)
-    results = tmp_path / "runs" / "sample"
     if node == "Remover":
         assert (done.returncode, done.stderr) == (0, "")
-        assert summary(results)["reason"] == "duration"
+        assert summary(results(tmp_path))["reason"] == "duration"
     else:
         fails_in_one_line(done, "runs/sample", "expected to write a run's results")
 
@@ -312,7 +205,7 @@ def test_a_run_that_cannot_be_looked_at_goes_on(where: str, tmp_path: Path) -> N
     assert done.returncode == 0
     assert "no monitor can connect to this run" in done.stderr
     assert "Traceback" not in done.stderr
-    assert summary(tmp_path / "runs" / "sample")["reason"] == "duration"
+    assert summary(results(tmp_path))["reason"] == "duration"
 
 
 @pytest.mark.parametrize(

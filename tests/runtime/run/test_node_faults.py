@@ -22,7 +22,8 @@ import pytest
 
 from runtime.tools.cli import main
 from tests.runtime.samples_faults import PLACES, WAYS
-from tests.runtime.tools.samples_cli import ROOT
+from tests.runtime.tools.samples_cli import ROOT, results
+from tests.runtime.tools.samples_cli import summary as summary_of
 
 COMBINATIONS = list(itertools.product(("lockstep", "real"), ("stop", "restart", "drop")))
 COROUTINES = {"on_startup", "on_ready", "run", "started", "task_group", "on_shutdown"}
@@ -104,8 +105,8 @@ def wrong_with(here: Path, place: str, way: str, rule: str) -> list[str]:
         expect("last line", last[: len(text) + 15], f"error: faulty: {text}")
     expect("traceback", "Traceback" in told["err"], False)
     try:
-        summary = json.loads((here / "runs/a/summary.json").read_text(encoding="utf-8"))
-    except OSError as error:
+        summary = summary_of(out := results(here))
+    except (OSError, ValueError) as error:
         return [*found, str(error), told["err"]]
     expect(
         "named in the summary", "faulty" in (summary["error"] or ""), fails and place != "after_run"
@@ -113,9 +114,9 @@ def wrong_with(here: Path, place: str, way: str, rule: str) -> list[str]:
     expect("reason", summary["reason"], reason)
     names = ["first"] if place == "on_startup" else ["first", "last"]
     for name in names:
-        count = int((here / f"runs/a/{name}.txt").read_text(encoding="utf-8"))
+        count = int((out / f"{name}.txt").read_text(encoding="utf-8"))
         expect(f"{name} kept", count > 0, place not in EARLY)
-        expect(f"{name} called", (here / f"runs/a/{name}.after").exists(), True)
+        expect(f"{name} called", (out / f"{name}.after").exists(), True)
     return found
 
 

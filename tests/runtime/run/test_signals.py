@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runtime.tools.samples_cli import config_file, start, summary
+from tests.runtime.tools.samples_cli import config_file, results, start, summary
 
 pytestmark = pytest.mark.timeout(120)
 CLOCKS = ["lockstep", "real"]
@@ -56,10 +56,10 @@ def test_a_signal_ends_a_run_in_order(
         process.send_signal(number)
         code, err = ends(process)
     assert (code, err) == (0, "")
-    found = summary(tmp_path / "runs" / "sample")
+    found = summary(results(tmp_path))
     assert (found["reason"], found["error"]) == (reason, None)
     assert found["sim_seconds"] >= 0.2
-    lines = (tmp_path / "runs" / "sample" / "pings.txt").read_text().splitlines(keepends=True)
+    lines = (results(tmp_path) / "pings.txt").read_text().splitlines(keepends=True)
     assert len(lines) == found["events"]["Ping"]
     assert all(line.endswith("\n") for line in lines)
 
@@ -70,7 +70,7 @@ def test_a_run_that_goes_as_fast_as_it_can_hears_ctrl_c(tmp_path: Path) -> None:
     with running(tmp_path, path, "running") as process:
         process.send_signal(signal.SIGINT)
         assert ends(process) == (0, "")
-    assert summary(tmp_path / "runs" / "sample")["reason"] == "Ctrl-C"
+    assert summary(results(tmp_path))["reason"] == "Ctrl-C"
 
 
 @pytest.mark.slow
@@ -80,7 +80,7 @@ def test_ctrl_c_during_a_slow_start_ends_in_order(clock: str, tmp_path: Path) ->
     with running(tmp_path, path, "starting") as process:
         process.send_signal(signal.SIGINT)
         assert ends(process) == (0, "")
-    found = summary(tmp_path / "runs" / "sample")
+    found = summary(results(tmp_path))
     assert (found["reason"], found["sim_seconds"]) == ("Ctrl-C", 0.0)
 
 
@@ -126,4 +126,4 @@ def test_what_a_shell_put_into_the_background_can_be_interrupted(tmp_path: Path)
     process.send_signal(signal.SIGINT)
     assert ends(process) == (0, "")
     run.__exit__(None, None, None)
-    assert summary(tmp_path / "runs" / "sample")["reason"] == "Ctrl-C"
+    assert summary(results(tmp_path))["reason"] == "Ctrl-C"

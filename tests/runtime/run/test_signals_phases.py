@@ -18,7 +18,7 @@ from unittest import mock
 import pytest
 
 from runtime.tools.cli import main
-from tests.runtime.tools.samples_cli import ROOT, start, summary
+from tests.runtime.tools.samples_cli import ROOT, results, start, summary
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 CLOCKS = ["lockstep", "real"]
@@ -89,11 +89,11 @@ def test_a_signal_ends_a_run_in_any_phase(
                 time.sleep(random.uniform(0.0, 0.2))  # real: it is real signals
                 process.send_signal(number)
                 assert json.loads(next_line(process)) == [0, ""], (trial, phase)
-                results = tmp_path / f"{trial}" / "runs" / "a"
+                out = results(tmp_path / f"{trial}")
                 in_shutdown = phase == "shutdown"  # its end was asked for already
-                assert summary(results)["reason"] == ("enough" if in_shutdown else SIGNALS[number])
-                assert (results / "first.txt").exists()
-                assert (results / "first.after").exists()
+                assert summary(out)["reason"] == ("enough" if in_shutdown else SIGNALS[number])
+                assert (out / "first.txt").exists()
+                assert (out / "first.after").exists()
             assert process.wait(LONGEST) == 0
         finally:
             process.kill()

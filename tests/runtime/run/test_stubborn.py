@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runtime.tools.samples_cli import start, summary
+from tests.runtime.tools.samples_cli import results, start, summary
 
 pytestmark = pytest.mark.timeout(180)
 CLOCKS = ["lockstep", "real"]
@@ -61,9 +61,9 @@ class Ended:
             self.seconds = time.monotonic() - begin
         self.lines = self.err.splitlines()
         self.last = self.lines[-1] if self.lines else ""
-        results = folder / "runs" / "a"
-        self.summary = summary(results)
-        assert (results / "first.after").exists()
+        out = results(folder)
+        self.summary = summary(out)
+        assert (out / "first.after").exists()
         assert "Traceback" not in self.err
 
 

@@ -13,7 +13,6 @@ import pytest
 
 from runtime import Duration, Input, Node
 from runtime.config.model import Config, RunConfig
-from runtime.errors import ResultsError
 from runtime.run.execute import execute
 from runtime.run.summarise import command_line, commit
 from runtime.summary import Summary
@@ -65,30 +64,6 @@ def test_a_failed_run_leaves_its_summary(tmp_path: Path) -> None:
     found = msgspec.json.decode((tmp_path / "summary.json").read_bytes(), type=Summary)
     assert found.error == "failing: RuntimeError: out of order"
     assert found.events["Ping"] in {5, 6}  # one is due as it fails
-
-
-@pytest.mark.slow
-def test_what_no_run_has_made_is_never_removed(tmp_path: Path) -> None:
-    """An earlier run is moved whole, and removed two runs later if all in it is its own."""
-    out = tmp_path / "run"
-    for mine in ("mine/notes.txt", "", "", ""):
-        run(out, Speaker)
-        if mine:
-            (out / mine).parent.mkdir()
-            (out / mine).touch()
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["run", "run.1", "run.2"]
-    found = {each.parent.parent.name for each in tmp_path.rglob("notes.txt")}
-    assert found == {"run.2"}
-
-
-def test_a_folder_that_no_run_has_written_is_left_as_it_is(tmp_path: Path) -> None:
-    file = tmp_path / "evaluation" / "mine.csv"
-    file.parent.mkdir()
-    file.touch()
-    with pytest.raises(ResultsError, match=r"expected a new or empty folder.*found 'evaluation'"):
-        run(tmp_path, Speaker)
-    assert [each.name for each in tmp_path.iterdir()] == ["evaluation"]
-    assert file.exists()
 
 
 def test_real_time_is_measured(tmp_path: Path) -> None:

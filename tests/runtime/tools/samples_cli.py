@@ -71,6 +71,11 @@ def command_here(*arguments: str | Path, folder: Path) -> subprocess.CompletedPr
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
+def results(folder: Path) -> Path:
+    """Return the folder of the newest run in ``runs``, also of a start that failed."""
+    return max((folder / "runs").glob("*/[0-9]*"))
+
+
 def summary(folder: Path) -> Any:
     """Read the summary of a run whose results are in `folder`."""
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,14 @@ import pytest
 from runtime import Node
 from runtime.summary import Summary, TickSummary
 from runtime.tools.cli.inspect import layers
-from tests.runtime.tools.samples_cli import ROOT, command, command_here, config_file, summary
+from tests.runtime.tools.samples_cli import (
+    ROOT,
+    command,
+    command_here,
+    config_file,
+    results,
+    summary,
+)
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -43,12 +51,14 @@ def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) 
     assert (done.returncode, done.stderr) == (0, "")
     first, last = done.stdout.splitlines()
     assert first.startswith("sample: 2.0 s on the lockstep clock, seed 0, in ")
-    assert last == "results in runs/sample   all figures: python -m runtime show runs/sample"
+    out = results(tmp_path)
+    where = out.relative_to(tmp_path)
+    assert re.fullmatch(r"runs/sample/\d{8}-\d{6}", str(where))
+    assert last == f"results in {where}   all figures: python -m runtime show {where}"
     shown = command_here("show", "runs/sample", folder=tmp_path)
     assert "speaker.pings" in shown.stdout
     assert shown.stdout.endswith(done.stdout)
-    results = tmp_path / "runs" / "sample"
-    first = summary(results)
+    first = summary(out)
     assert set(first) == set(Summary.__struct_fields__)
     assert (first["clock"], first["seed"], first["reason"]) == ("lockstep", 0, "duration")
     assert (first["error"], first["sim_seconds"]) == (None, 2.0)
@@ -59,36 +69,31 @@ def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) 
     tick = first["ticks"]["speaker.speak"]
     assert set(tick) == set(TickSummary.__struct_fields__)
     assert (tick["hz"], tick["late_max_us"], tick["missed"]) == (10.0, 0.0, 0)
-    assert len((results / "pings.txt").read_text().splitlines()) == first["events"]["Ping"]
-    assert (results / "log.txt").exists()
-    msgspec.json.decode((results / "summary.json").read_bytes(), type=Summary)
+    assert len((out / "pings.txt").read_text().splitlines()) == first["events"]["Ping"]
+    assert (out / "log.txt").exists()
+    msgspec.json.decode((out / "summary.json").read_bytes(), type=Summary)
 
-    again = command_here("run", results / "config.toml", "--out", "again", "-q", folder=tmp_path)
+    again = command_here("run", out / "config.toml", "--out", "again", "-q", folder=tmp_path)
     assert (again.returncode, again.stdout) == (0, "")
     assert summary(tmp_path / "again")["digest"] == first["digest"]
     other = command_here("run", path, "--set", "run.seed=1", "-q", folder=tmp_path)
     assert other.returncode == 0
-    assert summary(results)["digest"] != first["digest"]
+    assert summary(tmp_path / "runs" / "sample" / "latest")["digest"] != first["digest"]
 
 
 @pytest.mark.slow
-def test_the_results_of_an_earlier_run_are_kept_once(tmp_path: Path) -> None:
+def test_the_folder_of_an_earlier_run_is_renamed_by_its_time(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Noise", run="duration = 1")
-    runs = tmp_path / "runs"
     for seed in range(3):
-        done = command_here("run", path, "--set", f"run.seed={seed}", folder=tmp_path)
+        words = ["--set", f"run.seed={seed}", "--out", "runs/sample"]
+        done = command_here("run", path, *words, folder=tmp_path)
         assert done.returncode == 0
-        kept = "the earlier run in runs/sample is now runs/sample.1"
-        assert (kept in done.stderr) == (seed > 0)
-    assert sorted(each.name for each in runs.iterdir()) == ["sample", "sample.1"]
-    seeds = [summary(runs / name)["seed"] for name in ("sample.1", "sample")]
-    assert seeds == [1, 2]
-    (runs / "sample.1" / ".visnav-run").unlink()
-    (runs / "sample.1" / "summary.json").write_text("mine")
-    done = command_here("run", path, folder=tmp_path)
-    assert done.returncode == 2
-    assert "runs/sample.1: expected a new or empty folder" in done.stderr
-    assert summary(runs / "sample")["seed"] == 2
+        assert ("the folder of the earlier run is now runs/sample.2" in done.stderr) == (seed > 0)
+    done = command_here("run", path, "--set", "run.seed=3", folder=tmp_path)
+    assert "the folder of the earlier run is now runs/sample.2" in done.stderr
+    listed = command_here("runs", folder=tmp_path).stdout.splitlines()[1:]
+    assert [line.split()[4] for line in listed] == ["0", "1", "2", "3"]
+    assert all(summary(tmp_path / line.split()[0]) for line in listed)
 
 
 @pytest.mark.slow
@@ -99,10 +104,11 @@ def test_a_node_that_fails_is_one_line_and_a_summary(tmp_path: Path) -> None:
     line = done.stderr.splitlines()[-1]
     assert line.startswith("error: failing: RuntimeError: out of order (runtime/samples.py:")
     assert "Traceback" not in done.stderr
-    found = summary(tmp_path / "runs" / "sample")
+    found = summary(out := results(tmp_path))
+    assert done.stderr.splitlines()[-2] == f"{out.relative_to(tmp_path)}/log.txt says more"
     assert (found["reason"], found["sim_seconds"]) == ("failing failed", 0.5)
     assert found["error"] == "failing: RuntimeError: out of order"
-    log = (tmp_path / "runs" / "sample" / "log.txt").read_text()
+    log = (results(tmp_path) / "log.txt").read_text()
     assert "0.500000 ERROR    runtime: failing: RuntimeError: out of order" in log
     assert "Traceback" in log
 
@@ -118,7 +124,7 @@ def test_a_thread_that_never_returns_does_not_keep_the_process(
     assert done.returncode == code
     lines = [line for line in done.stderr.splitlines() if not line.startswith("error: ")]
     assert lines[-1] == "warning: still busy, left behind: offload_0"
-    assert summary(tmp_path / "runs" / "sample")["sim_seconds"] > 0.5
+    assert summary(results(tmp_path))["sim_seconds"] > 0.5
 
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
@@ -152,7 +158,7 @@ def test_an_error_is_printed_once(node: str, tmp_path: Path) -> None:
     (tmp_path / "f.toml").write_text(text)
     done = command("run", "f.toml", "-q", folder=tmp_path)
     assert (done.returncode, done.stderr.count("went wrong")) == (2, 1), done.stderr
-    assert "went wrong" in (tmp_path / "runs" / "run" / "log.txt").read_text()
+    assert "went wrong" in (results(tmp_path) / "log.txt").read_text()
 
 
 class Fatal(Node):
@@ -247,7 +253,7 @@ def test_log_events_prints_each_event_with_arrays_by_shape(tmp_path: Path) -> No
     path = config_file(tmp_path, "Speaker", "Painter", run="duration = 0.25")
     done = command_here("run", path, "--log", "events", "-q", folder=tmp_path)
     assert done.returncode == 0
-    log = (tmp_path / "runs" / "sample" / "log.txt").read_text()
+    log = (results(tmp_path) / "log.txt").read_text()
     assert log.count("events: speaker.pings Ping speaker: count=") == 3
     assert "events: painter.images Image painter: " in log
     assert "data=uint8[4, 6, 3]" in log

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -20,10 +21,15 @@ class JudgeConfig(NodeConfig):
 
     error: float = 0.5
     crash: bool = False
+    fails_in_start: bool = False
 
 
 class Judge(Node[JudgeConfig]):
     """Concludes a verdict, or crashes."""
+
+    async def on_startup(self) -> None:
+        if self.config.fails_in_start:
+            raise RuntimeError("not today")
 
     async def on_shutdown(self) -> None:
         good = self.config.error < 1
@@ -142,23 +148,43 @@ def test_a_verdict_is_shown_in_a_few_lines(file: Path, tmp_path: Path) -> None:
     lines = done.stdout.splitlines()
     assert lines[0].startswith("tour: 1.0 s on the lockstep clock, seed 0, in ")
     assert "vo PASSED" in lines
-    assert lines[-1] == "results in runs/tour   all figures: python -m runtime show runs/tour"
+    assert lines[-1].startswith("results in runs/tour/20")
     assert len(lines) <= 6
     tables: Any = command_here("run", file, "-v", folder=tmp_path).stdout
     assert "digest " in tables
     assert len(tables.splitlines()) > 8
     bad = command_here("run", file, "--set", "judge.error=7", folder=tmp_path)
     assert bad.stdout.splitlines()[0] == "vo FAILED: ate_percent: expected at most 1"
-    command_here("run", file, "--set", "judge.crash=true", "--out", "runs/bad", folder=tmp_path)
-    (tmp_path / "runs" / "torn").mkdir()
-    (tmp_path / "runs" / "torn" / "summary.json").write_text("{")
-    listed = command_here("runs", folder=tmp_path).stdout.splitlines()
-    rows = {line.split()[0]: line.split()[3:] for line in listed[1:]}
-    assert rows["torn"] == ["unreadable"]
-    assert rows["bad"][2:] == ["crashed", "vo", "0.5", "%"]
-    assert rows["tour"] == ["1.0", "0", "FAILED", "vo", "7", "%"]
-    assert rows["tour.1"] == ["1.0", "0", "PASSED", "vo", "0.5", "%"]
-    assert command_here("runs", "nowhere", folder=tmp_path).returncode == 2
     nothing = command_here("show", tmp_path, folder=tmp_path)
     assert nothing.returncode == 2
-    assert "expected a run's summary, found: No such file" in nothing.stderr
+    assert "expected the folder of a run, with summary.json," in nothing.stderr
+
+
+def test_runs_are_listed_with_their_verdicts_the_newest_last(file: Path, tmp_path: Path) -> None:
+    changes = ("error=0.5", "error=7", "crash=true", "fails_in_start=true")
+    for change in changes:
+        command_here("run", file, "--set", f"judge.{change}", folder=tmp_path)
+    for name in ("bad", "torn"):
+        command_here("run", file, "--out", f"runs/{name}", folder=tmp_path)
+    (tmp_path / "runs" / "bad" / "summary.json").unlink()
+    (tmp_path / "runs" / "torn" / "summary.json").write_text("{")
+    (tmp_path / "runs" / "notes").mkdir()
+    listed = command_here("runs", folder=tmp_path).stdout.splitlines()
+    rows = [re.split("  +", line.strip()) for line in listed[1:]]
+    assert [row[2:] for row in rows] == [
+        ["1.0", "0", "PASSED", "vo 0.5 %"],
+        ["1.0", "0", "FAILED", "vo 7 %"],
+        ["0.0", "0", "crashed", "vo 0.5 %"],
+        ["0.0", "0", "did not start"],
+        ["no summary: killed, or not over"],
+        ["unreadable"],
+    ]
+    assert [row[0].partition("/20")[0] for row in rows] == ["runs/tour"] * 4 + [
+        "runs/bad",
+        "runs/torn",
+    ]
+    for row in rows[:3]:
+        assert f"show {row[0]}\n" in command_here("show", row[0], folder=tmp_path).stdout
+    left = command_here("show", "runs/bad", folder=tmp_path)
+    assert "expected a run's summary, found: No such file" in left.stderr
+    assert command_here("runs", "nowhere", folder=tmp_path).returncode == 2

@@ -124,7 +124,7 @@ def test_a_script_flies_the_default_settings(tmp_path: Path) -> None:
     finally:
         running.send_signal(signal.SIGINT)
         assert running.wait(30) == 0
-    (table,) = (tmp_path / "runs/airsim/recording").glob("*/airsim_rec.txt")
+    (table,) = (tmp_path / "runs/airsim/latest/recording").glob("*/airsim_rec.txt")
     header, *rows = (line.split("\t") for line in table.read_text().splitlines())
     stamps = [int(row[header.index("TimeStamp")]) for row in rows]
     assert {after - before for before, after in itertools.pairwise(stamps)} == {50}

@@ -23,6 +23,7 @@ from tests.runtime.tools.samples_cli import (
     ROOT,
     command_here,
     config_file,
+    results,
     start,
     summary,
 )
@@ -65,9 +66,9 @@ def test_a_parameter_is_set_from_another_terminal(tmp_path: Path, sockets: Path)
         refused = command_here("set", "pilot.height=3", "--run", "sample", folder=tmp_path)
         assert refused.returncode == 2
         assert "error: pilot.height: cannot change while the run goes on" in refused.stderr
-    log = (tmp_path / "runs" / "sample" / "log.txt").read_text()
+    log = (results(tmp_path) / "log.txt").read_text()
     assert "pilot.gain is now 2.0" in log
-    assert summary(tmp_path / "runs" / "sample")["reason"] == "Ctrl-C"
+    assert summary(results(tmp_path))["reason"] == "Ctrl-C"
     assert list(sockets.iterdir()) == []
     gone = command_here("set", "pilot.gain=2", folder=tmp_path)
     assert gone.returncode == 2
@@ -141,7 +142,7 @@ def test_the_screen_and_the_run_share_a_terminal(tmp_path: Path, sockets: Path) 
     os.close(terminal)
     assert process.returncode == 0
     assert b"ended by: stopped by hand" in b" ".join(shown.split())  # wherever lines end
-    assert summary(tmp_path / "runs" / "sample")["reason"] == "stopped by hand"
+    assert summary(results(tmp_path))["reason"] == "stopped by hand"
 
 
 @pytest.mark.slow
