@@ -21,9 +21,9 @@ import pytest
 import visnav
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
-from runtime.errors import ConfigError, NodeError, VisnavError
+from runtime.errors import ConfigError, NodeError, ResultsError, VisnavError
 from tests.runtime.samples import Noise, Reader
-from tests.runtime.tools.samples_cli import ROOT, command_here, config_file
+from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, results
 from tests.runtime.tools.samples_cli import summary as summary_of
 
 TABLE: dict[str, Any] = {
@@ -54,7 +54,7 @@ def test_importing_it_imports_next_to_nothing() -> None:
 def test_a_run_is_that_of_the_command(tmp_path: Path) -> None:
     file = config_file(tmp_path, "Noise", "Reader", run="duration = 1")
     run = visnav.run(file, set={"run.seed": 3}, quiet=True)
-    assert (run.name, run.folder) == ("sample", Path("runs/sample"))
+    assert (run.name, run.folder) == ("sample", results(Path()))
     assert (run.passed, run.figures, run.truth, run.estimates, run.report) == (
         *(None, {}, None),
         *({}, None),
@@ -64,7 +64,9 @@ def test_a_run_is_that_of_the_command(tmp_path: Path) -> None:
     assert run.summary["digest"] == summary_of(tmp_path / "b")["digest"]
     assert visnav.load("b").summary["digest"] == run.summary["digest"]
     assert visnav.run(file, seed=4, quiet=True).summary["digest"] != run.summary["digest"]
-    assert Path("runs/sample.1").is_dir()
+    assert run.folder is not None
+    assert visnav.load(run.folder).summary == run.summary  # it is as it was
+    assert len(list(Path("runs/sample").glob("2*"))) == 2
 
 
 @pytest.mark.slow
@@ -114,7 +116,7 @@ def test_what_is_wrong_is_raised_here(tmp_path: Path) -> None:
         visnav.run({"nodes": [{"name": "noise", "type": Noise, "rat": 1}]})
     with pytest.raises(ConfigError, match=r"--set nois\.e=1: expected run or a node"):
         visnav.run(TABLE, set={"nois.e": 1})
-    with pytest.raises(ValueError, match="expected the folder of a run, found none"):
+    with pytest.raises(ResultsError, match=r"expected the folder of a run, .*found none"):
         visnav.load(tmp_path / "nowhere")
     file = config_file(tmp_path, "Noise", "Failing", run="duration = 1")
     with pytest.raises(NodeError, match="out of order"):

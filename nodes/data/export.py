@@ -167,8 +167,6 @@ def load(run: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:
     Raises:
         ValueError: The run left no trajectories, or one of them is none.
     """
-    if not run.is_dir():
-        raise ValueError(f"{run}: expected the folder of a run, found none")
     folder = run / "trajectories"
     if not (folder / f"{TRUTH}.tum").is_file():
         found = ", ".join(sorted(p.name for p in folder.glob("*.tum"))) or "no trajectories"

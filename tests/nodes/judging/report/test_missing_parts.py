@@ -16,6 +16,7 @@ from nodes.judging.report.page import write_report
 from nodes.judging.report.style import Floats
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row, write_tum
+from runtime.errors import ResultsError
 from tests.nodes.judging.report.folders import SECOND, evaluated, ply, recorded, summary, walk
 from tests.nodes.judging.report.test_report import Page
 
@@ -182,9 +183,9 @@ def test_clouds_without_breadth_are_drawn(tmp_path: Path, points: Floats) -> Non
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"none: expected the folder of a run, found none"):
+    with pytest.raises(ResultsError, match=r"none: expected the folder of a run, .*found none"):
         write_report(tmp_path / "none")
     (tmp_path / "letter.txt").touch()
-    with pytest.raises(ValueError, match=r"summary\.json.*found letter\.txt"):
+    with pytest.raises(ResultsError, match=r"summary\.json.*found letter\.txt"):
         write_report(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
