@@ -3,7 +3,7 @@
 Without a folder of the user's a run gets one by time, ``runs/NAME/20261123-154012``, and with its
 first update the link ``runs/NAME/latest`` names it. A folder that the runtime has made has a marker
 in it, which says what process uses it and when its first update was; that process holds a lock on
-it. Nobody's results are removed: where a run is given the folder of an earlier one, that one is
+it. A run removes nobody's results: where it is given the folder of an earlier one, that one is
 renamed by its time. Not here: what nodes write.
 
 While a run has programs, its nodes write into a private folder, which no program is told of: truth,
