@@ -257,6 +257,7 @@ def test_whatever_takes_a_run_takes_its_name(
     latest = run_folder(tmp_path / "runs" / "sample").relative_to(tmp_path)
     again = tmp_path / "again.toml"
     nodes = "[[nodes]]\nname = 'replay'\ntype = 'Replay'\nfile = 'runs/sample'\n"
+    nodes += "only = ['Event']\n[[nodes]]\nname = 'reader'\ntype = 'tests.runtime.samples:Reader'\n"
     again.write_text(f"[run]\nname = 'again'\n{nodes}")
     done = command_here("run", again, folder=tmp_path)
     assert done.returncode == 0, done.stderr

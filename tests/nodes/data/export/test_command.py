@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from nodes.data.export import export
 from nodes.trajectory.formats import write_tum
-from runtime.errors import ConfigError
+from runtime.errors import ConfigError, ResultsError
 from tests.nodes.trajectory.samples import walk
 
 app = typer.Typer()
@@ -43,6 +43,9 @@ def test_it_prints_what_it_wrote(run: Path) -> None:
 
 
 def test_a_run_without_trajectories_is_one_of_our_errors(tmp_path: Path) -> None:
+    with pytest.raises(ResultsError, match=r"expected the folder of a run, .* found nothing in it"):
+        call(str(tmp_path), "--format", "euroc")
+    (tmp_path / "trajectories").mkdir()
     with pytest.raises(ConfigError, match=r"expected the run's true trajectory"):
         call(str(tmp_path), "--format", "euroc")
 
