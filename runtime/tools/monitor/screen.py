@@ -134,13 +134,15 @@ class Screen(App[str]):
                 reason = snapshot.ended
         except VisnavError as error:
             reason = str(error)
-        head = self.query_one("#head", Static)
-        head.update(Text(f"the run is over: {reason or 'it does not answer any more'}"))
+        for head in self.query("#head").results(Static):  # none if the screen has closed meanwhile
+            head.update(Text(f"the run is over: {reason or 'it does not answer any more'}"))
         if self._leave:
             self.exit()
 
     def show(self, snapshot: Snapshot) -> None:
-        """Show a snapshot."""
+        """Show a snapshot, unless the screen is closing."""
+        if not self.query("#head"):
+            return
         self.snapshot = snapshot
         self.query_one("#head", Static).update(Text(snapshot.headline))
         for name in COLUMNS:
