@@ -296,8 +296,7 @@ class Evaluation(Node[EvaluationConfig]):
         if not self._records and self.clock.now() > 0:
             self.log.info("no estimator has announced itself or sent an estimate")
         judgements, verdict = await self.offload(self._finish, self.clock.now())
-        for name in judgements:
-            figures = verdict["estimators"][name]
+        for name, figures in verdict["estimators"].items():
             rest = {k: v for k, v in figures.items() if k != "passed"}
             self.conclude(name, rest, passed=figures["passed"])
             if figures.get("why"):

@@ -97,6 +97,8 @@ def conclude(
     stopped = ""  # by the user, before the plan was flown
     if end is not None and end.by == "user" and not end.planned:
         stopped = f"the user ended the run before its plan was flown: {end.reason}"
+    absent = {name: {"why": "expected estimates, found none"} for name in own if name not in found}
+    found = {**found, **absent}  # who is asked for something and is not there has failed
     estimators = {}
     for name, figures in found.items():
         of_run = {} if end is None else _of_run(name, figures, end, name in declared)

@@ -244,3 +244,7 @@ def test_an_estimator_may_have_thresholds_of_its_own() -> None:
     assert verdict["estimators"]["mono"]["passed"] is True
     assert verdict["estimators"]["vo"]["failed"] == ["ate_percent: expected at most 1, found 3"]
     assert verdict["own_thresholds"]["mono"]["ate_percent"] == 5.0
+    for there in ({}, {"vo": figures | {"ate_percent": 0.5}}):  # and it has to be there
+        verdict = conclude(there, limits, own={"mono": Thresholds(ate_percent=5.0)})
+        assert verdict["passed"] is verdict["estimators"]["mono"]["passed"] is False
+        assert verdict["estimators"]["mono"]["failed"] == ["expected estimates, found none"]
