@@ -23,11 +23,13 @@ from events import (
     CameraAnnouncement,
     DepthImage,
     EstimatorAnnouncement,
+    Event,
     Image,
     ImuAnnouncement,
     LidarAnnouncement,
     LidarScan,
     PoseEstimate,
+    SensorAnnouncement,
     TakenOff,
     TrackedFeatures,
     TrackingEvent,
@@ -78,9 +80,6 @@ class EstimatorConfig(NodeConfig):
     latency: Latency = Latency(0.015)  # immutable
     not_finite: Literal["error", "lost"] = "error"
 
-
-Frame = Image | DepthImage | LidarScan
-"""Events to estimate a pose for."""
 
 _KINDS = ("rgb", "grey", "depth", "segmentation", "lidar")
 """Kinds of data an estimator may need."""
@@ -343,24 +342,26 @@ class Estimator(Node[C], ABC):
             self.log.fatal("%s", self._missing())
         return self._choice.lidar
 
-    def exposed_at(self, image: Frame) -> int:
+    def exposed_at(self, image: Event) -> int:
         """Return when an image was exposed on the clock of IMU and ground truth (ns).
 
         That is its stamp without the offset of the camera's clock, which was announced; of a scan
-        the time of its last ray.
+        the time of its last ray, and of anything else its stamp.
         """
         if isinstance(image, LidarScan):
             return image.end
+        if not isinstance(image, Image | DepthImage):
+            return image.stamp
         return image.stamp - round(self.the_camera().time_offset * 1e9)
 
-    def _sensor(self) -> CameraAnnouncement | LidarAnnouncement:
+    def _sensor(self) -> CameraAnnouncement | SensorAnnouncement:
         """Return the sensor of the estimated pose."""
         return self._choice.lidar or self.the_camera()
 
     def _missing(self) -> str:
         return self._choice.missing()
 
-    def publish(self, image: Frame, result: TrackingResult, origin: int | None = None) -> None:
+    def publish(self, image: Event, result: TrackingResult, origin: int | None = None) -> None:
         """Send a tracker's result for an image: features, pose, loss of tracking.
 
         Args:
@@ -410,8 +411,8 @@ class Estimator(Node[C], ABC):
             self.log.warning("lost: %s", reason or "no reason given")
             self.tracking_events.send(TrackingLost(stamp=stamp, source=self.name, reason=reason))
 
-    def _send_features(self, image: Frame, result: TrackingResult) -> None:
-        if isinstance(image, LidarScan):
+    def _send_features(self, image: Event, result: TrackingResult) -> None:
+        if not isinstance(image, Image | DepthImage):
             return
         points = result.points
         if self._rectification is not None:

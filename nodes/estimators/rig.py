@@ -19,6 +19,7 @@ from events import (
     ImuAnnouncement,
     LidarAnnouncement,
     PoseEstimate,
+    SensorAnnouncement,
     TrajectoryEstimate,
     VehicleAnnouncement,
 )
@@ -236,11 +237,11 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
     @classmethod
     def of(
         cls,
-        camera: CameraAnnouncement | LidarAnnouncement,
+        camera: CameraAnnouncement | SensorAnnouncement,
         vehicle: VehicleAnnouncement | None,
         frame_id: str = "odom",
     ) -> Mount:
-        """Make the mount of an announced camera, or of a lidar in its place.
+        """Make the mount of an announced camera, or of another sensor in its place.
 
         Args:
             vehicle: The announcement of the vehicle, if the body had the announced pose at the

@@ -1,4 +1,4 @@
-"""Native interface: images and IMU samples for an external program, without ROS.
+"""Native interface: images, measurements and estimates for an external program, without ROS.
 
 `client` is the program's side, one file of standard library and numpy, to be copied, and
 ``visnav_link.hpp`` the same for C++17; ``python -m nodes.outside.native`` prints the folder that
@@ -6,7 +6,7 @@ both are in. `endpoint` is the run's side, `answers` checks what comes from the 
 of the run. docs/reference/link.md has the protocol, byte by byte.
 """
 
-from nodes.outside.native.answers import LinkAnswer, LinkError, describe
+from nodes.outside.native.answers import LinkAnswer, LinkError, LinkOrder, describe
 from nodes.outside.native.endpoint import Endpoint
 
-__all__ = ["Endpoint", "LinkAnswer", "LinkError", "describe"]
+__all__ = ["Endpoint", "LinkAnswer", "LinkError", "LinkOrder", "describe"]

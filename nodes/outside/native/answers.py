@@ -1,6 +1,6 @@
 """Answers of a linked program, checked field by field.
 
-Also the JSON text of WELCOME: the description of the run's cameras and IMU.
+Also the JSON text of WELCOME: the description of the run's cameras, inputs and outputs.
 """
 
 from __future__ import annotations
@@ -12,9 +12,18 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import CameraAnnouncement, ImuAnnouncement
+from events import Announcement, CameraAnnouncement
 from events.geometry import pose_matrix
-from nodes.outside.native.client import COVARIANCE, DONE_BODY, POSE_HEAD, STATUS, VELOCITY
+from nodes.outside.native.client import (
+    AXES,
+    COVARIANCE,
+    DONE_BODY,
+    ORDER_BODY,
+    ORDERS,
+    POSE_HEAD,
+    STATUS,
+    VELOCITY,
+)
 from runtime.errors import VisnavError
 
 TOLERANCE = 1e-4
@@ -34,6 +43,28 @@ class LinkError(VisnavError):
     """A program is missing, or does not keep to the protocol; or a run has the socket already."""
 
 
+class LinkOrder(msgspec.Struct, frozen=True):
+    """An order to the vehicle.
+
+    Attributes:
+        order: ``takeoff``, ``land``, ``position`` or ``velocity``.
+        axes: ``map`` or ``heading``, of a velocity.
+        position: Metres in ``map``.
+        velocity: Metres per second along the axes.
+        yaw: Radians.
+        yaw_rate: Radians per second.
+    """
+
+    sequence: int
+    stamp: int
+    order: str
+    axes: str
+    position: tuple[float, float, float]
+    velocity: tuple[float, float, float]
+    yaw: float
+    yaw_rate: float
+
+
 class LinkAnswer(msgspec.Struct, frozen=True, eq=False):
     """The answer to a frame.
 
@@ -41,13 +72,15 @@ class LinkAnswer(msgspec.Struct, frozen=True, eq=False):
         sequence: Number of the frame.
         stamp: Stamp of the frame (ns).
         status: ``done``: the program says no more about this frame.
-        pose: The optical camera 0 in the optical camera 0 of the program's first pose, shape
-            (4, 4); `None` if the status is not ``tracked``.
+        pose: The optical camera 0 (the body, without a camera) in that of the program's first
+            pose, shape (4, 4); `None` if the status is not ``tracked``.
         covariance: Of the error of that pose: a shift of the camera and a rotation about it, along
-            the axes of the optical camera of the first pose, shape (6, 6); `None` without any.
+            the axes of the camera (or body) of the first pose, shape (6, 6); `None` without any.
         velocity: Along the same axes, m/s, shape (3,); `None` without any.
         points: Features that were tracked: column and row, float32 pixels, shape (n, 2).
         inliers: Which of them agree with the pose: bool, shape (n,).
+        output: Number of the output; 0 is the answer itself.
+        before: Further outputs and orders that came before the answer to the same frame.
     """
 
     sequence: int
@@ -58,6 +91,8 @@ class LinkAnswer(msgspec.Struct, frozen=True, eq=False):
     velocity: npt.NDArray[np.float64] | None = None
     points: npt.NDArray[np.float32] = np.empty((0, 2), np.float32)
     inliers: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
+    output: int = 0
+    before: tuple[LinkAnswer | LinkOrder, ...] = ()
 
 
 def read_done(body: bytearray) -> LinkAnswer:
@@ -72,6 +107,22 @@ def read_done(body: bytearray) -> LinkAnswer:
     return LinkAnswer(sequence, stamp, "done")
 
 
+def read_order(body: bytearray) -> LinkOrder:
+    """Read the body of an ORDER.
+
+    Raises:
+        LinkError: It is not as the protocol says, or not finite.
+    """
+    if len(body) != ORDER_BODY.size:
+        raise LinkError(f"ORDER: expected {ORDER_BODY.size} bytes, found {len(body)}")
+    sequence, stamp, order, axes, *found = ORDER_BODY.unpack(body)
+    if order not in ORDERS.values() or axes not in AXES.values():
+        raise LinkError(f"ORDER: expected an order 0 to 3 with axes 0 or 1, found {order}, {axes}")
+    _finite("ORDER", np.array(found))
+    (x, y, z, u, v, w, yaw, rate), names = found, ([*ORDERS][order], [*AXES][axes])
+    return LinkOrder(sequence, stamp, *names, (x, y, z), (u, v, w), yaw, rate)
+
+
 def read_pose(body: bytearray) -> LinkAnswer:
     """Read the body of a POSE; pose, covariance and velocity are as the program gave them.
 
@@ -80,7 +131,7 @@ def read_pose(body: bytearray) -> LinkAnswer:
     """
     if len(body) < POSE_HEAD.size + MATRIX:
         raise LinkError(f"POSE: expected {POSE_HEAD.size + MATRIX} bytes, found {len(body)}")
-    sequence, stamp, number, follows, count, _ = POSE_HEAD.unpack_from(body)
+    sequence, stamp, number, follows, count, output = POSE_HEAD.unpack_from(body)
     status = next((name for name, code in STATUS.items() if code == number), None)
     if status is None:
         raise LinkError(f"POSE.status: expected one of {[*STATUS.values()]}, found {number}")
@@ -111,7 +162,8 @@ def read_pose(body: bytearray) -> LinkAnswer:
     points = np.frombuffer(body, "<f4", 2 * count, at).reshape(-1, 2)
     _finite("POSE.points", points)
     inliers = np.frombuffer(body, "u1", count, at + 8 * count) != 0
-    return LinkAnswer(sequence, stamp, status, pose, covariance, velocity, points, inliers)  # type: ignore[arg-type]
+    found: Any = status, pose, covariance, velocity, points, inliers, output
+    return LinkAnswer(sequence, stamp, *found)
 
 
 def _finite(field: str, values: npt.NDArray[np.floating] | None) -> None:
@@ -121,26 +173,32 @@ def _finite(field: str, values: npt.NDArray[np.floating] | None) -> None:
 
 def describe(
     cameras: Sequence[tuple[CameraAnnouncement, Sequence[str]]],
-    imu: ImuAnnouncement | None,
+    inputs: Sequence[tuple[str, str, Announcement]],
     clock: Mapping[str, Any],
+    outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return the description of a run: the announcements' fields, and transforms to the body (FRD).
 
     Args:
         cameras: Each with the kinds of image that will be sent of it (``rgb8``, ``depth32f``, …).
-        imu: The IMU whose samples will be sent.
+        inputs: Name, kind (one of `client.RECORDS`) and announcement of each.
         clock: ``kind`` of the run's clock (``lockstep`` or ``real``), and what else is known.
+        outputs: Names of the further outputs.
     """
+    given = [{"name": n, "kind": kind, **_sensor(of, "body_from_sensor")} for n, kind, of in inputs]
     return {
         "clock": dict(clock),
         "cameras": [
             {**_sensor(camera, "body_from_camera"), "images": list(kinds)}
             for camera, kinds in cameras
         ],
-        "imu": _sensor(imu, "body_from_imu") if imu else None,
+        "inputs": given,
+        "outputs": [*outputs],
     }
 
 
-def _sensor(sensor: CameraAnnouncement | ImuAnnouncement, transform: str) -> dict[str, Any]:
-    matrix = pose_matrix(sensor.position, sensor.orientation).tolist()
-    return {**msgspec.to_builtins(sensor), transform: matrix}
+def _sensor(announced: Announcement, transform: str) -> dict[str, Any]:
+    found: dict[str, Any] = msgspec.to_builtins(announced)
+    if "position" not in found:
+        return found
+    return {**found, transform: pose_matrix(found["position"], found["orientation"]).tolist()}

@@ -1,4 +1,4 @@
-"""The native interface's client: feeds a Python program with a run's images and IMU samples.
+"""The native interface's client: feeds a Python program with a run's images and measurements.
 
 This file may be copied; it needs numpy, and nothing else of the project::
 
@@ -7,7 +7,7 @@ This file may be copied; it needs numpy, and nothing else of the project::
         slam = MySlam(camera["fx"], camera["fy"], camera["cx"], camera["cy"])
         link.ready()
         for frame in link:                      # until the run ends
-            pose = slam.track(frame.image("rgb8"), frame.image("depth32f"), frame.imu)
+            pose = slam.track(frame.image("rgb8"), frame.image("depth32f"), frame.rows("imu"))
             link.lost(frame) if pose is None else link.pose(frame, pose)
 
 docs/reference/link.md of visnav-runtime has the protocol, byte by byte. All is little endian.
@@ -23,30 +23,56 @@ import os
 import socket
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-MAGIC, VERSION = b"VISNAVLK", 1
+MAGIC, VERSION = b"VISNAVLK", 2
 HELLO, WELCOME, REFUSED, READY, BYE = 1, 2, 3, 4, 5
-IMU, FRAME = 16, 17
-POSE, DONE, LOG = 32, 33, 34
+INPUT, FRAME = 16, 17
+POSE, DONE, LOG, ORDER = 32, 33, 34, 35
 
 HEADER = struct.Struct("<II")  # of each message: length of its body (bytes), type
 GREETING = struct.Struct("<8sII")  # begins HELLO, WELCOME and REFUSED: magic, version, 0
 MEMORY = struct.Struct("<Q")  # follows in WELCOME: size of the shared memory (bytes)
+INPUT_HEAD = struct.Struct("<IIq")  # input, number of rows, time at which they came (ns)
 FRAME_HEAD = struct.Struct("<QqII")  # sequence, stamp (ns), number of images, 0
 IMAGE_HEAD = struct.Struct("<IIIIIIQ")  # camera, kind, height, width, stride (bytes), 0, offset
-POSE_HEAD = struct.Struct("<QqIIII")  # sequence, stamp, status, what follows, number of points, 0
+POSE_HEAD = struct.Struct("<QqIIII")  # sequence, stamp, status, follows, points, output
 DONE_BODY = struct.Struct("<Qq")  # sequence, stamp (ns)
+ORDER_BODY = struct.Struct("<QqII8d")  # sequence, stamp, order, axes, numbers
 LONGEST, LONGEST_TEXT = 1 << 24, 4096  # bytes of a body; of a name, a reason, a line of the log
 
-SAMPLE = np.dtype(
-    [("stamp", "<i8"), ("angular_velocity", "<f8", 3), ("linear_acceleration", "<f8", 3)]
-)
-"""A sample of the IMU: ns, rad/s, m/s² in its own axes; 56 bytes."""
+_FIELDS: dict[str, list[tuple[Any, ...]]] = {
+    "imu": [("angular_velocity", "<f8", 3), ("linear_acceleration", "<f8", 3)],
+    "fluid_pressure": [("fluid_pressure", "<f8"), ("variance", "<f8")],
+    "magnetic_field": [("magnetic_field", "<f8", 3)],
+    "nav_sat_fix": [
+        ("latitude", "<f8"),
+        ("longitude", "<f8"),
+        ("altitude", "<f8"),
+        ("velocity", "<f8", 3),
+        ("position_covariance", "<f8", (3, 3)),
+        ("status", "<i8"),
+    ],
+    "range": [("range", "<f8"), ("min_range", "<f8"), ("max_range", "<f8")],
+    "lidar_scan": [("point", "<f4", 3), ("intensity", "<f4"), ("ring", "<u8")],
+    "pose_estimate": [
+        ("frame", "<u8"),
+        ("pose", "<f8", (3, 4)),
+        ("velocity", "<f8", 3),
+        ("covariance", "<f8", (6, 6)),
+    ],
+}
+RECORDS = {kind: np.dtype([("stamp", "<i8"), *rest]) for kind, rest in _FIELDS.items()}
+"""Rows of each kind of input: a stamp (ns), and the fields of the event of that name.
+
+Units and axes are those of the events. A point's stamp is that of its ray. Poses are of the body
+(FRD) in ``map`` or a frame of the estimator, numbered by `frame` from 0; NaN in all of a pose says
+that tracking is lost, in velocity or covariance that it is not known.
+"""
 
 KINDS: dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]] = {
     "mono8": (1, np.dtype("u1"), ()),
@@ -56,6 +82,8 @@ KINDS: dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]] = {
 }
 """Kinds of image: number, type of a value, values of a pixel."""
 
+ORDERS = {"takeoff": 0, "land": 1, "position": 2, "velocity": 3}
+AXES = {"map": 0, "heading": 1}
 STATUS = {"tracked": 0, "lost": 1, "initialising": 2}
 POSE_OF = {"camera": 0, "body": 1}
 COVARIANCE, VELOCITY = 1, 2  # what follows a pose
@@ -80,20 +108,43 @@ class LinkImage(NamedTuple):
     data: npt.NDArray[Any]
 
 
+class LinkInput(NamedTuple):
+    """Measurements of a sensor in a row, a whole scan, or estimates of another node.
+
+    Attributes:
+        name: One of the description's inputs.
+        arrived: Time of the run's clock at which the last one came (ns): its stamp and latency.
+        rows: One of `RECORDS`.
+    """
+
+    name: str
+    arrived: int
+    rows: npt.NDArray[Any]
+
+
 class Frame(NamedTuple):
-    """Images and IMU samples of an exposure.
+    """Images of an exposure, or another occasion for an answer, and what came before.
 
     Attributes:
         sequence: 0, 1, 2, …
-        stamp: Time of the exposure (ns).
+        stamp: Time of the exposure, or of the measurement that asks for an answer (ns).
         images: All images.
-        imu: Samples since the last frame, of type `SAMPLE`.
+        inputs: What came since the frame before, in the order in which it came.
+        kinds: Kind of each input, by name.
     """
 
     sequence: int
     stamp: int
     images: tuple[LinkImage, ...]
-    imu: npt.NDArray[Any]
+    inputs: tuple[LinkInput, ...]
+    kinds: Mapping[str, str]
+
+    def rows(self, name: str) -> npt.NDArray[Any]:
+        """Return what came of an input since the frame before; raise `LookupError` if unknown."""
+        if name not in self.kinds:
+            raise LookupError(f"expected one of {', '.join(self.kinds) or 'none'}, found {name!r}")
+        none = np.empty(0, RECORDS[self.kinds[name]])
+        return np.concatenate([none, *(each.rows for each in self.inputs if each.name == name)])
 
     def image(self, kind: str, camera: int = 0) -> npt.NDArray[Any]:
         """Return a camera's image of a kind; raise `LookupError` if there is none."""
@@ -119,6 +170,7 @@ class Link:
         path = path or os.environ.get("VISNAV_SOCKET", "")
         self._sending = threading.Lock()
         self._expected = 0
+        self._kinds: dict[str, str] = {}
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         with contextlib.ExitStack() as unless_joined:
             unless_joined.callback(self._socket.close)
@@ -128,10 +180,11 @@ class Link:
                 raise ProtocolError(f"expected the socket of a run at {path!r}: {error}") from None
             self._send(HELLO, GREETING.pack(MAGIC, VERSION, 0) + name.encode())
             self.description = self._welcome()
+            self._kinds = {each["name"]: each["kind"] for each in self.description["inputs"]}
             unless_joined.pop_all()
 
     description: dict[str, Any]
-    """Cameras, IMU and clock of the run."""
+    """Cameras, inputs, outputs and clock of the run."""
 
     def _welcome(self) -> dict[str, Any]:
         try:
@@ -165,17 +218,17 @@ class Link:
         self._send(READY, struct.pack("<II", POSE_OF[pose_of], 0))
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames until the run ends, each with the IMU samples since the frame before."""
-        samples = [np.empty(0, SAMPLE)]
+        """Yield the frames until the run ends, each with its inputs."""
+        inputs: list[LinkInput] = []
         while (received := self.receive()) is not None:
             if isinstance(received, Frame):
-                yield received._replace(imu=np.concatenate(samples))
-                samples = samples[:1]
+                yield received._replace(inputs=tuple(inputs))
+                inputs.clear()
             else:
-                samples.append(received)
+                inputs.append(received)
 
-    def receive(self) -> Frame | npt.NDArray[Any] | None:
-        """Wait for a frame (without its samples) or samples; return `None` at the end of the run.
+    def receive(self) -> Frame | LinkInput | None:
+        """Wait for a frame (without its inputs) or an input; return `None` at the end of the run.
 
         Raises:
             ProtocolError: The run has gone without a word, or does not keep to the protocol.
@@ -185,14 +238,21 @@ class Link:
             raise ProtocolError(f"the run has ended the connection: {text_of(body)}")
         if kind == BYE:
             return None
-        if kind == IMU and len(body) % SAMPLE.itemsize == 0:
-            return np.frombuffer(body, SAMPLE)
-        if kind == FRAME:
-            try:
-                return self._frame(body)
-            except (struct.error, ValueError) as error:
-                raise ProtocolError(f"expected a frame, found {error}") from None
-        raise ProtocolError(f"expected IMU, FRAME or BYE, found type {kind}, {len(body)} bytes")
+        if kind not in (INPUT, FRAME):
+            raise ProtocolError(f"expected INPUT, FRAME or BYE, found type {kind}")
+        try:
+            return self._frame(body) if kind == FRAME else self._input(body)
+        except (struct.error, ValueError, IndexError) as error:
+            what = "a frame" if kind == FRAME else "an input"
+            raise ProtocolError(f"expected {what}, found {error}") from None
+
+    def _input(self, body: bytearray) -> LinkInput:
+        number, count, arrived = INPUT_HEAD.unpack_from(body)
+        name, kind = list(self._kinds.items())[number]
+        rows = np.frombuffer(body, RECORDS[kind], offset=INPUT_HEAD.size)
+        if len(rows) != count:
+            raise ValueError(f"{len(rows)} rows in place of {count}")
+        return LinkInput(name, arrived, rows)
 
     def _frame(self, body: bytearray) -> Frame:
         sequence, stamp, count, _ = FRAME_HEAD.unpack_from(body)
@@ -215,7 +275,7 @@ class Link:
             strides = (stride, step, dtype.itemsize)[: 2 + len(pixel)]
             data = np.ndarray((height, width, *pixel), dtype, self._memory, offset, strides)
             images.append(LinkImage(camera, kind, data))
-        return Frame(sequence, stamp, tuple(images), np.empty(0, SAMPLE))
+        return Frame(sequence, stamp, tuple(images), (), self._kinds)
 
     def pose(
         self,
@@ -227,6 +287,7 @@ class Link:
         points: npt.ArrayLike = (),
         inliers: npt.ArrayLike | None = None,
         status: str = "tracked",
+        output: str = "",
     ) -> None:
         """Answer a frame with a pose.
 
@@ -239,6 +300,8 @@ class Link:
             points: Features that were tracked: column and row, pixels, shape (n, 2).
             inliers: Which of them agree with the pose, shape (n,); all if not given.
             status: ``tracked``, ``lost`` or ``initialising``; only ``tracked`` has a pose.
+            output: One of the description's further outputs, before the answer itself; each has a
+                frame of its own. Empty: this is the answer.
         """
         matrix = np.asarray(pose, "<f8").reshape(-1, 4)[:3]
         xy = np.asarray(points, "<f4").reshape(-1, 2)
@@ -246,7 +309,8 @@ class Link:
         spread = b"" if covariance is None else np.asarray(covariance, "<f8").tobytes()
         speed = b"" if velocity is None else np.asarray(velocity, "<f8").tobytes()
         follows = (COVARIANCE if spread else 0) | (VELOCITY if speed else 0)
-        head = frame.sequence, frame.stamp, STATUS[status], follows, len(xy), 0
+        number = self.description["outputs"].index(output) + 1 if output else 0
+        head = frame.sequence, frame.stamp, STATUS[status], follows, len(xy), number
         arrays = matrix.tobytes(), spread, speed, xy.tobytes(), flags.tobytes()
         self._send(POSE, POSE_HEAD.pack(*head), *arrays)
 
@@ -261,6 +325,32 @@ class Link:
     def done(self, frame: Frame) -> None:
         """Answer a frame without a pose, for example a skipped frame."""
         self._send(DONE, DONE_BODY.pack(frame.sequence, frame.stamp))
+
+    def order(
+        self,
+        frame: Frame,
+        order: str,
+        *,
+        position: npt.ArrayLike = (0.0, 0.0, 0.0),
+        velocity: npt.ArrayLike = (0.0, 0.0, 0.0),
+        yaw: float = 0.0,
+        yaw_rate: float = 0.0,
+        axes: str = "map",
+    ) -> None:
+        """Fly the vehicle, before the answer to a frame and from when that counts.
+
+        Args:
+            order: ``takeoff`` (to the height -z of `position` above the ground), ``land``,
+                ``position`` (with a velocity along a path) or ``velocity``.
+            position: Metres in ``map``: north, east, down.
+            velocity: Metres per second along `axes`.
+            yaw: Of a position: radians, clockwise from north seen from above.
+            yaw_rate: Radians per second.
+            axes: Of a velocity: ``map``, or ``heading`` (x ahead, y to the right, z down).
+        """
+        numbers = *np.asarray(position, float), *np.asarray(velocity, float), yaw, yaw_rate
+        head = frame.sequence, frame.stamp, ORDERS[order], AXES[axes]
+        self._send(ORDER, ORDER_BODY.pack(*head, *numbers))
 
     def log(self, text: str) -> None:
         """Write a line into the run's log."""

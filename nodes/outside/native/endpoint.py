@@ -24,7 +24,14 @@ import numpy.typing as npt
 
 from events.geometry import inverse
 from nodes.outside.native import client as wire
-from nodes.outside.native.answers import LinkAnswer, LinkError, read_done, read_pose
+from nodes.outside.native.answers import (
+    LinkAnswer,
+    LinkError,
+    LinkOrder,
+    read_done,
+    read_order,
+    read_pose,
+)
 from runtime.workers.output import plain_lines
 from runtime.workers.shared_memory import anonymous_file
 
@@ -36,9 +43,16 @@ GREETING_TIME = 10.0
 
 GREETING = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
 
-READERS = {wire.POSE: read_pose, wire.DONE: read_done}
+READERS: dict[int, Callable[[bytearray], LinkAnswer | LinkOrder]] = {
+    wire.POSE: read_pose,
+    wire.DONE: read_done,
+    wire.ORDER: read_order,
+}
 
 POSE_OF = {number.to_bytes(4, "little"): name for name, number in wire.POSE_OF.items()}
+
+MOST_BEFORE = 64
+"""Most outputs and orders before the answer to a frame."""
 
 ALIGNMENT = 64
 """Images begin at multiples of this (bytes); a slot has room for the gaps between 16 of them."""
@@ -54,8 +68,9 @@ class _Program:
         self.pose_of = ""  # until READY
         self.sequence = 0
         self.owed: dict[int, tuple[int, int]] = {}  # sequence: stamp, slot
+        self.before: dict[int, list[LinkAnswer | LinkOrder]] = {}  # of a sequence, until its answer
         self.free = list(range(slots))
-        self.origin: npt.NDArray[np.float64] | None = None  # inverse of its first pose
+        self.origins: dict[int, npt.NDArray[np.float64]] = {}  # inverse first pose, by output
         self.gone = False
 
     def send(self, kind: int, *parts: bytes) -> bool:
@@ -102,6 +117,7 @@ class Endpoint:
         logged: Called with each text for the log, unchecked and unlimited, in the thread that
             reads.
         skips: Whether an answer also frees the slots of all earlier frames.
+        orders: Whether the program may send orders.
     """
 
     def __init__(
@@ -115,10 +131,13 @@ class Endpoint:
         gone: Callable[[str], None],
         logged: Callable[[bytearray], None],
         skips: bool = False,
+        orders: bool = False,
     ) -> None:
         self._path = path
         self._description = msgspec.json.encode(description)
-        self._body_from_camera = np.array(description["cameras"][0]["body_from_camera"])
+        self._orders, self._outputs = orders, len(description["outputs"])
+        mounts = [camera["body_from_camera"] for camera in description["cameras"]]
+        self._body_from_camera = np.array(mounts[0]) if mounts else None
         self._slots = slots
         self._slot_bytes = slot_bytes + 16 * ALIGNMENT
         self._slot_bytes += -self._slot_bytes % mmap.PAGESIZE
@@ -159,14 +178,19 @@ class Endpoint:
                 found = f"found {self._program.name}, which did not say READY within {seconds:g} s"
         raise LinkError(f"{self._path}: expected a program, {found}")
 
-    def send_imu(self, samples: npt.NDArray[Any]) -> bool:
-        """Send a row of IMU samples (of type `SAMPLE`), and return whether a program is there.
+    def send_input(self, number: int, arrived: int, rows: npt.NDArray[Any]) -> bool:
+        """Send rows of an input, and return whether a program is there.
 
         Blocks while the program reads nothing and the connection is full.
+
+        Args:
+            number: Index in the description's inputs.
+            arrived: Time of the run's clock at which the last one came (ns).
+            rows: Of the type in `client.RECORDS`.
         """
         program = self._program
-        assert samples.dtype == wire.SAMPLE
-        return program is not None and program.send(wire.IMU, samples.tobytes())
+        head = wire.INPUT_HEAD.pack(number, len(rows), arrived)
+        return program is not None and program.send(wire.INPUT, head, rows.tobytes())
 
     def send_frame(
         self, stamp: int, images: Sequence[tuple[int, str, npt.NDArray[Any]]], wait: bool = True
@@ -309,16 +333,28 @@ class Endpoint:
             elif kind == wire.READY and not program.pose_of:
                 if body[4:] != bytes(4) or bytes(body[:4]) not in POSE_OF:
                     raise LinkError(f"READY.pose_of: expected 0 or 1, found {bytes(body)!r}")
+                pose_of = POSE_OF[bytes(body[:4])]
+                if pose_of == "camera" and self._body_from_camera is None:
+                    raise LinkError("READY.pose_of: expected 1, the body: there is no camera")
                 with self._changed:
-                    program.pose_of = POSE_OF[bytes(body[:4])]
+                    program.pose_of = pose_of
                     self._changed.notify_all()
             elif kind in READERS and program.pose_of:
                 self._take(program, READERS[kind](body))
             else:
-                raise LinkError(f"expected READY once, POSE, DONE, LOG or BYE, found type {kind}")
+                expected = "READY once, POSE, DONE, ORDER, LOG or BYE"
+                raise LinkError(f"expected {expected}, found type {kind}")
 
-    def _take(self, program: _Program, answer: LinkAnswer) -> None:
-        """Pass an answer on, and free the slot of its frame."""
+    def _take(self, program: _Program, answer: LinkAnswer | LinkOrder) -> None:
+        """Pass an answer on, with what came before it, and free the slot of its frame."""
+        further = not isinstance(answer, LinkAnswer) or answer.output > 0
+        if isinstance(answer, LinkAnswer):
+            if (output := answer.output) > self._outputs:
+                raise LinkError(f"POSE.output: expected at most {self._outputs}, found {output}")
+            if answer.pose is not None:
+                answer = self._of_the_camera(program, answer, answer.pose)
+        elif not self._orders:
+            raise LinkError("ORDER: expected none, as the program does not fly (pilot = true)")
         with self._changed:
             n = answer.sequence
             if n >= program.sequence:
@@ -326,24 +362,32 @@ class Endpoint:
             stamp, _ = program.owed.get(n, (answer.stamp, 0))
             if stamp != answer.stamp:
                 raise LinkError(f"stamp: expected {stamp} of frame {n}, found {answer.stamp}")
+            if further:
+                if n not in program.owed:
+                    raise LinkError(f"expected it before the answer to frame {n}, found it after")
+                before = program.before.setdefault(n, [])
+                before.append(answer)
+                if len(before) > MOST_BEFORE:
+                    raise LinkError(f"expected at most {MOST_BEFORE} outputs before an answer")
+                return
+            before = program.before.pop(n, [])
             for other in [m for m in program.owed if m == n or (self._skips and m < n)]:
                 program.free.append(program.owed.pop(other)[1])
+                program.before.pop(other, None)
             self._changed.notify_all()
-        if answer.pose is not None:
-            answer = self._of_the_camera(program, answer, answer.pose)
-        self._answered(answer)
+        assert isinstance(answer, LinkAnswer)
+        self._answered(msgspec.structs.replace(answer, before=tuple(before)) if before else answer)
 
     def _of_the_camera(
         self, program: _Program, answer: LinkAnswer, pose: npt.NDArray[np.float64]
     ) -> LinkAnswer:
         """Return an answer whose pose is the camera's, in the camera at the first pose."""
         lever = np.zeros(3)  # from what the program has the pose of to the camera, in its frame
-        if program.pose_of == "body":
+        if program.pose_of == "body" and self._body_from_camera is not None:
             of_body, pose = pose, pose @ self._body_from_camera
             lever = pose[:3, 3] - of_body[:3, 3]
-        if program.origin is None:
-            program.origin = inverse(pose)
-        turn, covariance, velocity = program.origin[:3, :3], answer.covariance, answer.velocity
+        origin = program.origins.setdefault(answer.output, inverse(pose))
+        turn, covariance, velocity = origin[:3, :3], answer.covariance, answer.velocity
         if covariance is not None:
             moved = np.zeros((6, 6))
             moved[:3, :3] = moved[3:, 3:] = turn
@@ -351,7 +395,7 @@ class Endpoint:
             covariance = moved @ covariance @ moved.T
         return msgspec.structs.replace(
             answer,
-            pose=program.origin @ pose,
+            pose=origin @ pose,
             covariance=covariance,
             velocity=None if velocity is None else turn @ velocity,
         )

@@ -1,4 +1,4 @@
-// The native interface's client for C++17: feeds a program with a run's images and IMU samples.
+// The native interface's client for C++17: feeds a program with a run's images and measurements.
 //
 // One header, which may be copied; docs/reference/link.md of visnav-runtime has the protocol.
 //
@@ -6,7 +6,7 @@
 //     visnav::Camera camera = link.camera(0);
 //     link.ready();
 //     while (auto frame = link.next())         // until the run ends
-//         if (auto pose = track(frame->image("rgb8"), frame->image("depth32f"), frame->imu))
+//         if (auto pose = track(frame->image("rgb8"), frame->image("depth32f"), frame->rows<visnav::Imu>("imu")))
 //             link.pose(*frame, *pose);
 //         else
 //             link.lost(*frame);
@@ -36,19 +36,67 @@
 
 namespace visnav {
 
-constexpr std::uint32_t version = 1;  // of the protocol
+constexpr std::uint32_t version = 2;  // of the protocol
 
 struct Error : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
 
-// A sample of the IMU, in its own axes, as it is in a message.
+// Rows of the inputs, as they are in a message; what is not known is NaN.
+
 struct Imu {
+    static constexpr const char* kind = "imu";
     std::int64_t stamp;                 // ns
-    double angular_velocity[3];         // rad/s
+    double angular_velocity[3];         // rad/s, in its own axes
     double linear_acceleration[3];      // m/s², specific force
 };
-static_assert(sizeof(Imu) == 56 && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__);
+struct FluidPressure {
+    static constexpr const char* kind = "fluid_pressure";
+    std::int64_t stamp;
+    double fluid_pressure, variance;    // Pa, Pa²
+};
+struct MagneticField {
+    static constexpr const char* kind = "magnetic_field";
+    std::int64_t stamp;
+    double magnetic_field[3];           // T, in its own axes
+};
+struct NavSatFix {
+    static constexpr const char* kind = "nav_sat_fix";
+    std::int64_t stamp;
+    double latitude, longitude, altitude;  // degrees, m above the ellipsoid
+    double velocity[3];                    // m/s: north, east, down
+    double position_covariance[9];         // m², of the same axes
+    std::int64_t status;                   // 0 a fix, -1 none yet
+};
+struct Range {
+    static constexpr const char* kind = "range";
+    std::int64_t stamp;
+    double range, min_range, max_range;    // m; infinite if nothing is in reach
+};
+struct LidarPoint {
+    static constexpr const char* kind = "lidar_scan";
+    std::int64_t stamp;                 // of its ray
+    float point[3];                     // m, in the sensor's axes then
+    float intensity;
+    std::uint64_t ring;
+};
+struct PoseEstimate {                   // of the body (FRD); NaN: tracking is lost
+    static constexpr const char* kind = "pose_estimate";
+    std::int64_t stamp;
+    std::uint64_t frame;                // number of the frame that it is in, from 0
+    double pose[12];                    // 3 rows of 4
+    double velocity[3];                 // m/s in that frame
+    double covariance[36];              // of a shift and a rotation in that frame
+};
+static_assert(sizeof(Imu) == 56 && sizeof(NavSatFix) == 136 && sizeof(LidarPoint) == 32 &&
+              sizeof(PoseEstimate) == 424 && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__);
+
+// Measurements of a sensor in a row, a whole scan, or estimates of another node.
+struct Input {
+    std::string name, kind;
+    std::int64_t arrived;               // when the last one came, on the run's clock (ns)
+    std::string bytes;                  // rows
+};
 
 // An image in shared memory: read-only, valid until its frame has been answered.
 struct Image {
@@ -62,12 +110,23 @@ struct Image {
     }
 };
 
-// The images of one exposure.
+// The images of one exposure, or another occasion for an answer, and what came before it.
 struct Frame {
     std::uint64_t sequence = 0;         // 0, 1, 2, …
     std::int64_t stamp = 0;             // ns
     std::vector<Image> images;
-    std::vector<Imu> imu;               // what came since the frame before
+    std::vector<Input> inputs;          // what came since the frame before, in that order
+    std::map<std::string, std::string> kinds;  // of all inputs, by name
+    template <class T> std::vector<T> rows(const std::string& name) const {
+        if (const auto found = kinds.find(name); found == kinds.end() || found->second != T::kind)
+            throw Error("expected an input " + name + " of kind " + T::kind);
+        std::string bytes;
+        for (const Input& each : inputs)
+            if (each.name == name) bytes += each.bytes;
+        std::vector<T> all(bytes.size() / sizeof(T));
+        if (!all.empty()) std::memcpy(all.data(), bytes.data(), bytes.size());
+        return all;
+    }
     const Image& image(const std::string& kind, std::uint32_t camera = 0) const {
         for (const Image& each : images)
             if (each.camera == camera && each.kind == kind) return each;
@@ -154,6 +213,9 @@ class Link {
 public:
     enum class PoseOf : std::uint32_t { camera, body };
     enum class Status : std::uint32_t { tracked, lost, initialising };
+    enum class Order : std::uint32_t { takeoff, land, position, velocity };
+    enum class Axes : std::uint32_t { map, heading };
+    using Vector = std::array<double, 3>;
 
     // Connect to a run; an empty path is $VISNAV_SOCKET.
     explicit Link(const std::string& name, std::string path = "") {
@@ -193,29 +255,30 @@ public:
         send(4, words(of, 0));
     }
 
-    // Wait for the next frame, with the IMU samples since the one before; nothing: the run ended.
+    // Wait for the next frame, with the inputs since the one before; nothing: the run ended.
     std::optional<Frame> next() {
-        std::vector<Imu> samples;
+        std::vector<Input> inputs;
         for (;;) {
             const auto [type, body] = receive();
             if (type == 5 && !body.empty()) throw Error("the run has ended the connection: " + body);
             if (type == 5) return std::nullopt;
-            if (type == 17) return read_frame(body, samples);
-            if (type != 16) throw Error("expected IMU, FRAME or BYE, found another message");
-            for (std::size_t at = 0; at < body.size(); at += sizeof(Imu))
-                samples.push_back(get<Imu>(body, at));
+            if (type == 17) return read_frame(body, std::move(inputs));
+            if (type != 16) throw Error("expected INPUT, FRAME or BYE, found another message");
+            inputs.push_back(read_input(body));
         }
     }
 
-    // Answer a frame. The covariance is 6×6, of a shift along x, y, z and a rotation about them, the
+    // Answer a frame, or give the pose of a further output before that. The covariance is 6×6, of a shift along x, y, z and a rotation about them, the
     // velocity in m/s, both in the frame of the poses; points are columns and rows of tracked
     // features, in turns; a missing inlier flag is 1.
     void pose(const Frame& frame, const Pose& pose, Status status = Status::tracked,
               const std::vector<float>& points = {}, std::vector<std::uint8_t> inliers = {},
-              const double* covariance = nullptr, const double* velocity = nullptr) {
+              const double* covariance = nullptr, const double* velocity = nullptr,
+              const std::string& output = "") {
         const std::size_t count = points.size() / 2;
         inliers.resize(count, 1);
-        std::string body = answer(frame) + words(status, (covariance ? 1 : 0) | (velocity ? 2 : 0), count, 0);
+        const int follows = (covariance ? 1 : 0) | (velocity ? 2 : 0);
+        std::string body = answer(frame) + words(status, follows, count, number_of(output));
         append(body, pose.matrix.data(), sizeof pose.matrix);
         append(body, covariance, covariance ? 36 * sizeof(double) : 0);
         append(body, velocity, velocity ? 3 * sizeof(double) : 0);
@@ -226,6 +289,17 @@ public:
     void lost(const Frame& frame) { pose(frame, {}, Status::lost); }
     void initialising(const Frame& frame) { pose(frame, {}, Status::initialising); }
     void done(const Frame& frame) { send(33, answer(frame)); }  // without a pose: it was skipped
+    // Fly the vehicle, before the answer to a frame: metres in map (take off to the height -z),
+    // m/s along the axes, radians clockwise from north seen from above.
+    void order(const Frame& frame, Order order, const Vector& position = {},
+               const Vector& velocity = {}, double yaw = 0, double yaw_rate = 0,
+               Axes axes = Axes::map) {
+        std::string body = answer(frame) + words(order, axes);
+        const double numbers[] = {position[0], position[1], position[2], velocity[0],
+                                  velocity[1], velocity[2], yaw, yaw_rate};
+        append(body, numbers, sizeof numbers);
+        send(35, body);
+    }
     void log(const std::string& text) { send(34, text); }       // a line of the run's log
 
 private:
@@ -312,16 +386,42 @@ private:
         if (file.fd < 0 || size == 0 || static_cast<off_t>(size) > ::lseek(file.fd, 0, SEEK_END))
             throw Error("expected the run's shared memory with WELCOME");
         description_ = Description(body.substr(24));
+        for (std::string place; description_.count(
+                 (place = "inputs." + std::to_string(inputs_.size()) + '.') + "name");)
+            inputs_.emplace_back(description_.text(place + "name"), description_.text(place + "kind"));
         void* mapped = ::mmap(nullptr, size, PROT_READ, MAP_SHARED, file.fd, 0);
         if (mapped == MAP_FAILED) throw Error(std::string("mmap: ") + std::strerror(errno));
         memory_ = mapped;
         size_ = size;
     }
 
-    Frame read_frame(const std::string& body, const std::vector<Imu>& samples) {
+    std::uint32_t number_of(const std::string& output) const {
+        if (output.empty()) return 0;
+        for (std::uint32_t n = 0;; ++n)
+            if (description_.text("outputs." + std::to_string(n)) == output) return n + 1;
+    }
+
+    Input read_input(const std::string& body) const {
+        static const std::map<std::string, std::size_t> sizes{
+            {Imu::kind, sizeof(Imu)}, {FluidPressure::kind, sizeof(FluidPressure)},
+            {MagneticField::kind, sizeof(MagneticField)}, {NavSatFix::kind, sizeof(NavSatFix)},
+            {Range::kind, sizeof(Range)}, {LidarPoint::kind, sizeof(LidarPoint)},
+            {PoseEstimate::kind, sizeof(PoseEstimate)}};
+        const auto [number, count] = get<std::array<std::uint32_t, 2>>(body, 0);
+        const auto arrived = get<std::int64_t>(body, 8);
+        if (number >= inputs_.size()) throw Error("expected an input of the description");
+        const auto& [name, kind] = inputs_[number];
+        if (const auto size = sizes.find(kind); size == sizes.end() ||
+            body.size() != 16 + std::size_t{count} * size->second)
+            throw Error("expected whole rows of the input " + name);
+        return {name, kind, arrived, body.substr(16)};
+    }
+
+    Frame read_frame(const std::string& body, std::vector<Input> inputs) {
         static const char* const kinds[] = {"mono8", "rgb8", "depth32f", "segmentation32i"};
         static const std::size_t pixels[] = {1, 3, 4, 4};
-        Frame frame{get<std::uint64_t>(body, 0), get<std::int64_t>(body, 8), {}, samples};
+        Frame frame{get<std::uint64_t>(body, 0), get<std::int64_t>(body, 8), {}, std::move(inputs),
+                    {inputs_.begin(), inputs_.end()}};
         const std::size_t count = get<std::uint32_t>(body, 16);
         if (frame.sequence != expected_++) throw Error("expected the next frame, found another");
         if (body.size() != 24 + count * 32) throw Error("expected a frame of another length");
@@ -343,6 +443,7 @@ private:
     File socket_;
     std::mutex sending_;
     Description description_;
+    std::vector<std::pair<std::string, std::string>> inputs_;  // name and kind
     void* memory_ = nullptr;
     std::size_t size_ = 0;
     std::uint64_t expected_ = 0;

@@ -1,10 +1,11 @@
 """Guard between the run and a program, to end the program with all its processes.
 
-    python -I -S guard.py SOCKET GRACE WORD…
+    python -I -S guard.py SOCKET GRACE PROCESSORS WORD…
 
 The exit code of the program goes to the socket, a line. When the run closes its end, or is gone
 however it went, the program gets SIGTERM; what is left after GRACE seconds is killed, wherever it
-went, for orphans become children of this process. It imports nothing of ours.
+went, for orphans become children of this process. PROCESSORS are the numbers of those that may be
+used, as in ``0,2``; all if empty. It imports nothing of ours.
 """
 
 import contextlib
@@ -70,6 +71,8 @@ def end_orphans(number: int, but: int = 0) -> None:
 
 
 if __name__ == "__main__":
-    number, seconds, *words = sys.argv[1:]
+    number, seconds, processors, *words = sys.argv[1:]
+    if processors:
+        os.sched_setaffinity(0, map(int, processors.split(",")))
     os.set_inheritable(int(number), False)
     main(socket.socket(fileno=int(number)), float(seconds), words)

@@ -18,7 +18,8 @@ from typing import Annotated, Any, Literal
 import jinja2
 import msgspec
 
-from nodes.data.dataset.recording import templates
+from nodes.calibration.formats import write_files
+from nodes.data.dataset.recording import Rig, templates
 from nodes.estimators import EstimatorConfig
 from nodes.outside import native
 from nodes.outside.process.program import Program
@@ -59,10 +60,25 @@ class ProcessConfig(EstimatorConfig):
             visnav_link.hpp and client.py) and ``VISNAV_PYTHON`` (the run's own interpreter).
         feed: ``link``: the program connects to ``$VISNAV_SOCKET``, see docs/reference/link.md.
             ``ros2``: a `Ros2Bridge` of the run feeds it, and holds for its answers.
-        images: Kinds of image to send, of each camera.
+        images: Kinds of image to send, of each camera; none for a program that `asks` otherwise.
         cameras: Cameras whose images of one exposure are sent together, as of a stereo rig:
             sources, or last parts of them. Poses are of the first. If empty, the first camera
             that gives the `images`.
+        inputs: What is sent besides: ``imu``, ``barometer``, ``magnetometer``, ``gnss``, ``range``,
+            ``lidar`` (the first of the vehicle), the last part of a sensor's source, or an
+            estimator, whose estimates are sent when they come, at its latency. The IMU of the
+            camera's body comes unasked.
+        asks: Input each of whose measurements asks for an answer, at their stamp; if empty, the
+            images do.
+        every: Every how many of these.
+        outputs: Names of further poses that it answers with, each judged by itself as
+            ``<node>/<name>``.
+        pilot: Whether it flies the vehicle by orders.
+        vehicle: Whose sensors are meant, and who gets the orders; if empty, the camera's or first.
+        calibration: Format of the calibration's files (see ``export``), which are written into
+            ``$VISNAV_FOLDER``; if empty, none.
+        cpus: Processors that it may use, 0 for all; with 1, threads that share sums add up in the
+            same order more often than not.
         method: Name of the method in the report; if empty, that of the program.
         scale_free: Whether the unit of its poses is arbitrary, as with a single camera.
         hold: How long simulated time waits for an answer, and what follows if none comes. With
@@ -77,11 +93,16 @@ class ProcessConfig(EstimatorConfig):
     folder: InputPath = ""
     environment: dict[str, str] = msgspec.field(default_factory=dict)
     feed: Literal["link", "ros2"] = "link"
-    images: Annotated[tuple[Literal["rgb", "grey", "depth"], ...], msgspec.Meta(min_length=1)] = (
-        "rgb",
-        "depth",
-    )
+    images: tuple[Literal["rgb", "grey", "depth"], ...] = ("rgb", "depth")
     cameras: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    asks: str = ""
+    every: Annotated[int, msgspec.Meta(ge=1)] = 1
+    outputs: tuple[str, ...] = ()
+    pilot: bool = False
+    vehicle: str = ""
+    calibration: Literal["", "kalibr", "openvins", "vins", "basalt", "orbslam3"] = ""
+    cpus: Annotated[int, msgspec.Meta(ge=0)] = 0
     method: str = ""
     scale_free: bool = False
     hold: HoldConfig = HoldConfig()
@@ -92,7 +113,10 @@ class ProcessConfig(EstimatorConfig):
     def __post_init__(self) -> None:
         if self.feed == "ros2" and not self.command:
             raise ValueError("command: expected one for a program that ROS 2 feeds, found none")
-        for name in ("images", "cameras"):
+        if self.feed == "link" and bool(self.images) == bool(self.asks):
+            found = f"asks = {self.asks!r} and images = {list(self.images)}"
+            raise ValueError(f"asks: expected images or the input that asks, found {found}")
+        for name in ("images", "cameras", "inputs", "outputs"):
             if len({*getattr(self, name)}) < len(getattr(self, name)):
                 raise ValueError(f"{name}: expected each once, found {getattr(self, name)}")
 
@@ -120,6 +144,7 @@ class Launch:
     def __init__(self, config: ProcessConfig, bridge: Any, folder: Path | None) -> None:
         self.working = Path(config.folder).absolute()
         self._config = config
+        self._processors: Sequence[int] = ()
         self._temporary: Path | None = None
         self._folder = folder and folder.absolute()
         self.folder = self._folder or Path("folder")
@@ -144,6 +169,19 @@ class Launch:
             return ""
         return f"{what}: expected a program that can be executed, found none at {place}"
 
+    def take_processors(self, taken: list[int]) -> str:
+        """Choose the processors, the least used first; return an error if there are too few.
+
+        Args:
+            taken: Those chosen by others; this program's are added.
+        """
+        there, wanted = sorted(os.sched_getaffinity(0), reverse=True), self._config.cpus
+        if wanted > len(there):
+            return f"cpus: expected at most the {len(there)} there are, found {wanted}"
+        self._processors = sorted(there, key=taken.count)[:wanted]
+        taken += self._processors
+        return ""
+
     def make_folder(self, *, anew: bool) -> None:
         """Create the program's folder; `anew` removes old content, lest the program read any."""
         if self._folder is None or len(os.fsencode(self.socket)) > _LONGEST:
@@ -166,6 +204,7 @@ class Launch:
             self.working,
             self.environment(),
             grace=self._config.grace,
+            processors=self._processors,
             printed=printed,
             ended=ended,
         )
@@ -189,16 +228,26 @@ class Launch:
         known = self.environment()
         return re.sub(r"\$(?:(\w+)|{(\w+)})", lambda m: known.get(m[1] or m[2], m[0]), word)
 
-    def texts(self, known: Mapping[str, Any]) -> dict[Path, str]:
+    def texts(self, known: Mapping[str, Any], rig: Rig | None) -> dict[Path, str]:
         """Return the texts of the program's files, by path.
 
         Args:
             known: Variables of the templates, by name.
+            rig: Sensors of the calibration; `None` if there are no cameras.
 
         Raises:
-            ProgramError: A template is missing or wrong.
+            ProgramError: A template is missing or wrong, or the calibration's format has no word
+                for the sensors.
         """
-        found = {}
+        found: dict[Path, str] = {}
+        if form := self._config.calibration:
+            if rig is None:
+                raise ProgramError("calibration: expected a camera, found none")
+            try:
+                files = write_files(rig, form, topics=self._config.feed == "ros2")
+            except ValueError as error:
+                raise ProgramError(f"calibration: {error}") from None
+            found = {self.folder / name: text for name, text in files.items()}
         for file in self._config.files:
             template = Path(file.template)
             try:

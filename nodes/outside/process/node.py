@@ -6,25 +6,49 @@ import asyncio
 import contextlib
 import math
 import types
-from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Announcement, CameraAnnouncement, DepthImage, Image, Imu, ImuAnnouncement
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    Command,
+    DepthImage,
+    Event,
+    FluidPressure,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Land,
+    LidarScan,
+    MagneticField,
+    NavSatFix,
+    PilotAnnouncement,
+    PoseEstimate,
+    PositionSetpoint,
+    Range,
+    SensorAnnouncement,
+    Setpoint,
+    Takeoff,
+    TrackingLost,
+    VehicleAnnouncement,
+    VelocitySetpoint,
+)
 from nodes.calibration.formats import variables
 from nodes.data.dataset.recording import Rig
-from nodes.estimators import Estimator, TrackingResult
-from nodes.outside.native import LinkAnswer, LinkError, describe
-from nodes.outside.native.client import SAMPLE
+from nodes.estimators import Estimator, Mount, TrackingResult
+from nodes.outside.native import LinkAnswer, LinkError, LinkOrder, describe
+from nodes.outside.process.inputs import Inputs
 from nodes.outside.process.launch import Launch, ProcessConfig, ProgramError
-from nodes.outside.process.program import KINDS, Feed, Program
+from nodes.outside.process.program import KINDS, Exposure, Feed, Program
 from nodes.ros2.messages.mappings import TopicKind, publication
 from nodes.ros2.messages.topics import PublishingConfig
-from runtime import Node, on
+from runtime import Node, Output, on
 from runtime.channels.bundles import Field, Matcher, Slot
 from runtime.channels.hold import Hold, Owed
 from runtime.channels.streams import Stream
@@ -32,6 +56,9 @@ from runtime.workers.output import Throttle
 
 _BEYOND = 64
 """Waiting frames beyond the slots, in lockstep with `on_missing = "continue"`."""
+
+_SLOTS = 256
+"""Unanswered frames without images, at most."""
 
 _STORY = 0.5
 """Real seconds to wait for a program's exit code after its connection has closed."""
@@ -63,6 +90,9 @@ class Process(Estimator[ProcessConfig]):
 
     starts_programs = True
 
+    setpoints = Output(Setpoint)
+    commands = Output(Command)
+
     def __init__(self) -> None:
         config = self.config
         self.needs = frozenset(config.images)
@@ -70,7 +100,9 @@ class Process(Estimator[ProcessConfig]):
         self.method = config.method or (Path(config.command[0]).name if config.command else "")
         self._named: dict[str, CameraAnnouncement] = {}
         self._imus: list[ImuAnnouncement] = []
-        self._samples: deque[Imu] = deque(maxlen=100_000)
+        self._inputs = Inputs((*dict.fromkeys((*config.inputs, *filter(None, [config.asks]))),))
+        self._asked = self._last = -1
+        self._further: dict[int, Mount] = {}
         self._slots: dict[tuple[str, type], Slot] = {}
         self._feed: Feed | None = None
         self._program: Program | None = None
@@ -112,13 +144,29 @@ class Process(Estimator[ProcessConfig]):
             raise ProgramError(f"build: {' '.join(command)} {build.story()}")
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the estimates, if they come from here."""
-        return super().announce() if self.config.feed == "link" else ()
+        """Announce the estimates, if they come from here, and the orders."""
+        config = self.config
+        if config.feed == "ros2":
+            return
+        reads = (*sorted(self.needs), *config.inputs)
+        for each in super().announce():
+            own = msgspec.structs.replace(each, reads=reads, vehicle=config.vehicle)
+            yield own
+            for name in config.outputs:
+                yield msgspec.structs.replace(own, source=f"{self.name}/{name}")
+        if config.pilot:
+            yield PilotAnnouncement(stamp=0, source=self.name, vehicle=config.vehicle)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Choose the cameras, and note the IMUs."""
+        """Choose the cameras, and note the other sensors."""
+        if announcement.source.partition("/")[0] != self.name:
+            self._inputs.announced(announcement)
         if isinstance(announcement, ImuAnnouncement):
             self._imus.append(announcement)
+        if not self.config.images:
+            if isinstance(announcement, VehicleAnnouncement):
+                self._vehicles += (announcement,)
+            return
         names = self.config.cameras
         if names and isinstance(announcement, CameraAnnouncement):
             path = f"/{announcement.source}"
@@ -138,7 +186,9 @@ class Process(Estimator[ProcessConfig]):
         if config.feed == "ros2" and self._bridge is None:
             yield 'feed: expected a Ros2Bridge in the file for "ros2", found none'
         if config.feed == "link":
-            yield from super().check()
+            if config.images:
+                yield from super().check()
+            yield from self._choose_inputs()
             for name in config.cameras:
                 given = {*self._named[name].images} if name in self._named else set()
                 if lacking := self.needs - given - ({"grey"} if "rgb" in given else set()):
@@ -153,8 +203,9 @@ class Process(Estimator[ProcessConfig]):
         what = "build" if self.checking and config.build else "command"  # built later
         if words := getattr(config, what):
             yield from filter(None, [self._launch.missing(what, words)])
+        yield from filter(None, [self._launch.take_processors(self.share("cpus", list[int]))])
         try:
-            self._launch.texts(self._known())
+            self._launch.texts(self._known(), self._rig())
         except ProgramError as error:
             yield str(error)
 
@@ -163,7 +214,7 @@ class Process(Estimator[ProcessConfig]):
         config, launch = self.config, self._launch
         self._loop = asyncio.get_running_loop()
         self._end: asyncio.Future[str] = self._loop.create_future()
-        for path, text in launch.texts(self._known()).items():
+        for path, text in launch.texts(self._known(), self._rig()).items():
             path.parent.mkdir(parents=True, exist_ok=True)
             await self.offload(path.write_text, text, "utf-8")
         if config.feed == "link":
@@ -189,26 +240,29 @@ class Process(Estimator[ProcessConfig]):
     def _make_feed(self) -> Feed:
         """Create the feed of the program, and the hold for its answers."""
         config, rig = self.config, self._rig()
-        assert rig is not None
-        if rig.imu is not None:
-            self.narrow("imu", rig.imu.source)
+        imus = [announced.source for _, kind, announced in self._inputs.chosen if kind == "imu"]
+        if len(imus) == 1:
+            self.narrow("imu", imus[0])
+        cameras = rig.cameras if rig else ()
         kinds = [KINDS[kind][0] for kind in config.images]
-        self._wanted = [(number, kind) for number, _ in enumerate(rig.cameras) for kind in kinds]
-        sources = [_source(camera, kind) for camera in rig.cameras for kind in config.images]
-        fields = {f"image{n}": Field(event, "one") for n, (_, event) in enumerate(sources)}
-        self._matcher = Matcher(Stream(f"{self.name}.frames", 1, "error"), _TOGETHER, fields, 0)
-        self._matcher.deliver = self._send
-        self._slots = dict(zip(sources, self._matcher.slots.values(), strict=True))
+        self._wanted = [(number, kind) for number, _ in enumerate(cameras) for kind in kinds]
+        if cameras:
+            sources = [_source(camera, kind) for camera in cameras for kind in config.images]
+            fields = {f"image{n}": Field(event, "one") for n, (_, event) in enumerate(sources)}
+            self._matcher = Matcher(Stream(f"{self.name}.frames", 1, "error"), _TOGETHER, fields, 0)
+            self._matcher.deliver = self._send
+            self._slots = dict(zip(sources, self._matcher.slots.values(), strict=True))
         self._hold: Hold[LinkAnswer] = self.hold(self.name, config.hold, config.latency)
         real = self.clock.kind == "real"
-        slots = math.ceil(config.latency * rig.cameras[0].rate) + 2
+        slots = math.ceil(config.latency * cameras[0].rate) + 2 if cameras else _SLOTS
         self._room = slots if real else math.inf
         if config.hold.on_missing == "continue" and not real:
             self._room = slots + _BEYOND
-        pixels = sum(camera.info.height * camera.info.width for camera in rig.cameras)
+        pixels = sum(camera.info.height * camera.info.width for camera in cameras)
+        described = [(c, kinds) for c in cameras], self._inputs.chosen, {"kind": self.clock.kind}
         return Feed(
             self._launch.socket,
-            describe([(c, kinds) for c in rig.cameras], rig.imu, {"kind": self.clock.kind}),
+            describe(*described, config.outputs),
             self._hold,
             self._story,
             self._processes,
@@ -216,6 +270,7 @@ class Process(Estimator[ProcessConfig]):
             slots=slots,
             slot_bytes=pixels * sum(KINDS[kind][1] for kind in config.images),
             logged=self._show.take,
+            orders=config.pilot,
         )
 
     # In the run.
@@ -228,8 +283,18 @@ class Process(Estimator[ProcessConfig]):
     @on(Imu)
     def imu(self, event: Imu) -> None:
         """Keep the samples of the IMU until the next frame."""
-        if "imu" in self.sources:
-            self._samples.append(event)
+        self.measurements(event)
+
+    @on(FluidPressure, MagneticField, NavSatFix, Range, LidarScan, PoseEstimate, TrackingLost)
+    def measurements(self, event: Event) -> None:
+        """Keep an input until the next frame; ask for an answer, if it is the one that asks."""
+        name = self._inputs.take(event, self.clock.now())
+        if not name or name != self.config.asks or self._feed is None:
+            return
+        self._asked += 1
+        if self._asked % self.config.every == 0 and self.exposed_at(event) > self._last:
+            self._last = self.exposed_at(event)
+            self._ask(event, self._last, ())
 
     @on(Image, DepthImage)
     def frames(self, event: Image | DepthImage) -> None:
@@ -239,28 +304,66 @@ class Process(Estimator[ProcessConfig]):
             slot.take(event)
 
     def _send(self, images: tuple[Image | DepthImage, ...]) -> None:
-        """Send an exposure, with the samples since the last, and await the answer."""
+        """Send an exposure."""
+        exposure = [(*wanted, image) for wanted, image in zip(self._wanted, images, strict=True)]
+        self._ask(images[0], images[0].stamp, exposure)
+
+    def _ask(self, event: Event, stamp: int, exposure: Exposure) -> None:
+        """Send a frame, with what came since the last, and await the answer."""
         assert self._feed is not None
-        owed = self._hold.owe(images[0].stamp)
+        owed = self._hold.owe(stamp)
         if not self._hold.expects or len(self._feed.unanswered) >= self._room:
             self._unsent += 1
             return
-        rows = [(s.stamp, s.angular_velocity, s.linear_acceleration) for s in self._samples]
-        self._samples.clear()
-        exposure = [(*wanted, image) for wanted, image in zip(self._wanted, images, strict=True)]
-        self._feed.send(exposure, np.array(rows, SAMPLE))
-        self.start(self._deliver(images[0], owed))
+        self._feed.send(stamp, exposure, self._inputs.drain())
+        self.start(self._deliver(event, owed))
 
-    async def _deliver(self, image: Image | DepthImage, owed: Owed[LinkAnswer]) -> None:
+    async def _deliver(self, event: Event, owed: Owed[LinkAnswer]) -> None:
         """Publish the program's answer to a frame."""
         answer = await owed
         if answer is None:
+            return
+        for each in answer.before:
+            if isinstance(each, LinkOrder):
+                self._order(each)
+            elif each.pose is not None:
+                self._publish_further(event, each, each.pose)
+        if answer.status == "done":
             return
         lost = answer.pose is None
         self._pose = self._pose if answer.pose is None else answer.pose
         reason = "the program says so" if lost else ""
         found = answer.points, answer.inliers, answer.velocity, answer.covariance
-        self.publish(image, TrackingResult(self._pose, lost, reason, *found))
+        self.publish(event, TrackingResult(self._pose, lost, reason, *found))
+
+    def _publish_further(
+        self, event: Event, answer: LinkAnswer, pose: npt.NDArray[np.float64]
+    ) -> None:
+        """Publish the pose of another output, in a frame that begins with its first."""
+        stamp, number = self.exposed_at(event), answer.output
+        mount = self._further.setdefault(number, self._mounting(stamp))
+        result = TrackingResult(pose, velocity=answer.velocity, covariance=answer.covariance)
+        source = f"{self.name}/{self.config.outputs[number - 1]}"
+        self.estimates.send(mount.estimate(stamp, source, result))
+
+    def _order(self, order: LinkOrder) -> None:
+        """Pass an order on to the vehicle."""
+        who: Any = {
+            "stamp": self.clock.now(),
+            "source": self.name,
+            "vehicle": self.config.vehicle,
+        }
+        velocity, yaw_rate = order.velocity, order.yaw_rate
+        if order.order == "takeoff":
+            self.commands.send(Takeoff(**who, altitude=-order.position[2]))
+        elif order.order == "land":
+            self.commands.send(Land(**who))
+        elif order.order == "position":
+            place: Any = {"position": order.position, "velocity": velocity, "yaw": order.yaw}
+            self.setpoints.send(PositionSetpoint(**who, **place, yaw_rate=yaw_rate))
+        else:
+            way: Any = {"frame_id": order.axes, "velocity": velocity, "yaw_rate": yaw_rate}
+            self.setpoints.send(VelocitySetpoint(**who, **way))
 
     # After the run.
 
@@ -272,6 +375,8 @@ class Process(Estimator[ProcessConfig]):
             )
         if missed := sum(self._matcher.missed.values()) if self._slots else 0:
             self.log.warning("%d exposures lacked an image", missed)
+        if dropped := self._inputs.dropped:
+            self.log.warning("%d measurements were dropped: no frame took them along", dropped)
         await self.offload(self._close)
 
     def _close(self) -> None:
@@ -318,6 +423,23 @@ class Process(Estimator[ProcessConfig]):
         return f"{why}; {self.config.command[0]} {self._program.story()}"
 
     # What was announced.
+
+    def _choose_inputs(self) -> Iterable[str]:
+        """Choose the sensors, and yield an error for each that is missing."""
+        rig = self._rig()
+        body, imu = (rig.body, rig.imu) if rig else (self.config.vehicle, None)
+        yield from self._inputs.choose(body, imu)
+
+    def _sensor(self) -> CameraAnnouncement | SensorAnnouncement:
+        """Return the sensor of the pose: the camera, or the body itself."""
+        if self.config.images:
+            return super()._sensor()
+        of = next(each for name, _, each in self._inputs.chosen if name == self.config.asks)
+        body = of.source.rpartition("/")[0] or self.config.vehicle
+        body = body or next((each.source for each in self._vehicles), self.name)
+        frame = getattr(of, "parent_frame_id", "base_link")
+        rate = getattr(of, "rate", 0.0)
+        return SensorAnnouncement(stamp=0, source=f"{body}/", rate=rate, parent_frame_id=frame)
 
     def _rig(self) -> Rig | None:
         """Return the cameras whose images are sent, and the IMU of their body, if any."""

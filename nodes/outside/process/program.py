@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from events import DepthImage, Image
 from nodes.outside.native import Endpoint, LinkAnswer, LinkError
+from nodes.outside.process.inputs import Message
 from runtime.channels.hold import Hold
 from runtime.workers.output import Output, how_it_ended
 
@@ -47,6 +48,7 @@ class Program:
     Args:
         command: A program and its arguments; no shell has a part in it.
         grace: Seconds that it may take to end once it gets SIGTERM.
+        processors: Numbers of those that it may use; all if none.
         printed: Called in a thread with each line that it prints, at once: it writes to a terminal
             of its own, so that no library keeps its output back.
         ended: Called in a thread, at once, when it has ended by itself, with how and what it last
@@ -66,6 +68,7 @@ class Program:
         environment: Mapping[str, str],
         *,
         grace: float,
+        processors: Sequence[int] = (),
         printed: Callable[[str], None],
         ended: Callable[[str], None] = lambda _: None,
     ) -> None:
@@ -78,10 +81,11 @@ class Program:
         self._how = ""
         self._control, theirs = socket.socketpair()
         guard = [sys.executable, "-I", "-S", str(Path(__file__).with_name("guard.py"))]
+        numbers = ",".join(map(str, processors))
         self._terminal, prints = _terminal()
         with theirs, os.fdopen(prints, "wb", buffering=0) as stdout:
             self._guard = subprocess.Popen(  # noqa: S603  # what the user's file says
-                [*guard, str(theirs.fileno()), str(grace), *command],
+                [*guard, str(theirs.fileno()), str(grace), numbers, *command],
                 cwd=folder,
                 env=environment,
                 stdin=subprocess.DEVNULL,
@@ -187,14 +191,14 @@ Exposure = Sequence[tuple[int, str, Image | DepthImage]]
 
 
 class Feed:
-    """Sends exposures and samples of the IMU to a program, and takes its answers.
+    """Sends exposures and measurements to a program, and takes its answers.
 
     Args:
         description: What the program is told; see `nodes.outside.native.describe`.
         story: Called in a thread with why it is gone; returns what else is known.
         processes: Returns the numbers of the program's processes, whose costs are measured.
         skips: Whether an answer says that none will come for the frames before it.
-        options: Of the `Endpoint`: `slots`, `slot_bytes`, `logged`.
+        options: Of the `Endpoint`: `slots`, `slot_bytes`, `logged`, `orders`.
     """
 
     def __init__(
@@ -213,7 +217,8 @@ class Feed:
         self.why_gone = ""
         self._hold, self._story, self._skips, self._processes = hold, story, skips, processes
         self._initialised = self._closed = False
-        self._outbox: queue.SimpleQueue[tuple[Exposure, npt.NDArray[Any]] | None] = (
+        self._names = [each["name"] for each in description["inputs"]]
+        self._outbox: queue.SimpleQueue[tuple[int, Exposure, Sequence[Message]] | None] = (
             queue.SimpleQueue()
         )
         self._endpoint = Endpoint(
@@ -224,10 +229,10 @@ class Feed:
         self._sender = threading.Thread(target=self._send_all, name=f"feed {path}", daemon=True)
         self._sender.start()
 
-    def send(self, exposure: Exposure, samples: npt.NDArray[Any]) -> None:
-        """Have samples of the IMU sent, and then a frame; returns at once."""
-        self.unanswered[exposure[0][2].stamp] = time.monotonic_ns()
-        self._outbox.put((exposure, samples))
+    def send(self, stamp: int, exposure: Exposure, inputs: Sequence[Message]) -> None:
+        """Have inputs sent, and then a frame of a stamp (ns); returns at once."""
+        self.unanswered[stamp] = time.monotonic_ns()
+        self._outbox.put((stamp, exposure, inputs))
 
     def close(self) -> None:
         """Say goodbye to the program; takes two seconds at most."""
@@ -238,12 +243,12 @@ class Feed:
 
     def _send_all(self) -> None:
         while (due := self._outbox.get()) is not None and not self._closed:
-            exposure, samples = due
-            stamp = exposure[0][2].stamp
+            stamp, exposure, inputs = due
             images = [(camera, kind, _pixels(kind, event)) for camera, kind, event in exposure]
             try:
-                if len(samples) and self._endpoint.send_imu(samples):
-                    self._hold.sent("imu", samples.tobytes())
+                for each in inputs:
+                    if self._endpoint.send_input(*each):
+                        self._hold.sent(self._names[each.number], each.rows.tobytes())
                 if self._endpoint.send_frame(stamp, images):
                     self._hold.sent("frames", stamp.to_bytes(8, "little", signed=True))
                     for camera, kind, image in images:
@@ -259,7 +264,8 @@ class Feed:
         for stamp in (*(earlier if self._skips else ()), answer.stamp):
             self.unanswered.pop(stamp, None)
         self._initialised = self._initialised or answer.pose is not None
-        useful = answer.pose is not None or (answer.status == "lost" and self._initialised)
+        useful = answer.pose is not None or bool(answer.before)
+        useful = useful or (answer.status == "lost" and self._initialised)
         says = answer.status if answer.status in ("initialising", "lost") else ""
         self._hold.answer(answer.stamp, answer if useful else None, says)
 

@@ -21,7 +21,7 @@ int main() try {
             colours = std::accumulate(rgb.row<std::uint8_t>(v), rgb.row<std::uint8_t>(v) + 3 * rgb.width, colours);
             depths = std::accumulate(depth.row<float>(v), depth.row<float>(v) + depth.width, depths);
         }
-        for (const visnav::Imu& sample : frame->imu)
+        for (const visnav::Imu& sample : frame->rows<visnav::Imu>("imu"))
             imu += double(sample.stamp) + sample.angular_velocity[2] + sample.linear_acceleration[0];
         std::vector<double> covariance(36);
         const double velocity[3] = {double(frame->sequence), 2, 3};

@@ -20,7 +20,7 @@ def main() -> None:
         )
         link.ready()
         for frame in link:
-            imu = frame.imu
+            imu = frame.rows("imu")
             pose = np.eye(4)
             pose[:3, 3] = (
                 frame.image("rgb8").sum(),

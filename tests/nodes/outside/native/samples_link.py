@@ -43,7 +43,10 @@ IMU = ImuAnnouncement(
     accelerometer_noise_density=1e-2,
     accelerometer_random_walk=1e-4,
 )
-DESCRIPTION = describe([(CAMERA, ["rgb8", "depth32f"])], IMU, {"kind": "lockstep"})
+INPUTS = [("imu", "imu", IMU)]
+DESCRIPTION = describe(
+    [(CAMERA, ["rgb8", "depth32f"])], INPUTS, {"kind": "lockstep"}, outputs=["fused"]
+)
 
 
 class Noted:
@@ -102,7 +105,7 @@ class Raw:
         return kind, self.socket.recv(length, socket.MSG_WAITALL) if length else b""
 
     def greet(self, name: bytes = b"raw") -> tuple[int, bytes]:
-        self.send(1, b"VISNAVLK" + struct.pack("<II", 1, 0) + name)
+        self.send(1, b"VISNAVLK" + struct.pack("<II", 2, 0) + name)
         return self.receive()
 
     def get_ready(self, pose_of: int = 0) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.outside.native.client import SAMPLE
+from nodes.outside.native.client import RECORDS
 from tests.nodes.outside.native.samples_link import (
     CAMERA,
     HEADER_PATH,
@@ -63,12 +63,12 @@ def test_frames_and_answers(mirror: list[str], tmp_path: Path) -> None:
         assert run.logs.get(timeout=LIMIT) == f"drone/camera 8 plumb_bob 5 {focal} lockstep"
         origin = None
         for n in range(10):
-            samples = np.zeros(n, SAMPLE)
+            samples = np.zeros(n, RECORDS["imu"])
             samples["stamp"] = np.arange(n)
             samples["angular_velocity"][:, 2] = 0.5
             samples["linear_acceleration"][:, 0] = 0.25
-            run.endpoint.send_imu(samples[: n // 2])
-            run.endpoint.send_imu(samples[n // 2 :])
+            run.endpoint.send_input(0, 7, samples[: n // 2])
+            run.endpoint.send_input(0, 8, samples[n // 2 :])
             sent = images(n)
             assert run.endpoint.send_frame(100 + n, sent)
             answer = run.answer()
@@ -131,7 +131,9 @@ def test_the_run_has_another_version(mirror: list[str], tmp_path: Path, kind: in
 
 
 NOT_OF_A_RUN = {
-    "samples cut off": struct.pack("<II", 3, 16) + b"abc",
+    "samples cut off": struct.pack("<II", 19, 16) + struct.pack("<IIq", 0, 1, 0) + b"abc",
+    "rows of no input": struct.pack("<II", 16, 16) + struct.pack("<IIq", 9, 0, 0),
+    "fewer rows than said": struct.pack("<II", 16, 16) + struct.pack("<IIq", 0, 2, 0),
     "too long": struct.pack("<II", 2**31, 16),
     "sequence": struct.pack("<II", 24, 17) + struct.pack("<QqII", 3, 0, 0, 0),
     "many images": struct.pack("<II", 24, 17) + struct.pack("<QqII", 0, 0, 2**32 - 1, 0),

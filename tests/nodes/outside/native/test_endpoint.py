@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from events.geometry import inverse, pose_matrix
 from nodes.outside.native import LinkError
-from nodes.outside.native.client import SAMPLE, Link
+from nodes.outside.native.client import RECORDS, Frame, Link
 from tests.nodes.outside.native.samples_link import (
     CAMERA,
     LIMIT,
@@ -44,7 +44,7 @@ def test_nobody_comes(run: Noted) -> None:
     with pytest.raises(LinkError, match=r"expected a program, found none within 0.01 s"):
         run.endpoint.wait(0.01)
     assert not run.endpoint.send_frame(0, images())
-    assert not run.endpoint.send_imu(np.zeros(1, SAMPLE))
+    assert not run.endpoint.send_input(0, 0, np.zeros(1, RECORDS["imu"]))
 
 
 def test_a_program_that_is_not_ready_is_named(run: Noted) -> None:
@@ -66,8 +66,8 @@ def test_a_program_that_goes_before_it_is_ready_is_named_at_once(run: Noted) -> 
 @pytest.mark.parametrize(
     ("hello", "reason"),
     [
-        (b"VISNAVLK" + struct.pack("<II", 2, 0) + b"new", "expected version 1 of the protocol"),
-        (b"VISNAVLX" + struct.pack("<II", 1, 0) + b"x", "expected HELLO with b'VISNAVLK'"),
+        (b"VISNAVLK" + struct.pack("<II", 1, 0) + b"old", "expected version 2 of the protocol"),
+        (b"VISNAVLX" + struct.pack("<II", 2, 0) + b"x", "expected HELLO with b'VISNAVLK'"),
         (b"", "expected HELLO"),
     ],
 )
@@ -77,11 +77,11 @@ def test_a_program_of_another_version_or_none_is_refused(
     with program(run.path) as raw:
         raw.send(1, hello)
         kind, body = raw.receive()
-        assert (kind, body[:12]) == (3, b"VISNAVLK" + struct.pack("<I", 1))
+        assert (kind, body[:12]) == (3, b"VISNAVLK" + struct.pack("<I", 2))
         assert reason in body[16:].decode()
         assert raw.socket.recv(1) in (b"\x08", b"")  # BYE's header, or the end
     if hello[:8] == b"VISNAVLK":
-        with pytest.raises(LinkError, match=r"found new: expected version 1 .* found 2"):
+        with pytest.raises(LinkError, match=r"found old: expected version 2 .* found 1"):
             run.endpoint.wait(LIMIT)
     with program(run.path) as raw:  # another may come
         raw.get_ready()
@@ -197,8 +197,8 @@ def test_close_does_not_wait_for_a_program_that_reads_nothing(run: Noted) -> Non
     with program(run.path) as raw:
         raw.get_ready()
         run.endpoint.wait(LIMIT)
-        samples = np.zeros(100_000, SAMPLE)
-        thread = threading.Thread(target=lambda: run.endpoint.send_imu(samples))
+        samples = np.zeros(100_000, RECORDS["imu"])
+        thread = threading.Thread(target=lambda: run.endpoint.send_input(0, 0, samples))
         thread.start()
         begin = time.monotonic()
         run.endpoint.close()
@@ -284,7 +284,7 @@ def test_poses_whose_first_is_the_identity_arrive_to_the_last_bit(run: Noted) ->
         for n, matrix in enumerate([np.eye(4), turned]):
             run.endpoint.send_frame(n, images())
             frame = link.receive()
-            assert isinstance(frame, tuple)
+            assert isinstance(frame, Frame)
             link.pose(frame, matrix)
             got = run.answer().pose
             assert got is not None
@@ -314,7 +314,7 @@ def test_strided_images_arrive(run: Noted) -> None:
         run.endpoint.wait(LIMIT)
         run.endpoint.send_frame(0, [(0, "mono8", whole[::2, ::-2])])
         frame = link.receive()
-        assert isinstance(frame, tuple)
+        assert isinstance(frame, Frame)
         assert np.array_equal(frame.image("mono8"), whole[::2, ::-2])
         with pytest.raises(LookupError, match="expected an image rgb8 of camera 0, found mono8"):
             frame.image("rgb8")

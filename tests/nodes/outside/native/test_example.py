@@ -65,7 +65,7 @@ def answers(program: Path, path: Path, frames: list[Any]) -> list[LinkAnswer]:
     camera = msgspec.structs.replace(CAMERA, info=INFO)
     endpoint = Endpoint(
         path,
-        describe([(camera, ["rgb8", "depth32f"])], None, {"kind": "lockstep"}),
+        describe([(camera, ["rgb8", "depth32f"])], [], {"kind": "lockstep"}),
         slots=1,
         slot_bytes=240 * 180 * 7,
         answered=got.append,

@@ -20,8 +20,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from nodes.outside.native import LinkError
-from nodes.outside.native.answers import read_done, read_pose
-from nodes.outside.native.client import SAMPLE, Frame, Link, ProtocolError
+from nodes.outside.native.answers import read_done, read_order, read_pose
+from nodes.outside.native.client import RECORDS, Frame, Link, ProtocolError
 from tests.nodes.outside.native.samples_link import (
     LIMIT,
     Raw,
@@ -43,13 +43,13 @@ def u32(data: bytes, at: int) -> int:
 
 def test_the_run_speaks_as_the_page_says(tmp_path: Path) -> None:
     with listening(tmp_path / "s") as run, program(run.path) as raw:
-        raw.send(1, b"VISNAVLK\x01\x00\x00\x00\x00\x00\x00\x00my program")
+        raw.send(1, b"VISNAVLK\x02\x00\x00\x00\x00\x00\x00\x00my program")
         head, fds, *_ = socket.recv_fds(raw.socket, 8, 1)
         length, kind = u32(head, 0), u32(head, 4)
         body = raw.socket.recv(length, socket.MSG_WAITALL)
         assert kind == 2
         assert body[:8] == b"VISNAVLK"
-        assert u32(body, 8) == 1
+        assert u32(body, 8) == 2
         (size,) = struct.unpack_from("<Q", body, 16)
         description = json.loads(body[24:])
         assert description["clock"] == {"kind": "lockstep"}
@@ -60,21 +60,24 @@ def test_the_run_speaks_as_the_page_says(tmp_path: Path) -> None:
             0.0,
             0.1,
         ]
-        assert description["imu"]["gyroscope_noise_density"] == 1e-3
+        assert description["inputs"][0]["gyroscope_noise_density"] == 1e-3
+        assert description["inputs"][0]["kind"] == "imu"
+        assert description["outputs"] == ["fused"]
         raw.send(4, struct.pack("<II", 0, 0))
         assert run.endpoint.wait(LIMIT) == "my program"
 
-        samples = np.zeros(2, SAMPLE)
+        samples = np.zeros(2, RECORDS["imu"])
         samples["stamp"] = [-5, 2**60]
         samples["angular_velocity"][1] = [1, 2, 3]
         samples["linear_acceleration"][1] = [4, 5, 6]
-        assert run.endpoint.send_imu(samples)
+        assert run.endpoint.send_input(0, -3, samples)
         kind, body = raw.receive()
-        assert (kind, len(body)) == (16, 112)
-        assert struct.unpack_from("<q", body, 0) == (-5,)
-        assert struct.unpack_from("<q", body, 56) == (2**60,)
-        assert struct.unpack_from("<3d", body, 56 + 8) == (1, 2, 3)
-        assert struct.unpack_from("<3d", body, 56 + 32) == (4, 5, 6)
+        assert (kind, len(body)) == (16, 16 + 112)
+        assert struct.unpack_from("<IIq", body, 0) == (0, 2, -3)
+        assert struct.unpack_from("<q", body, 16) == (-5,)
+        assert struct.unpack_from("<q", body, 16 + 56) == (2**60,)
+        assert struct.unpack_from("<3d", body, 16 + 56 + 8) == (1, 2, 3)
+        assert struct.unpack_from("<3d", body, 16 + 56 + 32) == (4, 5, 6)
 
         sent = images()
         assert run.endpoint.send_frame(-9, sent)
@@ -118,14 +121,15 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
             raw = Raw.__new__(Raw)
             raw.socket = connection
             sent.append(raw.receive()[1])
-            body = b"VISNAVLK" + struct.pack("<IIQ", 1, 0, 4096) + b'{"cameras": []}'
+            told = {"inputs": [{"name": "imu", "kind": "imu"}], "outputs": ["fused"]}
+            body = b"VISNAVLK" + struct.pack("<IIQ", 2, 0, 4096) + json.dumps(told).encode()
             socket.send_fds(connection, [struct.pack("<II", len(body), 2)], [fd])
             connection.sendall(body)
             sent.append(raw.receive()[1])
-            raw.send(16, struct.pack("<q6d", 3, 1, 2, 3, 4, 5, 6))
+            raw.send(16, struct.pack("<IIqq6d", 0, 1, 9, 3, 1, 2, 3, 4, 5, 6))
             head = struct.pack("<QqII", 0, 77, 1, 0)
             raw.send(17, head + struct.pack("<IIIIIIQ", 1, 1, 2, 3, 6, 0, 64))
-            sent.extend(raw.receive()[1] for _ in range(4))
+            sent.extend(raw.receive()[1] for _ in range(6))
             raw.send(5)
 
     thread = threading.Thread(target=run)
@@ -136,15 +140,20 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
     thread.join()
     listener.close()
     os.close(fd)
-    assert sent[0] == b"VISNAVLK\1\0\0\0\0\0\0\0" + "näme".encode()
+    assert sent[0] == b"VISNAVLK\2\0\0\0\0\0\0\0" + "näme".encode()
     assert sent[1] == struct.pack("<II", 1, 0)
     assert (frame.sequence, frame.stamp) == (0, 77)
     assert frame.image("mono8", camera=1).tolist() == [[0, 1, 2], [6, 7, 8]]
-    assert frame.imu["stamp"].tolist() == [3]
-    assert frame.imu["angular_velocity"].tolist() == [[1, 2, 3]]
-    assert frame.imu["linear_acceleration"].tolist() == [[4, 5, 6]]
+    assert [(each.name, each.arrived) for each in frame.inputs] == [("imu", 9)]
+    assert frame.rows("imu")["stamp"].tolist() == [3]
+    assert frame.rows("imu")["angular_velocity"].tolist() == [[1, 2, 3]]
+    assert frame.rows("imu")["linear_acceleration"].tolist() == [[4, 5, 6]]
+    with pytest.raises(LookupError, match="expected one of imu, found 'gnss'"):
+        frame.rows("gnss")
 
-    full, lost, done, log = sent[2:]
+    further, order, full, lost, done, log = sent[2:]
+    assert struct.unpack_from("<QqIIII", further) == (0, 77, 0, 0, 0, 1)
+    assert struct.unpack("<QqII8d", order) == (0, 77, 3, 1, 0, 0, 0, 1, 2, 3, 0, 0.5)
     assert struct.unpack_from("<QqIIII", full) == (0, 77, 0, 3, 2, 0)
     assert struct.unpack_from("<12d", full, 32) == (1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0)
     assert struct.unpack_from("<36d", full, 128) == tuple(range(36))
@@ -158,6 +167,8 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
 
 
 def _answer(link: Link, frame: Any) -> bool:
+    link.pose(frame, np.eye(4), output="fused")
+    link.order(frame, "velocity", velocity=[1, 2, 3], yaw_rate=0.5, axes="heading")
     sure: dict[str, Any] = {"covariance": np.arange(36).reshape(6, 6), "velocity": [7, 8, 9]}
     link.pose(frame, np.eye(4), points=[[1, 2], [3, 4]], inliers=[True, False], **sure)
     link.lost(frame)
@@ -173,6 +184,9 @@ def test_no_body_of_an_answer_breaks_the_reader(body: bytes) -> None:
         with contextlib.suppress(LinkError):
             answer = read(bytearray(body))
             assert answer.pose is None or np.isfinite(answer.pose).all()
+    with contextlib.suppress(LinkError):
+        order = read_order(bytearray(body))
+        assert np.isfinite([*order.position, *order.velocity, order.yaw, order.yaw_rate]).all()
 
 
 @QUICK
@@ -218,9 +232,9 @@ def test_a_lost_pose_may_hold_anything() -> None:
 @pytest.mark.parametrize(
     ("reply", "said"),
     [
-        ((3, b"VISNAVLK" + struct.pack("<II", 2, 0) + b"expected version 2"), "expected version 2"),
-        ((2, b"VISNAVLK" + struct.pack("<IIQ", 2, 0, 64) + b"{}"), "the run has 2"),
-        ((2, b"VISNAVLK" + struct.pack("<IIQ", 1, 0, 64) + b"{}"), "shared memory"),
+        ((3, b"VISNAVLK" + struct.pack("<II", 3, 0) + b"expected version 3"), "expected version 3"),
+        ((2, b"VISNAVLK" + struct.pack("<IIQ", 1, 0, 64) + b"{}"), "the run has 1"),
+        ((2, b"VISNAVLK" + struct.pack("<IIQ", 2, 0, 64) + b"{}"), "shared memory"),
         ((2, b"HTTP/1.1 400 Bad Request"), "something else"),
         ((9, b""), "something else"),
         (None, "without BYE"),
@@ -266,6 +280,7 @@ def test_no_run_breaks_a_client(tmp_path: Path, messages: list[tuple[int, bytes]
     link = Link.__new__(Link)
     link._socket, link._expected, link._sending = here, 0, threading.Lock()
     link._memory = mmap.mmap(-1, 4096)
+    link._kinds = {"imu": "imu", "vio": "pose_estimate"}
     with here, contextlib.suppress(ProtocolError):
         for frame in link:
             assert all(image.data.nbytes <= 4096 for image in frame.images)
@@ -288,7 +303,7 @@ def test_the_page_has_all_functions() -> None:
     for name in public:
         assert any(f" {name}(" in each for each in functions), name
     text = page.partition("```text\n")[2].partition("```")[0]
-    for name, method in (*vars(Link).items(), ("image", Frame.image)):
+    for name, method in (*vars(Link).items(), ("image", Frame.image), ("rows", Frame.rows)):
         if inspect.isfunction(method) and not name.startswith("_"):
             named = list(inspect.signature(method).parameters.values())[1:]
             plain = [each.replace(annotation=inspect.Parameter.empty) for each in named]

@@ -49,7 +49,8 @@ def main() -> None:
         for frame in link:
             number = frame.sequence
             if "log" in modes:
-                link.log(f"imu {len(frame.imu)} {frame.imu['stamp'].tolist()}")
+                imu = frame.rows("imu")
+                link.log(f"imu {len(imu)} {imu['stamp'].tolist()}")
             if "flood" in modes:
                 print("x" * 200 + "\n" * 500, flush=True)
             if "spies" in modes:  # wherever it was told of, and in the run's folder
