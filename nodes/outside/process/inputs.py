@@ -56,7 +56,7 @@ SENSORS: dict[str, Sensor] = {
     "range": Sensor(RangeAnnouncement, "range"),
     "lidar": Sensor(LidarAnnouncement, "lidar_scan"),
 }
-"""Kinds of sensor by their names in the setting ``inputs``."""
+"""Kinds of sensor by their names in the setting ``reads``."""
 
 
 def _fix(event: NavSatFix) -> tuple[Any, ...]:
@@ -129,7 +129,7 @@ class Inputs:
             if found is None:
                 sources = [each.source for each in self._announced]
                 known = f"found {', '.join(sources) or 'none'}{suggest(name, sources)}"
-                yield f"inputs: expected a sensor or an estimator called {name}, {known}"
+                yield f"reads: expected a sensor or an estimator called {name}, {known}"
             else:
                 self.chosen.append((name, _kind(found), found))
                 body = body or found.source.rpartition("/")[0]

@@ -64,7 +64,7 @@ class ProcessConfig(EstimatorConfig):
         cameras: Cameras whose images of one exposure are sent together, as of a stereo rig:
             sources, or last parts of them. Poses are of the first. If empty, the first camera
             that gives the `images`.
-        inputs: What is sent besides: ``imu``, ``barometer``, ``magnetometer``, ``gnss``, ``range``,
+        reads: What is sent besides: ``imu``, ``barometer``, ``magnetometer``, ``gnss``, ``range``,
             ``lidar`` (the first of the vehicle), the last part of a sensor's source, or an
             estimator, whose estimates are sent when they come, at its latency. The IMU of the
             camera's body comes unasked.
@@ -95,7 +95,7 @@ class ProcessConfig(EstimatorConfig):
     feed: Literal["link", "ros2"] = "link"
     images: tuple[Literal["rgb", "grey", "depth"], ...] = ("rgb", "depth")
     cameras: tuple[str, ...] = ()
-    inputs: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
     asks: str = ""
     every: Annotated[int, msgspec.Meta(ge=1)] = 1
     outputs: tuple[str, ...] = ()
@@ -116,7 +116,7 @@ class ProcessConfig(EstimatorConfig):
         if self.feed == "link" and bool(self.images) == bool(self.asks):
             found = f"asks = {self.asks!r} and images = {list(self.images)}"
             raise ValueError(f"asks: expected images or the input that asks, found {found}")
-        for name in ("images", "cameras", "inputs", "outputs"):
+        for name in ("images", "cameras", "reads", "outputs"):
             if len({*getattr(self, name)}) < len(getattr(self, name)):
                 raise ValueError(f"{name}: expected each once, found {getattr(self, name)}")
 

@@ -100,7 +100,7 @@ class Process(Estimator[ProcessConfig]):
         self.method = config.method or (Path(config.command[0]).name if config.command else "")
         self._named: dict[str, CameraAnnouncement] = {}
         self._imus: list[ImuAnnouncement] = []
-        self._inputs = Inputs((*dict.fromkeys((*config.inputs, *filter(None, [config.asks]))),))
+        self._inputs = Inputs((*dict.fromkeys((*config.reads, *filter(None, [config.asks]))),))
         self._asked = self._last = -1
         self._further: dict[int, Mount] = {}
         self._slots: dict[tuple[str, type], Slot] = {}
@@ -148,7 +148,7 @@ class Process(Estimator[ProcessConfig]):
         config = self.config
         if config.feed == "ros2":
             return
-        reads = (*sorted(self.needs), *config.inputs)
+        reads = (*sorted(self.needs), *config.reads)
         for each in super().announce():
             own = msgspec.structs.replace(each, reads=reads, vehicle=config.vehicle)
             yield own

@@ -171,7 +171,7 @@ class AsWorker(Estimator):
 
 
 def program(
-    *modes: str, on_error: OnError = "stop", ports: Mapping[str, str] | None = None, **config: Any
+    *modes: str, on_error: OnError = "stop", inputs: Mapping[str, str] | None = None, **config: Any
 ) -> NodeSpec:
     """Return the node that runs the stub."""
     settings = {
@@ -183,7 +183,7 @@ def program(
         "latency": 0.015,
         "grace": 0.5,
     }
-    return spec(Process, "slam", settings | config, on_error, ports)
+    return spec(Process, "slam", settings | config, on_error, inputs)
 
 
 def fly(

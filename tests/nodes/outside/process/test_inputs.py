@@ -146,7 +146,7 @@ OTHERS = (spec(Others, "others"), spec(Ear, "ear"))
 
 def test_a_filter_gets_all_that_came_and_answers_each_tenth_sample(tmp_path: Path) -> None:
     asks = {"asks": "drone/imu", "every": 10}
-    slam = fusion("further", inputs=[*SENSORS], outputs=["raw"], **asks)
+    slam = fusion("further", reads=[*SENSORS], outputs=["raw"], **asks)
     summary = fly(slam, tmp_path, 0.5, others=OTHERS)
     lines = said(tmp_path)
     assert "inputs " + " ".join(f"{name}:{of}" for name, of in SENSORS.items()) in lines
@@ -154,7 +154,7 @@ def test_a_filter_gets_all_that_came_and_answers_each_tenth_sample(tmp_path: Pat
     assert (outside.answered, outside.open, outside.lost) == (10, 0, 0)
     assert outside.reproducible
     ms = 1_000_000
-    assert f"{50 * ms} drone/imu {50 * ms} {[n * 5 * ms for n in range(1, 11)]}" in lines
+    assert f"{200 * ms} drone/imu {200 * ms} {[n * 5 * ms for n in range(31, 41)]}" in lines
     assert f"{150 * ms} vio {140 * ms} {[100 * ms]}" in lines  # stamped 0.1 s, came at 0.14 s
     assert f"{150 * ms} lidar {100 * ms} {[101 * ms, 102 * ms]}" in lines
     assert "estimates 424" in lines
@@ -248,8 +248,8 @@ def test_without_images_poses_are_of_the_body(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [
-        ({"asks": "sonar"}, "inputs: expected a sensor or an estimator called sonar, found"),
-        ({"asks": "imu", "inputs": ["slam"]}, "called slam, found drone/imu"),
+        ({"asks": "sonar"}, "reads: expected a sensor or an estimator called sonar, found"),
+        ({"asks": "imu", "reads": ["slam"]}, "called slam, found drone/imu"),
         ({"asks": "imu", "calibration": "openvins"}, "calibration: expected a camera, found none"),
         ({"asks": "imu", "cpus": 4096}, "cpus: expected at most the"),
     ],
