@@ -80,6 +80,7 @@ def test_a_copied_example_is_whole(path: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / named[1]).read_text(encoding="utf-8")) == SCHEMA
     beside = {"brightness": "brightness.py", "plain": "plain_room.xml"}
     beside |= {"computer_vision": "orbit.tum", "outside_cpp": "outside_cpp/odometry.cpp"}
+    beside |= {"outside_ros2": "outside_ros2.py"}
     if path.stem in beside:
         assert (tmp_path / beside[path.stem]).is_file()
     again = command_here("example", path.stem, "--out", str(tmp_path), folder=ROOT)
@@ -91,6 +92,28 @@ def test_an_example_that_is_not_there_is_guessed() -> None:
     done = command_here("example", "monoculer", folder=ROOT)
     assert done.returncode == 2
     assert "did you mean 'monocular'?" in done.stderr
+
+
+@pytest.mark.parametrize("language", ["python", "cpp", "ros2"])
+def test_a_new_estimator_is_whole(language: str, tmp_path: Path) -> None:
+    """The examples are what it begins with, and these fly in the tests."""
+    words = "new-estimator", "my_vio", "--language", language, "--out", str(tmp_path)
+    done = command_here(*words, folder=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert load(tmp_path / "my_vio.toml").run.name == "my_vio"
+    source = "my_vio/my_vio.cpp" if language == "cpp" else "my_vio.py"
+    texts = [(tmp_path / name).read_text(encoding="utf-8") for name in ("my_vio.toml", source)]
+    assert not re.search(r"outside_|own_estimator|OwnEst|examples/", "".join(texts))
+    assert f'"{Path(source).name}"' in texts[0] or '"my_vio:MyVio"' in texts[0]
+    again = command_here(*words, folder=ROOT)
+    assert (again.returncode, "found one" in again.stderr) == (2, True)
+
+
+def test_a_new_estimator_has_a_name_that_a_module_may_have(tmp_path: Path) -> None:
+    done = command_here("new-estimator", "my-vio", "--out", str(tmp_path), folder=ROOT)
+    assert done.returncode == 2
+    assert "expected a name of small letters, digits and _, found 'my-vio'" in done.stderr
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.slow

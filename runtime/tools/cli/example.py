@@ -1,7 +1,8 @@
-"""``demo`` and ``example``: the project's example files, also in an installed wheel."""
+"""``demo``, ``example`` and ``new-estimator``: the project's example files, also in a wheel."""
 
 from __future__ import annotations
 
+import enum
 from pathlib import Path
 from typing import Annotated
 
@@ -68,6 +69,69 @@ def example(
     schema(out / SCHEMA)  # of the nodes installed now: one from before is replaced
 
 
+class Language(enum.StrEnum):
+    """Languages and ways of an estimator of one's own."""
+
+    PYTHON = "python"
+    CPP = "cpp"
+    ROS2 = "ros2"
+
+
+def new_estimator(
+    name: Annotated[str, typer.Argument(help="Name of the estimator, and of its files.")],
+    language: Annotated[
+        Language, typer.Option(help="A node in Python, a C++ program, or a node of ROS 2.")
+    ] = Language.PYTHON,
+    out: Annotated[Path, typer.Option(help="Folder to write it to.")] = Path(),
+) -> None:
+    """Begin an estimator of one's own, which flies, tracks and is judged as it is.
+
+    It is the example of that language under another name: an odometry, to be replaced.
+    """
+    import re
+
+    from runtime.errors import CommandError
+    from runtime.tools.cli.inspect import schema
+
+    if not re.fullmatch("[a-z][a-z0-9_]*", name):
+        raise CommandError(f"expected a name of small letters, digits and _, found {name!r}")
+    called = "".join(word.capitalize() for word in name.split("_"))
+    words = {
+        Language.PYTHON: {"own_estimator": name, "OwnEstimator": called, '"own"': f'"{name}"'},
+        Language.CPP: {
+            "outside_cpp": name,
+            "odometry.cpp": f"{name}.cpp",
+            "FOLDER/odometry": f"FOLDER/{name}",
+            "-o odometry": f"-o {name}",
+            '"slam"': f'"{name}"',
+        },
+        Language.ROS2: {"outside_ros2": name},
+    }[language]
+    example = example_files()[next(iter(words))]
+    listed = [example, *_read_by(example)]
+    files = [
+        each for file in listed for each in (sorted(file.iterdir()) if file.is_dir() else [file])
+    ]
+
+    def renamed(text: str) -> str:
+        for word, other in words.items():
+            text = text.replace(word, other)
+        return text
+
+    targets = [out / renamed(str(file.relative_to(example.parent))) for file in files]
+    for target in targets:
+        if target.exists():
+            raise CommandError(f"{target}: expected no file of this name, found one")
+    for file, target in zip(files, targets, strict=True):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        text = renamed(file.read_text(encoding="utf-8")).replace("examples/", "")
+        text = re.sub(r"\A#:schema .*", f"#:schema {SCHEMA}", text)
+        target.write_text(text, encoding="utf-8")
+        print(target)
+    schema(out / SCHEMA)
+    print(f"try: python -m runtime run {targets[0]}")
+
+
 def example_files() -> dict[str, Path]:
     """Return the examples by name; the standard tour is ``config``.
 
@@ -105,5 +169,5 @@ def _read_by(path: Path) -> list[Path]:
     return [
         file
         for file in beside
-        if f' = "{file.name}"' in text or (file.suffix == ".py" and f'"{file.stem}:' in text)
+        if f'"{file.name}"' in text or (file.suffix == ".py" and f'"{file.stem}:' in text)
     ]
