@@ -33,6 +33,7 @@ class SyntheticOdometryConfig(NodeConfig):
         heading_drift: Error of the heading that grows with the distance flown, degrees per metre;
             its sign depends on the run's seed. The path turns with it.
         noise: Standard deviation of the position's noise along each axis, metres.
+        velocity_noise: The same of the velocity, m/s; if not given, none is sent.
     """
 
     rate: Annotated[float, msgspec.Meta(gt=0)] = 30
@@ -40,6 +41,7 @@ class SyntheticOdometryConfig(NodeConfig):
     drift: Share = 0.0
     heading_drift: Share = 0.0
     noise: NotNegative = 0.0
+    velocity_noise: NotNegative | None = None
 
 
 class SyntheticOdometry(Node[SyntheticOdometryConfig]):
@@ -91,6 +93,11 @@ class SyntheticOdometry(Node[SyntheticOdometryConfig]):
             position += self.rng.normal(0.0, config.noise, 3)
         orientation = turn * Rotation.from_quat(truth.orientation, scalar_first=True)
         x, y, z = position.tolist()
+        velocity = None
+        if config.velocity_noise is not None:
+            noise = self.rng.normal(0.0, config.velocity_noise, 3)
+            along = orientation.apply(np.array(truth.linear_velocity)) + noise
+            velocity = float(along[0]), float(along[1]), float(along[2])
         w, qx, qy, qz = orientation.as_quat(scalar_first=True).tolist()
         return PoseEstimate(
             stamp=truth.stamp,
@@ -99,4 +106,5 @@ class SyntheticOdometry(Node[SyntheticOdometryConfig]):
             child_frame_id=truth.child_frame_id,
             position=(x, y, z),
             orientation=(w, qx, qy, qz),
+            velocity=velocity,
         )

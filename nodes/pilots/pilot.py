@@ -107,6 +107,10 @@ C = TypeVar("C", bound=PilotConfig, default=PilotConfig)
 E = TypeVar("E")
 
 
+_REMINDER = 5.0
+"""Seconds without a first pose after which that is said."""
+
+
 class Pilot(Node[C], ABC):
     """Base of pilots of a scripted flight: take off, follow a path, land, end the run.
 
@@ -309,6 +313,22 @@ class VisualPilot(Pilot[VisualPilotConfig]):
                 self.log.warning(said, event.source, frame, event.frame_id)
             return
         self.update_pose(event)
+
+    async def run(self) -> None:
+        """Fly, and say so if no pose comes to take off by."""
+        self.start(self._remind())
+        await super().run()
+
+    async def _remind(self) -> None:
+        await self.clock.sleep(_REMINDER)
+        if self.pose is None:
+            who = ", ".join(self.senders_of(PoseEstimate)) or "anybody"
+            self.log.warning(
+                "no pose from %s for %g s: this pilot waits for the first one to take off, and an "
+                "estimator may wait for motion before its first one",
+                who,
+                _REMINDER,
+            )
 
     async def follow(self, path: WaypointPath) -> None:
         """Send the path's velocity, corrected for the distance of the estimate from the path."""

@@ -95,7 +95,13 @@ static_assert(sizeof(Imu) == 56 && sizeof(NavSatFix) == 136 && sizeof(LidarPoint
 struct Input {
     std::string name, kind;
     std::int64_t arrived;               // when the last one came, on the run's clock (ns)
-    std::string bytes;                  // rows
+    std::string bytes;
+    template <class T> std::vector<T> rows() const {
+        if (kind != T::kind) throw Error("expected " + name + " of kind " + T::kind + ", found " + kind);
+        std::vector<T> all(bytes.size() / sizeof(T));
+        if (!all.empty()) std::memcpy(all.data(), bytes.data(), bytes.size());
+        return all;
+    }
 };
 
 // An image in shared memory: read-only, valid until its frame has been answered.
@@ -120,12 +126,10 @@ struct Frame {
     template <class T> std::vector<T> rows(const std::string& name) const {
         if (const auto found = kinds.find(name); found == kinds.end() || found->second != T::kind)
             throw Error("expected an input " + name + " of kind " + T::kind);
-        std::string bytes;
+        Input all{name, T::kind, stamp, ""};
         for (const Input& each : inputs)
-            if (each.name == name) bytes += each.bytes;
-        std::vector<T> all(bytes.size() / sizeof(T));
-        if (!all.empty()) std::memcpy(all.data(), bytes.data(), bytes.size());
-        return all;
+            if (each.name == name) all.bytes += each.bytes;
+        return all.rows<T>();
     }
     const Image& image(const std::string& kind, std::uint32_t camera = 0) const {
         for (const Image& each : images)

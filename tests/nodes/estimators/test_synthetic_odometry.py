@@ -95,3 +95,17 @@ def test_noise_has_the_size_that_the_settings_say() -> None:
 def test_its_announcement_says_what_it_is() -> None:
     said = next(e for e in result(drift=2).sent if isinstance(e, EstimatorAnnouncement))
     assert said.method == "truth, 2 % drift, 15 ms late"
+
+
+def test_it_sends_a_velocity_if_it_is_told_to() -> None:
+    assert all(said.velocity is None for said, _ in estimates())
+    found = estimates(velocity_noise=0.0, heading_drift=10.0)
+    for said, _ in found:
+        assert said.velocity is not None
+        yaw = yaw_of(said.orientation)
+        ahead = (2.0 * math.cos(yaw), 2.0 * math.sin(yaw), 0.0)
+        np.testing.assert_allclose(said.velocity, ahead, atol=1e-12)
+    last, truth = found[-1]
+    assert yaw_of(last.orientation) != pytest.approx(yaw_of(truth.orientation), abs=0.1)
+    noisy = [said.velocity for said, _ in estimates(velocity_noise=0.1)]
+    assert 0.05 < np.std([each[2] for each in noisy if each]) < 0.2

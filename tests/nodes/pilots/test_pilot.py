@@ -291,6 +291,16 @@ def test_without_estimates_it_stops_and_waits(world: str) -> None:
     assert result.reason == "pilot: flight completed"
 
 
+def test_a_pilot_that_waits_for_its_first_estimate_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Who waits for motion and who waits for an estimate would wait for each other in silence."""
+    run_nodes([spec(VisualPilot, "pilot", {"waypoints": WAYPOINTS})], duration=4.9)
+    assert "no pose from" not in caplog.text
+    run_nodes([spec(VisualPilot, "pilot", {"waypoints": WAYPOINTS})], duration=5.1)
+    assert "no pose from script for 5 s: this pilot waits for the first one" in caplog.text
+
+
 def off_its_place(result: NodeResult, start: float, end: float) -> float:
     """Return how far the vehicle went, at most, from where it was at a time (seconds)."""
     flown = [e.position for e in result.of(Odometry) if start <= e.stamp / SECOND <= end]
