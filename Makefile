@@ -90,7 +90,7 @@ bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (abou
 bench-quick: $(READY)  ## Run the quick benchmarks (under two minutes).
 	$(BIN)/python -m runtime bench all --quick --out runs/bench-quick
 
-images: demo $(READY)  ## Make the documentation's images (needs ORB-SLAM3, KISS-ICP and Chromium; minutes).
+images: demo $(READY)  ## Make the documentation's images (needs ORB-SLAM3, evalio and Chromium; minutes).
 	$(BIN)/python -m runtime suite --scenario office --repeat 1 --out runs/office \
 		--estimator features --estimator orb_slam3_rgbd --estimator kiss_icp
 	$(BIN)/python tools/readme_images.py

@@ -219,9 +219,10 @@ def inertial_pairs(
     config: Config, announced: Announced
 ) -> Iterator[tuple[CameraAnnouncement, ImuAnnouncement]]:
     """Yield cameras with the IMU of their body, if an estimator of the file fuses both."""
+    on_images = [a for a in announced if "lidar" not in getattr(a, "reads", ())]
     fused = any(
         "inertial" in str(getattr(spec.config, "mode", "inertial")) and _reads_imu(spec)
-        for spec in estimators(config, announced)
+        for spec in estimators(config, on_images)
     )
     imus = [each for each in announced if isinstance(each, ImuAnnouncement) and fused]
     for camera in cameras(announced):

@@ -115,7 +115,7 @@ class Estimator(Node[C], ABC):
 
     **Lidars.** With `needs` of ``lidar`` alone, ``frames`` is an `Input` of scans. The tracker
     gives poses of the lidar (x forward, y right, z down) in the lidar at its first scan, that of a
-    scan at its last ray; no features are sent.
+    scan at its last ray, unless `exposed_at` is overridden; no features are sent.
 
     **Lenses.** What `refusal` says no to, and stereo pairs that are not `aligned`, is rectified
     beside the loop (`nodes.estimators.rectification`) before `frames` gives it, unless the setting
@@ -236,7 +236,7 @@ class Estimator(Node[C], ABC):
         """Choose the first sensors with the needed data, or those named in the file.
 
         The file names a camera as ``frames``, those of a stereo rig as ``frames.left`` and
-        ``frames.right``, and an IMU as ``frames.imu``.
+        ``frames.right``, and an IMU as ``frames.imu``; that beside a lidar as ``imu``.
         """
         if isinstance(announcement, VehicleAnnouncement):
             self._vehicles += (announcement,)
@@ -248,7 +248,7 @@ class Estimator(Node[C], ABC):
             self.imu_announcement = None
         if self.imu_announcement is None and choice.imu is not None:
             self.imu_announcement = choice.imu
-            self._narrow_to("frames.imu", choice.imu.source)
+            self._narrow_to(choice.imu_port, choice.imu.source)
         if choice.lidar is not None and lidar is None:
             self._narrow_to("frames", choice.lidar.source)
 

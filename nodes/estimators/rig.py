@@ -36,7 +36,7 @@ class SensorChoice:
         eyes: Number of cameras, 1 or 2.
         inertial: Whether an IMU is needed.
         named: Port to the source that the file names for it: ``frames`` or ``frames.left`` (the
-            first camera), ``frames.right``, ``frames.imu``.
+            first camera), ``frames.right``, ``frames.imu``; beside a lidar ``imu``.
         refusals: Returns why images of one or both eyes are of no use, a sentence by each source;
             empty if they are. Called with False, as they are, and with True, as they can be
             rectified.
@@ -45,7 +45,9 @@ class SensorChoice:
         cameras: The chosen ones, the left one first; empty while there are none. Those whose
             images are of use as they are come before those that have to be rectified.
         rectified: Whether their images have to be.
-        imu: The chosen IMU, on the vehicle of the first camera; `None` while there is none.
+        imu: The chosen IMU, on the vehicle of the lidar or first camera; `None` while there is
+            none.
+        imu_port: Port of its samples.
         lidar: The chosen lidar, if one is needed; `None` while there is none.
         named: As given.
     """
@@ -66,7 +68,8 @@ class SensorChoice:
         self._needs, self._eyes, self._inertial = frozenset(needs), eyes, inertial
         self._first = named.get("frames.left", named.get("frames"))
         self._second = named.get("frames.right")
-        self._imu = named.get("frames.imu")
+        self.imu_port = "imu" if "lidar" in needs else "frames.imu"
+        self._imu = named.get(self.imu_port)
         self._refused = refusals
         self._seen: list[CameraAnnouncement] = []
         self._imus: list[ImuAnnouncement] = []
@@ -74,7 +77,9 @@ class SensorChoice:
 
     def announced(self, announcement: Announcement) -> None:
         """Add a camera, an IMU or a lidar; choose if now possible."""
-        if "lidar" in self._needs:
+        if isinstance(announcement, ImuAnnouncement):
+            self._imus.append(announcement)
+        elif "lidar" in self._needs:
             fits = self._first in (None, announcement.source)
             if isinstance(announcement, LidarAnnouncement) and fits and self.lidar is None:
                 self.lidar = announcement
@@ -82,23 +87,26 @@ class SensorChoice:
             self._seen.append(announcement)
             if not self.cameras or self.rectified:
                 self._choose_cameras()
-        elif isinstance(announcement, ImuAnnouncement):
-            self._imus.append(announcement)
-        if self._inertial and self.imu is None and self.cameras:
-            body = self.cameras[0].source.rpartition("/")[0]
+        if self._inertial and self.imu is None and (beside := self._beside()):
+            body = beside.rpartition("/")[0]
             self.imu = next((imu for imu in self._imus if self._fits(imu, body)), None)
 
     def missing(self) -> str:
         """Return a sentence on the missing sensor; empty if none is missing."""
         if "lidar" in self._needs:
             called = f" called {self._first}" if self._first else ""
-            return "" if self.lidar else f"expected a lidar{called}, found none"
-        if not self.cameras:
-            return self._no_camera()
-        if self._inertial and self.imu is None:
+            lacks = "" if self.lidar else f"expected a lidar{called}, found none"
+        else:
+            lacks = "" if self.cameras else self._no_camera()
+        if not lacks and self._inertial and self.imu is None:
             found = ", ".join(imu.source for imu in self._imus) or "none"
-            return f"expected an IMU beside {self.cameras[0].source}, found {found}"
-        return ""
+            return f"expected an IMU beside {self._beside()}, found {found}"
+        return lacks
+
+    def _beside(self) -> str:
+        """Return the source of the lidar or first camera; empty while there is none."""
+        sensor = self.lidar or next(iter(self.cameras), None)
+        return sensor.source if sensor else ""
 
     def _fits(self, imu: ImuAnnouncement, body: str) -> bool:
         return imu.source == self._imu or (

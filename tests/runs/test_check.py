@@ -229,7 +229,7 @@ def test_our_own_files_are_right(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # as on a machine on which nothing has run
     code, lines = check(path)
     if code:
-        needy = {"replay", "orb_slam3", "plain", "euroc", "tum", "kitti", "svo", "kiss_icp"}
+        needy = {"replay", "orb_slam3", "plain", "euroc", "tum", "kitti", "svo", "evalio"}
         assert path.stem in needy
         causes = "expected a recording", "expected a vocabulary", "pip install"
         assert all(any(cause in line for cause in causes) for line in lines)

@@ -15,7 +15,7 @@ from runtime.config.reading import parse
 from runtime.tools.preflight import Finding, lint
 from runtime.tools.preflight import rules as all_rules
 from tests.nodes.calibration.samples import IMU, camera, stereo
-from tests.nodes.estimators.kiss_icp.test_node import lidar
+from tests.nodes.estimators.test_evalio import lidar
 from tests.runtime.tools.samples_cli import command
 
 SLAM: dict[str, Any] = {"name": "slam", "type": "OrbSlam3"}
@@ -39,7 +39,7 @@ def nodes_of(*types: str, duration: float = 1.0, **settings: Any) -> Config:
 
 DRONE, EVALUATION = "Multirotor", "Evaluation"
 PILOT = "WaypointFollower"
-ON_A_LIDAR = nodes_of("KissIcp")
+ON_A_LIDAR = nodes_of("Evalio")
 
 
 def square(**more: Any) -> CameraAnnouncement:
@@ -145,6 +145,8 @@ def test_nothing_is_said_of_a_sound_rig() -> None:
     near = msgspec.structs.replace(pair[1], position=(0.15, 0.12, -0.03), rate=30.0)
     assert [each.rule for each in lint(file("rgbd"), [pair[0], near])] == []
     assert lint(ON_A_LIDAR, [lidar()]) == []
+    on_a_lidar = msgspec.structs.replace(ESTIMATES, source="a", reads=("imu", "lidar"))
+    assert lint(ON_A_LIDAR, [lidar(), square(rate=40.0), IMU, on_a_lidar]) == []
     flown = nodes_of(DRONE, PILOT, duration=0.0, waypoints=[[0, 0, -1]])
     assert lint(flown, [square()]) == []
 
