@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Imu, ImuAnnouncement, LidarAnnouncement, LidarScan
+from events import Event, Imu, ImuAnnouncement, LidarAnnouncement, LidarScan
 from events.geometry import pose_matrix
 from nodes.estimators import (
     WORKER_ENVIRONMENT,
@@ -23,7 +23,6 @@ from nodes.estimators import (
     TrackingResult,
     sample_rows,
 )
-from nodes.estimators.estimator import Frame
 from runtime import Input, on
 from runtime.errors import MissingDependencyError, suggest
 from runtime.extras import install_command
@@ -48,7 +47,13 @@ _FIXED = {
 The sums of several threads have no fixed order, and ``realtime`` gives up by the processor's time.
 """
 
-_TIME_OF_POSE = {"ct": 0.0, "dlio": 0.5, "form": 0.5, "liosam": 0.0, "loam": 0.5}
+_USUAL = {"deskew": True, "mappingProcessInterval": 0.0}
+"""Defaults that are not the library's: LIO-SAM's, 0.15 s, repeats the pose before at 10 Hz."""
+
+_SCANS_LATE = {"liosam": 2}
+"""Scans that a pipeline holds back: a pose is that of an earlier scan."""
+
+_TIME_OF_POSE = {"ct": 0.0, "dlio": 0.5, "form": 0.5, "liosam": 0.5, "loam": 0.5}
 """Time of a pose within its scan, from the first ray (0) to the last (1); found on ideal data.
 
 The others correct a scan to its last ray, or, told not to, give a mean over all.
@@ -66,8 +71,8 @@ class EvalioConfig(EstimatorConfig):
             (KISS-ICP), ``liosam`` (LIO-SAM), ``loam`` (LOAM), ``mad`` (MAD-ICP). DLIO and LIO-SAM
             read the IMU, too.
         parameters: The pipeline's own, by name; all others are its defaults, but for ``deskew``,
-            the correction for the motion during a scan, which is on, and for those of threads and
-            real time, which are not settable.
+            the correction for the motion during a scan, which is on, ``mappingProcessInterval``,
+            which is 0, and those of threads and real time, which are not settable.
         max_range: Points farther away are left out, metres; 0 for the lidar's own range.
         min_points: Points of a scan below which the lidar is lost.
     """
@@ -116,7 +121,8 @@ class EvalioProcess:
             # They leave the number of threads to TBB; KISS-ICP limits it for the whole process.
             self._start(pipelines, EvalioConfig(), None)
         self._pipeline = self._start(pipelines, config, imu)
-        self._origin: Floats | None = None  # inverse of the lidar's first pose
+        self._origin = np.eye(4)  # inverse of the lidar's first pose
+        self._early = 1 + _SCANS_LATE.get(config.pipeline, 0)  # scans until that pose
         self._pose = np.eye(4)
 
     def _start(self, pipelines: Any, config: EvalioConfig, imu: ImuAnnouncement | None) -> Any:
@@ -148,7 +154,7 @@ class EvalioProcess:
         pipeline.set_imu_T_lidar(types.SE3(turn, mounting[:3, 3].copy()))
         defaults = pipeline.default_params()
         fixed = {name: value for name, value in _FIXED.items() if name in defaults}
-        usual = {"deskew": True} if "deskew" in defaults else {}
+        usual = {name: value for name, value in _USUAL.items() if name in defaults}
         given = _checked(config, {k: v for k, v in defaults.items() if k not in fixed})
         pipeline.set_params(defaults | usual | given | fixed)
         pipeline.initialize()
@@ -164,7 +170,7 @@ class EvalioProcess:
     ) -> TrackingResult:
         """Take in samples and the next scan; return the pose of the lidar.
 
-        It is in the lidar's frame at the first scan with a pose.
+        It is that of this scan, or of one `_SCANS_LATE` before, in the lidar's frame at the first.
 
         Args:
             stamp: Of the scan's first ray, ns.
@@ -190,7 +196,8 @@ class EvalioProcess:
         if not np.isfinite(pose).all():
             return self._lost("no finite pose was found")
         lidar = pose @ self._imu_from_lidar
-        if self._origin is None:
+        if self._early:
+            self._early -= 1
             self._origin = np.linalg.inv(lidar)
         self._pose = _UP @ self._origin @ lidar @ _UP
         return TrackingResult(pose=self._pose)
@@ -261,7 +268,7 @@ class Evalio(Estimator[EvalioConfig]):
         self.inertial = self.config.pipeline in _INERTIAL
         self._samples: deque[Imu] = deque()
 
-    def exposed_at(self, image: Frame) -> int:
+    def exposed_at(self, image: Event) -> int:
         """Return the time of the pipeline's pose within a scan (ns)."""
         start = image.stamp
         return start + round(self.config.time_of_pose() * (super().exposed_at(image) - start))
@@ -285,14 +292,15 @@ class Evalio(Estimator[EvalioConfig]):
 
     async def run(self) -> None:
         """Track each scan; estimates start with the first scan of enough points."""
-        tracking = False
         samples = self._samples
+        taken = deque[LidarScan](maxlen=1 + _SCANS_LATE.get(self.config.pipeline, 0))
         async for scan in self.frames:
             past = []
             while samples and samples[0].stamp <= scan.end:
                 past.append(samples.popleft())
             args = scan.stamp, scan.points, scan.times, scan.rings, sample_rows(past)
             result = await self._pipeline.call(EvalioProcess.track, *args)
-            tracking = tracking or not result.lost
-            if tracking:
-                self.publish(scan, result)
+            if not result.lost:
+                taken.append(scan)
+            if len(taken) == taken.maxlen:
+                self.publish(scan if result.lost else taken[0], result)
