@@ -4,7 +4,7 @@
 //     ekf2 NODE EV_DELAY [velocity]     # whose estimates; milliseconds; fuse its velocity, too
 //
 // As in an autopilot that is sent poses without a common clock, they are stamped when they arrive,
-// and EV_DELAY says how old they are then. It answers with the body's pose of now, at the IMU's last
+// and EV_DELAY says how old they are then. It answers with the pose of now, at the IMU's last
 // sample. Settings are the library's, least variances those of PX4's module around it.
 #include <EKF/ekf.h>
 
@@ -79,13 +79,12 @@ int main(int count, char** words) try {
     settings.fusion_mode = MASK_USE_EVPOS | MASK_USE_EVYAW | (velocity ? MASK_USE_EVVEL : 0);
     settings.vdist_sensor_type = VDIST_SENSOR_EV;
     settings.mag_fusion_type = MAG_FUSE_TYPE_NONE;
-    settings.arsp_thr = 0.0f;  // no airspeed
     settings.ev_delay_ms = std::stof(words[2]);
 
     visnav::Link link("EKF2");
     link.ready(visnav::Link::PoseOf::body);
-    std::int64_t last = 0;
-    bool flying = false, started = false;
+    std::int64_t last = 0, begun = 0;
+    bool flying = false;
     while (const auto frame = link.next()) {
         for (const visnav::Input& input : frame->inputs) {  // as they came
             if (input.kind == visnav::Imu::kind)
@@ -107,8 +106,8 @@ int main(int count, char** words) try {
                         ekf.setExtVisionData(vision_of(estimate, input.arrived));
                     }
         }
-        started = started || (ekf.attitude_valid() && ekf.control_status_flags().ev_pos);
-        if (!started)
+        if (!begun && ekf.attitude_valid() && ekf.control_status_flags().ev_pos) begun = frame->stamp;
+        if (!begun || frame->stamp < begun + 1000000000)  // its height settles within a second
             link.initialising(*frame);
         else if (ekf.inertial_dead_reckoning())
             link.lost(*frame);
