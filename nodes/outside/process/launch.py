@@ -91,7 +91,7 @@ class ProcessConfig(EstimatorConfig):
     command: tuple[str, ...] = ()
     build: tuple[str, ...] = ()
     folder: InputPath = ""
-    environment: dict[str, str] = msgspec.field(default_factory=dict)
+    environment: dict[str, str | int | float] = msgspec.field(default_factory=dict)
     feed: Literal["link", "ros2"] = "link"
     images: tuple[Literal["rgb", "grey", "depth"], ...] = ("rgb", "depth")
     cameras: tuple[str, ...] = ()
@@ -222,7 +222,8 @@ class Launch:
             "VISNAV_INCLUDE": str(Path(native.__file__).parent),
             "VISNAV_PYTHON": sys.executable,
         }
-        return {**os.environ, **places, **self._ours, **self._config.environment}
+        own = {name: str(value) for name, value in self._config.environment.items()}
+        return {**os.environ, **places, **self._ours, **own}
 
     def _expanded(self, word: str) -> str:
         known = self.environment()
