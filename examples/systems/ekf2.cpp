@@ -1,19 +1,14 @@
-// EKF2, the filter of PX4's autopilot, as an estimator of a run, by the native interface: it fuses
-// the IMU, the barometer, and the estimates of another node as external vision.
-//
-//     ekf2 NODE EV_DELAY [velocity]     # whose estimates; milliseconds; fuse its velocity, too
-//
-// As in an autopilot that is sent poses without a common clock, they are stamped when they arrive,
-// and EV_DELAY says how old they are then. It answers with the pose of now, at the IMU's last
-// sample. Settings are the library's, least variances those of PX4's module around it.
+// EKF2, the filter of PX4's autopilot, as an estimator of a run, by the native interface: `ekf2 NODE`
+// fuses the IMU, the barometer, and that node's estimates as external vision.
+// EKF2_EV_DELAY, milliseconds, is PX4's parameter: how old a pose is at its stamp ("measured": as the
+// first one is). EKF2_STAMPS: at "arrival", as without a common clock, or at "exposure". EKF2_VELOCITY: 1
+// fuses velocities, too. It answers with the body's pose of now, at the IMU's last sample. Other settings
+// are the library's, least variances those of PX4's module around it.
 #include <EKF/ekf.h>
-
 #include <iostream>
-
 #include "visnav_link.hpp"
 
 namespace {
-
 using Vector = matrix::Vector3f;
 
 std::uint64_t micro(std::int64_t stamp) {  // never 0: EKF2 takes that for "no measurement"
@@ -24,13 +19,9 @@ float altitude(double pressure) {  // of the standard atmosphere
     return float(44330.8 * (1.0 - std::pow(pressure / 101325.0, 0.190263)));
 }
 
-template <class T> std::vector<T> rows(const visnav::Input& input) {
-    std::vector<T> all(input.bytes.size() / sizeof(T));
-    if (!all.empty()) std::memcpy(all.data(), input.bytes.data(), input.bytes.size());
-    return all;
-}
+std::string variable(const char* name) { return std::getenv(name) ? std::getenv(name) : ""; }
 
-extVisionSample vision_of(const visnav::PoseEstimate& estimate, std::int64_t arrived) {
+extVisionSample vision_of(const visnav::PoseEstimate& estimate, std::int64_t stamp) {
     extVisionSample found;
     matrix::Dcmf turn;
     for (int i = 0; i < 3; ++i) {
@@ -39,7 +30,7 @@ extVisionSample vision_of(const visnav::PoseEstimate& estimate, std::int64_t arr
         const double variance = estimate.covariance[7 * i];  // NaN if unknown: then the least
         found.posVar(i) = variance > 0.01 ? float(variance) : 0.01f;
     }
-    found.time_us = micro(arrived);
+    found.time_us = micro(stamp);
     found.quat = matrix::Quatf(turn);
     found.angVar = estimate.covariance[35] > 0.0025 ? float(estimate.covariance[35]) : 0.0025f;
     found.vel = vector(estimate.velocity);
@@ -71,15 +62,18 @@ void answer(visnav::Link& link, const visnav::Frame& frame, const Ekf& ekf) {
 }  // namespace
 
 int main(int count, char** words) try {
-    if (count < 3) throw visnav::Error("expected the name of a node, and its delay in ms");
+    if (count != 2) throw visnav::Error("expected the name of a node");
     const std::string vio = words[1];
-    const bool velocity = count > 3 && std::string(words[3]) == "velocity";
+    const std::string delay = variable("EKF2_EV_DELAY");
+    const bool velocity = variable("EKF2_VELOCITY") == "1";
+    const bool exposed = variable("EKF2_STAMPS") == "exposure";
     Ekf ekf;
     parameters& settings = *ekf.getParamHandle();
     settings.fusion_mode = MASK_USE_EVPOS | MASK_USE_EVYAW | (velocity ? MASK_USE_EVVEL : 0);
     settings.vdist_sensor_type = VDIST_SENSOR_EV;
     settings.mag_fusion_type = MAG_FUSE_TYPE_NONE;
-    settings.ev_delay_ms = std::stof(words[2]);
+    bool timed = !delay.empty() && delay != "measured";
+    if (timed) settings.ev_delay_ms = std::stof(delay);
 
     visnav::Link link("EKF2");
     link.ready(visnav::Link::PoseOf::body);
@@ -87,8 +81,13 @@ int main(int count, char** words) try {
     bool flying = false;
     while (const auto frame = link.next()) {
         for (const visnav::Input& input : frame->inputs) {  // as they came
+            if (!timed && input.name == vio && !input.bytes.empty()) {
+                timed = true;  // its buffers are as long as this age when it begins
+                settings.ev_delay_ms = 1e-6f * float(input.arrived - input.rows<visnav::PoseEstimate>()[0].stamp);
+            }
+            if (!timed) continue;
             if (input.kind == visnav::Imu::kind)
-                for (const visnav::Imu& imu : rows<visnav::Imu>(input)) {
+                for (const visnav::Imu& imu : input.rows<visnav::Imu>()) {
                     const float dt = last ? 1e-9f * float(imu.stamp - last) : 0.005f;
                     last = imu.stamp;
                     ekf.set_in_air_status(flying);
@@ -97,13 +96,13 @@ int main(int count, char** words) try {
                     ekf.update();
                 }
             else if (input.kind == visnav::FluidPressure::kind)
-                for (const visnav::FluidPressure& air : rows<visnav::FluidPressure>(input))
+                for (const visnav::FluidPressure& air : input.rows<visnav::FluidPressure>())
                     ekf.setBaroData({micro(air.stamp), altitude(air.fluid_pressure)});
             else if (input.name == vio)
-                for (const visnav::PoseEstimate& estimate : rows<visnav::PoseEstimate>(input))
+                for (const visnav::PoseEstimate& estimate : input.rows<visnav::PoseEstimate>())
                     if (std::isfinite(estimate.pose[3])) {
                         flying = estimate.pose[11] < -0.2;  // metres down
-                        ekf.setExtVisionData(vision_of(estimate, input.arrived));
+                        ekf.setExtVisionData(vision_of(estimate, exposed ? estimate.stamp : input.arrived));
                     }
         }
         if (!begun && ekf.attitude_valid() && ekf.control_status_flags().ev_pos) begun = frame->stamp;
