@@ -114,7 +114,8 @@ def test_a_message_has_its_attachment_and_none_if_what_came_is_none() -> None:
     with listening() as (session, locator), zenoh_session(connect=locator) as other:
         heard: queue.SimpleQueue[Message] = queue.SimpleQueue()
         session.subscribe(PLAIN, heard.put)
-        publisher: Any = other.declare_publisher(data_key(DOMAIN, PLAIN))
+        block = zenoh.CongestionControl.BLOCK  # or the last may be dropped behind the longest
+        publisher: Any = other.declare_publisher(data_key(DOMAIN, PLAIN), congestion_control=block)
         until(lambda: publisher.matching_status.matching)
         for attached in (pack(said), None, b"", bytes(33), pack(said)[:-1], b"x" * 100_000):
             publisher.put(b"hello", attachment=attached)
