@@ -187,8 +187,13 @@ class Endpoint:
             number: Index in the description's inputs.
             arrived: Time of the run's clock at which the last one came (ns).
             rows: Of the type in `client.RECORDS`.
+
+        Raises:
+            ValueError: They are longer than a message may be.
         """
         program = self._program
+        if (most := (wire.LONGEST - wire.INPUT_HEAD.size) // rows.itemsize) < len(rows):
+            raise ValueError(f"expected at most {most} rows in a message, found {len(rows)}")
         head = wire.INPUT_HEAD.pack(number, len(rows), arrived)
         return program is not None and program.send(wire.INPUT, head, rows.tobytes())
 

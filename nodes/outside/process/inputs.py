@@ -130,6 +130,8 @@ class Inputs:
                 sources = [each.source for each in self._announced]
                 known = f"found {', '.join(sources) or 'none'}{suggest(name, sources)}"
                 yield f"reads: expected a sensor or an estimator called {name}, {known}"
+            elif (other := next((n for n, _, each in self.chosen if each is found), "")) != "":
+                yield f"reads: expected each once, found {found.source} as {other} and as {name}"
             else:
                 self.chosen.append((name, _kind(found), found))
                 body = body or found.source.rpartition("/")[0]

@@ -307,6 +307,11 @@ def test_an_image_that_does_not_fit_is_the_callers_error(
         run.endpoint.send_frame(0, [image])
 
 
+def test_more_rows_than_fit_into_a_message_are_the_callers_error(run: Noted) -> None:
+    with pytest.raises(ValueError, match="expected at most 524287 rows in a message, found 524288"):
+        run.endpoint.send_input(0, 0, np.zeros(524_288, RECORDS["lidar_scan"]))
+
+
 def test_strided_images_arrive(run: Noted) -> None:
     whole = np.arange(12 * 16, dtype=np.uint8).reshape(12, 16)
     with Link("p", str(run.path)) as link:

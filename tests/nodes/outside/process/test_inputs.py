@@ -250,6 +250,7 @@ def test_without_images_poses_are_of_the_body(tmp_path: Path) -> None:
     [
         ({"asks": "sonar"}, "reads: expected a sensor or an estimator called sonar, found"),
         ({"asks": "imu", "reads": ["slam"]}, "called slam, found drone/imu"),
+        ({"asks": "imu", "reads": ["drone/imu"]}, "found drone/imu as drone/imu and as imu"),
         ({"asks": "imu", "calibration": "openvins"}, "calibration: expected a camera, found none"),
         ({"asks": "imu", "cpus": 4096}, "cpus: expected at most the"),
     ],
