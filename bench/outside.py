@@ -85,7 +85,7 @@ def measure_link(samples: int = 1000) -> list[LinkRow]:
 
         endpoint = Endpoint(
             path,
-            {"cameras": [{"body_from_camera": np.eye(4).tolist()}]},
+            {"cameras": [{"body_from_camera": np.eye(4).tolist()}], "inputs": [], "outputs": []},
             slots=2,
             slot_bytes=colours.nbytes + depth.nbytes,
             answered=take,
