@@ -185,14 +185,16 @@ def describe(
         clock: ``kind`` of the run's clock (``lockstep`` or ``real``), and what else is known.
         outputs: Names of the further outputs.
     """
-    given = [{"name": n, "kind": kind, **_sensor(of, "body_from_sensor")} for n, kind, of in inputs]
     return {
         "clock": dict(clock),
         "cameras": [
             {**_sensor(camera, "body_from_camera"), "images": list(kinds)}
             for camera, kinds in cameras
         ],
-        "inputs": given,
+        "inputs": [
+            {"name": name, "kind": kind, **_sensor(announced, "body_from_sensor")}
+            for name, kind, announced in inputs
+        ],
         "outputs": [*outputs],
     }
 

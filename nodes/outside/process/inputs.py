@@ -37,26 +37,14 @@ from runtime.errors import suggest
 MOST_BYTES = 64 << 20
 """Most bytes waiting for the next frame; beyond, the oldest are dropped."""
 
-_ROWS = 1000
-"""Most rows of a message that grows."""
-
 
 class Sensor(NamedTuple):
-    """A kind of sensor: its announcement, and the kind of its rows."""
+    """A kind of sensor: its announcement, and the kind and fields of its rows."""
 
     announced: type[Announcement]
     kind: str
-
-
-SENSORS: dict[str, Sensor] = {
-    "imu": Sensor(ImuAnnouncement, "imu"),
-    "barometer": Sensor(BarometerAnnouncement, "fluid_pressure"),
-    "magnetometer": Sensor(MagnetometerAnnouncement, "magnetic_field"),
-    "gnss": Sensor(NavSatAnnouncement, "nav_sat_fix"),
-    "range": Sensor(RangeAnnouncement, "range"),
-    "lidar": Sensor(LidarAnnouncement, "lidar_scan"),
-}
-"""Kinds of sensor by their names in the setting ``reads``."""
+    event: type[Event]
+    fields: Callable[[Any], tuple[Any, ...]]
 
 
 def _fix(event: NavSatFix) -> tuple[Any, ...]:
@@ -65,13 +53,28 @@ def _fix(event: NavSatFix) -> tuple[Any, ...]:
     return (*place, event.velocity, covariance, event.status)
 
 
-_FIELDS: dict[type[Event], tuple[str, Callable[[Any], tuple[Any, ...]]]] = {
-    Imu: ("imu", lambda event: (event.angular_velocity, event.linear_acceleration)),
-    FluidPressure: ("fluid_pressure", lambda event: (event.fluid_pressure, event.variance)),
-    MagneticField: ("magnetic_field", lambda event: (event.magnetic_field,)),
-    NavSatFix: ("nav_sat_fix", _fix),
-    Range: ("range", lambda event: (event.range, event.min_range, event.max_range)),
+SENSORS = {
+    "imu": Sensor(
+        ImuAnnouncement, "imu", Imu, lambda e: (e.angular_velocity, e.linear_acceleration)
+    ),
+    "barometer": Sensor(
+        BarometerAnnouncement,
+        "fluid_pressure",
+        FluidPressure,
+        lambda e: (e.fluid_pressure, e.variance),
+    ),
+    "magnetometer": Sensor(
+        MagnetometerAnnouncement, "magnetic_field", MagneticField, lambda e: (e.magnetic_field,)
+    ),
+    "gnss": Sensor(NavSatAnnouncement, "nav_sat_fix", NavSatFix, _fix),
+    "range": Sensor(
+        RangeAnnouncement, "range", Range, lambda e: (e.range, e.min_range, e.max_range)
+    ),
+    "lidar": Sensor(LidarAnnouncement, "lidar_scan", LidarScan, tuple),  # see `_points`
 }
+"""Kinds of sensor by their names in the setting ``reads``."""
+
+_BY_EVENT = {sensor.event: sensor for sensor in SENSORS.values()}
 
 
 def _points(scan: LidarScan) -> npt.NDArray[Any]:
@@ -182,10 +185,10 @@ class Inputs:
             return _points(event)
         if isinstance(event, PoseEstimate | TrackingLost):
             return self._estimate(event)
-        own, fields = _FIELDS.get(type(event), ("", None))
-        if fields is None or own != kind:
+        sensor = _BY_EVENT.get(type(event))
+        if sensor is None or sensor.kind != kind:
             return None
-        return np.array([(event.stamp, *fields(event))], RECORDS[kind])
+        return np.array([(event.stamp, *sensor.fields(event))], RECORDS[kind])
 
     def _estimate(self, event: PoseEstimate | TrackingLost) -> npt.NDArray[Any]:
         frames = self._frames.setdefault(event.source, [])

@@ -38,11 +38,7 @@ def example(
 
     The schema of configuration files is written beside it, for editors that complete and check.
     """
-    import re
-    import shutil
-
-    from runtime.errors import CommandError, ConfigError, suggest
-    from runtime.tools.cli.inspect import schema
+    from runtime.errors import ConfigError, suggest
 
     examples = example_files()
     if name is None:
@@ -53,20 +49,7 @@ def example(
         raise ConfigError(
             f"expected the name of an example, found {name!r}{suggest(name, examples)}"
         )
-    files = [examples[name], *_read_by(examples[name])]
-    targets = [out / file.name for file in files]
-    if existing := [target for target in targets if target.exists()]:
-        raise CommandError(f"{existing[0]}: expected no file of this name, found one")
-    out.mkdir(parents=True, exist_ok=True)
-    for file, target in zip(files, targets, strict=True):
-        (shutil.copytree if file.is_dir() else shutil.copyfile)(file, target)
-        if file.suffix == ".toml":
-            text = file.read_text(encoding="utf-8")
-            target.write_text(
-                re.sub(r"\A#:schema .*", f"#:schema {SCHEMA}", text), encoding="utf-8"
-            )
-        print(target)
-    schema(out / SCHEMA)  # of the nodes installed now: one from before is replaced
+    _copy(examples[name], out, {})
 
 
 class Language(enum.StrEnum):
@@ -91,7 +74,6 @@ def new_estimator(
     import re
 
     from runtime.errors import CommandError
-    from runtime.tools.cli.inspect import schema
 
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise CommandError(f"expected a name of small letters, digits and _, found {name!r}")
@@ -107,29 +89,42 @@ def new_estimator(
         },
         Language.ROS2: {"outside_ros2": name},
     }[language]
-    example = example_files()[next(iter(words))]
-    listed = [example, *_read_by(example)]
-    files = [
-        each for file in listed for each in (sorted(file.iterdir()) if file.is_dir() else [file])
-    ]
+    words["examples/"] = ""
+    copied = _copy(example_files()[next(iter(words))], out, words)
+    print(f"try: python -m runtime run {copied}")
+
+
+def _copy(example: Path, out: Path, words: dict[str, str]) -> Path:
+    """Copy an example with all that it reads, and the schema; return the copy.
+
+    Args:
+        words: Replaced in names and texts.
+    """
+    import re
+
+    from runtime.errors import CommandError
+    from runtime.tools.cli.inspect import schema
 
     def renamed(text: str) -> str:
         for word, other in words.items():
             text = text.replace(word, other)
         return text
 
+    listed = [example, *_read_by(example)]
+    files = [each for file in listed for each in (file, *sorted(file.rglob("*"))) if each.is_file()]
     targets = [out / renamed(str(file.relative_to(example.parent))) for file in files]
-    for target in targets:
-        if target.exists():
-            raise CommandError(f"{target}: expected no file of this name, found one")
+    if existing := [target for target in targets if target.exists()]:
+        raise CommandError(f"{existing[0]}: expected no file of this name, found one")
     for file, target in zip(files, targets, strict=True):
         target.parent.mkdir(parents=True, exist_ok=True)
-        text = renamed(file.read_text(encoding="utf-8")).replace("examples/", "")
-        text = re.sub(r"\A#:schema .*", f"#:schema {SCHEMA}", text)
-        target.write_text(text, encoding="utf-8")
+        data = file.read_bytes()
+        if words or file.suffix == ".toml":
+            text = re.sub(r"\A#:schema .*", f"#:schema {SCHEMA}", renamed(data.decode()))
+            data = text.encode()
+        target.write_bytes(data)
         print(target)
-    schema(out / SCHEMA)
-    print(f"try: python -m runtime run {targets[0]}")
+    schema(out / SCHEMA)  # of the nodes installed now: one from before is replaced
+    return targets[0]
 
 
 def example_files() -> dict[str, Path]:
