@@ -57,10 +57,9 @@ class FreeCameraConfig(SimulatorConfig):
 class FreeCamera(Simulator[FreeCameraConfig]):
     """Cameras moved by set-points or a trajectory file, without vehicle and physics.
 
-    In a run with vehicles, the cameras share their world and see them.
-
-    The odometry's twist is that of the trajectory, or of the velocity set-point; at a row of the
-    file, where two straight lines meet, the mean of both; after a jump to a pose, zero.
+    In a run with vehicles, the cameras share their world and see them. The odometry's twist is that
+    of the trajectory, or of the velocity set-point; at a row of the file, where two straight lines
+    meet, the mean of both; after a jump to a pose, zero.
     """
 
     alone = True

@@ -89,10 +89,9 @@ class Multirotor(Simulator[MultirotorConfig]):
     """A quadrotor with cameras, an IMU and ground truth, in a MuJoCo world.
 
     It obeys commands (`Arm`, `Takeoff`, `Hover`, `Land`, `Disarm`), and follows set-points of
-    position, velocity, attitude, body rates or motors while it flies. `Teleport` and `Reset` put
-    it somewhere at once. Ground truth is sent as `odometry` and `camera_poses`, without noise.
-
-    Several are in one world: they collide, see one another, and obey what names them.
+    position, velocity, attitude, body rates or motors while it flies. `Teleport` and `Reset` put it
+    somewhere at once. Ground truth is sent as `odometry` and `camera_poses`, without noise. Several
+    are in one world: they collide, see one another, and obey what names them.
     """
 
     imu = Output(Imu)

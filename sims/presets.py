@@ -1,10 +1,9 @@
 """Presets of real sensors: settings by name, for `imu`, `cameras`, `depth_sensor` and `lidars`.
 
 Each figure has its source above it; *estimate* marks those that no source gives. Who adds a sensor
-adds a row here: the listing of nodes, the schema and the tests read these tables.
-
-A preset is the sensor, not its use: mounting, exposure times, latencies, and the rate of an IMU,
-which is its driver's choice, are left to the file.
+adds a row here: the listing of nodes, the schema and the tests read these tables. A preset is the
+sensor, not its use: mounting, exposure times, latencies, and the rate of an IMU, which is its
+driver's choice, are left to the file.
 """
 
 from __future__ import annotations

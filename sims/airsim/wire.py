@@ -1,10 +1,9 @@
 """AirSim's msgpack-rpc and structures: bytes to messages and back. No sockets.
 
-A connection carries msgpack objects one after another, without frames: a request is
-``[0, id, "method", [arguments]]``, its reply ``[1, id, error, result]``. Source: the specification
-of msgpack-rpc (https://github.com/msgpack-rpc/msgpack-rpc) and rpclib, which AirSim uses.
-
-Structures are maps by these names. Source: AirLib's ``api/RpcLibAdaptorsBase.hpp`` and
+A connection carries msgpack objects one after another, without frames: a request is ``[0, id,
+"method", [arguments]]``, its reply ``[1, id, error, result]``. Source: the specification of
+msgpack-rpc (https://github.com/msgpack-rpc/msgpack-rpc) and rpclib, which AirSim uses. Structures
+are maps by these names. Source: AirLib's ``api/RpcLibAdaptorsBase.hpp`` and
 ``vehicles/multirotor/api`` in AirSim 1.8.1. Unknown keys of incoming maps are ignored, missing ones
 keep these defaults. Units are SI; frames are NED and FRD. Numbers may be NaN, which often means
 "keep".

@@ -2,13 +2,12 @@
 
 The grey levels that MuJoCo draws are taken to be sRGB's (IEC 61966-2-1), and their white to be the
 light that fills a pixel at the reference exposure. Light beyond it was cut off in drawing, so a
-short exposure darkens the image, but brings no overexposed surface back.
-
-Depth is measured as sensors do, by triangulation, with what they cannot see left out:
-K. Khoshelham, S. O. Elberink, "Accuracy and Resolution of Kinect Depth Data", Sensors 2012 (noise
-of disparity, eq. 9); A. Handa et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction
-and SLAM", ICRA 2014 (noise of disparity before it is rounded); A. Grunnet-Jepsen et al.,
-"Best-Known-Methods for Tuning Intel RealSense D400 Depth Cameras", 2018 (invalid band, range).
+short exposure darkens the image, but brings no overexposed surface back. Depth is measured as
+sensors do, by triangulation, with what they cannot see left out: K. Khoshelham, S. O. Elberink,
+"Accuracy and Resolution of Kinect Depth Data", Sensors 2012 (noise of disparity, eq. 9); A. Handa
+et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014 (noise of
+disparity before it is rounded); A. Grunnet-Jepsen et al., "Best-Known-Methods for Tuning Intel
+RealSense D400 Depth Cameras", 2018 (invalid band, range).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Cameras: settings, announcements and mounting in a model.
 
-No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.spec`, the vehicles).
-
-A camera without a vehicle: its state is a pose, and nothing moves it but the user.
+No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.spec`, the vehicles). A
+camera without a vehicle: its state is a pose, and nothing moves it but the user.
 """
 
 from __future__ import annotations

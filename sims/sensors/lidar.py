@@ -47,8 +47,7 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         rate: Turns per second (AirSim: ``RotationsPerSecond``).
         pattern: ``spinning``: rings, column by column, clockwise seen from above. ``solid_state``:
             a rosette in the field of view that does not repeat, as two turning prisms draw it.
-        channels: Rays that are sent at a time, the uppermost first (AirSim:
-            ``NumberOfChannels``).
+        channels: Rays that are sent at a time, the uppermost first (AirSim: ``NumberOfChannels``).
         columns: Times in a turn at which they are sent.
         azimuths: First and last direction, degrees clockwise from ahead (AirSim:
             ``HorizontalFOVStart`` and ``End``). A spinning lidar is blind for the rest of the turn.

@@ -19,10 +19,8 @@ each update.
     (all)       Disarm, Reset           DISARMED      Disarmed
 
 Disarm stops the motors in every phase, in the air too. Whoever flies and is teleported holds the
-place where it is then.
-
-Whether places and paths are free is checked in the world before a run; they are metres NED, of the
-origin of ``base_link``.
+place where it is then. Whether places and paths are free is checked in the world before a run; they
+are metres NED, of the origin of ``base_link``.
 """
 
 from __future__ import annotations

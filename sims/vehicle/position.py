@@ -1,9 +1,8 @@
 """The outer loops: from position or velocity to attitude and thrust.
 
 Position P with feed-forward → velocity PID → acceleration → thrust vector and yaw → attitude, in
-NED and all in floats. How the attitude is reached is in `attitude`.
-
-Settings of the controller: gains of the cascade and limits of the flight.
+NED and all in floats. How the attitude is reached is in `attitude`. Settings of the controller:
+gains of the cascade and limits of the flight.
 """
 
 from __future__ import annotations

@@ -104,16 +104,15 @@ class Named:
 def rpc(name: str, *, cosys: int | None = None) -> Callable[[F], F]:
     """Mark a function of a group as the handler of a method.
 
-    Its parameters are converted as annotated (whole numbers to floats; maps to structures; names
-    to what has them). One that is annotated with `Caller` gets the client and is no argument.
-    Defaults stand for arguments that one of the flavours does not have.
-
-    What a handler does before its first wait is done when it is called, in the order in which
-    the requests came: one that waits is a plain function that returns an awaitable.
+    Its parameters are converted as annotated (whole numbers to floats; maps to structures; names to
+    what has them). One that is annotated with `Caller` gets the client and is no argument. Defaults
+    stand for arguments that one of the flavours does not have. What a handler does before its first
+    wait is done when it is called, in the order in which the requests came: one that waits is a
+    plain function that returns an awaitable.
 
     Args:
-        cosys: Number of arguments of Cosys-AirSim's clients, if it is another than AirSim's; a
-            call then tells whose client it is.
+        cosys: Number of arguments of Cosys-AirSim's clients, if it is another than AirSim's; a call
+            then tells whose client it is.
     """
 
     def mark(function: F) -> F:

@@ -63,20 +63,19 @@ class AirsimServerConfig(NodeConfig):
     """Settings of the server.
 
     Attributes:
-        host: Address to listen on; ``0.0.0.0`` for all of this machine's. Whoever can connect
-            can fly.
+        host: Address to listen on; ``0.0.0.0`` for all of this machine's. Whoever can connect can
+            fly.
         port: Port to listen on; 0 for any that is free.
         connections: Clients that may be connected at once.
-        flavour: Whose clients call: ``airsim`` (1.8.1, and Colosseum's) or ``cosys``
-            (Cosys-AirSim 3.5). They differ in the colours' order, among others.
+        flavour: Whose clients call: ``airsim`` (1.8.1, and Colosseum's) or ``cosys`` (Cosys-AirSim
+            3.5). They differ in the colours' order, among others.
         time: ``running``: time runs, at the run's `speed`. ``paused``: it stands from the start,
-            and a script steps it. ``awaited``: it runs only while a vehicle does what a client
-            has told it to. With the last two, a script whose only waiting is for replies gives
-            equal runs; with ``awaited``, if it waits for each task before it asks for anything.
+            and a script steps it. ``awaited``: it runs only while a vehicle does what a client has
+            told it to. With the last two, a script whose only waiting is for replies gives equal
+            runs; with ``awaited``, if it waits for each task before it asks for anything.
         default_vehicle: Name of the vehicle that an empty name stands for; empty for the first by
             name.
-        abandoned: Real time after which the run ends if time stands since the last client has
-            left.
+        abandoned: Real time after which the run ends if time stands since the last client has left.
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.
         estimators: Estimators in clients' scripts, whose poses are judged.
         settings: The settings.json that clients get when they ask for it: its text, or a file;
@@ -89,8 +88,8 @@ class AirsimServerConfig(NodeConfig):
         recording: What `startRecording` records.
         sensor_names: Names of vehicles' sensors by those by which scripts call them.
         objects: Objects that clients can bring into the world, and take out again.
-        movable: Regular expressions: the geoms and bodies of the world, by their whole names,
-            that clients can move.
+        movable: Regular expressions: the geoms and bodies of the world, by their whole names, that
+            clients can move.
     """
 
     host: str = "127.0.0.1"
