@@ -1,8 +1,4 @@
-"""Computer-vision mode: a free camera in a world, with no vehicle and no physics.
-
-For calibration and fast data sets. The camera jumps to pose set-points, moves with velocity
-set-points, or follows a trajectory file; each update gives one set of images.
-"""
+"""Computer-vision mode: a free camera in a world, with no vehicle and no physics."""
 
 from __future__ import annotations
 
@@ -217,12 +213,7 @@ def read_tum(path: Path) -> npt.NDArray[np.float64]:
 
 
 def pose_at(rows: npt.NDArray[np.float64], seconds: float) -> tuple[Vector3, Quaternion]:
-    """Return a trajectory's pose at a time: positions linear, orientations by slerp.
-
-    Args:
-        rows: As from `read_tum`.
-        seconds: Since the first row.
-    """
+    """Return a trajectory's (`read_tum`) pose seconds after its first row, by line and slerp."""
     after = int(np.clip(np.searchsorted(rows[:, 0], seconds), 1, len(rows) - 1))
     a, b = rows[after - 1], rows[after]
     share = (seconds - a[0]) / (b[0] - a[0])
@@ -241,5 +232,4 @@ def pose_at(rows: npt.NDArray[np.float64], seconds: float) -> tuple[Vector3, Qua
 
 
 def _at_rate(config: FreeCameraConfig) -> tuple[CameraSpec, ...]:
-    """Return the cameras, all at the rate of the updates."""
     return tuple(msgspec.structs.replace(c, rate=config.rate) for c in config.cameras)

@@ -1,7 +1,4 @@
-"""A simulated multirotor as a node: its inputs, outputs and timing.
-
-Physics and control are pure modules in `sims.vehicle`; cameras are in `sims.cameras`.
-"""
+"""A simulated multirotor as a node: its inputs, outputs and timing."""
 
 from __future__ import annotations
 
@@ -186,7 +183,6 @@ class Multirotor(Simulator[MultirotorConfig]):
                 )
 
     def _is_tied(self, camera: CameraSpec) -> bool:
-        """Return whether samples of the IMU trigger a camera."""
         periods = self.config.imu_rate / camera.rate
         whole = round(periods) > 0 and math.isclose(periods, round(periods))
         return self.config.trigger == "imu" and whole
@@ -225,10 +221,7 @@ class Multirotor(Simulator[MultirotorConfig]):
 
     @on(Setpoint)
     def setpoints(self, event: Setpoint) -> None:
-        """Follow a set-point for this vehicle, or log the reason for refusal.
-
-        Each reason in a row is logged once.
-        """
+        """Follow a set-point for this vehicle, or log a reason for refusal, each in a row once."""
         if not self._is_for_this(event, "setpoints"):
             return
         reason = self._autopilot.command(event) or ""
@@ -237,7 +230,6 @@ class Multirotor(Simulator[MultirotorConfig]):
         self._refused = reason
 
     def _jump(self, order: Command) -> str:
-        """Be somewhere else at once, or return why not."""
         physics, suite = self._physics, self._suite
         physics.advance_to(self.clock.now())
         if isinstance(order, Teleport):
@@ -303,14 +295,12 @@ class Multirotor(Simulator[MultirotorConfig]):
     def _advance(self, tick: Tick) -> int:
         """Step the physics up to a tick, and return the stamp of the state then.
 
-        That is the tick's stamp, or that of the physics if a later tick has been served before, as
-        may happen in real time.
+        It is later than the tick's if a later one has been served before, as in real time.
         """
         self._physics.advance_to(tick.stamp)
         return max(tick.stamp, self._physics.time_ns)
 
     def _send_odometry(self, stamp: int, state: State) -> None:
-        """Send the ground truth of a stamp, once."""
         if stamp <= self._odometry_stamp:
             return
         self._odometry_stamp = stamp
@@ -351,5 +341,4 @@ def start_of(config: MultirotorConfig) -> Vector3:
 
 
 def _stands_on(contact: Contact) -> bool:
-    """Return whether a contact is upwards and gentle, as of feet on the ground."""
     return contact.normal[2] < -0.7 and contact.speed < 1.0

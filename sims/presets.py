@@ -18,7 +18,6 @@ _G = 9.80665
 
 
 def _imu(gyroscope: tuple[float, ...], accelerometer: tuple[float, ...]) -> Preset:
-    """Return noise density, random walk, standard deviation of the bias, range and resolution."""
     names = ("noise_density", "random_walk", "turn_on_bias", "range", "resolution")
     both = {"gyroscope": gyroscope, "accelerometer": accelerometer}
     return {f"{one}_{n}": v for one, row in both.items() for n, v in zip(names, row, strict=True)}
@@ -67,7 +66,6 @@ DEPTH_SENSORS: dict[str, Preset] = {
 
 
 def _camera(kinds: tuple[str, ...], width: int, height: int, rate: float, **more: Any) -> Preset:
-    """Return a camera with noise of its own, which is an estimate for all."""
     return {"images": kinds, "width": width, "height": height, "rate": rate, "noise": 2.0, **more}
 
 

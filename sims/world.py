@@ -133,10 +133,7 @@ class SharedWorld:
         return self.simulation.history.at(stamp_ns)[0].copy()
 
     def set_wind(self, velocity: Vector3) -> None:
-        """Set the mean wind, m/s NED, from the next millisecond on; gusts and turbulence stay.
-
-        Without vehicles it blows on nothing.
-        """
+        """Set the mean wind for vehicles, m/s NED, from the next millisecond on; gusts stay."""
         if self.simulation is not None and self.air is None:
             random = np.random.default_rng([self._seed, *b"wind"])
             self.air = Air(self.model, WindSpec(), self.vehicles, random)

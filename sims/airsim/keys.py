@@ -1,7 +1,4 @@
-"""Reading of settings.json: its text, and typed access to its objects.
-
-What is not known, or has no effect, is noted on the way.
-"""
+"""Reading of settings.json: its text, typed access, and notes on keys without effect."""
 
 from __future__ import annotations
 
@@ -145,10 +142,7 @@ class Keys:
         return [self.number(key, default) for key in keys.split()]
 
     def mount(self, position: Vector3 = ZERO, orientation: Vector3 = ZERO) -> dict[str, Any]:
-        """Return `position` and `orientation` as our cameras and sensors have them, if given.
-
-        The arguments are what is taken of X, Y, Z, and of Roll, Pitch, Yaw, that are not given.
-        """
+        """Return our `position` and `orientation`; the arguments replace missing numbers."""
         found: dict[str, Any] = {}
         places = (("position", "X Y Z", position), ("orientation", "Roll Pitch Yaw", orientation))
         for ours, keys, usual in places:
@@ -216,5 +210,4 @@ class Keys:
 
 
 def _printable(line: str) -> str:
-    """Return a line with unprintable characters, such as line breaks, escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)

@@ -185,7 +185,6 @@ def _vehicles(keys: Keys, mode: str, world: str, server: Table) -> list[Table]:
 
 
 def _is_camera(vehicle: Keys, mode: str) -> bool:
-    """Return whether a vehicle is a camera of the computer-vision mode."""
     type_ = vehicle.text("VehicleType", _CAMERA if mode == _CAMERA else "")
     if (folded := type_.casefold()) not in {_CAMERA.casefold(), _DRONE.casefold()}:
         reason = f": {_REFUSED[folded]}" if folded in _REFUSED else ""
@@ -343,8 +342,6 @@ def _sensor(keys: Keys, type_: int) -> dict[str, Any]:
 
 
 def _imu(keys: Keys) -> dict[str, Any]:
-    """Return the IMU's noise densities, and random walks from bias stability and its time."""
-
     def density(key: str, default: float) -> float:
         return abs(keys.number(key, default))
 

@@ -236,7 +236,6 @@ class Development:
         return defocused(light, self._spec.blur)
 
     def _make_table(self, itemsize: int, factor: float, root: bool) -> Image | Codes:
-        """Return the lookup table from light to codes of its root, or to grey levels."""
         light = factor * (srgb_light() if itemsize == 1 else np.arange(65536) / _LINEAR)
         if root:
             return np.minimum(np.rint(np.sqrt(light) * _ROOT), 65535).astype(np.uint16)[None]
@@ -260,7 +259,6 @@ class Development:
         return np.asarray(cv2.LUT(root, self._levels(sigma)), np.uint8)
 
     def _make_levels(self, sigma: float) -> Image:
-        """Return the grey level of each code of a noisy root."""
         root = np.arange(65536) / _ROOT
         return self._grey_levels(np.maximum(root * root - sigma * sigma, 0.0))
 

@@ -24,10 +24,8 @@ ONE_FACE = math.radians(61.0)
 """Largest angle off the axis for a single face, radians; beyond, too many pixels."""
 
 FINER = 1.3
-"""Face pixels per image pixel, where the image is sharpest."""
 
 MARGIN = 3
-"""Margin of a face around its looked-up area, pixels."""
 
 LARGEST = 8192
 """Pixels of a face's side, at most."""
@@ -37,15 +35,15 @@ class Face(NamedTuple):
     """Pinhole drawing for a camera's image.
 
     Attributes:
-        turn: Its axes (right, down, ahead) in the optical frame, shape (3, 3), one in each row.
+        turn: Its axes (right, down, ahead) in the optical frame, shape (3, 3), a row each.
         left: Coordinate x/z of the left edge of the first column, in the face's axes.
         top: Coordinate y/z of the upper edge of the first row.
         pitch: Width and height of a pixel, in these coordinates.
-        columns: Column of the face on which each pixel of the image falls, shape (h, w); None if
-            the face is the image.
-        mask: The pixels that fall on this face, shape (h, w).
-        steepness: Planar depth in the optical frame for a planar depth of 1 in the face, shape
-            (h, w); ``inf`` where it would not be positive. None if it is 1.
+        columns: Column of the face for each pixel of the image, shape (h, w); None if they are
+            equal.
+        mask: Pixels on this face, shape (h, w).
+        steepness: Planar depth in the optical frame for a planar depth of 1 in the face, shape (h,
+            w); ``inf`` where it would not be positive. None if it is 1.
     """
 
     turn: Floats

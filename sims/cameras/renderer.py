@@ -74,10 +74,7 @@ class Shot(NamedTuple):
         return self.qvel is not None or self.motion is not None
 
     def state(self, model: Any, seconds: float) -> Floats:
-        """Return the generalised positions some seconds after the stamp, shape (nq,).
-
-        Between two known states the velocity is constant, as `mj_integratePos` understands it.
-        """
+        """Return the generalised positions some seconds after the stamp, shape (nq,)."""
         if seconds == 0.0 or not self.moves():
             return self.qpos
         if self.motion is None:
@@ -345,12 +342,10 @@ class CameraRenderer:
         return msgspec.structs.replace(frame, undistorted=twin)
 
     def _look(self, shot: Shot, spec: CameraSpec, number: int, seconds: float) -> None:
-        """Set up the scene for a camera, some seconds after an exposure's stamp."""
         state = shot.state(self._model, seconds)
         self._stage.look(number, state, shot.stamp * 1e-9 + seconds, spec.light)
 
     def _pose(self, shot: Shot, number: int, seconds: float) -> Pose:
-        """Return where a camera is some seconds after an exposure's stamp."""
         self._stage.move(shot.state(self._model, seconds))
         return self._stage.pose(number)
 
@@ -367,7 +362,6 @@ class CameraRenderer:
 
 
 def _number(model: Any, name: str) -> int:
-    """Return the number of a model's camera."""
     number: int = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
     if number < 0:
         known = ", ".join(model.camera(i).name for i in range(model.ncam))

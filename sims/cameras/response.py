@@ -141,9 +141,8 @@ def noisy_depth(
 ) -> npt.NDArray[np.float32]:
     """Return depth (metres) plus Gaussian noise with sigma = coefficient · depth².
 
-    The error of a triangulating sensor grows so (Khoshelham and Elberink, "Accuracy and
-    Resolution of Kinect Depth Data", Sensors 2012, eq. 9). What was not hit stays ``inf``, and
-    nothing comes closer than zero.
+    Source: Khoshelham and Elberink, Sensors 2012, eq. 9. ``inf`` stays; nothing is nearer than
+    zero.
     """
     if coefficient <= 0.0:
         return depth
@@ -175,7 +174,6 @@ def _draw(shape: tuple[int, ...], random: np.random.Generator) -> npt.NDArray[np
 
 
 def _look_up(table: npt.NDArray[N], places: npt.NDArray[np.uint16]) -> npt.NDArray[N]:
-    """Return the table's entries at some places, shape as theirs."""
     if _TABLES_OF_16_BITS:  # the same in half the time
         return np.asarray(cv2.LUT(places, table.reshape(1, -1)))
     return np.take(table, places)
@@ -190,7 +188,6 @@ def _quantiles() -> npt.NDArray[np.float32]:
 
 @functools.lru_cache(maxsize=16)
 def _steps(sigma: float, limit: int) -> npt.NDArray[np.int16]:
-    """Return the same, times sigma, in whole numbers up to a limit."""
     levels = np.clip(np.rint(sigma * _quantiles()), -limit, limit)
     return np.asarray(levels, dtype=np.int16)
 

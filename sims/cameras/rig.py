@@ -1,7 +1,4 @@
-"""Cameras of a vehicle: image events from physics states, rendered beside the event loop.
-
-Used by the nodes of `sims`; the drawing itself is in `sims.cameras.renderer`.
-"""
+"""Cameras of a vehicle: image events from physics states, rendered beside the event loop."""
 
 from __future__ import annotations
 
@@ -329,12 +326,10 @@ def _ns(seconds: float) -> int:
 
 
 def _spans(spec: CameraSpec) -> bool:
-    """Return whether an entry's rows and eyes are exposed at several times."""
     return bool(spec.readout or spec.offset)
 
 
 def _in_motion(spec: CameraSpec, shots: tuple[Shot, ...], states: States) -> tuple[Shot, ...]:
-    """Return the shots of an entry's eyes, each at its time, with the true states meanwhile."""
     begin = shots[0].stamp - _ns(spec.half)
     end = shots[0].stamp + _ns(spec.half + spec.offset)
     times = [begin, *range(begin - begin % STEP + STEP, end, STEP), end]

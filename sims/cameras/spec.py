@@ -1,7 +1,6 @@
-"""Cameras: settings, announcements and mounting in a model.
+"""Cameras: settings, announcements and mounting in a model, also without a vehicle.
 
-No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.spec`, the vehicles). A
-camera without a vehicle: its state is a pose, and nothing moves it but the user.
+A camera without a vehicle is a body whose pose nothing changes but the user.
 """
 
 from __future__ import annotations
@@ -374,7 +373,6 @@ def announcement(
 
 
 def _depth_truth(spec: CameraSpec) -> dict[str, Any]:
-    """Return the announced depth errors: noise, steps and limits."""
     sensor = spec.depth_sensor
     if sensor is None:
         return {"depth_noise": spec.depth_noise}
@@ -388,10 +386,7 @@ def _depth_truth(spec: CameraSpec) -> dict[str, Any]:
 
 
 def vertical_fov(spec: CameraSpec) -> float:
-    """Return the vertical field of view for MuJoCo's camera, degrees.
-
-    It has no effect on a camera with frames of its own (`sims.cameras.view`).
-    """
+    """Return MuJoCo's vertical field of view, degrees; no effect on a view with its own frames."""
     if not is_plain(spec):
         return 90.0
     half = math.tan(math.radians(spec.fov) / 2.0) * spec.height / spec.width

@@ -70,10 +70,7 @@ def gl_renderer() -> str:
 
 
 def set_fog(start: float, end: float) -> None:
-    """Set start and end distance (metres) of the fog in the current context.
-
-    MuJoCo sets them once, when a model enters a context.
-    """
+    """Set start and end (metres) of the present context's fog; MuJoCo sets them only once."""
     gl = importlib.import_module("OpenGL.GL")
     gl.glFogf(gl.GL_FOG_START, start)
     gl.glFogf(gl.GL_FOG_END, end)
@@ -189,11 +186,8 @@ class Stage:
         """Replace the camera's own view frame until the next `look`.
 
         Args:
-            turn: Axes of the view (right, down, ahead) in the camera's optical frame, shape (3, 3).
-            left: The edges of the image, as coordinates x/z and y/z in these axes.
-            right: See `left`.
-            top: See `left`.
-            bottom: See `left`.
+            turn: Axes of the view (right, down, ahead) in the optical frame, shape (3, 3). The
+                other arguments are the image's edges, as coordinates x/z and y/z in these axes.
         """
         if self._axes is None:
             own = self._scene.camera[0]
@@ -260,12 +254,7 @@ class Stage:
     def _draw(
         self, size: Size, rgb: Colours | None, depth: Depths | None, plain: bool = False
     ) -> None:
-        """Draw the geoms in view and read the image, from the bottom row upwards.
-
-        Args:
-            plain: Draw every object in a colour that is its number, without texture, lights and
-                sky: the same depth at less than half the cost.
-        """
+        """Draw and read an image, bottom row first; `plain`: each object's number as its colour."""
         self.model.geom_group[:] = np.where(self._in_view(size), self._groups, _OUT_OF_VIEW)
         scene, category = self._scene, mujoco.mjtCatBit.mjCAT_ALL
         scene.ngeom = 0
@@ -277,7 +266,6 @@ class Stage:
         mujoco.mjr_readPixels(rgb, depth, viewport, self._context)
 
     def _opaque(self) -> bool:
-        """Return whether all geoms are opaque: others hide nothing, but have numbers."""
         model = self.model
         return bool((model.geom_rgba[:, 3] >= 1.0).all() and (model.mat_rgba[:, 3] >= 1.0).all())
 
@@ -341,7 +329,6 @@ def _set_quality(model: Any, width: int, height: int) -> None:
 
 
 def _surfaces_only() -> Any:
-    """Return the options for textured geoms, without sites, tendons or arrows."""
     option = mujoco.MjvOption()
     option.flags[:] = 0
     option.flags[mujoco.mjtVisFlag.mjVIS_TEXTURE] = 1

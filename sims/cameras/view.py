@@ -18,10 +18,7 @@ from sims.cameras.stage import RANGE, Colours, Depths, Stage
 Numbers = npt.NDArray[np.int32]
 
 CREASE = 1e-3
-"""Least second difference of the inverse depth, as a share, between two surfaces.
-
-On a plane it is zero.
-"""
+"""Least second difference of the inverse depth, as a share, between two surfaces."""
 
 
 class Drawn(NamedTuple):
@@ -91,14 +88,10 @@ def stacked(pieces: list[Drawn]) -> Drawn:
 
 
 def looked_up(drawn: Drawn, columns: Maps, rows: Maps) -> Drawn:
-    """Return images whose pixels lie at other places of the ones given.
+    """Return images whose pixels lie at other places of the given ones, shape (h, w) each.
 
-    Colours are interpolated, numbers are the nearest pixel's. Of depth the inverse is
-    interpolated, since that is linear on any plane; where surfaces meet it is the nearest pixel's.
-
-    Args:
-        columns: Column of each pixel, shape (h, w); outside them if there is none.
-        rows: Row of each pixel.
+    Colours are interpolated, numbers are the nearest pixel's. Of depth the inverse, linear on any
+    plane, is interpolated; where surfaces meet it is the nearest pixel's.
     """
     colours, depth, numbers = drawn
     if colours is not None:
@@ -143,7 +136,6 @@ def _add(seen: Drawn, stage: Stage, face: Face, first: int, last: int) -> None:
 
 
 def _span(places: Maps, length: int) -> tuple[int, int]:
-    """Return the first pixel to draw, and the end of the range, for all places."""
     first, last = math.floor(places.min()) - MARGIN + 1, math.ceil(places.max()) + MARGIN
     return max(first, 0), min(last, length)
 

@@ -166,10 +166,7 @@ class ImuNoise:
         return (wx + ex, wy + ey, wz + ez), (ax + fx, ay + fy, az + fz)
 
     def errors(self, count: int) -> Floats:
-        """Return the errors of the next samples, rad/s and m/s², shape (count, 6).
-
-        They are drawn in blocks: `add` goes on after the last block that these have begun.
-        """
+        """Return errors of new samples, rad/s and m/s², shape (count, 6); ends `add`'s block."""
         blocks = []
         for _ in range(-(-count // _BLOCK)):
             self._draw()
@@ -267,7 +264,6 @@ class ImuModel:
         return ImuAnnouncement(**{**same, **special}, stamp=stamp, source=source)
 
     def _shake(self, rates: Vector3, force: Vector3, thrusts: Any) -> tuple[Vector3, Vector3]:
-        """Add the vibration of the rotors, and turn them on."""
         vibration = self.parameters.vibration
         share = np.clip(np.asarray(thrusts, dtype=np.float64), 0.0, None)
         speeds = vibration.rotor_speed * np.sqrt(share)

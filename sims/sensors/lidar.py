@@ -1,7 +1,4 @@
-"""Lidars: ray patterns, ray casting, and delivery of scans.
-
-MuJoCo casts the rays, in a worker process, each from where the sensor is at the ray's own time.
-"""
+"""Lidars: patterns, rays cast by a worker from where the sensor is then, and scans' delivery."""
 
 from __future__ import annotations
 
@@ -290,7 +287,6 @@ class Scanner:
         distances: Floats,
         returned: Floats,
     ) -> LidarScan:
-        """Return the scan for true distances; arrays of columns and channels."""
         intensities = np.clip(returned, 0.0, 1.0)
         intensities *= np.minimum(1.0, spec.full_range / np.maximum(distances, 1e-9)) ** 2
         valid = np.isfinite(distances) & (intensities >= spec.min_intensity)
@@ -321,10 +317,8 @@ def _unit(vectors: Floats) -> Floats:
 def _put_first(model: Any, met: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
     """Hide the world's own geoms not met by light from MuJoCo's ray casting.
 
-    For each ray it goes through all geoms of a body, the first `body_geomnum` of its own.
-
-    Returns:
-        The old number of each geom; names lead to the old ones still.
+    For each ray it goes through all geoms of a body, the first `body_geomnum` of its own. Returned
+    are the old numbers, to which names lead still.
     """
     order = np.arange(model.ngeom)
     world = np.flatnonzero(model.geom_bodyid == 0)
@@ -367,7 +361,6 @@ def reflectivities(model: Any) -> Floats:
 
 
 def _mean_of(model: Any, texture: int) -> Floats:
-    """Return the mean colour of a texture, from every sixteenth pixel."""
     channels = int(model.tex_nchannel[texture])
     size = int(model.tex_height[texture]) * int(model.tex_width[texture]) * channels
     begin = int(model.tex_adr[texture])
@@ -377,7 +370,6 @@ def _mean_of(model: Any, texture: int) -> Floats:
 
 
 def _looks(model: Any) -> list[tuple[int, int]]:
-    """Return pairs of geoms: a look, and its solid."""
     pairs = []
     for look in range(model.ngeom):
         name = model.geom(look).name
@@ -429,7 +421,6 @@ class LidarRig:
             self._node.every(lidar.spec.rate, functools.partial(self._turn, lidar), lidar.spec.name)
 
     def _turn(self, lidar: Lidar, tick: Tick) -> None:
-        """End the turn of the previous tick, and begin the next."""
         end = self._advance(tick)
         start = self._starts.get(lidar.source, end)
         self._starts[lidar.source] = end

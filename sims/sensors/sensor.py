@@ -56,7 +56,6 @@ class Truth(NamedTuple):
     """True state of a sensor's body at an instant."""
 
     stamp: int
-    """Nanoseconds."""
     position: Vector3
     """Metres NED."""
     orientation: Quaternion
@@ -71,9 +70,8 @@ class Place(NamedTuple):
     """Source, frame and geographic origin of a sensor."""
 
     source: str
-    """Of its measurements: ``drone/barometer``."""
+    """Source of its measurements: ``drone/barometer``."""
     parent_frame_id: str
-    """Frame of the body."""
     origin: tuple[float, float, float]
     """Latitude and longitude (degrees) and altitude (metres) of the origin of ``map``."""
 

@@ -293,7 +293,6 @@ class Autopilot:
                 self._controller.brake(state)
 
     def _take_off(self, state: State, dt: float) -> None:
-        """Move the place to be at up, gently at both ends."""
         acceleration = self._climb  # reaches the climb speed in a second
         self._speed = min(
             self._speed + acceleration * dt, self._climb, sqrt(2.0 * acceleration * self._to_climb)
@@ -386,7 +385,6 @@ class Clearance:
         return None if distance is None else distance - STANDING_HEIGHT
 
     def _ray(self, start: Vector3, way: Sequence[float]) -> tuple[int | None, float | None]:
-        """Return the first solid and its distance, metres."""
         length = math.hypot(*way)
         if length < 1e-6:
             return None, None

@@ -1,8 +1,4 @@
-"""MuJoCo model of the vehicle: attachment to a world, mass, motor limits.
-
-The numbers stand in ``vehicle.xml`` only; whoever needs them reads them from the compiled model
-with `read_parameters`. Stepping is in `physics`.
-"""
+"""MuJoCo model of the vehicle: attachment to a world, numbers of ``vehicle.xml``, motor limits."""
 
 from __future__ import annotations
 
@@ -90,14 +86,12 @@ class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def attach_vehicle(world: mujoco.MjSpec, name: str, position: Vector3, yaw: float) -> None:
-    """Put a vehicle into a world, and set the world's time step, gravity and air.
-
-    All names of the vehicle's parts get the prefix ``name/``.
+    """Put a vehicle, with names ``name/…``, into a world, and set time step, gravity and air.
 
     Args:
-        world: The world, in MuJoCo's axes read as NWU. Changed in place.
-        position: Initial position of ``base_link``, metres NED. Standing on flat ground at
-            z = 0 is (x, y, -`STANDING_HEIGHT`).
+        world: Changed in place; MuJoCo's axes are read as NWU.
+        position: Initial position of ``base_link``, metres NED. Standing on flat ground at z = 0 is
+            (x, y, -`STANDING_HEIGHT`).
         yaw: Initial heading, radians clockwise from north seen from above.
 
     Raises:
@@ -145,10 +139,7 @@ def read_parameters(model: mujoco.MjModel, name: str) -> VehicleParameters:
 
 
 def mover_of(model: mujoco.MjModel, geom: int) -> str:
-    """Return the name of a geom's vehicle or self-moving body.
-
-    Empty for a geom of neither: static, or moved by physics only.
-    """
+    """Return the name of a geom's vehicle or self-moving body; empty for a geom of neither."""
     root = int(model.body_rootid[model.geom_bodyid[geom]])
     name = str(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, root) or "")
     if model.body_mocapid[root] >= 0:

@@ -166,10 +166,7 @@ class Physics:
         return rotate_inverse(self._mounted, rates), rotate_inverse(self._mounted, force)
 
     def accelerations(self) -> tuple[Vector3, Vector3]:
-        """Return the true acceleration (m/s² NED) and angular acceleration (rad/s² FRD).
-
-        At rest both are zero: gravity is not in it, unlike in what an IMU feels.
-        """
+        """Return acceleration, m/s² NED, and angular acceleration, rad/s² FRD; zero at rest."""
         self.simulation.refresh()
         ax, ay, az, wx, wy, wz = self.data.qacc[self._of_twist].tolist()
         return (ax, -ay, -az), (wx, -wy, -wz)
@@ -257,10 +254,7 @@ class Physics:
         return Contact(other or f"geom {geom}", (x, -y, -z), (nx, -ny, -nz), closing, depth)
 
     def _velocity_at(self, body: int, point: Vector3) -> Vector3:
-        """Return the velocity (m/s, NWU) of a body's material at a point of the world.
-
-        That of a body which moves by itself is the one of its origin.
-        """
+        """Return the velocity, m/s NWU, of a body's material (or mocap origin) at a point."""
         mocap = int(self.model.body_mocapid[self.model.body_rootid[body]])
         if mocap >= 0:
             vx, vy, vz = self.simulation.mocap_velocities[mocap].tolist()
@@ -328,8 +322,6 @@ class Air:
 
 
 class _Felt:
-    """Wind and turbulence at a vehicle."""
-
     def __init__(self, model: Any, name: str, turbulence: Turbulence) -> None:
         self.wind: Vector3 = (0.0, 0.0, 0.0)
         self._turbulence = turbulence

@@ -104,11 +104,7 @@ _STILL = 0.2
 """Speed of a braking vehicle at the start of position hold, metres per second."""
 
 _LARGE = 0.5 * 0.5
-"""Square of the velocity error (m/s) at half the learning rate of the integrators.
-
-A large error says that a manoeuvre is under way, not that there is wind; learning from it would
-leave a slow tail after every step.
-"""
+"""Square of the velocity error (m/s) that halves the learning rate: a manoeuvre is no wind."""
 
 
 class PositionController:

@@ -17,11 +17,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class History:
-    """The states of a simulation's last milliseconds, as long a time as somebody has asked for.
-
-    Args:
-        simulation: The simulation, which calls `add` before each of its steps if `kept` is true.
-    """
+    """States of a simulation's last milliseconds, for as long as somebody has asked for."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
@@ -197,10 +193,7 @@ class Simulation:
         self._fresh = False
 
     def add_influence(self, influence: Influence) -> None:
-        """Apply an influence at each millisecond from the next on, after the others.
-
-        `reset` does not take it away.
-        """
+        """Apply an influence each millisecond from the next on, after others, `reset` or not."""
         self.influences += (influence,)
 
     def trial(self, seconds: float) -> Any:

@@ -36,9 +36,7 @@ WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {
     "night": night,
     "forest": forest,
 }
-"""Built-in worlds by name: functions of a seed and `bare`.
-
-A world with self-moving parts is a `Scene`.
+"""Built-in worlds by name: functions of a seed and `bare`; a `Scene` if parts move by themselves.
 """
 
 

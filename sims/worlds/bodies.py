@@ -180,20 +180,13 @@ def add_bodies(scene: Scene, node: str, specs: tuple[BodySpec, ...]) -> Dynamics
 
 
 def add_shape(scene: Scene, body: Any, kind: Kind, size: Vector3, colour: Vector3) -> None:
-    """Add the shape of a kind to a body: parts named after the body, and materials.
-
-    Args:
-        body: MuJoCo's body, with its origin in the middle of its foot.
-        colour: Red, green and blue, 0 to 1.
-    """
+    """Add a kind's parts and materials to a body, whose origin is the middle of its foot."""
     shape = _Shape(scene.spec, body, size, colour)
     for each in _shapes().iterfind(f"{kind}/*"):
         getattr(shape, each.tag)(each)
 
 
 class _Shape:
-    """Adds the parts of ``bodies.xml`` to a body."""
-
     def __init__(self, world: Any, body: Any, size: Vector3, colour: Vector3) -> None:
         self._world = world
         self._body = body
@@ -203,7 +196,6 @@ class _Shape:
         self._parts = 0
 
     def cloth(self, given: ET.Element) -> None:
-        """Add a material with small marks, as texture for cameras."""
         name = f"{self._name}/{given.get('name')}"
         shade = float(given.get("shade", 1.0))
         colour = _numbers(given, "rgb") or [shade * each for each in self._colour]
@@ -225,7 +217,6 @@ class _Shape:
         material.textures = textures
 
     def part(self, given: ET.Element) -> None:
-        """Add a primitive, solid and seen, of half lengths."""
         self._geom(
             given,
             type=_TYPES[given.attrib["type"]],
@@ -236,7 +227,6 @@ class _Shape:
         )
 
     def limb(self, given: ET.Element) -> None:
-        """Add a capsule between two places."""
         self._geom(
             given,
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,

@@ -86,7 +86,6 @@ class Builder:
         self.spec.visual.quality.offsamples = 0
 
     def _texture(self, name: str, draw: Draw, kind: Any) -> tuple[int, int]:
-        """Add a texture, and return its width and height, pixels."""
         random = own_generator(self._world, self._seed, name, self.random)
         if self._bare:
             image = np.zeros((6, 1, 3), np.uint8)  # as a skybox has it, which is six squares
@@ -100,12 +99,7 @@ class Builder:
     def material(
         self, name: str, draw: Draw, density: float, module: float = 0.0, glow: float = 0.0
     ) -> Material:
-        """Add a material drawn at `density` pixels per metre.
-
-        Args:
-            module: See `Material`.
-            glow: Light that it emits, 0..1.
-        """
+        """Add a material drawn at `density` pixels per metre, emitting light `glow`, 0 to 1."""
         width, height = self._texture(name, draw, mujoco.mjtTexture.mjTEXTURE_2D)
         material = self.spec.add_material(
             name=name, specular=0.05, shininess=0.1, reflectance=0.0, emission=glow
@@ -285,10 +279,7 @@ class Builder:
     def crate(
         self, name: str, material: Material, edge: float, place: Vector, turn: float | None = None
     ) -> None:
-        """Add a cube, each side with a random image of the nine of a material.
-
-        Without a `turn` (degrees) it stands a little askew, at random.
-        """
+        """Add a cube with random images of a material's nine, turned by degrees or at random."""
         windows = {
             face: tile(int(self.random.integers(9)), 3, 3) for face in FACES if face != "bottom"
         }
@@ -330,10 +321,7 @@ class Builder:
         thick: float = 0.3,
         window: Window = WHOLE,
     ) -> None:
-        """Add a single-sided wall; `place` is the middle of its foot.
-
-        It shows all of the material, or that `window` of it, which may repeat it.
-        """
+        """Add a single-sided wall, foot's middle at `place`; its `window` may repeat."""
         width, height = size
         middle = (place[0], place[1], place[2] + height / 2.0)
         self.panel(f"{name}.look", material, window, size, middle, facing)
@@ -353,10 +341,7 @@ class Builder:
         window: Window = WHOLE,
         step: float = STEP,
     ) -> None:
-        """Add level ground, north up in the material; `half` are its half lengths along x and y.
-
-        It is cut every `step` metres, at the corners of which it is lit.
-        """
+        """Add level ground, north up, of half lengths `half`, lit at each `step` metres."""
         self._level(f"{name}.look", material, half, (*middle, 0.0), window, 1.0, step)
         self.solid(name, mujoco.mjtGeom.mjGEOM_PLANE, [*half, 0.1], (*middle, 0.0))
 
@@ -403,11 +388,7 @@ class Builder:
         place: Vector,
         facing: float,
     ) -> None:
-        """Hang up an image (drawn, without collisions).
-
-        Args:
-            facing: Direction in which it faces: degrees from north to the west.
-        """
+        """Hang up an image, without collisions, facing degrees from north to the west."""
         width, height = size
         surface = quad(
             np.array([0.0, -width / 2.0, height / 2.0]),
@@ -428,10 +409,9 @@ class Builder:
         place: Vector,
         turn: float = 0.0,
     ) -> None:
-        """Add a round arch: two legs and a half ring, open along its x axis.
+        """Add a round arch, open along its x axis: ``<name>/left``, ``/right`` and ``/ring``.
 
         Args:
-            name: Its name; the legs are ``<name>/left``, ``/right``, the ring ``<name>/ring``.
             opening: Clear width, and height of the legs, metres.
             leg: Width of a leg and of the ring, metres.
             depth: Thickness along x, metres.

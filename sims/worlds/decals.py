@@ -68,7 +68,6 @@ def poster(shape: tuple[int, int], random: np.random.Generator, number: int) -> 
 def _composition(
     shape: tuple[int, int], random: np.random.Generator, number: int
 ) -> npt.NDArray[np.uint8]:
-    """Return a poster's image: rings, towers, shards or dots; bytes, for soft edges."""
     height, width = shape
     paper, ink, second = (
         tuple(round(255 * part) for part in colour) for colour in INKS[number % len(INKS)]
@@ -280,7 +279,6 @@ def _door(front: Image, left: int, top: int, density: float, random: np.random.G
 
 
 def _sign(front: Image, density: float, random: np.random.Generator, number: int) -> None:
-    """Paint a shop's name between the ground floor and the first."""
     paper, ink, _ = INKS[number % len(INKS)]
     bottom = front.shape[0] - int((STOREY - 0.55) * density)
     top = bottom - int(0.62 * density)

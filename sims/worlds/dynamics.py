@@ -25,24 +25,16 @@ from runtime.units import Duration
 
 
 class Motion(Protocol):
-    """Motion or change in a world. An implementation can be pickled.
-
-    Attributes:
-        solid: Whether vehicles can touch the moved part; else physics need not know it.
-    """
+    """Motion or change in a world. An implementation can be pickled."""
 
     @property
     def solid(self) -> bool:
         """Whether vehicles can touch the moved part."""
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Move or change the part to its state at a time.
+        """Write the part's state at a time into model and data, whatever was there before.
 
-        What is written must not depend on what was there before, only on `seconds`.
-
-        Args:
-            model: The compiled world; lights and colours may be written to.
-            data: MuJoCo's data of it; ``mocap_pos`` and ``mocap_quat`` may be written to.
+        It may write lights and colours of `model`, ``mocap_pos`` and ``mocap_quat`` of `data`.
         """
 
 

@@ -122,7 +122,6 @@ def _stems(b: Builder, bark: Material) -> list[Vector]:
 
 
 def _leaves(b: Builder, green: Material, ends: list[Vector], sways: list[Any]) -> None:
-    """Hang a cluster of leaves at each end, all drawn alike but turned."""
     b.mesh("crown", _cluster(b, 64, 2.1, 0.44))
     b.mesh("spray", _cluster(b, 20, 0.6, 0.17))
     for number, place in enumerate(ends):
@@ -168,7 +167,6 @@ def _shadows(b: Builder, sways: list[Any]) -> None:
 
 
 def _ground(random: np.random.Generator) -> Image:
-    """Return the wood's ground: grass, soil, fallen leaves, spots of sun."""
     shape = (int(2 * HALF * DENSITY),) * 2
     ground = materials.grass(shape, random, DENSITY)
     where = fractal(shape, random, coarse=4.0 * DENSITY)

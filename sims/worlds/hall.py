@@ -103,7 +103,6 @@ def _floor(random: np.random.Generator) -> Image:
 
 
 def _pixel(x: float, y: float) -> tuple[int, int]:
-    """Return column and row of a place on the floor."""
     return int((WEST - y) * DENSITY), int((NORTH - x) * DENSITY)
 
 
@@ -167,12 +166,10 @@ def _columns(random: np.random.Generator) -> Image:
 
 
 def _crate_faces(random: np.random.Generator) -> Image:
-    """Return nine crates' faces, three by three."""
     return decals.sheets([decals.crate_face(256, random, n) for n in range(9)], 3)
 
 
 def _posters(random: np.random.Generator) -> Image:
-    """Return twelve posters, four by three."""
     return decals.sheets([decals.poster((288, 216), random, n) for n in range(12)], 4)
 
 
@@ -257,7 +254,6 @@ def _partition(b: Builder, wood: Material, posters: Material) -> None:
 
 
 def _shelf(b: Builder, wood: Material, crates: Material) -> None:
-    """Put a rack along the west wall: boards on uprights, with boxes on them."""
     for number, x in enumerate((-3.6, -1.8, 0.0)):
         b.box(f"rack/upright_{number}", wood, (0.08, 0.5, 2.3), (x, 5.7, 0.0))
     for level, height in enumerate((0.35, 1.05, 1.75)):

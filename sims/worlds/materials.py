@@ -183,7 +183,6 @@ def _strips(image: Image) -> Iterator[slice]:
 
 
 def _three(amount: Image) -> Image:
-    """Repeat a single-channel image as three channels."""
     flat = np.ascontiguousarray(amount, dtype=np.float32)
     return np.asarray(cv2.merge((flat, flat, flat)), dtype=np.float32)
 
@@ -397,10 +396,7 @@ SIZE = 384
 
 
 def sky(random: np.random.Generator, night: bool = False) -> Image:
-    """Return a sky for `Builder.sky`: haze at the horizon, blue above, flat clouds.
-
-    By night all of that is hardly seen, before a few stars.
-    """
+    """Return a sky for `Builder.sky`: haze, blue, flat clouds; by night a few stars before them."""
     clouds = fractal((1024, 1024), random, coarse=200, fine=6, gain=0.62)
     faces = np.concatenate([_face(axes, clouds) for axes in _AXES], 0)
     if night:

@@ -103,7 +103,6 @@ def _glazing(b: Builder, frame: Material) -> None:
 
 
 def _tiles(random: np.random.Generator) -> Image:
-    """Return 3 x 3.2 m of ceiling: white tiles and a lamp."""
     tiles = materials.paint((205, 192), random, (0.76, 0.76, 0.76))
     for k in range(5):
         tiles[k * 41] *= 0.88

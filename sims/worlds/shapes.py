@@ -37,12 +37,7 @@ class Surface(NamedTuple):
 
 
 def grid(points: Array, texture: Array) -> Surface:
-    """Return the surface through a grid of points.
-
-    Args:
-        points: Shape (rows, columns, 3).
-        texture: Coordinates, shape (rows, columns, 2).
-    """
+    """Return the surface through points (rows, columns, 3), with texture coordinates (…, 2)."""
     rows, columns = points.shape[:2]
     right = np.gradient(points, axis=1)
     up = -np.gradient(points, axis=0)

@@ -57,11 +57,7 @@ def own_generator(
 def texture(
     world: str, seed: int, name: str, draw: Draw, random: np.random.Generator
 ) -> npt.NDArray[np.uint8]:
-    """Return a texture, RGB of shape (h, w, 3), from the cache or drawn.
-
-    A cache that cannot be read or written is done without, and a file in it that is not whole is
-    replaced.
-    """
+    """Return a texture (h, w, 3), RGB, from a readable cache or drawn."""
     file = f"{world}-{seed}-{name}"
     with contextlib.suppress(OSError, RuntimeError, ValueError):
         return _read(folder() / file)
@@ -105,7 +101,6 @@ def _digest(content: bytes | memoryview) -> bytes:
 
 
 def _read(path: Path) -> npt.NDArray[np.uint8]:
-    """Read a texture."""
     content = path.read_bytes()
     if content[:_DIGEST] != _digest(memoryview(content)[_DIGEST:]):
         raise ValueError(f"{path}: expected a whole texture")
@@ -126,7 +121,6 @@ def _write(path: Path, image: npt.NDArray[np.uint8]) -> None:
 
 
 def _tidy(here: Path) -> None:
-    """Remove long unused textures of other versions."""
     for other in here.parent.iterdir():
         used = max((each.stat().st_atime for each in other.glob("*")), default=0.0)
         if other != here and time.time() - used > _UNUSED:

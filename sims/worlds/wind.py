@@ -20,19 +20,13 @@ W20 = {"none": 0.0, "light": 15 * KNOT, "moderate": 30 * KNOT, "severe": 45 * KN
 """Wind at a height of 20 feet by strength of turbulence, m/s."""
 
 STRONGEST = 50.0
-"""Limit of mean wind and gusts together, metres per second.
-
-In a step of 1 ms, a vehicle carried by more may get past a wall without touching it.
-"""
+"""Limit of mean wind and gusts together, m/s: in 1 ms, more carries a vehicle past a wall."""
 
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT
 """Range of heights of the model, metres; other heights are clipped."""
 
 SLOWEST = 1.0
-"""Least airspeed assumed for turbulence, metres per second.
-
-At 0, turbulence would stand still.
-"""
+"""Least airspeed assumed for turbulence, m/s; at 0 the turbulence would stand still."""
 
 
 def check_strength(*velocities: Vector3) -> None:
@@ -120,11 +114,7 @@ class WindSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 def scales(height: float, w20: float) -> tuple[Vector3, Vector3]:
-    """Return intensities (m/s) and lengths (m) along, across, vertical at a height (metres).
-
-    Args:
-        w20: Wind at a height of 20 feet, m/s.
-    """
+    """Return intensities (m/s) and lengths (m) along, across, vertical, by height and wind."""
     height = min(max(height, LOWEST), HIGHEST)
     shape = 0.177 + 0.000823 * height / FOOT
     vertical = 0.1 * w20
@@ -157,12 +147,16 @@ class Turbulence:
     def step(
         self, seconds: float, speed: float, height: float, w20: float, noise: list[float]
     ) -> Vector3:
-        """Go on by some seconds at a speed through the air (m/s) and a height above the ground (m).
-
-        Returns the velocity along, across and vertical, m/s; `noise` is five normal numbers.
+        """Go on by seconds at a speed through the air and a height; return the velocity, m/s.
 
         Args:
+            speed: Metres per second.
+            height: Metres above the ground.
             w20: Wind at a height of 20 feet, m/s.
+            noise: Five normal numbers.
+
+        Returns:
+            Along, across, vertical.
         """
         sigma, length = scales(height, w20)
         way = max(speed, SLOWEST) * seconds

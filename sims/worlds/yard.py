@@ -314,7 +314,6 @@ def _crate_faces(random: np.random.Generator) -> Image:
 
 
 def _walls(b: Builder, red: Material) -> None:
-    """Add the yard's own wall, on the two sides where the houses stand further back."""
     for number, start in enumerate(np.arange(-15.0, 15.0, 6.0)):
         b.box(f"wall_south_{number}", red, (0.3, 6.0, 2.3), (-15.15, float(start) + 3.0, 0.0))
         b.box(f"wall_west_{number}", red, (6.0, 0.3, 2.3), (float(start) + 3.0, 15.15, 0.0))
@@ -349,7 +348,6 @@ def _houses(b: Builder) -> None:
 
 
 def _fronts(random: np.random.Generator, row: Sequence[tuple[float, int]], side: str) -> Image:
-    """Return the fronts of a row of houses, side by side."""
     fronts = [
         decals.house(width, storeys, random, HOUSE_DENSITY, number + len(side))
         for number, (width, storeys) in enumerate(row)

@@ -174,7 +174,6 @@ class AirsimClient(Node[AirsimClientConfig]):
             await self.clock.sleep_until(due)
 
     async def _read(self) -> None:
-        """Send a sample of the IMU and the true state."""
         vehicle, origin = self._remote.vehicle, self._remote.origin
         state = await self._ask("getMultirotorState", MultirotorState, vehicle)
         sample = await self._ask("getImuData", ImuData, "", vehicle)
@@ -209,7 +208,6 @@ class AirsimClient(Node[AirsimClientConfig]):
         await self.clock.sleep_until(self.clock.now() + ahead)
 
     async def _take_images(self) -> None:
-        """Send a set of images, and a new contact."""
         found = await self._source.call_for(0.0, ImageSource.fetch)
         if isinstance(found, str):
             self._report("a set of images is lost", found)
@@ -244,7 +242,6 @@ class AirsimClient(Node[AirsimClientConfig]):
                     self._report(pose.source, f"its {kind} images have another size now")
 
     async def _obey(self) -> None:
-        """Pass on orders, and send the resulting vehicle events."""
         if self._orders is not None and self._pose is not None:
             for event in await self._orders.obey(self.clock.now(), self._pose):
                 self.vehicle_events.send(event(stamp=self.clock.now(), source=self.name))
@@ -296,7 +293,6 @@ class AirsimClient(Node[AirsimClientConfig]):
                     before = self._connected
 
     async def _connect(self) -> None:
-        """Make both connections, or end the run."""
         seconds = float(self.config.start_timeout)
         try:
             await self._state.connect(seconds)

@@ -47,7 +47,6 @@ from sims.airsim.wire import (
 Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Kind = Literal["rgb", "depth", "segmentation"]
 Call = Callable[..., Awaitable[Any]]
-"""Calls a method of the server with its arguments, and gives the result."""
 
 FRAME = "base_link"
 _KINDS = {0: "rgb", 1: "depth", 5: "segmentation", 7: "segmentation"}
@@ -225,7 +224,6 @@ def _read(text: Any, log: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _noise(own: dict[str, Any]) -> dict[str, Any]:
-    """Return the noise of a vehicle's IMU; AirSim's default if unknown."""
     imu = own.get("imu") or settings.read("{}", "", lambda _: None)["nodes"][0]["imu"]
     sensors = ("gyroscope", "accelerometer")
     names = [f"{each}_{what}" for each in sensors for what in ("noise_density", "random_walk")]
@@ -437,11 +435,7 @@ class Orders:
 
 
 def move(setpoint: ev.Setpoint, pose: ev.Odometry, duration: float) -> tuple[Any, ...]:
-    """Return the call for a vehicle at a pose to follow a set-point for some seconds.
-
-    Returns:
-        The method and its arguments but for the vehicle's name.
-    """
+    """Return method and arguments, without the vehicle's name, to follow a set-point (s)."""
     match setpoint:
         case ev.PositionSetpoint():
             apart = [a - b for a, b in zip(setpoint.position, pose.position, strict=True)]
@@ -466,7 +460,6 @@ def move(setpoint: ev.Setpoint, pose: ev.Odometry, duration: float) -> tuple[Any
 
 
 def _is_there(setpoint: ev.Setpoint | None, pose: ev.Odometry) -> bool:
-    """Return whether a climb is over: near its end, and slow."""
     assert isinstance(setpoint, ev.PositionSetpoint)
     velocity = rotate(pose.orientation, pose.linear_velocity)
     return abs(setpoint.position[2] - pose.position[2]) < 0.1 and math.hypot(*velocity) < 0.2

@@ -270,7 +270,6 @@ def camera_of_file(spec: CameraSpec, body: int) -> Camera:
 
 
 def _of_entry(entry: ServedCamera, body: int, free: bool) -> Camera:
-    """Return a camera of the server's settings."""
     position, orientation = default_mount(entry.name, free)
     mount = _mount(entry.position or position, entry.orientation or orientation)
     captures = {-1: Capture()} | {each.image_type: each for each in entry.captures}
@@ -290,8 +289,6 @@ def _mount(position: Vector3, degrees: Vector3) -> Mount:
 
 
 class _Exposure(NamedTuple):
-    """Images of a call before rendering: the state to show, and the known responses."""
-
     stamp: int
     qpos: npt.NDArray[np.float64]
     ids: npt.NDArray[np.uint8]

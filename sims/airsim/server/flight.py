@@ -103,10 +103,7 @@ class Control:
 
     @rpc("simSetVehiclePose")
     def set_vehicle_pose(self, pose: Pose, ignore_collision: bool, vehicle: ServedVehicle) -> None:  # noqa: ARG002
-        """Set a vehicle's pose, at rest, despite obstacles; in flight, hold the place.
-
-        NaN keeps the present value.
-        """
+        """Set a pose, at rest, despite obstacles; in flight, hold the place. NaN keeps a value."""
         self._put(vehicle, KinematicsState(pose.position, pose.orientation))
 
     @rpc("simSetKinematics")
@@ -116,10 +113,7 @@ class Control:
         ignore_collision: bool,  # noqa: ARG002
         vehicle: ServedVehicle,
     ) -> None:
-        """Put a vehicle into a pose with velocities; accelerations are left to the physics.
-
-        Numbers that are NaN keep what they stand for.
-        """
+        """Set pose and velocities; the physics gives accelerations. NaN keeps the present value."""
         self._put(vehicle, state)
 
     @rpc("simAddVehicle")
@@ -435,6 +429,5 @@ def _heading(yaw_mode: YawMode, drivetrain: int) -> moves.Heading:
 
 
 def _bounded(vehicle: ServedMultirotor, yaw_rate: float) -> float:
-    """Return a yaw rate within the vehicle's limit, so the heading cannot run away."""
     limit: float = vehicle.config.limits.yaw_rate
     return min(max(yaw_rate, -limit), limit)

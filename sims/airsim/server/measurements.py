@@ -135,10 +135,7 @@ class Sensors:
 
     @rpc("getGpsData")
     def gps(self, name: str, vehicle: ServedMultirotor = FIRST) -> wire.GpsData:
-        """Return the newest fix of a satellite receiver; `eph` and `epv` are standard deviations.
-
-        Its name is ``gps``, as AirSim calls it by default, or ``gnss``.
-        """
+        """Return the newest fix of ``gps``, alias ``gnss``; `eph` and `epv` are deviations."""
         name = "gnss" if name == "gps" else name
         _, fix = self._read(announcements.NavSatAnnouncement, "gps", name, vehicle)
         if fix is None:
@@ -324,7 +321,6 @@ class Estimates:
 
 
 def _checked(pose: Pose) -> tuple[Vector3, Quaternion]:
-    """Return the numbers of a client's pose."""
     position: Vector3 = astuple(pose.position)
     orientation: Quaternion = astuple(pose.orientation)
     norm = math.hypot(*orientation)
@@ -486,7 +482,6 @@ def _make_folder(base: Path) -> Path:
 
 
 def _write(folder: Path, vehicle: str, pose: Pose, images: list[ImageResponse]) -> None:
-    """Write the images of an instant, and a row with their names."""
     names = []
     for image in images:
         suffix = "pfm" if image.pixels_as_float else "png" if image.compress else "ppm"

@@ -187,7 +187,6 @@ def _add_spare(
 
 
 def _free(spec: Any, world: Any, expression: str) -> list[str]:
-    """Free matching geoms and fixed bodies of the world, and return their names."""
     geoms = {geom.name: geom for geom in spec.worldbody.geoms if geom.name}
     bodies = {body.name: body for body in spec.worldbody.bodies if body.name}
     still = {name: body for name, body in bodies.items() if not body.joints and not body.mocap}

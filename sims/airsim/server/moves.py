@@ -161,8 +161,6 @@ class Tasks:
 
 
 class _Slot:
-    """State of a vehicle's tasks."""
-
     def __init__(self, vehicle: ServedMultirotor) -> None:
         self.vehicle = vehicle
         self.task: Task | None = None
@@ -180,7 +178,7 @@ class _Slot:
 
 
 def lookahead_of(lookahead: float, adaptive: float, velocity: float) -> float:
-    """Return the look-ahead distance, metres; the default for a negative distance.
+    """Return the look-ahead distance (m), by default for a negative one.
 
     Raises:
         ValueError: It is zero.
@@ -409,10 +407,7 @@ def at_height(parameters: VehicleParameters, height: float) -> Thrust:
 
 
 def share_of(parameters: VehicleParameters, throttle: float) -> float:
-    """Return the share of our motors' thrust for a throttle of AirSim's quadrotor.
-
-    It is the same multiple of the weight.
-    """
+    """Return the share of our motors' thrust for AirSim's throttle: as a multiple of weight."""
     return min(max(throttle, 0.0), 1.0) * parameters.hover_thrust / HOVER_THROTTLE
 
 

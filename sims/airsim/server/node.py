@@ -396,7 +396,6 @@ class Time:
 
 
 def _copy(task: asyncio.Future[R], reply: asyncio.Future[R]) -> None:
-    """Copy a task's outcome to its reply, unless the reply is done."""
     if reply.done():
         return
     if task.cancelled():

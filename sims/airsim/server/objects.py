@@ -120,10 +120,7 @@ class Objects:
         return self._still
 
     def identify(self, touched: str) -> tuple[str, int]:
-        """Return name and segmentation ID of the object of a geom or body in the model.
-
-        A spare object in the world has another name than its body.
-        """
+        """Return name and segmentation ID of the object of a geom or body in the model."""
         model = self._world.model
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, touched)
         body = mujoco.mj_name2id(model, _BODY, touched)
@@ -200,10 +197,7 @@ class Objects:
         physics: bool = False,
         blueprint: bool = False,  # noqa: ARG002
     ) -> str:
-        """Add a spare object of the settings, of this scale if any; return its name.
-
-        A name already taken gets a number.
-        """
+        """Add a spare object of this scale; return its name, numbered if the name is taken."""
         if len(name) > LONGEST_NAME:
             raise RpcError(f"name: expected up to {LONGEST_NAME} characters, found {len(name)}")
         qpos = _qpos(pose)
@@ -257,7 +251,6 @@ class Objects:
         self._ids[list(self.geoms[name])] = object_id
 
     def _warn(self, method: str, text: str) -> None:
-        """Log a method's deviation from the request, the first time for each method."""
         if method not in self._warned:
             self._warned.add(method)
             self._log.warning("%s: %s", method, text)
@@ -334,10 +327,7 @@ class Scenery:
 
     @rpc("simGetWorldExtents")
     def extents(self) -> list[GeoPoint]:
-        """Return the southernmost, westernmost and lowest, and the opposite corner of all objects.
-
-        What is without end, such as a plane, is not counted.
-        """
+        """Return the lowest south-west corner of all finite objects, and the opposite."""
         model, data = self._world.model, self._objects.data()
         shown = {geom for geoms in self._objects.geoms.values() for geom in geoms}
         bounded = [geom for geom in sorted(shown) if model.geom_rbound[geom] > 0.0]

@@ -160,10 +160,9 @@ def surface_normals(depth: Depths, info: CameraInfo) -> Depths:
 
 
 def _slope_along(values: Depths) -> Depths:
-    """Return the difference of each value in a row to the previous or the next value.
+    """Return the difference of each value to its neighbour on the pixel's own surface.
 
-    Of the two, the one that changes less further on: at the edge of an object, that is on the
-    side of the pixel's own surface.
+    Of a row's two neighbours, that is the side that changes less further on.
     """
     if values.shape[1] < 2:
         return np.zeros_like(values)

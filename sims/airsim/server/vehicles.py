@@ -328,11 +328,7 @@ class Vehicles(dict[str, ServedVehicle]):
 
     @rpc("getRotorStates")
     def rotors(self, vehicle: ServedMultirotor) -> RotorStates:
-        """Return speed, thrust and torque of all rotors: front right, rear left, the other two.
-
-        Those are front left and rear right. The physics has no speeds: they are those of which the
-        IMU's vibration is made.
-        """
+        """Return speed (as in vibration), thrust and torque: front right, rear left, the others."""
         vehicle.state()
         fastest = math.tau * vehicle.config.imu.vibration.rotor_speed
         thrusts, motors = vehicle.physics.thrusts.tolist(), vehicle.physics.parameters.motors
@@ -347,7 +343,6 @@ class Vehicles(dict[str, ServedVehicle]):
         return RotorStates(vehicle.stamp, rotors)
 
     def _described(self) -> dict[str, Any]:
-        """Return the vehicles with their starts and cameras as settings.json has them."""
         vehicles = {}
         for name, vehicle in self.items():
             flies = isinstance(vehicle, ServedMultirotor)
@@ -414,7 +409,6 @@ class Collisions:
                 self._take(vehicle, new)
 
     def _take(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
-        """Keep the deepest of some contacts as a collision."""
         contact = max(contacts, key=lambda each: each.depth)
         vehicle.collision = CollisionInfo(
             True,
