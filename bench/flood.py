@@ -54,10 +54,7 @@ class FloodRow(LateRow, frozen=True, kw_only=True):
 
 
 def measure(
-    *,
-    windows: int = 30,
-    rate: float = RATE,
-    progress: Callable[[str], None] = lambda _: None,
+    *, windows: int = 30, rate: float = RATE, progress: Callable[[str], None] = lambda _: None
 ) -> list[FloodRow]:
     """Measure quiet windows and flooded ones, in turns.
 

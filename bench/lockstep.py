@@ -33,12 +33,7 @@ from runtime.run.execute import execute
 from runtime.workers.shared_memory import SharedPipe, anonymous_file
 from sims.cameras.response import generator, noisy_depth, noisy_image
 from sims.sensors import ImuNoise, ImuParameters
-from sims.vehicle import (
-    STANDING_HEIGHT,
-    Autopilot,
-    Physics,
-    attach_vehicle,
-)
+from sims.vehicle import STANDING_HEIGHT, Autopilot, Physics, attach_vehicle
 from sims.worlds import load_world
 
 CONTROL, IMU = 400, 200

@@ -233,10 +233,9 @@ def logging_to(
 def terminal_handler(console: Console | None = None) -> logging.Handler:
     """Return a handler printing to standard error, in colour on a terminal.
 
-    The console may be given if other things, such as a progress bar, are drawn on it, too.
-
-    Left out are tracebacks, and what the command line says itself when the run is over (records
-    with `reported`).
+    The console may be given if other things, such as a progress bar, are drawn on it, too. Left out
+    are tracebacks, and what the command line says itself when the run is over (records with
+    `reported`).
     """
     from rich.console import Console
     from rich.logging import RichHandler

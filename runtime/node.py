@@ -13,15 +13,7 @@ import functools
 import zlib
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
-from typing import (
-    Any,
-    ClassVar,
-    Generic,
-    Literal,
-    ParamSpec,
-    dataclass_transform,
-    get_args,
-)
+from typing import Any, ClassVar, Generic, Literal, ParamSpec, dataclass_transform, get_args
 
 import msgspec
 import numpy as np
@@ -222,8 +214,7 @@ class Node(Generic[C]):
     def siblings(self, cls: type[Any]) -> tuple[Sibling, ...]:
         """Return the run's nodes of a class in file order, including this node.
 
-        They are known by their settings before any of them starts up, those in other processes
-        too.
+        They are known by their settings before any of them starts up, those in other processes too.
         """
         return tuple(each for each in self._host.siblings if issubclass(each.node, cls))
 

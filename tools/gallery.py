@@ -15,13 +15,7 @@ from events import DepthImage, Event, Image, Imu, LidarScan, SegmentationImage
 from events.frames import from_rpy
 from runtime.config.reading import load
 from runtime.testing import run_nodes
-from sims.cameras import (
-    CameraRenderer,
-    CameraSpec,
-    add_free_camera,
-    model_to_bytes,
-    pose_to_qpos,
-)
+from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.worlds import WORLDS, load_scene
 
 DOCS = Path("docs/images")

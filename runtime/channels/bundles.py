@@ -136,11 +136,7 @@ class Matcher(Generic[B]):
     """
 
     def __init__(
-        self,
-        stream: Stream[B],
-        set_type: type[B],
-        fields: dict[str, Field],
-        tolerance: int,
+        self, stream: Stream[B], set_type: type[B], fields: dict[str, Field], tolerance: int
     ) -> None:
         self.name = stream.name
         self.stream = stream

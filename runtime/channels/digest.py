@@ -19,16 +19,13 @@ _CHUNK = 1 << 16
 class Digest:
     """Hashes every event: its type, stamp, source and content, arrays included.
 
-    Each output (and what each node announces) has a fingerprint of its own, of its events in
-    order, and that of the run is made of these. So it says nothing of the order of events of
-    different outputs at one time, is the same for a run in one process and in several, and names
-    the output at which two runs differ.
-
-    What an event holds must be data: numbers, texts, lists, mappings and what else msgspec knows,
-    and arrays of numbers. Of any other object it cannot be told whether it is the same again.
-
-    XXH3 (xxhash.com) takes 0.1 ms for a megabyte image; it guards against accidents, not
-    against forgery.
+    Each output (and what each node announces) has a fingerprint of its own, of its events in order,
+    and that of the run is made of these. So it says nothing of the order of events of different
+    outputs at one time, is the same for a run in one process and in several, and names the output
+    at which two runs differ. What an event holds must be data: numbers, texts, lists, mappings and
+    what else msgspec knows, and arrays of numbers. Of any other object it cannot be told whether it
+    is the same again. XXH3 (xxhash.com) takes 0.1 ms for a megabyte image; it guards against
+    accidents, not against forgery.
     """
 
     def __init__(self) -> None:

@@ -52,12 +52,7 @@ class Link:
     """
 
     def __init__(
-        self,
-        name: str,
-        config: LinkConfig,
-        clock: Clock,
-        seed: int,
-        before: Link | None = None,
+        self, name: str, config: LinkConfig, clock: Clock, seed: int, before: Link | None = None
     ) -> None:
         self.name = name
         self.lost: int = before.lost if before else 0

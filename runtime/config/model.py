@@ -53,15 +53,14 @@ class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """The ``[network]`` table: how the processes of a run with ``--only`` find each other.
 
     Attributes:
-        meet: A Zenoh endpoint at which they meet. Whichever process on its host comes first
-            listens there; the others connect to it. By default on this machine only.
+        meet: A Zenoh endpoint at which they meet. Whichever process on its host comes first listens
+            there; the others connect to it. By default on this machine only.
         zenoh: A Zenoh configuration file, which then says where to listen and connect instead, and
             who may: for TLS, access control, a router.
         secret: Only who knows it may take part: ``env:NAME`` (of a variable), ``file:PATH``, or at
             least 16 characters. Without it, a random key in a private file of this user, which
             serves on one machine.
-        shared: Whether large events to a process on this machine pass through memory that both
-            see.
+        shared: Whether large events to a process on this machine pass through memory that both see.
         lease: A process that is silent for so long is gone.
         wait: How long to wait for the others at the start.
     """

@@ -1,10 +1,9 @@
 """Handshake: from two visible processes to a session, and a check of their compatibility.
 
-Each greets the other with a nonce; a process that answers ours with the seal of the run is
-present and knows the secret: then a session begins, and only what it seals is received. A
-greeting that answers nothing may be an old one, and changes nothing. A new session ends the one
-before: the other process had lost us. Processes fit if they make up the run: all nodes once, and
-equal files.
+Each greets the other with a nonce; a process that answers ours with the seal of the run is present
+and knows the secret: then a session begins, and only what it seals is received. A greeting that
+answers nothing may be an old one, and changes nothing. A new session ends the one before: the other
+process had lost us. Processes fit if they make up the run: all nodes once, and equal files.
 """
 
 from __future__ import annotations

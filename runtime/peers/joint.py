@@ -149,8 +149,7 @@ class JointStart:
             return reference.begin is not None and ready()
 
         await self._until(
-            lambda: reference.over != "" or told(),
-            whom=lambda m: not m.ready or m is reference,
+            lambda: reference.over != "" or told(), whom=lambda m: not m.ready or m is reference
         )
         return told()  # then the run has begun, even if the one that said so is gone since
 

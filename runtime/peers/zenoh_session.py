@@ -168,11 +168,7 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
         "connect/endpoints": [network.meet],
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
-        "connect/retry": {
-            "period_init_ms": 100,
-            "period_max_ms": 400,
-            "period_increase_factor": 2,
-        },
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
         "transport/shared_memory/enabled": False,  # we have our own, and nothing is left behind
     }
     for key, value in settings.items():

@@ -159,13 +159,7 @@ class _Run:
         clock = self._clock = make_clock(run, loop)
         out = None if self._folder is None else self._folder.path
         self.supervisor = supervisor = Supervisor(
-            self._config,
-            clock,
-            self._taps,
-            self.private or out,
-            self._only,
-            self._stand_ins,
-            out,
+            self._config, clock, self._taps, self.private or out, self._only, self._stand_ins, out
         )
         if self._folder is not None:
             supervisor.state.before_first_update = self._folder.flown

@@ -111,9 +111,7 @@ def connect(
 
 
 def truth_readers(
-    nodes: Iterable[Node[Any]],
-    listeners: Iterable[Listener],
-    announcements: Iterable[Announcement],
+    nodes: Iterable[Node[Any]], listeners: Iterable[Listener], announcements: Iterable[Announcement]
 ) -> set[str]:
     """Return the nodes receiving true poses of vehicles or cameras for no declared use."""
     truths = [

@@ -41,9 +41,7 @@ def show(
     print_lines(summary, folder)
 
 
-def runs(
-    folder: Annotated[Path, typer.Argument(help="Folder of runs.")] = Path("runs"),
-) -> None:
+def runs(folder: Annotated[Path, typer.Argument(help="Folder of runs.")] = Path("runs")) -> None:
     """List the runs in a folder, the newest last: when, how long, and who passed."""
     from datetime import datetime
 

@@ -57,12 +57,10 @@ def compare(
     two builds of a program: `--a 'slam.command=["./old"]' --b 'slam.command=["./new"]'`. Each
     flight is recorded once, and both get it. Half of the flights are looked at first; if all
     figures are decided then, the others are not flown. Or A and B are two folders of finished
-    sweeps.
-
-    Each figure is *better*, *worse*, *no difference* larger than the margin, *not enough runs*, or
-    *not comparable*, an error after different alignments.
-    Crashes and lost estimators count as worst. Ends with 0; with 1 if a figure is worse, or with
-    --margin also if it may be worse by more than that; with 130 after Ctrl-C.
+    sweeps. Each figure is *better*, *worse*, *no difference* larger than the margin, *not enough
+    runs*, or *not comparable*, an error after different alignments. Crashes and lost estimators
+    count as worst. Ends with 0; with 1 if a figure is worse, or with --margin also if it may be
+    worse by more than that; with 130 after Ctrl-C.
     """
     from runtime.tools.cli.sweep import carry_out
     from runtime.tools.comparison import compare as compare_all

@@ -101,9 +101,7 @@ def set_(
     print(f"run {found.stem.rpartition('-')[0]}: {ask(found, Set(text=change))}")
 
 
-def trace(
-    file: Annotated[Path, typer.Argument(help="A trace that run --trace wrote.")],
-) -> None:
+def trace(file: Annotated[Path, typer.Argument(help="A trace that run --trace wrote.")]) -> None:
     """Show the latency from sensors to set-points, and how much of the loop each node had.
 
     A path is the events from an exposure to a set-point: → where one follows from another (it

@@ -94,11 +94,9 @@ def run(
     log.txt, the resolved config.toml, and whatever the nodes write. The link runs/<name>/latest
     leads to the newest run that had a first update. An earlier run in the folder given by --out is
     renamed to FOLDER.<its time>. Printed is who passed, and how well; --verbose and `show` print
-    all else.
-
-    Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
-    immediate); with 1 if a threshold of the run was not met, or it was run twice and differed;
-    with 2 if something failed.
+    all else. Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
+    immediate); with 1 if a threshold of the run was not met, or it was run twice and differed; with
+    2 if something failed.
     """
     from runtime.config.reading import load_configuration
     from runtime.run.execute import execute

@@ -70,12 +70,11 @@ def sweep(
 
     Each run is a process of its own; one that fails is a row of the table. Runs that differ only in
     what comes after the sensors fly once: that flight is recorded, and kept for later sweeps (see
-    the command flights). Results go to
-    sweeps/<name>: index.html shows all of them; table.csv, summary.csv, plots/, each run's folder
-    in runs/, and, since they depend on the machine, timing.csv and what workers cost in costs.csv.
-    Called again, only what is missing or has crashed is run. Ends with 0 if every run came to its
-    end and met its thresholds; with 1 if a threshold was missed; with 2 if a run crashed; with 130
-    after Ctrl-C.
+    the command flights). Results go to sweeps/<name>: index.html shows all of them; table.csv,
+    summary.csv, plots/, each run's folder in runs/, and, since they depend on the machine,
+    timing.csv and what workers cost in costs.csv. Called again, only what is missing or has crashed
+    is run. Ends with 0 if every run came to its end and met its thresholds; with 1 if a threshold
+    was missed; with 2 if a run crashed; with 130 after Ctrl-C.
     """
     from rich.console import Console
 

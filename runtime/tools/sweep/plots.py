@@ -132,10 +132,7 @@ def _percent(found: Iterable[bool]) -> float:
 
 
 def _draw(
-    parameter: Parameter,
-    found: dict[str, list[Line]],
-    shares: dict[str, list[float]],
-    path: Path,
+    parameter: Parameter, found: dict[str, list[Line]], shares: dict[str, list[float]], path: Path
 ) -> None:
     from matplotlib.figure import Figure
 

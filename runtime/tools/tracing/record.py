@@ -37,9 +37,8 @@ class TraceInstrument(Instrument):
         "worker", process, method, asked, answered
 
     Times are nanoseconds of `time.perf_counter_ns`; `run` and `stamp` are of the run's clock, but
-    for `run` in real time (see `ClockRate`).
-    An identity is `id` of the event; a cause is the identity of the event that the innermost step
-    was given, or 0.
+    for `run` in real time (see `ClockRate`). An identity is `id` of the event; a cause is the
+    identity of the event that the innermost step was given, or 0.
 
     Args:
         spool: Takes the notes, a list at a time.
