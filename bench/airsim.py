@@ -67,11 +67,7 @@ class Window(NamedTuple):
 def measure(
     *, rounds: int = 10, progress: Callable[[str], None] = lambda _: None
 ) -> list[AirsimRow]:
-    """Measure quiet windows and others, in turns.
-
-    Args:
-        progress: Called with what is being measured.
-    """
+    """Measure quiet windows and others, in turns."""
     progress(f"airsim: {2 * rounds * len(CASES)} windows of {WINDOW:g} s")
     port = free_port()
     windows: list[Window] = []

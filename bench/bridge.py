@@ -52,7 +52,6 @@ class BridgeRow(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         bytes: Of its payload.
-        samples: Round trips of each side.
         ours_per_second: Events of a burst that came through, each second.
     """
 
@@ -73,7 +72,6 @@ class RosImageRow(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         bytes: Of a message.
-        samples: Of each side.
     """
 
     case: str
@@ -233,7 +231,6 @@ def measure(
 
     Args:
         samples: Round trips with small events on each side; a quarter with images.
-        progress: Called with what is measured.
     """
     meet, locator = f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
     Asker.samples, Asker.progress, Asker.rows = samples, staticmethod(progress), []

@@ -31,7 +31,6 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     """Statistics of a system at a number of nodes, over all rounds' pooled samples.
 
     Attributes:
-        samples: Round trips in all rounds.
         rounds_us: Median of each round.
     """
 
@@ -54,7 +53,6 @@ class Outcome(msgspec.Struct, frozen=True):
     """Result of a whole benchmark.
 
     Attributes:
-        rows: Measurements.
         missing: System to the reason for its absence.
         versions: System to its version.
     """
@@ -94,7 +92,6 @@ def measure_all(
         warm_up: Round trips left out before them.
         only: Parts of names; systems whose name has none of them are left out. Empty: all.
         budget: About how many seconds of round trips one measurement may take.
-        progress: Called with what is measured, and the share that is done.
     """
     wanted = tuple(part.lower() for part in only)
     missing: dict[str, str] = {}
@@ -138,7 +135,6 @@ def measure_all(
 
 
 def _affordable(samples: int, system: System, case: str, nodes: int, budget: float) -> int:
-    """Return how many round trips fit the budget, at least 30."""
     round_trip = system.slowness * 1e-6 * max(nodes / 2, 1.0)
     if case == "large":
         round_trip += 2e-3
@@ -187,11 +183,7 @@ def _row(case: str, system: str, mode: str, nodes: int, place: str, runs: Sequen
 
 
 def find(module: str, name: str) -> System:
-    """Return a system by its module and name.
-
-    Raises:
-        LookupError: The module has no such system.
-    """
+    """Return a system by its module and name."""
     systems: tuple[System, ...] = importlib.import_module(module).SYSTEMS
     for system in systems:
         if system.name == name:

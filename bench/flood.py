@@ -61,7 +61,6 @@ def measure(
     Args:
         windows: Of both kinds together.
         rate: Messages a second of a flood.
-        progress: Called with what is being measured.
     """
     progress(f"{windows} windows of {WINDOW:g} s, every other with {rate:g} messages a second")
     port = free_port()

@@ -29,10 +29,8 @@ class LateRow(msgspec.Struct, frozen=True, kw_only=True):
     """Base of the rows.
 
     Attributes:
-        ticks: How many ticks were measured.
         late_p50_us: Median lateness of the 400 Hz tick, microseconds.
         late_p99_us: Its 99th percentile; of several runs, the median of theirs.
-        late_max_us: Its maximum.
         ratio_p99: Of the 99th percentile, to that of the row or of the runs that it is held
             against.
     """
@@ -110,9 +108,7 @@ def lateness(begin: int, end: int) -> npt.NDArray[np.float64]:
 def ratios(runs: Sequence[Any], beside: Sequence[Any]) -> tuple[float, float]:
     """Return the medians over all pairs of the ratios of their medians and 99th percentiles.
 
-    Args:
-        runs: Lateness, nanoseconds, in each run or window.
-        beside: The same in what each of them is held against.
+    Lateness is in nanoseconds; `beside` has what each run or window is held against.
     """
     each = [
         np.percentile(late, (50, 99)) / np.percentile(before, (50, 99))
@@ -167,7 +163,6 @@ def measure_recording(
 
     Args:
         rate: Of the camera, Hz.
-        progress: Called with what is measured.
     """
     found: dict[str, list[_Run]] = {case: [] for case in CASES}
     for number, case in in_turns(CASES, repeats):

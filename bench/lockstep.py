@@ -46,7 +46,6 @@ class LockstepRow(msgspec.Struct, frozen=True, kw_only=True):
     """Speed of a way to simulate.
 
     Attributes:
-        case: ``bare loop``, ``run``, ``run with cameras``.
         speed: Simulated seconds per second, median.
         share: Of the time that is the runtime's own (`run` only).
     """
@@ -60,9 +59,7 @@ class PartRow(msgspec.Struct, frozen=True, kw_only=True):
     """Part of the cost of a frame.
 
     Attributes:
-        part: The work.
         ms: Processor time of all processes, milliseconds a frame, median.
-        share: Of the whole.
     """
 
     part: str
@@ -99,7 +96,6 @@ def measure(
 
     Args:
         seconds: Simulated, without cameras; a fifth of it with.
-        progress: Called with what is being measured.
     """
     ways: dict[str, Callable[[], float]] = {
         "bare loop": lambda: _bare(seconds),
@@ -141,7 +137,6 @@ def _run(seconds: float, cameras: list[dict[str, Any]]) -> float:
 
 
 def _bare(seconds: float) -> float:
-    """Fly the same, in a loop."""
     world = load_world("hall")
     attach_vehicle(world, "drone", (0.0, 0.0, -STANDING_HEIGHT), 0.0)
     physics = Physics(world.compile(), "drone")
@@ -252,7 +247,6 @@ def _images() -> tuple[Any, Any]:
 
 
 def _cost(do: Callable[[], None], calls: int = 100) -> float:
-    """Return the processor time of a call, milliseconds, median."""
     times = []
     for _ in range(calls):
         begin = time.process_time()

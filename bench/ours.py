@@ -29,8 +29,6 @@ class OneConfig(NodeConfig):
 
 
 class _One(Node[OneConfig]):
-    """Node 1: sends pings, and notes when the replies come."""
-
     pings = Output(Ping)
 
     def __init__(self) -> None:

@@ -49,7 +49,6 @@ class LinkRow(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         bytes: Of its images.
-        samples: Of each side.
     """
 
     case: str
@@ -115,7 +114,6 @@ def measure_link(samples: int = 1000) -> list[LinkRow]:
 async def _measure(
     by_link: Callable[[], Awaitable[None]], frame: tuple[Any, Any], samples: int
 ) -> list[list[int]]:
-    """Return the times (ns) through the link and by a worker."""
     clock = RealClock(asyncio.get_running_loop())
     worker = Worker("taker", clock, Taker, niceness=0)
     try:
@@ -155,11 +153,7 @@ class HeldRow(msgspec.Struct, frozen=True, kw_only=True):
 def measure_held(
     *, seconds: float = 8.0, repeats: int = 5, progress: Callable[[str], None] = lambda _: None
 ) -> list[HeldRow]:
-    """Measure, interleaved.
-
-    Args:
-        progress: Called with what is being measured.
-    """
+    """Measure, interleaved."""
     found: dict[str, list[Summary]] = {side: [] for side in _ESTIMATORS}
     for number, side in in_turns(_ESTIMATORS, repeats):
         progress(f"held: round {number + 1} of {repeats}")

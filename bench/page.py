@@ -59,7 +59,6 @@ def measure(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> 
 
     Args:
         quick: Measure less: under two minutes.
-        progress: Called with what is being measured, and the share of its part that is done.
     """
     few = (2, 16, 128)
     outcomes: list[Outcome] = []
@@ -205,12 +204,7 @@ def plot_boxes(rows: Sequence[Row], title: str, out: Path) -> None:
 
 
 def write(results: Results, out: Path, page_path: Path) -> None:
-    """Write the page of results, its plots, and the figures themselves.
-
-    Args:
-        out: Folder for results.json and the plots, made if missing.
-        page_path: The page, Markdown.
-    """
+    """Write the page of results, its plots, and the figures themselves."""
     out.mkdir(parents=True, exist_ok=True)
     encoded = msgspec.json.format(msgspec.json.encode(results), indent=1)
     (out / "results.json").write_bytes(encoded + b"\n")
@@ -240,7 +234,6 @@ def page(results: Results, plots: Mapping[str, Sequence[str]], folder: str) -> s
 
 
 def _goals(results: Results) -> Iterator[tuple[Any, ...]]:
-    """Yield table rows to compare measurements with the project's own goals."""
     medians = {(r.case, r.system, r.mode, r.nodes): r.median_us for r in results.rows}
     nodes = sorted({nodes for case, _, _, nodes in medians if case == "small"})
     ros, cpp, queue = "ROS 1 nodelets", "thesis client (C++)", "asyncio.Queue (uvloop)"

@@ -37,9 +37,6 @@ class Change(msgspec.Struct, frozen=True):
 
     Attributes:
         what: Case, system, mode, nodes.
-        before_us: Median in the first file.
-        after_us: Median in the second.
-        ratio: After to before.
         noise: Ratio that noise explains: the product of both files' spreads between rounds.
     """
 

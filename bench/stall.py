@@ -54,7 +54,6 @@ class StallRow(LateRow, frozen=True, kw_only=True):
 
     Attributes:
         missed: Ticks left out because an earlier one came too late.
-        update_mean_ms: Mean time from one tick to the next.
         frames: How many pairs of images came.
         fetch_ms_median: From asking for a pair to having it; 0 without any.
     """
@@ -136,7 +135,6 @@ class Camera(Node[CameraConfig]):
             self._close = renderer.close
 
     async def _connect(self) -> None:
-        """Connect to the slow server; fetch blocking the loop, or awaiting the answer."""
         config = self.config
         size = pair_size(config.width, config.height)
         if config.mode == "fetch":
@@ -208,10 +206,6 @@ def measure(
 
     Args:
         seconds: Of each run, after a second of warm-up.
-        repeats: Runs of each mode; their order is shuffled in each round.
-        rate: Hertz of the camera.
-        size: Width and height of its images.
-        progress: Called with what is being measured.
     """
     _collected.clear()
     with slow_server(pair_size(size, size)) as port:
@@ -264,9 +258,7 @@ def _serve(server: socket.socket, delay: float, answer: bytes) -> None:
 def slow_server(size: int, delay: float = DELAY) -> Iterator[int]:
     """Run the server while the block runs, and give its port.
 
-    Args:
-        size: Bytes of an answer.
-        delay: Seconds that it takes.
+    An answer has `size` bytes and takes `delay` seconds.
     """
     command = [sys.executable, "-m", "bench.stall", str(delay), str(size)]
     with subprocess.Popen(

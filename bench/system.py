@@ -36,15 +36,13 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     """Case to measure.
 
     Attributes:
-        case: ``small``: no payload. ``large``: each ping carries a fresh copy of a float32 array
-            of `LARGE_SHAPE`, made within the measured time. ``large-shared``: each ping carries
-            the same array by reference, or whatever comes nearest in the system.
+        case: ``small``: no payload. ``large``: each ping carries a fresh copy of a float32 array of
+            `LARGE_SHAPE`, made within the measured time. ``large-shared``: each ping carries the
+            same array by reference, or whatever comes nearest in the system.
         mode: ``handler``: receivers are functions that are called. ``stream``: receivers are
-            coroutines or threads that wait for the next message. ``routed``: the ping reaches
-            its receiver only.
+            coroutines or threads that wait for the next message. ``routed``: the ping reaches its
+            receiver only.
         nodes: N, sender included; at least 2.
-        samples: Round trips to record.
-        warm_up: Round trips to leave out before.
     """
 
     case: CaseName = "small"
@@ -63,11 +61,9 @@ class System(msgspec.Struct, frozen=True):
 
     Attributes:
         name: As in tables: ``asyncio.Queue (uvloop)``.
-        modes: Supported modes.
         measure: Measures a case; called in a fresh process of its own.
-        slowness: About how many microseconds a round trip takes at N = 2; the driver shortens
-            runs of slow systems by it.
-        cases: Supported cases.
+        slowness: About how many microseconds a round trip takes at N = 2; the driver shortens runs
+            of slow systems by it.
         place: Whether its nodes share a process.
         max_nodes: Beyond this it is not measured: too slow, or too many processes for a laptop.
         missing: Returns why it cannot be measured here (with what installs it), or `None`.
@@ -93,11 +89,7 @@ def in_processes(
     max_nodes: int = 16,
     **options: Any,
 ) -> System:
-    """Return a system whose nodes have processes of their own.
-
-    Args:
-        options: Of `System`; payloads are copied, unless its cases say more.
-    """
+    """Return a system whose nodes have processes of their own."""
     options = {"cases": ("small", "large"), **options}
     return System(name, modes, measure, slowness, place="processes", max_nodes=max_nodes, **options)
 
@@ -108,13 +100,7 @@ def large_array() -> npt.NDArray[np.float32]:
 
 
 class Ping(Event):
-    """Message from node 1 to all nodes.
-
-    Attributes:
-        receiver: Number of the node that is to reply.
-        number: Of the ping.
-        payload: An array, or `None`.
-    """
+    """Message from node 1 to all nodes; `receiver` is the number of the node that is to reply."""
 
     receiver: int
     number: int
@@ -122,11 +108,7 @@ class Ping(Event):
 
 
 class Pong(Event):
-    """Reply of the receiver to node 1.
-
-    Attributes:
-        number: Of the ping.
-    """
+    """Reply of the receiver to node 1, with the ping's number."""
 
     number: int
 
@@ -137,11 +119,7 @@ def packaged(**packages: str) -> dict[str, Any]:
 
 
 def needs(**packages: str) -> Callable[[], str | None]:
-    """Return a `System.missing` to ask for absent packages.
-
-    Args:
-        packages: Name of each module that must be there, and of the package that has it.
-    """
+    """Return a `System.missing` to ask for absent packages."""
 
     def missing() -> str | None:
         absent = [package for name, package in packages.items() if not _is_here(name)]
@@ -185,11 +163,7 @@ def free_port() -> int:
 
 
 def zenoh_config(**endpoints: str) -> Any:
-    """Return the configuration of a Zenoh peer without scouting: endpoints only.
-
-    Args:
-        endpoints: ``listen`` or ``connect``, as locators.
-    """
+    """Return the configuration of a Zenoh peer without scouting: only ``listen`` or ``connect``."""
     made = importlib.import_module("zenoh").Config()
     made.insert_json5("mode", '"peer"')
     made.insert_json5("scouting/multicast/enabled", "false")
@@ -212,11 +186,7 @@ def zenoh_subscriber(session: Any, key: str, callback: Callable[[Any], None]) ->
 
 
 def in_turns(sides: Iterable[T], rounds: int) -> Iterator[tuple[int, T]]:
-    """Yield the number of a round and a side, for each side of each round.
-
-    Each round has an order of its own, which is drawn, so that whatever else the machine does
-    falls on all sides alike.
-    """
+    """Yield the number of a round and a side, for all sides in each round's own random order."""
     order, shuffle = [*sides], random.Random(0).shuffle
     for number in range(rounds):
         shuffle(order)
@@ -225,13 +195,9 @@ def in_turns(sides: Iterable[T], rounds: int) -> Iterator[tuple[int, T]]:
 
 
 def pair(taken: Mapping[str, Sequence[int]]) -> dict[str, float]:
-    """Return the fields of a row to compare two sides.
+    """Return the fields of a row to compare two sides: times (ns) by the prefix of their fields.
 
-    Args:
-        taken: Times (ns) of both sides, by the prefix of their fields.
-
-    Returns:
-        Medians and 99th percentiles in microseconds, and the ratio of the two medians.
+    Medians and 99th percentiles are in microseconds; `ratio` is that of the two medians.
     """
     found: dict[str, float] = {}
     for side, times in taken.items():

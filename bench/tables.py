@@ -12,11 +12,9 @@ if TYPE_CHECKING:
 
 
 class Column(NamedTuple):
-    """Column of a table.
+    """Column of a table: an attribute or key of its rows, under a heading.
 
     Attributes:
-        heading: Above it.
-        key: Attribute of a row, or key of a row that is a dictionary.
         spec: As of `format`; ``us``: a time with three significant figures; with ``?`` before it,
             nothing stands where the figure is 0.
     """
@@ -39,7 +37,6 @@ class Table(NamedTuple):
 
     Attributes:
         title: What is measured, as a sentence without its end.
-        columns: From the left.
         texts: Leading columns of words; the others hold numbers.
     """
 

@@ -48,11 +48,7 @@ class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class IdleRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Processor load in a run of a timer.
-
-    Attributes:
-        cpu_percent: Of one core, all threads of the process together.
-    """
+    """Processor load in a run of a timer: percent of one core, all threads together."""
 
     hz: float
     seconds: float
@@ -111,7 +107,6 @@ async def _measure(bursts: int) -> list[ThroughputRow]:
 
 
 def _making_rows(bursts: int) -> list[ThroughputRow]:
-    """Measure the cost of making a pose with and without its checks, in turns."""
     place, turn = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
     taken: dict[type[Unchecked] | type[PoseEstimate], list[float]] = {
         Unchecked: [],

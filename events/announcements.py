@@ -401,11 +401,8 @@ class Vehicles:
         self.names: list[str] = []
         """Names of the vehicles, in the order of their announcements."""
         self._cameras: dict[str, str] = {}
-        """Optical frame to source."""
         self._followed: dict[str, str] = {}
-        """Estimator to the optical frame of its camera."""
         self._estimated: dict[str, str] = {}
-        """Estimator to its announced vehicle."""
 
     def announced(self, announcement: Announcement) -> None:
         """Note a vehicle, a camera or an estimator."""

@@ -138,11 +138,7 @@ def check_pose(event: Any, position: tuple[float, ...], orientation: tuple[float
 
 
 def check_frames(event: Any, *names: str) -> None:
-    """Refuse blank names of frames.
-
-    Raises:
-        ValueError: A name is blank.
-    """
+    """Raise `ValueError` for blank names of frames."""
     for name in names:
         if not name.strip():
             raise ValueError(
@@ -170,7 +166,6 @@ def _norm(numbers: tuple[float, ...]) -> float:
 
 
 def _check_all(event: Any) -> None:
-    """Check each field in full after a fast check has failed, and name the wrong field."""
     where = type(event).__name__
     if type(event.stamp) is not int:
         raise TypeError(

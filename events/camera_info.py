@@ -15,9 +15,7 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
-"""ROS names: plumb_bob (k1, k2, p1, p2, k3), also called radtan; rational_polynomial
-(k1, k2, p1, p2, k3, k4, k5, k6); equidistant (k1, k2, k3, k4), the Kannala-Brandt fisheye.
-"""
+"""ROS names; plumb_bob is also called radtan, equidistant is the Kannala-Brandt fisheye."""
 
 COEFFICIENTS: dict[str, int] = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """Number of coefficients of each model."""
@@ -30,21 +28,16 @@ _STEPS = 2048
 class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
     """Intrinsics in OpenCV's convention: pixel *centres* have whole coordinates.
 
-    A point (x, y, z) in the optical frame has the normalised coordinates (x/z, y/z), which the
-    lens distorts to (u, v), and falls on column ``fx·u + cx``, row ``fy·v + cy``.
+    A point (x, y, z) in the optical frame has the normalised coordinates (x/z, y/z), which the lens
+    distorts to (u, v), and falls on column ``fx·u + cx``, row ``fy·v + cy``, all in pixels. An
+    ideal camera has the principal point ``(width - 1) / 2``, ``(height - 1) / 2``.
 
     Attributes:
-        width: Pixels.
-        height: Pixels.
-        fx: Focal length in pixels along the columns.
-        fy: Focal length in pixels along the rows.
-        cx: Principal point, column; ``(width - 1) / 2`` for an ideal camera.
-        cy: Principal point, row.
         distortion_model: ``plumb_bob``, ``rational_polynomial`` or ``equidistant``, with the
             formulae of OpenCV ("Camera Calibration and 3D Reconstruction", "Fisheye camera model").
-        distortion: Its coefficients: plumb_bob (k1, k2, p1, p2, k3), rational_polynomial
-            (k1, k2, p1, p2, k3, k4, k5, k6), equidistant (k1, k2, k3, k4). An ideal camera is
-            plumb_bob with zeros.
+        distortion: Its coefficients: plumb_bob (k1, k2, p1, p2, k3), rational_polynomial (k1, k2,
+            p1, p2, k3, k4, k5, k6), equidistant (k1, k2, k3, k4). An ideal camera is plumb_bob with
+            zeros.
     """
 
     width: int
@@ -92,14 +85,10 @@ class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points: npt.ArrayLike) -> Floats:
-        """Return the pixels of points, inside the image or not.
+        """Return the pixels, shape (n, 2), of points in the optical frame (any unit), shape (n, 3).
 
-        Args:
-            points: Metres (or directions of any length) in the optical frame, shape (n, 3).
-
-        Returns:
-            Columns and rows, shape (n, 2); NaN where the lens sees nothing: behind a plumb_bob
-            camera, and beyond the angle up to which a model is monotonic.
+        A pixel may be outside the image; it is NaN where the lens sees nothing: behind a plumb_bob
+        camera, and beyond the angle up to which a model is monotonic.
         """
         xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         beside = np.hypot(xyz[:, 0], xyz[:, 1])
@@ -117,14 +106,9 @@ class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
         return np.asarray(pixels)
 
     def unproject(self, pixels: npt.ArrayLike) -> Floats:
-        """Return the rays of some pixels; the inverse of `project`.
+        """Return the unit rays, shape (n, 3), of pixels, shape (n, 2); the inverse of `project`.
 
-        Args:
-            pixels: Columns and rows, shape (n, 2).
-
-        Returns:
-            Directions in the optical frame, of length 1, shape (n, 3); NaN where no direction
-            within the monotonic range falls on the pixel.
+        A ray is NaN where no direction within the monotonic range falls on the pixel.
         """
         uv = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - (self.cx, self.cy)) / (
             self.fx,
@@ -158,8 +142,7 @@ class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
     def widest_angle(self) -> float:
         """Return the angle off the axis (radians) where the distorted radius stops rising.
 
-        π/2 for a pinhole; less where the polynomial turns back, beyond which one pixel would show
-        two directions.
+        π/2 for a pinhole; beyond a smaller one a pixel would show two directions.
         """
         most = _HALF_TURN[self.distortion_model]
         if self.is_pinhole:
@@ -229,11 +212,8 @@ def srgb_light() -> Floats:
 def response_light(response: tuple[float, ...]) -> Floats:
     """Return the light of each of the 256 grey levels, shape (256,), from 0 to 1.
 
-    Args:
-        response: As in `CameraAnnouncement`, 256 rising numbers; empty stands for sRGB's.
-
     Raises:
-        ValueError: They are not 256, or do not rise.
+        ValueError: There are not 256, or they do not rise.
     """
     if not response:
         return srgb_light()
@@ -247,12 +227,7 @@ def response_light(response: tuple[float, ...]) -> Floats:
 
 
 def vignette_map(info: CameraInfo, vignette: tuple[float, ...]) -> Floats:
-    """Return the share of light reaching each pixel, shape (height, width).
-
-    Args:
-        vignette: Coefficients a1, a2, … of ``1 + a1 r² + a2 r⁴ + …``, where r is the distance from
-            the principal point in halves of the image's diagonal.
-    """
+    """Return the share of light reaching each pixel, shape (height, width), by its coefficients."""
     half = np.hypot(info.width, info.height) / 2.0
     across = (np.arange(info.width) - info.cx) / half
     down = (np.arange(info.height) - info.cy) / half

@@ -49,11 +49,7 @@ def inverse(rotation: Quaternion) -> Quaternion:
 
 
 def normalize(rotation: Quaternion) -> Quaternion:
-    """Return the quaternion scaled to length 1.
-
-    Raises:
-        ValueError: Its length is not between 0.001 and 1000: no rotation.
-    """
+    """Return the quaternion scaled to length 1; raise `ValueError` outside 0.001 to 1000."""
     w, x, y, z = rotation
     norm = sqrt(w * w + x * x + y * y + z * z)
     if not 1e-3 < norm < 1e3:
@@ -90,15 +86,8 @@ def cross(a: Vector3, b: Vector3) -> Vector3:
 def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
     """Return the rotation by `yaw` about z, then `pitch` about the new y, then `roll` about x.
 
-    This is the order of aeronautics (intrinsic ZYX), and ROS's roll, pitch, yaw (REP 103).
-
-    Args:
-        roll: Radians; in FRD right side down.
-        pitch: Radians; in FRD nose up.
-        yaw: Radians; in NED clockwise from north seen from above.
-
-    Returns:
-        Rotation from the body to the world.
+    This is the order of aeronautics (intrinsic ZYX), and ROS's roll, pitch, yaw (REP 103): from the
+    body to the world. Radians; in FRD right side down and nose up, in NED clockwise from above.
     """
     cy, sy = cos(0.5 * yaw), sin(0.5 * yaw)
     cp, sp = cos(0.5 * pitch), sin(0.5 * pitch)
@@ -117,10 +106,7 @@ def from_yaw(yaw: float) -> Quaternion:
 
 
 def yaw_of(rotation: Quaternion) -> float:
-    """Return the heading of the x axis, radians in [-π, π] (the yaw of `from_rpy`).
-
-    It has no meaning when x points straight up or down.
-    """
+    """Return the heading of the x axis, radians in [-π, π]; meaningless if x is vertical."""
     w, x, y, z = rotation
     return atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -143,12 +129,7 @@ def angle_between(a: Quaternion, b: Quaternion) -> float:
 def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
     """Return the spherical linear interpolation from `a` to `b`, along the shorter arc.
 
-    K. Shoemake, "Animating rotation with quaternion curves", 1985.
-
-    Args:
-        a: Unit quaternion, the result for a share of 0.
-        b: Unit quaternion; the result for a share of 1 is the same rotation.
-        share: Number in [0, 1].
+    K. Shoemake, "Animating rotation with quaternion curves", 1985. `share` is in [0, 1].
     """
     cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     sign = -1.0 if cosine < 0.0 else 1.0
@@ -223,13 +204,7 @@ def convert_vector(axes: Axes, vector: Vector3) -> Vector3:
 
 
 def convert_rotation(parent: Axes, child: Axes, rotation: Quaternion) -> Quaternion:
-    """Take a rotation from child to parent from our axes to ROS's, or back.
-
-    Args:
-        parent: Kind of the frame it leads to.
-        child: Kind of the frame it comes from.
-        rotation: Unit quaternion; the result is one too.
-    """
+    """Take a rotation from child to parent from our axes to ROS's, or back."""
     if parent == "world" and child == "body":  # the one that is needed hundreds of times a second
         w, x, y, z = rotation
         return (_S * (w + z), _S * (x + y), _S * (x - y), _S * (w - z))
@@ -318,12 +293,10 @@ def from_geodetic(place: Geodetic, origin: Geodetic) -> Vector3:
 
 @functools.lru_cache(maxsize=16)
 def _frame(origin: Geodetic) -> tuple[tuple[Vector3, Vector3, Vector3], Vector3]:
-    """Return the axes at an origin, and its own place."""
     return _axes(origin), to_ecef(origin)
 
 
 def _axes(origin: Geodetic) -> tuple[Vector3, Vector3, Vector3]:
-    """Return the unit vectors north, east and down at a place, in ECEF."""
     latitude, longitude = radians(origin[0]), radians(origin[1])
     sp, cp, sl, cl = sin(latitude), cos(latitude), sin(longitude), cos(longitude)
     return (-sp * cl, -sp * sl, cp), (-sl, cl, 0.0), (-cp * cl, -cp * sl, -sp)

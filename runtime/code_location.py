@@ -85,10 +85,7 @@ def _awaiting(task: asyncio.Task[Any]) -> Iterator[tuple[FrameType, int]]:
 
 
 def _innermost(frames: Iterable[tuple[FrameType, int]]) -> tuple[str, str]:
-    """Return node and line of the first frame in a node's own code, given the innermost first.
-
-    If there is none: ``runtime``, and the line of the first.
-    """
+    """Return node and line of the first frame in a node's own code; else of the first frame."""
     innermost = "?"
     for frame, number in frames:
         if innermost == "?":

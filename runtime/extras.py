@@ -10,17 +10,13 @@ from pathlib import Path
 from typing import Any
 
 _PROJECT = Path(__file__).parents[1] / "pyproject.toml"
-"""Of a checkout; an installed wheel has none."""
 
 
 def install_command(extra: str) -> str:
     """Return the command to install an extra's libraries, for the message of an error.
 
-    In a checkout, the command names the extra. A wheel's package is in no index, and so its extra
+    In a checkout, the command names the extra. A wheel's package is in no index, so that its extra
     cannot be asked for by name: there, the command names the libraries.
-
-    Args:
-        extra: As in ``pyproject.toml``: ``ros2``, ``record``…
     """
     if _PROJECT.is_file():
         return f"pip install -e '.[{extra}]'"

@@ -16,10 +16,8 @@ class Figure(msgspec.Struct, frozen=True):
 
     Attributes:
         name: In files; its end is the unit.
-        meaning: In words.
         limit: Whether a threshold is the least value allowed, or the most; "" if there is none.
         default: The threshold where the file gives none.
-        counts: Whether it is a whole number.
         optional: Whether a threshold is not missed where there is no figure: not everybody sends
             velocities, and nobody who never restarts counts how often.
         all_or_none: Percentage required as soon as there is any: of values sent with some of the
@@ -83,7 +81,6 @@ _UNITS = {
     "_m": "m",
     "_seconds": "s",
 }
-"""Units by the end of a figure's name."""
 
 
 def _error(name: str, meaning: str, **more: Any) -> Figure:

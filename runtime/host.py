@@ -24,9 +24,6 @@ class Sibling(NamedTuple):
     """A node of the run, as described by the file.
 
     Attributes:
-        name: As in the file.
-        node: Its class.
-        config: Its settings.
         sources: Ports that the file narrows to a source.
         here: Whether it runs in this process.
     """
@@ -71,7 +68,6 @@ class Host(Protocol):
     Attributes:
         siblings: All nodes of the run, in file order.
         shared: Objects shared by nodes of this process, by name.
-        stepping: Pauses and steps simulated time.
         run_end: How the run ended; `None` before.
     """
 

@@ -11,9 +11,6 @@ import numpy as np
 def plain(value: Any, where: str) -> Any:
     """Return a value in JSON types: numpy's numbers as numbers, its arrays as lists.
 
-    Args:
-        value: Numbers, texts, lists, mappings, events, and what else msgspec knows.
-
     Raises:
         TypeError: The value has no form in JSON.
     """

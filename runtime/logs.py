@@ -85,18 +85,12 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
         self.log(TRACE, msg, *args)
 
     def fatal(self, msg: str, *args: object) -> NoReturn:
-        """Log a message and end the run: the node cannot go on.
-
-        Raises:
-            FatalError: Always.
-        """
+        """Log a message and end the run by a `FatalError`: the node cannot go on."""
         self.log(logging.CRITICAL, msg, *args, extra={"reported": True})  # as the run's error
         raise FatalError(self.node, msg % args if args else msg)
 
 
 class _Queued(logging.handlers.QueueHandler):
-    """Queues records, as long as there is room; their tracebacks stay apart from their messages."""
-
     def __init__(self, records: queue.SimpleQueue[logging.LogRecord]) -> None:
         super().__init__(records)
         self.given = self.taken = self.dropped = 0
@@ -195,7 +189,6 @@ def logging_to(
     """Send all log records through a queue to `handlers` while the block runs.
 
     Args:
-        handlers: Where records end up; they run in a thread of their own.
         level: One of `LEVELS`, for nodes and runtime; libraries log warnings and worse.
         now: The run's clock (ns), read when a record is made.
     """
@@ -233,9 +226,8 @@ def logging_to(
 def terminal_handler(console: Console | None = None) -> logging.Handler:
     """Return a handler printing to standard error, in colour on a terminal.
 
-    The console may be given if other things, such as a progress bar, are drawn on it, too. Left out
-    are tracebacks, and what the command line says itself when the run is over (records with
-    `reported`).
+    Left out are tracebacks, and what the command line says itself when the run is over (records
+    with `reported`).
     """
     from rich.console import Console
     from rich.logging import RichHandler

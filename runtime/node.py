@@ -75,9 +75,7 @@ class Node(Generic[C]):
 
     Attributes:
         name: As in the file.
-        config: The node's settings.
         clock: The run's clock; the only time that a node should know.
-        stepping: Pauses and steps simulated time.
         log: The node's logger (trace, debug, info, warning, error, fatal).
         rng: Random numbers that depend on the run's seed and the node's name only.
         seed: The run's, for random numbers that nodes share.
@@ -212,10 +210,7 @@ class Node(Generic[C]):
     # What a node can ask for.
 
     def siblings(self, cls: type[Any]) -> tuple[Sibling, ...]:
-        """Return the run's nodes of a class in file order, including this node.
-
-        They are known by their settings before any of them starts up, those in other processes too.
-        """
+        """Return the run's nodes of a class in file order, with this node and those elsewhere."""
         return tuple(each for each in self._host.siblings if issubclass(each.node, cls))
 
     def senders_of(self, *events: type[Event]) -> list[str]:
@@ -231,7 +226,7 @@ class Node(Generic[C]):
     def share(self, name: str, make: Callable[[], R]) -> R:
         """Return the object shared in this process under a name, made by the first caller.
 
-        It outlives a restart of any of them, and is forgotten with the run.
+        It outlives restarts, and is forgotten with the run.
         """
         shared = self._host.shared
         if name not in shared:
@@ -276,11 +271,7 @@ class Node(Generic[C]):
         return await self._host.worker(self, factory, args, **options)
 
     def hold(self, name: str, config: HoldConfig, latency: float) -> Hold[Any]:
-        """Hold simulated time for the answers of a system outside the process.
-
-        Args:
-            config: How long is waited, and what if nothing comes.
-            latency: Seconds of the run's clock from a frame to its answer.
+        """Hold simulated time for the answers of a system outside the process; see `Hold`.
 
         Raises:
             ConfigError: There are no latencies in the file that `config` names.
@@ -292,9 +283,7 @@ class Node(Generic[C]):
         self._host.start(self, coro)
 
     def every(self, hz: float, call: Callable[[Tick], Any], name: str = "") -> Ticker:
-        """Call a function at a rate from the first update on, as `@every` does.
-
-        For rates that are known only at run time; call it in `on_startup`.
+        """Call a function at a rate from the first update on, as `@every` does; for `on_startup`.
 
         Raises:
             DeclarationError: The rate is not above 0, or above `MAX_HZ`.
@@ -325,13 +314,12 @@ class Node(Generic[C]):
         If any verdict of a run is not passed, the command line ends with exit code 1.
 
         Args:
-            subject: What was judged: the source of an estimator.
+            subject: What was judged: the source of an estimator; of a `flight`, the vehicle.
             passed: Whether it met its thresholds; `None` if nothing was asked of it.
-            flight: Whether a vehicle's flight was judged, and the subject is the vehicle.
 
         Raises:
-            TypeError: A figure is nothing that JSON knows (numpy's numbers and arrays are made
-                into such), or `passed` is neither a bool nor `None`.
+            TypeError: A figure is nothing that JSON knows (numpy's numbers and arrays are made into
+                such), or `passed` is neither a bool nor `None`.
         """
         where = f"conclude({subject!r})"
         if not isinstance(passed, bool | np.bool_ | None):
@@ -348,10 +336,7 @@ class Node(Generic[C]):
         self._host.note_environment(name, value)
 
     def after_run(self, call: Callable[[Path], Any]) -> None:
-        """Have a function called with the run's folder once its summary is written.
-
-        It is called in the order of asking, and not at all if the run writes no files.
-        """
+        """Have a function called with the run's folder, if any, once its summary is written."""
         self._host.after_run(call)
 
 
@@ -392,10 +377,7 @@ def make_node(
 
 
 class _Call(functools.partial[R]):
-    """A call whose `StopIteration` becomes a `RuntimeError`, as in a coroutine.
-
-    No future takes one, and a task that awaited it would wait for ever.
-    """
+    """A call whose `StopIteration`, which no future takes, becomes a `RuntimeError`."""
 
     def __call__(self, /, *args: Any, **kwargs: Any) -> R:
         try:

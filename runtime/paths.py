@@ -52,12 +52,7 @@ class GivenHere(str):
 
 
 def resolve(table: Any, type_: Any, folder: Path) -> Any:
-    """Return settings, as given by `tomllib`, with absolute paths of input files.
-
-    Args:
-        table: Of a node or of the network; values of a wrong type stay as they are.
-        folder: Where relative paths start.
-    """
+    """Return settings, as given by `tomllib`, with absolute paths of input files."""
 
     def absolute(kind: Kind, text: str) -> str:
         if kind == "output" or not text or (kind == "json" and text.lstrip().startswith("{")):
@@ -84,10 +79,7 @@ def unmarked(value: Any) -> Any:
 
 
 def file_names(table: Any, type_: Any) -> Any:
-    """Return settings with input paths cut to their last part.
-
-    For comparing the settings of two machines, whose folders may be elsewhere.
-    """
+    """Return settings with input paths cut to their last part, to compare those of two machines."""
     return _walk(
         table, type_, lambda kind, text: Path(text).name if kind in {"input", "name"} else text
     )
@@ -130,7 +122,6 @@ def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
 
 
 _RESERVED = {"truth", "plan"}
-"""File names of a run not available to sources."""
 
 
 def source_file(source: str) -> str:

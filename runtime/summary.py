@@ -66,16 +66,10 @@ class WorkerSummary(msgspec.Struct, frozen=True):
 
     Attributes:
         latency_ms: As the file declares, on the run's clock; `None` if it differs by call.
-        calls: Answered calls.
         wall_p50_ms: Real time of a call in the worker's process: median.
-        wall_p95_ms: 95th percentile.
-        wall_max_ms: Longest.
-        cpu_p50_ms: Processor time of all threads of that process from one call's end to the
-            next one's: median.
-        cpu_p95_ms: 95th percentile.
-        cpu_max_ms: Most.
+        cpu_p50_ms: Processor time of all threads of that process from one call's end to the next
+            one's: median.
         peak_rss_mb: Peak memory of any of the processes; `None` if unknown.
-        processes: Most at once.
     """
 
     latency_ms: float | None
@@ -139,15 +133,12 @@ class OutsideSummary(msgspec.Struct, frozen=True):
 
     Attributes:
         latency_ms: Declared, on the run's clock; `None` if it differs by frame.
-        sent: Frames sent.
         received: Frames that the system confirmed; `None` if it cannot say.
-        answered: Frames with an answer.
         says_lost: Answers that report lost tracking, among those and the empty ones.
         empty: Frames with an empty answer, such as no pose.
-        initialising: Frames for which the system was still initialising: it said so, or had not
-            yet answered any, as was allowed.
+        initialising: Frames for which the system was still initialising: it said so, or had not yet
+            answered any, as was allowed.
         skipped: Frames that the system left out, as a later answer says.
-        lost: Frames without an answer in time.
         open: Frames on their way when the run ended. `sent` is the sum of `answered`, `empty`,
             `initialising`, `skipped`, `lost` and `open`.
         late: Answers to frames that were given up.
@@ -156,7 +147,6 @@ class OutsideSummary(msgspec.Struct, frozen=True):
         unknown: Answers whose stamp is no frame's.
         initialisation_s: From the first frame to the first that was answered.
         wall_p50_ms: Real time from a frame to its answer: median.
-        wall_p99_ms: 99th percentile.
         inputs: Digest of all that the system was sent; equal if it got the same.
         answers: Digest of all answers, each with its frame.
         reproducible: Whether an equal run gives the same, if the system answers the same.
@@ -231,7 +221,6 @@ class TwiceSummary(msgspec.Struct, frozen=True):
     """Comparison of a run with an equal earlier run; see `runtime.tools.twice`.
 
     Attributes:
-        repeats: Whether all was the same.
         first: Who differed first, the rig or a system outside, when, and by how much.
         outputs: Those whose events differed.
     """
@@ -266,8 +255,6 @@ class ProcessSummary(msgspec.Struct, frozen=True):
     """A process of a run.
 
     Attributes:
-        nodes: Nodes in the process.
-        place: Host and process number.
         clock_offset_ms: Its monotonic clock, less that of the process whose summary this is.
         round_trip_ms: Of the quickest question and answer; the offset is off by half of it at most.
         clock_drift_ppm: How much quicker its clock is, in millionths, if ours follows it.
@@ -288,28 +275,14 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Summary of a run.
 
     Attributes:
-        name: Of the run.
         clock: ``lockstep`` or ``real``.
-        seed: Of the run's random numbers.
-        reason: Why the run ended.
         ended_by: A node's name, ``user``, or "" for its duration; see `RunEnd`.
-        error: Error of the run, or `None`.
         wall_seconds: Real seconds, from the first update to when the end was asked for.
         sim_seconds: The same time on the run's clock: all events were sent in it.
-        digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels
-            depend on the graphics driver, so digests compare on one machine.) `None` if off.
+        digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels depend
+            on the graphics driver, so digests compare on one machine.) `None` if off.
         digests: Fingerprint of each output's events, of which that of the run is made.
         not_deterministic: Nodes because of which equal runs may have unequal digests.
-        verdict: Conclusions of nodes; `None` if none.
-        events: Events sent, by type.
-        outputs: Events sent, by output.
-        drops: Events dropped, by input.
-        streams: Inputs' bounds and peaks.
-        links: Losses of links, by port.
-        ticks: Punctuality, by ticker.
-        stalls: Times the loop did not turn, by node.
-        longest_stalls: The worst of them, by node.
-        announcements: Announcements of nodes.
         truth_readers: Nodes that received true poses, but those that fly, judge, record or show.
         environment: Machine and versions; the command line, and the commit of the current folder.
         processes: Where which nodes ran, if not all in one process.

@@ -43,9 +43,6 @@ class NodeResult(msgspec.Struct, frozen=True):
 
     Attributes:
         sent: Every event that the nodes under test sent, in order; announcements first.
-        reason: What ended the run.
-        drops: Inputs' peaks and drops, by ``node.port``.
-        ticks: Punctuality, by ``node.method``.
         seconds: On the simulated clock.
         outside: What became of the frames for systems outside the process, by their names.
     """
@@ -88,7 +85,6 @@ def run_node(
 
     Args:
         inputs: Events to send to it, each at its own stamp; announcements before all.
-        config: Its settings, as in the file.
         duration: Seconds until the run ends, if nothing ends it before.
 
     Raises:
@@ -181,8 +177,6 @@ def any_source(node: type[N]) -> type[N]:
 
 
 def _script(inputs: list[Event]) -> type[Node[Any]]:
-    """Return a class of node for sending the listed events."""
-
     class Script(Node):
         script = Output(Event)
 

@@ -19,11 +19,7 @@ class Duration(float):
 
     @classmethod
     def parse(cls, value: object) -> Duration:
-        """Read a duration.
-
-        Raises:
-            ValueError: It is neither a non-negative number nor a text like ``"80ms"``.
-        """
+        """Read a non-negative number or a text like ``"80ms"``; or raise `ValueError`."""
         seconds = math.nan
         if isinstance(value, int | float) and not isinstance(value, bool):
             seconds = value
@@ -53,11 +49,7 @@ class Latency(Duration):
 
     @classmethod
     def parse(cls, value: object) -> Latency:
-        """Read a latency.
-
-        Raises:
-            ValueError: It is no duration, or a number above `LONGEST_BARE` without a unit.
-        """
+        """Read a duration, up to `LONGEST_BARE` without a unit; or raise `ValueError`."""
         latency = cls(super().parse(value))
         if not isinstance(value, str) and latency > LONGEST_BARE:
             raise ValueError(

@@ -29,13 +29,9 @@ _LENGTH = struct.Struct("<I")
 
 
 class Packed(msgspec.Struct, frozen=True):
-    """An event taken apart: a head, and the event's own arrays, not copied.
+    """An event taken apart: a head, and the event's own arrays, C-contiguous, not copied.
 
-    Attributes:
-        head: All but the arrays, with their place in the frame.
-        arrays: C-contiguous.
-        offsets: Where each array begins in the frame.
-        size: Bytes of the frame.
+    `offsets` and `size` are bytes in the frame.
     """
 
     head: bytes
@@ -72,11 +68,7 @@ def kind_of(event: type[Event]) -> str:
 
 
 def event_type(kind: str) -> type[Event]:
-    """Return the type of event of a kind, if imported in this process.
-
-    Raises:
-        WireError: It is not imported.
-    """
+    """Return the type of event of a kind imported in this process, or raise `WireError`."""
     known = _types.get(kind)
     if known is None:
         _types.update((kind_of(each), each) for each in _subclasses(Event))

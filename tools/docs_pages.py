@@ -65,7 +65,6 @@ def figures_section() -> str:
 
 
 def _refuse(warning: str) -> None:
-    """Stop the build: the reference would lack a node."""
     raise PluginError(warning)
 
 

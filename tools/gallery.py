@@ -37,7 +37,6 @@ def main() -> None:
 
 
 def _seen(name: str) -> Any:
-    """Return a camera's image of a world, BGR."""
     world, dynamics = load_scene(name, 1)
     camera = CameraSpec(name="camera", images=("rgb",), width=SIZE[0], height=SIZE[1])
     prefix = add_free_camera(world, "free", (camera,))
@@ -52,7 +51,6 @@ def _seen(name: str) -> Any:
 
 
 def _sensed() -> dict[str, Any]:
-    """Return an image of each sensor at the end of the flight, by caption."""
     result = run_nodes(load(Path("tools/sensors.toml")).nodes, duration=7.5, seed=1)
 
     def last(kind: type[Event], source: str) -> Any:
@@ -85,7 +83,6 @@ def _coloured(depth: Any) -> Any:
 
 
 def _numbered(numbers: Any) -> Any:
-    """Return a colour of its own for each object number."""
     table = np.random.default_rng(3).integers(40, 255, (int(numbers.max()) + 2, 3), np.uint8)
     table[0] = 0
     return table[numbers + 1]
@@ -119,7 +116,6 @@ def _plotted(values: list[Any]) -> Any:
 
 
 def _write(name: str, images: dict[str, Any], columns: int) -> None:
-    """Write images with their captions, some in a row."""
     tiles = []
     for caption, image in images.items():
         tile = np.ascontiguousarray(image)

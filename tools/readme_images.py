@@ -47,7 +47,6 @@ def main() -> None:
 
 
 def _overview() -> Any:
-    """Return the figure: the world, and beside it the camera's image and the verdicts."""
     runs = {name: run for run in sorted(RUNS.iterdir()) for name in SYSTEMS if _is(run, name)}
     if missing := SYSTEMS.keys() - runs.keys():
         raise SystemExit(f"expected runs of {', '.join(missing)} in {RUNS}: run `make images`")

@@ -156,7 +156,6 @@ def _debugging_port(file: Path) -> int:
 
 
 def _is_full(png: bytes) -> bool:
-    """Tell whether there is more on a image than an empty page."""
     return len(png) > 100_000
 
 

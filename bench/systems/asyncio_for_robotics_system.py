@@ -42,8 +42,6 @@ async def _listen(node: int, session: Any, *, large: bool) -> None:
 
 
 class _Sender:
-    """Node 1."""
-
     def __init__(self, session: Any, case: Case, check: Callable[[int, str], None]) -> None:
         afor: Any = importlib.import_module("asyncio_for_robotics.zenoh")
         self._case = case

@@ -58,10 +58,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         node: Its number, from 2.
-        nodes: N.
-        case: What pings carry.
         address: Where to meet: a directory, a locator, a name; as the peer has it.
-        variant: Which of a module's systems.
     """
 
     node: int
@@ -82,10 +79,7 @@ class Crew:
         self._nodes = nodes
 
     def check(self, since: int, awaited: str) -> None:
-        """Raise if waiting on is of no use.
-
-        Args:
-            since: `time.perf_counter_ns` when the waiting began.
+        """Raise if waiting since `since` (`time.perf_counter_ns`) is of no more use.
 
         Raises:
             PeerError: A process has ended, or the waiting has taken too long.
@@ -159,11 +153,7 @@ def answer(node: int, receiver: int, number: int) -> int | None:
 
 
 def reply_to(node: int, ping: Any) -> bytes | None:
-    """Return a node's pong for a ping; `None` for another receiver.
-
-    Args:
-        ping: Bytes that begin with a `PING`.
-    """
+    """Return a node's pong for the bytes of a ping; `None` for another receiver."""
     stamp, _, receiver, number = PING.unpack_from(ping)
     answered = answer(node, receiver, number)
     return None if answered is None else PONG.pack(stamp, answered)

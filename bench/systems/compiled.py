@@ -30,8 +30,7 @@ SOURCES = Path(__file__).parent / "cpp"
 KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": "33554432", "MALLOC_TRIM_THRESHOLD_": "1073741824"}
 """Environment for glibc to keep freed memory rather than returning pages.
 
-Otherwise each large message may land on pages that the kernel first has to clear, which costs more
-than copying it: a property of the allocator's defaults and not of what is measured.
+Clearing new pages costs more than copying a large message, a property of the allocator.
 """
 
 
@@ -58,7 +57,6 @@ def build(source: str, libraries: Sequence[str] = (), built_for: str = "") -> Pa
 
     Args:
         source: Name of its one file in `SOURCES`.
-        libraries: To link with.
         built_for: Version of what it is linked with.
 
     Raises:
@@ -86,10 +84,6 @@ def build(source: str, libraries: Sequence[str] = (), built_for: str = "") -> Pa
 
 def run(command: Sequence[str | Path], deadline: float, env: dict[str, str] | None = None) -> str:
     """Run a program, ended with this process or at the deadline; return its output.
-
-    Args:
-        deadline: Seconds.
-        env: More variables for its environment.
 
     Raises:
         CompiledError: It failed or did not end in time.
@@ -130,11 +124,7 @@ def deadline_for(case: Case) -> float:
 
 
 def read(out: Path, case: Case) -> Samples:
-    """Read the samples written by a program.
-
-    Raises:
-        CompiledError: Not as many samples as expected.
-    """
+    """Read the samples written by a program; raise `CompiledError` unless all are there."""
     samples = np.fromfile(out, np.int64)
     if len(samples) != case.samples:
         raise CompiledError(f"{out.name}: expected {case.samples} samples, found {len(samples)}")
@@ -151,11 +141,7 @@ def _cache() -> Path:
 
 
 def measure_client(case: Case) -> Samples:
-    """Measure round trips.
-
-    Raises:
-        CompiledError: The client cannot be compiled, or failed.
-    """
+    """Measure round trips."""
     with tempfile.TemporaryDirectory() as directory:
         out = Path(directory) / "samples"
         run([build(CLIENT), *arguments(case, out)], deadline_for(case))

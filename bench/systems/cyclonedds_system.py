@@ -45,8 +45,6 @@ _DOMAIN = """
 
 
 class _Domain:
-    """A participant and the two topics."""
-
     def __init__(self, number: int, *, large: bool) -> None:
         load = importlib.import_module
         dds: Any = load("cyclonedds.core")

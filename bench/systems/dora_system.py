@@ -58,7 +58,6 @@ class _Address(msgspec.Struct, frozen=True):
 
 
 def _dataflow(case: Case) -> bytes:
-    """Return the description of the dataflow; JSON is YAML."""
     others = range(2, case.nodes + 1)
     pongs = {f"pong{n}": {"source": f"node{n}/pong", "queue_size": 1000} for n in others}
     nodes: list[dict[str, object]] = [
@@ -79,7 +78,6 @@ def _dataflow(case: Case) -> bytes:
 
 @contextlib.contextmanager
 def _running(address: _Address, *arguments: str) -> Iterator[None]:
-    """Run dora in a session of its own, until the block ends."""
     process = subprocess.Popen([*_DORA, *arguments], cwd=address.directory, start_new_session=True)
     try:
         yield

@@ -132,11 +132,7 @@ def _units(ez: Any) -> tuple[Any, Any]:
 
 
 def measure(case: Case, *, processes: bool) -> Samples:
-    """Measure round trips between units.
-
-    Raises:
-        PeerError: Messages ceased to come.
-    """
+    """Measure round trips between units."""
     os.environ["EZMSG_LOGLEVEL"] = "ERROR"
     # The units' classes are made here, and reach the other processes with a fork only.
     multiprocessing.set_start_method("fork", force=True)

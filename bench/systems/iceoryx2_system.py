@@ -43,8 +43,6 @@ class Large(ctypes.Structure):
 
 
 class _Topic:
-    """Service for samples and, for sleeping nodes, another for events."""
-
     def __init__(self, node: Any, name: str, kind: type, *, events: bool) -> None:
         iox2: Any = importlib.import_module("iceoryx2")
         self._iox2 = iox2

@@ -198,7 +198,6 @@ def _in_processes(command: list[str | Path], case: Case) -> Samples:
 
 
 def _program(source: str, *libraries: str) -> Path:
-    """Return a compiled program, rebuilt for another version of roscpp."""
     built_for = _version("libroscpp-dev")
     return build(source, (*libraries, *LIBRARIES), built_for)
 
@@ -213,12 +212,7 @@ def _version(package: str) -> str:
 def _packaged(
     name: str, package: str, files: dict[str, Path], *, compiled: bool = True
 ) -> dict[str, Any]:
-    """Return `missing` and `version` of a `System` made of Debian packages.
-
-    Args:
-        name: Before the version of `package`.
-        files: A file of each required package.
-    """
+    """Return `missing` and `version` of a `System` made of Debian packages."""
 
     def missing() -> str | None:
         wanted = {"python3-rosmaster": MASTER, **files}

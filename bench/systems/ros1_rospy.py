@@ -85,11 +85,7 @@ def be_pinger(
     warm_up: str,
     out: str,
 ) -> None:
-    """Measure as node 1, and write the samples to `out` as raw int64.
-
-    Raises:
-        RuntimeError: Somebody is silent.
-    """
+    """Measure as node 1, and write the samples to `out` as raw int64."""
     import numpy as np
 
     receiver = int(nodes)

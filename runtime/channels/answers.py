@@ -40,8 +40,6 @@ class Settled(msgspec.Struct, frozen=True, gc=False):
     """A frame whose outcome is known.
 
     Attributes:
-        stamp: Of the frame (ns).
-        due: When its answer was due (ns).
         latency: Real seconds that its answer took.
         digest: Of its answer; `None` if it is known only that there is none.
         says_lost: Whether the answer reports lost tracking.
@@ -60,11 +58,9 @@ class Answers:
 
     Attributes:
         counts: Frames by `Outcome`, and wrong answers by `Wrong`.
-        sent: Frames that went out.
-        received: Frames of which the system has confirmed that it has them; `None` if it has no
-            way to say so.
+        received: Frames of which the system has confirmed that it has them; `None` if it has no way
+            to say so.
         latency: Seconds declared from a frame to its answer; `None` if they vary.
-        lost_allowed: How many frames may be lost.
         why_not: Why an equal run might differ, whatever the system's own answers do.
         costs: Cost of its answers, if its processes are known.
     """
@@ -104,10 +100,7 @@ class Answers:
                 self._initialised = frame.stamp
 
     def end(self, now: int) -> None:
-        """Forget the outcomes of frames not due by now (ns): nobody has received them.
-
-        Whether they were answered by now was up to real time, and no figure is.
-        """
+        """Forget the outcomes of frames not due by now (ns): they are up to real time."""
         with self._lock:
             self.counts -= Counter(each.outcome for each in self._settled if each.due > now)
             self._settled = [each for each in self._settled if each.due <= now]
@@ -180,15 +173,11 @@ class Answers:
 
 
 def read_latencies(path: Path, factor: float = 1.0) -> Callable[[int], float]:
-    """Return the measured latencies of a run as a function of a frame's stamp.
+    """Return the measured latencies (s) of a run by a frame's stamp (ns): the last answered one's.
 
     Args:
-        path: An ``answers/<name>.csv``.
+        path: An ``answers/<name>.csv``; before its first answered frame, that one's counts.
         factor: Multiplies each: how much slower the intended machine is.
-
-    Returns:
-        From a stamp (ns) to seconds: those of the last answered frame up to then, or else of the
-        first one.
 
     Raises:
         ConfigError: The file cannot be read, or is none; the message says where.

@@ -69,16 +69,13 @@ class Bundle(_Port, Generic[B]):
 
         async for image, depth, pose, imu in self.frames: ...
 
-    On an instance this is a `Matcher`. In the file, ``inputs = { frames = "drone/front" }``
-    narrows all fields but the tuples to one source, and ``"frames.imu" = "drone/imu"`` one field.
+    On an instance this is a `Matcher`. In the file, ``inputs = { frames = "drone/front" }`` narrows
+    all fields but the tuples to one source, and ``"frames.imu" = "drone/imu"`` one field. The
+    arguments not named here are as for `Input`, of whole sets.
 
     Args:
-        set_type: A `NamedTuple` of events, with fields as in the example.
         tolerance: Seconds by which stamps may differ from the first field's; the nearest is taken.
-        keep: ``every`` or ``latest``: which *sets* may be skipped, as for `Input`.
-        bound: How many sets ``every`` keeps.
-        overflow: ``error`` or ``drop_oldest``: what happens to one more.
-        wake: As for `Input`.
+        overflow: ``error`` or ``drop_oldest``: what happens to one more set than `bound`.
         source: Take only events of this source or below it (tuples apart).
 
     Raises:
@@ -207,7 +204,6 @@ class Matcher(Generic[B]):
                 self.missed[missing] += 1
 
     def _with_tuples_of(self, skipped: B, following: B) -> B:
-        """Return a set with the tuples of a skipped set prepended."""
         parts = list(following)
         for at in self._tuples:
             parts[at] = (*skipped[at], *parts[at])[-GATHERED:]
@@ -307,7 +303,6 @@ _WAIT: Any = object()
 
 
 def _fields(set_type: Any) -> dict[str, Field]:
-    """Read the fields of a `NamedTuple` class."""
     if not (isinstance(set_type, type) and hasattr(set_type, "_fields")):
         raise DeclarationError(f"Bundle: expected a NamedTuple of events, found {set_type!r}")
     hints = get_type_hints(set_type)
@@ -394,7 +389,6 @@ def read_declarations(cls: type[Any], base: type[Any]) -> Declared:
 
 
 def _check_phases(cls: type[Any], base: type[Any]) -> None:
-    """Raise `DeclarationError` for a phase with a missing or a superfluous ``async``."""
     for phase, method in vars(cls).items():
         meant = vars(base).get(phase)
         if not inspect.isfunction(method) or not inspect.isfunction(meant):

@@ -83,9 +83,7 @@ def future() -> concurrent.futures.Future[Any]:
 
 
 BEHIND = 2.0
-"""Lag of simulated time behind real time while a system initialises, in real seconds: an answer
-no later than this still decides when the run begins to hold.
-"""
+"""Most lag of simulated time behind real time while a system initialises, in real seconds."""
 
 IN_A_ROW = 3
 """Frames lost in a row for a system to count as hung, not waited for until its next answer."""
@@ -131,9 +129,7 @@ class Hold(Generic[T]):
     """Answers owed by an outside system.
 
     Args:
-        config: The wait, and the reaction to missing answers.
         latency: Seconds of the run's clock from a frame to its answer.
-        answers: Record of each frame's outcome.
         log: Called with lines for the run's log, in any thread.
         wall: Returns real seconds, without those in which the run is paused.
 
@@ -184,13 +180,10 @@ class Hold(Generic[T]):
     # On the loop.
 
     def owe(self, stamp: int) -> Owed[T]:
-        """Register an outgoing frame, and return its pending answer.
-
-        Args:
-            stamp: Of the frame (ns); greater than that of the one before.
+        """Register an outgoing frame by its stamp (ns), and return its pending answer.
 
         Raises:
-            ValueError: The stamp is not greater.
+            ValueError: The stamp is not greater than that of the frame before.
             MissingAnswerError: The system is gone, or hangs, and by the settings that is an error.
         """
         with self._changed:
@@ -235,14 +228,10 @@ class Hold(Generic[T]):
     def answer(
         self, stamp: int, value: T | None, says: Literal["", "initialising", "lost"] = ""
     ) -> None:
-        """Take an answer.
+        """Take an answer to the frame of a stamp (ns); `None` if no more is to come for it.
 
         Args:
-            stamp: Of the frame that it answers (ns).
-            value: What it holds, which is data; `None` if it is known only that there is no more
-                to come.
-            says: What it says of the system: nothing, that it still initialises, or that it has
-                lost track.
+            says: What it says of the system: nothing, that it still initialises, or has lost track.
         """
         digest = None if says == "initialising" else fingerprint(value)  # no answer yet
         with self._changed:
@@ -280,11 +269,7 @@ class Hold(Generic[T]):
             self._settle(owed, outcome, value, now - owed.since, digest, says == "lost")
 
     def gone(self, why: str) -> None:
-        """Report the loss of the system, effective at once.
-
-        Args:
-            why: Reason, for the log and the error.
-        """
+        """Report the loss of the system, effective at once."""
         with self._changed:
             if self._closed or self._gone:
                 return
@@ -347,7 +332,6 @@ class Hold(Generic[T]):
     # With the lock.
 
     def _initialising(self, stamp: int) -> bool:
-        """Tell whether nothing is owed yet for a frame."""
         if self._heard is not None or self._began is None:
             return False
         return stamp - self._began[0] < self.config.initialise * SECOND
@@ -366,11 +350,7 @@ class Hold(Generic[T]):
     def _settle(
         self, owed: Owed[T], outcome: Outcome, value: T | None = None, *answer: Any
     ) -> None:
-        """Settle a frame.
-
-        Args:
-            answer: Of what came: latency, digest, and whether it says lost; see `Settled`.
-        """
+        """Settle a frame; `answer` holds the further fields of `Settled`."""
         del self._owed[owed.stamp]
         settled = Settled(owed.stamp, owed.due, outcome, *answer)
         self._settled[owed.stamp] = settled
@@ -442,7 +422,6 @@ class Hold(Generic[T]):
         )
 
     def _watch(self) -> None:
-        """Have a thread look, from the first frame on."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._look_on, name=self.name, daemon=True)
             self._thread.start()

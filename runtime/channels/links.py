@@ -47,7 +47,6 @@ class Link:
     it have had the event.
 
     Args:
-        name: ``node.port``.
         before: Replaced link, whose figures are carried on.
     """
 

@@ -47,10 +47,8 @@ class Input(_Port, Generic[T]):
     On an instance this is a `runtime.channels.streams.Stream`.
 
     Args:
-        event: The type of event; its subclasses come too.
-        keep: What may be skipped. ``every``: nothing; up to `bound` events wait, and
-            `overflow` says what happens to one more. ``latest``: all but the newest.
-        bound: How many events ``every`` keeps.
+        keep: What may be skipped. ``every``: nothing; up to `bound` events wait, and `overflow`
+            says what happens to one more. ``latest``: all but the newest.
         overflow: ``error`` (default), ``drop_oldest``, or ``wait`` for senders that await
             `Sender.send_wait`.
         wake: ``now`` resumes the reader inside `send`; ``soon`` when the loop next turns.
@@ -102,11 +100,7 @@ class Input(_Port, Generic[T]):
 
 
 class Output(_Port, Generic[T]):
-    """An output: ``self.estimate.send(event)``. On an instance this is a `Sender`.
-
-    Args:
-        event: The type of event it sends. A base class allows any of its subclasses.
-    """
+    """An output: ``self.estimate.send(event)``. On an instance this is a `Sender`."""
 
     def __init__(self, event: type[T]) -> None:
         check_event_type("Output", event)
@@ -135,14 +129,11 @@ class Ticks(msgspec.Struct, frozen=True):
 
 
 def on(*events: type[Event], source: str | None = None) -> Callable[[F], F]:
-    """Make a method the handler of some types of event.
+    """Make a method the handler of some types of event, with their subclasses.
 
-    It runs inside `send`, in the order of the nodes in the file. It may return True: handled,
-    and no node after this one gets the event. It must be quick, and cannot wait.
-
-    Args:
-        events: Types of event; their subclasses come too.
-        source: Take only events of this source or below it.
+    It runs inside `send`, in the order of the nodes in the file. It may return True: handled, and
+    no node after this one gets the event. It must be quick, and cannot wait. With `source`, only
+    events of this source or below it come.
 
     Raises:
         DeclarationError: No event type, or the method is a coroutine function or a generator.

@@ -36,13 +36,10 @@ sender.)"""
 
 
 class Voices:
-    """Owners of source names: each node owns its name, and its announced sources.
+    """Owners of source names: each node owns its name, its announced sources, and all names below.
 
-    A name includes those below it, such as ``drone/imu``. A node that announces ``*`` (a replay
-    does) may send in all names without another owner.
-
-    Args:
-        scripted: Those that may send in any name: scripts of tests.
+    A node that announces ``*`` (a replay does) may send in all names without another owner; those
+    in `scripted`, scripts of tests, in any.
     """
 
     def __init__(self, nodes: Iterable[str], scripted: Collection[str] = ()) -> None:
@@ -52,11 +49,7 @@ class Voices:
         self._announced: set[tuple[type[Announcement], str]] = set()
 
     def announce(self, node: str, announcement: Announcement) -> None:
-        """Register a node as the owner of an announced source.
-
-        Raises:
-            ChannelSourceError: The source is another node's.
-        """
+        """Register a node as the owner of an announced source, or raise `ChannelSourceError`."""
         kind, source = type(announcement), announcement.source
         if kind is Announcement and source == "*":
             self._for_others.add(node)
@@ -103,9 +96,8 @@ class Sender(Generic[T]):
     """An output of a node.
 
     Args:
-        name: ``node.port``.
-        outside: Work of its node in threads just now. While there is some, each event is checked
-            to be sent by the loop's thread; else the first only.
+        outside: Work of its node in threads just now. While there is some, each event is checked to
+            be sent by the loop's thread; else the first only.
     """
 
     __slots__ = (
@@ -207,7 +199,6 @@ class Sender(Generic[T]):
         return self.send(event)
 
     def _check(self, event: T) -> None:
-        """Raise for a wrong type, thread or source; otherwise enable the fast path."""
         if not isinstance(event, self.event):
             raise ChannelTypeError(
                 f"{self.name}: expected events of type {self.event.__name__}, "
@@ -285,10 +276,7 @@ class Sender(Generic[T]):
     def _go_on(
         self, listeners: tuple[Deliver, ...], failed: Deliver, error: BaseException, event: T
     ) -> bool:
-        """Report the failed listener, and deliver to the remaining listeners.
-
-        Of handlers that answer one another, the first `send` reports: the last has no room left.
-        """
+        """Report the failed listener, and deliver to the remaining listeners."""
         if isinstance(error, RecursionError):
             if _sends(sys._getframe(2)):
                 raise error
@@ -319,7 +307,6 @@ class Listener:
     Args:
         events: Types received, with their subclasses.
         source: Only this source and those below it; `None` for all.
-        stream: The stream, if it is one.
     """
 
     __slots__ = ("deliver", "events", "node", "source", "stream")
@@ -395,5 +382,4 @@ def _circle(error: BaseException) -> str:
 
 
 def _raise(_: Deliver, error: BaseException) -> None:
-    """Pass a listener's error on to the sender: the default outside a run."""
     raise error

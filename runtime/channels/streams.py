@@ -31,12 +31,9 @@ _WOKEN: Any = None
 
 
 class StreamStatistics(msgspec.Struct, frozen=True):
-    """How full a stream is and was.
+    """How full a stream is and was: waiting now, the most that ever waited, and dropped.
 
-    Attributes:
-        buffered: Events waiting now.
-        peak: Most that ever waited.
-        dropped: Events discarded to make room (``latest``: replaced before anyone saw them).
+    Dropped are events discarded to make room (``latest``: replaced before anyone saw them).
     """
 
     buffered: int
@@ -58,11 +55,9 @@ class Stream(Generic[T]):
     """Buffer of events on their way to a single coroutine.
 
     Args:
-        name: For messages: ``node.port``.
-        bound: How many events are kept.
         overflow: What happens to one more: ``error`` raises `ChannelFullError`, ``drop_oldest``
-            discards the oldest and counts it, ``wait`` is for senders that await
-            `Sender.send_wait` (a plain `send` raises).
+            discards the oldest and counts it, ``wait`` is for senders that await `Sender.send_wait`
+            (a plain `send` raises).
         soon: Resume the reader when the loop next turns instead of inside `offer`.
     """
 
@@ -213,11 +208,7 @@ class Stream(Generic[T]):
         self._wake()
 
     def keep(self, event: T) -> None:
-        """Buffer an event; when full, apply the overflow policy.
-
-        Raises:
-            ChannelFullError: The buffer is full, and the policy drops nothing.
-        """
+        """Buffer an event; when full, apply the overflow policy, or raise `ChannelFullError`."""
         buffer = self._buffer
         if self._closed:
             return

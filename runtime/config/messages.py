@@ -56,7 +56,6 @@ def _translate(types: str) -> str:
 
 
 def _choices(type_: Any) -> list[str]:
-    """Return the possible values of a setting's type."""
     if get_origin(type_) is Literal:
         return [show(value) for value in get_args(type_)]
     if get_args(type_):
@@ -81,7 +80,6 @@ def _fields_at(type_: Any, path: str) -> list[str]:
 
 
 def _type_at(type_: Any, path: str) -> Any:
-    """Return the type of the setting at a path; `None` if there is none."""
     for name in re.findall(r"\.([\w-]+)", path):
         struct = struct_in(type_)
         fields = () if struct is None else msgspec.structs.fields(struct)

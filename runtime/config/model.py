@@ -77,13 +77,8 @@ class NodeSpec(msgspec.Struct, frozen=True, kw_only=True):
     """A ``[[nodes]]`` table.
 
     Attributes:
-        name: Unique in the file.
         type_name: As in the file: a listed node's name, or ``module:Class``.
         on_error: Effect of an exception in the node on the run.
-        inputs: Port or handler to the source it is narrowed to.
-        links: Port or handler to the settings of its link.
-        node: The class.
-        config: The node's own settings.
     """
 
     name: str

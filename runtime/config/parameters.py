@@ -42,7 +42,6 @@ class Change(NamedTuple):
 
     Attributes:
         node: Its name; empty if nothing changes.
-        config: The new settings.
         values: Each new value, as TOML, by key: ``gain``, ``cameras.front.loss``.
     """
 
@@ -116,7 +115,6 @@ def toml(value: Any) -> str:
 
 
 def _table(config: msgspec.Struct) -> dict[str, Any]:
-    """Return settings as read by `tomllib`; unset settings are left out."""
     found: dict[str, Any] = without_none(msgspec.to_builtins(config, enc_hook=plain))
     return found
 
@@ -136,7 +134,6 @@ def _differences(before: Any, after: Any) -> Iterator[tuple[tuple[str, ...], Any
 
 
 def _names(value: Any) -> list[str]:
-    """Return the names of a list of tables; empty unless all have a name."""
     if not isinstance(value, list) or not all(isinstance(v, dict) and "name" in v for v in value):
         return []
     return [v["name"] for v in value]

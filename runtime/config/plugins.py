@@ -36,7 +36,6 @@ class Offer(NamedTuple):
     """Entry point offered by a package.
 
     Attributes:
-        package: The name of the distribution.
         name: The name of the command, or of the node's class.
         value: ``module:attribute``.
     """

@@ -57,9 +57,6 @@ class _NodeHead(msgspec.Struct, frozen=True, kw_only=True):
 def load_configuration(path: Path, overrides: Sequence[str] = ()) -> Config:
     """Read a configuration file: TOML, or a package's format, chosen by suffix.
 
-    Args:
-        overrides: As of `load`.
-
     Raises:
         ConfigError: Something in the file is wrong.
         CommandError: The package's reader cannot be imported.
@@ -72,7 +69,6 @@ def load_configuration(path: Path, overrides: Sequence[str] = ()) -> Config:
 
 @cache
 def _warn_once(warning: str) -> None:
-    """Print a warning, but not again if a file is read again, as for a sweep."""
     print(f"warning: {warning}", file=sys.stderr)
 
 
@@ -81,12 +77,11 @@ def load(
     overrides: Sequence[str] = (),
     read: Callable[[str, str], dict[str, Any]] | None = None,
 ) -> Config:
-    """Read a file.
+    """Read a file, with changes as of `--set`.
+
+    Relative paths start, and modules of nodes are looked for, in its folder.
 
     Args:
-        path: The file. Its folder is where relative paths in it start, and where modules of its
-            nodes are looked for, too.
-        overrides: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word.
         read: Makes the table of a whole file from its text and its name, if it is not TOML.
 
     Raises:
@@ -101,11 +96,7 @@ def load(
 
 
 def text_of(path: Path) -> str:
-    """Return the text of a file.
-
-    Raises:
-        ConfigError: It cannot be read, or is no text.
-    """
+    """Return the text of a file, or raise `ConfigError`."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -203,11 +194,7 @@ _DEEPEST = 32
 
 
 def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
-    """Return the node classes offered by packages, by name in a file, sorted.
-
-    Args:
-        warn: Called with a line for each that cannot be imported; it is left out.
-    """
+    """Return the node classes offered by packages, by name, sorted; warn of broken ones."""
     found = {}
     offered = Counter(offer.name for offer in offers(NODES))
     for package, name, value in offers(NODES):
@@ -384,7 +371,6 @@ def _decode(type_: type[Any], value: Any) -> Any:
 
 
 def _known_modules() -> list[str]:
-    """Return the names of the modules in our rooms for nodes, without importing them."""
     names = []
     for room in ("sims", "nodes"):
         spec = importlib.util.find_spec(room)

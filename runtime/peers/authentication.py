@@ -97,12 +97,7 @@ class Seal:
 class Sealing:
     """Seals of a session, in both directions.
 
-    Args:
-        mine: Id and nonce of this process.
-
     Attributes:
-        nonce: Of this process.
-        seen: Of the other one.
         tag: Names the session.
     """
 
@@ -141,11 +136,7 @@ SHORTEST = 16
 
 
 def secret_of(setting: str) -> bytes:
-    """Return the secret shared by all processes of a run.
-
-    Args:
-        setting: `network.secret`: ``env:NAME``, ``file:PATH``, the secret itself, or nothing for
-            that of this user on this machine.
+    """Return the secret shared by all processes of a run, as `network.secret` describes it.
 
     Raises:
         PeerError: There is none, or others may read it.
@@ -180,7 +171,6 @@ def _of_this_user() -> str:
 
 
 def _make(path: Path) -> None:
-    """Write a new key; of several processes at once, the first succeeds."""
     with tempfile.NamedTemporaryFile("w", dir=path.parent) as file:  # mode 0600
         file.write(secrets.token_hex(32))
         file.flush()

@@ -29,11 +29,7 @@ LIMIT = 500e-6
 async def compare(
     member: Member, until: Callable[[Callable[[], bool]], Coroutine[Any, Any, None]]
 ) -> None:
-    """Measure the offset of another process's monotonic clock, unless the process is lost.
-
-    Args:
-        until: Waits for something that other processes bring about.
-    """
+    """Measure the offset of another process's monotonic clock, unless the process is lost."""
     for _ in range(KEPT):
         count = member.exchanges.count
         ask(member)
@@ -48,10 +44,8 @@ def ask(member: Member) -> None:
 class PhaseLockedLoop:
     """How quickly to run to catch up with a clock: a phase-locked loop of the second order.
 
-    It is critically damped and settles in half a minute. (As in RFC 5905, section 11.3.)
-
-    Attributes:
-        drift: How much quicker the other clock is, as far as is known.
+    It is critically damped and settles in half a minute. (As in RFC 5905, section 11.3.) `drift` is
+    how much quicker the other clock is, as far as is known.
     """
 
     PROPORTIONAL = 0.2  # a second
@@ -61,11 +55,7 @@ class PhaseLockedLoop:
         self.drift = 0.0
 
     def factor(self, late: float, seconds: float) -> float:
-        """Return how quickly to run from here on.
-
-        Args:
-            late: Seconds by which our clock is late.
-        """
+        """Return how quickly to run from here on, `late` seconds behind."""
         drift = self.drift + self.INTEGRAL * late * seconds
         wanted = drift + self.PROPORTIONAL * late
         if abs(wanted) < LIMIT:  # else this is more than drift

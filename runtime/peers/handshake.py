@@ -41,7 +41,6 @@ class Contact:
 
     Attributes:
         nonce: In our greetings, until one is answered.
-        member: The process, while there is a session.
         doubt: Nonce of a greeting of another session than ours, until it is replied to.
     """
 
@@ -74,11 +73,7 @@ class Handshakes:
 
     Zenoh's callbacks hold its locks: requests to Zenoh are left to the loop.
 
-    Args:
-        membership: Describes this process, and is notified of sessions.
-
     Attributes:
-        id: By which the others know us.
         refused: Number of messages left out, since no process of the run wrote them.
     """
 
@@ -226,7 +221,6 @@ class Handshakes:
             self._session.put(other, seal.put_on(0, encode(hello)), b"")
 
     def _contact(self, other: str) -> Contact | None:
-        """Return the contact of a process, created if new; `None` beyond `STRANGERS`."""
         if other not in self._contacts:
             if sum(c.member is None for c in self._contacts.values()) >= STRANGERS:
                 return None

@@ -63,11 +63,7 @@ LEAD = 50_000_000
 
 
 class JointStart:
-    """Our part in the start of a run.
-
-    Args:
-        startup_limit: Seconds that one node may take to start up.
-    """
+    """Our part in the start of a run."""
 
     def __init__(self, membership: Membership, clock: Clock, startup_limit: float) -> None:
         self._membership = membership
@@ -99,12 +95,10 @@ class JointStart:
         return [a for name in self._membership.nodes for a in everything.get(name, ())]
 
     async def begin(self) -> Member | None:
-        """Agree with the others on the first update, and wait until then.
+        """Agree with the others on the first update, wait for it, and return whose clock counts.
 
-        A process that comes back to a run that goes on joins it where it is.
-
-        Returns:
-            The process whose clock counts, or `None` if it is this one.
+        A process that comes back to a run that goes on joins it where it is. `None` is this
+        process.
         """
         membership, lockstep = self._membership, isinstance(self._clock, LockstepClock)
         while True:
@@ -187,7 +181,6 @@ class JointStart:
             )
 
     def _whole(self) -> bool:
-        """Return whether nobody is waited for to return: all are there, or the run goes on."""
         return self._membership.complete() or any(m.running for m in self._membership.present())
 
     async def _until(
@@ -196,11 +189,9 @@ class JointStart:
         await self._membership.waiting.until(condition, whom=whom, limit=self._limit())
 
     def _limit(self) -> float:
-        """Return the real seconds for all nodes of another process to start up."""
         return self._startup_limit * (self._membership.largest() + 1)
 
     def _reference(self) -> Member | None:
-        """Return the process with the reference clock; `None` for this process."""
         present = self._membership.present()
         running = [m for m in present if m.running]
         first = next(iter(running or present), None)
@@ -236,7 +227,6 @@ class JointShutdown:
         on_timeout: Called when some are not waited for any more.
 
     Attributes:
-        ended_nodes: Nodes of other processes that have ended.
         at_work: Whether a node here is about to end.
         received_at: When the last message of another process came, on `time.monotonic`.
     """
@@ -277,11 +267,7 @@ class JointShutdown:
     def receive(
         self, member: Member, message: FinalSummary | SummaryReceived | StillWorking
     ) -> None:
-        """Handle a part of the summary from another process, or its receipt of ours.
-
-        Raises:
-            WireError: It is no summary.
-        """
+        """Handle a part of another's summary, or its receipt of ours; or raise `WireError`."""
         if isinstance(message, SummaryReceived):
             member.has_our_summary = True
         if not isinstance(message, FinalSummary):
@@ -339,7 +325,6 @@ class JointShutdown:
         self._watch()
 
     def _give_up(self) -> None:
-        """End without the silent processes."""
         membership = self._membership
         if silent := [m for m in membership.present() if not m.has_our_summary]:
             names = "; ".join(name_of(m.nodes) for m in silent)

@@ -62,7 +62,6 @@ class Outbox:
 
     Attributes:
         replaced: Number of events replaced by a newer one of the same output.
-        peak: Most messages that ever waited.
         memory: Shared with the other process, once confirmed.
     """
 
@@ -211,12 +210,9 @@ KEPT = 20
 
 
 class Exchange(NamedTuple):
-    """Result of a question and its answer, in nanoseconds.
+    """Result of a question and its answer (ns): `offset` is their monotonic clock minus ours.
 
-    Attributes:
-        round_trip: Duration; half of it bounds the error of the others.
-        offset: Their monotonic clock minus ours.
-        late: Their clock of the run minus ours.
+    Half of the round trip bounds its error, and that of `late`: their clock of the run minus ours.
     """
 
     round_trip: int
@@ -225,11 +221,7 @@ class Exchange(NamedTuple):
 
 
 class Exchanges:
-    """Latest exchanges with a process; the quickest counts.
-
-    Attributes:
-        count: Total number so far.
-    """
+    """Latest exchanges with a process; the quickest counts."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -255,12 +247,6 @@ FREE_EVERY = 4
 class Member:
     """Another process, for the duration of a session.
 
-    Args:
-        hello: Its description of itself.
-        sealing: Seals of the session.
-        put: Writes a message to it; may wait.
-        failed: Called with the error of a failed write.
-
     Attributes:
         number: Its number among the processes of the run, or -1 if it is none of them.
         over: Why the session has ended, if it has.
@@ -268,15 +254,10 @@ class Member:
         running: Whether its first update was already, as far as is known.
         unfit: Whether it is no part of the run: it runs another file, or nodes that run elsewhere.
         held: Messages it has sent, while another process with its nodes is still in the run.
-        exchanges: Of the time.
         drift_ppm: Drift of its clock relative to ours, parts per million, if we follow it.
-        announced: What its nodes announced.
-        ready: Whether its nodes can begin.
         begin: When the first update is, if it has sent that.
-        final_summary: Its part of the run's summary.
         outgoing: Memory that was offered to it.
         incoming: Memory of its own that we see.
-        has_our_summary: Whether it has our part of the run's summary.
     """
 
     def __init__(
@@ -311,11 +292,7 @@ class Member:
         )
 
     def event(self, message: EventMessage, payload: bytes) -> Event:
-        """Return the event of a message.
-
-        Raises:
-            WireError: There is none that is known here.
-        """
+        """Return the event of a message, or raise `WireError`."""
         if message.place is None:
             return unpack(payload)
         if self.incoming is None:

@@ -82,11 +82,8 @@ class Membership:
         peers: Notified, on the loop, of messages and losses.
 
     Attributes:
-        nodes: Of the whole file, in order.
         here: Those that run in this process, in order.
         me: Number of this process. They are numbered by their first nodes, once all have met.
-        count: How many processes there are in all.
-        hello: Who we are.
         waiting: For other processes, and for the return of those lost before the first update.
         ended: Once the run ends, what is sent to processes that join.
     """
@@ -154,10 +151,6 @@ class Membership:
         return self._before
 
     def _number_all(self) -> bool:
-        """Give the processes numbers when all are there; return whether they have them.
-
-        Called as each joins: when the loop comes to a coroutine that waits for it, one may be lost.
-        """
         if self._numbers:
             return True
         if self._missing():

@@ -78,23 +78,13 @@ class Subscriptions(Message, frozen=True):
 
 
 class Ping(Message, frozen=True):
-    """Request for the receiver's time.
-
-    Attributes:
-        sent: My monotonic clock, in nanoseconds.
-    """
+    """Request for the receiver's time; `sent` is my monotonic clock (ns)."""
 
     sent: int
 
 
 class Pong(Message, frozen=True):
-    """An answer.
-
-    Attributes:
-        sent: As in the ping.
-        here: My monotonic clock, in nanoseconds.
-        now: My clock of the run.
-    """
+    """An answer: `sent` of the ping, `here` my monotonic clock (ns), `now` that of the run."""
 
     sent: int
     here: int
@@ -102,11 +92,7 @@ class Pong(Message, frozen=True):
 
 
 class Ready(Message, frozen=True):
-    """My nodes can begin.
-
-    Attributes:
-        begun: They have: our session began after my first update.
-    """
+    """My nodes can begin; or, of a session later than my first update, have begun."""
 
     begun: bool = False
 
@@ -124,13 +110,7 @@ class FirstUpdate(Message, frozen=True):
 
 
 class MemoryOffer(Message, frozen=True):
-    """Memory of the sender for large frames, if visible to the receiver.
-
-    Attributes:
-        machine: Where it is.
-        path: To its file.
-        key: Its first bytes.
-    """
+    """Memory of the sender for large frames, if the receiver sees it; `key` is its first bytes."""
 
     machine: str
     path: str
@@ -145,7 +125,6 @@ class EventMessage(Message, frozen=True):
     """An event of an output (``node.port``).
 
     Attributes:
-        output: Whose.
         serial: Its place among the ordered messages.
         place: Where its frame stands in my memory, and its size; `None`: it is the payload.
     """
@@ -159,8 +138,6 @@ class Stop(Message, frozen=True):
     """End the run.
 
     Attributes:
-        reason: Why.
-        error: What went wrong, if anything did.
         serial: Its place among the ordered messages.
         apart: Whether I take no part in the turns: my first update was not yet, or I give up.
         by: Who ends it, as in `RunEnd`.
@@ -202,7 +179,6 @@ class TimeToken(Message, frozen=True):
 
     Attributes:
         epoch: Turns of an earlier one are void.
-        now: Nanoseconds of the run's clock.
         orders: Counters that order what is due at one time: of the schedule, and of the loop.
         keys: What each process has due next.
         unread: Processes that have messages to take in before time goes on.
@@ -240,9 +216,6 @@ class StateReport(Message, frozen=True):
     Attributes:
         processes: Ids of all that I know to be there.
         epoch: Of the last turn that I know of.
-        now: As in `TimeToken`.
-        orders: As in `TimeToken`.
-        key: What I have due next.
         sent: How many ordered messages I have sent to each process.
     """
 
@@ -279,11 +252,7 @@ _decoder: msgspec.msgpack.Decoder[AnyMessage] = msgspec.msgpack.Decoder(AnyMessa
 
 
 def decode(data: bytes) -> AnyMessage:
-    """Read a message.
-
-    Raises:
-        WireError: It is none.
-    """
+    """Read a message, or raise `WireError`."""
     try:
         return _decoder.decode(data)
     except (msgspec.DecodeError, RecursionError) as error:

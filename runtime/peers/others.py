@@ -25,10 +25,7 @@ class Others:
         self._clock = clock
 
     async def meet(self) -> int:
-        """Wait until all nodes of the file are there.
-
-        Returns:
-            How often the nodes here were in this run before, in a process that was lost.
+        """Wait until all nodes of the file are there; return how often ours were lost before.
 
         Raises:
             PeerError: They are not within the limit, or one runs another file or our nodes.
@@ -40,11 +37,7 @@ class Others:
         return list(chain(*own.values()))
 
     async def begin(self, connect: Callable[[], None]) -> None:
-        """Agree with the others on the first update, and wait until then.
-
-        Args:
-            connect: Connects the nodes here, so that each process knows what the others receive.
-        """
+        """Agree with the others on the first update, and wait until then."""
 
     def start_clock(self) -> None:
         """Start the run's clock, if nobody else does."""

@@ -66,11 +66,7 @@ class Run(Protocol):
 
 
 class Peers(Others):
-    """All other processes of a run.
-
-    Attributes:
-        shutdown: Our part in the end of it.
-    """
+    """All other processes of a run."""
 
     def __init__(self, config: Config, only: Iterable[str], clock: Clock, run: Run) -> None:
         self._config = config
@@ -94,14 +90,7 @@ class Peers(Others):
     # Before the run.
 
     async def meet(self) -> int:
-        """Wait until all nodes of the file are there.
-
-        Returns:
-            How often the nodes here were in this run before, in a process that was lost.
-
-        Raises:
-            PeerError: They are not within the limit, or one runs another file or our nodes.
-        """
+        """Wait until all nodes of the file are there."""
         membership = self._membership
         before = await membership.meet()
         self._remote = RemoteEvents(
@@ -148,7 +137,6 @@ class Peers(Others):
             self.lost(absent.pop(min(absent)))
 
     def _receive_early(self) -> None:
-        """Handle messages received too early, but not those of processes lost since."""
         early, self._early = self._early, []
         for item in early:
             self._membership.take(*item)
@@ -223,11 +211,7 @@ class Peers(Others):
     # What the membership notifies of.
 
     def receive(self, member: Member, message: OfTheRun, event: Event | None) -> None:
-        """Take in a message of another process.
-
-        Raises:
-            WireError: It makes no sense.
-        """
+        """Take in a message of another process, or raise `WireError`."""
         self.shutdown.received_at = time.monotonic()
         match message:
             case EventMessage() if self._begun and self._token is None:  # first: there are many
@@ -330,7 +314,6 @@ class Peers(Others):
             log.warning("to %s: %s", name_of(member.nodes), error)
 
     def _do(self, number: int, message: Ordered, event: Event | None) -> None:
-        """Carry out another process's message; in lockstep, at our turn."""
         try:
             match message:
                 case EventMessage() if self._remote is not None and event is not None:
@@ -363,10 +346,7 @@ class Peers(Others):
         self._run.connect()
 
     def _gather(self, *new: int, at_once: bool = False) -> None:
-        """In lockstep, share turns among the processes present, once none is awaited (any more).
-
-        Those in `new` were not there before.
-        """
+        """In lockstep, share turns among the processes present, unless one is awaited."""
         if self._token is None or self._loop is None or not self._begun:
             return
         self._new.update(new)
@@ -401,7 +381,6 @@ class Peers(Others):
                 member.outbox.send(message)
 
     def _leave(self, process: int, output: str, event: Event, skip: bool) -> None:
-        """Let an event leave for another process."""
         if self._token is not None:
             self._token.post(process, EventMessage(output), event)
         elif member := self._membership.numbered(process):

@@ -18,11 +18,7 @@ Leave = Callable[[int, str, Event, bool], None]
 
 
 class RemoteEvents:
-    """Events between this process and the others.
-
-    Args:
-        owners: The number of the process that has each node.
-    """
+    """Events between this process and the others."""
 
     def __init__(
         self, specs: Iterable[NodeSpec], owners: dict[str, int], me: int, leave: Leave
@@ -48,10 +44,7 @@ class RemoteEvents:
         self._wanted[process] = wanted
 
     def listeners(self, output: str) -> list[Listener]:
-        """Return the listeners of an output in other processes.
-
-        They come before those in this process, so that a handler here ends no delivery there.
-        """
+        """Return the listeners in other processes; before those here, to reach them in any case."""
         return [
             RemoteListener(process, output, wanted, self._leave)
             for process, wanted in sorted(self._wanted.items())

@@ -37,8 +37,7 @@ KEY = 32
 class Outgoing:
     """Memory written by this process, with large events for another.
 
-    `put` is called by one thread at a time, `freed` by any. The file is closed when this
-    object is used no more.
+    `put` is called by one thread at a time, `freed` by any. The file is closed with this object.
     """
 
     def __init__(self) -> None:
@@ -77,7 +76,7 @@ class Outgoing:
 class Incoming:
     """Memory written by another process, with large events for this process.
 
-    The file is closed when this object is used no more; arrays that stand in it stay valid.
+    The file is closed with this object; arrays that stand in it stay valid.
     """
 
     def __init__(self, fd: int) -> None:
@@ -110,11 +109,7 @@ class Incoming:
         return cls(fd)
 
     def frame(self, offset: int, size: int) -> memoryview:
-        """Return a frame in place, without a copy.
-
-        Raises:
-            WireError: There is none.
-        """
+        """Return a frame in place, without a copy; raise `WireError` if there is none."""
         try:
             block = self._window.view(offset, size)
         except (OSError, ValueError) as error:

@@ -51,7 +51,6 @@ class TimeTokenHolder:
 
     Args:
         me: Number of this process; they are numbered in the order of their first nodes.
-        count: Number of processes.
         deliver: Given the messages of others, in order, at this process's turn.
     """
 
@@ -86,10 +85,8 @@ class TimeTokenHolder:
     def gather(self, alive: Sequence[int], ids: Sequence[str], new: Sequence[int] = ()) -> None:
         """Begin anew with these processes, by number and id: the turn may be lost.
 
-        Args:
-            alive: Who is there, this process included.
-            ids: Their ids; all must report the same before there is a turn again.
-            new: Those that were not there before, or not as they are now.
+        There is a turn again once all report the same ids; `new` were not there before, or have
+        changed.
         """
         self._alive = frozenset(alive)
         self._ids = tuple(sorted(ids))
@@ -146,11 +143,7 @@ class TimeTokenHolder:
         message: TimeToken | TokenRequest | StateReport | Ordered,
         event: Event | None,
     ) -> None:
-        """Take in a message of another process.
-
-        Raises:
-            WireError: It is of another number of processes.
-        """
+        """Take in a message of another process; raise `WireError` if it counts other processes."""
         match message:
             case TimeToken():
                 if not message.fits(len(self._keys)):
@@ -224,7 +217,6 @@ class TimeTokenHolder:
     # After a process left or joined.
 
     def _report_state(self, key: Key) -> None:
-        """Report our state to the process making the next turn."""
         self._report_due = False
         self._reported_key = key
         standing = StateReport(
@@ -243,7 +235,6 @@ class TimeTokenHolder:
             self._send(maker, standing, None)
 
     def _resume(self) -> None:
-        """Make a turn, if ours to make and all have reported their state."""
         found = [self._reports.get(n) for n in sorted(self._alive)]
         if min(self._alive, default=-1) != self._me or any(
             s is None or s.processes != self._ids for s in found

@@ -26,7 +26,6 @@ class Waiting:
     """Waits of this process for conditions met by other processes.
 
     Args:
-        present: Returns the other processes of the run that are there.
         startup_limit: Real seconds within which a process lost before the first update must return.
 
     Attributes:
@@ -108,7 +107,6 @@ class Waiting:
             log.warning("%s: back, at %s", name_of(member.nodes), member.place)
 
     def _time_left(self, begin: float, limit: float) -> float:
-        """Return the real seconds left for a wait."""
         if limit == math.inf:
             return limit
         ends = [max([begin, *self._first_losses.values()]) + limit]
@@ -117,11 +115,7 @@ class Waiting:
         return min(ends) - time.monotonic()
 
     def _name(self, whom: Callable[[Member], bool], limit: float, *, late: bool) -> None:
-        """Log the awaited processes.
-
-        Raises:
-            PeerError: It is too late.
-        """
+        """Log the awaited processes."""
         slow = "; ".join(f"{name_of(m.nodes)} ({m.place})" for m in self._present() if whom(m))
         gone = "; ".join(_loss(member) for _, member in sorted(self.absent.items()))
         if late and gone:
@@ -138,8 +132,6 @@ def _loss(member: Member) -> str:
 
 
 class _Closed:
-    """Closed gate of simulated time: nothing passes."""
-
     def may_go(self, key: Key) -> bool:  # noqa: ARG002
         return False
 

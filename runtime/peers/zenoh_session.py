@@ -34,22 +34,16 @@ CLOSING = 3.0
 """Real seconds for a session to close; a hung peer keeps Zenoh waiting for longer."""
 
 _ENDPOINT = re.compile(r"(\w+)/\[?([^\]#?]+?)\]?:(\d+)([#?].*)?")
-"""Protocol, host and port."""
 
 
 class Session:
     """A place among the processes of a run.
 
     Args:
-        run: The run's name; processes of other runs are not seen.
-        network: Where processes meet, and how they talk.
         secret: That they share. Without a Zenoh file, no other process can connect.
 
     Raises:
         PeerError: The session cannot be opened.
-
-    Attributes:
-        id: By which the other processes know this one.
     """
 
     def __init__(self, run: str, network: NetworkConfig, secret: bytes) -> None:
@@ -76,7 +70,6 @@ class Session:
         """Be seen by the others, and see them.
 
         Args:
-            on_message: Called with each message.
             on_presence: Called for processes that come and go, this one not included.
         """
 
@@ -142,7 +135,6 @@ class Session:
 
 
 def _configuration(network: NetworkConfig) -> zenoh.Config:
-    """Return the file's configuration; where silent, settings to find the other processes."""
     plain, configuration = zenoh.Config(), zenoh.Config()
     if network.zenoh:
         if not Path(network.zenoh).is_file():
@@ -193,7 +185,6 @@ def _endpoints(configuration: zenoh.Config, way: str) -> list[str]:
 
 
 def _warn_if_open(configuration: zenoh.Config) -> None:
-    """Warn of an endpoint open to other machines without encryption."""
     bare = [
         endpoint
         for endpoint in _endpoints(configuration, "listen")
@@ -224,7 +215,6 @@ def _beside(meet: str) -> list[str]:
 
 
 def _is_here(endpoint: str) -> bool:
-    """Return whether only processes of this machine reach an endpoint."""
     parts = _ENDPOINT.fullmatch(endpoint)
     host = parts[2] if parts else ""
     try:

@@ -100,10 +100,9 @@ async def _exercise(factory: Factory | None, loop: asyncio.AbstractEventLoop) ->
 
 
 class RunTask(asyncio.Task[Any]):
-    """Task hashed independently of its address; protectable by the run.
+    """Task protectable by the run, hashed independently of its address.
 
-    Code that goes through a set of tasks (a `TaskGroup` that cancels them, a caller of
-    `asyncio.wait`) does so in the same order in equal runs.
+    So code that goes through a set of tasks does so in the same order in equal runs.
     """
 
     tasks = 0
@@ -120,11 +119,7 @@ class RunTask(asyncio.Task[Any]):
         return self._number
 
     def cancel(self, msg: Any | None = None) -> bool:
-        """Cancel the task, as `asyncio.Task` does.
-
-        Raises:
-            NodeError: It is protected, and a node other than its own cancels it.
-        """
+        """Cancel the task; raise `NodeError` if it is protected from the node that asks."""
         caller = sys._getframe(1)
         if self.protected and not caller.f_globals.get("__name__", "").startswith("runtime."):
             node, place = code_location.of_thread(caller)
@@ -181,11 +176,9 @@ def run_to_end(
     """Run a loop until a coroutine is done, close the loop, and return the coroutine's result.
 
     Args:
-        loop: Not running yet.
         escaped: Called with errors of the loop while `main` is not done; the loop then goes on,
             unless this raises.
 
-    Raises:
         BaseException: Whatever `main` raises.
     """
     try:
@@ -224,7 +217,6 @@ def _close(loop: asyncio.AbstractEventLoop) -> None:
 def _run_for(
     loop: asyncio.AbstractEventLoop, coro: Coroutine[Any, Any, Any], seconds: float
 ) -> None:
-    """Run a loop until a coroutine is done, for so many real seconds at most."""
     task = loop.create_task(coro)
     task.add_done_callback(lambda _: loop.stop())
 

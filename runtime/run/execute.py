@@ -56,12 +56,10 @@ def execute(
 
     Args:
         out: Folder for results, or its path; `None` writes nothing.
-        handlers: Where log records go, besides ``log.txt`` in `out`.
         watch: Given the supervisor, returns a context that lasts as long as the run: a progress
             bar, a monitor.
         only: Nodes to run here; the others run in other processes. All, if empty.
         stand_ins: Classes that run in the place of some nodes' own, by the node's name.
-        digest: What takes in all events; by default one is made if the settings say so.
         complete: Called with the summary before it is written; returns what is.
 
     Raises:
@@ -92,11 +90,7 @@ def execute(
 
 
 def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
-    """Return a new event loop for the run's clock.
-
-    Raises:
-        UnsupportedInterpreterError: Time cannot be simulated on this interpreter.
-    """
+    """Return a new event loop for the run's clock, or raise `UnsupportedInterpreterError`."""
     if run.clock == "lockstep":
         lockstep.check_interpreter()
         return LockstepLoop(speed=None if run.speed in {None, "max"} else run.speed)  # type: ignore[arg-type]
@@ -119,8 +113,6 @@ def make_clock(run: RunConfig, loop: asyncio.AbstractEventLoop) -> Clock:
 
 
 class _Run:
-    """A run, from its loop to the callbacks after its end; see `execute`."""
-
     supervisor: Supervisor
     private: Path | None = None
     """Output folder of nodes starting no programs; `None` for the run's folder."""

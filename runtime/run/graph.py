@@ -88,12 +88,9 @@ def connect(
 
     Args:
         nodes: In the order in which they receive events.
-        sources: Ports narrowed by the file.
-        links: Ports whose events come late or not at all.
         fault: Called with listeners that raise; without it, `send` raises what they do.
         elsewhere: Given ``node.port``, returns its listeners in other processes.
         wrap: Puts something round the nodes' handlers.
-        voices: Who may send in which name; without it, all in any.
     """
     connected = [
         listener

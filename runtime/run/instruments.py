@@ -35,7 +35,6 @@ class Instrument:
         """Return the function to call instead of `call`, the loop's entry into a node.
 
         Args:
-            what: The handler, the tick or the coroutine.
             call: Takes an event, a `Tick`, or what a coroutine is sent.
         """
         return call
@@ -56,11 +55,7 @@ class Instrument:
 
 
 class Instruments:
-    """The instruments of a run.
-
-    Args:
-        reconnect: Connects the run's senders and listeners anew, if it is running.
-    """
+    """The instruments of a run."""
 
     def __init__(self, runners: Mapping[str, NodeRunner], reconnect: Callable[[], None]) -> None:
         self._runners = runners
@@ -123,7 +118,6 @@ class Instruments:
         return call  # type: ignore[no-any-return]
 
     def _renew(self) -> None:
-        """Wrap all tickers, tasks and workers anew, and reconnect the run."""
         for name, runner in self._runners.items():
             for ticker in runner.tickers:
                 self.on_ticker(ticker)

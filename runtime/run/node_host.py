@@ -34,14 +34,7 @@ log = logging.getLogger("visnav.runtime")
 
 
 class NodeHost:
-    """The `Host` of a run's nodes.
-
-    Args:
-        out: Folder for what nodes write, or `None`.
-        create: Makes a task that the run owns.
-        stop: Ends the run, for a reason of a node.
-        fault: Called with the node and what it raised.
-    """
+    """The `Host` of a run's nodes."""
 
     checking = False
 
@@ -254,7 +247,6 @@ def siblings(config: Config, here: Container[str]) -> tuple[Sibling, ...]:
 
 
 def _ticker_name(runner: NodeRunner, name: str) -> str:
-    """Return ``node.name``, with a number if the node has a ticker of this name already."""
     full = f"{runner.spec.name}.{name}"
     taken = {ticker.name for ticker in runner.tickers if not ticker.stopped}
     return next(n for n in chain([full], (f"{full}_{i}" for i in count(2))) if n not in taken)

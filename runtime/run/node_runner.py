@@ -47,14 +47,7 @@ Create = Callable[[Coroutine[Any, Any, Any], str], asyncio.Task[Any]]
 
 
 class NodeRunner:
-    """State of a node in a run: its tasks, tickers, workers, holds, links and phase.
-
-    Args:
-        create: Makes a task that the run owns.
-
-    Attributes:
-        phase: The step that the run waits for, if it does: ``on_startup``, ``its tasks``…
-    """
+    """State of a node in a run: its tasks, tickers, workers, holds, links and phase."""
 
     def __init__(self, spec: NodeSpec, create: Create) -> None:
         self.spec = spec
@@ -81,10 +74,7 @@ class NodeRunner:
 
     @property
     def doing(self) -> str:
-        """Work of the node in its own words; in a phase without any, the phase; or "".
-
-        May be read in any thread.
-        """
+        """Work of the node in its own words, its phase, or ""; for any thread."""
         return (self.node.doing if self.node is not None else "") or self.phase
 
     def awaited(self) -> list[asyncio.Task[Any]]:
@@ -94,11 +84,8 @@ class NodeRunner:
     async def start_up(self, host: Host, limit: float) -> None:
         """Make the node and the links before its ports, and run `on_startup`.
 
-        Args:
-            limit: Real seconds for `on_startup`.
-
         Raises:
-            NodeError: The node failed.
+            NodeError: The node failed, or took longer than `limit` (real s).
         """
         spec = self.spec
         self.shutting_down = False
@@ -120,11 +107,7 @@ class NodeRunner:
             self.starts += self._succeeded
 
     def announcements(self) -> list[Announcement]:
-        """Return the node's announcements.
-
-        Raises:
-            NodeError: The node failed, or returned something else.
-        """
+        """Return the node's announcements, or raise `NodeError`."""
         assert self.node is not None
         name = self.spec.name
         try:
@@ -146,8 +129,8 @@ class NodeRunner:
         """Hand the node all announcements, then call its `check`.
 
         Raises:
-            NodeError: The node failed; a `RefusedError` if it cannot work with an announcement, or
-                lacks something.
+            NodeError: The node failed; a `RefusedError` if it cannot work with one, or lacks
+                something.
         """
         assert self.node is not None
         name = self.spec.name
@@ -167,14 +150,7 @@ class NodeRunner:
             raise RefusedError(name, "; ".join(lacks))
 
     async def get_ready(self, limit: float) -> None:
-        """Run the node's `on_ready`, after all announcements.
-
-        Args:
-            limit: Real seconds for `on_ready`.
-
-        Raises:
-            NodeError: The node failed.
-        """
+        """Run the node's `on_ready` within a limit (real s), or raise `NodeError`."""
         assert self.node is not None
         await self._within(limit, "on_ready", self.node.on_ready())
 
@@ -187,14 +163,7 @@ class NodeRunner:
             return await self._last_step(limit, "on_end", node.on_end())
 
     async def shut_down(self, limit: float) -> list[NodeError]:
-        """End ticks, tasks, node and workers; whatever goes wrong, the other steps follow.
-
-        Args:
-            limit: Real seconds that a step may take.
-
-        Returns:
-            What went wrong; it is logged.
-        """
+        """End ticks, tasks, node and workers, within a limit (real s) each; return the errors."""
         node, wrong = self.node, []
         self.shutting_down = True
         for ticker in self.tickers:
@@ -234,12 +203,7 @@ class NodeRunner:
         return []
 
     async def _within(self, limit: float, what: str, coro: Coroutine[Any, Any, Any]) -> None:
-        """Run a step of the node as a separate task; left behind after the limit.
-
-        Raises:
-            NodeTimeoutError: It did not end within the limit.
-            NodeError: It raised something.
-        """
+        """Run a step of the node as a task left behind after the limit; raise `NodeError`."""
         task = self._create(_outcome(coro), self.spec.name)
         if inspect.iscoroutine(coro):  # which it may never begin, if it is cancelled at once
             task.add_done_callback(lambda _: coro.close())
@@ -260,7 +224,6 @@ class NodeRunner:
             raise wrap(self.spec.name, error) from error
 
     async def _end_tasks(self, limit: float) -> list[NodeError]:
-        """Cancel the node's tasks, and any started meanwhile, and await their end."""
         wrong: list[NodeError] = []
         until = time.monotonic() + limit
         while self.tasks:
@@ -298,10 +261,7 @@ class NodeRunner:
 
 
 def log_error(error: NodeError, *, last: bool) -> None:
-    """Log a node's error; with its traceback unless the cause is a `VisnavError`.
-
-    With `last`, the command line prints the error, and the terminal need not show it twice.
-    """
+    """Log a node's error, with the traceback of a foreign one; `last`: it is printed, too."""
     cause = error.__cause__
     ours = isinstance(code_location.leaf(error if cause is None else cause), VisnavError)
     log.error("%s", with_place(error), exc_info=None if ours else cause, extra={"reported": last})

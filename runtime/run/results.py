@@ -88,11 +88,7 @@ class Folder:
         os.close(self._marker)
 
     def flown(self) -> None:
-        """Note the first update: from here on ``latest`` is this run.
-
-        Raises:
-            ResultsError: The note cannot be written.
-        """
+        """Note the first update: from here on ``latest`` is this run; or raise `ResultsError`."""
         with _readable(self.path):
             os.write(self._marker, f"{_FLOWN}\n".encode())
         if self._by_time:
@@ -100,11 +96,7 @@ class Folder:
 
 
 def run_folder(path: Path) -> Path:
-    """Return the run's folder meant by a path: itself, or the one that its ``latest`` links to.
-
-    Raises:
-        ResultsError: There is neither.
-    """
+    """Return the run's folder meant by a path: itself or its ``latest``; else `ResultsError`."""
     found = newest(path)
     if any((found / sign).exists() for sign in SIGNS):
         return found
@@ -147,7 +139,6 @@ def clear(out: Path) -> None:
 
     Raises:
         ResultsError: A run uses the folder, or no run has made it.
-        OSError: The folder cannot be made.
     """
     claim(out)
     os.close(_lock(out))
@@ -160,7 +151,6 @@ def claim(out: Path) -> None:
 
     Raises:
         ResultsError: There is something in it, and no run has made it.
-        OSError: It cannot be made.
     """
     out.mkdir(parents=True, exist_ok=True)
     marker = out / MARKER
@@ -181,11 +171,6 @@ def _marked(folder: Path) -> str:
 
 
 def _lock(folder: Path) -> int:
-    """Return the marker of a folder, open and locked.
-
-    Raises:
-        ResultsError: A run uses the folder.
-    """
     marker = os.open(folder / MARKER, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -223,7 +208,6 @@ def _link(link: Path, name: str) -> None:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder while its runs are moved."""
     number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         with contextlib.suppress(OSError):  # a file system without locks
@@ -234,11 +218,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file: as a whole, or not at all.
-
-    Raises:
-        OSError: It cannot be written; what was there before is as it was.
-    """
+    """Write a file as a whole, or raise `OSError` and leave what was there."""
     with replacing(path) as new, new.open("wb") as file:
         file.write(content)
         file.flush()
@@ -248,13 +228,9 @@ def write(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path for a new file, then move the new file to `path`.
+    """Yield a path for a new file, then move the new file to `path`, unless an error is raised.
 
     Only a file is ever replaced. A link stays, and so does a device, which is written to itself.
-
-    Raises:
-        OSError: What is there can be neither replaced nor written to, or the block raises it; then
-            `path` is as it was.
     """
     if path.is_symlink():
         path = Path(os.path.realpath(path))
@@ -274,21 +250,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_config(out: Path, config: Config) -> None:
-    """Write all settings of a run as ``config.toml``.
-
-    Raises:
-        ResultsError: It cannot be written.
-    """
+    """Write all settings of a run as ``config.toml``, or raise `ResultsError`."""
     with _readable(out):
         write(out / "config.toml", tomli_w.dumps(to_builtins(config)).encode())
 
 
 def write_summary(out: Path, summary: Summary) -> None:
-    """Write a run's ``summary.json``; a folder removed meanwhile is made anew.
-
-    Raises:
-        ResultsError: The file cannot be written.
-    """
+    """Write a run's ``summary.json``, in a new folder if need be; or raise `ResultsError`."""
     encoded = msgspec.json.format(msgspec.json.encode(summary, enc_hook=_plain), indent=2)
     with _readable(out):
         if not out.is_dir():
@@ -318,11 +286,7 @@ def _plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def private_results(out: Path) -> Iterator[Path]:
-    """Yield a private folder for nodes' files, moved into the run's folder at the end.
-
-    Raises:
-        ResultsError: It cannot be made.
-    """
+    """Yield a private folder for nodes' files, moved into the run's folder at the end."""
     base = _home()
     try:
         base.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -356,11 +320,7 @@ def _home() -> Path:
 
 @contextlib.contextmanager
 def _private_results_locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder; any end of the process releases the lock.
-
-    Raises:
-        OSError: Another process has it, or it is no folder.
-    """
+    """Hold the lock of a folder; any end of the process releases the lock."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -370,14 +330,12 @@ def _private_results_locked(folder: Path) -> Iterator[None]:
 
 
 def _is_left(folder: Path) -> bool:
-    """Tell whether a private folder was left behind by a run already ended."""
     with contextlib.suppress(OSError), _private_results_locked(folder):
         return True
     return False
 
 
 def _private_results_move(source: Path, target: Path) -> None:
-    """Move a folder's content into another folder, replacing files of the same names."""
     target.mkdir(parents=True, exist_ok=True)
     for each in source.iterdir():
         there = target / each.name

@@ -31,10 +31,7 @@ from runtime.time.schedule import SECOND, Ticker
 from runtime.workers.costs import Costs
 
 SHUTDOWN_SHARE = 0.05
-"""Share of a run's length in `shutdown_limit`: longer runs have more to finish.
-
-The length is the longer of the clock's and real time.
-"""
+"""Share of a run's length (clock's or real time, if longer) in `shutdown_limit`."""
 
 
 @dataclass
@@ -42,32 +39,16 @@ class RunState:
     """State of a run in this process.
 
     Attributes:
-        config: What runs.
-        clock: The run's clock.
         runners: The nodes that run in this process, by name, in file order.
-        several_processes: Whether other nodes of the file run in other processes.
         running: Whether the first update has been, and nodes may send.
         first_update: When that was, on `time.monotonic`; `None` before.
-        stop_requested: Why the end of the run was requested, such as by a signal; the loop may
-            not know of it yet.
+        stop_requested: Why the end of the run was requested, such as by a signal; the loop may not
+            know of it yet.
         stopped: When the end of the run was asked for, on `time.monotonic`; `None` before.
-        stopped_at: The same on the run's clock (ns).
-        reason: Why the run ends; "" before.
-        end: How the run ended; `None` before.
-        error: The first that went wrong, if anything did.
         interruption: An exception that is to be raised in a node that blocks the loop.
-        announcements: What the nodes announced.
-        truth_readers: As in `RunEnd`.
         all_nodes: All nodes there have been, those restarted or dropped included.
-        tickers: By ``node.method``.
         links: All links of the nodes that there are, by ``node.port``.
-        conclusions: What nodes concluded of estimators, by source.
-        flights: What they concluded of flights, by vehicle.
         environment: What nodes found of the machine on which figures depend.
-        costs: What workers cost, by ``node.Factory``.
-        outside: What became of the frames for systems outside the process, by their names.
-        before_first_update: What is called once all nodes have started.
-        after_run: What is called with the run's folder at the very end.
     """
 
     config: Config
@@ -111,11 +92,7 @@ log = logging.getLogger("visnav.runtime")
 
 
 class ParameterServer:
-    """Changes settings of a run's nodes, and sends an event for each.
-
-    Args:
-        fault: Called with the node and what it raised.
-    """
+    """Changes settings of a run's nodes, and sends an event for each."""
 
     def __init__(self, state: RunState, fault: Callable[[str, BaseException], None]) -> None:
         self._state = state
@@ -127,13 +104,7 @@ class ParameterServer:
         self._sender.connect(listeners, taps, fault)
 
     def set(self, text: str) -> dict[str, str]:
-        """Change a setting now, between two steps.
-
-        Args:
-            text: ``node.key=value``.
-
-        Returns:
-            What changed: each new value, as TOML, by key; nothing if all was so before.
+        """Change a setting (``node.key=value``) between two steps; return new values by key.
 
         Raises:
             ConfigError: It cannot be: the message says why, and all is as it was.

@@ -70,11 +70,7 @@ def command_line() -> str:
 
 
 def commit(folder: Path | None = None) -> str:
-    """Return the commit of a folder's files, with ``-dirty`` if they differ; empty without git.
-
-    Args:
-        folder: Somewhere in a repository; the current folder if not given.
-    """
+    """Return the commit of a folder's files, with ``-dirty`` if they differ; empty without git."""
     command = ["git", "describe", "--always", "--dirty"]
     try:
         done = subprocess.run(  # noqa: S603
@@ -188,7 +184,6 @@ def _not_deterministic(state: RunState) -> list[str]:
 
 
 def _losses(outside: dict[str, Answers]) -> dict[str, dict[str, Any]]:
-    """Return a failed verdict for each outside system with too many lost frames."""
     return {
         f"{name} (answers)": {
             "passed": False,

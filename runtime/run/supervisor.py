@@ -57,19 +57,11 @@ class Supervisor:
     """Runs the nodes of a configuration on the running loop.
 
     Args:
-        taps: See every event before its listeners do.
         out: Folder for what nodes write, or `None`.
         out_of_programs: That for nodes that start programs, if it is another one.
         only: Nodes that run here, if others run in other processes.
         stand_ins: Classes in the place of some nodes' own, by the node's name.
         scripted: Nodes that may send in any name: scripts of tests.
-
-    Attributes:
-        state: What is known of the run.
-        instruments: What looks at the run.
-        parameters: Changes settings of nodes.
-        stepping: Pauses and steps simulated time.
-        others: The other processes of the run.
     """
 
     def __init__(
@@ -128,7 +120,6 @@ class Supervisor:
             self._host.close()
 
     def _own(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
-        """Make a task of the run."""
         task = asyncio.get_running_loop().create_task(coro, name=name)
         if isinstance(task, RunTask):
             task.protected = True
@@ -149,7 +140,6 @@ class Supervisor:
         """End the run in order; the first reason counts.
 
         Args:
-            error: What went wrong, if anything did.
             by: Who ends it, as in `RunEnd`.
             from_peer: Whether another process reported it, and need not be notified.
         """
@@ -224,11 +214,7 @@ class Supervisor:
             self.restart(name)
 
     def restart(self, name: str, *, anyway: bool = False) -> None:
-        """Shut a node down, and start a new instance if its `on_error` says so.
-
-        Args:
-            anyway: Start a new instance whatever `on_error` says, on request.
-        """
+        """Shut a node down, and start a new instance if its `on_error` says so, or `anyway`."""
         runner = self.state.runners[name]
         runner.restarting = True
         if self.state.clock.now() - runner.running_since > HEALTHY * SECOND:
@@ -406,7 +392,6 @@ class Supervisor:
         await self._wait_to_end("")
 
     async def _wait_to_end(self, name: str) -> None:
-        """Wait until the nodes after this node have ended, in any process."""
         try:
             await self.others.wait_to_end(name)
         except VisnavError as error:

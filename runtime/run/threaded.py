@@ -60,10 +60,7 @@ class ThreadedRun(threading.Thread):
             yield
 
     def wait(self) -> None:
-        """Wait for the end; raise what went wrong.
-
-        A Ctrl-C ends the run first; a second one is raised at once.
-        """
+        """Wait for the end; raise what went wrong. Ctrl-C ends the run, a second is raised."""
         try:
             self._over.wait()
         except BaseException:

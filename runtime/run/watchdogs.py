@@ -203,14 +203,12 @@ class ProgressWatchdog:
         return bool(run.stop_requested) and run.stopped is None and run.first_update is None
 
     def _mark(self) -> tuple[Any, ...]:
-        """Return a mark of the run's progress, constant without any; in any thread."""
         run = self._state
         now = self._loop.now if isinstance(self._loop, LockstepLoop) else 0
         phases = tuple((runner.starts, runner.phase) for runner in list(run.runners.values()))
         return now, run.first_update, run.stopped, run.stop_requested, phases
 
     def _ask(self, until: float, seen: Counter[tuple[str, str]]) -> str | None:
-        """Ask the loop to explain, and sample its line; `None` without an answer."""
         answers: list[tuple[str, list[tuple[str, str]]]] = []
         asked = known = 0
 

@@ -23,12 +23,7 @@ R = TypeVar("R")
 
 
 class Clock(ABC):
-    """Time of a run: integer nanoseconds from its start.
-
-    Attributes:
-        kind: ``real`` or ``lockstep``.
-        schedule: What is due when on this clock.
-    """
+    """Time of a run: integer nanoseconds from its start."""
 
     kind: Literal["real", "lockstep"]
     schedule: Schedule
@@ -66,10 +61,7 @@ class Clock(ABC):
         """Let time run, from 0: the first update is now."""
 
     def hurry(self) -> None:  # noqa: B027  # real time has no order to keep
-        """End soon: nothing due waits for slower work any more, as order would require.
-
-        For a run that ends by an error or by a signal: neither comes at a promised time.
-        """
+        """End soon, by an error or a signal: nothing due waits for slower work any more."""
 
     def close(self) -> None:  # noqa: B027  # most clocks hold nothing
         """Release the clock's resources."""
@@ -86,14 +78,7 @@ class Alarm(Protocol):
 
 
 class RealClock(Clock):
-    """Nanoseconds since the first update, times `speed`.
-
-    Args:
-        speed: Seconds of this clock per real second.
-
-    Attributes:
-        speed: The same.
-    """
+    """Nanoseconds since the first update, times `speed` (seconds of this clock per real second)."""
 
     kind: Literal["real"] = "real"
 

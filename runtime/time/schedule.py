@@ -159,7 +159,6 @@ class Ticker:
     Args:
         name: ``node.method``, for statistics.
         hz: Rate; due times are exact multiples of its period, rounded down to nanoseconds.
-        call: Takes a `Tick`.
         fault: Called with what `call` raises.
         before: The ticker that this one replaces, whose statistics it carries on.
     """

@@ -38,13 +38,9 @@ class Stepping:
         self._over = over
         self._wall = wall
         self._pauses: tuple[float | None, float] = None, 0.0
-        """Start of the present pause (`wall`), or `None`; seconds of earlier pauses.
-
-        Read and written at once, as other threads read it.
-        """
+        """Start of the present pause (`wall`) or `None`, and seconds of earlier ones."""
         self._loop = clock._loop if isinstance(clock, LockstepClock) else None
         self._limit = 0
-        """Latest time (ns) of the loop while this is its gate."""
         self._steps: list[tuple[int, asyncio.Future[int]]] = []
         """Start (ns) and waiting future of each step in progress."""
 
@@ -85,21 +81,13 @@ class Stepping:
         return False
 
     def pause(self) -> None:
-        """Pause time once all work due by now is done; ends a step in progress.
-
-        Raises:
-            CommandError: Time cannot be controlled.
-        """
+        """Pause time once all work due by now is done; ends a step. Raises as `resume` does."""
         loop = self._checked()
         self._limit = loop.now
         loop.gate = self
 
     def resume(self) -> None:
-        """Let time run; a step ends.
-
-        Raises:
-            CommandError: Time cannot be controlled.
-        """
+        """Let time run, and end a step; raise `CommandError` if time is not ours."""
         loop = self._checked()
         self._go_on()
         loop.gate = None
@@ -107,15 +95,10 @@ class Stepping:
         self._end_steps()
 
     def step(self, ns: int | None = None) -> asyncio.Future[int]:
-        """Let time run a little, and then stand.
+        """Let time run for `ns` nanoseconds, or to what is due next, and then stand.
 
-        Args:
-            ns: How far, nanoseconds, from 1; `None`: to what is due next. A step that is asked
-                for while another goes on is added to it.
-
-        Returns:
-            The nanoseconds by which time has gone on, once it stands again: fewer than `ns` if
-            time was paused or resumed, or the run ended, before.
+        A step that is asked for while another goes on is added to it. The result is the nanoseconds
+        by which time has gone on: fewer if time was paused or resumed, or the run ended, before.
 
         Raises:
             CommandError: Time cannot be controlled.
@@ -136,10 +119,7 @@ class Stepping:
     def stands(self) -> asyncio.Future[int]:
         """Return a future done once time is paused; at once if no pause is requested.
 
-        After `pause`, all else due now is still done before time stands.
-
-        Raises:
-            CommandError: Time cannot be controlled.
+        After `pause`, all else due now is still done before time stands. Raises as `resume` does.
         """
         loop = self._checked()
         done: asyncio.Future[int] = loop.create_future()
@@ -149,14 +129,7 @@ class Stepping:
         return done
 
     def pace(self, factor: float | None) -> None:
-        """Set the speed of time.
-
-        Args:
-            factor: Simulated seconds per real second; `None`: as fast as it can.
-
-        Raises:
-            CommandError: Time cannot be controlled.
-        """
+        """Set the speed in simulated seconds per real second (`None`: unlimited)."""
         loop = self._checked()
         loop._pace = 0.0 if factor is None else 1.0 / (factor * SECOND)
         loop._wall_origin = None

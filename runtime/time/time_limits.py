@@ -54,13 +54,10 @@ async def real_time_limit(seconds: float) -> AsyncIterator[None]:
 
 
 class Starvation:
-    """Real seconds of waiting for a processor, by a process or its descendants.
+    """Real seconds that a process or its descendants waited for a processor, from the first look.
 
     On a busy machine that is most of the time, and no fault of whoever has a limit. It is 0 where
-    the kernel does not tell. It counts from the first look.
-
-    Args:
-        process: Process number; this process, if not given.
+    the kernel does not tell.
     """
 
     def __init__(self, process: int | None = None) -> None:
@@ -91,11 +88,7 @@ def waits_of(process: int) -> dict[str, int]:
 
 
 async def ended(tasks: Iterable[asyncio.Task[Any]], seconds: float) -> list[asyncio.Task[Any]]:
-    """Wait until all tasks have ended, for so many real seconds at most without `Starvation`.
-
-    Returns:
-        Those that have not.
-    """
+    """Wait for tasks to end, so many real seconds without `Starvation`; return late ones."""
     tasks = [task for task in tasks if not task.done()]
     begin, starvation, left = time.monotonic(), Starvation(), seconds
     while tasks:

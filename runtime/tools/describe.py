@@ -33,9 +33,7 @@ class PortDescription(msgspec.Struct, frozen=True, kw_only=True):
         name: As in ``inputs`` and ``links`` of the file; ``bundle.field`` for a part of a bundle.
         kind: ``input`` and ``bundle`` are read by a coroutine, a ``handler`` is called inside the
             sender's `send`, an ``output`` sends.
-        events: The names of its types of event.
         delivery: What an input may skip, or how a field of a bundle is matched; empty for others.
-        doc: What it is for, from the docstring of the node, the handler, or the event.
     """
 
     name: str
@@ -49,9 +47,7 @@ class TickDescription(msgspec.Struct, frozen=True, kw_only=True):
     """A method called at a rate.
 
     Attributes:
-        name: Of the method.
         rate: ``400 Hz``, or the setting that holds the rate.
-        doc: What it does.
     """
 
     name: str
@@ -63,14 +59,9 @@ class SettingDescription(msgspec.Struct, frozen=True, kw_only=True):
     """A setting of a TOML file.
 
     Attributes:
-        name: Its key.
         type: ``float``, ``duration``, ``list of string``, ``"lockstep" or "real"``, ``table``…
         default: As in TOML; empty if it is required, or not set by default.
-        required: Whether the file must have it.
         constraint: The range of numbers, the lengths of lists and texts; empty if there is none.
-        doc: What it means, with its unit.
-        changeable: Whether it can change while a run goes on.
-        settings: Those of the table, or of each table of the list, that it is.
     """
 
     name: str
@@ -84,16 +75,7 @@ class SettingDescription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NodeDescription(msgspec.Struct, frozen=True, kw_only=True):
-    """A node from the user's point of view.
-
-    Attributes:
-        type: Its name or ``module:Class``, as in the file.
-        doc: Its docstring.
-        inputs: What it listens to: inputs, fields of bundles and handlers.
-        outputs: What it sends.
-        ticks: What it does at a rate.
-        settings: What stands in its table of the file beside name and type.
-    """
+    """A node from the user's point of view."""
 
     type: str
     doc: str
@@ -104,11 +86,7 @@ class NodeDescription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def describe(cls: type[Node[Any]], type_name: str = "") -> NodeDescription:
-    """Describe a class of node.
-
-    Args:
-        type_name: How a file names it; ``module:Class`` if empty.
-    """
+    """Describe a class of node; files name it by `type_name`, or ``module:Class``."""
     declared, docs = cls.declared, attribute_docs(cls)
     inputs = tuple(_inputs(cls, docs))
     outputs = tuple(
@@ -237,7 +215,6 @@ def _delivery(bound: int, overflow: str, keep: str) -> str:
 
 
 def _structs(info: types.Type) -> Iterator[type[msgspec.Struct]]:
-    """Yield the structs in a type: the type itself, or its items."""
     match info:
         case types.StructType():
             yield info.cls
@@ -268,7 +245,6 @@ def _default(field: Any) -> str:
 
 
 def _type(info: types.Type) -> str:
-    """Return the name of a type in plain words."""
     match info:
         case types.Metadata():
             names = presets_in(info.extra)
@@ -306,7 +282,6 @@ _LENGTHS = {"min_length": "at least", "max_length": "at most"}
 
 
 def _constraint(info: types.Type) -> str:
-    """Return the range of a number, or the length of a list or a text."""
     match info:
         case types.Metadata():
             return _constraint(info.type)

@@ -1,4 +1,4 @@
-"""Checks of a run before its begin, by its file and by its nodes.
+"""Checks of a run before its begin, by its file, its nodes, and rules that packages offer.
 
 `of_file` looks at classes and settings only, and is quick enough for every run. `of_nodes` also
 goes through all phases before the first update, and then through the last one:
@@ -6,11 +6,7 @@ goes through all phases before the first update, and then through the last one:
     construct → on_startup → announce → on_announcement → check → on_shutdown
 
 Meanwhile no worker is started, no file is written, and `Node.checking` tells the nodes to leave
-alone what is outside the process.
-
-What a careful colleague would say about a file, by rules that packages offer.
-
-A package names its rules in its ``pyproject.toml``; this project does the same for its own:
+alone what is outside the process. A package names its rules in its ``pyproject.toml``:
 
     [project.entry-points."visnav.lint"]
     my_package = "my_package.rules:RULES"       # a list of functions
@@ -61,7 +57,6 @@ class Findings(msgspec.Struct, frozen=True):
     Attributes:
         errors: With any of these the run cannot do what the file says: a line each.
         warnings: What is odd, and may be meant.
-        announcements: Of the nodes, if they were brought up.
     """
 
     errors: list[str]
@@ -70,11 +65,7 @@ class Findings(msgspec.Struct, frozen=True):
 
 
 def of_file(config: Config, only: Collection[str] = ()) -> Findings:
-    """Check the settings of a file, and the classes of its nodes.
-
-    Args:
-        only: Nodes that run in this process; all, if empty.
-    """
+    """Check the settings of a file, and the classes of its nodes."""
     here = [spec for spec in config.nodes if not only or spec.name in only]
     warnings = [
         f"{node}.{port}: expects {event}, and no node sends it"
@@ -165,8 +156,6 @@ class _NoWorkerError(VisnavError):
 
 
 class _Absent:
-    """Stands for a worker."""
-
     async def call(self, *_: Any, **__: Any) -> NoReturn:
         raise _NoWorkerError("not while the file is only checked")
 
@@ -177,8 +166,6 @@ class _Absent:
 
 
 class _DryHost:
-    """Host for nodes in a check: does as little as possible."""
-
     checking = True
     out: Path | None = None
     out_of_programs: Path | None = None
@@ -230,7 +217,6 @@ class _DryHost:
 
 @contextlib.contextmanager
 def _warnings() -> Iterator[list[str]]:
-    """Collect the warnings of nodes, instead of printing them."""
     found: list[str] = []
 
     class Collect(logging.Handler):
@@ -293,10 +279,7 @@ def mentioned_in(cls: type[Node[Any]]) -> set[Any]:
 
 
 def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement]) -> Iterator[str]:
-    """Yield errors for `inputs` narrowed to a source without events.
-
-    A node that announces nothing may send from anywhere below its name.
-    """
+    """Yield errors for `inputs` narrowed to a source without events, of nodes that announce any."""
     specs = {spec.name: spec for spec in nodes}
     sources = dict.fromkeys([*specs, *(each.source for each in announced)])
     for spec in specs.values():
@@ -324,7 +307,6 @@ def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement
 
 
 def _types(cls: type[Node[Any]], port: str) -> tuple[Any, ...]:
-    """Return the types of event of a port, or of a bundle's fields."""
     return tuple(
         event
         for name, events in input_types(cls).items()
@@ -346,9 +328,7 @@ class Finding(msgspec.Struct, frozen=True):
 
     Attributes:
         subject: Source of the sensor, or name of the node.
-        found: What is odd about it.
         change: What to change, if it is not meant.
-        rule: Name of the rule.
     """
 
     subject: str
@@ -364,11 +344,7 @@ Rule = Callable[[Config, Sequence[Announcement]], Iterable[Finding]]
 
 
 def rules() -> dict[str, Rule]:
-    """Return all rules by name.
-
-    Raises:
-        CommandError: Those of a package cannot be imported.
-    """
+    """Return all rules by name; raise `CommandError` if one cannot be imported."""
     found: list[Rule] = [rule for offer in offers(GROUP) for rule in offer.load()]
     return {rule.__name__.replace("_", "-"): rule for rule in found}
 
@@ -431,7 +407,6 @@ RULES: list[Rule] = [no_end, idle, nobody_judged]
 
 
 def _may_end(spec: NodeSpec) -> bool:
-    """Return whether a node may end the run."""
     sends = (output.event for output in spec.node.declared.outputs.values())
     ends = "stop" in mentioned_in(spec.node) or any(
         issubclass(event, Shutdown | WindowClosed) for event in sends

@@ -35,11 +35,9 @@ _BOUNDS = {
 
 
 def schema(nodes: Mapping[str, type[Node[Any]]]) -> Schema:
-    """Return the schema of a configuration file.
+    """Return the schema of a configuration file, with settings of these nodes, by name.
 
-    Args:
-        nodes: Name to class: the nodes whose settings it checks. Those that a file names as
-            ``module:Class`` may have any settings.
+    Those of nodes that a file names as ``module:Class`` may be any.
     """
     maker = _Maker()
     by_type = [
@@ -71,7 +69,6 @@ def schema(nodes: Mapping[str, type[Node[Any]]]) -> Schema:
 
 
 def _head() -> Schema:
-    """Return the settings common to all ``[[nodes]]`` tables."""
     return {
         "name": {**_NAME, "description": "Unique in the file."},
         "type": {"type": "string", "description": TYPE_DOC},
@@ -144,7 +141,6 @@ class _Maker:
         return made | ({"required": required} if required else {})
 
     def _of(self, info: types.Type) -> Schema:
-        """Return the schema of a type described by msgspec."""
         match info:
             case types.Metadata():
                 names = list(presets_in(info.extra))

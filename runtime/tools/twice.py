@@ -62,10 +62,6 @@ def run_twice(
 ) -> Summary:
     """Run a configuration twice, and compare.
 
-    Args:
-        out: Folder for the results of the second run.
-        options: Of `execute`, for the second run.
-
     Raises:
         ConfigError: Time is real, or other processes have a part in the run.
         VisnavError: Something went wrong in one of the runs.
@@ -113,7 +109,6 @@ def _compared(was: OutsideSummary, now: OutsideSummary) -> OutsideSummary:
 
 
 def _who(summary: Summary, track: Track, differ: list[str]) -> str:
-    """Return the first difference, in words."""
     if track.first is None:  # events are missing at the end of an output
         return f"{', '.join(differ)} at the end"
     output, event, apart = track.first

@@ -73,7 +73,6 @@ def _end_with_the_run(connection: socket.socket) -> None:
 
 
 def _end_group(number: signal.Signals) -> None:
-    """Send a signal to the process group, if this process leads the group."""
     if os.getpgrp() == os.getpid():
         os.killpg(0, number)
 

@@ -22,12 +22,10 @@ class Costs:
     """Costs of all processes of a worker, in constant memory; used from any thread.
 
     Attributes:
-        calls: Answered calls.
         wall: Real time of each (ns), from its arguments in the process to its result.
-        cpu: Processor time of all threads of the process (ns), since the call before: what they
-            go on doing after an answer is counted with the next one.
+        cpu: Processor time of all threads of the process (ns), since the call before: what they go
+            on doing after an answer is counted with the next one.
         peak: Peak memory (bytes) of any of the processes; 0 if unknown.
-        processes: Most at once.
         latency: Declared seconds of a call on the run's clock; `None` if it varied.
     """
 
@@ -49,10 +47,7 @@ class Costs:
             self.cpu.add(cpu)
 
     def measure(self, wall: int, pids: Iterable[int]) -> None:
-        """Count a call of processes without own timing; the first only sets the start.
-
-        Their processor time is counted from the call before.
-        """
+        """Count a call of processes without own timing: processor time since the call before."""
         before, self._used = self._used, {pid: cpu_time(pid) for pid in pids}
         for pid in self._used:
             self.look_at(pid)

@@ -40,12 +40,7 @@ def plain_lines(data: bytes | bytearray) -> Iterable[str]:
 
 
 class Throttle:
-    """Hands on lines from any thread, at most `LINES` a second, and says how many more there were.
-
-    Args:
-        printed: Called with each line.
-        now: Real seconds.
-    """
+    """Hands on lines from any thread, `LINES` a second at most, and then their number."""
 
     def __init__(
         self, printed: Callable[[str], None], now: Callable[[], float] = time.monotonic
@@ -85,11 +80,7 @@ class Throttle:
 
 
 class Output:
-    """Lines printed by a process, and the last of them for the report of its end.
-
-    Args:
-        printed: Called with each line, without its end.
-    """
+    """Lines printed by a process, without their ends; the last are for a report."""
 
     def __init__(self, printed: Callable[[str], None]) -> None:
         self._printed = printed

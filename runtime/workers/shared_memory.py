@@ -153,7 +153,6 @@ class SharedPipe:
     One thread may send and another receive, each always the same one.
 
     Args:
-        connection: Carries the messages: one end of a pair of stream sockets.
         out_fd: File for the arrays that this side sends.
     """
 
@@ -169,11 +168,7 @@ class SharedPipe:
         self._writer: threading.Thread | None = None
 
     def send(self, message: Any) -> None:
-        """Send an object, and wait until the connection has taken all bytes.
-
-        Raises:
-            OSError: The other side is gone.
-        """
+        """Send an object, and wait until the connection has taken all bytes; else `OSError`."""
         self.write(self.pack(message))
 
     def write(self, packed: bytes) -> None:
@@ -205,9 +200,7 @@ class SharedPipe:
         return _LENGTH.pack(len(frame)) + frame
 
     def post(self, packed: bytes) -> None:
-        """Send the result of `pack` without ever waiting.
-
-        What the connection does not take at once, a thread sends as soon as it does.
+        """Send the result of `pack` without ever waiting: what is left, a thread sends.
 
         Raises:
             OSError: The other side is gone.
@@ -233,12 +226,7 @@ class SharedPipe:
                         return
 
     def receive(self) -> Any:
-        """Wait for an object.
-
-        Raises:
-            EOFError: The other side is gone.
-            OSError: The same, found out in another way.
-        """
+        """Wait for an object; `EOFError` or `OSError`: the other side is gone."""
         return self.unpack(self.read())
 
     def read(self) -> bytearray:

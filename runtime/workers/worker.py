@@ -64,11 +64,9 @@ class Worker(Generic[W]):
         latency: Seconds of the run's clock from a call to its result.
         timeout: Real seconds after which a call that has no answer is a `WorkerTimeoutError`.
         env: Environment variables for the processes, added to ours.
-        niceness: How much the processes stand back for others, 0 to 19. In real time they also
-            keep off one core, so that a tick need not wait for a core to come free.
+        niceness: How much the processes stand back for others, 0 to 19. In real time they also keep
+            off one core, so that a tick need not wait for a core to come free.
         printed: Called with each line that a process prints.
-        died: Called when a process ends on its own or is killed for hanging; from any thread.
-        costs: Where to note what the calls cost.
 
     Raises:
         WorkerError: The factory is of no module that a process could import.
@@ -140,8 +138,6 @@ class Worker(Generic[W]):
 
         Args:
             method: The function as it stands in the class: ``Renderer.render``.
-            args: Its arguments; large arrays pass through shared memory.
-            kwargs: The same.
 
         Raises:
             WorkerDiedError: The process ended.
@@ -402,7 +398,6 @@ class _Process:
         self._pipe.shut_down()
 
     def _kill(self) -> None:
-        """Kill the process, and its remaining children."""
         with contextlib.suppress(OSError):
             os.killpg(self._child.pid, signal.SIGKILL)
 

@@ -59,7 +59,6 @@ def main() -> None:
 
 
 def _unheard() -> NoReturn:
-    """End the process: the reader of its output has gone."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(2)
 

@@ -61,7 +61,6 @@ def runs(folder: Annotated[Path, typer.Argument(help="Folder of runs.")] = Path(
 
 
 def _row(folder: Path) -> tuple[str, str, str, str]:
-    """Return seconds, seed, state and estimators of the run in a folder."""
     from runtime.run.results import has_flown
 
     try:
@@ -172,7 +171,6 @@ def _failures(summary: Summary) -> Iterator[str]:
 
 
 def _flight(vehicle: str, figures: Mapping[str, Any]) -> Iterator[str]:
-    """Return the line of a flight that hit something, had a plan, or was asked something."""
     shown = []
     if figures.get("collisions"):
         shown.append(f"{figures['collisions']} collisions")
@@ -184,7 +182,6 @@ def _flight(vehicle: str, figures: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _figures(figures: Mapping[str, Any]) -> Iterator[str]:
-    """Return the line of errors, if there are any."""
     if figures.get("ate_rmse_m") is None:
         return
     shown = [f"ATE {figures['ate_rmse_m']:.3g} m"]
@@ -203,7 +200,6 @@ def _figures(figures: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _flow(name: str, figures: Mapping[str, Any], summary: Summary) -> Iterator[str]:
-    """Return the lines of what came, when, and what was lost on the way."""
     node = name.partition("/")[0]
     shown = [f"{figures.get('estimates', 0)} poses"]
     if figures.get("frame_coverage_percent") is not None:

@@ -107,11 +107,7 @@ def _plain_errors() -> Iterator[None]:
 
 
 def load(offer: Offer) -> Any:
-    """Import a command.
-
-    Raises:
-        CommandError: It cannot be imported, or is no command.
-    """
+    """Import a command, or raise `CommandError`."""
     found = offer.load()
     if not isinstance(found, typer.Typer):
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -128,7 +124,6 @@ def load(offer: Offer) -> Any:
 
 @cache
 def _commands() -> dict[str, list[Offer]]:
-    """Return the offers of each command: several if packages chose the same name."""
     found: dict[str, list[Offer]] = {}
     for offer in offers(COMMANDS):
         found.setdefault(offer.name, []).append(offer)
@@ -136,7 +131,6 @@ def _commands() -> dict[str, list[Offer]]:
 
 
 def _chosen(name: str) -> Offer:
-    """Return the offer used for a name: the first of several, with a warning."""
     used, *others = _commands()[name]
     for other in others:
         warn(
@@ -147,7 +141,6 @@ def _chosen(name: str) -> Offer:
 
 
 def _help(offer: Offer) -> str:
-    """Return the help of a command, or why the command cannot be used."""
     module, _, name = offer.value.partition(":")
     source = _source(module)
     if source is not None:
@@ -162,7 +155,6 @@ def _help(offer: Offer) -> str:
 
 
 def _source(module: str) -> Path | None:
-    """Return the source file of a module, without importing its parent packages."""
     search: Any = None
     spec = None
     parts = module.split(".")

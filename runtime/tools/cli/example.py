@@ -95,11 +95,7 @@ def new_estimator(
 
 
 def _copy(example: Path, out: Path, words: dict[str, str]) -> Path:
-    """Copy an example with all that it reads, and the schema; return the copy.
-
-    Args:
-        words: Replaced in names and texts.
-    """
+    """Copy an example with all that it reads, words replaced, and the schema; return the copy."""
     import re
 
     from runtime.errors import CommandError
@@ -128,11 +124,7 @@ def _copy(example: Path, out: Path, words: dict[str, str]) -> Path:
 
 
 def example_files() -> dict[str, Path]:
-    """Return the examples by name; the standard tour is ``config``.
-
-    Raises:
-        CommandError: Only a part of the project is installed.
-    """
+    """Return the examples by name, or raise `CommandError`; the standard tour is ``config``."""
     from runtime.errors import CommandError
 
     if INSTALLED.is_dir():
@@ -145,7 +137,6 @@ def example_files() -> dict[str, Path]:
 
 
 def _about(path: Path) -> str:
-    """Return the first sentence of the comment at the top of a file."""
     comment = []
     for line in path.read_text(encoding="utf-8").splitlines():
         text = line.removeprefix("#").strip()

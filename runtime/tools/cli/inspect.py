@@ -1,13 +1,4 @@
-"""The command ``check``: find errors in a file before anything flies.
-
-``graph``: the events between nodes, as Mermaid text or as a drawing.
-
-``nodes``: the types of node for a file.
-
-``settings``: the settings of every file, whatever its nodes.
-
-``schema``: a JSON schema of files, for editors that complete and check TOML.
-"""
+"""Commands to look into a file, and at nodes and settings, before anything flies."""
 
 from __future__ import annotations
 
@@ -163,7 +154,6 @@ def layers(names: list[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]
 
 
 def _by_pair(edges: list[tuple[str, str, str, str, str]]) -> dict[tuple[str, str], list[str]]:
-    """Return the types of event sent, by pair of sender and receiver."""
     pairs: dict[tuple[str, str], dict[str, None]] = {}
     for sender, _, event, receiver, _ in edges:
         pairs.setdefault((sender, receiver), {})[event] = None
@@ -216,7 +206,6 @@ def nodes(
 
 
 def _tree(node: NodeDescription) -> Tree:
-    """Return a node as a tree: its description, ports, ticks and settings."""
     from rich.markup import escape
     from rich.tree import Tree
 

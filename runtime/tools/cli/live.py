@@ -36,11 +36,7 @@ def top(
 
 
 def _check_terminal() -> None:
-    """Check for a terminal able to show the screen.
-
-    Raises:
-        CommandError: No terminal, or not in UTF-8.
-    """
+    """Check for a terminal able to show the screen."""
     import codecs
     import sys
 

@@ -42,7 +42,6 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """Outcome of a run for one of its estimators, or of a flight of which something was asked.
 
     Attributes:
-        run: Name of the run, or settings, seed and repeat within a sweep.
         estimator: Its source, or ``flight of`` a vehicle; empty for a run without any.
         reasons: Sentences on a failure or crash.
         seconds: Real time of the whole run.
@@ -81,11 +80,7 @@ def of_verdict(run: str, verdict: Verdict | None, seconds: float | None = None) 
 
 
 def of_rows(names: Iterable[str], rows: Iterable[Row]) -> list[Outcome]:
-    """Return the outcomes of a sweep's runs.
-
-    Args:
-        names: What tells each run from the others.
-    """
+    """Return the outcomes of a sweep's runs."""
     from runtime.summary import Verdict
 
     found: list[Outcome] = []
@@ -103,10 +98,7 @@ def of_rows(names: Iterable[str], rows: Iterable[Row]) -> list[Outcome]:
 
 @contextlib.contextmanager
 def writing(name: str, junit: Path | None, json: Path | None) -> Iterator[list[Outcome]]:
-    """Yield a list for outcomes, and write it at the end; an exception is one of them.
-
-    Args:
-        name: Of the test suite; of a run that crashes, too.
+    """Yield a list for outcomes, written at the end as a test suite; an exception is one of them.
 
     Raises:
         OSError: A file cannot be written.
@@ -158,7 +150,6 @@ def to_junit(name: str, outcomes: Sequence[Outcome]) -> bytes:
 
 
 def _printable(text: str) -> str:
-    """Return a text without control characters, for which XML has no place."""
     return "".join(c if c.isprintable() or c in "\n\t" else "�" for c in text)
 
 

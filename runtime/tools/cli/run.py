@@ -190,11 +190,7 @@ def look_at(settings: Config, only: Collection[str] = ()) -> None:
 
 
 def leave_behind(code: int, last: str = "") -> NoReturn:
-    """End the process, even if work of a node never returns; Python would wait.
-
-    Args:
-        last: Printed at the end, to standard error.
-    """
+    """End the process with a last line, even if work of a node never returns; Python would wait."""
     from runtime.run import event_loop
 
     threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node", "zenoh"))]
@@ -222,9 +218,6 @@ def observed(
 
     Args:
         name: By which to find it: the run's, and more if it is one process of several.
-        quiet: Whether there is to be no progress bar.
-        top: Whether to show the monitor's screen in this terminal.
-        web: Port on which to show it as a page.
     """
     from rich.console import Console
 

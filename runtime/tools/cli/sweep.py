@@ -114,11 +114,8 @@ def sweep(
 def end(rows: Sequence[Row], *, judged: bool = True) -> None:
     """Print how many runs crashed or failed.
 
-    Args:
-        judged: Whether a missed threshold counts, too.
-
     Raises:
-        typer.Exit: With 2 if a run crashed, with 1 if a threshold was missed.
+        typer.Exit: With 2 if a run crashed, with 1 if a threshold was missed and runs are `judged`.
     """
     if crashed := sum(bool(row["error"]) for row in rows):
         typer.echo(f"error: {crashed} of {len(rows)} runs crashed", err=True)
@@ -131,7 +128,6 @@ def end(rows: Sequence[Row], *, judged: bool = True) -> None:
 def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> list[Row]:
     """Run the missing jobs of a plan on this machine, and show the progress.
 
-    Args:
         jobs: Runs at the same time; if not given, as many as there are cores if they share their
             flights, else half of that.
 

@@ -114,7 +114,6 @@ def _show(value: Any) -> str:
 
 
 def _table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table whose columns but the first are aligned right, unless they are text."""
     table = Table(*headings, title=title, title_justify="left")
     for row in rows:
         table.add_row(*row)
@@ -135,12 +134,7 @@ _LINE_PERIOD = 10.0
 def progress(
     run: RunConfig, console: Console
 ) -> Callable[[Supervisor], contextlib.AbstractContextManager[None]]:
-    """Return a progress bar as the `watch` of `execute`.
-
-    Args:
-        console: Where to draw. What else is printed there, such as log lines, appears above the
-            bar.
-    """
+    """Return a progress bar on a console as the `watch` of `execute`; log lines appear above it."""
     return lambda supervisor: _watching(run, supervisor, console)
 
 

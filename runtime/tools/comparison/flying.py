@@ -38,7 +38,6 @@ class Compared(msgspec.Struct, frozen=True):
     """Result of a comparison.
 
     Attributes:
-        rows: A comparison for each estimator and figure.
         margin: Largest change that does not matter, as `Comparison.change`.
         page: ``compare.html``, with a line from A to B for each flight.
     """
@@ -74,8 +73,6 @@ def compare(
 
     Args:
         what: Files, one a scenario; or two folders of finished sweeps or runs.
-        a: Settings of A, ``node.key=value``.
-        b: Settings of B.
         figures: `USUAL` if none.
 
     Raises:
@@ -107,7 +104,6 @@ def _fly(
     fly: Fly,
     options: Mapping[str, Any],
 ) -> list[Comparison]:
-    """Fly both sides until all figures are decided."""
     first: dict[Path, int] = {}
     planned = []
     for file, (side, own) in itertools.product(files, zip("AB", changes, strict=True)):
@@ -148,11 +144,7 @@ def _fly(
 
 
 def read_folder(folder: Path) -> dict[Key, list[Row]]:
-    """Read the rows of a finished sweep, or of a single run (or its ``latest``), by flight.
-
-    Raises:
-        ConfigError: It is neither.
-    """
+    """Read the rows of a finished sweep or run by flight; or raise `ConfigError`."""
     found: dict[Key, list[Row]] = {}
     if (folder / "rows.jsonl").is_file():
         for row in decode_rows((folder / "rows.jsonl").read_bytes()).values():

@@ -47,13 +47,10 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         a: Median over the flights, of those with the figure.
-        b: The same of the other side.
         change: Pseudo-median of B less A: percent if `relative`, else in the figure's unit;
             infinite if most pairs were lost by a failure.
         low: Lower end of the interval for it.
-        high: Upper end.
         p: Share of random signs with a result as extreme.
-        pairs: Number of flights.
         failures: Flights without the figure, in A and in B.
         verdict: "not comparable" for an error after different alignments in A and B.
         more: Flights that would probably tell, for a verdict of "not enough runs".
@@ -110,10 +107,7 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
         return bool(self.high > margin)
 
     def fails(self, margin: float) -> bool:
-        """Return whether B is not good enough.
-
-        Without a margin if it is worse; with one, unless it was shown to be no worse than that.
-        """
+        """Return whether B is worse, or with a margin was not shown to be no worse than that."""
         return self.inferior(margin) if margin else self.verdict == "worse"
 
 
@@ -129,7 +123,6 @@ def compare_values(
 
     Args:
         pairs: Values of A and B by flight; `None` for a failure, which is worse than any value.
-        margin: Largest change that does not matter, as `Comparison.change`.
         error: Probability of a difference found where there is none.
     """
     sign = -1.0 if figure(name).limit == "least" else 1.0  # of a change for the worse
@@ -229,7 +222,6 @@ def _more(n: int, change: float, low: float, high: float, margin: float, error: 
 
 
 def _least(error: float) -> int:
-    """Return the number of flights of which fewer cannot tell, whatever they show."""
     return math.ceil(math.log2(2 / error))
 
 
@@ -244,7 +236,6 @@ def compare_until_sure(
 
     Args:
         compare: Compares so many flights, with so much error.
-        most: Number of flights.
         looked: Numbers of flights that were looked at earlier; extended.
     """
     half = math.ceil(most / 2)
@@ -335,7 +326,6 @@ def _estimators(sides: Iterable[Sequence[Row]]) -> dict[str, None]:
 
 
 def _value(rows: Sequence[Row], estimator: str, name: str) -> float | None:
-    """Return the mean over repeats; `None` if any of them has failed to have it."""
     values = [
         None if row["error"] else row["estimators"].get(estimator, {}).get(name) for row in rows
     ]

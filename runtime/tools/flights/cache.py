@@ -39,11 +39,7 @@ class Kept(NamedTuple):
 def recorded(config: Config, *, record: bool) -> dict[str, type[Node[Any]]]:
     """Return stand-ins for the flying nodes of a file, playing their recorded flight.
 
-    Args:
-        record: Whether to fly it, if it is not kept; this takes as long as the flight alone.
-
-    Returns:
-        Classes by name of a node; none if it has to be flown by the run itself.
+    There are none if the run itself has to fly. With `record`, a flight that is not kept is flown.
     """
     part = flight_of(config)
     if part is None:
@@ -107,7 +103,6 @@ def _remove(file: Path, flight: Path) -> bool:
 
 
 def _write(part: Config, path: Path) -> None:
-    """Fly, and keep the file, also of an unfit flight; keep nothing if flying fails."""
     new = _unfinished(path)
     try:
         fly(part, new)
@@ -121,7 +116,6 @@ def _write(part: Config, path: Path) -> None:
 
 
 def _unfinished(path: Path) -> Path:
-    """Return the file of a flight still being written."""
     return path.with_name(f".{path.name}.new")
 
 

@@ -51,7 +51,6 @@ class Action(NamedTuple):
         kind: ``send`` an event, say in a handler that it is ``handled``, ``stop`` the run; or set
             what is due later: in the schedule (``once``), work done elsewhere (``held``), a timer
             of asyncio's.
-        node: Which did it.
         turn: Turns of the loop since the occasion; -1 before the loop went on.
         inner: What was done while the event was delivered, by those that got it.
         text: The output (``node.port``), or why the run is to stop.
@@ -74,7 +73,6 @@ class Flown(NamedTuple):
     """A node of a flight.
 
     Attributes:
-        announcements: What it announced.
         tickers: By name, in the order of their making, rate and the ticks on which something was
             done, with their occasions.
         start: The occasion on which its `run` begins, if it does.
@@ -86,11 +84,9 @@ class Flown(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """A whole flight.
+    """A whole flight; `unfit` is why it cannot be used.
 
     Attributes:
-        unfit: Why it cannot be used; empty if it can.
-        nodes: By name.
         occasions: Their actions, in order.
         environment: What the nodes found of the machine.
     """
@@ -110,11 +106,7 @@ class Writer:
         self._size = 0
 
     def event(self, event: Event) -> tuple[int, tuple[int, ...]]:
-        """Write an event; return its place and the sizes of its frames.
-
-        Raises:
-            Exception: Whatever pickling raises for something that is no data.
-        """
+        """Write an event that can be pickled; return its place and the sizes of its frames."""
         arrays: list[pickle.PickleBuffer] = []
         head = pickle.dumps(event, pickle.HIGHEST_PROTOCOL, buffer_callback=arrays.append)
         frames = [memoryview(head), *(array.raw() for array in arrays)]
@@ -261,11 +253,7 @@ class Player:
         del self._nodes[node.name]
 
     def play(self, occasion: int, turn: int, first: int = 0) -> None:
-        """Play the actions of an occasion.
-
-        Args:
-            turn: Up to which it is done now; the rest follows as the loop turns.
-        """
+        """Play the actions of an occasion up to a turn; the rest follows as the loop turns."""
         actions = self._flight.occasions[occasion]
         while first < len(actions) and actions[first].turn <= turn:
             self._do(actions[first])

@@ -38,10 +38,7 @@ from runtime.time.schedule import Once, Tick, Ticker
 from runtime.tools.flights.player import Action, Flight, Flown, Writer, prune
 
 _REST = 10.0
-"""Seconds of the clock for a flight to go on without ticks.
-
-Events on their way at the end, such as images, arrive in a run whose estimator ends late.
-"""
+"""Seconds of the clock for a flight to go on without ticks: images on their way still arrive."""
 
 
 def record(config: Config, path: Path) -> None:
@@ -217,13 +214,11 @@ class _Recorder(Instrument):
         patched._run_once = turned
 
     def _later(self, kind: str, due: float) -> int:
-        """Note an action due later, and return the number of its occasion."""
         occasion = self._new()
         self._act(kind, due=due, later=occasion)
         return occasion
 
     def _on(self, occasion: int, function: Callable[..., Any], *args: Any) -> Any:
-        """Call a function on an occasion."""
         self._begin(occasion)
         self._inside = True
         try:
@@ -324,10 +319,7 @@ def _sources(modules: Iterable[str]) -> Iterator[Path]:
 
 
 def _imported(path: Path, package: str) -> Iterator[str]:
-    """Yield the modules imported anywhere in a package's file, and possible modules.
-
-    A file that is no Python names none.
-    """
+    """Yield the modules imported anywhere in a package's file, and possible modules."""
     if path.suffix not in {".py", ".pyi"}:
         return
     with contextlib.suppress(SyntaxError, ValueError):
@@ -356,7 +348,6 @@ def _origin(name: str) -> Path | None:
 
 @functools.cache
 def _is_here(root: str) -> bool:
-    """Return whether a module or package is neither Python's own nor installed."""
     path = None if not root or root in sys.stdlib_module_names else _origin(root)
     return path is not None and not {"site-packages", "dist-packages"} & {*path.parts}
 

@@ -41,11 +41,7 @@ class Client:
         self._turn = asyncio.Lock()
 
     async def snapshots(self) -> AsyncIterator[Snapshot]:
-        """Yield snapshots until the run is over.
-
-        Raises:
-            CommandError: No run listens there, or it is of another version.
-        """
+        """Yield snapshots until the run is over, or raise `CommandError` if none listens."""
         try:
             reader, writer = await asyncio.open_unix_connection(self._path, limit=LONGEST_LINE)
         except OSError as error:
@@ -102,11 +98,7 @@ _LONGEST = 100
 
 
 def socket_of(run: str) -> Path:
-    """Return the path of the socket for a run of this process.
-
-    Raises:
-        CommandError: The folder cannot be used, or others could enter it.
-    """
+    """Return the path of the socket for a run of this process, or raise `CommandError`."""
     place, number = user_folder(), f"{os.getpid()}"
     if threading.current_thread() is not threading.main_thread():  # others may run in others
         number += f".{threading.get_native_id()}"

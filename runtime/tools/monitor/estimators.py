@@ -143,7 +143,6 @@ class Measured:
 
     @functools.cached_property
     def _vehicles(self) -> Vehicles:
-        """Vehicles, as announced before the first event that asks for them."""
         vehicles = Vehicles()
         for each in self._state.announcements:
             vehicles.announced(each)

@@ -69,7 +69,6 @@ class Sample(NamedTuple):
     Attributes:
         real: Seconds of `time.perf_counter`.
         run: Nanoseconds of the run's clock.
-        sent: Events sent since the run began, by output.
         amounts: What a `Meter` added up since the sample before.
     """
 
@@ -111,14 +110,7 @@ class RecentSamples:
 
 
 class Meter(Instrument):
-    """An instrument to add up durations.
-
-    Args:
-        measured: Gets the events that it follows, too.
-
-    Attributes:
-        last: When each output's last event was sent, on the run's clock (ns), by ``node.port``.
-    """
+    """An instrument to add up durations."""
 
     def __init__(self, clock: Clock, measured: Measured) -> None:
         self.last: dict[str, int] = {}
@@ -132,8 +124,8 @@ class Meter(Instrument):
     def take(self) -> Mapping[str, Amount]:
         """Return the sums, and start again from zero.
 
-        They are the time that each node took of the loop, without the calls of other nodes in it,
-        and the times from stamp to delivery of each output's events, by ``node.port``.
+        They are the time of the loop of each node, without nested calls of others, and the times
+        from stamp to delivery of each output's events, by ``node.port``.
         """
         taken, self._amounts = self._amounts, collections.defaultdict(Amount)
         return taken
@@ -363,11 +355,7 @@ class Observer:
     # Commands.
 
     def execute(self, command: Command) -> str:
-        """Carry a command out, and return a text about its effect.
-
-        Raises:
-            VisnavError: It cannot be carried out; the message says why.
-        """
+        """Carry a command out, and return a text about its effect; or raise `VisnavError`."""
         stepping = self._supervisor.stepping
         match command:
             case Pause():

@@ -51,7 +51,6 @@ class LogLine(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         number: Counts the run's records, from 0.
-        level: ``INFO``, ``WARNING``, …
         text: Seconds of the run's clock, level, node (or ``runtime``) and message.
     """
 
@@ -64,17 +63,14 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """State of a run at a moment.
 
     Attributes:
-        headline: The run's name, time, speed and condition.
         now: Seconds since the first update.
         ended: Why the run ends or has ended; empty while it goes on.
-        paused: Whether simulated time is paused.
         fixed: Why it can be neither paused nor set; empty if it can.
         speed: Base for faster and slower: the requested speed, or else the present one.
         tables: Rows of each of the tables of `COLUMNS`; nodes are in the order of the file.
         paths: Places passed since somebody watches, seen from above (metres east, metres north):
             first the vehicles' true paths (``drone: truth``), then the estimators'.
         cameras: ``node.port: source`` of those that sent an image since somebody watches.
-        log: The last records.
     """
 
     headline: str
@@ -149,7 +145,6 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True):
     """The answer to a request.
 
     Attributes:
-        done: Whether it was carried out.
         text: What was done, or why not.
         jpeg: The image asked for, made small, its features drawn.
     """

@@ -53,11 +53,7 @@ _PATHS = ("white", "bright_magenta", "bright_cyan", "bright_yellow", "bright_gre
 
 
 class Screen(App[str]):
-    """Nodes, channels, clock and log of a run.
-
-    Args:
-        leave: Whether to exit when the run is over, instead of showing how it ended.
-    """
+    """Nodes, channels, clock and log of a run; with `leave`, it exits with the run."""
 
     CSS = """
     #head { background: $primary; color: $text; height: 1; padding: 0 1; text-style: bold; }
@@ -176,7 +172,6 @@ class Screen(App[str]):
     # Keys.
 
     def _ask(self, command: Command) -> None:
-        """Send a command; keys keep working while the answer is awaited."""
         self.run_worker(self._send(command))
 
     async def _send(self, command: Command) -> None:
@@ -255,7 +250,6 @@ class Screen(App[str]):
             self._ask(Set(text=event.value))
 
     def _selected_node(self) -> str | None:
-        """Return the node under the cursor."""
         table: DataTable[Text] = self.query_one("#nodes", DataTable)
         if not table.row_count:
             return None
@@ -275,8 +269,6 @@ def drawn(paths: dict[str, Points], width: int, height: int) -> Text:
 
     Args:
         paths: East and north of their places, metres; of two that cross, the later is above.
-        width: Characters.
-        height: Lines, that of the names included.
     """
     text = Text(no_wrap=True, overflow="ellipsis")
     colours = dict(zip(paths, itertools.cycle(_PATHS), strict=False))

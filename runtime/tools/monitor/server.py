@@ -77,12 +77,7 @@ class Kept:
 
 
 class Server:
-    """Server for the clients of a run's monitor.
-
-    Args:
-        observer: Makes snapshots of the run, and carries commands out.
-        loop: The run's loop, on which the observer is called.
-        path: Where to listen.
+    """Server at a path for the clients of a run's monitor; `loop` is the run's.
 
     Raises:
         OSError: There can be no socket.
@@ -94,7 +89,6 @@ class Server:
         self._path = path
         self._clients: dict[threading.Thread, socket.socket] = {}
         self._calls: set[Future[Any]] = set()
-        """Calls that the run's loop has not made yet."""
         self._watching = 0
         self._changing = threading.Lock()
         self._end = threading.Event()
@@ -162,7 +156,6 @@ class Server:
         self._clients.pop(threading.current_thread(), None)
 
     def _watch(self, client: socket.socket) -> None:
-        """Send snapshots until the client goes or the run ends."""
         self._count(1)
         try:
             while not self._end.wait(PERIOD):
@@ -218,11 +211,6 @@ class Server:
         return small_jpeg(image.data, features)
 
     def _on_run_loop(self, call: Callable[[], R]) -> R:
-        """Have a function called on the run's loop, and return its result.
-
-        Raises:
-            CancelledError: The run ended before.
-        """
         done: Future[R] = Future()
 
         def do() -> None:
@@ -251,9 +239,8 @@ def _shut(connection: socket.socket, how: int) -> None:
 def small_jpeg(data: npt.NDArray[np.uint8], features: Sequence[TrackedFeatures] = ()) -> bytes:
     """Return an image as JPEG, made smaller where a side is longer than `MAX_SIDE` pixels.
 
-    Args:
-        data: Pixels, shape (height, width, 3) in RGB, or (height, width) in grey.
-        features: Drawn in it: inliers green, all others red.
+    Pixels have the shape (height, width, 3) in RGB, or (height, width) in grey. Of its features,
+    inliers are green, all others red.
     """
     import cv2  # not before somebody asks for an image
 
@@ -276,11 +263,7 @@ def small_jpeg(data: npt.NDArray[np.uint8], features: Sequence[TrackedFeatures] 
 
 @contextlib.contextmanager
 def serving(observer: Observer, run: str) -> Iterator[Path | None]:
-    """Let a run be watched and controlled while the block lasts; called on its loop.
-
-    Yields:
-        The socket's path; `None` if there can be none.
-    """
+    """Serve a run's monitor on its loop; yield the socket's path, `None` without one."""
     try:
         path = socket_of(run)
         server = Server(observer, asyncio.get_running_loop(), path)

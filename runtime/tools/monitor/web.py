@@ -54,7 +54,6 @@ class PageServer(ThreadingHTTPServer):
 
     Args:
         port: On 127.0.0.1; 0 for any that is free.
-        run: The socket at which the run listens.
         token: Required in addresses; random if not given.
 
     Raises:
@@ -74,8 +73,6 @@ class PageServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Handler of a connection's one request."""
-
     server: PageServer
     timeout = 10.0  # seconds for the request to come, and for a page to take what it is sent
 
@@ -117,11 +114,7 @@ class _Handler(BaseHTTPRequestHandler):
                 raise HttpError(404, f"there is no {url.path}")
 
     def _authorize(self, token: str) -> None:
-        """Check a request's token and, against DNS rebinding, its host: this machine.
-
-        Raises:
-            HttpError: It is not allowed.
-        """
+        """Check a request's token and, against DNS rebinding, its host; or raise `HttpError`."""
         for name in _ONCE:
             if len(self.headers.get_all(name, ())) > 1:
                 raise HttpError(400, f"expected one header {name}, found two")

@@ -53,7 +53,6 @@ def sweep(
 
     Args:
         run: Runs one job; must be picklable if the executor needs that.
-        watch: Is told how it gets on.
         fresh: Forget rows of earlier sweeps in the same folder.
 
     Returns:
@@ -61,8 +60,8 @@ def sweep(
 
     Raises:
         ConfigError: Another sweep writes into the same folder.
-        BaseException: Whatever interrupts it, such as KeyboardInterrupt, once the running jobs
-            have ended; those that ended well are kept. A second one is not waited for.
+        BaseException: Whatever interrupts it, such as KeyboardInterrupt, once the running jobs have
+            ended; those that ended well are kept. A second one is not waited for.
     """
     watch = watch or Watch()
     with Rows(plan.out / "rows.jsonl", fresh=fresh) as rows:
@@ -88,11 +87,7 @@ def sweep(
 
 
 def run_here(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> list[Row]:
-    """Run the missing jobs of a plan on this machine, and show nothing; see `sweep`.
-
-    Args:
-        jobs: Runs at the same time; `at_once` if not given.
-    """
+    """Run the missing jobs of a plan on this machine, and show nothing; see `sweep`."""
     children = Children()
     watch = Watch()
     watch.interrupted = children.interrupt  # type: ignore[method-assign]
@@ -259,7 +254,6 @@ def print_summary(console: Console, plan: Plan, combinations: Sequence[Combinati
 
 
 def _columns(plan: Plan, combinations: Sequence[Combination]) -> Iterator[Column]:
-    """Yield all columns; figures last, and beside their alignment."""
     for index, parameter in enumerate(plan.parameters):
         yield Column(parameter.path, tuple(each.settings[index] for each in combinations))
     passed = ["" if c.passed is None else f"{c.passed} of {c.runs}" for c in combinations]

@@ -30,7 +30,6 @@ class Parameter(msgspec.Struct, frozen=True):
     """A setting varied by a sweep.
 
     Attributes:
-        path: As in ``--set``: ``camera.rate``.
         texts: Its values as they were written, each as ``--set`` takes it.
     """
 

@@ -38,8 +38,6 @@ class Line(msgspec.Struct, frozen=True):
 
     Attributes:
         label: Its name among others; empty for a single line.
-        texts: The values.
-        spreads: Of the figure at each of them.
     """
 
     label: str
@@ -117,7 +115,6 @@ def _line(label: str, found: dict[str, list[float]], parameter: Parameter) -> Li
 
 
 def _shares(parameter: Parameter, rows: Sequence[Row]) -> dict[str, list[float]]:
-    """Return the percentages of runs crashed and failed, at each value; none if all 0."""
     groups = [[r for r in rows if r["parameters"][parameter.path] == t] for t in parameter.texts]
     shares = {
         "crashed": [_percent(bool(row["error"]) for row in group) for group in groups],
@@ -196,11 +193,7 @@ def _decades(values: Sequence[float]) -> bool:
 
 
 def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
-    """Write the page of a sweep into its folder; its tables and plots are there already.
-
-    Returns:
-        The page.
-    """
+    """Write the page of a sweep into its folder, beside its tables and plots, and return it."""
     combinations = summarise(plan, rows)
     figures = [n for n in MAIN if any(n in each.figures for each in combinations)]
     aligned = Counter(each.alignment for each in combinations if each.alignment)
@@ -240,7 +233,6 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
 
 
 def _cell(spread: Spread | None) -> tuple[str, ...]:
-    """Return the lines of a cell: median, quartiles, ends; nothing for no figure."""
     if spread is None:
         return ()
     if spread.least == spread.most:

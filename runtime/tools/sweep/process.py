@@ -235,6 +235,5 @@ def last_error(output: str) -> str:
 
 
 def _same_everywhere(error: str, job: Job) -> str:
-    """Remove from an error the parts different between equal sweeps."""
     error = error.replace(job.out, f"runs/{job.id}")
     return re.sub(r"\b0x[0-9a-f]{6,}", "0x…", error)[:_LONGEST_ERROR]

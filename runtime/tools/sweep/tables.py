@@ -29,12 +29,8 @@ class Row(TypedDict):
 
     Keys:
         id: Of the job.
-        parameters: Path to value, as they were written.
-        seed: Of the run's random numbers.
         exit_code: Of the process; negative for the signal that ended it, `None` if there was no
             process.
-        error: What went wrong, in one line; empty for a run that is finished.
-        passed: The run's verdict; `None` if it has none.
         repeat: Which of the runs with equal settings and seed it is.
         digest: Of all events; `None` if off, or if equal runs may differ in it.
         digests: Name of an estimator to the digest of all that it has sent.
@@ -42,8 +38,6 @@ class Row(TypedDict):
         run_seconds: Real seconds from the first update to the end.
         wall_seconds: Real seconds of the whole process.
         estimators: Name to figures, as the run's verdict has them.
-        flights: Vehicle to figures of its flight, as the run's verdict has them.
-        workers: Name to what its calls cost, as the run's summary has it.
     """
 
     id: str
@@ -94,11 +88,8 @@ def decode_rows(text: bytes) -> dict[str, Row]:
 class Rows:
     """A file of rows, open for adding; a context manager.
 
-    Of several rows of one job the last one counts. A line that was cut short, by a full disk or
-    a power cut, is as if it were not there.
-
-    Args:
-        path: The file; its folder is made if missing.
+    Of several rows of one job the last one counts. A line that was cut short, by a full disk or a
+    power cut, is as if it were not there.
 
     Raises:
         ConfigError: Another sweep has it open.
@@ -175,11 +166,8 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
     """A combination of settings and an estimator, over all seeds and repeats.
 
     Attributes:
-        settings: Values of the parameters, in their order.
         estimator: Its name; empty if no run has a verdict.
-        runs: How many there were.
         crashed: How many of these came to nothing; no figure knows of them.
-        passed: How many met the estimator's thresholds; `None` if there are none.
         failed: How many did not meet them.
         repeatable: Whether runs with equal settings and seed gave the same, in words; empty if
             there were no two of them.
@@ -317,7 +305,6 @@ def _repeatable(name: str, group: Sequence[Row]) -> str:
 
 
 def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], list[list[Any]]]:
-    """Return header and lines: a line per run and estimator, or per run without any."""
     header = ["run", *paths, *_seed(rows), "exit_code", "error", "passed", "sim_seconds", "digest"]
     found = {key for _, row in rows for f in row["estimators"].values() for key in f}
     figures = [name for name in ("alignment", *IN_SWEEPS) if name in found]
@@ -335,7 +322,6 @@ def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], li
 
 
 def _seed(rows: Sequence[tuple[Job, Row]]) -> list[str]:
-    """Return the columns to tell runs with equal settings apart."""
     return ["seed", "repeat"] if any(job.repeat > 1 for job, _ in rows) else ["seed"]
 
 

@@ -34,11 +34,7 @@ class SentEvent(msgspec.Struct, eq=False):
 
     Attributes:
         time: Of `time.perf_counter_ns`, when it was sent.
-        run: The same on the run's clock (ns).
         node: Sender.
-        event: Its type.
-        source: Its source.
-        stamp: Its stamp.
         seen: Whether its path begins with a camera.
         how: ``begins`` a path, ``follows`` from `cause`, or ``holds`` it at best.
         cause: The event that it follows from.
@@ -65,8 +61,6 @@ class SentEvent(msgspec.Struct, eq=False):
 
 
 class _HeardEvents:
-    """The sensors' events, and events caused by these, received by a node."""
-
     def __init__(self) -> None:
         self.by_stamp: OrderedDict[int, list[SentEvent]] = OrderedDict()
         self.newest: SentEvent | None = None

@@ -39,9 +39,6 @@ class TraceInstrument(Instrument):
     Times are nanoseconds of `time.perf_counter_ns`; `run` and `stamp` are of the run's clock, but
     for `run` in real time (see `ClockRate`). An identity is `id` of the event; a cause is the
     identity of the event that the innermost step was given, or 0.
-
-    Args:
-        spool: Takes the notes, a list at a time.
     """
 
     def __init__(self, clock: Clock, spool: Spool) -> None:
@@ -136,11 +133,7 @@ class TraceInstrument(Instrument):
 
 @contextlib.contextmanager
 def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
-    """Trace a run while the block lasts, then write the trace.
-
-    Args:
-        supervisor: Of the run; nothing has been sent yet.
-        path: Of the trace; compressed if it ends with ``.gz``.
+    """Trace a run from its begin while the block lasts, then write the trace (``.gz``: compressed).
 
     Raises:
         ConfigError: There can be no such file.

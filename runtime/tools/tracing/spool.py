@@ -48,9 +48,6 @@ class EventNote(NamedTuple):
         time: Of sending, real time (ns).
         run: Of sending, the run's clock (ns).
         sender: ``node.port``.
-        event: Its type.
-        source: Its source.
-        stamp: Its stamp.
         identity: Its `id`.
         given: The `id` of the event that the step which sent it was handling; 0 if none.
     """
@@ -89,7 +86,6 @@ class Spool:
 
     Attributes:
         beside: Notes of other threads than the loop's.
-        rate: Of the run's clock, if that is real; known at the end.
         kinds: What is known of each type of event, by name.
         receivers: Nodes that hear events of a sender, type and source.
     """

@@ -34,10 +34,7 @@ _TITLES = {
     SENSORS: "exposures",
 }
 _MOMENT = 0.1
-"""Microseconds of the slice of an instant, for an arrow to begin there.
-
-It overlaps nothing: an event is delivered later, as the note itself is made in between.
-"""
+"""Microseconds of the slice of an instant, for an arrow to begin there; shorter than a delivery."""
 
 
 def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Iterable[str]) -> None:
@@ -45,7 +42,6 @@ def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Itera
 
     Args:
         path: Of the trace; compressed if it ends with ``.gz``.
-        clock: ``lockstep`` or ``real``.
         nodes: Names, in the order in which they are to be shown.
     """
     about = {"run": name, "clock": clock, "made by": MADE_BY}
@@ -66,8 +62,6 @@ def _open(path: Path, *, compress: bool) -> IO[bytes]:
 
 
 class _Writer:
-    """Converter of notes into trace events."""
-
     def __init__(self, spool: Spool, nodes: Iterable[str]) -> None:
         self._spool = spool
         self._causes = Causes(spool.kinds, spool.receivers)
@@ -255,7 +249,6 @@ class PathLatency(msgspec.Struct, frozen=True):
     """Latency of a path from a sensor to a set-point.
 
     Attributes:
-        path: The events on it.
         run_ms: From exposure to set-point on the run's clock, milliseconds, one a set-point.
         real_ms: The same in real time.
     """
@@ -269,12 +262,10 @@ class NodeLoad(msgspec.Struct, frozen=True):
     """Load of a node on the loop.
 
     Attributes:
-        node: Its name.
         steps: How often the loop went into it.
         busy_ms: Milliseconds in it, less those in others that it called.
         share: Of the time from the first step to the last.
         longest_ms: The longest step, less what it called.
-        longest: Name of that step.
     """
 
     node: str
@@ -286,11 +277,7 @@ class NodeLoad(msgspec.Struct, frozen=True):
 
 
 def read_trace(path: Path) -> Trace:
-    """Read a trace.
-
-    Raises:
-        ConfigError: There is none, or it is something else.
-    """
+    """Read a trace, or raise `ConfigError`."""
     try:
         content = path.read_bytes()
         if content.startswith(b"\x1f\x8b"):
