@@ -1,8 +1,8 @@
 """Proof 2: Allan deviation of a stationary IMU, compared with the announced noise.
 
 IEEE Std 952-1997, annex C: σ²(τ) = N²/τ of white noise with the density N, K²τ/3 of a random walk
-with the density K. Both are fitted at once, to the overlapping estimates of all axes. How far such
-a fit may be off is measured on the same number of samples made of the announced numbers.
+with the density K. Both are fitted at once, to the overlapping estimates of all axes; the fit's
+tolerance comes from as many samples made of the announced numbers.
 """
 
 from __future__ import annotations
@@ -26,14 +26,7 @@ _TRIALS = 24
 
 
 class Curve(msgspec.Struct, frozen=True, eq=False):
-    """Allan deviation of a sensor, measured and announced.
-
-    Attributes:
-        name: gyroscope or accelerometer.
-        seconds: Averaging times τ, shape (n,).
-        measured: Deviation at each, shape (n,).
-        announced: Deviation that the announced numbers give, shape (n,).
-    """
+    """Allan deviation of a sensor, measured and as announced; arrays have the shape (n,)."""
 
     name: str
     seconds: Floats
@@ -42,7 +35,7 @@ class Curve(msgspec.Struct, frozen=True, eq=False):
 
 
 def variances(samples: Floats, rate: float) -> tuple[Floats, Floats]:
-    """Return averaging times (s) and the overlapping Allan variance at each, mean of all axes.
+    """Return averaging times (s) and overlapping Allan variances, mean of all axes.
 
     Args:
         samples: At equal intervals, shape (n, axes).
@@ -90,11 +83,7 @@ def needed(imu: ImuAnnouncement, most: float) -> float:
 
 
 def noise(imu: ImuAnnouncement, samples: dict[str, Floats]) -> Iterator[tuple[Curve, list[Figure]]]:
-    """Yield the curve and the figures of the gyroscope and the accelerometer.
-
-    Args:
-        samples: Of each, while it stands, shape (n, 3).
-    """
+    """Yield curve and figures of each sensor; its samples at rest have the shape (n, 3)."""
     for name, rows in samples.items():
         white, walk, step = _announced(imu, name)
         seconds, found = variances(rows, imu.rate)

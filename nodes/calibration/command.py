@@ -1,8 +1,4 @@
-"""``selftest`` and ``lint``: a measured check and a rule check of a rig's settings.
-
-For the self-test a file's vehicles are flown alone in the calibration room, and held against what
-they announced.
-"""
+"""``selftest`` and ``lint``: a measured check and a rule check of a rig's settings."""
 
 from __future__ import annotations
 
@@ -64,10 +60,8 @@ class Result(msgspec.Struct, eq=False):
     """Self-test results of a vehicle.
 
     Attributes:
-        vehicle: Its name.
         figures: By number of the proof.
         notes: What was switched off, or cannot be shown.
-        curves: Allan deviations.
         points: By source of the camera.
     """
 
@@ -216,7 +210,6 @@ def _config(nodes: list[dict[str, Any]], config: Config, seconds: float) -> Conf
 
 
 def _run(nodes: list[dict[str, Any]], config: Config, seconds: float = _SECONDS) -> _Collector:
-    """Run nodes, and return the last of them."""
     kept: list[Supervisor] = []
 
     @contextlib.contextmanager

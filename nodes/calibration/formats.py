@@ -1,21 +1,15 @@
 """Announced rigs as calibration files of other programs.
 
-Each file is a template beside this module, ``<format>.<file>.jinja``, and reads like the file.
-
-Every file speaks of the IMU's frame and of optical frames (x right, y down, z forward); pixel
-centres have whole coordinates in all of them. A rig without an IMU has the body's frame in its
-place. The IMU's axes are those of the measurements that the file is for: of a file that names
-topics those of ROS (forward, left, up), else ours, as exported data, the link and libraries have
-them (forward, right, down). Noise is that of ``ImuAnnouncement``, continuous
-densities as Kalibr's, or what a template says beside it. What a format has no word for is refused
-if the projection depends on it, and otherwise said in a comment.
-
+Each file is a template beside this module, ``<format>.<file>.jinja``. Every file speaks of the
+IMU's frame and of optical frames (x right, y down, z forward); pixel centres have whole coordinates
+in all of them. Without an IMU, the body's frame takes its place. The IMU's axes are ROS's (forward,
+left, up) in files that name topics, else ours, as in exported data (forward, right, down). Noise is
+that of ``ImuAnnouncement``, continuous densities as Kalibr's, or what a template says beside it.
+What a format cannot express is refused if the projection depends on it, else noted in a comment.
 Sources: github.com/ethz-asl/kalibr/wiki/yaml-formats; docs.openvins.com/gs-calibration.html and
-open_vins/config; VINS-Fusion/config and camodocal; basalt-headers' ``calibration.hpp``;
-ORB-SLAM3's "Calibration_Tutorial.pdf", section 5; github.com/VSLAM-LAB/VSLAM-LAB,
+open_vins/config; VINS-Fusion/config and camodocal; basalt-headers' ``calibration.hpp``; ORB-SLAM3's
+"Calibration_Tutorial.pdf", section 5; github.com/VSLAM-LAB/VSLAM-LAB,
 ``Datasets/DatasetVSLAMLAB.py`` and its data sets.
-
-VSLAM-LAB's has a place for the data of a finished run, too.
 """
 
 from __future__ import annotations
@@ -68,11 +62,9 @@ class Format(msgspec.Struct, frozen=True):
     """Files and capabilities of a calibration format.
 
     Attributes:
-        files: Names of its files.
-        radtan: How many coefficients its radial-tangential lens has: 4 (k1, k2, p1, p2), 5 (and
-            k3) or 8 (and k4, k5, k6 in the denominator).
-        pair_only: Whether it is for one camera or one stereo pair.
-        needs_imu: Whether there is none of it without an IMU.
+        radtan: Coefficients of its radial-tangential lens: 4 (k1, k2, p1, p2), 5 (k3) or 8 (k4, k5,
+            k6 in the denominator).
+        pair_only: Limited to one camera or one stereo pair.
         camera_file: A file of each camera, with ``{}`` for its number; empty for none.
         topics: Whether its files name the topics of ROS.
     """
@@ -102,16 +94,14 @@ FORMATS = {
 
 
 def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
-    """Return the files of a format, by name, with their texts.
+    """Return the texts of a format's files, by name.
 
     Args:
-        rig: Sensors of one body.
         name: One of `FORMATS`.
-        topics: Whether who reads them listens to the topics that they name; else our own
-            measurements come in another way.
+        topics: Whether the reader listens to the topics named; else measurements come another way.
 
     Raises:
-        ValueError: The format has no word for something that the projection depends on.
+        ValueError: The format cannot express something that the projection depends on.
     """
     form = FORMATS[name]
     if form.needs_imu and rig.imu is None:
@@ -146,7 +136,6 @@ def variables(
     """Return all templates' variables: cameras, imu, stereo, gravity, depth_factor.
 
     Args:
-        rig: Sensors of one body.
         cameras: In a format's words; if not given, all of the rig, with up to eight coefficients.
         topics: Whether the IMU's axes are those on the topics of ROS.
     """
@@ -199,11 +188,7 @@ def _camera(rig: Rig, camera: CameraAnnouncement, name: str, *, ros: bool) -> di
 
 
 def _coefficients(camera: CameraAnnouncement, name: str) -> tuple[float, ...]:
-    """Return a lens's coefficients in a format's order.
-
-    Raises:
-        ValueError: It has no word for the lens.
-    """
+    """Return a lens's coefficients in a format's order."""
     info, most = camera.info, FORMATS[name].radtan if name else 8
     if info.distortion_model == "equidistant":
         return info.distortion
@@ -274,15 +259,10 @@ def export_calibration(
         form: One of `nodes.calibration.formats.FORMATS`.
         out: Folder for the files; ``export/<form>`` in the run's folder if None.
         epoch: The run's time 0 in the data: a date (ISO 8601), or nanoseconds of Unix time.
-        camera: Source of a camera, or of the body whose cameras are wanted; the first camera's
-            body if None.
-
-    Returns:
-        What was written.
+        camera: Source of a camera or of its body; the first camera's body if None.
 
     Raises:
-        ValueError: The run left no announcements, it has no such camera, or the format has no word
-            for it.
+        ValueError: The run has no announcements or no such camera, or the format cannot express it.
         OSError: A file cannot be written.
     """
     zero = epoch_of(epoch)
@@ -322,7 +302,7 @@ def announcements(run: Path) -> list[Announcement]:
     """Return the announcements of cameras and IMUs in a run's summary.
 
     Raises:
-        ValueError: It left none, as a run that was killed does.
+        ValueError: There are none, as of a killed run.
     """
     path = run / "summary.json"
     try:

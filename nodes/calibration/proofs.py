@@ -1,8 +1,4 @@
-"""The six proofs: a rig's data from the calibration room, compared with its announcements.
-
-Pure functions on what `_Collector` has kept. Each returns figures with what is allowed of them, and
-a sentence of what is wrong.
-"""
+"""The six proofs: a rig's data from the calibration room, compared with its announcements."""
 
 from __future__ import annotations
 
@@ -30,9 +26,7 @@ _POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.005, 0.1, 0.3, 0.005, 1e-5
 """Metres; pixels, global and rolling shutter; metres; pixels."""
 
 _MOST = 0.99
-"""Least share of points, and of depths, within the limit.
-
-No point may be missing, or beyond three times the limit.
+"""Least share of points, and of depths, within the limit; the rest is within three times the limit.
 """
 
 _LATE, _PLACE, _TURN = 2e-4, 5e-4, 5e-4
@@ -43,12 +37,8 @@ class Figure(msgspec.Struct, frozen=True):
     """Measured number of a proof, with its limit.
 
     Attributes:
-        subject: Whose.
-        name: What.
-        value: Measured.
-        limit: Greatest that is allowed; None if nothing is.
-        unit: Of both.
-        remark: What is wrong, or cannot be shown, in a sentence.
+        limit: Greatest allowed; None if nothing is.
+        remark: Fault, or why nothing can be shown, in a sentence.
     """
 
     subject: str
@@ -86,9 +76,8 @@ class Points(msgspec.Struct, frozen=True, eq=False):
 def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, begin: int) -> Figure:
     """Return how far the ideal IMU, integrated, gets from the truth: proof 1.
 
-    Rotation by the exponential of the mean of two angular velocities, velocity by the trapezoidal
-    rule on the rotated specific forces, position likewise, on splines through the samples; of an
-    IMU that averages, by its sample.
+    Rotations are exponentials of the mean of two angular velocities; velocity and position follow
+    by the trapezoidal rule on splines through the samples; of an IMU that averages, by its sample.
     """
     used = [s for s in samples if begin <= s.stamp <= begin + round(INTEGRATED * 1e9)]
     stamps = np.array([s.stamp for s in used], np.int64)

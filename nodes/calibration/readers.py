@@ -1,7 +1,7 @@
 """The calibration files of other programs, read as their documentation says.
 
-Written against the formats and not against `nodes.calibration.formats`: YAML is OpenCV's reader,
-lenses are OpenCV's functions, so that a mistake in a file does not cancel out.
+Independent of `nodes.calibration.formats` and on OpenCV's functions, so a mistake in a file does
+not cancel out.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ReadCamera(msgspec.Struct, frozen=True, eq=False):
         matrix: K, shape (3, 3).
         lens: Coefficients in OpenCV's order.
         fisheye: Whether they are those of OpenCV's fisheye model.
-        time_offset: Seconds to add to an image's stamp to be on the IMU's clock, if the file says.
+        time_offset: Seconds from an image's stamp to the IMU's clock, if the file says.
     """
 
     in_imu: Floats

@@ -1,7 +1,6 @@
 """The calibration room: its surfaces, the sensor data sent there, and the true motion.
 
-Black walls, and white spheres in every direction. Its surfaces are known as numbers, so what a ray
-meets is computed here and not by a renderer.
+Black walls, and white spheres in every direction; rays are intersected here and not by a renderer.
 """
 
 from __future__ import annotations
@@ -49,10 +48,8 @@ _COUNT = 130
 def spheres(angle: float) -> tuple[Floats, Floats]:
     """Return the spheres' centres (metres in ``map``, shape (n, 3)) and radii (metres, (n,)).
 
-    They lie on a spiral of equal areas, seen from the room's centre, before the walls.
-
-    Args:
-        angle: Half of the angle that each takes up from there, radians.
+    They lie on a spiral of equal areas around the room's centre, each half `angle` (radians) wide
+    there.
     """
     number = np.arange(_COUNT) + 0.5
     down = 1.0 - 2.0 * number / _COUNT
@@ -95,15 +92,12 @@ def mjcf(angle: float) -> str:
 
 
 def hits(angle: float, origins: Floats, rays: Floats) -> tuple[Floats, npt.NDArray[np.int64]]:
-    """Return the first surface along each ray.
+    """Return distances (m) of the first surfaces, and each sphere's number, or below 0 for a wall.
 
     Args:
         angle: As of `spheres`.
         origins: Metres in ``map``, within the room, shape (n, 3).
         rays: Unit directions in ``map``, shape (n, 3).
-
-    Returns:
-        Distances, metres, shape (n,); and what is met: the number of a sphere, or below 0 a wall.
     """
     with np.errstate(divide="ignore"):
         faces = np.where(rays > 0, HIGH - origins, LOW - origins) / rays
@@ -189,11 +183,7 @@ Stamps = npt.NDArray[np.int64]
 
 
 class Motion:
-    """The true motion of a body: cubic between odometry's rows, with their twists.
-
-    Args:
-        rows: Of one body, two or more, in order.
-    """
+    """The true motion of a body: cubic between two or more rows of odometry, with their twists."""
 
     def __init__(self, rows: Sequence[Odometry]) -> None:
         self.stamps: Stamps = np.array([row.stamp for row in rows], np.int64)
@@ -205,11 +195,7 @@ class Motion:
         self._place = CubicHermiteSpline(seconds, self.positions, self.velocities)
 
     def at(self, stamps: Stamps) -> tuple[Floats, Rotation]:
-        """Return positions (metres, shape (n, 3)) and rotations to the parent frame at some times.
-
-        Args:
-            stamps: Nanoseconds, shape (n,), within those of the rows.
-        """
+        """Return positions (m, (n, 3)) and rotations to the parent frame at stamps (ns, (n,))."""
         after = np.clip(np.searchsorted(self.stamps, stamps), 1, len(self.stamps) - 1)
         before = after - 1
         length = ((self.stamps[after] - self.stamps[before]) / 1e9)[:, None]

@@ -1,11 +1,9 @@
 """``export``: a run's trajectories, measurements and calibration, as files for other tools.
 
-A run leaves trajectories as ``trajectories/truth.tum`` and ``trajectories/<estimator>.tum``, in
-``map`` (NED) or the estimator's own frame, just as the estimator sent them; nothing here aligns
-them. Stamps of an export are Unix time: its files say which epoch is the run's time 0. TUM's files
-keep the run's frames; EuRoC's world is z up (north, west, up), as that data set's own; KITTI's
-poses are those of the left camera, from identity. Measurements are CSV files: one for each sensor
-and kind.
+A run leaves ``trajectories/truth.tum`` and ``trajectories/<estimator>.tum``, in ``map`` (NED) or
+the estimator's own frame, as sent; nothing here aligns them. Exported stamps are Unix time, and
+files say which epoch is the run's time 0. TUM's files keep the run's frames, EuRoC's world is
+north, west, up, KITTI's poses are those of the left camera, from identity.
 """
 
 from __future__ import annotations
@@ -51,22 +49,18 @@ def export_trajectories(
 ) -> list[Path]:
     """Write a run's true trajectory and its estimates in another format.
 
-    ``tum`` and ``euroc`` give a file each for the truth and every estimator. As evo compares a
-    EuRoC truth with an estimate in TUM's format, ``euroc`` adds the latter. ``kitti``, whose files
-    go together line by line, gives a pair for every estimator, at the estimator's stamps: poses
-    of the first camera that the run announced, in the frame of its first one. Without a camera on
-    the body it is one at the body's origin that looks ahead.
+    ``tum`` and ``euroc`` give a file each for the truth and every estimator. ``euroc`` adds the
+    estimates in TUM's format for evo. ``kitti`` gives a pair for every estimator, at the
+    estimator's stamps: poses of the first announced camera (else one at the body's origin that
+    looks ahead) from its first pose.
 
     Args:
         form: One of `FORMATS`.
         out: Folder for the files, made if need be; ``export`` in the run's folder if None.
         epoch: The run's time 0: a date (ISO 8601), or nanoseconds of Unix time.
 
-    Returns:
-        What was written, the truth first.
-
     Raises:
-        ValueError: The run left no trajectories, one of them is none, or so is the epoch.
+        ValueError: A trajectory or the epoch is missing or malformed.
         OSError: A file cannot be written.
     """
     zero = epoch_of(epoch)
@@ -119,8 +113,7 @@ def export_trajectories(
 def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
     """Return the transform from an announced camera to its body, shape (4, 4).
 
-    If none is named it is the first one on a body, or else one at the body's origin that looks
-    ahead.
+    The default is the first one on a body, else one at the body's origin that looks ahead.
 
     Raises:
         ValueError: The run's summary is none, or there is no such camera.
@@ -144,8 +137,6 @@ def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
 
 
 class _Announced(msgspec.Struct):
-    """Announcement fields used by an export."""
-
     type: str
     source: str = ""
     parent_frame_id: str = "map"
@@ -154,18 +145,16 @@ class _Announced(msgspec.Struct):
 
 
 class _Summary(msgspec.Struct):
-    """Summary fields used by an export."""
-
     announcements: list[_Announced] = []
 
 
 def load(run: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:
     """Read a run's true trajectories and its estimates, both by the names of their files.
 
-    The first vehicle's truth is ``truth``, those of others are ``truth.<vehicle>``.
+    Truths are ``truth`` and, of further vehicles, ``truth.<vehicle>``.
 
     Raises:
-        ValueError: The run left no trajectories, or one of them is none.
+        ValueError: A trajectory is missing or malformed.
     """
     folder = run / "trajectories"
     if not (folder / f"{TRUTH}.tum").is_file():
@@ -195,26 +184,20 @@ def _truth_of(run: Path, estimate: str) -> str:
 
 
 class _Verdict(msgspec.Struct):
-    """Verdict fields used by an export."""
-
     estimators: dict[str, dict[str, Any]] = {}
 
 
 def export_measurements(run: Path, out: Path | None = None, epoch: int | str = EPOCH) -> list[Path]:
     """Write the samples of IMUs, barometers, receivers, … as ``<source>.<kind>.csv``.
 
-    Rows are in the order in which the measurements came; a column is named by its field and unit.
+    Rows are in order of arrival; a column is named by field and unit.
 
     Args:
-        run: The run's folder, with recordings (MCAP) in it.
         out: Folder for the files, made if need be; ``export`` in the run's folder if None.
         epoch: The run's time 0: a date (ISO 8601), or nanoseconds of Unix time.
 
-    Returns:
-        What was written.
-
     Raises:
-        ValueError: There is no recording, or no measurement in it; or the epoch is none.
+        ValueError: There is no measurement, or the epoch is none.
         OSError: A file cannot be written.
     """
     zero = epoch_of(epoch)
@@ -295,19 +278,14 @@ def export(
 ) -> None:
     """Write a run's trajectories, measurements or calibration, as other tools read them.
 
-    tum, euroc and kitti are the true and the estimated trajectories, as evo reads them.
-    tum and euroc give one file each for the truth and every estimator; euroc adds the estimates
-    in TUM's format, which is what evo_ape euroc compares with, and turns all to a world with z
-    up. kitti has no stamps, so it gives a pair of files for every estimator, pose by pose: those
-    of the first camera, from identity.
-
-    csv gives what IMU, barometer, magnetometer, satellite receiver and range finders measured, and
-    the wind: a file each, if the run has a recording.
-
-    The others are calibrations: cameras, IMU and the transforms between them, as that program's
-    files say it: kalibr, openvins, vins (VINS-Fusion), basalt, orbslam3, and vslamlab, which also
-    gets images, IMU data and ground truth if the run has a recording. A lens that a format has no
-    word for is refused.
+    tum, euroc and kitti are true and estimated trajectories for evo. tum and euroc give a file for
+    the truth and each estimator; euroc turns the world z up and adds the estimates in TUM's format
+    for evo_ape. kitti has no stamps: a pair of files for every estimator, poses of the first
+    camera, from identity. csv gives a file for each IMU, barometer, magnetometer, satellite
+    receiver, range finder and the wind, if the run has a recording. kalibr, openvins, vins
+    (VINS-Fusion), basalt, orbslam3 and vslamlab are calibrations: cameras, IMU and their
+    transforms; vslamlab adds images, IMU data and ground truth if the run has a recording. A lens
+    that a format cannot express is refused.
     """
     from nodes.calibration.formats import export_calibration
     from runtime.errors import ConfigError

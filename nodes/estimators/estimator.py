@@ -1,8 +1,4 @@
-"""The base of all estimators: choice of the sensor, outputs, and the frame of the estimates.
-
-Poses are computed in the subclasses (`nodes.estimators.visual_odometry` and others), and judged in
-`nodes.judging.evaluation`.
-"""
+"""The base of all estimators: choice of the sensor, outputs, and the frame of the estimates."""
 
 from __future__ import annotations
 
@@ -54,24 +50,21 @@ WORKER_ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-"""Environment of an estimator's process: a single core each.
-
-The sums of linear algebra then always have the same order, and so the same result.
-"""
+"""Environment of an estimator's process: a single core, so that sums always have one order."""
 
 
 class EstimatorConfig(NodeConfig):
     """Settings of every estimator.
 
     Attributes:
-        origin: ``announced``: the estimates are in ``map`` and start at the pose that the vehicle
-            announced, if that is known to be true (else as ``start``; see `Estimator`). ``start``:
-            they are in ``odom``, whose origin is the body at the first image with a pose.
-        rectify: Whether images that it cannot compute with, because of their lens or because the
-            rows of both eyes are not aligned, are turned into those of pinhole cameras first. If
-            not, they are refused. Cameras whose images need it come after others.
+        origin: ``announced``: estimates are in ``map`` and start at the vehicle's announced pose,
+            if known to be true (else as ``start``; see `Estimator`). ``start``: they are in
+            ``odom``, with its origin at the body at the first image with a pose.
+        rectify: Whether images unusable because of their lens or unaligned rows of a stereo pair
+            are turned into those of pinhole cameras, else refused. Cameras that need it come after
+            others.
         latency: Time on the run's clock from the arrival of an image to its estimate.
-        not_finite: What a pose is that is not finite (NaN): an ``error`` that ends the run, or
+        not_finite: Meaning of a pose that is not finite (NaN): an ``error`` that ends the run, or
             ``lost``.
     """
 
@@ -92,9 +85,9 @@ class Estimator(Node[C], ABC):
     """Base class of nodes estimating poses from images or lidar scans.
 
     A subclass declares its input as ``frames``, a `Bundle` of one camera's images (of a stereo rig
-    with the fields ``left`` and ``right``, with an IMU one more, ``imu``); says in `needs`, `eyes`,
-    `inertial` and `lenses` what it takes; starts its tracker in `on_ready`, when `the_camera` is
-    known; and in `run` calls `publish` with a `TrackingResult` for each image::
+    ``left`` and ``right``, with an IMU also ``imu``), and its needs in `needs`, `eyes`, `inertial`
+    and `lenses`; starts its tracker in `on_ready`, when `the_camera` is known; and in `run` calls
+    `publish` with a `TrackingResult` for each image::
 
         class MyEstimator(Estimator):
             needs = frozenset({"grey", "depth"})
@@ -110,22 +103,21 @@ class Estimator(Node[C], ABC):
                     self.publish(image, await self.tracker.call(MyTracker.track, *args))
 
     The tracker gives poses of the optical camera (x right, y down, z forward) in the optical camera
-    at its first image. What is sent is the pose of the body (FRD) that carries the camera, as a
-    `PoseEstimate`; its stamp is on the clock of the IMU (`exposed_at`).
+    at its first image. A `PoseEstimate` is the pose of the body (FRD) that carries the camera, on
+    the clock of the IMU (`exposed_at`).
 
     **Lidars.** With `needs` of ``lidar`` alone, ``frames`` is an `Input` of scans. The tracker
     gives poses of the lidar (x forward, y right, z down) in the lidar at its first scan, that of a
     scan at its last ray, unless `exposed_at` is overridden; no features are sent.
 
-    **Lenses.** What `refusal` says no to, and stereo pairs that are not `aligned`, is rectified
-    beside the loop (`nodes.estimators.rectification`) before `frames` gives it, unless the setting
-    ``rectify`` is false. `the_camera` is the pinhole camera then, and features are sent where they
-    are in the announced camera's own image. Rows keep the read-out time of a rolling shutter only
-    nearly.
+    **Lenses.** Images that `refusal` rejects, and stereo pairs that are not `aligned`, are
+    rectified beside the loop (`nodes.estimators.rectification`) before `frames` gives it, unless
+    the setting ``rectify`` is false. `the_camera` is the pinhole camera then, and features are sent
+    where they are in the announced camera's own image. Rows keep the read-out time of a rolling
+    shutter only nearly.
 
     **Frame and alignment.** The `frame_id` of the estimates, chosen with the first pose of each
-    map, says what is known about their origin, and so how `nodes.judging.evaluation` aligns them
-    with the ground truth before it compares:
+    map, says how `nodes.judging.evaluation` aligns them with the ground truth:
 
     - ``map``: the origin is that of the ground truth. No alignment.
     - ``odom``, ``odom_1``, ``odom_2``, …: the origin is the body at the first image. The first pose
@@ -151,10 +143,7 @@ class Estimator(Node[C], ABC):
     """
 
     needs: frozenset[str] = frozenset()
-    """Kinds of image required of the camera, all of them; or ``lidar`` alone.
-
-    ``rgb`` serves for ``grey``, too.
-    """
+    """Kinds of image required of the camera (``rgb`` serves ``grey``); or ``lidar`` alone."""
     eyes: int = 1
     """Number of cameras read together; 2 for a stereo rig, with the left camera's pose."""
     inertial: bool = False
@@ -201,9 +190,9 @@ class Estimator(Node[C], ABC):
         cls.needs = frozenset(needs)
 
     def read(self, frame: type[tuple[Any, ...]]) -> None:
-        """Set the type of ``frames``, for classes with inputs chosen by their settings.
+        """Set the type of ``frames`` in ``__init__``, if settings choose the inputs.
 
-        Call it in ``__init__``. The class declares all fields of all such types.
+        The class declares all fields of all such types.
         """
         bundle = Bundle(frame, keep="latest")
         bundle.name = "frames"
@@ -235,8 +224,8 @@ class Estimator(Node[C], ABC):
     def on_announcement(self, announcement: Announcement) -> None:
         """Choose the first sensors with the needed data, or those named in the file.
 
-        The file names a camera as ``frames``, those of a stereo rig as ``frames.left`` and
-        ``frames.right``, and an IMU as ``frames.imu``; that beside a lidar as ``imu``.
+        The file names a camera as ``frames``, a stereo rig as ``frames.left`` and ``frames.right``,
+        an IMU as ``frames.imu`` (beside a lidar ``imu``).
         """
         if isinstance(announcement, VehicleAnnouncement):
             self._vehicles += (announcement,)
@@ -265,7 +254,6 @@ class Estimator(Node[C], ABC):
             self._narrow_to(port, camera.source)
 
     def _narrow_to(self, port: str, source: str) -> None:
-        """Receive only this source on a port, unless the file names another."""
         if port not in self._choice.named:
             self.sources[port] = source
 
@@ -306,10 +294,7 @@ class Estimator(Node[C], ABC):
         self._armed_at = {event.source: event.stamp, **self._armed_at}
 
     def check(self) -> Iterable[str]:
-        """Return an error if a needed camera or IMU is missing.
-
-        If the file is only checked, also if the library is missing. Logs the rectification.
-        """
+        """Return an error if a needed camera or IMU, or in a mere check the library, is missing."""
         library, install = self.library
         if self.checking and library and (why := why_missing(library)):
             yield f"{self.method} needs {library} ({why}): {install}"
@@ -345,8 +330,7 @@ class Estimator(Node[C], ABC):
     def exposed_at(self, image: Event) -> int:
         """Return when an image was exposed on the clock of IMU and ground truth (ns).
 
-        That is its stamp without the offset of the camera's clock, which was announced; of a scan
-        the time of its last ray, and of anything else its stamp.
+        Its stamp less the announced offset of the camera's clock; of a scan its last ray's time.
         """
         if isinstance(image, LidarScan):
             return image.end
@@ -355,7 +339,6 @@ class Estimator(Node[C], ABC):
         return image.stamp - round(self.the_camera().time_offset * 1e9)
 
     def _sensor(self) -> CameraAnnouncement | SensorAnnouncement:
-        """Return the sensor of the estimated pose."""
         return self._choice.lidar or self.the_camera()
 
     def _missing(self) -> str:
@@ -365,8 +348,8 @@ class Estimator(Node[C], ABC):
         """Send a tracker's result for an image: features, pose, loss of tracking.
 
         Args:
-            origin: When the image was exposed at which the tracker's poses start (ns); if `None`,
-                the first image that is published with a pose.
+            origin: Exposure of the image at which the tracker's poses start (ns); if `None`, of the
+                first image published with a pose.
 
         Raises:
             NodeError: It is no such result.
@@ -430,12 +413,10 @@ class Estimator(Node[C], ABC):
     def publish_trajectory(
         self, stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float64], number: int = 0
     ) -> None:
-        """Send the tracker's trajectory after loop closures; see `on_end`.
-
-        Without a pose that was published in that map, none is sent.
+        """Send the tracker's trajectory after loop closures; none without a pose in its map.
 
         Args:
-            stamps: When the images were exposed (`exposed_at`), ns, strictly rising, shape (n,).
+            stamps: Exposures of the images (`exposed_at`), ns, strictly rising, shape (n,).
             poses: The optical camera as in `TrackingResult`, shape (n, 4, 4).
         """
         try:
@@ -489,7 +470,6 @@ class Estimator(Node[C], ABC):
         return f"odom_{number}" if number else "odom"
 
     def _frame_number(self) -> int:
-        """Return a frame number unused so far, also before a restart."""
         return max([self.restarts, *(number + 1 for number in self._frame_numbers())])
 
     def _frame_numbers(self) -> list[int]:

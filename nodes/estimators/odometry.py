@@ -1,14 +1,10 @@
 """Tools of the odometries: grey images, corners followed by flow, poses, relocalization.
 
 Images are of the announced size and without distortion; flow goes from one to another, and back.
-
-The pose of a camera comes from the pixels and depths of landmarks by robust Gauss-Newton.
-Residuals of each landmark are its two pixels and its inverse depth, each in units of its noise, as
-a stereo camera's three coordinates would be (R. Mur-Artal and J. D. Tardós, "ORB-SLAM2", IEEE
-T-RO 2017, section III-A); weights are Huber's.
-
-A lost camera is relocalized by ORB descriptors of points whose place is known: E. Rublee et al.,
-"ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
+Poses come from pixels and depths of landmarks by robust Gauss-Newton with Huber's weights;
+residuals are two pixels and the inverse depth, in units of noise (R. Mur-Artal and J. D. Tardós,
+"ORB-SLAM2", IEEE T-RO 2017, section III-A). Relocalization is by ORB descriptors of known points:
+E. Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
 """
 
 from __future__ import annotations
@@ -89,15 +85,13 @@ def follow_both_ways(
     """Follow corners from a guess, and back; good corners return to their start.
 
     Args:
-        image: Where they are, grey.
-        other: Where to look for them, grey.
         pixels: Column and row, shape (n, 2), n > 0.
         guess: Their approximate pixels in the other image, shape (n, 2).
-        window: Side of the neighbourhood that is compared, pixels.
+        window: Side of the compared neighbourhood, pixels.
         levels: Halvings of the images.
 
     Returns:
-        Their pixels in the other image, shape (n, 2), and which are good, shape (n,).
+        Pixels in the other image, shape (n, 2), and a mask of the good ones, shape (n,).
     """
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
     options: Any = {
@@ -131,7 +125,7 @@ class Observations(msgspec.Struct, frozen=True, eq=False):
         landmarks: Metres in the world, shape (n, 3).
         pixels: Column and row, shape (n, 2).
         inverse: Measured inverse depth, 1/m, shape (n,).
-        measured: Which have a measured inverse depth, shape (n,).
+        measured: Mask of measured inverse depths, shape (n,).
     """
 
     landmarks: Floats
@@ -169,13 +163,13 @@ def solve_pose(
     """Return the pose with the least sum of robust squared residuals.
 
     Args:
-        seen: At least four landmarks, or fewer if something is known of the initial pose.
+        seen: At least four landmarks, or fewer with `information`.
         start: Initial pose, world to camera, shape (4, 4).
         matrix: K, shape (3, 3).
         pixel_noise: Standard deviation of a coordinate, pixels.
         depth_noise: Standard deviation of inverse depth, 1/m.
-        information: Inverse covariance of the initial pose, if that is more than a guess: of a
-            small motion of the camera's frame, translation, then rotation, shape (6, 6).
+        information: Inverse covariance of the initial pose, if known: of a small motion of the
+            camera's frame, translation, then rotation, shape (6, 6).
     """
     fx, fy, cx, cy = intrinsics(matrix)
     pose, count = start.copy(), len(seen.pixels)
@@ -293,13 +287,7 @@ def detect_and_describe(image: Grey, count: int) -> tuple[Floats, Descriptors]:
 
 
 def describe(image: Grey, pixels: Floats, points: Floats) -> DescribedPoints:
-    """Return the described points at given pixels; those too near to the edge are left out.
-
-    Args:
-        image: Grey.
-        pixels: Column and row, shape (n, 2).
-        points: Their places in the world, shape (n, 3).
-    """
+    """Return points (n, 3) with descriptors at pixels (n, 2); without those near to the edge."""
     # For given points ORB does not compute the orientation, as it does for those that it detects.
     keys = [
         cv2.KeyPoint(float(x), float(y), 31.0, float(angle), class_id=row)
@@ -324,9 +312,8 @@ def relocalize(
     """Return an image's pose by known points, world to camera; `None` if not found.
 
     Args:
-        pixels: Points of the image, as `detect_and_describe` gives them, shape (n, 2).
-        descriptors: Descriptors of these, shape (n, 32).
-        known: Points that the image may show.
+        pixels: Points of the image, as of `detect_and_describe`, shape (n, 2).
+        descriptors: Theirs, shape (n, 32).
         matrix: K, shape (3, 3).
         method: OpenCV's solver of a pose from points.
     """
@@ -353,10 +340,7 @@ def relocalize(
 
 
 def _orientations(image: Grey, pixels: Floats) -> Floats:
-    """Return the directions from corners to the centroids of their neighbourhoods, degrees.
-
-    The intensity centroid of "ORB", section 3.2; shape (n,).
-    """
+    """Return corners' directions to their intensity centroids ("ORB", section 3.2), degrees."""
     side = np.arange(-_RADIUS, _RADIUS + 1)
     dx, dy = (axis.ravel() for axis in np.meshgrid(side, side))
     disc = dx**2 + dy**2 <= _RADIUS**2

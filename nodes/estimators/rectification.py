@@ -1,14 +1,11 @@
 """Rectification: images of distorting lenses as pinhole images; stereo pairs row-aligned.
 
-For a single camera the optical axis, the principal point and the size stay. Both eyes of a stereo
-rig get one new orientation: x along the line from the left to the right one, z between both optical
-axes (as in A. Fusiello et al., "A compact algorithm for rectification of stereo pairs", 2000), and
-one matrix, so that a point falls on the same row of both, and its disparity is f · baseline / z.
-
-**The focal length** is that of square pixels, and the shortest with which every pixel of the new
-image shows something, at most `WIDEST` across. So the middle keeps about the resolution that it
-had, nothing is black, and the rim of a wide lens is cut off: of a fisheye of 150 degrees its middle
-is left. A lens of which less than a quarter would be left is refused.
+A single camera keeps optical axis, principal point and size. Both eyes of a stereo rig get one
+orientation: x from the left to the right one, z between both optical axes (A. Fusiello et al., "A
+compact algorithm for rectification of stereo pairs", 2000), and one matrix: disparity is f ·
+baseline / z. **The focal length** is the shortest, of square pixels, without black pixels in the
+new image, at most `WIDEST` across: the middle keeps about its resolution, the rim of a wide lens is
+cut off. A lens with less than a quarter left is refused.
 """
 
 from __future__ import annotations
@@ -45,8 +42,7 @@ class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
     """A camera and its pinhole replacement.
 
     Attributes:
-        lens: Intrinsics of its images.
-        pinhole: Those of the rectified ones.
+        pinhole: Intrinsics of the rectified images.
         turn: Rotation from the rectified to the announced optical frame, shape (3, 3).
     """
 
@@ -55,10 +51,7 @@ class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
     turn: Floats
 
     def original(self, pixels: npt.ArrayLike) -> Floats:
-        """Return where rectified pixels, shape (n, 2), are in the camera's own images.
-
-        NaN where they are not.
-        """
+        """Return the announced camera's pixels, NaN outside, of rectified pixels, shape (n, 2)."""
         uv = np.asarray(pixels, np.float64).reshape(-1, 2)
         info = self.pinhole
         x, y = (uv - (info.cx, info.cy)).T / [[info.fx], [info.fy]]
@@ -74,15 +67,13 @@ class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
 
     @cached_property
     def _fixed(self) -> Any:
-        """The same in 32nds of pixels, as OpenCV is quickest with."""
         return cv2.convertMaps(self._map, _NO_MAP, cv2.CV_16SC2)
 
     def rectify(self, event: Image | DepthImage) -> Image | DepthImage:
         """Return an image as taken by the pinhole camera.
 
-        Brightness is interpolated; of depth the nearest pixel is taken, for the mean of two
-        surfaces is none. Depth is measured along the optical axis, so this is for depth only if
-        the axis stays.
+        Depth is the nearest pixel's, along the optical axis, so this is for depth only if the axis
+        stays.
 
         Raises:
             ValueError: The image is not of the announced size.
@@ -111,11 +102,9 @@ class Rectification:
 
     Attributes:
         cameras: The same with the pinhole cameras' intrinsics and orientations.
-        eyes: What makes their images.
 
     Raises:
-        ValueError: No pinhole image shows enough of what they see, or both eyes are not side by
-            side; says why.
+        ValueError: No pinhole image shows enough, or both eyes are not side by side; says why.
     """
 
     def __init__(self, cameras: Sequence[CameraAnnouncement]) -> None:
@@ -166,10 +155,9 @@ class Rectification:
 
 
 def misalignment(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
-    """Return by how much a pair of pinhole images misses being aligned row by row, pixels.
+    """Return the largest row or disparity error of a pair of pinhole images as aligned, pixels.
 
-    The most that a point's right pixel differs from that to the left of its left one by f ·
-    baseline / z; ``inf`` if it cannot be seen, or their sizes differ.
+    Disparity should be f · baseline / z; ``inf`` if nothing is seen by both, or sizes differ.
     """
     info = left.info
     if (info.width, info.height) != (right.info.width, right.info.height):

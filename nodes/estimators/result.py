@@ -13,20 +13,19 @@ class TrackingResult(msgspec.Struct, frozen=True, eq=False):
     """Result of a tracker for an image: camera pose, and the features used.
 
     Attributes:
-        pose: The optical camera at this image in the optical camera at the first one: the transform
-            from this frame to that one, shape (4, 4). Metres, or the tracker's own unit.
-        lost: Whether the pose is not known; `pose` is then the last known one.
+        pose: The optical camera at this image in that at the first one, shape (4, 4); metres, or
+            the tracker's own unit.
+        lost: Whether `pose` is just the last known one.
         reason: Why tracking was lost, or how it was regained.
-        points: Features that were tracked: column and row, float32 pixels, shape (n, 2).
-        inliers: Which of them agree with the pose: bool, shape (n,).
-        velocity: Of the optical camera at this image, in the optical camera at the first one,
-            metres per second, shape (3,); `None` if the tracker does not know it.
+        points: Tracked features: column and row, float32 pixels, shape (n, 2).
+        inliers: Mask of those that agree with the pose: bool, shape (n,).
+        velocity: Of the optical camera, in that at the first image, m/s, shape (3,); `None` if
+            unknown.
         covariance: Of the pose's error (x, y, z, roll, pitch, yaw) in the optical camera at the
             first image, m², m rad and rad², shape (6, 6): a shift of the camera and a rotation
-            about it, both along that frame's axes; `None` if the tracker does not know it.
-        map: Number of the map that the pose is in. A tracker that begins a new map at a pose, or
-            with a unit of length, that it only guesses counts it up; one that finds an earlier map
-            again says that one's number. Poses of each map are sent in a frame of their own.
+            about it, along that frame's axes; `None` if unknown.
+        map: Number of the pose's map; a new map of guessed pose or unit counts it up, an earlier
+            map found again has its old number. Poses of each map are sent in a frame of their own.
     """
 
     pose: npt.NDArray[np.float64]
@@ -47,7 +46,7 @@ def check_result(result: Any) -> str:
     """Return a complaint about the first non-finite number of a result; empty if none.
 
     Raises:
-        ValueError: It is no such result; the message says what was expected and found.
+        ValueError: It is no such result.
     """
     if not isinstance(result, TrackingResult):
         raise ValueError(f"expected a TrackingResult, found {_kind(result)}")
@@ -76,7 +75,6 @@ def check_trajectory(stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float6
 
 
 def _check_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
-    """Raise `ValueError` if something is no array of real numbers of a shape."""
     numbers = isinstance(array, np.ndarray) and array.dtype.kind in "fiu"
     if not numbers or array.shape != shape:
         raise ValueError(

@@ -34,22 +34,16 @@ class SensorChoice:
     Args:
         needs: Kinds of image that each camera must give.
         eyes: Number of cameras, 1 or 2.
-        inertial: Whether an IMU is needed.
-        named: Port to the source that the file names for it: ``frames`` or ``frames.left`` (the
-            first camera), ``frames.right``, ``frames.imu``; beside a lidar ``imu``.
-        refusals: Returns why images of one or both eyes are of no use, a sentence by each source;
-            empty if they are. Called with False, as they are, and with True, as they can be
-            rectified.
+        named: Ports to the sources named in the file: ``frames`` or ``frames.left`` (the first
+            camera), ``frames.right``, ``frames.imu``; beside a lidar ``imu``.
+        refusals: Reasons, by source, why images of one or both eyes are unusable; called with
+            False, as they are, and with True, as they can be rectified.
 
     Attributes:
-        cameras: The chosen ones, the left one first; empty while there are none. Those whose
-            images are of use as they are come before those that have to be rectified.
+        cameras: The chosen ones, the left one first, usable images before those to be rectified;
+            empty while there are none.
         rectified: Whether their images have to be.
-        imu: The chosen IMU, on the vehicle of the lidar or first camera; `None` while there is
-            none.
-        imu_port: Port of its samples.
-        lidar: The chosen lidar, if one is needed; `None` while there is none.
-        named: As given.
+        imu: On the vehicle of the lidar or first camera; `None` while there is none.
     """
 
     def __init__(
@@ -104,7 +98,6 @@ class SensorChoice:
         return lacks
 
     def _beside(self) -> str:
-        """Return the source of the lidar or first camera; empty while there is none."""
         sensor = self.lidar or next(iter(self.cameras), None)
         return sensor.source if sensor else ""
 
@@ -125,7 +118,6 @@ class SensorChoice:
                 self._refusals |= found
 
     def _candidates(self) -> Iterator[tuple[CameraAnnouncement, ...]]:
-        """Yield cameras (or pairs) with all needed kinds of image."""
         for camera in self._seen:
             right_eye = camera.stereo and camera.source != self._first
             if right_eye or not self._gives_all(camera, self._first):
@@ -143,11 +135,7 @@ class SensorChoice:
         return camera.stereo == left.source
 
     def _gives_all(self, camera: CameraAnnouncement, named: str | None) -> bool:
-        """Tell whether a camera may be chosen and gives all kinds of image.
-
-        Raises:
-            ValueError: It is the one that the file names, and lacks a kind of image.
-        """
+        """Return whether a camera gives all images; raise `ValueError` if named and lacking."""
         if named is not None and camera.source != named:
             return False
         lacking = self._needs - given(camera)
@@ -252,8 +240,8 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
         """Make the mount of an announced camera, or of another sensor in its place.
 
         Args:
-            vehicle: The announcement of the vehicle, if the body had the announced pose at the
-                first image; `None` if its pose there is unknown.
+            vehicle: The vehicle, if the body had the announced pose at the first image; else
+                `None`.
             frame_id: Parent frame of the estimates if the pose is unknown.
         """
         return cls(
@@ -266,14 +254,10 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
         )
 
     def estimate(self, stamp: int, source: str, result: TrackingResult) -> PoseEstimate:
-        """Return the body's pose as an event.
+        """Return the body's pose, from that of the optical camera in its first frame, as an event.
 
-        The body's velocity is that of the camera: what the lever between them adds when the body
-        turns is not known here, and small (0.1 m/s at 1 rad/s and 0.1 m).
-
-        Args:
-            stamp: Stamp of the image (ns).
-            result: With the optical camera in its own first frame.
+        The body's velocity is the camera's, without the lever's share (0.1 m/s at 1 rad/s and 0.1
+        m).
         """
         body = self._bodies(result.pose)
         position, orientation = pose_tuples(body)
@@ -304,7 +288,7 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
         """Return the body's poses as an event.
 
         Args:
-            stamp: When it is sent (ns).
+            stamp: Of the event (ns).
             stamps: Those of the poses (ns), shape (n,).
             poses: The optical camera in its own first frame, shape (n, 4, 4).
         """

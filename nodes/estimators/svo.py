@@ -1,7 +1,6 @@
 """SVO in a worker's process, and its node: images in, estimates out.
 
-It is under the GPL, and may end or crash its process. The library is imported when an object is
-made, so that others may import this module for its names.
+Under the GPL, and able to crash its process; imported only when an object is made.
 """
 
 from __future__ import annotations
@@ -37,22 +36,22 @@ class SvoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """SVO's own settings (``config.cpp``), besides the calibration; its names are in brackets.
 
     Attributes:
-        features: Landmarks that are matched in an image, at most (``max_fts``).
+        features: Landmarks matched in an image, at most (``max_fts``).
         grid_size: Side of the cells of which each gives one landmark, pixels (``grid_size``).
         levels: Levels of the image pyramid (``n_pyr_levels``).
-        corner_score: Least score of a corner that becomes a landmark (``triang_min_corner_score``).
-        init_disparity: Median motion of the corners since the first image at which the map is
-            made, pixels (``init_min_disparity``).
-        keyframe_distance: Distance from all key frames in view at which another is made, as a share
-            of the mean depth of the scene (``kfselect_mindist``).
-        keyframes: Key frames that are kept, the nearest ones; 0 for all (``max_n_kfs``).
-        reprojection_threshold: Pixels by which an agreeing landmark misses its corner at most
-            (``reproj_thresh``, ``poseoptim_thresh``).
+        corner_score: Least score of a landmark's corner (``triang_min_corner_score``).
+        init_disparity: Median motion of the corners since the first image at which the map is made,
+            pixels (``init_min_disparity``).
+        keyframe_distance: Distance from key frames in view for another, as a share of the scene's
+            mean depth (``kfselect_mindist``).
+        keyframes: Nearest key frames kept; 0 for all (``max_n_kfs``).
+        reprojection_threshold: Largest error of an agreeing landmark, pixels (``reproj_thresh``,
+            ``poseoptim_thresh``).
         min_features: Matched landmarks below which the camera is lost (``quality_min_fts``).
-        max_feature_drop: Landmarks fewer than in the image before, above which it is lost
+        max_feature_drop: Drop of landmarks from the last image above which it is lost
             (``quality_max_drop_fts``).
-        reset_timeout: Seconds for which a lost camera is only relocalized; then a new map is made,
-            whose unit of length is a guess.
+        reset_timeout: Seconds of mere relocalization of a lost camera; then a new map, of a guessed
+            unit of length, is made.
     """
 
     features: Count = 120
@@ -87,22 +86,14 @@ class SvoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 Floats = npt.NDArray[np.float64]
 
 INSTALL = "make svo, or: pip install --no-deps 'svo-cpp>=1.5'"
-"""Installation of SVO without its dependencies.
-
-``opencv-python``, not imported, would replace files of ``opencv-python-headless`` by others in
-need of a screen's libraries.
-"""
+"""Installation of SVO without ``opencv-python``, which overwrites the headless one's files."""
 
 
 class SvoProcess:
     """SVO, whose thread for depths works between two images.
 
-    Its map starts at the first key frame, where the camera's pose is identity, with a mean depth of
-    1. A map that starts after tracking was lost is put at the last known pose, in the same unit,
-    since nothing better is known.
-
-    Args:
-        info: Calibration of the camera, without distortion.
+    Its map starts with identity at the first key frame, and a mean depth of 1; a map after a loss
+    starts at the last known pose, in the same unit.
 
     Raises:
         MissingDependencyError: `svo_cpp` cannot be imported.
@@ -135,7 +126,7 @@ class SvoProcess:
         """Return the pose of the next image; `None` while there has been no map yet.
 
         Args:
-            stamp: Stamp of the exposure (ns); later than the last one.
+            stamp: Of the exposure (ns), rising.
             image: Grey, or red, green and blue; shape (h, w) or (h, w, 3).
 
         Raises:
@@ -172,7 +163,6 @@ class SvoProcess:
 
 
 def _grey(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return an image in grey for SVO, by the weights of ITU-R BT.601."""
     if image.ndim == 3:
         image = np.rint(image @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
     return np.ascontiguousarray(image)
@@ -181,12 +171,10 @@ def _grey(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 def _matrix(transform: Any) -> Floats:
     """Return a ``Sophus::SE3d`` as a matrix, shape (4, 4); NaN if not finite.
 
-    The module gives no rotation: its method for that returns a type which Python does not know. So
-    the rotation is read where it lies: in an object of pybind11 the pointer to the value comes
-    after the head of the object, and a value is a quaternion (x, y, z, w) and a translation.
-
-    Raises:
-        RuntimeError: What lies there does not fit what the module's methods say.
+    The module's own method returns a type unknown to Python, so the rotation is read from memory:
+    in a pybind11 object the value's pointer follows the object's head, and the value is a
+    quaternion (x, y, z, w) and a translation. Raises `RuntimeError` if it contradicts the module's
+    methods.
     """
     said = np.ravel(transform.translation())
     centre = np.ravel(transform.inverse().translation())
@@ -207,16 +195,14 @@ def _matrix(transform: Any) -> Floats:
 
 
 def _threads() -> set[str]:
-    """Return the numbers of this process's threads."""
     return set(os.listdir("/proc/self/task"))  # noqa: PTH208  # names are all that is wanted
 
 
 def _wait_for(threads: Iterable[str]) -> None:
     """Return when threads of this process sleep: then they wait for work.
 
-    SVO's thread takes a frame into its filters while the next one is tracked: how many it has taken
-    by then would depend on the machine, and a frame that comes before the third last is done, is
-    skipped. It waits for nothing but frames.
+    How many frames SVO's thread has in its filters would else depend on the machine; a frame before
+    the third last is done would be skipped.
     """
     files = [Path(f"/proc/self/task/{thread}/stat") for thread in threads]
     asleep = 0
@@ -238,7 +224,7 @@ class SvoConfig(EstimatorConfig):
 
 
 class Svo(Estimator[SvoConfig]):
-    """Estimates the pose of a single camera by SVO, in a process and a unit of length of its own.
+    """Estimator of a single camera's pose by SVO, in a process and a unit of length of its own.
 
     C. Forster, M. Pizzoli and D. Scaramuzza, "SVO: Fast Semi-Direct Monocular Visual Odometry",
     ICRA 2014.

@@ -1,8 +1,4 @@
-"""An estimator made of the truth: as late and as wrong as its settings say.
-
-With it a study varies one error at a time, which no real estimator allows: what does a drift of
-1 %, or a delay of 100 ms, do to a vehicle that flies on its estimate?
-"""
+"""An estimator made of the truth: as late and as wrong as its settings say."""
 
 from __future__ import annotations
 
@@ -28,11 +24,11 @@ class SyntheticOdometryConfig(NodeConfig):
     Attributes:
         rate: Estimates per second.
         latency: Time on the run's clock from a pose to its estimate.
-        drift: Error of the position that grows with the distance flown, in percent of it, in a
-            horizontal direction that depends on the run's seed.
-        heading_drift: Error of the heading that grows with the distance flown, degrees per metre;
-            its sign depends on the run's seed. The path turns with it.
-        noise: Standard deviation of the position's noise along each axis, metres.
+        drift: Position error in percent of the distance flown, in a horizontal direction by the
+            run's seed.
+        heading_drift: Heading error, degrees per metre flown, its sign by the run's seed; the path
+            turns with it.
+        noise: Standard deviation of the position along each axis, metres.
         velocity_noise: The same of the velocity, m/s; if not given, none is sent.
     """
 
@@ -45,9 +41,9 @@ class SyntheticOdometryConfig(NodeConfig):
 
 
 class SyntheticOdometry(Node[SyntheticOdometryConfig]):
-    """Sends the true pose of a vehicle with a chosen drift, noise and latency.
+    """Sender of a vehicle's true pose with a chosen drift, noise and latency.
 
-    Where there are several vehicles, the file narrows ``odometry`` to one of them.
+    Of several vehicles, narrow ``odometry`` to one.
     """
 
     estimates = Output(PoseEstimate)

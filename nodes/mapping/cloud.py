@@ -1,11 +1,8 @@
 """Coloured points from depth images, thinned to a point per voxel. Pure numpy.
 
-A voxel holds one measured point, never a mean: the mean of points on both sides of an edge lies on
-neither surface. Of several it holds the one that was measured from nearest, because whatever is
-wrong with a point (noise of the depth, an angle, the size of a pixel) grows with the distance.
-
-Clouds are written as PLY files, binary, little-endian, coloured; the format is G. Turk's, "The PLY
-polygon file format" (1994); it counts what follows the header.
+A voxel holds the point measured from nearest, never a mean, which at edges lies on no surface;
+errors (depth noise, angle, pixel size) grow with the distance. Files are PLY, binary,
+little-endian, coloured: G. Turk, "The PLY polygon file format" (1994).
 """
 
 from __future__ import annotations
@@ -39,7 +36,7 @@ class Cloud(msgspec.Struct, frozen=True, eq=False):
     Attributes:
         points: Metres in ``map`` (NED), float32, shape (n, 3).
         colors: Red, green, blue, uint8, shape (n, 3); `None` if the file has none.
-        total: How many the file holds.
+        total: Points in the file.
     """
 
     points: npt.NDArray[np.float32]
@@ -53,13 +50,12 @@ def write_ply(
     colours: npt.NDArray[np.uint8],
     frame_id: str,
 ) -> None:
-    """Write a cloud as a PLY file; missing folders are created.
+    """Write a whole PLY file or none; missing folders are created.
 
     Args:
-        path: The file. It appears whole or not at all.
         points: Metres, shape (n, 3).
         colours: Red, green, blue, shape (n, 3).
-        frame_id: Frame of the points; named in a comment of the header.
+        frame_id: Named in a comment of the header.
 
     Raises:
         ValueError: The arrays do not fit each other.
@@ -90,8 +86,7 @@ def read_ply(path: Path, most: int) -> Cloud:
     """Read the finite points of a cloud, or a sample of them.
 
     Args:
-        most: How many points are enough; if there are more, so many are drawn by lot, always the
-            same.
+        most: Greatest number of points, by a reproducible draw.
 
     Raises:
         OSError: It cannot be read.
@@ -152,14 +147,11 @@ _BITS = 21
 
 
 def rays_of(info: CameraInfo, stride: int) -> Points:
-    """Return where the rays of every n-th pixel meet the plane at depth 1.
-
-    Args:
-        stride: n, along rows and columns alike.
+    """Return where the rays of every n-th (`stride`) pixel meet the plane at depth 1.
 
     Returns:
         x and y in the optical frame, shape (ceil(height / n), ceil(width / n), 2); NaN where the
-        ray does not meet it, as in the corners of a fisheye.
+        ray misses, as in the corners of a fisheye.
     """
     rows, columns = np.mgrid[0 : info.height : stride, 0 : info.width : stride]
     rays = info.unproject(np.stack([columns, rows], axis=-1).reshape(-1, 2))
@@ -171,15 +163,12 @@ def rays_of(info: CameraInfo, stride: int) -> Points:
 def back_project(
     depth: Points, rays: Points, max_depth: float
 ) -> tuple[Points, npt.NDArray[np.bool_]]:
-    """Return the points of a depth image, in the optical frame.
+    """Return a depth image's points in the optical frame, metres, (n, 3), and their mask, (h, w).
 
     Args:
         depth: Metres along the optical z axis, shape (h, w).
         rays: From `rays_of`, shape (h, w, 2).
-        max_depth: Metres; what is farther, or was not hit, is left out.
-
-    Returns:
-        Points in the optical frame, metres, shape (n, 3); and which pixels they are, shape (h, w).
+        max_depth: Metres, beyond which pixels are left out.
 
     Raises:
         ValueError: The shapes do not fit.
@@ -198,7 +187,7 @@ class VoxelCloud:
         voxel: Edge of a voxel, metres.
 
     Attributes:
-        keys: Numbers of the voxels that hold a point, int64, rising, shape (n,).
+        keys: Numbers of the voxels with a point, int64, rising, shape (n,).
 
     Raises:
         ValueError: The edge is not above zero.
@@ -233,10 +222,10 @@ class VoxelCloud:
         Args:
             points: Metres, shape (n, 3).
             colours: Shape (n, 3).
-            distances: From where they were measured, metres, shape (n,).
+            distances: To the camera, metres, shape (n,).
 
         Raises:
-            ValueError: A point is farther from the origin than voxels can be numbered.
+            ValueError: A point is too far from the origin for voxel numbers.
         """
         keys = self._keys_of(points)
         order = np.lexsort((distances, keys))
@@ -283,7 +272,6 @@ class VoxelCloud:
         self._distances[slots] = distances[chosen]
 
     def _make_room(self, count: int) -> None:
-        """Have slots for so many voxels; doubling keeps the copying in proportion."""
         if count > len(self._points):
             room = max(count, 2 * len(self._points), 4096)
             for name in ("_points", "_colours", "_distances"):
@@ -297,9 +285,9 @@ class Mapper:
     """Builder of a cloud from depth images.
 
     Args:
-        stride: The images that it is given are every n-th pixel of the camera's.
+        stride: Given images are every n-th pixel of the camera's.
         voxel: Edge of a voxel, metres.
-        max_depth: Metres; what is farther is left out.
+        max_depth: Metres, beyond which points are left out.
     """
 
     def __init__(self, stride: int, voxel: float, max_depth: float) -> None:
@@ -314,18 +302,15 @@ class Mapper:
         image: npt.NDArray[np.uint8],
         pose: npt.NDArray[np.float64],
     ) -> int:
-        """Add the points of an exposure to the cloud.
+        """Add the points of an exposure to the cloud; return its number of points.
 
         Args:
             depth: Metres along the optical z axis, shape (h, w).
             image: Its colours, shape (h, w, 3), or greys, shape (h, w).
             pose: The optical frame in the cloud's, shape (4, 4).
 
-        Returns:
-            How many points the cloud has now.
-
         Raises:
-            ValueError: The shapes do not fit, or the pose is out of this world.
+            ValueError: The shapes do not fit, or the pose is not finite.
         """
         if image.shape[:2] != depth.shape:
             raise ValueError(

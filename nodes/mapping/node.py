@@ -41,14 +41,13 @@ class MappingConfig(NodeConfig):
 
     Attributes:
         pose: ``matched``: the camera's pose of the depth image's own stamp. ``latest``: the
-            vehicle's newest odometry when the frame is taken up, and the camera's mounting on
-            it: by then the vehicle has moved on, and the cloud smears.
+            vehicle's newest odometry, and the camera's mounting on it: later than the image, so the
+            cloud smears.
         voxel: Edge of a voxel, metres: no two points of the cloud share one.
         stride: Take every n-th pixel of every n-th row.
-        max_depth: Metres; what is farther from the camera is left out.
-        every: Take one frame in this time at most.
-        latency: Seconds on the run's clock that a frame takes; those that come meanwhile are
-            skipped.
+        max_depth: Metres, beyond which points are left out.
+        every: Least time between two frames.
+        latency: Run-clock seconds of a frame's mapping; others meanwhile are skipped.
         rate: Clouds to send a second, at most; 0: only the one at the end.
         file: In the run's folder; empty for ``clouds/<name>.ply``.
     """
@@ -78,10 +77,7 @@ class Mapping(Node[MappingConfig]):
         self._used = 0
 
     async def on_startup(self) -> None:
-        """Start the worker process of the cloud.
-
-        In a thread, the loop would wait for Python's lock at every step between numpy's functions.
-        """
+        """Start the worker process of the cloud; a thread would hold Python's lock too often."""
         config = self.config
         self._mapper = await self.worker(
             Mapper,
@@ -157,11 +153,7 @@ class Mapping(Node[MappingConfig]):
         )
 
     def _the_camera(self) -> CameraAnnouncement:
-        """Return the camera to map with.
-
-        Raises:
-            FatalError: None gives what is needed.
-        """
+        """Return the camera to map with."""
         if self._camera is None:
             self.log.fatal("%s", self._lacking())
         return self._camera
@@ -179,7 +171,6 @@ class Mapping(Node[MappingConfig]):
         return pose_matrix(vehicle.position, vehicle.orientation) @ mounting
 
     async def _send(self) -> int:
-        """Send the cloud, and return its number of points."""
         points, colours = await self._mapper.call_for(0.0, Mapper.cloud)
         self.clouds.send(
             PointCloud(

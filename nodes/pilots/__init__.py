@@ -1,8 +1,4 @@
-"""Pilots: nodes to fly a vehicle, by set-points and commands.
-
-`WaypointFollower` flies along waypoints by the vehicle's true pose, `VisualPilot` by the pose that
-an estimator gives, and `Teleop` by the keys of a keyboard.
-"""
+"""Pilots: nodes to fly a vehicle, by set-points and commands."""
 
 from nodes.pilots.pilot import Pilot, PilotConfig, VisualPilot, VisualPilotConfig, WaypointFollower
 from nodes.pilots.teleop import Keys, Teleop, TeleopConfig

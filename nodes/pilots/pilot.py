@@ -1,7 +1,6 @@
 """Scripted flights: take off, follow a path, land, end the run.
 
-By which pose the path is followed is up to the subclass: `WaypointFollower` takes the vehicle's
-true one, `VisualPilot` an estimator's: visual navigation in closed loop.
+`WaypointFollower` flies by the vehicle's true pose, `VisualPilot` by an estimator's.
 """
 
 from __future__ import annotations
@@ -58,22 +57,20 @@ class PilotConfig(NodeConfig):
     """Settings of a scripted flight.
 
     Attributes:
-        vehicle: Name of the vehicle that is flown; may be left out if there is only one.
+        vehicle: Name of the vehicle to fly; may be left out if there is only one.
         waypoints: Places to pass, metres in ``map`` (x north, y east, z down: heights are
-            negative). The path begins above the place where the vehicle stands. May be left out
-            where there is a `figure_eight`.
+            negative). The path begins above the vehicle. May be left out beside a `figure_eight`.
         speed: Highest speed along the path, metres per second.
         acceleration: Highest acceleration along the path and across it, metres per second squared.
         corner_radius: Distance from a waypoint at which the rounding of its corner begins, metres.
         turn_time: Seconds over which changes of heading are smoothed.
-        heading: ``path``: the nose is in the direction of flight. ``fixed``: it keeps the heading
-            of the start. ``sweep``: it swings to both sides of the direction of flight, by 40° and
-            every 6 s.
-        excitation: Movement on the spot about all axes between take-off and the path, which
-            initializes a visual-inertial system; none unless it is given.
-        figure_eight: A figure eight that is flown after the waypoints.
+        heading: ``path``: the nose is in the direction of flight. ``fixed``: the heading of the
+            start. ``sweep``: it swings about the direction of flight, by 40° and every 6 s.
+        excitation: Movement on the spot about all axes before the path, to initialize a
+            visual-inertial system; none if not given.
+        figure_eight: A figure eight after the waypoints.
         rate: Set-points per second.
-        start_delay: Time from the first known pose to take-off, seconds: the vehicle stands still.
+        start_delay: Seconds from the first known pose to take-off, at rest.
         end_run: Whether the run ends once the vehicle has landed.
     """
 
@@ -114,7 +111,7 @@ _REMINDER = 5.0
 class Pilot(Node[C], ABC):
     """Base of pilots of a scripted flight: take off, follow a path, land, end the run.
 
-    A subclass calls `update_pose` with the vehicle's pose as it knows it, and implements `follow`.
+    A subclass calls `update_pose` with its vehicle's pose, and implements `follow`.
     """
 
     flies = True
@@ -242,9 +239,9 @@ class Pilot(Node[C], ABC):
 
 
 class WaypointFollower(Pilot[PilotConfig]):
-    """Flies a vehicle along waypoints, its nose in the direction of flight.
+    """Pilot along waypoints by the true pose, its nose in the direction of flight.
 
-    It takes off, follows the path, lands, and ends the run.
+    Takes off, follows the path, lands, and ends the run.
     """
 
     setpoints = Output(PositionSetpoint)
@@ -269,9 +266,8 @@ class VisualPilotConfig(PilotConfig):
         gain: Correction for the distance from the path, (m/s)/m.
         yaw_gain: Correction for the error of the heading, (rad/s)/rad.
         max_correction: Highest speed of the correction, metres per second.
-        estimate_timeout: Age of the newest estimate beyond which the vehicle stops and waits for
-            the next one.
-        landing_timeout: Time for which it waits; then it lands where it is, and the run ends.
+        estimate_timeout: Age of the newest estimate beyond which the vehicle stops and waits.
+        landing_timeout: Longest wait; then it lands there, and the run ends.
     """
 
     gain: Changeable[Positive] = 1.0
@@ -284,14 +280,11 @@ class VisualPilotConfig(PilotConfig):
 class VisualPilot(Pilot[VisualPilotConfig]):
     """Pilot along waypoints by an estimator's poses.
 
-    It knows no other pose, and sends velocities in the frame of the vehicle's own heading, so every
-    error of the estimate, that of the heading included, shows in the flight. (The vehicle itself
-    holds its attitude and velocity, by its true state.)
-
-    Waypoints are in the frame of the first estimate. Estimates in any other frame are ignored:
-    those of a restarted estimator, for example, are in ``odom_1``, whose origin is where the
-    vehicle was then. Without estimates the vehicle hovers; it goes on when estimates in the first
-    frame come again, and lands when they do not.
+    Sends velocities in the frame of the vehicle's own heading, so every error of the estimate shows
+    in the flight. (The vehicle itself holds its attitude and velocity, by its true state.)
+    Waypoints are in the frame of the first estimate; estimates in other frames, as of a restarted
+    estimator, are ignored. Without estimates the vehicle hovers; it goes on when they come again,
+    and lands when they do not.
     """
 
     setpoints = Output(VelocitySetpoint)
@@ -363,11 +356,7 @@ class VisualPilot(Pilot[VisualPilotConfig]):
             )
 
     async def _wait_for_estimate(self) -> int | None:
-        """Stop while the newest estimate is too old.
-
-        Returns:
-            Time that this took (ns); `None` if it took so long that the flight is over.
-        """
+        """Stop while the newest estimate is too old; return that time (ns), `None` if too long."""
         start = self.clock.now()
         assert self.pose is not None
         if start - self.pose.stamp <= self.config.estimate_timeout * 1e9:

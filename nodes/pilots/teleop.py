@@ -1,7 +1,4 @@
-"""Flying by hand: held keys become velocities, single keys become commands.
-
-Keys are events, whoever sends them; `nodes.viewers.window` is one node that does.
-"""
+"""Flying by hand: held keys, from any source, become velocities, single keys commands."""
 
 from __future__ import annotations
 
@@ -80,7 +77,7 @@ class Keys(NodeConfig):
         """Return each key's action.
 
         Raises:
-            ValueError: There is no such key, or one key is to do two things.
+            ValueError: A key is unknown, or has two actions.
         """
         found: dict[str, str] = {}
         for action in self.__struct_fields__:
@@ -102,15 +99,14 @@ class TeleopConfig(NodeConfig):
     """Settings of a `Teleop`.
 
     Attributes:
-        vehicle: Name of the vehicle, or free camera, that is flown; may be left out if there is
-            only one.
-        speed: Horizontal speed, metres per second; the same where two keys make a diagonal.
+        vehicle: Name of the vehicle, or free camera, to fly; may be left out if there is only one.
+        speed: Horizontal speed, metres per second, on diagonals, too.
         climb_rate: Vertical speed, metres per second.
         yaw_rate: Turning rate, radians per second.
-        acceleration: Rate of change of the velocity asked for while keys are held, m/s².
+        acceleration: Rate of change of the requested velocity, m/s².
         altitude: Height of a take-off above the ground, metres.
-        rate: Set-points per second while keys are held. Vehicles ignore set-points older than half
-            a second.
+        rate: Set-points per second while keys are held; vehicles ignore those older than half a
+            second.
         keys: The keys of each action.
     """
 
@@ -125,14 +121,12 @@ class TeleopConfig(NodeConfig):
 
 
 class Teleop(Node[TeleopConfig]):
-    """Flies a vehicle, or a free camera, by keys.
+    """Pilot of a vehicle, or a free camera, by keys.
 
-    While a movement key is held, velocities in the vehicle's heading frame are sent at `rate`. When
-    the last one is released, a velocity of zero is sent at once, and then nothing, so that the
-    set-points of other nodes are obeyed. A command (take-off, land, hover, …) ends the movement of
-    all keys that are held then; they must be pressed again to move on.
-
-    Keys are not marked as handled, so recorders and other nodes hear them too.
+    While a movement key is held, velocities in the vehicle's heading frame are sent at `rate`;
+    after the last one a velocity of zero, and then nothing, so that other nodes' set-points are
+    obeyed. A command (take-off, land, hover, …) ends the movement of all held keys. Keys are not
+    marked as handled, so others hear them too.
     """
 
     ends_run = "hand"

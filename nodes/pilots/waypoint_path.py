@@ -1,7 +1,6 @@
 """Timed paths through waypoints: rounded corners, limited speed and acceleration, smooth heading.
 
-And what a scripted flight can be given besides: excitation, a figure eight, a sweeping heading.
-Pure numpy; `nodes.pilots.pilot` puts them together.
+Also excitation, a figure eight, and a sweeping heading. Pure numpy.
 """
 
 from __future__ import annotations
@@ -77,12 +76,11 @@ def plan(
 
     Args:
         waypoints: Metres in ``map``, shape (n, 3), n ≥ 2, no two neighbours alike.
-        speed: Metres per second that it never exceeds.
+        speed: Highest, metres per second.
         acceleration: Metres per second squared, along the path and across it.
         radius: Metres from a corner at which its rounding begins, at most.
         yaw: Heading at the start, radians.
-        turn_time: Seconds over which changes of heading are smoothed; apart from that, the heading
-            is the direction of flight.
+        turn_time: Seconds over which the direction of flight is smoothed to the heading.
         step: Seconds between rows.
     """
     points, along = _resample(_round_corners(waypoints, radius), _SPACING)
@@ -185,14 +183,13 @@ _MOST = 4.0
 class Excitation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Movement on the spot about all axes, after take-off.
 
-    It makes scale, gravity and biases observable to a visual-inertial system.
+    Makes scale, gravity and biases observable to a visual-inertial system.
 
     Attributes:
         duration: How long it takes.
-        amplitude: Greatest distance from the place along each axis, metres. The vehicle rolls and
-            pitches as the accelerations ask for.
+        amplitude: Greatest distance from the place along each axis, metres.
         frequency: Frequency of the movement north, Hz; those east, down and about the vertical are
-            1.3, 0.8 and 0.6 times as high, so that the axes move independently.
+            1.3, 0.8 and 0.6 times as high.
         yaw: Greatest change of the heading, degrees.
     """
 
@@ -226,7 +223,7 @@ class FigureEight(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         centre: Crossing of the curve, metres in ``map``.
         length: Extent along its axis, metres.
         width: Extent across its axis, metres.
-        rise: Height by which one loop's end is above the centre, and the other's below, metres.
+        rise: Height of one loop's end above the centre, and the other's below, metres.
         direction: Direction of its axis, degrees clockwise from north.
         laps: Number of laps.
     """
@@ -264,9 +261,8 @@ def headed(path: WaypointPath, heading: Heading, yaw: float) -> WaypointPath:
     """Return a path with another heading.
 
     Args:
-        path: The path; its heading is the direction of flight.
-        heading: ``path``: that one. ``fixed``: `yaw` all the way. ``sweep``: to both sides of the
-            direction of flight, 40° within 6 s.
+        heading: ``path``: the direction of flight. ``fixed``: `yaw`. ``sweep``: 40° to both sides
+            of the direction, within 6 s.
         yaw: Heading at the start, radians.
     """
     if heading == "path":

@@ -8,7 +8,7 @@
 - KITTI (cvlibs.net/datasets/kitti/eval_odometry.php): the first three rows of the transform from
   child to parent, row by row; no stamps, so two such files go together line by line.
 
-They are written with nanoseconds, nanometres and 12 decimals of a quaternion.
+Written with nanoseconds, nanometres and 12 decimals of a quaternion.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def read_tum(path: Path, *, whole: bool = True, in_order: bool = True) -> Trajec
 
     Args:
         whole: Whether a last line without its end counts; a killed run's may be cut off.
-        in_order: Whether stamps have to rise. If not, the rows are sorted, and of several with one
-            stamp the first counts.
+        in_order: Whether stamps have to rise; else rows are sorted, and the first of equal stamps
+            counts.
 
     Raises:
         ValueError: It cannot be read or holds something else; the message names the line.
@@ -55,10 +55,7 @@ def read_tum(path: Path, *, whole: bool = True, in_order: bool = True) -> Trajec
 
 
 def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write a TUM file.
-
-    Args:
-        comment: Lines for its head, such as the names of the frames.
+    """Write a TUM file, with the lines of a comment before.
 
     Raises:
         OSError: It cannot be written.
@@ -113,10 +110,7 @@ def read_vslamlab(path: Path) -> Trajectory:
 
 
 def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write a EuRoC ground truth, poses as they are; velocities by differences, biases zero.
-
-    Args:
-        comment: Lines to go before the header.
+    """Write a EuRoC ground truth; velocities by differences, biases zero, a comment before.
 
     Raises:
         OSError: It cannot be written.
@@ -132,14 +126,7 @@ def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
 def euroc_row(
     stamp: int, position: Vector3, orientation: Quaternion, velocity: Vector3 = (0.0, 0.0, 0.0)
 ) -> str:
-    """Return a pose as a line of a EuRoC ground truth, with zero biases.
-
-    Args:
-        stamp: Nanoseconds.
-        position: Metres.
-        orientation: w, x, y, z.
-        velocity: Metres per second in the parent frame.
-    """
+    """Return a pose (ns, metres, w x y z, m/s) as a line of a EuRoC ground truth; biases zero."""
     x, y, z = position
     w, i, j, k = orientation
     u, v, s = velocity
@@ -150,10 +137,7 @@ def euroc_row(
 
 
 def read_kitti(path: Path) -> Floats:
-    """Read a KITTI file.
-
-    Returns:
-        Transforms child to parent, shape (n, 4, 4); see `Trajectory.from_matrices`.
+    """Read a KITTI file: transforms child to parent, shape (n, 4, 4).
 
     Raises:
         ValueError: It cannot be read or holds something else; the message names the line.

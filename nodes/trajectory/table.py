@@ -1,7 +1,7 @@
 """Text files of numbers in rows, common to all trajectory formats.
 
-Also files of a run that outlast its failures: they grow with the run, so that a killed run leaves
-all but its last second; and files from before a node's restart are never overwritten.
+Files of a run grow with the run, so that a killed run lacks only its last second; those of before a
+node's restart are never overwritten.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ _TOO_LATE = 1 << 63
 """First number of nanoseconds beyond 64 bits."""
 
 EPOCH = "2020-01-01T00:00:00Z"
-"""When a run begins in files of other tools, if nothing else is set. They expect stamps of
-Unix time: with 19 digits names sort, and Kalibr can take the last nine for nanoseconds."""
+"""Default start of a run in files of other tools, which expect Unix time with 19 digits."""
 
 _LATEST = 7 << 60
 """Latest epoch (ns), with room for a run of decades."""
@@ -33,10 +32,7 @@ _SHOWN = 60
 
 
 def epoch_of(given: int | str) -> int:
-    """Return an epoch in nanoseconds of Unix time.
-
-    Args:
-        given: Nanoseconds, or a date as ISO 8601 has it; UTC if it names no zone.
+    """Return an epoch in nanoseconds of Unix time, given as such or by ISO 8601 (default UTC).
 
     Raises:
         ValueError: It is neither, before 1970 or after 2225.
@@ -59,12 +55,7 @@ def epoch_of(given: int | str) -> int:
 
 
 class Row:
-    """A line of a file, split into fields; ``#`` starts a comment.
-
-    Attributes:
-        where: Path and number of the line, for messages.
-        fields: Its texts.
-    """
+    """A line of a file, split into fields; ``#`` starts a comment."""
 
     __slots__ = ("fields", "where")
 
@@ -134,9 +125,9 @@ def read_rows(
 
     Args:
         separator: Between fields; None for blanks.
-        columns: How many fields a row may have.
+        columns: Allowed numbers of fields.
         whole: Whether a last line without its end counts.
-        header: Whether a first line that begins with a letter is passed over.
+        header: Whether to skip a first line that begins with a letter.
 
     Raises:
         ValueError: The file cannot be read, has no rows, or a row of another length.
@@ -175,10 +166,7 @@ _INTERVAL = 500_000_000
 
 
 def part_name(node: Node[Any], name: str) -> str:
-    """Return the name of a node's file or folder, with a number after a restart.
-
-    ``flight.png`` is followed by ``flight-2.png``, ``dataset`` by ``dataset-2``.
-    """
+    """Return the name of a node's file or folder; after a restart ``flight-2.png``, and so on."""
     path = Path(name)
     number = f"-{node.restarts + 1}" if node.restarts else ""
     return str(path.with_name(f"{path.stem}{number}{path.suffix}"))
@@ -187,8 +175,7 @@ def part_name(node: Node[Any], name: str) -> str:
 class GrowingFile:
     """A file of lines: added on the loop, and written beside the loop twice a second.
 
-    Args:
-        path: The file; made anew, unless the node was restarted: then it goes on.
+    A restarted node goes on with its file.
     """
 
     def __init__(self, node: Node[Any], path: Path, head: str = "") -> None:

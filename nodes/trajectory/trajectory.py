@@ -1,10 +1,4 @@
-"""Poses in time: checked arrays, interpolation, matrices; and rows for nodes to collect.
-
-Pure numpy and scipy. Files are in `nodes.trajectory.formats`; errors between two trajectories in
-`nodes.judging.evaluation.metrics`.
-
-The poses of the last seconds, for nodes that look them up while a run goes on.
-"""
+"""Poses in time: checked arrays, interpolation, matrices; and rows for nodes to collect."""
 
 from __future__ import annotations
 
@@ -46,7 +40,7 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         orientations: Unit quaternions w, x, y, z, child to parent, float64, shape (n, 4).
 
     Raises:
-        ValueError: The arrays differ from that; the message names the first row that does.
+        ValueError: The arrays differ; the message names the first row.
     """
 
     stamps: Stamps
@@ -92,11 +86,7 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
 
     @classmethod
     def from_matrices(cls, stamps: Stamps, matrices: Floats) -> Trajectory:
-        """Make a trajectory of transforms.
-
-        Args:
-            stamps: Nanoseconds, shape (n,).
-            matrices: Child to parent, shape (n, 4, 4): rotation and metres.
+        """Make a trajectory of transforms child to parent (metres, (n, 4, 4)) at stamps (ns, (n,)).
 
         Raises:
             ValueError: They are no rigid transforms.
@@ -126,20 +116,14 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def near(self, stamps: Stamps) -> Trajectory:
-        """Return only the rows near stamps (ns): two before and two after each.
-
-        Between them `velocities` are those of the whole.
-        """
+        """Return the rows near stamps (ns), two on each side: `velocities` between are the same."""
         after = np.clip(np.searchsorted(self.stamps, stamps), 1, max(len(self) - 1, 1))
         rows = np.zeros(len(self), np.bool_)
         rows[np.clip(after[:, None] + np.arange(-2, 2), 0, len(self) - 1)] = True
         return self.take(rows)
 
     def velocities(self) -> Floats:
-        """Return velocities by differences of the positions, m/s in the parent frame, shape (n, 3).
-
-        Zeros if there is but one pose.
-        """
+        """Return velocities by differences, m/s in the parent frame, (n, 3); zero for one pose."""
         if len(self) < 2:
             return np.zeros((len(self), 3))
         # As np.gradient, whose seconds since the start cannot tell stamps of nanoseconds apart.
@@ -181,8 +165,8 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
     def at(self, stamps: Stamps) -> Trajectory:
         """Return the poses at other times: positions linear, orientations by slerp.
 
-        A stamp that the trajectory has gives that very row. (K. Shoemake, "Animating rotation
-        with quaternion curves", 1985.)
+        A stamp of the trajectory gives that very row. (K. Shoemake, "Animating rotation with
+        quaternion curves", 1985.)
 
         Args:
             stamps: Nanoseconds, strictly rising, all of them covered; see `covers`.
@@ -213,10 +197,10 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
 
 
 class PoseRows:
-    """Poses as events bring them, in any order, until a trajectory is made of them.
+    """Poses of events, in any order, until a trajectory is made of them.
 
-    All but the newest wait in a nameless temporary file, so that a run of any length needs no more
-    memory while it goes on; if there is no room for the file, they stay in memory.
+    All but the newest wait in a nameless temporary file, so that memory does not grow; without room
+    for the file, they stay in memory.
     """
 
     def __init__(self) -> None:
@@ -299,9 +283,9 @@ def associate(
     """Return the truth at the estimate's stamps, and the estimate where there is a truth.
 
     Args:
-        truth: True poses, as densely as there are: they are interpolated, and only estimates
-            before their start or after their end are left out.
-        name: What the message of an error begins with, such as the estimate's file.
+        truth: Dense, as it is interpolated; estimates before its start or after its end are left
+            out.
+        name: Beginning of errors' messages, such as the estimate's file.
 
     Raises:
         ValueError: They have no time in common; the message says if their units or clocks differ.
@@ -386,11 +370,7 @@ class RecentPoses:
         del stamps[:old], poses[:old]
 
     def at(self, stamp: int) -> Pose | None:
-        """Return the pose at a time (ns): positions linear, orientations by slerp.
-
-        A stamp that is kept gives its very pose. Before the first and after the last stamp nothing
-        is guessed, and the result is `None`.
-        """
+        """Return the pose at a time (ns), by slerp; `None` outside of the kept stamps."""
         stamps, poses = self._stamps, self._poses
         after = bisect_left(stamps, stamp)
         if after == len(stamps):

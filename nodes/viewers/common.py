@@ -97,7 +97,7 @@ class PathPieces:
     def add(self, stamp: int, position: Vector3) -> list[Vector3] | None:
         """Add a pose (ns, metres); return a piece when complete.
 
-        Each piece begins where the one before ended, unless there was a gap between them.
+        Pieces are joined, unless there was a gap.
         """
         piece = None
         if self._points and not 0 <= stamp - self._last <= GAP:
@@ -125,8 +125,7 @@ def estimate_frame(
 ) -> tuple[Vector3, Quaternion] | None:
     """Return the pose of an estimate's frame in ``map``, from its first estimate.
 
-    The first pose lies where the body truly was, as evaluation aligns it; `None` if that is not
-    known.
+    The first pose lies on the true one, as in the evaluation; `None` if unknown.
     """
     found = None if truth is None else truth.at(event.stamp)
     if found is None:
@@ -140,11 +139,7 @@ _KEPT = 4000
 
 
 class Trail:
-    """Path flown so far.
-
-    Args:
-        thickness: Metres.
-    """
+    """Path flown so far; its thickness is in metres."""
 
     def __init__(self, name: str, frame_id: str, colour: Colour, thickness: float) -> None:
         self.name = name
@@ -188,12 +183,7 @@ class ImageSelection:
         self._selected: dict[str, deque[int]] = {}
 
     def select(self, kind: str, source: str, frame_id: str, stamp: int) -> bool:
-        """Tell whether an image is shown: the first of its source in its period.
-
-        Args:
-            kind: Of image; each kind of a source is selected for itself.
-            stamp: Of its exposure (ns).
-        """
+        """Tell whether an image, by stamp (ns), is the first of its kind and source in a period."""
         if not self._rate:
             return False
         period = int(stamp * self._rate // SECOND)

@@ -1,8 +1,6 @@
 """A window as a node: shows a camera's images and turns keys into events.
 
-The window itself, by GLFW and OpenGL, runs in a worker process; the only module that imports glfw
-and OpenGL, and not before a `GlfwWindow` is made. What a key does is decided in
-`nodes.pilots.teleop`.
+GLFW and OpenGL run in a worker process, imported here only, when a `GlfwWindow` is made.
 """
 
 from __future__ import annotations
@@ -44,15 +42,10 @@ Change = Key | Size | Close
 
 
 class GlfwWindow:
-    """Window on the user's display for the newest image.
+    """Window on the user's display for the newest image; needs the main thread of its process.
 
-    Needs the main thread of its process; draws only when there is something new to show. Letters
-    and punctuation are named by the label that the user's layout puts on the key, all other keys
-    (and those whose label is not ASCII) by their position on a US keyboard.
-
-    Args:
-        width: Width of the content at the start, in screen coordinates (mostly pixels).
-        height: Height of the content at the start, in the same unit.
+    Letters and punctuation are named by the label in the user's layout, other keys (and those not
+    in ASCII) by their position on a US keyboard. Sizes are in screen coordinates (mostly pixels).
 
     Raises:
         MissingDependencyError: There is no display, no OpenGL on it, or a library is missing.
@@ -85,8 +78,8 @@ class GlfwWindow:
         """Show an image, and return the changes since the last poll, in order.
 
         Args:
-            image: uint8, shape (height, width, 3) RGB or (height, width) grey, top row first;
-                `None` leaves the last one.
+            image: uint8, shape (height, width, 3) RGB or (height, width) grey; `None` keeps the
+                last one.
 
         Raises:
             ValueError: The image has another type or shape.
@@ -239,10 +232,10 @@ class ImageWindowConfig(NodeConfig):
 
     Attributes:
         title: Text of the title bar.
-        width: Width of the window's content at the start, pixels.
-        height: Height of the window's content at the start, pixels.
+        width: Initial width of the content, pixels.
+        height: Initial height of the content, pixels.
         rate: Polls per second of the run's clock; each shows the newest image and reads the keys.
-        show_images: Whether images are shown; otherwise the window is for keys only.
+        show_images: Whether images are shown; else keys only.
     """
 
     title: str = "visnav"
@@ -262,14 +255,10 @@ class ImageWindow(Node[ImageWindowConfig]):
         type = "ImageWindow"
         inputs = { images = "drone/front_center" }   # of one camera
 
-    The window lives in a process of its own, so that a slow X server never delays the event loop.
-    It is polled on the run's clock; to fly by hand, run with ``clock = "real"`` or ``speed = 1``,
-    because simulated time would otherwise pass too fast. Keys that are held when the window loses
-    the focus, or when this node ends or fails, are released. Closing the window ends the run,
-    unless a node handles `WindowClosed`.
-
-    The stamp of an event is the time of the poll that found it, at most one period after the key
-    was pressed.
+    The window's process is polled on the run's clock; to fly by hand, run with ``clock = "real"``
+    or ``speed = 1``. Held keys are released when the window loses the focus, or this node ends.
+    Closing the window ends the run, unless a node handles `WindowClosed`. An event's stamp is its
+    poll's time, at most one period late.
     """
 
     ends_run = "hand"
@@ -328,7 +317,6 @@ class ImageWindow(Node[ImageWindowConfig]):
         self.key_releases.send(KeyReleased(stamp=self.clock.now(), source=self.name, key=key))
 
     def _newest(self) -> Image | None:
-        """Return the newest image if not shown yet."""
         try:
             image = self.images.receive_nowait()
         except LookupError:

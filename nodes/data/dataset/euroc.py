@@ -39,8 +39,7 @@ class Euroc(Recording):
         mav0/state_groundtruth_estimate0/data.csv, sensor.yaml
 
     Raises:
-        ValueError: A camera or the IMU does not sit on the body, or the layout has no word for a
-            camera's distortion.
+        ValueError: A camera or the IMU is not on the body, or a distortion cannot be expressed.
     """
 
     def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
@@ -166,11 +165,7 @@ class Euroc(Recording):
 
 
 def _lens(camera: CameraAnnouncement) -> tuple[str, str, tuple[float, ...]]:
-    """Return Kalibr's name of a distortion model, the coefficients' names and values.
-
-    Raises:
-        ValueError: Kalibr has no name for the model.
-    """
+    """Return Kalibr's name of a distortion model, the coefficients' names and values."""
     model, lens = camera.info.distortion_model, camera.info.distortion
     if model == "equidistant":
         return "equidistant", "k1, k2, k3, k4", lens

@@ -27,11 +27,7 @@ _AT_ONCE = 4
 """Image files written concurrently."""
 
 _WAITING = 64
-"""Images of a kind waiting to be written.
-
-In lockstep, time waits for the files, and none is dropped; in real time the oldest is, and the
-run's summary counts it.
-"""
+"""Images of a kind waiting to be written; beyond, lockstep waits and real time drops the oldest."""
 
 
 class DatasetConfig(NodeConfig):
@@ -39,14 +35,14 @@ class DatasetConfig(NodeConfig):
 
     Attributes:
         format: ``euroc``: grey images of all cameras of the first camera's vehicle (and depth),
-            IMU, the vehicle's poses. ``tum_rgbd``: colour and depth images of the first camera
-            and its poses. ``tum_mono``: grey images of the first camera with its photometric
-            calibration and poses, as TUM's monoVO data set has them and DSO reads them.
-        folder: Its name in the run's folder. A data set that was there is removed.
-        depth_factor: Steps of a depth image per metre; 65535 of them are the limit, so 5000
-            reach 13.1 m, and depth beyond that is written as none.
-        epoch: The run's time 0 in the files: a date (ISO 8601), or nanoseconds of Unix time. It
-            is noted in them (``epoch_ns``), and `nodes.data.replay` counts from there.
+            IMU, the vehicle's poses. ``tum_rgbd``: colour and depth images of the first camera and
+            its poses. ``tum_mono``: grey images of the first camera, its photometric calibration
+            and poses, as DSO reads them.
+        folder: Its name in the run's folder; replaces an older data set.
+        depth_factor: Steps of a depth image per metre; 65535 are the limit (5000: 13.1 m), deeper
+            is written as none.
+        epoch: The run's time 0 in the files: a date (ISO 8601), or nanoseconds of Unix time; noted
+            as ``epoch_ns`` for replays.
     """
 
     format: Literal["euroc", "tum_rgbd", "tum_mono"] = "euroc"
@@ -61,9 +57,8 @@ class DatasetConfig(NodeConfig):
 class DatasetWriter(Node[DatasetConfig]):
     """Writes images, IMU measurements and the ground truth in the layout of EuRoC or of TUM.
 
-    Which camera (or vehicle) can be chosen by ``inputs = { images = "drone/front" }``. The world
-    of the files is z up: north, west, up. After a restart a numbered folder (``dataset-2``) holds
-    what came then.
+    Choose a camera (or vehicle) by ``inputs = { images = "drone/front" }``. The files' world is
+    north, west, up. A restart begins a numbered folder (``dataset-2``).
     """
 
     reads_truth = "recording"
@@ -98,7 +93,6 @@ class DatasetWriter(Node[DatasetConfig]):
                 await self._queue.put(file)
 
     async def _write(self) -> None:
-        """Write queued images, each offloaded from the event loop."""
         while True:
             file = await self._queue.get()
             await self.offload(file)
@@ -163,11 +157,7 @@ class DatasetWriter(Node[DatasetConfig]):
 
 
 def _make_empty(folder: Path) -> None:
-    """Create a folder without files of an earlier run.
-
-    Raises:
-        ConfigError: It has other files.
-    """
+    """Create a folder without files of an earlier run; raise a `ConfigError` if it has others."""
     if folder.is_dir() and any(folder.iterdir()):
         if not any((folder / sign).exists() for sign in ("mav0", "rgb.txt", "times.txt")):
             raise ConfigError(
@@ -179,7 +169,6 @@ def _make_empty(folder: Path) -> None:
 
 
 def _finish(recording: Recording, files: list[ImageFile]) -> None:
-    """Write the remaining images, also waiting for other threads; close the recording."""
     try:
         for file in files:
             file()

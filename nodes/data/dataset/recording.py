@@ -1,7 +1,6 @@
 """Common parts of all data set layouts: a rig, events in, rows and images out.
 
-Rows are written at once; an image is returned as a `ImageFile`, for whoever has time to write
-it. Nothing here waits or knows a clock.
+Rows are written at once; an image is returned as an `ImageFile`, to be written later.
 """
 
 from __future__ import annotations
@@ -31,10 +30,7 @@ from events import (
 from events.announcements import Vehicles
 
 WORLD_AXES = "world: x north, y west, z up; origin on the ground"
-"""World axes of a data set, for file headers: z up, as expected by readers.
-
-Bodies stay FRD and cameras optical, so measurements and mountings stay as they are.
-"""
+"""World axes of a data set, for file headers; bodies stay FRD and cameras optical."""
 
 
 class Rig(msgspec.Struct, frozen=True):
@@ -42,8 +38,7 @@ class Rig(msgspec.Struct, frozen=True):
 
     Attributes:
         body: Source of its odometry.
-        cameras: One or more, in the order in which they were announced.
-        imu: Its IMU, if it has one.
+        cameras: One or more, in the order of their announcements.
     """
 
     body: str
@@ -134,10 +129,7 @@ def in_grey(data: Pixels) -> Pixels:
 
 
 class RowFile:
-    """A text file of rows with rising stamps.
-
-    Args:
-        header: Its first lines, each with its end.
+    """A text file of rows with rising stamps, after the lines of a header.
 
     Raises:
         OSError: It cannot be written.
@@ -172,8 +164,8 @@ class Recording(ABC):
     """Base class of data sets being written.
 
     Args:
-        folder: Where; it exists and is empty.
-        rig: The sensors. Events of others are passed over.
+        folder: Existing and empty.
+        rig: The sensors; other sources' events are ignored.
         depth_factor: Steps of a depth image per metre.
         epoch: The run's time 0 in the files, nanoseconds of Unix time.
     """

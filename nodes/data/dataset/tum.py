@@ -44,7 +44,7 @@ class TumMono(Recording):
         groundtruthSync.txt     the camera's optical frame in the world, at the images' stamps
 
     Raises:
-        ValueError: The camera's distortion cannot be written down so.
+        ValueError: The camera's distortion cannot be expressed.
     """
 
     def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:

@@ -1,8 +1,8 @@
 """The bytes of an MCAP file from outside: its records, its index, and how they reach the disk.
 
-Needs no mcap. Of the format (mcap.dev/spec) no more stands here than what finds the records of a
-file that may be torn or damaged anywhere (mcap's own readers stop there); what is in them is for
-`native`. A file is written in pieces that are there or are not, for its disk may be full.
+Needs no mcap: no more of the format (mcap.dev/spec) than finds the records of a file that may be
+torn or damaged anywhere, where mcap's own readers stop. Files are written in whole pieces, for the
+disk may be full.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def pieces(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, byte
     """Yield the records of some opcodes from a file, up to its footer.
 
     Raises:
-        TornError: There is no footer, or something else than a record before it.
+        TornError: There is no footer, or no record before it.
     """
     for opcode, length in _heads(file):
         if opcode in wanted:
@@ -81,7 +81,7 @@ def check_chunk(content: bytes) -> None:
     """Check the sizes claimed at a chunk's beginning: by its head, and by its frame.
 
     Raises:
-        ValueError: That is more than `LARGEST`, or there is no such beginning.
+        ValueError: More than `LARGEST`, or no such beginning.
     """
     try:
         _, _, size, _, length = _CHUNK.unpack_from(content)
@@ -107,11 +107,7 @@ def frame_size(data: bytes) -> int:
 
 
 def _heads(file: IO[bytes]) -> Iterator[tuple[int, int]]:
-    """Yield opcode and length of each record, with the file at its content.
-
-    Raises:
-        TornError: As for `pieces`.
-    """
+    """Yield opcode and length of each record, with the file at its content."""
     size = file.seek(0, io.SEEK_END)
     at = len(MAGIC)
     while True:
@@ -133,7 +129,7 @@ def piece_at(file: IO[bytes], at: int, size: int) -> bytes:
     """Return the content of a record at a position from an index.
 
     Args:
-        size: Its bytes, with those before its content.
+        size: Bytes including its head.
 
     Raises:
         ValueError: There is none.
@@ -177,10 +173,7 @@ class RecordingError(VisnavError):
 
 
 class WholeWrites(io.BufferedIOBase):
-    """File of whole pieces: a full disk leaves no half of a chunk.
-
-    A piece is all that is written until `flush`.
-    """
+    """File of whole pieces (all writes until `flush`): a full disk leaves no half of a chunk."""
 
     def __init__(self, raw: io.RawIOBase) -> None:
         self._raw = raw
@@ -203,7 +196,7 @@ class WholeWrites(io.BufferedIOBase):
         """Write the piece.
 
         Raises:
-            OSError: It could not be written, and nothing of it is in the file.
+            OSError: Nothing of the piece is in the file.
         """
         piece, self._piece = self._piece, []
         try:
@@ -232,7 +225,7 @@ def open_anew(path: Path) -> IO[bytes]:
     """Open a file for writing from the beginning, locked against other writers.
 
     Raises:
-        OSError: It cannot be opened, or somebody else is writing it.
+        OSError: It cannot be opened, or is being written.
     """
     file = open(  # noqa: SIM115
         path,

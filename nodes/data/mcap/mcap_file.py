@@ -1,10 +1,8 @@
 """MCAP files: written with little loss if the process is killed, and read even if torn.
 
-What the messages mean is not known here. What stands in a file is for `records`.
-
-A file grows by whole chunks, which go to the system in one piece and unbuffered: what was written
-survives the process, however it ends (a power cut only with `fsync`). A torn file has no index
-and perhaps half a chunk at its end; `read` reads it all the same, and `recover` mends it.
+A file grows by whole chunks, written unbuffered in one piece: they survive the process, however it
+ends (a power cut only with `fsync`). A torn file has no index and perhaps half a chunk at its end;
+`read` reads it all the same, and `recover` mends it. Contents are for `native`.
 """
 
 from __future__ import annotations
@@ -32,12 +30,8 @@ class Record(NamedTuple):
     """A message of a recording.
 
     Attributes:
-        topic: Of its channel.
-        type: Name of its schema.
-        metadata: Of its channel.
-        time: When it was published, nanoseconds.
-        sequence: Its number among those of its channel, from 0; a gap means that one was lost.
-        data: Its bytes.
+        time: Of publication, nanoseconds.
+        sequence: Number in its channel, from 0; a gap means a loss.
     """
 
     topic: str
@@ -54,7 +48,6 @@ class Contents(msgspec.Struct, frozen=True):
     Attributes:
         ours: Whether `McapWriter` wrote it.
         complete: Whether it was closed, and has an index.
-        metadata: By name.
     """
 
     ours: bool
@@ -157,7 +150,7 @@ class McapWriter:
         """Compress the pending messages and write them as a chunk.
 
         Raises:
-            RecordingError: The disk is full, or the like; what was written before is readable.
+            RecordingError: The disk is full, or the like; earlier chunks are readable.
         """
         self._pending = 0
         try:
@@ -244,9 +237,8 @@ def read(
     """Yield the messages of a file in the order of writing.
 
     Args:
-        path: The file; torn ones are read as far as they go.
-        start: Messages before this time (ns) are left out.
-        end: So are those at this time and after.
+        start: First time (ns) of messages.
+        end: Time (ns) before which messages end.
         damaged: Called for parts that cannot be read, which are passed over.
 
     Raises:

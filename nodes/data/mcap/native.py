@@ -1,10 +1,8 @@
 """Records of an MCAP file, intact or damaged, and events in their own encoding.
 
-The only module that imports mcap (mcap.dev/spec). Records are found by the index, or one after the
-other. An event is a ``std_msgs/msg/UInt8MultiArray``, so that a file holds nothing but CDR: ``ros2
-bag`` refuses files in which encodings are mixed. Its data is a frame of `runtime.wire`; or, if the
-arrays stand in another message of the same time, only the frame's beginning, up to its arrays,
-which are then taken from that message.
+The only module that imports mcap (mcap.dev/spec). An event is a ``std_msgs/msg/UInt8MultiArray``:
+``ros2 bag`` refuses files that mix encodings with CDR. Its data is a frame of `runtime.wire`; or,
+if the arrays stand in another message of the same time, the frame's beginning, up to its arrays.
 """
 
 from __future__ import annotations
@@ -43,24 +41,14 @@ _decode = msgspec.msgpack.Decoder(tuple[str, list[tuple[str, list[int], int]], m
 
 
 class Shape(msgspec.Struct, frozen=True):
-    """Array of a frame, present or lacking.
-
-    Attributes:
-        dtype: As numpy writes it.
-        shape: Its lengths.
-    """
+    """Array of a frame, present or lacking; its `dtype` as numpy writes it."""
 
     dtype: str
     shape: tuple[int, ...]
 
 
 def message(frame: bytes | bytearray | memoryview, arrays: bool = True) -> bytes:
-    """Return a frame as a message.
-
-    Args:
-        frame: Of `runtime.wire`.
-        arrays: Whether its arrays are to be in it.
-    """
+    """Return a frame of `runtime.wire` as a message, with or without its arrays."""
     size = len(frame) if arrays else _LENGTH.size + _LENGTH.unpack_from(frame)[0]
     return b"".join((_HEAD.pack(_CDR, 0, 0, size), memoryview(frame)[:size]))
 
@@ -102,7 +90,7 @@ def event(data: bytes, arrays: Sequence[npt.NDArray[Any]] = ()) -> Event:
     """Return the event of a message.
 
     Raises:
-        WireError: The two do not fit, or the type of event is not known here.
+        WireError: The two do not fit, or the event's type is unknown.
     """
     if not arrays:
         return unpack(memoryview(data)[_HEAD.size :])
@@ -181,9 +169,9 @@ def arrays(
 
 
 def _cloud(message: Any, shapes: list[Shape], axes: Axes) -> list[Array]:
-    """Return the arrays of a cloud, or of a lidar's turn, in the order of the event's fields.
+    """Return the arrays of a cloud or of a lidar's turn, in the order of the event's fields.
 
-    A cloud's colours are there if there is room for them: all are white where there were none.
+    Colours are there if there is room for them: all are white where there were none.
     """
     scan = message.point_step == LIDAR_POINT.itemsize
     rows = np.frombuffer(message.data, LIDAR_POINT if scan else POINT, shapes[0].shape[0])
@@ -239,8 +227,6 @@ def writer(
 
     Args:
         compression: Of chunks: ``zstd``, ``lz4`` or ``none``.
-        chunk_size: Bytes of a chunk.
-        profile: What the file is for, for its header.
 
     Raises:
         OSError: It cannot be written.
@@ -325,8 +311,8 @@ def records(
     """Yield schemas, channels and messages; of a file with an index, by its chunks in the range.
 
     Args:
-        start: Messages before this time (ns) may be left out.
-        end: So may those at this time and after.
+        start: Earlier messages (ns) may be left out.
+        end: So may those from this time on.
         damaged: Called for parts that cannot be read, which are passed over.
         everything: Yield metadata and attachments, too.
 
@@ -401,11 +387,7 @@ def _one_by_one(file: IO[bytes], damaged: Callable[[str], None], everything: boo
 
 
 def _parsed(opcode: int, content: bytes) -> Any:
-    """Return a record.
-
-    Raises:
-        McapError: It is damaged; or one of `_DAMAGED`.
-    """
+    """Return a record; raise a `McapError` or one of `_DAMAGED` if damaged."""
     stream = ReadDataStream(BytesIO(content))
     if opcode == Opcode.MESSAGE:
         return Message.read(stream, len(content))

@@ -1,8 +1,7 @@
-"""Recordings in MCAP, with ROS 2's messages for its tools and the events as they are for replays.
+"""Recordings in MCAP: ROS 2's messages for its tools, and the events as they are for replays.
 
-`node` takes all events; `writer_process` holds those that wait, and hands them through `pipe` to
-the process that makes messages of them and writes the file (`process`). `recover` repairs files of
-runs that were killed; what is in a file is for `nodes.data.mcap`.
+`node` takes events; `writer_process` queues them, and feeds them through `pipe` to the process that
+encodes and writes (`process`). `recover` repairs files of killed runs.
 """
 
 from nodes.data.recorder.node import McapRecorder

@@ -34,8 +34,8 @@ class McapRecorder(Node[McapRecorderConfig]):
         name = "recorder"
         type = "McapRecorder"
 
-    Put it first in the file: it then gets events before those that they cause, and those that
-    another node handles. They are recorded in the order in which it gets them.
+    Put it first in the file: events are recorded in the order of arrival, causes before effects
+    then.
     """
 
     reads_truth = "recording"
@@ -117,11 +117,7 @@ class McapRecorder(Node[McapRecorderConfig]):
             self.log.fatal("%s", process.error)
 
     def _finish(self, _: Path) -> None:
-        """Give a slow disk more time, after the run.
-
-        Raises:
-            RecordingError: The disk is full, or the like.
-        """
+        """Give a slow disk more time, after the run."""
         process = self._process
         if process is None or self._unfinished is None:
             return
@@ -186,11 +182,7 @@ class McapRecorder(Node[McapRecorderConfig]):
         self.log.fatal("%s", error)
 
     async def _wait(self) -> None:
-        """Have simulated time wait until there is room.
-
-        Raises:
-            FatalError: The process that writes shows no sign of life.
-        """
+        """Have simulated time wait until there is room."""
         if not self._waits:
             self.log.info(
                 "the disk is slower than the run: simulated time waits, now and again, with "

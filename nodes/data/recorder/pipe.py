@@ -34,24 +34,23 @@ class McapRecorderConfig(NodeConfig):
     """Settings of a recording.
 
     Attributes:
-        file: Its name in the run's folder. An older one is replaced.
-        image_format: How images are kept: ``raw``, ``png`` (smaller, and no loss), or
-            ``jpeg`` (small; a replay gives what is left).
+        file: Its name in the run's folder; replaces an older file.
+        image_format: How images are kept: ``raw``, ``png`` (smaller, and no loss), or ``jpeg``
+            (small, with loss).
         depth_format: How depth images are kept: ``raw``, or ``png``: whole millimetres, up to 65 m.
         jpeg_quality: 1 to 100.
         compression: Of the file's chunks: ``zstd``, ``lz4`` (quicker, larger) or ``none``.
-        chunk_size: Bytes of a chunk before compression. A chunk also ends 0.4 s after its
-            first event, real or on the run's clock.
+        chunk_size: Bytes of a chunk before compression. A chunk also ends 0.4 s after its first
+            event, real or on the run's clock.
         memory: Bytes of events that may wait to be written.
-        when_full: What happens if more would wait. ``wait``: simulated time waits for the disk;
-            real time cannot, and does as ``drop_images``: images and clouds are left out until
-            there is room. A process that shows no sign of life for 10 s while it is waited for
-            ends the run. ``drop_oldest``: what has waited longest is left out. What is left out
-            is counted among the run's drops, and logged. What the disk has not taken when the run
-            ends is written afterwards, before the command returns.
-        fsync: Wait for the disk at the end of each chunk. Without it, what is written survives
-            the end of the process, but not a power cut.
-        distribution: Of ROS 2, whose types the messages have.
+        when_full: What happens beyond. ``wait``: simulated time waits for the disk (a process
+            without a sign of life for 10 s ends the run); real time cannot, and does as
+            ``drop_images``: images and clouds are left out until there is room. ``drop_oldest``:
+            the oldest events are left out. Drops are counted and logged. The remainder at the run's
+            end is written before the command returns.
+        fsync: Wait for the disk at the end of each chunk. Without it, data survives the process,
+            but not a power cut.
+        distribution: Of ROS 2, for the messages' types.
     """
 
     file: Annotated[OutputPath, msgspec.Meta(pattern=r"^[^/]+\.mcap$")] = "recording.mcap"
@@ -71,9 +70,9 @@ class WriteRequest(msgspec.Struct, frozen=True):
 
     Attributes:
         attachment: A file to add, if it is there.
-        niceness: How much to stand back for others.
+        niceness: Of the process, as of nice(1).
         cores: To run on; all if empty.
-        metadata: The file beside it that makes a bag of ROS 2 of their folder; none if empty.
+        metadata: File beside it that makes their folder a bag of ROS 2; none if empty.
     """
 
     path: str
@@ -93,9 +92,8 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     """Line sent by the writing process.
 
     Attributes:
-        what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``;
-            ``gone`` stands for a process that ended without a reply.
-        written: Events in the file.
+        what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``; ``gone``
+            stands for a process that ended without a reply.
         size: Bytes of the file.
     """
 
@@ -109,8 +107,7 @@ EVENT, ANNOUNCEMENT, END = 0, 1, 2
 
 _HEAD = struct.Struct("<qIB")
 _PART = 1 << 16
-"""Bytes written at once: the kernel does not let go of the core meanwhile, and the loop may need
-it."""
+"""Bytes written at once: the kernel does not let go of the core meanwhile."""
 
 
 class Piece(NamedTuple):
@@ -125,7 +122,7 @@ def write(file: IO[bytes], time: int, what: int, event: Packed | None = None) ->
     """Write a piece to a buffered pipe; the GIL is free while blocked.
 
     Raises:
-        OSError: Nobody reads any more.
+        OSError: The reader is gone.
     """
     file.write(_HEAD.pack(time, 0 if event is None else event.size, what))
     for part in () if event is None else event.parts():
@@ -138,7 +135,7 @@ def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator
     """Yield pieces up to the end of the pipe; an incomplete last piece is left out.
 
     Args:
-        idle: Seconds without anything after which `while_idle` is called, again and again.
+        idle: Seconds of silence after which `while_idle` is called, repeatedly.
     """
     while True:
         while not select.select([file], [], [], idle)[0]:

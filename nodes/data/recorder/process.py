@@ -1,12 +1,10 @@
 """The recording process: reads events from its standard input, and writes the file.
 
-Started by `writer_process` as ``python -m nodes.data.recorder.process``. It is a process of its
-own because encoding holds Python's lock, and would keep the run's loop from it for milliseconds;
-and because it outlives a run that is killed, and closes the file in order.
-
-Events become ROS's messages, as the bridge makes them, and messages of their own. A large array
-stands in the file once, in ROS's message; the event's own message then lacks it, has the same time,
-and names that topic in its channel.
+Started by `writer_process` as ``python -m nodes.data.recorder.process``. A process of its own,
+because encoding holds Python's lock for milliseconds, and to close the file of a killed run. Events
+become ROS's messages, as the bridge makes them, and messages of their own. A large array stands in
+the file once, in ROS's message; the event's own message lacks it, has the same time, and names that
+topic in its channel.
 """
 
 from __future__ import annotations
@@ -60,7 +58,7 @@ class EventWriter:
     """Writer of events to a file; as a `Sink`, target of `Publishing`'s ROS messages.
 
     Args:
-        complain: Called for events that are recorded as they are, but not as ROS's messages.
+        complain: Called for events not recorded as ROS's messages.
     """
 
     def __init__(
@@ -86,11 +84,7 @@ class EventWriter:
         """Topic holding the arrays of the current event."""
 
     def write(self, time: int, frame: bytes | bytearray, announcement: bool) -> None:
-        """Write an event.
-
-        Args:
-            time: When it was published (ns).
-            frame: The event, as `runtime.wire` has it.
+        """Write an event, a frame of `runtime.wire`, published at a time (ns).
 
         Raises:
             WireError: It is no frame.

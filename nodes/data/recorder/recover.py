@@ -23,12 +23,9 @@ class Recovery(msgspec.Struct, frozen=True):
     """Result of mending a file.
 
     Attributes:
-        path: The whole file.
-        messages: How many it has.
-        trouble: What could not be read, now or when it was mended before; empty if the file was
-            whole.
+        trouble: Parts unread, now or when mended before; empty if the file was whole.
         mended: Whether there was anything to do.
-        partial: Whether messages are missing between others, and not just after the last one.
+        partial: Whether messages are missing before the last one, too.
     """
 
     path: Path
@@ -42,13 +39,12 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
     """Write a whole, indexed file from the readable parts of a torn file.
 
     Args:
-        out: The whole one; if `None`, it takes the place of the torn one when it is complete, and
-            the torn one is gone: all that could be read of it is in the new one. A file that has
-            its index is left alone then, for what is damaged in it may yet be of use.
+        out: The whole file; if `None`, it replaces the torn one when complete. A file with an index
+            is left alone then, for its damaged parts may be of use.
 
     Raises:
-        RecordingError: The file is no MCAP file or is being written, nothing can be read of it, or
-            the other cannot be written.
+        RecordingError: The file is no MCAP file, unreadable or being written, or the other cannot
+            be written.
     """
     found = contents(path)
     with records.open_file(path) as file:
@@ -80,11 +76,7 @@ def _all_of(path: Path, trouble: list[str]) -> Iterator[Any]:
 
 
 def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
-    """Write the readable messages of a file to another, complete and with an index.
-
-    Returns:
-        How many messages there were, and what could not be read.
-    """
+    """Write a file's readable messages, with an index; return their number, and the troubles."""
     trouble: list[str] = []
     messages = 0
     with records.open_file(path) as torn:

@@ -1,9 +1,8 @@
 """The writing process as seen by the run: its backlog and its threads.
 
-The loop puts events into the backlog, and calls nothing here that waits. One thread feeds the
-process, and another reads its replies. It is no `runtime.workers.worker.Worker`: that copies what
-it is given on the loop, and ends its process soon after the run; this one outlives a run that is
-killed, or whose disk is slow, and closes its file in order.
+The loop puts events into the backlog, and waits for nothing here. One thread feeds the process,
+another reads its replies. No `runtime.workers.worker.Worker`, which copies on the loop, and ends
+its process soon after the run: this one outlives a killed run, or a slow disk, and closes its file.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ _IN_A_ROW = 16
 STANDSTILL = 10.0
 """Real seconds without any sign of life before the process is given up.
 
-A stopped or frozen process would be waited for without end. A slow disk shows in the file's size.
+A slow disk shows a sign of life in the file's size.
 """
 
 _LOOK = 0.5
@@ -74,11 +73,10 @@ class Backlog:
     Args:
         limit: Bytes that may wait.
         when_full: What happens beyond: ``wait`` keeps everything, and `is_full` shows it;
-            ``drop_images`` drops what is large, and the oldest only if there is nothing but small
-            events; ``drop_oldest`` makes room, whatever it costs.
+            ``drop_images`` drops large events, and the oldest if all are small; ``drop_oldest``
+            makes room.
 
     Attributes:
-        dropped: Events.
         peak: Bytes.
     """
 
@@ -151,11 +149,7 @@ class Backlog:
             self._room.set()
 
     def wait_for_room(self, timeout: float | None = None) -> bool:
-        """Wait for half of the room, or for `release`; return False on timeout.
-
-        Args:
-            timeout: Real seconds to wait at most.
-        """
+        """Wait for half of the room, or for `release`; return False after a time-out (real s)."""
         self._room.clear()
         return self.bytes <= self.limit // 2 or self._room.wait(timeout)
 
@@ -169,8 +163,8 @@ class WriterProcess:
     """Process for writing a recording, fed from a backlog.
 
     Args:
-        failed: Called in a thread, once, with what ended the writing.
-        complain: Called in a thread with what could not be recorded.
+        failed: Called in a thread, once, with the error.
+        complain: Called in a thread with events that could not be recorded.
 
     Attributes:
         error: What ended the writing.
@@ -233,13 +227,13 @@ class WriterProcess:
     def close(self, end: int, timeout: float | None = None) -> bool:
         """Write all queued events; return whether the file is closed. Not for a loop.
 
-        A process that somebody stopped is continued, and one that shows no sign of life for
-        `STANDSTILL` seconds is ended; `error` then says so.
+        A stopped process is continued; one without a sign of life for `STANDSTILL` seconds is
+        ended, as `error` then says.
 
         Args:
-            end: Time of the run's clock (ns) at which it ends.
-            timeout: Real seconds to wait at most, after which it may be called again; if `None`,
-                as long as the disk takes.
+            end: Of the run's clock, ns.
+            timeout: Real seconds, after which it may be called again; `None`: as long as the disk
+                takes.
         """
         self._end = end
         self._closing.set()

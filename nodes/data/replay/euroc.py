@@ -1,10 +1,9 @@
 """Data sets in the layout of EuRoC MAV, as published, and as `nodes.data.dataset` writes them.
 
-M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The world's z points up; it
-is turned to NED by half a turn about x. Times count from the first stamp, or from the epoch that
-``body.yaml`` notes (``epoch_ns``). The body keeps the axes that the data set gives it: with
-EuRoC's own those of its IMU, which is no FRD, but cameras and truth agree on it. Of two cameras
-side by side the second is announced as the right one of a stereo rig.
+M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The world, z up, is turned to
+NED by half a turn about x. Times count from the first stamp, or from the epoch that ``body.yaml``
+notes (``epoch_ns``). The body keeps the data set's axes: in EuRoC's own those of the IMU, not FRD.
+The second of two cameras side by side is announced as the right one of a stereo rig.
 """
 
 from __future__ import annotations
@@ -96,14 +95,14 @@ class Sensor(msgspec.Struct, frozen=True):
 
 
 class Euroc(FolderReader):
-    """Reads the cameras, the first IMU and the ground truth of a data set.
+    """Reader of a data set's cameras, first IMU and ground truth.
 
     Args:
         folder: The one with cam0 in it (mav0).
         vehicle: Source of the truth; sensors are below it.
 
     Raises:
-        ReplayError: Something in it is not as published.
+        ReplayError: A file is not as published.
     """
 
     def __init__(self, folder: Path, vehicle: str) -> None:

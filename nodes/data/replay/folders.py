@@ -36,10 +36,8 @@ R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
 def while_seen(truth: list[R], first: int, last: int) -> list[R]:
     """Return the truth during the sensors' time, with the row before and the row after.
 
-    More than that belongs to no flight that an estimator could have seen.
-
     Args:
-        truth: Rows, the first field of each its stamp (ns), in order.
+        truth: Rows in order, each with its stamp (ns) first.
     """
     begin = bisect.bisect_right(truth, first, key=lambda row: row[0]) - 1
     end = bisect.bisect_left(truth, last, key=lambda row: row[0]) + 1
@@ -83,10 +81,10 @@ def camera_at(
 
 
 def as_pair(left: CameraAnnouncement, right: CameraAnnouncement) -> CameraAnnouncement:
-    """Return the right camera as of a stereo rig, or unchanged if both are none.
+    """Return the right camera as of a stereo rig, or unchanged if the two are no pair.
 
-    Both are if they have one size and one rate, and stand side by side: less than 60 degrees apart
-    in direction, and the right one at least half of their distance to the left one's right.
+    A pair has one size and one rate, less than 60 degrees between its directions, and the right one
+    at least half of their distance to the left one's right.
     """
     one, other = (pose_matrix(each.position, each.orientation) for each in (left, right))
     apart = other[:3, 3] - one[:3, 3]
@@ -99,14 +97,7 @@ def as_pair(left: CameraAnnouncement, right: CameraAnnouncement) -> CameraAnnoun
 
 
 class Rows(NamedTuple):
-    """Ordered rows of a data set, and the function turning them into events.
-
-    Attributes:
-        kind: Type of the events.
-        source: Of the events.
-        rows: The first field of each is its stamp (ns).
-        make: Called with the fields of a row.
-    """
+    """Ordered rows of a data set, each with its stamp (ns) first, and the function to events."""
 
     kind: type[Event]
     source: str
@@ -115,7 +106,7 @@ class Rows(NamedTuple):
 
 
 class FolderReader(Reader):
-    """Reads a data set in a folder, whose stamps are its times too.
+    """Reader of a data set in a folder, whose stamps are its times too.
 
     Args:
         vehicle: Source of the truth; sensors are below it.
@@ -194,7 +185,6 @@ def read_depth(path: Path, stamp: int, source: str, frame_id: str, factor: float
     """Read a depth image of 16 bits.
 
     Args:
-        stamp: Of the event (ns).
         factor: Steps per metre; a step of 0 is none, and becomes ``inf``.
 
     Raises:

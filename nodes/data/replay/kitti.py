@@ -31,14 +31,14 @@ _AXES = pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
 
 
 class Kitti(FolderReader):
-    """Reads the cameras, and the true poses if they are there.
+    """Reader of the cameras, and of the true poses if they are there.
 
     Args:
         folder: The sequence's, with times.txt in it.
         vehicle: Source of the truth; the cameras are below it.
 
     Raises:
-        ReplayError: Something in it is not as published.
+        ReplayError: A file is not as published.
     """
 
     def __init__(self, folder: Path, vehicle: str) -> None:
@@ -58,7 +58,6 @@ class Kitti(FolderReader):
             raise ReplayError(str(error)) from None
 
     def _rows(self) -> Iterator[Rows]:
-        """Yield truth and images."""
         yield Rows(Odometry, self._vehicle, self._truth, self._pose)
         for source, paths in self._images.items():
             rows = list(zip(self._stamps, paths, strict=True))

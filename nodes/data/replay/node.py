@@ -1,6 +1,6 @@
 """A recording in the place of the simulator: the same announcements, events, stamps and sources.
 
-Reads ahead of the loop in a thread, so that it never decodes an image; bounded by bytes.
+A thread reads ahead of the loop, bounded by bytes, so that the loop never decodes an image.
 """
 
 from __future__ import annotations
@@ -35,12 +35,7 @@ _SMALL = 512
 
 
 class ReadAhead:
-    """Events from a thread, batch by batch.
-
-    Args:
-        events: What to read; used in the thread only.
-        limit: Bytes that may wait, but for the last batch.
-    """
+    """Events from a thread, batch by batch, up to a limit of bytes that may wait."""
 
     def __init__(self, events: Iterator[Timed], limit: int) -> None:
         self._events = events
@@ -57,11 +52,7 @@ class ReadAhead:
         self._thread.start()
 
     def take(self) -> Batch | None:
-        """Wait for the next batch; `None` when all has been read. Not on a loop.
-
-        Raises:
-            ReplayError: Or whatever the reading raised.
-        """
+        """Wait for the next batch or an error (not on a loop); return `None` at the end."""
         with self._change:
             while not self._batches and not self._ended:
                 self._change.wait()
@@ -132,7 +123,7 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
     """Return a reader of a recording.
 
     Raises:
-        ReplayError: There is nothing there that can be read.
+        ReplayError: Nothing there can be read.
         MissingDependencyError: A library is not installed.
     """
     path = newest(Path(config.file))
@@ -190,8 +181,8 @@ class Timeline:
     def moved(self, event: Event) -> Event | None:
         """Return an event on the run's clock; `None` if true before the run.
 
-        A stamp of before a pause stays where it was then; of a trajectory those poses are left out
-        that were not played.
+        A stamp before a pause stays where it was; poses of a trajectory that were not played are
+        left out.
         """
         if not self.shift and len(self._stretches) < 2:
             return event
@@ -236,7 +227,7 @@ _SLICE = SECOND // 10
 
 
 class Replay(Node[ReplayConfig]):
-    """Sends recorded events again, each at its time, on either clock.
+    """Player of recorded events, each at its time, on either clock.
 
     ::
 
@@ -245,8 +236,8 @@ class Replay(Node[ReplayConfig]):
         type = "Replay"
         file = "../runs/record/latest/recording.mcap"
 
-    The run ends with the recording. While it goes on, ``python -m runtime set replay.paused=true``
-    and ``replay.position=12s`` do what `pause` and `seek` do; these are for the loop's thread.
+    The run ends with the recording. Meanwhile ``python -m runtime set replay.paused=true`` and
+    ``replay.position=12s`` do as `pause` and `seek`, which are for the loop's thread.
     """
 
     ends_run = "plan"

@@ -1,7 +1,6 @@
 """Recordings as seen by a replay, in any format; choice of their events; settings.
 
-All of it is for threads beside the loop, and knows no clock: times count from the recording's
-beginning.
+All for threads beside the loop; times count from the recording's beginning.
 """
 
 from __future__ import annotations
@@ -47,11 +46,11 @@ class Wants(Protocol):
 
 
 class Reader(ABC):
-    """Reads a recording.
+    """Reader of a recording.
 
     Attributes:
-        trouble: What could not be read so far, in words.
-        left_out: How many events could not be read.
+        trouble: Parts unread so far, in words.
+        left_out: Number of events unread so far.
     """
 
     def __init__(self) -> None:
@@ -68,14 +67,9 @@ class Reader(ABC):
 
     @abstractmethod
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
-        """Yield the events from `start` to before `end`, in their original order.
+        """Yield the events from `start` to before `end` (ns; `None` for all), in original order.
 
-        Events may share arrays with nothing that changes. Their stamps are on the same clock as
-        the times.
-
-        Args:
-            start: Nanoseconds.
-            end: Nanoseconds; `None` for all there are.
+        Nothing changes arrays that events share. Stamps are on the same clock as the times.
 
         Raises:
             ReplayError: It cannot be read.
@@ -103,10 +97,9 @@ class Choice:
     """Selection of events; see `nodes.data.replay.reader` for the rules.
 
     Args:
-        only: Types and sources; if there are any, an event must be of one of the types and from
-            one of the sources named. If there are none, it must be of the usual categories, and
-            not from an estimator.
-        skip: Types and sources that are never wanted.
+        only: Types and sources that events must be of; if empty, the usual categories, without
+            estimators.
+        skip: Types and sources left out.
     """
 
     def __init__(
@@ -127,7 +120,7 @@ class Choice:
         """Names without a matching event so far."""
 
     def __call__(self, kind: type[Event], source: str) -> bool:
-        """Tell whether events of a type from a source are wanted."""
+        """Return whether events of a type from a source are wanted."""
         key = kind, source
         known = self._known.get(key)
         if known is None:
@@ -175,12 +168,11 @@ class BagTopic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """A topic of a ROS bag and the use of its messages.
 
     Attributes:
-        topic: Its name.
         use: ``as`` in the file. ``image`` (from Image or CompressedImage), ``depth``, ``camera``
             (CameraInfo: a camera is announced), ``imu``, ``odometry`` and ``truth`` (Odometry,
             PoseStamped or TransformStamped: the vehicle's true pose), ``estimate``.
         source: Of the events; if empty, the node's name, and for a camera the topic's namespace.
-        frame_id: If set, the frame that events name, whatever the messages say.
+        frame_id: If set, the frame of the events, in place of the messages'.
     """
 
     topic: str
@@ -190,7 +182,7 @@ class BagTopic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Pinhole(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Intrinsics of a camera, for data sets without intrinsics.
+    """Intrinsics of a camera, for data sets without intrinsics; `fx`, `fy`, `cx`, `cy` in pixels.
 
     Attributes:
         fx: Pixels.
@@ -227,22 +219,22 @@ class ReplayConfig(NodeConfig):
         file: A recording of `nodes.data.recorder` (torn ones too), a ROS 2 bag (a folder, or an
             MCAP or SQLite file), or the folder of a data set in the layout of EuRoC, of TUM RGB-D,
             or of KITTI's odometry (``sequences/00``).
-        start: Where to begin. The run's clock is 0 there, and stamps count from there.
+        start: Where to begin; the run's clock and stamps count from there.
         end: Where to end, on the recording's own time; 0 for its end.
-        linger: How long the run goes on after the last event, so that others can react to it.
-            A recording that says when it ended, or an `end`, ends just then.
-        loop: Begin again at the end. The clock goes on, and stamps with it.
-        paused: Send nothing; can change in a run. The clock goes on, and what follows comes later.
-        position: Where to go on, on the recording's own time, whenever it is set in a run.
-        only: Types (``Image``, ``Odometry``) and sources (``drone``, with all below it); an event
-            must be of one of the types and from one of the sources, so far as any are named.
-            ``["Event"]`` is everything. If empty: the events of sensors and of the vehicle, and the
-            true poses; not those of pilots, estimators and evaluations.
-        skip: Types and sources that are left out.
+        linger: How long the run goes on after the last event, so that others can react; 0 if the
+            recording or `end` says when it ends.
+        loop: Begin again at the end; clock and stamps go on.
+        paused: Send nothing; can change in a run. The clock goes on, and events come later.
+        position: Where to go on when set in a run, on the recording's own time.
+        only: Types (``Image``, ``Odometry``) and sources (``drone``, with all below it); events
+            must be of the types and from the sources named. ``["Event"]`` is everything. If empty:
+            events of sensors and of the vehicle, and true poses; not of pilots, estimators and
+            evaluations.
+        skip: Types and sources left out.
         memory: Bytes that may be read ahead.
-        topics: What is read of a ROS bag, and as what.
-        vehicle: Source of a data set's true poses; its cameras are below it. If empty, the
-            node's name.
+        topics: Topics read from a ROS bag, and their use.
+        vehicle: Source of a data set's true poses; its cameras are below it. If empty, the node's
+            name.
         camera: Intrinsics of a data set in TUM's layout, if it has no camera.yaml.
         depth_factor: Steps of its depth images per metre.
     """

@@ -22,7 +22,7 @@ _LOOK = 64
 
 
 class Recorded(Reader):
-    """Reads a recording of ours, torn ones too.
+    """Reader of a recording of ours, torn ones too.
 
     Raises:
         ReplayError: It is no MCAP file.

@@ -1,10 +1,9 @@
 """Foreign ROS bags: their messages as events, in our frames (`nodes.ros2.messages`).
 
-Messages with a header keep its stamp, unless that is zero; they are sent at their time of receipt.
-Where the two are of different clocks (a simulator's and the recording machine's), each counts
-from its own first. Topics that settings do not name are known by type and name. Cameras sit where
-``/tf_static`` puts their optical frames in ``base_link``; one that it does not know looks ahead
-from the body's origin.
+Messages keep a header's stamp, unless zero, and are sent at their time of receipt; two different
+clocks each count from their own first. Topics that settings do not name are known by type and name.
+Cameras sit where ``/tf_static`` puts their optical frames in ``base_link``, else look ahead from
+the body's origin.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ def chosen(
 
     Args:
         found: Type and number of messages, by topic.
-        wanted: What the file says; if nothing, topics are taken by type and name.
+        wanted: From the file; if empty, topics are taken by type and name.
 
     Raises:
         ReplayError: A wanted topic is not there or of another type; or there is nothing to read.
@@ -132,11 +131,7 @@ _HERE: Pose = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 class Mountings:
-    """A tree of fixed transforms, in ROS's axes.
-
-    Args:
-        messages: tf2_msgs/TFMessage.
-    """
+    """A tree of fixed transforms, in ROS's axes, from messages of tf2_msgs/TFMessage."""
 
     def __init__(self, messages: Iterable[Any]) -> None:
         self._parents: dict[str, tuple[str, Pose]] = {}
@@ -176,12 +171,11 @@ _LATER = 1 << 62
 
 
 class RosBag(Reader):
-    """Reads a bag.
+    """Reader of a ROS bag.
 
     Args:
         path: A folder, or an MCAP or SQLite file.
-        topics: What to read; if empty, by types and names.
-        vehicle: Source of the true poses.
+        topics: Topics to read; if empty, by types and names.
 
     Raises:
         ReplayError: It cannot be read, or a topic is not there.
@@ -358,6 +352,5 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def _stamp(message: Any) -> int:
-    """Return a header's stamp (ns), 0 if unset."""
     stamp = message.header.stamp
     return int(stamp.sec) * SECOND + int(stamp.nanosec)

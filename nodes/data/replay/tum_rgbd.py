@@ -1,11 +1,10 @@
 """Data sets in the layout of TUM's RGB-D benchmark.
 
-As published, and as `nodes.data.dataset` writes it: J. Sturm et al., "A benchmark for the
-evaluation of RGB-D SLAM systems", IROS 2012, and cvg.cit.tum.de/data/datasets/rgbd-dataset/
-file_formats. The world's z points up; it is turned to NED by half a turn about x. A depth image
-is taken with the colour image nearest to it, within 20 ms as their associate.py does it, and gets
-its stamp, so that estimators find pairs. Times count from the first stamp, or from the epoch that
-``camera.yaml`` notes (``epoch_ns``).
+As published and as `nodes.data.dataset` writes it: J. Sturm et al., "A benchmark for the evaluation
+of RGB-D SLAM systems", IROS 2012, and cvg.cit.tum.de/data/datasets/rgbd-dataset/ file_formats. The
+world, z up, is turned to NED by half a turn about x. A depth image gets the stamp of the nearest
+colour image, within 20 ms as in their associate.py. Times count from the first stamp, or from the
+epoch that ``camera.yaml`` notes (``epoch_ns``).
 """
 
 from __future__ import annotations
@@ -45,10 +44,7 @@ _Images = list[tuple[int, Path]]
 
 
 class TumRgbd(FolderReader):
-    """Reads colour, depth and the camera's true poses.
-
-    The camera sits in the body's origin and looks ahead, so that the body's pose (FRD) is known
-    where the camera's is.
+    """Reader of colour, depth and true poses; the camera looks ahead from the body's origin.
 
     Args:
         folder: The one with rgb.txt in it.
@@ -57,7 +53,7 @@ class TumRgbd(FolderReader):
         depth_factor: Steps per metre.
 
     Raises:
-        ReplayError: Something in it is not as published, or nothing says the intrinsics.
+        ReplayError: A file is not as published, or the intrinsics are missing.
     """
 
     def __init__(

@@ -1,8 +1,4 @@
-"""Visual-inertial odometry: a camera with depth, or a stereo rig, and an IMU, tightly coupled.
-
-`preintegration` (what the IMU felt), `filter` (the state), `rolling_shutter` (its images),
-`tracker` (all of it with the map of `nodes.estimators.visual_odometry`), `node`.
-"""
+"""Visual-inertial odometry: a camera with depth, or a stereo rig, and an IMU, tightly coupled."""
 
 from nodes.estimators.inertial_odometry.node import (
     InertialOdometryConfig,

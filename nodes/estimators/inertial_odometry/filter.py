@@ -3,14 +3,10 @@
 The state is orientation, position and velocity of the IMU, the biases of gyroscope and
 accelerometer, and the direction of gravity, on the sphere, as in W. Xu, Y. Cai, D. He, J. Lin and
 F. Zhang, "FAST-LIO2", IEEE T-RO 2022: the world is the first camera, which need not be level, and a
-flight may begin in motion.
-
-Landmarks are where the key frames that saw them first were, and these are known as well as the
-filter knew its own pose then, and as their pixels and depths there placed them. Their poses are
-states that are considered and not estimated: so the uncertainty grows with the length of the way
-and not only with time, and shrinks when the camera comes back to an old key frame. (S. F. Schmidt's
-filter; P. Geneva, J. Maley and G. Huang, "An efficient Schmidt-EKF for 3D visual-inertial SLAM",
-CVPR 2019.)
+flight may begin in motion. Poses of the key frames in which landmarks were first seen are
+considered, not estimated: uncertainty grows with the length of the trajectory, and shrinks when the
+camera comes back to an old key frame (P. Geneva, J. Maley and G. Huang, "An efficient Schmidt-EKF
+for 3D visual-inertial SLAM", CVPR 2019).
 """
 
 from __future__ import annotations
@@ -37,19 +33,13 @@ G = slice(15, 17)
 """Slice of gravity's direction: small rotations about the two level axes."""
 POSE = slice(0, 6)
 _FRAME = 7
-"""States considered of a key frame: pose, and mean error of its inverse depths, 1/m.
-
-By the latter, a motion seen by its landmarks is too long or too short.
-"""
+"""States considered of a key frame: pose, and mean error of its inverse depths, 1/m."""
 _SIZE = 17
 GRAVITY = 9.81
 _SPEED = 3.0
 """Standard deviation of the unknown velocity at the start, m/s."""
 _TILT = 0.35
-"""Standard deviation of gravity's direction from the first samples, radians.
-
-That of a vehicle with an acceleration of 3.5 m/s².
-"""
+"""Standard deviation of gravity's direction from first samples, radians: that of 3.5 m/s²."""
 _NO_TILT = 1.5
 """The same without samples."""
 _UNSTATED = np.array([0.01, 0.1])
@@ -138,17 +128,15 @@ class Sighting(msgspec.Struct, frozen=True, eq=False):
 
 
 class InertialFilter:
-    """Estimates the state of an IMU.
+    """Estimator of an IMU's state.
 
     Args:
-        imu: Its model.
         camera: The optical camera in the IMU's frame, shape (4, 4).
-        capacity: Number of key frames that are remembered.
-        common: Shares of variance that the errors of all landmarks in one image have in common, so
-            that many tell no more than its inverse: of what is seen, and of places besides.
+        capacity: Number of remembered key frames.
+        common: Shares of variance common to all landmarks in one image, of sightings and of places:
+            many landmarks tell no more than its inverse.
 
     Attributes:
-        state: The estimate.
         covariance: Of the state's error, shape (17, 17).
     """
 
@@ -169,9 +157,6 @@ class InertialFilter:
 
     def start(self, force: Floats, pose: Floats | None = None) -> None:
         """Begin at an image, with gravity against the specific force, if not zero.
-
-        What is not known of velocity, gravity and biases is found from the first images, at rest or
-        in motion.
 
         Args:
             force: Mean specific force, m/s², shape (3,).
@@ -198,10 +183,9 @@ class InertialFilter:
         """Store the present pose as a key frame's.
 
         Args:
-            number: Its number, that of the newest one; or below zero, for an image beside them, of
-                which only those are kept that are noted again.
-            placed: Its new landmarks, with the noise of their places: that stays as it is whenever
-                they are seen, so they tell the pose by no more than it lets them.
+            number: That of the newest one; or below zero, for an image beside them, kept only if
+                noted again.
+            placed: Its new landmarks, with the lasting noise of their places.
         """
         at = int(self._slots(np.array([number]))[0])
         self._frames.pop(number - self._capacity, None)
@@ -263,14 +247,12 @@ class InertialFilter:
     def update_pose(self, camera: Floats, number: int, information: Floats, first: bool) -> bool:
         """Update by an image's pose from a key frame; return False if contradictory.
 
-        The error of such a pose is half that of the image, and half that of the key frame, which
-        does not change from image to image.
+        Half of such a pose's error is the key frame's, which is the same in all images.
 
         Args:
             camera: The camera in the world if the key frame is where it was remembered, (4, 4).
-            number: The key frame.
-            information: Inverse covariance of a small motion of the camera's frame, as `moved` in
-                `nodes.estimators.odometry` has it, shape (6, 6).
+            information: Inverse covariance of a small motion of the camera's frame, as of `moved`
+                in `nodes.estimators.odometry`, shape (6, 6).
             first: Whether this is the first pose by that key frame.
         """
         found = camera @ inverse(self.camera)
@@ -300,10 +282,9 @@ class InertialFilter:
     def _correct(self, numbers: npt.NDArray[np.int64], measure: Measurement) -> bool:
         """Update by a measurement relative to key frames, unless contradictory.
 
-        Iterated Kalman update in the information form of the measurements: with their information
-        Λ and the covariance M of the poses concerned, gain and covariance need (I + ΛM)⁻¹ only.
-        Each step is gated on the innovation as the pose sees it, whose covariance ΛMΛ + Λ has the
-        correlations of the state with the key frames in it.
+        Iterated Kalman update: with the measurements' information Λ and the covariance M of the
+        poses concerned, gain and covariance need (I + ΛM)⁻¹ only. Steps are gated on the
+        innovation, of covariance ΛMΛ + Λ, with the correlations of state and key frames.
         """
         slots = self._slots(numbers)
         # Covariances of the poses concerned with themselves, and of the state with these.

@@ -34,8 +34,6 @@ class InertialOdometryConfig(EstimatorConfig):
 
 
 class _InertialOdometry(Estimator[InertialOdometryConfig]):
-    """Common base: the tracker in a process of its own."""
-
     inertial = True
     lenses = frozenset()
 

@@ -1,13 +1,11 @@
 """IMU preintegration, and its use for rolling shutter correction.
 
-The samples say of a motion the same, whatever pose and speed it began at: C. Forster, L. Carlone,
-F. Dellaert and D. Scaramuzza, "On-manifold preintegration for real-time visual-inertial odometry",
-IEEE T-RO 2017, equations 33 to 48; rotation, velocity and position here stand in this order. Rates
-are those in the middle of two samples, so errors fall with the square of the interval.
-
-Row v of h rows is exposed at ``readout · (v / (h - 1) - 1/2)`` after the middle one (see
-`events.CameraAnnouncement`). A point p of the camera at the middle row is at ``p - t (v + ω × p)``
-in the camera at t: so far the image is shifted back, by the depth of each pixel where it is known.
+Source: C. Forster, L. Carlone, F. Dellaert and D. Scaramuzza, "On-manifold preintegration for
+real-time visual-inertial odometry", IEEE T-RO 2017, equations 33 to 48; rotation, velocity and
+position here stand in this order. Rates are those in the middle of two samples. Row v of h rows is
+exposed at ``readout · (v / (h - 1) - 1/2)`` after the middle one (see `events.CameraAnnouncement`).
+A point p of the camera at the middle row is at ``p - t (v + ω × p)`` in the camera at t: so far the
+image is shifted back, where depth is known.
 """
 
 from __future__ import annotations
@@ -34,7 +32,6 @@ class Preintegrated(msgspec.Struct, frozen=True, eq=False):
     """Preintegrated IMU motion, without gravity and initial velocity.
 
     Attributes:
-        seconds: How long it took.
         rotation: The frame at the end in that at the start, shape (3, 3).
         velocity: Change of velocity in the frame at the start, m/s, shape (3,).
         position: Change of position in the frame at the start, metres, shape (3,).
@@ -53,9 +50,6 @@ class Preintegrated(msgspec.Struct, frozen=True, eq=False):
 
 class ImuModel:
     """IMU parameters for the filter, from an announcement.
-
-    Args:
-        imu: The announcement.
 
     Attributes:
         pose: The IMU in the frame of its parent, shape (4, 4).
@@ -84,8 +78,7 @@ class ImuModel:
     def corrected(self, samples: Floats) -> Floats:
         """Return samples, shape (n, 7), without the announced scale and misalignment.
 
-        Args:
-            samples: Seconds, angular velocity (rad/s), specific force (m/s²), by rows.
+        Rows are seconds, angular velocity (rad/s), specific force (m/s²).
         """
         turn, force = (
             s @ u.T for s, u in zip((samples[:, 1:4], samples[:, 4:]), self._undo, strict=True)
@@ -93,11 +86,9 @@ class ImuModel:
         return np.hstack([samples[:, :1], turn, force])
 
     def at(self, samples: Floats, times: Floats) -> Floats:
-        """Return samples, shape (m, 7), at times (m,): interpolated, or held outside.
+        """Return samples, shape (m, 7), at times (s, shape (m,)): interpolated, or held outside.
 
-        Args:
-            samples: As `corrected` gives them, strictly rising in time, shape (n, 7), n > 0.
-            times: Seconds.
+        Samples are as of `corrected`, strictly rising in time, shape (n, 7), n > 0.
         """
         if self._averaged:
             rows = np.searchsorted(samples[:, 0], times).clip(max=len(samples) - 1)
@@ -109,7 +100,7 @@ class ImuModel:
         """Return the motion from the first sample to the last.
 
         Args:
-            samples: As `corrected` gives them, strictly rising in time, shape (n, 7), n > 1.
+            samples: As of `corrected`, strictly rising in time, shape (n, 7), n > 1.
             bias: Of gyroscope and accelerometer, shape (6,).
         """
         steps = np.diff(samples[:, 0])

@@ -1,11 +1,10 @@
 """Visual-inertial odometry: the RGB-D tracker's map, and a filter driven by the IMU.
 
-The IMU says where the map should be in the next image, all landmarks found there correct the
-filter (tightly coupled: none is too few), and the filter's pose is what the map grows from. Where
-landmarks are few, a camera with depth corrects it by an alignment of edges and surfaces, too; a
-stereo rig, whose coarse depth is wrong there, has few landmarks only. Where nothing is seen, the
-IMU alone carries the pose on, for a while; then the camera is lost, and what it does not find
-again becomes a new map, in a frame of its own.
+The IMU predicts the next image's pose, all landmarks found there correct the filter (tightly
+coupled), and the map grows from the filter's pose. Where landmarks are few, a camera with depth is
+aligned by edges and surfaces, too; a stereo rig's depth is too coarse there. Where nothing is seen,
+the IMU alone carries the pose for a while; then the camera is lost, and without relocalization a
+new map begins, in a frame of its own.
 """
 
 from __future__ import annotations
@@ -61,8 +60,7 @@ class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """Settings of the fusion with an IMU.
 
     Attributes:
-        carry: Seconds without any landmark for which the IMU alone gives the pose; then the camera
-            is lost.
+        carry: Seconds without landmarks that the IMU alone bridges; then the camera is lost.
         pixel_noise: Standard deviation of a landmark's pixel, errors of its place included.
     """
 
@@ -77,11 +75,7 @@ class InertialTracker(FeatureTracker):
 
     Args:
         camera: The camera, or the left one of a rectified rig.
-        imu: The IMU.
         baseline: Metres to the right camera; 0 if there is none.
-        features: Settings of the map.
-        inertial: Settings of the fusion.
-        stereo: Settings of the stereo matching.
     """
 
     def __init__(
@@ -126,7 +120,7 @@ class InertialTracker(FeatureTracker):
         """Return the pose of the next image.
 
         Args:
-            stamp: When the image was exposed on the clock of the IMU (ns).
+            stamp: Exposure on the clock of the IMU (ns).
             image: Grey or colour, of the (left) camera.
             other: Its depth in metres, or the image of the right camera.
             samples: Of the IMU since the image before: stamp (ns), angular velocity, specific
@@ -180,10 +174,7 @@ class InertialTracker(FeatureTracker):
         )
 
     def _advance(self, now: float) -> Floats:
-        """Bring the filter to a time; return angular velocity and specific force then, shape (6,).
-
-        Samples that are missing at the end are replaced by the last one.
-        """
+        """Advance the filter; return angular velocity and specific force then, shape (6,)."""
         samples = self._samples
         if len(samples):
             newest = np.maximum.accumulate(samples[:, 0])
@@ -204,14 +195,12 @@ class InertialTracker(FeatureTracker):
         return rates
 
     def _camera_velocity(self) -> Floats:
-        """Return the camera's velocity in its own axes, m/s, shape (3,)."""
         camera, state = self._filter.camera, self._filter.state
         turning = np.cross(self._rates[:3], camera[:3, 3])
         velocity: Floats = camera[:3, :3].T @ (state.rotation.T @ state.velocity + turning)
         return velocity
 
     def _camera_covariance(self) -> Floats:
-        """Return the camera pose's covariance, as in `TrackingResult`."""
         state, camera = self._filter.state, self._filter.camera
         moved = np.zeros((6, 6))
         moved[:3, :3] = -state.rotation @ cross(camera[:3, 3])
@@ -259,7 +248,6 @@ class InertialTracker(FeatureTracker):
         return None if self._is_doubted else self._corrected(match)
 
     def _judge(self, agrees: bool) -> None:
-        """Note whether the landmarks of an image agree with the filter."""
         share = min((self._now - self._judged_at) / _PATIENCE, 1.0) if self._is_known else 0.0
         self._doubt += share * ((not agrees) - self._doubt)
         self._judged_at = self._now
@@ -275,7 +263,6 @@ class InertialTracker(FeatureTracker):
         alignment: Alignment,
         match: MapMatch | None,
     ) -> MapMatch | None:
-        """Let an alignment correct the filter."""
         if self._is_doubted:
             return None
         if first := bool((alignment.reference == self._noted_pose).all()):
@@ -286,7 +273,6 @@ class InertialTracker(FeatureTracker):
         return self._corrected(match)
 
     def _corrected(self, match: MapMatch | None) -> MapMatch | None:
-        """Return a match at the filter's pose."""
         self._pose = inverse(self._camera_pose())
         if match is None:
             return None
@@ -314,10 +300,7 @@ class InertialTracker(FeatureTracker):
         self._filter.remember(number, self._seen(new, self._map.pixels[new], read, _PLACED))
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
-        """Return a lost result; after a while, start a new map.
-
-        The map starts at the IMU's pose while known, else in a new frame.
-        """
+        """Return a lost result; after a while, start a map at the IMU's pose or in a new frame."""
         result = self._lost(stamp, "too few landmarks of the map were found")
         waited = stamp - (self._lost_since or stamp)
         if waited < self._settings.reset_timeout * 1e9 and not self._is_doubted:
@@ -336,14 +319,12 @@ class InertialTracker(FeatureTracker):
         return self._is_known and self._now - self._seen_at <= self._inertial.carry
 
     def _camera_pose(self) -> Floats:
-        """Return the camera in the world, shape (4, 4)."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self._filter.state.rotation, self._filter.state.position
         found: Floats = pose @ self._filter.camera
         return found
 
     def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:
-        """Return the agreeing landmarks of a match."""
         rows, pixels = match.rows[match.agree], match.pixels[match.agree]
         read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
         return self._seen(rows, pixels, read, (1.0, 1.0))

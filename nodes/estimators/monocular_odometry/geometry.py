@@ -1,12 +1,9 @@
 """Geometry of several views: two-view motion, triangulation, and bundle adjustment.
 
-Besides, the corners of an image, stored key frames, and the settings of the method. Poses are world
-to camera, shape (4, 4); lengths are in the map's own unit.
-
-Bundle adjustment optimizes the poses of a few key frames and their landmarks together: Gauss-Newton
-on reprojection errors with Huber weights and a little damping; landmarks are eliminated by the
-Schur complement (B. Triggs et al., "Bundle adjustment: a modern synthesis", 2000, section 6.1).
-Dense, because a window of key frames is small.
+Poses are world to camera, shape (4, 4); lengths are in the map's own unit. Bundle adjustment:
+Gauss-Newton on reprojection errors with Huber weights and a little damping; landmarks are
+eliminated by the Schur complement (B. Triggs et al., "Bundle adjustment: a modern synthesis", 2000,
+section 6.1).
 """
 
 from __future__ import annotations
@@ -40,21 +37,18 @@ def adjust(
     noise: float,
     steps: int = 4,
 ) -> tuple[Floats, Floats, Floats]:
-    """Return poses and landmarks after bundle adjustment, and the remaining errors.
+    """Return poses and landmarks after bundle adjustment, and reprojection errors (pixels, (m,)).
 
     Args:
         poses: World to camera, shape (k, 4, 4).
         landmarks: Points in the world, shape (l, 3).
         frame: Index of the pose of each observation, shape (m,).
-        landmark: Index of its landmark, in ascending order, shape (m,): each has observations, at
-            most one in each frame.
+        landmark: Index of its landmark, ascending, shape (m,): each has observations, at most one
+            in each frame.
         pixels: Column and row of each observation, shape (m, 2).
         matrix: K, shape (3, 3).
-        fixed: Number of first poses that stay; two of them fix position, rotation and scale.
+        fixed: Number of first poses that stay; two fix position, rotation and scale.
         noise: Standard deviation of an observation, pixels.
-
-    Returns:
-        Poses, landmarks, and reprojection errors in pixels, shape (m,).
     """
     poses, landmarks = poses.copy(), landmarks.copy()
     free = len(poses) - fixed
@@ -112,15 +106,11 @@ def linearise(
     target: Floats,
     scale: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the residuals of all observations, and their derivatives.
+    """Return the residuals of all observations (see `adjust`), and their derivatives.
 
     Args:
-        poses: World to camera, shape (k, 4, 4).
-        landmarks: Points in the world, shape (l, 3).
-        frame: Index of the pose of each observation, shape (m,).
-        landmark: Index of its landmark, shape (m,).
         target: Each observation as a ray with z = 1, shape (m, 2).
-        scale: Standard deviations in a unit of that, shape (2,).
+        scale: Standard deviations in its unit, shape (2,).
 
     Returns:
         Residuals in standard deviations, shape (m, 2); their derivatives by a small motion of the
@@ -164,15 +154,12 @@ _EPIPOLAR = 1.0
 
 
 def triangulate(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
-    """Return the midpoints between pairs of rays where these are closest to each other.
+    """Return the midpoints (n, 3) between pairs of rays where closest; not finite if parallel.
 
     Args:
         second: Pose of the second camera.
         a: Rays in the first, shape (n, 3).
         b: Rays in the second, shape (n, 3).
-
-    Returns:
-        Points in the world, shape (n, 3); not finite where the rays are parallel.
     """
     centre_a, centre_b = centre(first), centre(second)
     u, v = a @ first[:3, :3], b @ second[:3, :3]
@@ -195,16 +182,7 @@ def parallax(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
 
 
 def reprojection_errors(pose: Floats, points: Floats, pixels: Floats, matrix: Floats) -> Floats:
-    """Return the distances between projected points and their observed pixels.
-
-    Args:
-        points: Points in the world, shape (n, 3).
-        pixels: Their observed pixels, shape (n, 2).
-        matrix: K, shape (3, 3).
-
-    Returns:
-        Pixels, shape (n,); ``inf`` behind the camera and for a point that is not finite.
-    """
+    """Return distances (n,) of points (n, 3) from pixels (n, 2); ``inf`` behind the camera."""
     seen = points @ pose[:3, :3].T + pose[:3, 3]
     ahead = seen[:, 2] > 1e-6
     z = np.where(ahead, seen[:, 2], 1.0)
@@ -219,20 +197,12 @@ def centre(pose: Floats) -> Floats:
 
 
 def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
-    """Return the possible motions between two views of the same corners.
+    """Return the second camera's possible poses, baseline 1, from corners (n, 2) in both views.
 
-    A homography (the corners lie on a plane; up to four motions: E. Malis and M. Vargas, "Deeper
-    understanding of the homography decomposition", INRIA 2007) and an essential matrix (they do
-    not: D. Nistér, "An efficient solution to the five-point relative pose problem", PAMI 2004) are
-    both fitted; which of all is right shows in further views.
-
-    Args:
-        first: Pixels in the first view, shape (n, 2).
-        second: Pixels in the second, shape (n, 2).
-        matrix: K, shape (3, 3).
-
-    Returns:
-        Poses of the second camera in the first's frame, with a baseline of 1.
+    A homography (corners on a plane; up to four motions: E. Malis and M. Vargas, "Deeper
+    understanding of the homography decomposition", INRIA 2007) and an essential matrix (D. Nistér,
+    "An efficient solution to the five-point relative pose problem", PAMI 2004) are both fitted;
+    further views tell the right one.
     """
     found: list[Floats] = []
     cv2.setRNGSeed(1)
@@ -261,7 +231,6 @@ class Keyframe(msgspec.Struct, frozen=True, eq=False):
     """An image and its landmarks.
 
     Attributes:
-        image: Grey.
         pose: World to camera, shape (4, 4).
         landmarks: Points in the world, shape (n, 3).
         pixels: Their pixels in the image, shape (n, 2).
@@ -281,16 +250,7 @@ _QUALITY = 0.005
 
 
 def new_corners(image: Grey, taken: Floats, count: int) -> Floats:
-    """Return up to `count` corners away from existing corners.
-
-    Args:
-        image: Grey.
-        taken: The other corners: column and row, shape (k, 2).
-        count: At least one.
-
-    Returns:
-        Column and row, shape (n, 2).
-    """
+    """Return up to `count` (at least one) new corners (n, 2) away from those taken (k, 2)."""
     mask = np.zeros_like(image)
     mask[BORDER:-BORDER, BORDER:-BORDER] = 255
     for column, row in np.rint(taken).astype(int).tolist():
@@ -303,19 +263,18 @@ class MonocularSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """Settings of the method.
 
     Attributes:
-        corners: Corners that are followed from a key frame.
+        corners: Corners followed from a key frame.
         window: Side of the neighbourhood that optical flow compares, pixels; odd.
         levels: Times that flow halves the image for large motions between two images.
         pixel_noise: Standard deviation of a followed corner, pixels.
-        keyframes: Key frames that are adjusted together.
-        keyframe_shift: A key frame is made, and initialization tried, at this median motion since
-            the last one, pixels,
-        keyframe_overlap: or when less than this share of the last one's corners, or of its
-            landmarks, is in view.
+        keyframes: Key frames adjusted together.
+        keyframe_shift: Median motion since the last key frame at which one is made, and
+            initialization tried, pixels,
+        keyframe_overlap: or share of its corners, or landmarks, in view below which one is made.
         min_parallax: Angle between two views of a corner from which its point is computed, degrees.
         min_inliers: Agreeing landmarks below which the camera is lost.
-        reset_timeout: Seconds for which a lost camera is only relocalized; then a new map is tried
-            as well, whose unit of length is a guess.
+        reset_timeout: Seconds of mere relocalization of a lost camera; then a new map, of a guessed
+            unit of length, is tried as well.
     """
 
     corners: Annotated[int, msgspec.Meta(ge=60, le=2000)] = 250

@@ -1,8 +1,4 @@
-"""The map: its initialization from two views, the last key frames, their corners and points.
-
-Corners are followed until two views show how the camera has moved. Poses between key frames are
-computed in `nodes.estimators.monocular_odometry.tracker`.
-"""
+"""The map: its initialization from two views, the last key frames, their corners and points."""
 
 from __future__ import annotations
 
@@ -47,11 +43,7 @@ class InitialMap(msgspec.Struct, frozen=True, eq=False):
 
 
 class Initialization:
-    """Follows corners from a first image until there is a map.
-
-    Args:
-        matrix: K, shape (3, 3).
-    """
+    """Follower of corners from a first image until there is a map."""
 
     def __init__(self, matrix: Floats, settings: MonocularSettings) -> None:
         self._matrix = matrix
@@ -64,8 +56,7 @@ class Initialization:
     def add(self, image: Grey) -> InitialMap | None:
         """Add the next image, grey; return a map once available.
 
-        It starts again with this image if too few corners are left, or if a long motion gave no
-        map, as rotation alone does not.
+        Starts again with this image if too few corners are left, or a long motion gave no map.
         """
         if self._first is None or self._before is None:
             self._restart(image)
@@ -231,12 +222,7 @@ class Tracks:
 
 
 class LocalMap:
-    """Key frames and landmarks; adding a key frame may remove the oldest.
-
-    Attributes:
-        image: Image of the newest key frame, grey.
-        tracks: The corners that are followed from it.
-    """
+    """Key frames and landmarks; adding a key frame may remove the oldest."""
 
     def __init__(
         self,
@@ -271,7 +257,6 @@ class LocalMap:
             image: The second of its images, grey.
             start: Pose of its first camera: camera to world, shape (4, 4).
             unit: Its unit of length in that of the world.
-            matrix: K, shape (3, 3).
         """
         second = found.second.copy()
         second[:3, 3] *= unit
@@ -330,9 +315,8 @@ class LocalMap:
         """Add an image as a key frame, and refine the map.
 
         Args:
-            image: Grey.
             pose: World to camera, shape (4, 4).
-            rows: Indices of the tracks that it shows, shape (n,), ascending.
+            rows: Indices of the visible tracks, shape (n,), ascending.
             pixels: Their pixels, shape (n, 2).
         """
         number = self.newest + 1
@@ -351,7 +335,6 @@ class LocalMap:
         self.tracks.add(new_corners(self.image, self.tracks.pixels, count), self.newest)
 
     def _triangulate(self) -> None:
-        """Triangulate corners with enough parallax by now."""
         tracks, pose = self.tracks, self.pose
         by_first: dict[int, list[int]] = {}
         for row in np.flatnonzero(~tracks.known).tolist():
@@ -368,7 +351,6 @@ class LocalMap:
             tracks.points[np.array(rows)[good]] = points[good]
 
     def _adjust(self) -> None:
-        """Adjust the last key frames and their landmarks."""
         window = self.keyframes[-self._settings.keyframes :]
         if len(window) < 3:
             return

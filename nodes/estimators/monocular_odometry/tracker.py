@@ -1,10 +1,9 @@
 """Monocular odometry on corners, and its node: poses from landmarks, landmarks from poses.
 
 In the manner of sparse, semi-direct methods (C. Forster, M. Pizzoli and D. Scaramuzza, "SVO", ICRA
-2014): patches are aligned with the last key frame directly, poses come from the landmarks behind
-them, and new landmarks from two views far enough apart; the last key frames and their landmarks are
-then adjusted together. The unit of length is the first map's. Maps are made in
-`nodes.estimators.monocular_odometry.local_map`.
+2014): patches are aligned with the last key frame directly, poses come from their landmarks, new
+landmarks from two views far enough apart; the last key frames and landmarks are adjusted together.
+The unit of length is the first map's.
 """
 
 from __future__ import annotations
@@ -54,10 +53,7 @@ _ORB_POINTS = 1000
 
 
 class MonocularTracker:
-    """Tracks a single camera. Equal images give equal poses, to the bit.
-
-    Args:
-        info: Intrinsics of the images, which must be free of distortion.
+    """Tracker of a single camera without distortion; equal images give equal poses, to the bit.
 
     Raises:
         ValueError: The images are distorted.
@@ -81,7 +77,7 @@ class MonocularTracker:
         """Return the pose of the next image; `None` before there is a map.
 
         Args:
-            stamp: Stamp of the exposure (ns).
+            stamp: Of the exposure (ns).
             image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
 
         Raises:
@@ -125,8 +121,7 @@ class MonocularTracker:
     def _initialize(self, grey: Grey) -> TrackingResult | None:
         """Add an image to the initialization; return its pose if there is a map now.
 
-        The first map is the world. Any other is put where the last one ended and given its median
-        depth, for want of anything better.
+        The first map is the world; others are put where the last one ended, with its median depth.
         """
         if self._initialization is None:
             self._initialization = Initialization(self._matrix, self._settings)

@@ -48,12 +48,11 @@ class OrbSlam3Config(EstimatorConfig):
     """Settings of ORB-SLAM3.
 
     Attributes:
-        mode: The sensors that are used.
-        vocabulary: File in DBoW2's text format; if empty, the one that
-            ``python -m runtime vocabulary CONFIG`` has made.
+        mode: The sensors used.
+        vocabulary: File in DBoW2's text format; if empty, that of ``python -m runtime vocabulary
+            CONFIG``.
         orb: ORB-SLAM3's own settings.
-        mapping_timeout: Time that its other threads may compute after each image, at most, before
-            the next; not counted while other programs have the processors.
+        mapping_timeout: Processor time of its other threads after each image, at most.
     """
 
     mode: Mode = "rgbd"
@@ -63,7 +62,7 @@ class OrbSlam3Config(EstimatorConfig):
 
 
 class OrbSlam3(Estimator[OrbSlam3Config]):
-    """Estimates the pose of a camera by ORB-SLAM3, in a process of its own.
+    """Estimator of a camera's pose by ORB-SLAM3, in a process of its own.
 
     Because of its threads the results vary from run to run, and so does the digest.
     """

@@ -47,18 +47,16 @@ class KeyFrame(NamedTuple):
 
 
 class Anchor:
-    """Takes poses from ORB-SLAM3's worlds to the frame of the very first key frame.
+    """Converter of poses from ORB-SLAM3's worlds to the frame of the very first key frame.
 
-    ORB-SLAM3's world is that of its present map: when it has been lost for long it starts another
-    one at identity, when it recognizes a place it merges the two, and when the IMU's scale and
-    gravity become known it turns the world upright. What stays is the map's first key frame, whose
-    present pose is read whenever the world may have changed.
-
-    A map that starts after tracking was lost is put at the last known pose of the camera, since
-    nothing better is known: so the motion in between is missing, until the maps are merged.
+    ORB-SLAM3's world is that of its present map: after a long loss it starts another one at
+    identity, at a known place it merges the two, and with the IMU's scale and gravity it turns the
+    world upright. The map's first key frame stays; its present pose is read whenever the world may
+    have changed. A map after a loss is put at the camera's last known pose: the motion in between
+    is missing until a merge.
 
     Attributes:
-        last: The last pose that was known; identity before the first.
+        last: The last known pose; identity before the first.
     """
 
     def __init__(self) -> None:
@@ -79,11 +77,7 @@ class Anchor:
         return list(self._first).index(self._map) if self._first else 0
 
     def world_may_have_changed(self, first: KeyFrame, pose: Floats) -> None:
-        """Note the first key frame of the camera's present map.
-
-        Args:
-            pose: The camera now in the same world, shape (4, 4).
-        """
+        """Note the present map's first key frame; `pose` is the camera in that map, (4, 4)."""
         known = first.stamp in self._first
         if not known:
             begin = np.linalg.inv(pose) @ first.pose  # first key frame in the camera now
@@ -97,7 +91,6 @@ class Anchor:
             self._from_world, self._map = from_world, first.stamp
 
     def _jump(self, from_world: Floats, pose: Floats) -> float:
-        """Return the distance of a pose from the last pose."""
         return float(np.linalg.norm((from_world @ pose)[:3, 3] - self.last[:3, 3]))
 
     def first(self, stamp: float) -> tuple[int, Floats] | None:
@@ -131,24 +124,21 @@ INSTALL = (
 """Installation of ORB-SLAM3 with its vocabulary; `make` serves in a checkout."""
 
 _REACH = 6.0
-"""Largest distance of a projected map point from its corner, pixels.
-
-A corner high in the pyramid is known to a few pixels only.
-"""
+"""Largest distance of a projected map point from its corner, pixels."""
 
 
 class OrbSlam3Result(TrackingResult, frozen=True, eq=False):
     """Result of ORB-SLAM3 for an image.
 
-    The pose is in the optical camera at the first key frame; the points are all corners, without
-    distortion, and the inliers those that agree with the map.
+    The pose is in the optical camera at the first key frame; points are all undistorted corners,
+    inliers those that agree with the map.
 
     Attributes:
-        state: ORB-SLAM3's own word (OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …), or RESET when
-            it has just discarded its map.
-        matches: Number of map points that were found in the image.
+        state: ORB-SLAM3's own word (OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …), or RESET for a
+            map just discarded.
+        matches: Number of map points found.
         first_keyframe: Stamp of the first key frame (ns); -1 before there is one.
-        maps: Number of maps so far. The motion between two is guessed: see `Anchor`.
+        maps: Number of maps so far; see `Anchor`.
     """
 
     state: str = ""
@@ -163,10 +153,8 @@ class OrbSlam3Process:
     Args:
         settings: Mode, settings file, size of images.
         vocabulary: In DBoW2's text format, its name ending with ``.txt``.
-        mapping_time: Seconds of computing that `track` leaves to the other threads, at most, after
-            each image; less if they have nothing to do. Without any, images that come faster than
-            a camera takes them make the map poorer, and without depth it is lost sooner. Real time
-            is not counted, lest a busy machine make the map poorer.
+        mapping_time: Processor seconds that `track` leaves to the other threads, at most, after
+            each image. Without any, images faster than real time make the map poorer.
 
     Raises:
         MissingDependencyError: `pyorbslam3` cannot be imported.
@@ -206,14 +194,14 @@ class OrbSlam3Process:
         """Return the pose of the next image.
 
         Args:
-            stamp: Stamp of the exposure (ns); later than the last one.
+            stamp: Of the exposure (ns), rising.
             image: Shape (h, w, 3) red, green, blue, or (h, w) grey; of a stereo rig the left one.
-            depth: Metres along the optical axis, shape (h, w); ``inf`` where there is none. For
-                modes with depth only.
+            depth: Metres along the optical axis, shape (h, w); ``inf`` for none. For modes with
+                depth only.
             right: The right image, for stereo modes only.
-            imu: For inertial modes: the measurements since the last call, in order, shape (n, 7):
-                stamp (ns), angular velocity (rad/s), specific force (m/s²). Later ones than the
-                image wait for the next.
+            imu: For inertial modes: measurements since the last call, shape (n, 7): stamp (ns),
+                angular velocity (rad/s), specific force (m/s²). Those after the image wait for the
+                next.
 
         Raises:
             ValueError: An array is missing, superfluous, or of the wrong shape.
@@ -238,13 +226,11 @@ class OrbSlam3Process:
         return found
 
     def trajectory(self) -> tuple[npt.NDArray[np.int64], Floats, int]:
-        """End ORB-SLAM3's threads; return the poses after all corrections.
-
-        They are those of the images that were tracked in its largest map.
+        """End ORB-SLAM3's threads; return the poses of its largest map after all corrections.
 
         Returns:
-            Stamps of images as given to `track`, strictly rising, shape (n,), the optical camera in
-            the frame of `track`'s poses, shape (n, 4, 4), and the number of that map.
+            Stamps as given to `track`, strictly rising, shape (n,), the optical camera in the frame
+            of `track`'s poses, shape (n, 4, 4), and the number of that map.
         """
         _wait_for_other_threads(self._left_alone + _LAST)
         self._slam.shutdown()
@@ -363,7 +349,7 @@ def check_arrays(
 def _wait_for_other_threads(until: float) -> None:
     """Return when the other threads have nothing to do, or at an amount of `time.process_time`.
 
-    They look for work every 3 and 5 ms, and do not say when they have none.
+    They poll for work every 3 and 5 ms.
     """
     quiet, naps = 0, _naps()
     while quiet < 3 and time.process_time() < until:

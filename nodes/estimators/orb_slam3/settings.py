@@ -1,9 +1,8 @@
 """ORB-SLAM3's settings, made from the announcements of cameras and IMUs.
 
-They are in the older of the two forms that ORB-SLAM3 1.0 reads (the parsers of its
-``Tracking.cc``): only this one has a parameter with which RGB-D with an IMU initializes without a
-quick motion. Every required parameter is given, since it ends the process if one is missing;
-the file is the template ``settings.yaml.jinja``.
+In the older of the two forms of ORB-SLAM3 1.0 (the parsers of its ``Tracking.cc``): only this one
+lets RGB-D with an IMU initialize without a quick motion. A missing parameter would end the process.
+The template is ``settings.yaml.jinja``.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ LENSES: dict[str, frozenset[str]] = {
 }
 """Distortion models supported by ORB-SLAM3, by the mode without IMU.
 
-With depth it takes key points for those of a pinhole unless they have plumb_bob's distortion
-(``Frame::UndistortKeyPoints`` and ``Frame::UnprojectStereo``). Of a stereo pair it looks for a
-point's partner in the same row before it removes any distortion (``Frame::ComputeStereoMatches``).
+With depth, key points are pinhole's or plumb_bob's (``Frame::UndistortKeyPoints``,
+``Frame::UnprojectStereo``). Stereo partners are looked for in the same row of distorted images
+(``Frame::ComputeStereoMatches``).
 """
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -44,18 +43,17 @@ class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """ORB-SLAM3's own settings, besides the calibration.
 
     Attributes:
-        features: Corners looked for in an image. With depth, it initializes with the first image in
-            which it finds more than 500.
+        features: Corners looked for in an image. With depth, the first image with more than 500
+            initializes.
         scale_factor: Factor between two levels of the image pyramid.
         levels: Levels of the image pyramid.
         fast_threshold: Grey levels by which a corner differs from its surroundings.
         min_fast_threshold: The same, for regions without corners by `fast_threshold`.
-        baseline: Distance of two cameras, in metres, which ORB-SLAM3 assumes for an RGB-D camera.
-            It gives the weight of depth: the variance of its error is ``(z² / (baseline fx))²``
-            square metres per square pixel. That of a stereo rig is known.
-        close_depth: Depth in metres up to which a point is put into the map from its depth at once;
-            a farther one when it has been seen from two sides. Any measured depth is used.
-        loop_closing: Whether places seen before correct the map.
+        baseline: Metres between two cameras, assumed for an RGB-D camera. It weighs depth: the
+            variance is ``(z² / (baseline fx))²`` square metres per square pixel.
+        close_depth: Depth in metres up to which a point enters the map at once; a farther one after
+            two views.
+        loop_closing: Whether known places correct the map.
     """
 
     features: Annotated[int, msgspec.Meta(ge=100, le=10_000)] = 1000
@@ -72,10 +70,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """Start-up settings of an ORB-SLAM3 process.
 
     Attributes:
-        mode: The sensors that are used.
+        mode: The sensors used.
         text: The settings file, as YAML.
-        width: Width of the images, pixels.
-        height: Height of the images, pixels.
         intrinsics: fx, fy, cx, cy, in pixels.
         camera_on_imu: The (left) camera in the IMU's frame, shape (4, 4); identity without an IMU.
     """
@@ -98,7 +94,6 @@ def make_settings(
 
     Args:
         cameras: The camera, or the left and the right one of a rectified stereo rig.
-        orb: ORB-SLAM3's own settings.
 
     Raises:
         ValueError: The IMU is not on the body that carries the camera.
@@ -131,7 +126,6 @@ def make_settings(
 
 
 def _distortion(info: CameraInfo) -> dict[str, float]:
-    """Return a lens's coefficients by ORB-SLAM3's names."""
     if info.distortion_model == "equidistant":
         return dict(zip(("k1", "k2", "k3", "k4"), info.distortion, strict=True))
     k1, k2, p1, p2, k3 = info.distortion[:5]
@@ -141,16 +135,11 @@ def _distortion(info: CameraInfo) -> dict[str, float]:
 
 
 def _pose(sensor: CameraAnnouncement | ImuAnnouncement) -> npt.NDArray[np.float64]:
-    """Return a sensor's pose on its body, shape (4, 4)."""
     return pose_matrix(sensor.position, sensor.orientation)
 
 
 def _on_imu(camera: CameraAnnouncement, imu: ImuAnnouncement) -> npt.NDArray[np.float64]:
-    """Return the camera in the IMU's frame, shape (4, 4).
-
-    Raises:
-        ValueError: They are not on the same body.
-    """
+    """Return the camera in the IMU's frame, shape (4, 4)."""
     if imu.parent_frame_id != camera.parent_frame_id:
         raise ValueError(
             f"expected an IMU on {camera.parent_frame_id}, on which {camera.source} is mounted, "

@@ -1,9 +1,4 @@
-"""Training of ORB-SLAM3's vocabulary from a run's images, by a node; written at the end.
-
-``python -m runtime vocabulary CONFIG`` runs it in place of the ORB-SLAM3 nodes of a file.
-
-The command ``vocabulary``: what ORB-SLAM3 recognises places with, made from a file's images.
-"""
+"""``vocabulary``: training of ORB-SLAM3's vocabulary from a run's images, by a node."""
 
 from __future__ import annotations
 
@@ -32,7 +27,7 @@ class VocabularyTrainerConfig(NodeConfig):
 
     Attributes:
         path: File to write; if empty, the one that ORB-SLAM3 nodes read by default.
-        image_interval: One of this many images of each camera is used.
+        image_interval: Uses one of this many images of each camera.
         features: Corners described in an image, at most.
         shape: Shape of the vocabulary's tree.
     """
@@ -77,12 +72,7 @@ class VocabularyTrainer(Node[VocabularyTrainerConfig]):
 
 
 def describe(image: Bytes, features: int) -> Bytes:
-    """Return the ORB descriptors of an image's corners, uint8 (n, 32).
-
-    Args:
-        image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
-        features: Number of corners, at most.
-    """
+    """Return the ORB descriptors, uint8 (n, 32), of up to `features` corners of an image."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     # 7 grey levels: what ORB-SLAM3 goes down to where there is little to see.
     orb = cv2.ORB.create(nfeatures=features, fastThreshold=7)
@@ -105,9 +95,8 @@ def vocabulary(
 ) -> None:
     """Train ORB-SLAM3's vocabulary from the images of a file's cameras.
 
-    Runs the file without its ORB-SLAM3 nodes and without a folder of results; once done, the
-    file's ORB-SLAM3 nodes find the vocabulary by themselves. One made from one world serves in
-    others, and best in its own.
+    Runs the file without its ORB-SLAM3 nodes and results; these nodes then find the vocabulary by
+    themselves. It serves best in its own world.
     """
     import msgspec
     from rich.console import Console

@@ -1,10 +1,10 @@
 """ORB-SLAM3's bag of visual words for place recognition: training, and file format.
 
-A tree of binary descriptors, made by k-majority (Grana et al., *A fast approach for integrating
-ORB descriptors in the bag of words model*, 2013): k-means with Hamming distance, where a centre's
-bit is what most of its members have. The file is DBoW2's text format, as in ORB-SLAM3's own
-``ORBvoc.txt``: a line ``k L scoring weighting``, then one line a node after its parent's line,
-``parent leaf d0 … d31 weight``, the root not being written.
+A tree of binary descriptors, made by k-majority (Grana et al., *A fast approach for integrating ORB
+descriptors in the bag of words model*, 2013): k-means with Hamming distance and majority bits. The
+file is DBoW2's text format, as in ORB-SLAM3's own ``ORBvoc.txt``: a line ``k L scoring weighting``,
+then one line a node after its parent's line, ``parent leaf d0 … d31 weight``, the root not being
+written.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         branching: Children of a node, at most.
         depth: Levels below the root, at most: up to ``branching ** depth`` words.
-        index_level: Level of the nodes by which ORB-SLAM3 sorts features before it compares them
-            one by one; 0 compares all with all. A higher one is quicker and gives fewer matches.
+        index_level: Level of the nodes by which ORB-SLAM3 sorts features before comparing; 0
+            compares all with all, a higher one is quicker and gives fewer matches.
         seed: Seed of the choice of the first centres.
     """
 
@@ -54,11 +54,7 @@ class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
 
     def header_depth(self) -> int:
-        """Return L as stated in the file.
-
-        ORB-SLAM3 takes the nodes four levels above L for its index (``transform(…, 4)``), however
-        deep the tree is.
-        """
+        """L of the file: ORB-SLAM3's index is four levels above it (``transform(…, 4)``)."""
         return max(self.index_level + 4, self.depth)
 
 
@@ -86,8 +82,7 @@ def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary
     """Make a vocabulary from the descriptors of images.
 
     Args:
-        images: uint8 (n, 32) each: the descriptors of one image.
-        shape: Shape of the tree.
+        images: The descriptors of each, uint8 (n, 32).
 
     Raises:
         ValueError: There are no descriptors, or they are not of ORB's size.
@@ -126,11 +121,7 @@ def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary
 
 
 def _grow(descriptors: Bytes, shape: TreeShape) -> tuple[Integers, Bytes, Integers]:
-    """Split all descriptors repeatedly, level by level of the tree.
-
-    Returns:
-        Parents (n,), centres (n, 32), and each descriptor's leaf.
-    """
+    """Split descriptors level by level; return parents (n,), centres (n, 32) and leaves."""
     rng = np.random.default_rng(shape.seed)
     parents, centres = [-1], [np.zeros(_BYTES, np.uint8)]
     leaf_of = np.zeros(len(descriptors), np.int64)
@@ -152,11 +143,7 @@ def _grow(descriptors: Bytes, shape: TreeShape) -> tuple[Integers, Bytes, Intege
 
 
 def _split(descriptors: Bytes, k: int, rng: np.random.Generator) -> tuple[Bytes, Integers]:
-    """Split descriptors into at most k clusters.
-
-    Returns:
-        Centres (n, 32), and the cluster of each descriptor.
-    """
+    """Split descriptors into at most k clusters; return centres (n, 32) and memberships."""
     # k-means++ (Arthur & Vassilvitskii 2007).
     centres = descriptors[rng.integers(len(descriptors), size=1)]
     nearest = _distances(descriptors, centres)[:, 0]
@@ -186,10 +173,7 @@ def _distances(descriptors: Bytes, centres: Bytes) -> Integers:
 
 
 def cached_vocabulary(shape: TreeShape) -> Path:
-    """Return the path of the cached vocabulary of this shape, existing or not.
-
-    It is below ``$XDG_CACHE_HOME``, or ``~/.cache``.
-    """
+    """Return the path of this shape's vocabulary, below ``$XDG_CACHE_HOME`` or ``~/.cache``."""
     base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
     key = hashlib.sha256(msgspec.json.encode(shape)).hexdigest()[:12]
     return base / "visnav-runtime" / f"orb-vocabulary-{key}.txt"
@@ -226,12 +210,7 @@ def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def check_vocabulary(path: Path) -> tuple[int, int]:
-    """Check quickly whether a file can be a vocabulary.
-
-    ORB-SLAM3 ends its process, or reads nonsense, if it is not.
-
-    Returns:
-        Branching and depth.
+    """Check quickly whether ORB-SLAM3 can read a file, fatal to it otherwise; return k and L.
 
     Raises:
         ValueError: It is missing, or its beginning is not in DBoW2's text format.

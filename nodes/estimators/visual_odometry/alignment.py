@@ -1,13 +1,10 @@
 """Alignment of an image with a reference image by brightness at edges and by depth.
 
-Corners need texture; a plain room has but few, most of them at the outlines of things, where depth
-is torn. Here any pixel with a gradient is compared (J. Engel, V. Koltun and D. Cremers, "Direct
-Sparse Odometry", IEEE T-PAMI 2018, with gain and offset of the brightness), and beside it the
-distances of surfaces (point-to-plane: Y. Chen and G. Medioni, "Object modeling by registration of
-multiple range images", ICRA 1991). Distances are compared as inverse depth, in which a plane is
-affine, and a triangulating sensor has the same noise everywhere.
-
-The pose at which it starts is that expected from the motion of the images before (`Motion`).
+Where corners are few, any pixel with a gradient is compared (J. Engel, V. Koltun and D. Cremers,
+"Direct Sparse Odometry", IEEE T-PAMI 2018, with gain and offset of the brightness), and distances
+of surfaces (point-to-plane: Y. Chen and G. Medioni, "Object modeling by registration of multiple
+range images", ICRA 1991). Distances are inverse depths: planes are affine in them, and a
+triangulating sensor's noise is uniform.
 """
 
 from __future__ import annotations
@@ -73,8 +70,8 @@ class View(msgspec.Struct, frozen=True, eq=False):
 
     Attributes:
         greys: Grey float32 images, each half as large as the one before.
-        inverse_of: Inverse depth, as `inverse_depth` gives it, shape (h, w).
-        smooth: The same, the mean of more pixels.
+        inverse_of: As of `inverse_depth`, shape (h, w).
+        smooth: The same, a mean of more pixels.
     """
 
     greys: tuple[Depth, ...]
@@ -96,9 +93,9 @@ class Reference(msgspec.Struct, frozen=True, eq=False):
     Attributes:
         pose: World to camera, shape (4, 4).
         edges: Points at edges of brightness, in the camera, metres, shape (3, n).
-        brightness: Theirs, for each size of image, shape (levels, n).
+        brightness: Theirs, by size of image, shape (levels, n).
         surfaces: Points of surfaces, in the camera, metres, shape (3, m).
-        planes: Their planes: vectors p with p · x = 1 for all points x of it, shape (3, m).
+        planes: Their planes: vectors p with p · x = 1 for all points x, shape (3, m).
     """
 
     pose: Floats
@@ -112,7 +109,6 @@ class Reference(msgspec.Struct, frozen=True, eq=False):
         """Return the points of a view.
 
         Args:
-            view: The view.
             pose: World to camera, shape (4, 4).
             matrix: K, shape (3, 3).
             noise: Standard deviation of inverse depth, 1/m.
@@ -141,13 +137,12 @@ class Alignment(NamedTuple):
     Attributes:
         pose: World to camera, shape (4, 4).
         reference: The same of the reference.
-        information: Inverse covariance of the pose's error, a small motion of the camera's frame:
-            translation, rotation, shape (6, 6); of the image alone, without what was expected.
-        share: Share of the reference's points that are in the image and agree.
-        sharp: Share of the edges in view whose brightness agrees, to the noise and a part of a
-            pixel; 1 if there are too few to tell.
-        pixels: Of the reference's points that are in the image, shape (n, 2).
-        agree: Which of them agree, shape (n,).
+        information: Inverse covariance of a small motion of the camera's frame (translation,
+            rotation) by the image alone, shape (6, 6).
+        share: Share of the reference's points in the image that agree.
+        sharp: Share of visible edges with agreeing brightness; 1 if too few.
+        pixels: Of the reference's points in the image, shape (n, 2).
+        agree: Mask of those that agree, shape (n,).
     """
 
     pose: Floats
@@ -187,8 +182,6 @@ def align(
     """Return the alignment of an image with a reference.
 
     Args:
-        reference: The reference.
-        view: The image.
         start: Expected pose, world to camera, shape (4, 4).
         matrix: K, shape (3, 3).
         noise: Standard deviation of inverse depth at a point, 1/m.
@@ -298,7 +291,6 @@ def _huber(errors: Floats) -> Floats:
 def _brightness(
     reference: Reference, view: View, level: int, pose: Floats, brightness: Floats, matrix: Floats
 ) -> _Residuals:
-    """Return the differences of brightness at edges."""
     image, pixels = _project(reference.edges, pose, matrix)
     good = np.flatnonzero(inside(pixels, view.inverse_of.shape, 2 * 2**level))
     image, pixels = image[:, good], pixels[good]

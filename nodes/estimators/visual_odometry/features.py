@@ -1,13 +1,9 @@
 """RGB-D odometry on corners: patches of key frames are found again, and placed by their depth.
 
-A few corners, followed from the previous image, give an approximate pose. Then landmarks of all
-stored key frames are looked for as they should look from there, each by its patch in the key frame
-in which it was first seen: so the error grows with new landmarks and not with images, and not at
-all where the camera returns soon enough. A landmark's depth is the mean of all readings.
-
-Where that finds few landmarks, edges and surfaces are aligned with those of an earlier image, and
-the landmarks refine the pose. The parts are in `keyframes`, `landmarks`, `patches`, `surfaces`,
-`alignment`, `references`, `motion`, and in `nodes.estimators.odometry`.
+A few corners, followed from the previous image, give an approximate pose. Landmarks of all stored
+key frames are then searched, each by its patch in its first key frame: error grows with new
+landmarks and not with images. A landmark's depth is the mean of all readings. Where few landmarks
+are found, edges and surfaces are aligned with an earlier image, too.
 """
 
 from __future__ import annotations
@@ -64,15 +60,9 @@ _AGREES = 4.0
 _FEW = 120
 """Number of corners sufficient for an approximate pose, at most."""
 _ENOUGH = 60 / 512**2
-"""Agreeing landmarks per pixel sufficient for a pose: smaller images have fewer.
-
-With less than that, edges and surfaces are aligned, too.
-"""
+"""Agreeing landmarks per pixel sufficient for a pose; else edges and surfaces are aligned."""
 BELIEVED = 0.03
-"""Weight of an alignment's information beside landmarks.
-
-Errors of neighbouring pixels are not independent, and some pixels may be on moving things.
-"""
+"""Weight of an alignment beside landmarks: neighbouring pixels' errors are not independent."""
 _FEWEST = 4
 """Least number of agreeing landmarks beside an alignment."""
 _SEARCHED = 20
@@ -86,18 +76,13 @@ _NEAR = 64.0
 _SOON = 8
 """Images between updates of the list of such landmarks."""
 _READING = 0.5
-"""Noise of a depth reading, relative to a single pixel's.
-
-A reading is the mean of many pixels, but not of an exact plane.
-"""
+"""Noise of a depth reading, a mean of many pixels, relative to a single pixel's."""
 
 
 class FeatureTracker:
-    """Tracks an RGB-D camera. Equal images give equal poses, to the bit.
+    """Tracker of an RGB-D camera without distortion; equal images give equal poses, to the bit.
 
     Args:
-        info: Intrinsics of the images, which must be free of distortion.
-        settings: Settings of the method.
         surfaces: Reads depth at pixels, as `surfaces_at` does.
     """
 
@@ -194,7 +179,6 @@ class FeatureTracker:
         alignment: Alignment,
         match: MapMatch | None,  # noqa: ARG002
     ) -> MapMatch | None:
-        """Return the match of an aligned image, beside a match of few landmarks."""
         believed = BELIEVED * alignment.information
         found = self._find(grey, inverse_of, alignment.pose, believed)
         return found or MapMatch.without_landmarks(alignment.pose)
@@ -231,8 +215,7 @@ class FeatureTracker:
     def _expect(self, grey: Grey) -> Floats | None:
         """Return the approximate pose, by following a few corners from the previous image.
 
-        Coarse to fine, and without a guess: where texture repeats, a guess that is off by half a
-        brick would find the next brick.
+        Coarse to fine, without a guess, which could follow a repeated texture.
         """
         image, rows, pixels = self._before
         if len(rows) < self._settings.min_inliers:
@@ -281,10 +264,7 @@ class FeatureTracker:
         expected: Floats,
         information: Floats | None = None,
     ) -> MapMatch | None:
-        """Find the map in an image taken near an expected pose.
-
-        If that pose comes with its information, as an alignment gives it, few landmarks suffice.
-        """
+        """Find the map near an expected pose; given its information, few landmarks suffice."""
         settings, landmarks = self._settings, self._map
         least = settings.min_inliers if information is None else _FEWEST
         size = self._info.width, self._info.height
@@ -353,7 +333,6 @@ class FeatureTracker:
         return self._is_far_from(last.pose, float(np.median(z)))
 
     def _is_far_from(self, other: Floats, depth: float) -> bool:
-        """Return whether the camera has turned much, or moved much for things at a depth."""
         settings, between = self._settings, self._pose @ inverse(other)
         angle = math.acos(min(max((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0), 1.0))
         shift = self._info.fx * float(np.linalg.norm(between[:3, 3]) / depth)
@@ -425,10 +404,7 @@ class FeatureTracker:
         return False
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
-        """Return a lost result; after a while, start a new map.
-
-        Its start is known from the images meanwhile, or guessed from the last motion.
-        """
+        """Return a lost result; after a while, start a new map at the carried or guessed pose."""
         result = self._lost(stamp, "too few landmarks of the map were found")
         assert self._lost_since is not None
         carried = self._pose

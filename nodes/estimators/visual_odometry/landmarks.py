@@ -1,9 +1,7 @@
 """The map: key frames, and landmarks with the depth in their first key frame.
 
-Rows are in the order of age, so that forgetting the oldest key frame is cutting off the front. A
-lost camera is relocalized by key frames. Landmarks are corners, the best of each square of the
-image that has none yet: J. Shi and C. Tomasi, "Good Features to Track", CVPR 1994: where the
-smaller eigenvalue of the structure tensor is large, a patch cannot slide unnoticed.
+Rows are in the order of age. Landmarks are corners, the best of each empty square of the image: J.
+Shi and C. Tomasi, "Good Features to Track", CVPR 1994.
 """
 
 from __future__ import annotations
@@ -43,8 +41,8 @@ class Landmarks:
 
     Attributes:
         places: Metres in the world, shape (n, 3).
-        keyframes: Number of the key frame each was first seen in, ascending, shape (n,).
-        pixels: Its pixels there, shape (n, 2).
+        keyframes: Number of each's first key frame, ascending, shape (n,).
+        pixels: Pixels there, shape (n, 2).
     """
 
     _COLUMNS = (
@@ -83,7 +81,6 @@ class Landmarks:
         Args:
             number: Number of the key frame, not less than any before.
             pose: World to camera, shape (4, 4).
-            pixels: Their pixels there, shape (n, 2).
             seen: Their surfaces, all continuous.
         """
         back, count, before = inverse(pose), len(pixels), len(self)
@@ -121,7 +118,6 @@ class Landmarks:
             pose: World to camera, shape (4, 4).
             size: Width and height.
             margin: Pixels; below zero for those well inside.
-            rows: Rows of the landmarks.
         """
         pixels, z = self.project(pose, rows)
         inside = (pixels > -margin).all(axis=1) & (pixels < np.array(size) - 1 + margin).all(axis=1)
@@ -140,8 +136,7 @@ class Landmarks:
 
         Args:
             pose: World to camera, shape (4, 4).
-            inverse_depth: As `surfaces.inverse_depth` gives it, shape (h, w).
-            rows: Rows of the landmarks.
+            inverse_depth: As of `surfaces.inverse_depth`, shape (h, w).
             noise: Standard deviation of a reading, 1/m.
         """
         pixels, z = self.project(pose, rows)
@@ -155,9 +150,9 @@ class Landmarks:
         return np.asarray(rows[self._inactive_until[rows] <= now])
 
     def patches(self, pose: Floats, rows: Rows) -> tuple[Rows, Patches]:
-        """Return the patches to look for, and the rows whose look has not changed too much.
+        """Return the rows whose view has not changed too much, and their patches.
 
-        The warp is the derivative, at the landmark, of the homography that its plane induces.
+        Warps are derivatives, at the landmark, of its plane's homography.
         """
         fx, fy, *_ = intrinsics(self._matrix)
         expected, z = self.project(pose, rows)
@@ -182,10 +177,7 @@ class Landmarks:
         return rows, Patches(self.keyframes[rows], self.pixels[rows], expected[good], warps[good])
 
     def update_found(self, now: int, found: Rows, missed: Rows) -> None:
-        """Record found landmarks; missed landmarks are left out for a while.
-
-        That is the longer, the more often they were missed in a row.
-        """
+        """Record found landmarks; repeatedly missed ones are left out the longer."""
         self._missed[found] = 0
         self._missed[missed] += 1
         self._inactive_until[missed] = now + 1 + self._missed[missed] ** 2
@@ -195,8 +187,6 @@ class Landmarks:
 
         Args:
             pose: World to camera, shape (4, 4).
-            rows: Landmarks seen.
-            read: Their surfaces in this image.
             noise: Standard deviation of a reading, 1/m.
         """
         _, z = self.project(pose, rows)
@@ -225,8 +215,7 @@ class MapMatch(msgspec.Struct, frozen=True, eq=False):
         pose: World to camera, shape (4, 4).
         rows: Landmarks found, shape (n,).
         pixels: Their pixels, shape (n, 2).
-        agree: Which of them agree with the pose, shape (n,).
-        missed: Landmarks looked for and not found.
+        agree: Mask of those that agree with the pose, shape (n,).
     """
 
     pose: Floats
@@ -252,12 +241,7 @@ ORB_POINTS = 500
 
 
 class Keyframe(msgspec.Struct, frozen=True, eq=False):
-    """Image with the first sight of some landmarks.
-
-    Attributes:
-        image: Grey.
-        pose: World to camera, shape (4, 4).
-    """
+    """Grey image, and pose (world to camera, shape (4, 4)), of some landmarks' first sight."""
 
     image: Grey
     pose: Floats
@@ -267,8 +251,7 @@ class Described:
     """A key frame's points for relocalization, described when a lost camera first asks for them.
 
     Args:
-        frame: The key frame.
-        inverse_of: Its inverse depth, as `inverse_depth` gives it; released once described.
+        inverse_of: As of `inverse_depth`; released once described.
         matrix: K, shape (3, 3).
         noise: Standard deviation of inverse depth, 1/m.
     """
@@ -309,7 +292,6 @@ def find_corners(image: Grey, spacing: int, taken: Floats) -> Floats:
     """Return corners in empty squares, as whole pixels (column, row), shape (n, 2).
 
     Args:
-        image: Grey, shape (h, w).
         spacing: Side of a square, pixels.
         taken: Other corners, column and row, shape (m, 2).
     """

@@ -1,11 +1,10 @@
 """RGB-D visual odometry node: its images, and its methods, feature-based and dense.
 
 The dense one is OpenCV's `cv2.Odometry` on all pixels: colour and depth, coarse to fine (F.
-Steinbrücker, J. Sturm and D. Cremers, "Real-time visual odometry from dense RGB-D images",
-ICCV Workshops 2011), with the point-to-plane distances of depth beside the differences of colour.
-It is an example of a method from a library. The library does not tell how sure it is of a motion,
-so where little is to be seen (a plain wall, a corridor) poses are wrong by percents of the way and
-are not said to be lost.
+Steinbrücker, J. Sturm and D. Cremers, "Real-time visual odometry from dense RGB-D images", ICCV
+Workshops 2011), with the point-to-plane distances of depth beside the differences of colour. The
+library gives no certainty: before a plain wall poses are wrong by percents of the path and not
+lost.
 """
 
 from __future__ import annotations
@@ -35,12 +34,10 @@ class DenseSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Settings of the dense method.
 
     Attributes:
-        width: Pixels to which wider images are reduced. Much less than 250 is too little for the
-            library's four levels.
-        max_depth: Metres beyond which depth is not used. (The library takes an image with more
-            than 10 m in it for one in units of a five-thousandth of a metre.)
+        width: Pixels to which wider images are reduced, about 250 or more.
+        max_depth: Metres beyond which depth is not used; over 10 m the library misreads the unit.
         keyframe_interval: Images from one key frame to the next.
-        pixel_share: Share of the pixels that are compared, at most; time grows with it.
+        pixel_share: Largest share of compared pixels; time grows with it.
         max_depth_change: Metres by which a point's depth may change between key frame and image.
         reset_timeout: Seconds without a pose after which a new map starts at the last pose.
     """
@@ -54,11 +51,9 @@ class DenseSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class DenseTracker:
-    """Tracks an RGB-D camera from key frame to key frame. Equal images give equal poses.
+    """Tracker of an RGB-D camera without distortion, from key frame to key frame.
 
-    Args:
-        info: Intrinsics of the images, which must be free of distortion.
-        settings: Settings of the method.
+    Equal images give equal poses.
     """
 
     def __init__(self, info: CameraInfo, settings: DenseSettings | None = None) -> None:
@@ -115,7 +110,6 @@ class DenseTracker:
         return TrackingResult(pose, reason=reason, map=self._maps)
 
     def _make_keyframe(self, frame: Any) -> None:
-        """Make this the key frame."""
         self._keyframe, self._keyframe_pose, self._age = frame, self._pose, 0
 
     def _align(self, frame: Any, other: Any, pose: Floats) -> Floats | None:
@@ -151,7 +145,7 @@ class Tracker(Protocol):
         """Return the pose of the next image.
 
         Args:
-            stamp: Stamp of the exposure (ns).
+            stamp: Of the exposure (ns).
             image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
             depth: Metres along the optical axis, shape (h, w); ``inf`` where nothing was measured.
 
@@ -165,7 +159,7 @@ class VisualOdometryConfig(EstimatorConfig):
 
     Attributes:
         method: ``features``: corners, followed by optical flow, and their depth; ``dense``: every
-            pixel, by OpenCV's ``cv2.Odometry``, as an example: it does not know when it is wrong.
+            pixel, by OpenCV's ``cv2.Odometry``, an example that never knows itself lost.
         features: Settings of the method ``features``.
         dense: Settings of the method ``dense``.
     """

@@ -1,9 +1,8 @@
 """Search of an image for patches of key frames, each warped to the expected view.
 
-A patch is always compared with the key frame in which it was first seen, so that no error
-accumulates, and it is warped, so that neither distance nor slant shifts it.
-
-`References` are the images with which others are aligned where corners are few, and after a loss.
+Patches are compared with their first key frames, so no error accumulates, and warped, so neither
+distance nor slant shifts them. `References` are the images with which others are aligned where
+corners are few, and after a loss.
 """
 
 from __future__ import annotations
@@ -19,10 +18,7 @@ from nodes.estimators.odometry import Depth, Floats, Grey, follow_both_ways
 from nodes.estimators.visual_odometry.alignment import Alignment, Reference, View, align
 
 SAME = 0.5
-"""Least correlation of a patch with its counterpart.
-
-Flow finds noise wherever it begins, and so confirms any expected place.
-"""
+"""Least correlation of a patch with its counterpart; flow alone would confirm any place."""
 
 Rows = npt.NDArray[np.int64]
 
@@ -34,7 +30,7 @@ class Patches(msgspec.Struct, frozen=True, eq=False):
     """Patches to look for.
 
     Attributes:
-        source: Number of the image that each is cut from, shape (n,).
+        source: Number of each's image, shape (n,).
         pixels: Its centre there, column and row, shape (n, 2).
         expected: Its centre in the new image, shape (n, 2).
         warps: Pixels of the new image by pixels of the old one, shape (n, 2, 2).
@@ -62,9 +58,8 @@ def find_patches(
 
     Args:
         patches: At least one; expected `half_width` or more from the image's edge.
-        images: Those that they are cut from, by number.
-        image: Where to look.
-        window: Side of what is compared, pixels; odd, 7 or more.
+        images: Their sources, by number.
+        window: Side of the compared square, pixels; odd, 7 or more.
     """
     half = half_width(window)
     side = 2 * half + 1
@@ -145,7 +140,6 @@ class References:
     """Alignment of images with the last reference.
 
     Args:
-        matrix: K, shape (3, 3).
         noise: Standard deviation of one pixel's inverse depth, 1/m.
     """
 
@@ -157,12 +151,10 @@ class References:
         self._known: tuple[Grey, Depth, Floats] | None = None
 
     def note(self, grey: Grey, inverse_of: Depth, pose: Floats, aligned: bool) -> None:
-        """Remember an image of known pose, as a possible reference.
+        """Remember a grey image of known pose (world to camera), as a possible reference.
 
         Args:
-            grey: Grey image.
-            inverse_of: Inverse depth, as `inverse_depth` gives it.
-            pose: World to camera, shape (4, 4).
+            inverse_of: As of `inverse_depth`.
             aligned: Whether the present reference served, and shall be kept.
         """
         self._known, self._bridge = (grey, inverse_of, pose), None
@@ -177,8 +169,7 @@ class References:
         """Return the alignment of a view with the reference, or with the last known image.
 
         Args:
-            view: The view.
-            starts: Expected poses to begin with, world to camera, shape (4, 4) each.
+            starts: Expected initial poses, world to camera, shape (4, 4) each.
             lost: Whether these are guesses only.
         """
         found = None
@@ -199,10 +190,7 @@ class References:
         return max((found for found in tried if found), key=lambda f: f.sharp, default=None)
 
     def carry(self, view: View, expected: Floats) -> Floats:
-        """Return the pose of a view while tracking is lost.
-
-        It is found by alignment with the lost images before it, or else is as expected.
-        """
+        """Return a view's pose while lost, by alignment with images before it, or as expected."""
         found = None if self._bridge is None else self._align(self._bridge, view, expected, False)
         pose = expected if found is None else found.pose
         if found is None or found.share < _AGREE:

@@ -1,10 +1,10 @@
 """Stereo odometry: a node, its tracker, and depth from a rectified pair.
 
 Block matching (K. Konolige, "Small vision systems", ISRR 1997; OpenCV's `cv2.StereoBM`) on halved
-images says where surfaces are continuous, and starts the optical flow that finds a corner in the
-right image to a few hundredths of a pixel, and back. Block matching alone draws slanted surfaces
-towards whole pixels: in the hall its trajectory has four times the error. Where it finds nothing,
-as on surfaces of one colour, flow starts from afar, and finds the corner's neighbours, too.
+images finds continuous surfaces, and starts the optical flow of a corner to the right image (to
+hundredths of a pixel) and back. Alone it draws slanted surfaces towards whole pixels, with four
+times the error. Where it finds nothing, flow starts from afar, and is checked by the corner's
+neighbours.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """Settings of stereo matching.
 
     Attributes:
-        min_depth: Metres; what is nearer has no depth. The nearer, the wider is the strip at the
-            left edge in which nothing can be matched.
-        max_depth: Metres; what is farther has no depth.
+        min_depth: Metres, below which there is no depth; the less, the wider the unmatched strip at
+            the left edge.
+        max_depth: Metres, above which there is no depth.
         noise: Standard deviation of a corner's disparity, pixels.
     """
 
@@ -77,12 +77,10 @@ class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class StereoMatcher:
-    """Measures depth in the left camera of a rectified pair.
+    """Meter of depth in the left camera of a rectified pair without distortion.
 
     Args:
-        info: Intrinsics of both cameras, without distortion.
         baseline: Metres from the left camera to the right one.
-        settings: Settings of the matching.
 
     Attributes:
         depth_noise: Standard deviation of a corner's inverse depth, 1/m.
@@ -107,9 +105,7 @@ class StereoMatcher:
     def depth(self, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8]) -> Depth:
         """Return coarse depth (metres, shape (h, w); ``inf`` where unknown), and keep the images.
 
-        Args:
-            left: Grey, shape (h, w), or red, green, blue, shape (h, w, 3).
-            right: The same.
+        Images are grey, shape (h, w), or red, green, blue, shape (h, w, 3).
 
         Raises:
             ValueError: The size is not that of the camera.
@@ -133,8 +129,7 @@ class StereoMatcher:
         """Return the planes around pixels of the pair last given to `depth`.
 
         Args:
-            inverse: Of its coarse depth, as
-                `nodes.estimators.visual_odometry.surfaces.inverse_depth` gives it, shape (h, w).
+            inverse: Of its coarse depth, as of `surfaces.inverse_depth`, shape (h, w).
             pixels: Column and row, shape (n, 2).
             noise: Standard deviation of inverse depth, 1/m.
         """
@@ -234,13 +229,10 @@ class StereoOdometry(Estimator[StereoOdometryConfig]):
 
 
 class StereoTracker:
-    """Tracks the left camera of a pair. Equal images give equal poses, to the bit.
+    """Tracker of the left camera of a pair without distortion; equal images give equal poses.
 
     Args:
-        info: Intrinsics of both cameras, which must be free of distortion.
         baseline: Metres from the left camera to the right one.
-        stereo: Settings of the matching.
-        features: Settings of the tracker.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Settings of the features, and inverse depth at corners where the surface is continuous.
 
-On a plane inverse depth is an affine function of the pixel, and a triangulating sensor's noise is
-the same at every distance in it; so inverse depth is smoothed, fitted, checked and weighted.
+On a plane, inverse depth is affine in the pixel, and a triangulating sensor's noise is uniform in
+it.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Surfaces(msgspec.Struct, frozen=True, eq=False):
 
     Attributes:
         inverse: Inverse depth at each, 1/m, shape (n,).
-        slope: Its change by a column and by a row, 1/m, shape (n, 2).
-        continuous: Where there is one, shape (n,): elsewhere depth is torn or missing.
+        slope: Its change by column and by row, 1/m, shape (n, 2).
+        continuous: Mask, shape (n,): elsewhere depth is torn or missing.
     """
 
     inverse: Floats
@@ -64,7 +64,7 @@ def surfaces_at(inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
     """Fit a plane to inverse depth around each pixel.
 
     Args:
-        inverse: As `inverse_depth` gives it, shape (h, w).
+        inverse: As of `inverse_depth`, shape (h, w).
         pixels: Column and row, shape (n, 2).
         noise: Standard deviation of one pixel's inverse depth, 1/m.
     """
@@ -86,20 +86,19 @@ class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """Settings of the method on features.
 
     Attributes:
-        spacing: Side of the squares of the image of which each holds one landmark, pixels. Time
-            grows with their number.
-        window: Side of the patches that are compared, pixels; odd.
+        spacing: Side of image squares with a landmark each, pixels; time grows with their number.
+        window: Side of compared patches, pixels; odd.
         levels: Times that flow halves the image for large motions between two images.
         pixel_noise: Standard deviation of a patch's position, pixels.
         depth_noise: Standard deviation of inverse depth, 1/m: k of a sensor with sigma = k z².
-        keyframes: Key frames that are stored. One takes the memory of a grey image.
-        keyframe_overlap: A key frame is made when less than this share of the last one's landmarks
-            is in view,
-        keyframe_rotation: or at this rotation since the last one, degrees,
-        keyframe_shift: or at this motion since the last one, pixels at the median depth.
+        keyframes: Stored key frames, each of the size of a grey image.
+        keyframe_overlap: Share of the last key frame's landmarks in view below which another is
+            made,
+        keyframe_rotation: or rotation since the last one, degrees,
+        keyframe_shift: or motion since the last one, pixels at the median depth.
         min_inliers: Agreeing landmarks below which the camera is lost.
-        reset_timeout: Seconds for which a lost camera is only relocalized; then a new map starts at
-            its last pose.
+        reset_timeout: Seconds of mere relocalization of a lost camera; then a new map starts at its
+            last pose.
     """
 
     spacing: Annotated[int, msgspec.Meta(ge=12, le=128)] = 28

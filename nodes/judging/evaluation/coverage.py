@@ -1,8 +1,7 @@
 """Coverage of a flight by poses, and the intervals without a pose.
 
-Everything is measured on the stamps of the images there were, from the first to the last: silence
-before the first pose and after the last one counts. When a pose arrived plays no part here, so an
-estimator that is late is late in `latency`, and one that is silent is lost.
+Measured on the stamps of all images: silence before the first pose and after the last one counts.
+Arrival plays no part: late estimates show in `latency`.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ class Coverage(msgspec.Struct, frozen=True):
 
     Attributes:
         flight: From the first image to the last.
-        frames: How many images there were, or would have been.
-        answered: How many of them have a pose: one within half an image's period.
-        lost: Intervals without a pose, in order; they do not touch.
+        frames: Number of images, missing ones of an early end included.
+        answered: Images with a pose within half an image's period.
+        lost: Disjoint intervals without a pose, in order.
     """
 
     flight: Interval
@@ -64,16 +63,16 @@ def cover(
 ) -> Coverage:
     """Return the coverage of a flight by poses.
 
-    Lost is what a user means by it: no pose for longer than `gap` although there were images, or
-    the estimator's own word. A camera that is slower than `gap` makes nobody lost.
+    Lost is no pose for longer than `gap` (ns) although there were images, or by the estimator's own
+    word; a camera slower than `gap` makes nobody lost.
 
     Args:
         frames: Stamps of the images, strictly rising, shape (n,), n ≥ 1.
         poses: Stamps of the poses, strictly rising, shape (m,).
         gap: Silence that counts (ns).
-        announced: Intervals in which the estimator itself reported that it was lost, in any order.
-        planned: When the flight should have ended (ns), if it was ended before: images were to
-            come until then at their usual rate, and are without a pose.
+        announced: Intervals reported as lost by the estimator, in any order.
+        planned: Planned end of the flight (ns), if it was ended before: images at their usual rate
+            until then are without a pose.
     """
     first, last = int(frames[0]), int(frames[-1])
     has_pose = answered(frames, poses)
@@ -99,8 +98,7 @@ def cover(
 def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
     """Return a mask, shape (n,), of images with a pose within half the image period.
 
-    Stamps that went through a double or a clock of their own still count; a wrong pose for the
-    stamp is found by the errors.
+    Rounded stamps still count.
     """
     if not len(poses):
         return np.zeros(len(frames), np.bool_)
@@ -112,10 +110,7 @@ def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
 
 
 def choose_frames(cameras: Mapping[str, Stamps], poses: Stamps) -> Stamps | None:
-    """Return the stamps of an estimator's camera: shared by most of its poses.
-
-    The first of equally good cameras; `None` if no camera has images.
-    """
+    """Return the stamps of the first camera that shares most poses; `None` without images."""
     there = (stamps for stamps in cameras.values() if len(stamps))
     return max(there, key=lambda stamps: int(np.isin(poses, stamps).sum()), default=None)
 

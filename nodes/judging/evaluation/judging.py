@@ -1,11 +1,8 @@
 """Figures from estimates and ground truth: pure functions, and the flight of a vehicle.
 
-The errors of the poses there are (`nodes.judging.evaluation.metrics`) say nothing of those that are
-missing: an estimator that gives up when it gets difficult would look better than one that drifts.
-Here every image of the flight has an error. Where the estimator is lost, its last pose is held, and
-what it cannot know is added: the length of the true path since then. So being lost costs as much as
-a drift of 100 %, wherever the vehicle flies meanwhile: a tour that ends where it began makes nobody
-look good who stayed there.
+Every image of the flight has an error, lest giving up look better than drifting. While lost, the
+last pose is held, and the length of the true path since then is added: being lost costs as much as
+a drift of 100 %, also on a closed tour.
 """
 
 from __future__ import annotations
@@ -54,22 +51,17 @@ from runtime.time.schedule import SECOND
 def held_errors(
     truth: Trajectory, frames: Stamps, poses: Stamps, errors: Floats, lost: Sequence[Interval]
 ) -> Floats:
-    """Return the position error at each image of a flight, by the poses as first sent.
+    """Return the position error at each image of a flight (m), by the poses as first sent.
 
-    An image has the error of the worst pose that is nearer to it in time than to any other image,
-    so that nothing hides between images; if there is none, that of the nearest pose; or, if it has
-    no pose within a lost interval, that of the last pose before plus the true path length since.
-    Before the first pose, that is the path length since the first image.
+    An image has the error of the worst pose nearest to it in time; without one, of the nearest
+    pose; within a lost interval, of the last pose plus the true path length since. Before the first
+    pose, that is the path length since the first image.
 
     Args:
-        truth: The true poses.
         frames: Stamps of the flight's images (ns), strictly rising, within the truth's time.
-        poses: Stamps of the poses, strictly rising, shape (n,), n ≥ 0.
-        errors: Distance of each to the truth after alignment, metres, shape (n,).
+        poses: Stamps of poses, strictly rising, shape (n,), n ≥ 0.
+        errors: Their distances to the truth after alignment, metres, shape (n,).
         lost: Intervals without a pose; see `nodes.judging.evaluation.coverage.cover`.
-
-    Returns:
-        Metres, one for each image.
     """
     path = _path_at(truth, frames)
     if not len(poses) or not len(frames):
@@ -93,17 +85,13 @@ def held_errors(
 
 
 def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory) -> Floats:
-    """Return the position error at each image of a flight, by poses corrected later.
+    """Return the position error at each image of a flight (m), by poses corrected later.
 
-    Between two poses, key frames perhaps, the estimate is interpolated. Before the first and after
-    the last, the nearer one is held, and the true path length from there is added.
+    Poses are interpolated; before the first and after the last one, the nearer is held, and the
+    true path length from there added.
 
     Args:
-        truth: The true poses.
         frames: Stamps of the flight's images (ns), strictly rising, within the truth's time.
-
-    Returns:
-        Metres, one for each image.
     """
     first, last = int(estimate.stamps[0]), int(estimate.stamps[-1])
     inside = np.clip(frames, first, last)
@@ -121,20 +109,15 @@ MILLISECOND = 1_000_000
 _MOST_TICKS = 100_000
 _BLOCK = 65_536
 _LATE = 5
-"""Largest delay of a pose, in image periods.
-
-An estimator that answers each image needs two, and its camera one or two; any later, it had images
-after that of the pose.
-"""
+"""Largest delay of a pose, in image periods; two for the estimator, one or two for its camera."""
 
 
 class Errors(msgspec.Struct, frozen=True, eq=False):
     """Errors over time, a row per pose; all arrays of shape (n,).
 
     Attributes:
-        stamps: Nanoseconds: of the image, or of the control tick.
-        since: Nanoseconds: when the estimate came; for ticks, the stamp of the pose there was.
-            Shape (0,) if not known.
+        stamps: Of the image, or of the control tick, ns.
+        since: Arrival of the estimate, or stamp of a tick's pose, ns; shape (0,) if not known.
         position: Metres, after alignment.
         rotation: Radians, after alignment.
     """
@@ -149,14 +132,14 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
     """Final judgement of an estimator.
 
     Attributes:
-        figures: Its figures, by name (a unit is the name's end).
-        estimate: Its estimates, as it sent them.
-        aligned: The same in the truth's frame, where there is a truth; `None` if it sent none.
+        figures: By name, which ends with the unit.
+        estimate: As sent.
+        aligned: The same in the truth's frame, where there is a truth; `None` if there are none.
         of_images: Errors of each pose at the time of its image.
-        of_ticks: Errors of the newest pose there was at each control tick; of a long flight at
-            every second one, fourth, ….
-        lost: When it had no pose.
-        final: Its trajectory after loop closures in the truth's frame, if it sent one.
+        of_ticks: Errors of the newest pose at each control tick; of a long flight every second one,
+            fourth, ….
+        lost: Intervals without a pose.
+        final: Trajectory after loop closures in the truth's frame, if sent.
     """
 
     figures: dict[str, Any]
@@ -180,19 +163,16 @@ def judge(
     rate: float = 400.0,
     gap: float = 0.5,
 ) -> Judgement:
-    """Judge an estimator against the truth.
+    """Judge an estimator against the truth of the same body.
 
     Args:
-        record: What it sent. Where arrivals are not known, latencies and errors at control ticks
-            are not among the figures.
-        truth: The true poses of the same body.
-        cameras: Stamps of the images (ns), strictly rising, by camera. The flight is from the
-            first to the last image of the camera that the estimator follows; without cameras it
-            is that of the truth.
-        end: When the run ended (ns); the end of the truth if not given.
-        planned: When it was to end (ns), if it ended before.
-        body: Frame of the truth's body, whose pose is to be estimated.
-        alignment: How the two frames are brought together; see `choose_alignment`.
+        record: Without arrivals, latencies and errors at control ticks are not among the figures.
+        cameras: Stamps of the images (ns), strictly rising, by camera: the flight is that of the
+            estimator's camera; without cameras that of the truth.
+        end: End of the run (ns); of the truth if not given.
+        planned: Planned end (ns), if it ended before.
+        body: Frame of the truth's body.
+        alignment: See `choose_alignment`.
         rate: Control ticks a second.
         gap: Seconds of silence that count as lost.
     """
@@ -362,15 +342,9 @@ def _said_with_poses(
 
 
 def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
-    """Return the vehicle's distance from its planned path.
+    """Return root mean square and maximum of the vehicle's distances from its planned path, metres.
 
-    Args:
-        truth: Its true poses.
-        plan: Where it was to be at each stamp, in the same frame.
-
-    Returns:
-        Root mean square and maximum of the distances, metres; empty if the truth covers no stamp
-        of the plan.
+    Empty if the truth covers no stamp of the plan, which is in the same frame.
     """
     rows = np.flatnonzero(truth.covers(plan.stamps))
     if not len(rows):
@@ -383,8 +357,8 @@ def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
 def choose_alignment(scale_free: bool, frame_id: str) -> How:
     """Return the alignment implied by an estimate's frame.
 
-    ``sim3`` if its unit is its own, ``none`` if it claims to be in ``map``, else ``origin``: its
-    first pose is laid on the true one.
+    ``sim3`` for a unit of its own, ``none`` in ``map``, else ``origin``: first pose on the true
+    one.
     """
     if scale_free:
         return "sim3"
@@ -394,16 +368,13 @@ def choose_alignment(scale_free: bool, frame_id: str) -> How:
 def errors_at_ticks(
     truth: Trajectory, estimate: Trajectory, arrivals: npt.NDArray[np.int64], rate: float
 ) -> tuple[Errors | None, dict[str, float]]:
-    """Return the errors of the newest pose available to a controller at each tick.
+    """Return the errors of the newest pose at each control tick, and their figures.
+
+    The errors of a long flight are those of every second tick, fourth, …; `None` without ticks.
 
     Args:
-        truth: True poses.
-        arrivals: When each came (ns), shape (n,).
-        rate: Ticks a second, from the first estimate's arrival to the end of the truth.
-
-    Returns:
-        The errors, of a long flight those of every second tick, fourth, …; and the figures of all.
-        `None` and nothing if there was no tick.
+        arrivals: Of the estimates (ns), shape (n,).
+        rate: Ticks a second, from the first arrival to the end of the truth.
     """
     first, last = max(int(arrivals.min()), int(truth.stamps[0])), int(truth.stamps[-1])
     ticks = np.arange(first, last + 1, SECOND / rate).astype(np.int64)
@@ -433,14 +404,11 @@ def errors_at_ticks(
 
 
 class Flight:
-    """Flight of a vehicle so far.
+    """Flight of a vehicle so far: its true poses, the last of them, and collisions in order.
 
     Attributes:
-        truth: Its true poses.
-        recent: The last of them.
-        path: Length of the path through them, metres.
+        path: Length of the path, metres.
         body: Frame of its body.
-        collisions: In the order in which they came.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
 """Errors of an estimated trajectory: absolute, relative, drift; and its covariances against them.
 
 Definitions are those of J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems"
-(IROS 2012), as the tool evo computes them, so that its figures and ours agree. Both trajectories
-have the same stamps; `align` brings them together, in frame and in scale.
+(IROS 2012), as evo computes them. Both trajectories have the same stamps; `align` brings them
+together, in frame and in scale.
 """
 
 from __future__ import annotations
@@ -24,13 +24,11 @@ Indices = npt.NDArray[np.int64]
 
 
 def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
-    """Return the absolute trajectory errors (ATE) of an aligned estimate: how far each pose is off.
+    """Return the absolute trajectory errors (ATE) of an aligned estimate, by name with unit.
 
-    Returns:
-        By name, with the unit at its end: root mean square, mean, median, standard deviation,
-        and maximum of the distances; root mean squares along x (north), y (east) and z (down) of
-        the truth's frame; root mean square of the angles between the orientations, and of the
-        differences of the headings: where the body's x axis points, seen along z.
+    Of distances: root mean square (also by axis of the truth's frame), mean, median, standard
+    deviation, maximum; root mean squares of orientations' angles, and of headings (body's x axis
+    along z).
 
     Raises:
         ValueError: The stamps of the two differ.
@@ -57,13 +55,10 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
 def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> dict[str, float]:
     """Return the relative errors (RPE) over all pairs of poses a given path length apart.
 
-    No alignment but that of the scale changes them. The same as evo's with ``--delta 1
-    --delta_unit m --all_pairs --pairs_from_reference`` (without the last, evo measures the
-    stretches along the estimate, which noise makes longer).
+    As evo's ``--delta 1 --delta_unit m --all_pairs --pairs_from_reference``; only an alignment's
+    scale changes them.
 
     Args:
-        truth: The true poses.
-        estimate: The estimated ones, at the same stamps.
         delta: Length of true path in metres; a pair may miss it by a tenth.
 
     Raises:
@@ -101,15 +96,12 @@ def frame_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
 def segment_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict[str, float | None]:
     """Return the relative errors over stretches of a flight: shares of its path, and KITTI's.
 
-    As the development kit of KITTI's odometry benchmark has it (A. Geiger, P. Lenz, R. Urtasun,
-    CVPR 2012; ``evaluate_odometry.cpp``): the mean, not the root mean square, of the errors of all
-    stretches of a length, divided by the length; and the mean over the stretches of all lengths.
-    Two things differ: every pose begins a stretch and not every tenth, and it ends at the pose that
-    is nearest to its length, and within a tenth of it (`path_pairs`), not at the first one beyond.
+    As the development kit of KITTI's odometry benchmark (A. Geiger, P. Lenz, R. Urtasun, CVPR 2012;
+    ``evaluate_odometry.cpp``): mean errors of stretches, divided by their length; but every pose
+    (not every tenth) begins a stretch, which ends at the pose nearest to its length, within a tenth
+    (`path_pairs`).
 
     Args:
-        truth: The true poses.
-        estimate: The estimated ones, at the same stamps.
         path: Metres of the whole flight, above 0.
 
     Returns:
@@ -148,8 +140,7 @@ def _mean(values: Floats) -> float | None:
 def end_error_percent(truth: Trajectory, estimate: Trajectory) -> float:
     """Return the error of the last pose seen from the first, in percent of the true path.
 
-    As if the estimate had been aligned at its first pose: no alignment but that of the scale
-    changes it.
+    Only an alignment's scale changes it.
 
     Raises:
         ValueError: The stamps of the two differ, or the true path has no length.
@@ -166,12 +157,12 @@ def end_error_percent(truth: Trajectory, estimate: Trajectory) -> float:
 def path_pairs(distances: Floats, delta: float, tolerance: float = 0.1) -> tuple[Indices, Indices]:
     """Return all pairs of poses a given path length apart, as evo's `filter_pairs_by_path` does.
 
-    For each pose that is the later one whose distance is nearest; the first of equals.
+    Each pose's partner is the nearest in distance; the first of equals.
 
     Args:
         distances: Path length from the start to each pose, metres, not falling, shape (n,).
-        delta: Metres between the two.
-        tolerance: By what share of it a pair may miss it.
+        delta: Metres between the two, above 0.
+        tolerance: Share by which a pair may miss it.
 
     Returns:
         Row numbers of the first and of the second poses, each of shape (m,).
@@ -200,15 +191,7 @@ def position_errors(truth: Floats, estimate: Floats) -> Floats:
 
 
 def rotation_errors(truth: Floats, estimate: Floats) -> Floats:
-    """Return the angles between orientations, radians in [0, π].
-
-    Args:
-        truth: Unit quaternions w, x, y, z, shape (n, 4).
-        estimate: The same.
-
-    Returns:
-        Shape (n,).
-    """
+    """Return the angles between unit quaternions w, x, y, z (n, 4), radians in [0, π]."""
     apart, along = (np.linalg.norm(estimate + s * truth, axis=1) for s in (-1.0, 1.0))
     return np.asarray(4.0 * np.arctan2(np.minimum(apart, along), np.maximum(apart, along)))
 
@@ -253,11 +236,7 @@ def relative_errors(
 ) -> tuple[Floats, Floats]:
     """Return the errors of the motions between pairs of poses: metres and radians, shape (m,).
 
-    Args:
-        truth: The true poses.
-        estimate: The estimated ones, at the same stamps.
-        first: Row numbers of the first pose of each pair; see `path_pairs`.
-        last: Row numbers of the second.
+    Pairs are given by row numbers of their first and last poses; see `path_pairs`.
     """
     (r1, p1), (r2, p2) = (
         (t.rotations(), t.positions[last] - t.positions[first]) for t in (truth, estimate)
@@ -286,25 +265,19 @@ def consistency(
 ) -> dict[str, float | int | None]:
     """Return the consistency of pose errors with the received covariances.
 
-    The normalized estimation error squared (NEES) is ``eᵀ P⁻¹ e``, with the error e and its stated
-    covariance P. If the covariances are true, it is distributed as chi-squared: its mean is the
-    number of dimensions, 3 for the position and 6 for the pose, and 95 % of the values are within
-    the two-sided bounds (0.216 to 9.35, and 1.24 to 14.4). Greater means overconfident. Y.
-    Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
-    Navigation" (2001), section 5.4.
-
-    The error of the pose is the difference of the positions, and the rotation vector that turns the
-    true orientation to the estimated one, both along the axes of the truth's frame.
+    The normalized estimation error squared (NEES), ``eᵀ P⁻¹ e`` of error e and covariance P, is
+    chi-squared if the covariances are true: its mean is the number of dimensions (position 3, pose
+    6), and 95 % of the values are within 0.216 to 9.35, and 1.24 to 14.4; greater means
+    overconfident. Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to
+    Tracking and Navigation" (2001), section 5.4. A pose's error is the difference of positions, and
+    the rotation vector from true to estimated orientation, along the axes of the truth's frame.
 
     Args:
-        truth: The true poses.
-        estimate: The aligned ones, at the same stamps.
         covariances: Of (x, y, z, roll, pitch, yaw) in the truth's frame, shape (n, 6, 6).
 
     Returns:
-        Means and shares by name. A covariance that is not symmetric and positive definite is none:
-        it is counted, is outside of all bounds, and has no part in the means, which are `None` if
-        no other is left.
+        Means and shares by name. A covariance not symmetric and positive definite is counted as
+        outside of all bounds, and left out of the means (`None` if no other is left).
 
     Raises:
         ValueError: The stamps of the two differ.
@@ -329,10 +302,7 @@ def consistency(
 
 
 def positive_definite(matrices: Floats) -> npt.NDArray[np.bool_]:
-    """Return a mask, shape (n,), of symmetric positive definite matrices (n, k, k).
-
-    They are scaled to correlations before, as their units differ.
-    """
+    """Return a mask (n,) of symmetric positive definite matrices (n, k, k), after scaling."""
     if len(matrices) > _BLOCK:  # each copy of many takes much memory
         blocks = np.split(matrices, range(_BLOCK, len(matrices), _BLOCK))
         return np.concatenate([positive_definite(block) for block in blocks])
@@ -348,7 +318,7 @@ def positive_definite(matrices: Floats) -> npt.NDArray[np.bool_]:
 How = Literal["none", "origin", "se3", "sim3"]
 """``none``: as is. ``origin``: first pose on first pose. ``se3``: rigid, least squares.
 
-``sim3``: the same with scale, for estimates in their own unit. Both use all positions.
+``sim3``: the same with scale, for estimates in their own unit.
 """
 
 
@@ -376,8 +346,7 @@ def align(estimate: Trajectory, truth: Trajectory, how: How) -> Alignment:
         how: See `How`.
 
     Raises:
-        ValueError: The stamps differ; or all positions of one lie on a line (or a point), and
-            so determine nothing of the rotation about it.
+        ValueError: The stamps differ; or all positions of one lie on a line or a point.
     """
     same_stamps(truth, estimate)
     rotation, translation, scale = np.eye(3), np.zeros(3), 1.0
@@ -412,18 +381,15 @@ def transform(
 
 
 def umeyama(source: Floats, target: Floats, *, with_scale: bool) -> tuple[Floats, Floats, float]:
-    """Return R, t, c with the least mean square of ``target - (c · R · source + t)``.
+    """Return R (3, 3), t (3,), c with the least mean square of ``target - (c · R · source + t)``.
 
-    S. Umeyama, "Least-squares estimation of transformation parameters between two point
-    patterns", IEEE PAMI 13(4), 1991; equation numbers are that paper's.
+    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
+    IEEE PAMI 13(4), 1991; equation numbers are that paper's.
 
     Args:
         source: Points, shape (n, 3).
         target: The same points elsewhere, shape (n, 3).
         with_scale: Whether c may differ from 1.
-
-    Returns:
-        R of shape (3, 3), t of shape (3,), c.
 
     Raises:
         ValueError: One of the sets lies on a line (or a point).

@@ -44,10 +44,7 @@ from runtime.paths import source_file
 
 
 class LiveErrors:
-    """Errors of an estimator so far.
-
-    Estimates in ``odom`` are laid on the truth at the first.
-    """
+    """Errors of an estimator so far; estimates in ``odom`` are laid on the truth at the first."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -97,20 +94,18 @@ class EvaluationConfig(NodeConfig):
     Attributes:
         alignment: How an estimate is laid on the truth: ``none``, ``origin`` (first pose on first
             pose), ``se3``, ``sim3``; ``auto`` is ``sim3`` for scale-free estimators, ``none`` for
-            estimates in ``map``, and ``origin`` for all others. Whatever it is, the verdict has
-            the trajectory errors after ``se3`` and ``sim3``, too.
-        vehicle: Name of the vehicle whose truth all estimates are held against; if empty, each
-            estimator's is that which its source names or which carries the camera that it follows,
-            or else the first.
-        control_rate: Hertz of the controller for which the newest pose is judged.
+            estimates in ``map``, and ``origin`` for all others. The verdict always has trajectory
+            errors after ``se3`` and ``sim3``, too.
+        vehicle: Vehicle whose truth all estimates are held against; if empty, the one in an
+            estimator's source, or of its camera, else the first.
+        control_rate: Hertz of the controller for which newest poses are judged.
         gap: Silence of an estimator that counts as lost.
-        thresholds: What the figures may be; if one is missed, the run's exit code is 1. Without
-            any, an estimator is not judged, unless it misses what is asked of everybody (it was
-            there for nine tenths of the flight, in one frame, with stamps that rise; its vehicle
-            hit nothing; the run came to its planned end). With some, there must be an estimator.
-            ``collisions`` and ``plan_*`` are thresholds of the flight, and fail no estimator.
-        estimators: Other settings for single estimators, by their sources.
-        image_count: Sample images with features to keep of each estimator; 0 for none.
+        thresholds: Limits of figures; a missed one makes the run's exit code 1. Always asked: poses
+            for nine tenths of the flight, one frame, rising stamps, no collision, the run's planned
+            end. With thresholds, there must be an estimator. ``collisions`` and ``plan_*`` are
+            thresholds of the flight, and fail no estimator.
+        estimators: Settings of single estimators, by source.
+        image_count: Sample images with features of each estimator; 0 for none.
     """
 
     alignment: Laid = "auto"
@@ -122,11 +117,6 @@ class EvaluationConfig(NodeConfig):
     image_count: Annotated[int, msgspec.Meta(ge=0, le=100)] = 12
 
     def __post_init__(self) -> None:
-        """Check the thresholds of single estimators.
-
-        Raises:
-            ValueError: One has no such name, or is a flight's.
-        """
         for name, own in self.estimators.items():
             for each in own.thresholds:
                 known = [k for k in self.thresholds.__struct_fields__ if not FIGURES[k].of_flight]
@@ -153,8 +143,8 @@ class EvaluationConfig(NodeConfig):
 class Evaluation(Node[EvaluationConfig]):
     """Evaluation of every received estimator against the odometry of its vehicle.
 
-    Errors are sent as `Score` as the estimates come; the rest is written at the end, and the
-    verdict put into the run's summary.
+    Errors are sent as `Score`; files are written at the end, and the verdict into the run's
+    summary.
     """
 
     reads_truth = "judging"

@@ -19,11 +19,7 @@ _AHEAD = 1_000_000
 
 
 class Said:
-    """Rows of numbers of some of the poses (velocity, covariance), by rising stamp.
-
-    Args:
-        width: Numbers of a row.
-    """
+    """Rows of numbers of some of the poses (velocity, covariance), by rising stamp."""
 
     def __init__(self, width: int) -> None:
         self._width = width
@@ -47,24 +43,23 @@ class Said:
 class EstimatorRecord:
     """Events of an estimator, sorted into a trajectory and counts.
 
-    The trajectory has the poses in the frame of the first pose, with strictly rising stamps. All
-    other poses are only counted.
+    The trajectory has the poses in the first one's frame, with strictly rising stamps; others are
+    only counted.
 
     Args:
         scale_free: Whether its unit of length is arbitrary.
-        reads: Kinds of data that it computes with; see `events.EstimatorAnnouncement`.
+        reads: See `events.EstimatorAnnouncement`.
 
     Attributes:
         rows: Poses of the trajectory.
-        repeated: Poses whose stamp was not later than the one before: sent twice, or backwards.
+        repeated: Poses with a stamp not later than the last.
         future: Poses and tracking events stamped later than their arrival.
         bodies: Number of poses by body (`child_frame_id`).
         elsewhere: Poses in another frame than the first one.
         restarts: Number of changes to another frame, one after each loss of tracking.
         velocities: Velocities of the poses that carry one: 3 numbers.
         covariances: Likewise: 36 numbers, row by row.
-        final: The last trajectory sent after loop closures; `None` if there was none, or it was
-            empty.
+        final: The last trajectory after loop closures; `None` for none, or an empty one.
         final_frame_id: Frame of `final`.
     """
 
@@ -142,11 +137,7 @@ class EstimatorRecord:
         return np.array(self._arrivals, np.int64)
 
     def reported_lost(self, end: int) -> list[Interval]:
-        """Return the lost intervals by the estimator's own tracking events.
-
-        Args:
-            end: End of the run (ns); a loss without recovery lasts until then.
-        """
+        """Return the lost intervals reported by the estimator, up to the run's end (ns)."""
         found = []
         since: int | None = None
         for stamp, lost in self._tracking:

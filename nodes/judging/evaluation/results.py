@@ -100,11 +100,7 @@ _RECENT_GREEN, _OUTLIER_RED = (90, 255, 60), (60, 70, 255)  # blue, green, red
 
 
 class Album:
-    """Keeps about `size` images of each estimator, or untracked camera, however long the run.
-
-    Args:
-        size: How many images, at most.
-    """
+    """Collection of about `size` images of each estimator, or untracked camera, of a run."""
 
     def __init__(self, size: int) -> None:
         self._size = size

@@ -83,16 +83,14 @@ def conclude(
 
     Args:
         found: See `judge`.
-        thresholds: What the figures may be.
         faults: Further reasons why all have failed.
-        end: How the run ended, if there was one.
-        declared: Those who announced that they read the truth.
+        declared: Estimators that announced that they read the truth.
         flights: Figures of the flights themselves, by vehicle.
-        own: Thresholds of estimators with other ones.
+        own: Thresholds of single estimators.
 
     Returns:
-        ``passed``, ``estimators``, ``flights``, ``thresholds``; and in ``failed`` why nobody has
-        passed, if thresholds were given and nobody was there to meet them.
+        ``passed``, ``estimators``, ``flights``, ``thresholds``; ``failed`` has the reason if there
+        are thresholds and no estimator.
     """
     stopped = ""  # by the user, before the plan was flown
     if end is not None and end.by == "user" and not end.planned:

@@ -45,22 +45,18 @@ def judge(
 
     Reads TUM, EuRoC, KITTI (with --times: seconds, one a line) and VSLAM-LAB files, and Path,
     Odometry, PoseStamped and PoseWithCovarianceStamped topics of bags. Figures, report and
-    thresholds are those of a run, except for figures that need more than poses, such as latencies.
+    thresholds are those of a run, but for figures that need more than poses, such as latencies.
     --frames is a times.txt, rgb.txt, rgb.csv or cam0/data.csv; without it the flight is that of the
-    truth.
-
-    --final NAME=FILE is the trajectory of the estimate NAME after loop closures: its figures stand
-    beside those of the poses sent at the time.
-
+    truth. --final NAME=FILE is the trajectory of the estimate NAME after loop closures, judged
+    beside it.
     Alignment is sim3 with --scale-free; otherwise none for an estimate in the frame map, origin for
     one in another named frame, and se3 for all others. World and body are NED and FRD in TUM files;
     z up, with the body as it is, in EuRoC and VSLAM-LAB files (nwu); those of a camera that looks
     ahead in KITTI files (optical); enu is ENU and FLU. --axes sets the axes of other files. If
-    estimates are of a camera, --body-from-camera is its optical frame in the truth's body:
-    "tx ty tz qx qy qz qw", a TUM file with one pose, or a camera of the truth's run.
-
-    Exit codes: 0; 1 if a threshold is missed (by default also: poses for 90 % of the flight); 2 if
-    an input cannot be read.
+    estimates are of a camera, --body-from-camera is its optical frame in the truth's body: "tx ty
+    tz qx qy qz qw", a TUM file with one pose, or a camera of the truth's run. Exit codes: 0; 1 if a
+    threshold is missed (by default also: poses for 90 % of the flight); 2 if an input cannot be
+    read.
     """
     from rich.console import Console
 

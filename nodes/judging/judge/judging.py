@@ -1,8 +1,7 @@
 """Evaluation of several trajectories against a common truth, and its results folder.
 
-The figures are those of an evaluation (`nodes.judging.evaluation.judging`), but for what poses
-alone do not tell: when they came, and thus latencies, errors at control ticks and stamps of the
-future.
+The figures are those of an evaluation, but for those of arrivals: latencies, errors at control
+ticks and future stamps.
 """
 
 from __future__ import annotations
@@ -36,13 +35,12 @@ from runtime.time.schedule import SECOND
 
 
 class JudgeConfig(EvaluationConfig):
-    """How to judge: as an evaluation, but ``auto`` is ``se3`` where nobody says the frame.
+    """Settings of a judgement: as an evaluation, but ``auto`` is ``se3`` for an unknown frame.
 
     Attributes:
         scale_free: Whether the estimates' unit of length is their own.
         axes: Those of the estimates' files; see `nodes.judging.judge.sources.AXES`.
-        max_difference: From an estimate to the nearest true pose, at most; one that is farther
-            from it is not compared.
+        max_difference: From an estimate to the nearest true pose; farther ones are not compared.
     """
 
     scale_free: bool = False
@@ -60,12 +58,11 @@ def judge_all(
     """Judge estimates against the truth, at the stamps of the images if known.
 
     Args:
-        truth: The true poses.
-        frames: Stamps of the images (ns), if they are known.
-        finals: The trajectories after loop closures, by the name of the estimate.
+        frames: Stamps of the images (ns), if known.
+        finals: The trajectories after loop closures, by estimate.
 
     Returns:
-        Judgements by name, the verdict, and sentences on what was not compared.
+        Judgements by name, the verdict, and notes on exclusions.
 
     Raises:
         ValueError: A name is not unique, an estimate is nowhere near a true pose in time, or a
@@ -115,7 +112,7 @@ def write(
     An earlier judgement there is renamed by its time.
 
     Raises:
-        ResultsError: There is something else in the folder, or it cannot be written.
+        ResultsError: The folder has something else, or cannot be written.
     """
     if (out / "config.toml").exists():
         raise ResultsError(f"{out}: expected no run's folder: name another with --out")

@@ -1,10 +1,8 @@
 """Where trajectories come from: files, topics of bags, and folders of runs and data sets.
 
-A file's format is recognized by its content. No file says which axes it means: the user does, or
-else the format's habit holds (`AXES`).
-
-A topic of a bag is read as its messages are, in our frames (`nodes.ros2.messages.incoming`).
-Of a ``nav_msgs/msg/Path``, which each time holds all poses so far, the last message counts.
+A file's format is recognized by its content; its axes are the user's word, or the format's habit
+(`AXES`). Messages of a topic are read in our frames (`nodes.ros2.messages.incoming`); of
+``nav_msgs/msg/Path`` the last one counts.
 """
 
 from __future__ import annotations
@@ -43,8 +41,8 @@ def read_topic(path: Path, topic: str) -> tuple[Trajectory, EventAxes, Estimator
     """Read the poses of a topic: frames with z up get z down, those of cameras stay optical.
 
     Returns:
-        The poses that count, the kind of their child frame (a pose that names none is of a body),
-        and the record, which has counted the others.
+        The poses that count, the kind of their child frame (by default a body), and the record with
+        counts of the others.
 
     Raises:
         ValueError: It cannot be read, or holds something else; the message names the pose.
@@ -99,7 +97,7 @@ AXES: dict[Axes, tuple[Floats, Floats]] = {
 """Transforms from a file's world to NED, and from its body to the truth's body, shape (4, 4).
 
 ``ned``: our own files and TUM's; ``nwu``: z up, the body as it is, as EuRoC and VSLAM-LAB; ``enu``:
-REP 103, with a body FLU; ``optical``: both as a camera that looks ahead has them, as KITTI.
+REP 103, with a body FLU; ``optical``: both of a camera that looks ahead, as KITTI.
 """
 
 _FORMATS = (
@@ -116,7 +114,7 @@ class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """A trajectory from outside: poses of the truth's body in a world NED.
 
     Attributes:
-        frame_id: That the poses are in, if the source says so.
+        frame_id: Of the poses, if the source says so.
         counts: Figures that only a topic has: restarts and repeated stamps.
     """
 
@@ -148,11 +146,11 @@ def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = 
     """Read a trajectory: a file, or a topic as ``bag:/topic``.
 
     Args:
-        text: Where it is; ``NAME=`` before it gives it a name.
+        text: Its place, after an optional ``NAME=``.
         axes: Those of a file, if they are not its format's; a topic's are REP 103's.
         times: File of the stamps of a KITTI file.
-        camera: Transform from a camera's optical frame to the body, shape (4, 4), if the poses
-            are the camera's: then the body's axes are of no account.
+        camera: Transform from the optical frame to the body, shape (4, 4), if the poses are a
+            camera's; the body's axes are then of no account.
 
     Raises:
         ValueError: It cannot be read; the message names file and line, or pose.
@@ -190,8 +188,8 @@ def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = 
 def read_mounting(text: str, run: str) -> Floats:
     """Return the transform from a camera's optical frame to the body, shape (4, 4).
 
-    It is given as ``tx ty tz qx qy qz qw`` (metres, the scalar last), as a file in TUM's format
-    with one pose, or by the name of a camera that the run in a folder has announced.
+    Given as ``tx ty tz qx qy qz qw`` (metres, the scalar last), a TUM file with one pose, or the
+    name of a camera that the run announced.
 
     Raises:
         ValueError: It is none of these.
@@ -211,7 +209,7 @@ def read_mounting(text: str, run: str) -> Floats:
 def read_stamps(path: Path) -> npt.NDArray[np.int64]:
     """Return the stamps (ns) of a list of images or of poses: the first field of each row.
 
-    They are nanoseconds where there are commas (EuRoC, VSLAM-LAB), or else seconds (TUM, KITTI).
+    With commas nanoseconds (EuRoC, VSLAM-LAB), else seconds (TUM, KITTI).
 
     Raises:
         ValueError: It cannot be read, or the stamps do not rise; the message names the line.

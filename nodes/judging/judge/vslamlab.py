@@ -1,8 +1,7 @@
 """``vslamlab``: programs of VSLAM-LAB's contract, run on an exported sequence and judged.
 
-Such a program gets the folder of a sequence, and leaves ``<exp_id>_KeyFrameTrajectory.csv`` in that
-of the experiment; whether it does is its success (github.com/VSLAM-LAB/VSLAM-LAB,
-``Baselines/BaselineVSLAMLab.py``).
+A program gets the folder of a sequence, and leaves ``<exp_id>_KeyFrameTrajectory.csv`` in that of
+the experiment (github.com/VSLAM-LAB/VSLAM-LAB, ``Baselines/BaselineVSLAMLab.py``).
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ def arguments(
     """Return a program's arguments: ``key:value``, or ``--key value`` with `dashes`.
 
     Args:
-        run: Folder of the experiment, and in it the name of the run.
+        run: Folder of the experiment, with the name of the run.
         mode: ``mono``, ``rgbd``, ``stereo``, ``mono-vi`` or ``stereo-vi``.
         settings: Its settings_yaml, if it has one.
-        dashes: As programs in Python take it; those in C++ do not.
+        dashes: For programs in Python; those in C++ lack it.
     """
     values = {
         "sequence_path": sequence,
@@ -45,15 +44,11 @@ def arguments(
 
 
 def run_once(command: Sequence[str], run: Path, limit: float) -> Path:
-    """Run a program; after `limit` seconds, end all its processes.
+    """Run a program for at most `limit` real seconds; return its trajectory file.
 
     Args:
         command: Program and arguments. Its output goes to ``system_output_<exp_id>.txt``.
         run: As of `arguments`.
-        limit: Real seconds.
-
-    Returns:
-        The trajectory file.
 
     Raises:
         ValueError: The program left no trajectory, failed (with its last output), or took too long.
@@ -90,12 +85,11 @@ def vslamlab(
 ) -> None:
     """Run a program of VSLAM-LAB's contract on an exported sequence, and judge its trajectories.
 
-    It is started REPEAT times, one run after the other, with key:value for sequence_path,
-    calibration_yaml, rgb_csv, exp_folder, exp_id, settings_yaml, verbose and mode. A run that
-    leaves no <exp_id>_KeyFrameTrajectory.csv, ends with an error or takes too long has failed.
-    Scale is aligned in the mode mono only.
-
-    Ends with 0; with 1 if a run failed or a threshold was missed; with 2 if something is missing.
+    Started REPEAT times in a row, with key:value for sequence_path, calibration_yaml, rgb_csv,
+    exp_folder, exp_id, settings_yaml, verbose and mode. A run that leaves no
+    <exp_id>_KeyFrameTrajectory.csv, ends with an error or takes too long has failed. Scale is
+    aligned in the mode mono only. Ends with 0; with 1 if a run failed or a threshold was missed;
+    with 2 if something is missing.
     """
     from rich.console import Console
 

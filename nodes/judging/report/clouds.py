@@ -1,7 +1,6 @@
 """Point clouds side by side, with a common viewpoint and scale, to reveal smearing.
 
-Points are painted straight into an array of pixels, the nearer over the farther; matplotlib only
-adds axes.
+Points are painted into an array of pixels, near over far; matplotlib only adds axes.
 """
 
 from __future__ import annotations
@@ -31,10 +30,8 @@ class Shown(msgspec.Struct, frozen=True, eq=False):
     """A cloud prepared for drawing.
 
     Attributes:
-        name: Of its file.
         points: East, north, up, metres, float32, shape (n, 3).
         colors: Red, green, blue, uint8, shape (n, 3).
-        total: Points in the file.
     """
 
     name: str
@@ -47,11 +44,9 @@ class View(msgspec.Struct, frozen=True, eq=False):
     """An orthographic view.
 
     Attributes:
-        title: What is seen.
         axes: East, north, up to right, up on the image, towards the viewer; shape (3, 3).
         low: Corner of the image, metres right and up, shape (2,).
-        high: The opposite corner.
-        labels: Of the axes, right and up; none, and an image has a scale bar instead.
+        labels: Of the axes, right and up; if empty, a scale bar instead.
     """
 
     title: str
@@ -62,15 +57,11 @@ class View(msgspec.Struct, frozen=True, eq=False):
 
 
 def visible(cloud: Shown, view: View, pixels: float) -> tuple[Indices, Indices, Indices]:
-    """Return the nearest point of each pixel with a point.
+    """Return rows, columns and cloud indices of each pixel's nearest point; (m,), farthest first.
 
     Args:
-        cloud: East, north, up; at most `MOST` points.
+        cloud: At most `MOST` points.
         pixels: Per metre.
-
-    Returns:
-        Their rows and columns in the image, and their indices in the cloud; each of shape (m,),
-        the farthest first.
     """
     width = _size(view, pixels)[1]
     seen = cloud.points @ view.axes.T.astype(np.float32)
@@ -95,9 +86,8 @@ def paint(cloud: Shown, view: View, pixels: float, dot: int | None = None) -> Pa
     """Return a cloud painted in a view as an image, shape (h, w, 3), and the dot width.
 
     Args:
-        cloud: East, north, up; with colours.
         pixels: Per metre.
-        dot: Width of a point in pixels; if not given, enough to fill the gaps between points.
+        dot: Width of a point in pixels; by default enough to fill gaps.
     """
     height, width = _size(view, pixels)
     row, column, number = visible(cloud, view, pixels)
@@ -114,7 +104,6 @@ def paint(cloud: Shown, view: View, pixels: float, dot: int | None = None) -> Pa
 
 
 def _size(view: View, pixels: float) -> tuple[int, int]:
-    """Return an image's height and width in pixels."""
     across, up = np.maximum(np.ceil((view.high - view.low) * pixels), 1).astype(int).tolist()
     return up, across
 
@@ -137,10 +126,7 @@ _DETAIL = 3.6
 
 
 def draw_clouds(run: Run) -> list[Plot]:
-    """Draw all readable clouds; `Run.missing` names the others.
-
-    Of several figures, each begins with the first cloud, for comparison.
-    """
+    """Draw all readable clouds (`Run.missing` names the others), the first one in each figure."""
     height = _ceiling(run)
     clouds = []
     for path in run.clouds:
@@ -219,7 +205,7 @@ def _frame(low: Floats, high: Floats) -> tuple[Floats, Floats]:
 
 
 def _busiest(points: Floats, colors: npt.NDArray[np.uint8]) -> Floats:
-    """Return the middle of a place of 2 m where there is much to see: many heights, and colours."""
+    """Return the middle of the 2 m with the most heights and colours."""
     cells = np.floor(points[:, :2] / 2.0).astype(np.int64)
     cells -= cells.min(axis=0)
     index = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
@@ -272,7 +258,6 @@ def _aspect(view: View) -> float:
 
 
 def _show(axis: Any, cloud: Shown, view: View, pixels: float, dot: int | None) -> int:
-    """Paint a cloud into some axes; return the width of its dots."""
     image, dot = paint(cloud, view, pixels, dot)
     extent = (view.low[0], view.high[0], view.low[1], view.high[1])
     axis.imshow(image, extent=extent, interpolation="nearest")

@@ -197,11 +197,7 @@ def draw_latency(run: Run) -> Plot | None:
 
 
 def _shares(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, ylabel: str) -> None:
-    """Draw the cumulative distribution of each estimator's values.
-
-    A histogram of stepped values, as of a fixed latency or of ticks, would have gaps wherever its
-    bins do not fit the steps.
-    """
+    """Draw cumulative distributions of values; histograms of stepped ones would have gaps."""
     axis.set(xlabel=xlabel, ylabel=ylabel, ylim=(0, 101))
     if not series:
         axis.text(0.5, 0.5, "not known", ha="center", transform=axis.transAxes, color="#777777")
@@ -280,12 +276,7 @@ def _boxes(axis: Any, each: Estimator, boxes: list[tuple[float, float, Floats]])
 
 
 def _scale(axis: Any, series: list[Floats], which: str, share: float = 100.0) -> None:
-    """Start an axis at 0, or make the axis logarithmic for series of very unlike size.
-
-    Args:
-        which: ``x`` or ``y``.
-        share: Percent of each series that is shown.
-    """
+    """Start an axis (``x``, ``y``) at 0, or make it logarithmic for series of very unlike size."""
     top = 1.05 * max((float(np.nanpercentile(v, share)) for v in series if len(v)), default=1.0)
     if not wide_range(series):
         axis.set(**{f"{which}lim": (0, top or 1.0)})

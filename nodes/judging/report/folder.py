@@ -1,7 +1,6 @@
 """Lenient reader of a run's folder, for the report.
 
-Every file is optional, as a run may have been killed at any time: missing and unreadable files
-are named in `Run.missing`, and the rest of the report goes on without them.
+Every file is optional: missing and unreadable ones are named in `Run.missing`.
 """
 
 from __future__ import annotations
@@ -57,13 +56,7 @@ def gaps(estimate: Trajectory | None, truth: Trajectory | None) -> list[Interval
 
 
 def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interval]) -> Floats:
-    """Return a copy with NaN in each lost interval, to break the plotted line.
-
-    Args:
-        values: Shape (n,) or (n, k).
-        stamps: Nanoseconds, shape (n,).
-        lost: Intervals.
-    """
+    """Return a copy of rows, shape (n,) or (n, k), with NaN in each lost interval (ns)."""
     values = values.copy()
     for start, end in lost:
         inside = (stamps > start) & (stamps < end)

@@ -55,17 +55,14 @@ _ALIGNED = {
 
 
 def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:
-    """Write ``report.html`` and its figures, ``plots/*``, anew.
+    """Write ``report.html`` and its figures, ``plots/*``, anew; return the page's path.
 
     Args:
-        out: The folder of a run, whatever is in it.
+        out: A run's folder, whatever is in it.
         formats: Of the figures: png (always, if there is any), svg, pdf; none for tables only.
 
-    Returns:
-        The page's path.
-
     Raises:
-        ResultsError: The folder is not there, or is no run's.
+        ResultsError: The folder is missing or no run's.
         OSError: Something cannot be written.
     """
     run = read_run(out)
@@ -182,8 +179,8 @@ class ReportConfig(NodeConfig):
     """Settings of the report.
 
     Attributes:
-        figures: Formats of the figures in ``plots``: png, svg, pdf. The page shows the PNGs; with
-            no format at all it has tables only, and takes no time to draw.
+        figures: Formats of the figures in ``plots``: png (as on the page), svg, pdf; none for
+            tables only.
     """
 
     figures: tuple[Literal["png", "svg", "pdf"], ...] = ("png", "svg")
@@ -192,8 +189,7 @@ class ReportConfig(NodeConfig):
 class Report(Node[ReportConfig]):
     """Writer of ``report.html`` and its figures, from the files of all other nodes.
 
-    Runs last, after the summary, with or without an evaluation. The command ``report`` writes the
-    same page anew from the folder.
+    Runs last, with or without an evaluation. The command ``report`` writes the page anew.
     """
 
     files = ("plots", "report.html")
@@ -212,7 +208,7 @@ def report(
 ) -> None:
     """Write a run's report.html and its figures (plots/*) anew.
 
-    A run that was killed, or that nobody evaluated, gives a page that says what is missing.
+    The page names what a killed or unjudged run lacks.
     """
     from runtime.errors import ConfigError
 

@@ -79,12 +79,11 @@ class Plot(msgspec.Struct, frozen=True, eq=False):
     """A figure of the report.
 
     Attributes:
-        name: Of its files, without what tells their format.
-        figure: What is drawn.
+        name: Of its files, without suffix.
         title: What it shows.
         caption: How to read it.
-        raster: Whether it is made of pixels, so that an SVG or PDF of it would be no better.
-        photo: Whether it is of camera images, which the page holds as JPEG: a fifth of the size.
+        raster: Whether it is made of pixels: no SVG or PDF.
+        photo: Whether it is of camera images, which the page holds as JPEG.
     """
 
     name: str
@@ -95,10 +94,7 @@ class Plot(msgspec.Struct, frozen=True, eq=False):
     photo: bool = False
 
     def write(self, folder: Path, formats: Sequence[str]) -> Path:
-        """Write the figure as PNG, and in the other formats; return the PNG's path.
-
-        Equal figures give equal bytes.
-        """
+        """Write the figure as PNG, and in other formats; return the PNG's path. Reproducible."""
         path = folder / f"{self.name}.png"
         self.figure.savefig(path, dpi=DPI, metadata={"Software": None})
         for each in {"svg", "pdf"}.intersection(() if self.raster else formats):
@@ -126,9 +122,9 @@ def sheet(
     """Return an empty figure.
 
     Args:
-        height: Inches, and as much more as the legend is higher than one row.
-        names: What the legend above all will say.
-        constrained: Whether axes find their places themselves.
+        height: Inches, with one row of the legend.
+        names: Entries of the legend above all.
+        constrained: Whether axes are placed automatically.
     """
     rows = -(-len(names) // legend_columns(names))
     size = (width, height + 0.2 * max(rows - 1, 0))
@@ -185,11 +181,7 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def wide_range(values: list[Floats], share: float = 95.0) -> bool:
-    """Tell whether series need a logarithmic axis: tops differ over 20-fold.
-
-    Args:
-        share: Percentile taken as a series' top, as a few values may be of any size.
-    """
+    """Tell whether series need a logarithmic axis: percentiles (`share`) differ over 20-fold."""
     tops = [top for v in values if len(v) and (top := float(np.nanpercentile(v, share))) > 0.0]
     return len(tops) > 1 and max(tops) > 20.0 * min(tops)
 

@@ -28,8 +28,7 @@ from runtime.summary import (
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
     """Contents of ``summary.json`` for the report; see `runtime.summary.Summary`.
 
-    Of trajectories judged without a run (`nodes.judging.judge`), ``judged`` has their files by
-    name, and ``notes`` the remarks on them.
+    Of trajectories judged without a run, ``judged`` has the files by name, ``notes`` the remarks.
     """
 
     name: str | None = None
@@ -63,17 +62,10 @@ class Verdict(summary.Verdict, frozen=True):
 
 
 class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """An estimator of the report, judged or not.
+    """An estimator of the report, judged or not; see `nodes.judging.evaluation.judging.Judgement`.
 
     Attributes:
-        name: Its source.
-        color: In every figure.
         figures: From the verdict; empty if there is none.
-        aligned: Its poses in the truth's frame.
-        of_images: Errors of each pose at the time of its image.
-        of_ticks: Errors of the newest pose there was at each control tick.
-        lost: When it had no pose.
-        final: Its trajectory after loop closures in the truth's frame.
     """
 
     name: str
@@ -90,18 +82,12 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Contents of a run's folder, as far as read.
 
     Attributes:
-        folder: Where it is.
-        facts: From the summary.
-        verdict: What the evaluation concluded.
         truths: True poses, by vehicle; the first vehicle's first.
-        plans: Where pilots meant their vehicles to be, by vehicle.
-        collisions: Where vehicles hit something: north, east, down, metres, shape (n, 3).
-        estimators: By order of the verdict.
+        plans: Poses intended by pilots, by vehicle.
+        collisions: North, east, down, metres, shape (n, 3).
         frames: Sample images with features, by estimator's file name.
-        clouds: Files of clouds.
-        config: Text of ``config.toml``.
         log: Its warnings and errors.
-        missing: Sentences that say what is not there or cannot be read.
+        missing: Sentences on missing or unreadable files.
     """
 
     folder: Path
@@ -145,11 +131,8 @@ class Row(msgspec.Struct, frozen=True):
     """A row of a table of figures.
 
     Attributes:
-        name: In the files.
-        meaning: In words.
-        unit: Of its values.
         limit: Threshold; empty if there is none.
-        cells: One an estimator: its value, and whether it is missed.
+        cells: By estimator: its value, and whether it is missed.
     """
 
     name: str

@@ -57,10 +57,7 @@ class _Line(msgspec.Struct, frozen=True, eq=False):
 
 
 def draw_trajectories(run: Run) -> Plot | None:
-    """Draw truth, plan and aligned estimates; `None` if there is none of them.
-
-    Both views are of one scale, metre for metre, and share the east axis.
-    """
+    """Draw truth, plan and aligned estimates at one scale; `None` if there is none of them."""
     lines = _lines(run)
     if not lines:
         return None
@@ -152,10 +149,7 @@ def _shown(positions: Floats) -> Floats:
 
 
 def _bounds(lines: list[_Line]) -> tuple[Floats, Floats]:
-    """Return the corners of plotted lines, with a margin and a least side length.
-
-    An estimate that goes astray is followed only so far: as far again as the truth is wide.
-    """
+    """Return the corners of plotted lines; estimates count to twice the truth's width."""
     points = np.concatenate([line.points for line in lines])
     true = [line.points for line in lines if line.style["color"] in TRUTHS]
     if true:
@@ -172,10 +166,7 @@ def _layout(
 ) -> tuple[float, Rectangle, Rectangle, Rectangle]:
     """Return the figure's height, and the places of: above, from the side, over time; inches.
 
-    What is broad has its views one below the other; what is tall has them side by side.
-
-    Args:
-        east: Metres to show.
+    Broad views are one below the other; tall ones side by side.
     """
     across = WIDTH - _LEFT - _RIGHT
     if north < 0.7 * east:
@@ -254,7 +245,6 @@ def read_image(path: Path) -> npt.NDArray[Any]:
 
 
 def _sheet(run: Run, paths: list[Path]) -> Figure | None:
-    """Draw a sheet; `None` if there was nothing to draw."""
     columns = min(_COLUMNS, len(paths))
     width = (round(WIDTH * DPI) - _GAP * (_COLUMNS - 1)) // _COLUMNS
     shown = []

@@ -1,8 +1,8 @@
 """Estimators in ROS 2 with an answer owed to each image: messages and answers.
 
-They get all messages of the node, complete and in the order of its events: an image after the IMU
-and the ``/clock`` of the time at which it arrived. Their answers are read in the thread that takes
-them, and given to a `Hold`. Nothing here decides by real time what is sent, or when.
+They get all messages of the node, complete and in order: an image after the IMU and the ``/clock``
+of its arrival. Answers are read in the thread that takes them, and given to a `Hold`. Real time
+decides nothing here.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _LOOK = 0.01
 class HeldEstimator:
     """An estimator in ROS 2: its presence, the images owed an answer, and its answers.
 
-    Its `topics` are that of its estimates, and the ``done`` topic, if any.
+    `topics` are its estimates and ``done``, if any.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class HeldEstimator:
     def owe(self, image: Event, matched: Callable[[], Sequence[str]]) -> Owed[Event] | None:
         """Return the answer owed to an image about to go out; `None` if none is.
 
-        Of several images of one exposure, it is owed to the first.
+        Of an exposure's images, the first is owed one.
         """
         if image.source != self.subscription.answers_to or image.stamp <= self._owed:
             return None
@@ -100,7 +100,6 @@ class HeldEstimator:
         return self.hold.owe(image.stamp)
 
     def _take(self, incoming: IncomingTopic, message: Message) -> None:
-        """Take a message, in any thread."""
         try:
             if not self._is_next(incoming, message):
                 return
@@ -161,15 +160,15 @@ def held_estimators(
 class HeldLine:
     """Thread to publish messages in the order of the calls.
 
-    In lockstep nothing is dropped: messages wait until the estimators are there, as does simulated
-    time. In real time these messages are left out, and so are images when too many messages wait.
+    In lockstep nothing is dropped: messages and simulated time wait for the estimators. In real
+    time early messages are left out, and images when too many wait.
 
     Args:
-        session: Declares the publishers, as complete: reliable, and waiting for slow readers.
-        deliver: Sends the event of an answer, at its time.
+        session: Declares the publishers as held.
+        deliver: Sends an answer's event, at its time.
 
     Attributes:
-        dropped: Images that were left out.
+        dropped: Images left out.
     """
 
     def __init__(
@@ -202,7 +201,7 @@ class HeldLine:
         """Wait for the estimators, while time stands, and begin to publish.
 
         Args:
-            first: Puts what holds for the whole run.
+            first: Puts the messages that hold for the whole run.
 
         Raises:
             FatalError: They are not there in time.
@@ -222,11 +221,7 @@ class HeldLine:
     def publish_image(
         self, image: Event, put: Callable[[Any], object], clock: Callable[[int], object]
     ) -> None:
-        """Put the time, then an image or a point cloud, in turn; hold for the answers.
-
-        Args:
-            clock: Puts the time (ns).
-        """
+        """Put the time (`clock`, ns), then an image or a point cloud; hold for the answers."""
         self._once_there(self._publish_image, image, put, clock)
 
     async def close(self) -> None:
@@ -291,7 +286,6 @@ class HeldLine:
                 return f"{missing or 'no further subscriptions'} within {end - begin:g} s"
 
     def _matched(self) -> list[str]:
-        """Return the topics with a subscriber."""
         return [each.topic.name for each in self._publishers if each.matched()]
 
     def _note(self, publisher: Publisher, message: bytearray) -> None:

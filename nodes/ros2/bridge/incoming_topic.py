@@ -1,8 +1,8 @@
 """Topics by settings of the user's: from messages to events, and by mappings of their own back.
 
-Whatever may be wrong with a message is counted. Messages pass from the threads that read topics to
-the loop bounded, with one wake-up for a burst: what comes faster than is allowed is dropped where
-it is read, before its bytes are copied, and the loop is given back when it was held for `BUDGET`.
+Faults of messages are counted. Messages pass bounded from the reading threads to the loop, with one
+wake-up for a burst: too fast ones are dropped before their bytes are copied, and the loop is given
+back after `BUDGET`.
 """
 
 from __future__ import annotations
@@ -41,9 +41,6 @@ from runtime import Stream
 
 class IncomingTopic:
     """Reader of a subscription's messages as events.
-
-    Args:
-        node: The bridge's name, for the events' source.
 
     Raises:
         ValueError: The type is not known, or the mapping cannot be imported.
@@ -118,7 +115,7 @@ class IncomingTopic:
     def answer(self, data: bytes, stamps: Stamps) -> tuple[int, Event | None] | None:
         """Return the stamp of the image answered by a message (ns), and the message's event.
 
-        The event is `None` if refused or of no use: still an answer. In any thread.
+        The event is `None` if refused or useless: still an answer. In any thread.
         """
         message = self._message(data)
         if message is None:
@@ -182,9 +179,9 @@ class Inbox:
     Args:
         deliver: Called on the loop with the bytes of each; must not raise.
         depth: Messages that wait at most; the oldest is dropped.
-        max_rate: Messages a second at most; a burst of `depth` may come at once.
+        max_rate: Messages a second at most, with bursts of `depth`.
         max_size: Bytes of a message at most.
-        complain: Called, in the thread that reads, with the reason of a drop.
+        complain: Called in the reading thread with the reason of a drop.
         now: Real seconds.
     """
 
@@ -262,10 +259,6 @@ class Inbox:
 
 class OutgoingTopic:
     """Writer of a publication's messages.
-
-    Attributes:
-        waiting: Events that wait to be published.
-        publisher: Of the topic, once it is declared.
 
     Raises:
         ValueError: The type is not known, or the event or the mapping cannot be imported.

@@ -1,9 +1,8 @@
 """Names, attachments and complaints of messages on Zenoh, as in rmw_zenoh_cpp.
 
 Data keys, liveliness tokens and QoS as text are those of rmw_zenoh's docs/design.md and
-liveliness_utils.cpp; zenoh-plugin-ros2dds names topics otherwise (`ros2dds_key`). With every
-message go its number, when it was sent, and by whom: a ROS process that gets a malformed attachment
-ends, so there is one place that makes them. Nothing here talks to Zenoh.
+liveliness_utils.cpp; zenoh-plugin-ros2dds names topics otherwise (`ros2dds_key`). A malformed
+attachment (number, time and sender of a message) ends a ROS process. Nothing here talks to Zenoh.
 """
 
 from __future__ import annotations
@@ -28,13 +27,7 @@ ADMIN_SPACE = "@ros2_lv"
 
 
 class NodeName(msgspec.Struct, frozen=True, kw_only=True):
-    """A ROS node.
-
-    Attributes:
-        name: Without namespace.
-        namespace: ``/`` or ``/fleet/one``.
-        domain_id: ROS_DOMAIN_ID.
-    """
+    """A ROS node; `namespace` is ``/`` or ``/fleet/one``, `domain_id` ROS_DOMAIN_ID."""
 
     name: str
     namespace: str = "/"
@@ -45,12 +38,10 @@ class Token(msgspec.Struct, frozen=True, kw_only=True):
     """Contents of a node's or endpoint's liveliness token.
 
     Attributes:
-        key: The token itself; `attachment.gid` of it stands in its owner's messages.
-        kind: Kind of its owner.
-        node: Node of its owner.
+        key: The token itself; its `gid` stands in its owner's messages.
         zid: The session's id as text.
-        topic: The name of its topic or service; empty for a node.
-        extra: The rest; newer releases say there which buffers an endpoint can share.
+        topic: Name of its topic or service; empty for a node.
+        extra: The rest, as shareable buffers of newer releases.
     """
 
     key: str
@@ -107,12 +98,7 @@ def node_token(node: NodeName, zid: str, node_id: int) -> str:
 def endpoint_token(
     node: NodeName, zid: str, node_id: int, id_: int, kind: Kind, topic: Topic
 ) -> str:
-    """Return the liveliness token of a publisher or subscription.
-
-    Args:
-        zid: The session's id as text.
-        id_: Its own number in the session.
-    """
+    """Return the liveliness token of a publisher or subscription, number `id_` in its session."""
     head = _token(node, zid, node_id, id_, kind)
     return f"{head}/{mangle(topic.name)}/{dds_type(topic.type)}/{topic.hash}/{topic.qos.text()}"
 
@@ -140,7 +126,7 @@ class Attachment(NamedTuple):
     Attributes:
         sequence: Number of the message from its publisher, from 1.
         stamp: Wall clock, nanoseconds since 1970.
-        gid: The 16 bytes by which ROS tells one publisher from another.
+        gid: Publisher's 16 bytes.
     """
 
     sequence: int
@@ -152,8 +138,6 @@ class Message(NamedTuple):
     """A received message; its bytes are copied only on request.
 
     Attributes:
-        size: Bytes.
-        read: Returns the bytes.
         attached: Returns the attachment, to convert to bytes; `None` if there is none.
     """
 
@@ -206,11 +190,7 @@ LOG_INTERVAL = 5.0
 
 
 class Complaints:
-    """Counts of refusals and errors, by topic and kind. For any thread.
-
-    Args:
-        now: Real seconds.
-    """
+    """Counts of refusals and errors, by topic and kind. For any thread."""
 
     def __init__(
         self, log: Callable[[str], None], now: Callable[[], float] = time.monotonic
@@ -222,11 +202,7 @@ class Complaints:
         self._lock = threading.Lock()
 
     def add(self, where: str, kind: str, detail: str = "") -> None:
-        """Count an error; log once per `LOG_INTERVAL`, topic and kind.
-
-        Args:
-            kind: In few words; there are only a few.
-        """
+        """Count an error; log once per `LOG_INTERVAL`, topic and (one of a few) kind."""
         with self._lock:
             key, now = (where, kind), self._now()
             self.counts[key] += 1

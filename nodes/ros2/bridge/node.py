@@ -47,7 +47,7 @@ WAITING = 8
 
 
 class Ros2Bridge(Node[Ros2BridgeConfig]):
-    """Makes the run a node of ROS 2 with ordinary topics, and topics of ROS 2 events of the run.
+    """Bridge between a run, as a node of ROS 2 with ordinary topics, and topics of ROS 2 as events.
 
     ::
 
@@ -60,12 +60,11 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         type = "geometry_msgs/msg/Twist"
         as = "velocity"
 
-    What is announced has its topics from the start; what is not, from its first event. Messages
-    from outside that make no sense are counted, logged now and then, and left out.
-
-    An ``estimate`` that `answers_to` a camera is held: simulated time waits for the answer to each
-    image. All that this node publishes is then reliable and complete, whatever `sensor_qos` says,
-    and in one order: a subscriber that reads slowly slows the run down.
+    Announced sources have topics from the start, others from their first event. Invalid messages
+    are counted, logged now and then, and left out. An ``estimate`` that `answers_to` a camera is
+    held: simulated time waits for the answer to each image. All of this node's topics are then
+    reliable, complete and in one order, whatever `sensor_qos` says: a slow subscriber slows the run
+    down.
     """
 
     reads_truth = "showing"
@@ -116,7 +115,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
         Raises:
             MissingDependencyError: rosbags is not installed.
-            FatalError: The settings make no sense together, or there is no session to be had.
+            FatalError: The settings contradict each other, or there is no session.
         """
         config = self.config
         if config.time == "wall" and self.clock.kind != "real":
@@ -286,11 +285,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             self._publish(self._publishing.clock, self.clock.now())
 
     def _declare_mapped_events(self) -> None:
-        """Have `publications` called with the events of the file's publications.
-
-        Raises:
-            FatalError: A publication has no type of event.
-        """
+        """Have `publications` called with the events of the file's publications."""
         try:
             events = tuple({event_type(each) for each in self.config.publications})
         except ValueError as error:
@@ -315,7 +310,6 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             await self.offload(put, event)
 
     async def _read_images(self, incoming: IncomingTopic, waiting: Stream[bytes]) -> None:
-        """Read images beside the loop."""
         async for data in waiting:
             event = await self.offload(incoming.event, data, self.clock.now(), self._fix_time())
             if event is not None:
@@ -347,7 +341,6 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         )
 
     def _send(self, event: Event) -> None:
-        """Send an event by the first output of its type."""
         outputs = self.declared.outputs.items()
         port = next(port for port, output in outputs if isinstance(event, output.event))
         getattr(self, port).send(event)

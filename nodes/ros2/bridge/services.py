@@ -1,11 +1,10 @@
 """ROS 2 services and an action of a run: requests come as Zenoh's queries.
 
-`ServiceServer` takes them, and answers beside the run. simulation_interfaces 2.1
-(https://github.com/ros-simulation/simulation_interfaces) shows and sets whether simulated time
-runs, and steps it, with a reset refused: a run has one beginning. An action is three services and
-two topics (https://design.ros2.org/articles/actions.html); a goal that cannot be pursued is
-accepted and aborted at once, as a rejection could not say why. Each vehicle is armed, disarmed, and
-made to take off and land, by ``std_srvs/Trigger``.
+simulation_interfaces 2.1 (https://github.com/ros-simulation/simulation_interfaces) shows and sets
+whether simulated time runs, and steps it, with a reset refused: a run has one beginning. An action
+is three services and two topics (https://design.ros2.org/articles/actions.html); an impossible goal
+is accepted and aborted, as a rejection has no reason. Each vehicle is armed, disarmed, and made to
+take off and land, by ``std_srvs/Trigger``.
 """
 
 from __future__ import annotations
@@ -73,10 +72,7 @@ class ServiceServer:
         self._out = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="answers")
 
     def declare(self, name: str, type_: str, serve: Serve) -> None:
-        """Declare a service, relative to the namespace; called in any thread.
-
-        Requests are answered by `serve` on the loop, as a task of the node.
-        """
+        """Declare a service, relative to the namespace, in any thread; `serve` runs on the loop."""
         for part in ("_Request", "_Response"):  # the first of each takes milliseconds
             written = self.store.serialize(self.store.zero(type_ + part))
             self.store.deserialize(bytes(written), type_ + part)

@@ -1,6 +1,6 @@
 """Zenoh session as a ROS 2 node, and its publishers: the only import of zenoh.
 
-Zenoh has threads of its own and no asyncio: what it calls runs there, and must not wait.
+Zenoh's callbacks run in its own threads, and must not wait.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ from nodes.ros2.messages.topics import Topic
 
 
 class Publisher:
-    """Puts messages on a topic.
+    """Publisher of messages on a topic.
 
     Args:
-        put: Zenoh's.
         matched: Tells whether somebody subscribes to the topic.
         gid_: Of the endpoint; if ``None``, messages have no attachment.
-        max_wait: Real seconds that `put` waits for a peer that does not read; then the message is
-            given up.
+        max_wait: Real seconds that `put` waits for a peer that does not read; the message is then
+            lost.
 
     Attributes:
-        sent: How many messages went out.
-        failed: How many did not: the session is closed, or a peer did not read for `max_wait`.
-        note: Called with each message that was put.
+        sent: Number of messages out.
+        failed: Number of messages lost: the session is closed, or a peer did not read for
+            `max_wait`.
+        note: Called with each message put.
         kept: The last messages and their attachments, if the topic is transient local.
-        wanted: Whether messages are to be made, even where nobody subscribes.
+        wanted: Whether messages are made even without subscribers.
     """
 
     wanted = True
@@ -142,12 +142,11 @@ class Session:
     """Zenoh session of a single ROS node.
 
     Args:
-        keys: How topics are named.
-        connect: Endpoints to connect to, again and again until they answer.
-        file: A Zenoh configuration. What it leaves out, and the two endpoints if they are `None`,
-            is as without a file: that of rmw_zenoh_cpp.
-        max_wait: Real seconds for which a held message waits for a peer that does not read; then
-            it counts as failed, and the connection to that peer is given up.
+        keys: Naming of topics.
+        connect: Endpoints to connect to, until they answer.
+        file: A Zenoh configuration; the default, also for endpoints of `None`, is rmw_zenoh_cpp's.
+        max_wait: Real seconds that a held message waits for a peer that does not read; it then
+            fails, and that connection ends.
 
     Raises:
         SessionError: It cannot be opened.
@@ -184,9 +183,8 @@ class Session:
     def publisher(self, topic: Topic, *, held: bool = False) -> Publisher:
         """Declare a publisher, visible to ROS.
 
-        Args:
-            held: Whether every message must arrive: it is reliable, keeps all, and a put waits
-                (up to `max_wait`) for a peer that reads slowly rather than drop a message.
+        Held, it is reliable, keeps all, and waits (up to `max_wait`) for slow peers rather than
+        drop.
         """
         if held:
             qos = msgspec.structs.replace(topic.qos, reliable=True, keep_all=True)
@@ -224,10 +222,7 @@ class Session:
         return publisher
 
     def subscribe(self, topic: Topic, take: Take, *, late: bool = False) -> None:
-        """Declare a subscription, visible to ROS.
-
-        With `late`, messages that were sent before and are kept come too, as for transient local.
-        """
+        """Declare a subscription, visible to ROS; with `late`, kept messages come too."""
         # Not called by Zenoh for each message: each call takes the interpreter from the loop, and
         # under a flood the loop would wait for it again and again.
         ext, key, qos = zenoh.ext, self._key(topic), topic.qos
@@ -251,11 +246,7 @@ class Session:
         self._show(topic, "MS")
 
     def subscribe_in_order(self, takes: Sequence[tuple[Topic, Take]]) -> None:
-        """Subscribe to topics with a common order: messages are taken in the order of arrival.
-
-        So what a process says on one of them after another is taken after it. This costs the loop
-        more than `subscribe`.
-        """
+        """Subscribe to topics in a common order of arrival, at more cost than by `subscribe`."""
         came: queue.Queue[tuple[Take, zenoh.Sample] | None] = queue.Queue(WAITING)
 
         def queue_for(take: Take) -> Any:
@@ -276,11 +267,11 @@ class Session:
     def watch(self, topic_name: str, kind: Kind, changed: Callable[[bool, Token], None]) -> None:
         """Report the endpoints of other sessions on a topic, now and at each change.
 
-        Those of a process that is killed disappear at once; invalid tokens are left out.
+        Those of a killed process disappear at once; invalid tokens are left out.
 
         Args:
             kind: Of the endpoints: ``MP`` for publishers, ``MS`` for subscriptions.
-            changed: Called in any thread with whether one is there (else it is gone), and which.
+            changed: Called in any thread with an endpoint's presence and token.
         """
 
         def tell(sample: zenoh.Sample) -> None:
@@ -296,12 +287,7 @@ class Session:
         self._kept.append(liveliness.declare_subscriber(key, tell, history=True))
 
     def serve(self, service: Topic, take: Callable[[Message, Answer], None]) -> None:
-        """Declare a service, visible to ROS.
-
-        Args:
-            service: Its name, type, hash and quality of service.
-            take: Called in a thread of Zenoh's with each request; must not wait.
-        """
+        """Declare a service, visible to ROS; `take` gets requests in a thread: no waiting."""
         key = data_key(self._node.domain_id, service)
 
         def answer(query: zenoh.Query, reply: bytearray | str, attachment: bytes) -> None:
@@ -320,8 +306,8 @@ class Session:
     def close(self) -> bool:
         """Close the session; return whether done within `CLOSING`.
 
-        A peer that stands still can keep Zenoh waiting for longer (10 s). Then a thread goes
-        on with it, and the process ends after that: to end before would crash in Zenoh.
+        Zenoh waits up to 10 s for a peer that stands still; a thread then delays the process's end,
+        which would crash in Zenoh otherwise.
         """
         thread = threading.Thread(target=self._session.close, name="zenoh close")
         thread.start()
@@ -375,7 +361,6 @@ def _message(sample: zenoh.Sample | zenoh.Query) -> Message:
 def _configuration(
     connect: tuple[str, ...] | None, listen: tuple[str, ...] | None, file: str
 ) -> zenoh.Config:
-    """Return the configuration of a peer as in rmw_zenoh_cpp, or as in `file`."""
     plain, configuration = zenoh.Config(), zenoh.Config()
     if file:
         if not Path(file).is_file():

@@ -1,7 +1,4 @@
-"""The bridge's settings in a run's file.
-
-Imports what a file names: mappings of the user's own, and the events that they are of.
-"""
+"""The bridge's settings in a run's file, and imports of the user's own mappings and events."""
 
 from __future__ import annotations
 
@@ -41,9 +38,9 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             PoseWithCovarianceStamped, Odometry or the end of a Path), ``odometry`` (Odometry),
             ``velocity`` (Twist, TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``,
             ``depth`` (Image), ``imu`` (Imu), ``range`` (Range), ``pressure`` (FluidPressure),
-            ``magnetic_field`` (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the
-            run waits for the first one, and a camera is announced), ``done`` (Header or Time: an
-            estimator will say no more about the image of this stamp).
+            ``magnetic_field`` (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the run
+            waits for it, and announces a camera), ``done`` (Header or Time: an estimator is done
+            with the image of this stamp).
         mapping: Instead of `use`: ``module:function``, called with a message and a
             `MessageContext`; returns an event, or None.
         source: Source of the events; if empty, the node's name and the topic.
@@ -53,17 +50,17 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         reliable: Quality of service, as ROS shows it.
         depth: Messages that wait at most.
         max_rate: Messages a second at most; the rest is dropped.
-        transient_local: Whether to get messages that were published before, and are kept
-            (``/map``, ``/tf_static``); a ``camera`` always does.
-        timeout: Seconds that the run's start waits for a ``camera``, or for the estimator that
+        transient_local: Whether to get kept messages of before (``/map``, ``/tf_static``); a
+            ``camera`` always does.
+        timeout: Seconds that the start waits for a ``camera``, or for the estimator that
             `answers_to` images.
-        answers_to: Source of the images whose stamps the messages of an ``estimate`` or ``done``
-            bear. Simulated time waits for the answer to each image, and nothing between the two
-            is dropped; `depth` and `max_rate` do not apply. See `runtime.channels.hold`.
+        answers_to: Source of the images answered by an ``estimate`` or ``done`` of the same stamp.
+            Simulated time waits for each answer, and nothing is dropped; `depth` and `max_rate` do
+            not apply.
         latency: Time on the run's clock from the arrival of an image to its answer's event.
-        hold: How long to wait for an answer, and what follows if none comes.
-        needs: Topics of this node that the estimator must have subscribed to before the first
-            image is sent; if empty, that of the images.
+        hold: Longest wait for an answer, and its consequence.
+        needs: Topics of this node to which the estimator must subscribe before the first image; if
+            empty, that of the images.
     """
 
     topic: str
@@ -136,12 +133,12 @@ class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         topic: Relative to the namespace, or with a leading slash.
         type: Type of the messages: ``sensor_msgs/msg/BatteryState``.
         event: Type of the events, ``module:Class``, with its subclasses.
-        mapping: ``module:function``, called with an event and a `MessageBuilder` in a thread
-            beside the loop; returns a message of `type`, or None.
+        mapping: ``module:function``, called beside the loop with an event and a `MessageBuilder`;
+            returns a message of `type`, or None.
         source: Take only events of this source or below it.
         reliable: Quality of service, as ROS shows it.
         transient_local: Whether late joiners get the last `depth` messages.
-        depth: Messages that are kept, and events that wait, at most.
+        depth: Messages kept, and events waiting, at most.
     """
 
     topic: str
@@ -178,19 +175,19 @@ class Ros2BridgeConfig(PublishingConfig):
         node_name: As ``ros2 node list`` shows it.
         distribution: Of ROS 2, on the other side.
         keys: ``rmw_zenoh``, or ``ros2dds`` for a bridge with zenoh-plugin-ros2dds.
-        connect: Zenoh endpoints to connect to; if not given, those of `zenoh_config`, or else
-            ``tcp/localhost:7447``, where ``rmw_zenohd`` listens.
-        listen: The same for listening; or else any port of the loopback.
+        connect: Zenoh endpoints to connect to; by default those of `zenoh_config`, else
+            ``tcp/localhost:7447`` (``rmw_zenohd``).
+        listen: The same for listening; by default any port of the loopback.
         zenoh_config: A Zenoh configuration file (JSON5) for other settings: TLS, access control,
-            shared memory. What it leaves out is as without it: no multicast, for one.
+            shared memory; defaults stay, as no multicast.
         clock_rate: Messages a second on ``/clock``, on the run's clock.
         max_message_size: Bytes of a message from outside, at most.
         definitions: Message types missing in ROS 2, and the ``.msg`` file of each.
         subscriptions: Topics of ROS 2 whose messages become events.
-        publications: Topics to publish by functions of the user's own.
-        services: Groups of services to offer. ``simulation``: simulation_interfaces, by which ROS
-            pauses, steps and ends the run. ``vehicle``: ``std_srvs/Trigger`` as ``arm``,
-            ``disarm``, ``take_off`` and ``land`` below each vehicle's name.
+        publications: Topics published by functions of the user's own.
+        services: Groups of services. ``simulation``: simulation_interfaces, to pause, step and end
+            the run. ``vehicle``: ``std_srvs/Trigger`` as ``arm``, ``disarm``, ``take_off`` and
+            ``land`` below each vehicle's name.
         step: Simulated time of one step of ``step_simulation`` and ``simulate_steps``.
         paused: Whether simulated time stands from the run's start until a service resumes it.
     """
@@ -241,10 +238,7 @@ class Ros2BridgeConfig(PublishingConfig):
 
 
 def import_mapping(topic: str, path: str) -> Callable[[Any, Any], Any]:
-    """Return a function.
-
-    Args:
-        path: ``module:function``.
+    """Return a function of the form ``module:function``.
 
     Raises:
         ValueError: It cannot be imported, or is no function.

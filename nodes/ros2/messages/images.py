@@ -1,12 +1,10 @@
 """Images and point clouds as messages, JPEG and PNG, and their pixels back.
 
-Nearly all of such a message is its data, so the rest is serialised once by `typestore`, and then
-only stamp, length and data are written, into a buffer that is used again: an image is copied once
-at most. The bytes are those that rosbags would make. A writer belongs to one topic and one thread
-at a time.
-
-Compressed depth is a PNG of 16 bits, as compressed_depth_image_transport has it (its codec.cpp),
-after twelve bytes: an int32 0 (inverse depth), then a and b as float32. 0 stands for no depth.
+The head is serialised once by `typestore`; then only stamp, length and data are written into a
+reused buffer: at most one copy. The bytes are as of rosbags. A writer belongs to one topic and one
+thread at a time. Compressed depth is a PNG of 16 bits, as compressed_depth_image_transport has it
+(its codec.cpp), after twelve bytes: an int32 0 (inverse depth), then a and b as float32. 0 stands
+for no depth.
 
 - ``32FC1``: a depth z becomes ``a / z + b`` with ``a = q (q + 1)`` and ``b = 1 - a / z_max``. Here
   ``q`` is its setting ``depth_quantization``, 100, and ``z_max`` its ``depth_max``, 10 m.
@@ -28,25 +26,14 @@ from nodes.ros2.messages.typestore import Time, TypeStore
 def encode_image(
     data: npt.NDArray[np.uint8], format_: Literal["jpeg", "png"], quality: int = 90
 ) -> npt.NDArray[np.uint8]:
-    """Return the bytes of an encoded image.
-
-    Args:
-        data: Pixels, shape (height, width, 3) in RGB, or (height, width) in grey.
-        format_: ``png`` loses nothing.
-        quality: Of a JPEG, 1 to 100.
-    """
+    """Return the bytes of an encoded image, RGB (height, width, 3) or grey (height, width)."""
     pixels: Any = cv2.cvtColor(data, cv2.COLOR_RGB2BGR) if data.ndim == 3 else data
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if format_ == "jpeg" else []
     return np.asarray(cv2.imencode(f".{format_}", pixels, options)[1], np.uint8).ravel()
 
 
 def depth_in_steps(depth: npt.NDArray[np.float32], per_metre: float) -> npt.NDArray[np.uint16]:
-    """Return depth as whole steps of 16 bits; 0 where there is none, or more than 65535 steps.
-
-    Args:
-        depth: Metres; ``inf`` where there is none.
-        per_metre: Steps per metre: 1000 for millimetres.
-    """
+    """Return depth (metres, ``inf`` for none) as 16 bits; 0 for none, or more than 65535 steps."""
     steps = np.rint(depth * np.float32(per_metre))
     return np.where((steps >= 1.0) & (steps <= 65535.0), steps, 0.0).astype(np.uint16)
 
@@ -69,11 +56,7 @@ POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
 """Point of a cloud's PointCloud2: colour in a single field, ``rgb``, as PCL packs colours."""
 
 LIDAR_POINT = np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
-"""Point of a lidar's PointCloud2, with the fields of Velodyne's driver.
-
-LIO-SAM and FAST-LIO read them; ``time`` is seconds after the message's stamp, that of the first
-ray.
-"""
+"""Point of a lidar's PointCloud2, as of Velodyne's driver; ``time``: seconds after the stamp."""
 
 _FLOAT32, _UINT16 = 7, 4
 """Of sensor_msgs/msg/PointField."""
@@ -91,7 +74,7 @@ _TURNS = {
 
 
 class ImageWriter:
-    """Writes ``sensor_msgs/msg/Image``.
+    """Writer of ``sensor_msgs/msg/Image``.
 
     Args:
         frame_id: Optical frame.
@@ -106,7 +89,7 @@ class ImageWriter:
         self._buffer = bytearray()
 
     def write(self, time: Time, data: npt.NDArray[Any]) -> bytearray:
-        """Return the message; the next call overwrites its bytes.
+        """Return the message, overwritten by the next call.
 
         Args:
             time: Seconds and nanoseconds.
@@ -146,13 +129,7 @@ def cloud(
     points: npt.NDArray[np.float32],
     kind: np.dtype[np.void],
 ) -> tuple[bytearray, npt.NDArray[np.void]]:
-    """Return a ``sensor_msgs/msg/PointCloud2`` with its points, and its rows for the rest.
-
-    Args:
-        header: ``std_msgs/msg/Header``.
-        points: Metres in ROS's axes, shape (n, 3).
-        kind: `POINT` or `LIDAR_POINT`.
-    """
+    """Return a ``sensor_msgs/msg/PointCloud2`` with points (metres in ROS's axes), and its rows."""
     count = len(points)
     field = store.message("sensor_msgs/msg/PointField")
     fields = [*_XYZ, ("rgb", 12, _FLOAT32)] if kind == POINT else [*_XYZ, *_MEASURED]
@@ -199,7 +176,7 @@ def image_pixels(message: Any) -> npt.NDArray[np.uint8]:
 def depth_pixels(message: Any) -> npt.NDArray[np.float32]:
     """Return the metres of an Image of metres (``32FC1``) or millimetres (``16UC1``).
 
-    What is not known is ``inf``.
+    Unknown depth is ``inf``.
 
     Raises:
         ValueError: The encoding is another, or sizes do not fit each other.
@@ -248,9 +225,8 @@ def inverse_depth(depth: npt.NDArray[np.float32], farthest: float, quantization:
 
     Args:
         depth: Metres, shape (height, width); ``inf`` where there is none.
-        farthest: Metres; what is farther away becomes unknown.
-        quantization: Larger for finer steps; what is nearer than about q² / 65535 m appears to be
-            there.
+        farthest: Metres, beyond which depth is unknown.
+        quantization: Larger for finer steps; the least depth is about q² / 65535 m.
     """
     most = np.float32(farthest)
     a = np.float32(quantization * (quantization + 1.0))

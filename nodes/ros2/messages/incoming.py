@@ -1,7 +1,7 @@
 """Events from ROS messages, in our frames. Invalid messages raise ValueError.
 
-A function for each row of `mappings`; a mapping of the user's own is called alike. World ENU
-becomes NED, body FLU FRD; optical axes stay.
+A function for each row of `mappings`, as for users' own mappings. World ENU becomes NED, body FLU
+FRD; optical axes stay.
 """
 
 from __future__ import annotations
@@ -52,11 +52,10 @@ class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
     """Input of a reader besides the message.
 
     Attributes:
-        source: Source of the event.
+        source: Of the event.
         now: On the run's clock (ns).
-        stamps: How times in messages become stamps.
         frame_id: If set, replaces the message's.
-        vehicle: Vehicle of a set-point.
+        vehicle: Of a set-point.
     """
 
     source: str
@@ -282,15 +281,14 @@ def nothing(message: Any, context: MessageContext) -> None:
 def camera_announcement(
     message: Any, source: str, images: tuple[str, ...], frame_id: str = ""
 ) -> CameraAnnouncement:
-    """Return the announcement of a camera looking ahead from the body's origin.
+    """Return the announcement, by a CameraInfo, of a camera looking ahead from the body's origin.
 
     Args:
-        message: A ``sensor_msgs/msg/CameraInfo``.
         images: Kinds of its images.
         frame_id: If set, replaces the message's.
 
     Raises:
-        ValueError: The message is no calibration of a camera.
+        ValueError: The message is no camera's calibration.
     """
     info = camera_info(message)
     return CameraAnnouncement(

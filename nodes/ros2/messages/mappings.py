@@ -1,7 +1,6 @@
 """Table of all mappings between events and ROS messages, and lookups in the table.
 
-Bridge, recorder, replay, judge and viewers read it: who adds a mapping adds a row, and its function
-to `outgoing` or `incoming`.
+A new mapping is a row here, and a function in `outgoing` or `incoming`.
 """
 
 from __future__ import annotations
@@ -93,20 +92,16 @@ class Mapping(msgspec.Struct, frozen=True):
 
     Attributes:
         kind: Name of the publication.
-        topic: Its topic, `{}` standing for the source of the events.
-        type: Of the messages.
-        group: Its group in the setting ``publish``.
+        topic: With `{}` for the source of the events.
+        group: In the setting ``publish``.
         events: Published events; an event of several rows goes by the order of the table.
-        write: Makes the message.
         announced: Announcements for which the topic is there from the start.
         gives: Kinds of image of which a camera has to give at least one.
-        qos: Quality of service.
         large: Whether a message takes long to make.
         image: Whether an estimator may subscribe to it for its images.
         source: Returns the text for `{}`; `None` for an event without such a message.
         wanted: Whether settings let it be published, beside `group`.
         use: Use of the messages, as settings name it.
-        read: Makes the event.
         becomes: Type of the events that are read, if it is not `events`.
         bags: Whether only replays of bags read it.
     """

@@ -1,7 +1,7 @@
 """Events to ROS messages, in ROS's frames and axes: a function for each row of `mappings`.
 
-A function takes what all have in common (`Outgoing`) and an event, and returns a message, or the
-bytes of one (`images`, `paths`), or `None` if there is nothing to say.
+Functions take their common context (`Outgoing`) and an event, and return a message, its bytes, or
+`None`.
 """
 
 from __future__ import annotations
@@ -61,9 +61,8 @@ class Outgoing:
         time: Returns the time in messages of a stamp (ns).
 
     Attributes:
-        names: Names of the run's frames in ROS.
         cameras: By source.
-        bodies: Sources of bodies that move by themselves.
+        bodies: Sources of self-moving bodies.
         sensors: Announcement of a topic, by its kind and source.
     """
 
@@ -307,10 +306,7 @@ def path(out: Outgoing, event: Odometry | PoseEstimate) -> bytearray | None:
 
 
 def imu(out: Outgoing, event: Imu) -> Any:
-    """Return a sensor_msgs/Imu without orientation.
-
-    The covariances are those of one sample: squared noise density times rate.
-    """
+    """Return a sensor_msgs/Imu without orientation; covariances are noise density² times rate."""
     axes, noise = out.names.axes(event.frame_id), out.sensors.get(("imu", event.source))
     gyroscope = accelerometer = _ZEROS_9
     if noise is not None:

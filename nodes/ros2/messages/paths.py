@@ -1,7 +1,6 @@
 """Path of a vehicle, or of an estimate, as ``nav_msgs/msg/Path`` for RViz.
 
-A path is sent whole again and again, so its poses are kept as the bytes that they are sent as; the
-bytes are those that rosbags would make.
+Poses are kept as sent, in the bytes of rosbags, because a path is sent whole again and again.
 """
 
 from __future__ import annotations
@@ -26,12 +25,7 @@ _POSE = 56
 
 
 class Paths:
-    """The paths of all vehicles and estimates.
-
-    Args:
-        names: Of frames, as ROS calls them.
-        config: How far apart poses are, how many there are, and how often a path is sent.
-    """
+    """The paths of all vehicles and estimates."""
 
     def __init__(self, store: TypeStore, names: FrameNames, config: PublishingConfig) -> None:
         self._store = store
@@ -41,11 +35,7 @@ class Paths:
         """Path and its next time of sending (ns), by source."""
 
     def message(self, event: Odometry | PoseEstimate, time: Time) -> bytearray | None:
-        """Add a pose to the path of its source; return the path if due.
-
-        Args:
-            time: Of its stamp, in messages: seconds and nanoseconds.
-        """
+        """Add a pose to its source's path, at a message time (s, ns); return the path if due."""
         config, frame = self._config, self._names.name(event.frame_id, event.source)
         path, due = self._paths.get(event.source, (None, event.stamp))
         if path is None or path.frame != frame:
@@ -70,9 +60,8 @@ class PathMessage:
 
     Args:
         frame: The poses' parent, as ROS calls it.
-        step: Metres from one pose to the next that is kept.
-        length: Poses of a message at most. When there would be more, every other is left out and
-            the step is doubled: a path becomes coarser, but never loses its start.
+        step: Metres between kept poses.
+        length: Poses of a message at most; beyond, every other is left out and the step doubled.
     """
 
     def __init__(self, store: TypeStore, frame: str, step: float, length: int) -> None:
@@ -100,13 +89,7 @@ class PathMessage:
         return not self._kept or dist(position, self._last) >= self.step
 
     def add(self, time: Time, position: Vector3, orientation: Quaternion) -> None:
-        """Keep a pose.
-
-        Args:
-            time: Seconds and nanoseconds.
-            position: Metres in ROS's axes.
-            orientation: The same.
-        """
+        """Keep a pose, in ROS's axes, at a time (s, ns)."""
         if self._kept == len(self._rows) - 1:  # the last is for the newest pose
             half = self._rows[: self._kept : 2].copy()
             self._rows[: len(half)] = half
@@ -115,13 +98,7 @@ class PathMessage:
         self._kept, self._last = self._kept + 1, position
 
     def message(self, time: Time, position: Vector3, orientation: Quaternion) -> bytearray:
-        """Return the path up to a pose, kept or not.
-
-        Args:
-            time: Seconds and nanoseconds.
-            position: Metres in ROS's axes.
-            orientation: The same.
-        """
+        """Return the path up to a pose, kept or not; arguments are as of `add`."""
         self._put(self._kept, time, position, orientation)
         count = self._kept + (self._kept == 0 or dist(position, self._last) > 0.0)
         data = self._first(time)

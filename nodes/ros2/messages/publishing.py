@@ -1,7 +1,4 @@
-"""Puts the messages of events on their topics, as `mappings` has them.
-
-Where they go is up to a `Sink`: the bridge's Zenoh session, a recording's file, a viewer's server.
-"""
+"""Publishing of events' messages, by `mappings`, to a `Sink`: a session, a file, a server."""
 
 from __future__ import annotations
 
@@ -61,14 +58,10 @@ class Sink(Protocol[P_co]):
 
 
 class Publishing(Generic[P]):
-    """Makes messages of events, and puts them where they belong.
+    """Maker and publisher of events' messages.
 
     Args:
         time: Returns the time in messages of a stamp (ns).
-
-    Attributes:
-        names: What ROS calls the frames of the run.
-        builder: For mappings of the user's own.
     """
 
     def __init__(

@@ -1,9 +1,8 @@
 """Topics and frames: names allowed by ROS, quality of service, and publishing settings.
 
-Frames and how their axes lie are those of REP 103 and REP 105. The definitions of services that
-rosbags does not come with are as in their packages' ``.srv`` files, without comments, constants and
-default values, on which the hash of a type does not depend: std_srvs and action_msgs of ROS 2
-Jazzy, simulation_interfaces 2.1.0.
+Frames are those of REP 103 and REP 105. Definitions of services missing in rosbags are from their
+packages' ``.srv`` files, without parts that no hash depends on (comments, constants, default
+values): std_srvs and action_msgs of ROS 2 Jazzy, simulation_interfaces 2.1.0.
 """
 
 from __future__ import annotations
@@ -29,10 +28,8 @@ class Qos(msgspec.Struct, frozen=True, kw_only=True):
     """Quality of service, as far as used here.
 
     Attributes:
-        reliable: Else best effort.
         transient_local: Whether late joiners get the last `depth` messages.
-        depth: How many messages are kept.
-        keep_all: Whether a publisher waits for who is slow rather than drop a message.
+        keep_all: Whether a publisher waits for slow readers rather than drop a message.
     """
 
     reliable: bool = True
@@ -58,8 +55,7 @@ class Topic(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         name: With its leading slash.
         type: ``sensor_msgs/msg/Image``.
-        hash: ``RIHS01_…``, or `NO_HASH`; empty where nobody needs it.
-        qos: Of this end.
+        hash: ``RIHS01_…``, or `NO_HASH`; empty if not needed.
     """
 
     name: str
@@ -137,26 +133,25 @@ class PublishingConfig(NodeConfig):
         namespace: Prefix of all topic names without a leading slash.
         publish: Groups of topics to publish.
         topics: Other names for topics, by default name.
-        time: ``simulated``: stamps count from the run's start, and ``/clock`` gives the time (set
-            ``use_sim_time``). ``wall``: they are shifted to the wall clock, and there is no
-            ``/clock``; with the real clock only.
-        vehicle: Vehicle whose truth ``/tf`` shows; if empty, all announced vehicles. If there are
-            several, their frames begin with the vehicle's name.
+        time: ``simulated``: stamps count from the run's start, with ``/clock`` (set
+            ``use_sim_time``). ``wall``: by the wall clock, without ``/clock``; with the real clock
+            only.
+        vehicle: Vehicle whose truth ``/tf`` shows; if empty, all announced ones, with its name
+            before each of several ones' frames.
         tf: ``truth``, or the source of the estimates that place ``base_link`` instead.
         path_rate: Messages a second, at most, of the path of a vehicle or of an estimate.
         path_step: Metres from one pose of a path to the next.
-        path_length: Poses of a path at most; beyond that, every other is left out and the step
-            doubled, so that a path always reaches back to its start.
+        path_length: Poses of a path at most; beyond, every other is left out and the step doubled.
         covariance: Publish estimates as PoseWithCovarianceStamped.
         raw_images: Publish images as ``Image``.
         compressed_images: Publish images as ``CompressedImage`` of this format.
-        raw_depth: Publish depth images as ``Image``: in metres (32FC1), or in whole
-            ``millimetres`` up to 65.535 m (16UC1).
-        compressed_depth: Publish depth images as compressed_depth_image_transport does:
-            ``inverse`` depth in 16 bits (32FC1), or whole ``millimetres`` up to 65.535 m (16UC1).
+        raw_depth: Publish depth images as ``Image``: in metres (32FC1), or in whole ``millimetres``
+            up to 65.535 m (16UC1).
+        compressed_depth: Publish depth images as of compressed_depth_image_transport: ``inverse``
+            depth in 16 bits (32FC1), or whole ``millimetres`` up to 65.535 m (16UC1).
         depth_max: Metres beyond which ``inverse`` depth is unknown.
-        depth_quantization: Metres near which steps of ``inverse`` depth are a hundredth of the
-            depth; farther away they grow with its square.
+        depth_quantization: Metres at which steps of ``inverse`` depth are a hundredth of the depth;
+            they grow with its square.
         jpeg_quality: 1 to 100.
         sensor_qos: ``best_effort`` (as ROS's sensor data) or ``reliable``, for the topics of
             sensors.
@@ -242,9 +237,8 @@ class CameraFrames(msgspec.Struct, frozen=True):
 class FrameNames:
     """Names and axes of the run's frames, and their names in ROS.
 
-    Of one vehicle alone, frames have the names of REP 105 (``odom``, ``base_link``). Once there is
-    a second, the vehicle's name stands before those of each: ``drone/odom``, ``drone/base_link``.
-    Whose frame is meant follows from the source: ``drone/camera`` is of ``drone``.
+    Frames of a single vehicle are REP 105's (``odom``, ``base_link``), of several ``drone/odom``,
+    ``drone/base_link``; the vehicle is that of the source (``drone/camera``: ``drone``).
     """
 
     def __init__(self) -> None:

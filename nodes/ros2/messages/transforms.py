@@ -1,7 +1,7 @@
 """The frames on ``/tf`` and ``/tf_static``: map, odom, base_link, camera_link, optical frames.
 
-REP 105: ``odom`` is where the vehicle started, so ``map → odom`` is fixed, and estimates that are
-in ``odom`` stand where they should. Poses in, transforms in ROS's names and axes out; no messages.
+REP 105: ``odom`` is the vehicle's start, so ``map → odom`` is fixed. Poses in, transforms in ROS's
+names and axes out; no messages.
 """
 
 from __future__ import annotations
@@ -42,8 +42,7 @@ class Transforms:
     """The tree of frames of all vehicles and cameras.
 
     Args:
-        names: What ROS calls our frames.
-        vehicle: The only one whose frames are shown; if empty, all are.
+        vehicle: The only one shown; if empty, all are.
         body: ``truth``, or the source of the estimates that place its vehicle instead.
     """
 
@@ -161,7 +160,6 @@ class Transforms:
         return [self._turned(event.frame_id, child, pose, event.source)]
 
     def _is_fixed(self, vehicle: str, child: str) -> bool:
-        """Tell whether a frame of a vehicle has its place already."""
         return any(
             frame == child and self._names.vehicles.of(source) == vehicle
             for source, frame in self._fixed

@@ -1,8 +1,7 @@
 """Message types, their hashes, CDR, and bags: the only import of rosbags.
 
-Messages are objects of the classes that rosbags makes from the types' definitions; their fields
-have the names in ROS's files. A mapping of the user's own is called with an event and a
-`MessageBuilder`::
+Messages are of rosbags' classes, with fields as in ROS's files. A mapping of the user's own is
+called with an event and a `MessageBuilder`::
 
     def battery(event: Battery, builder: MessageBuilder) -> Any:
         return builder.make(
@@ -33,8 +32,7 @@ Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 def _hash_as_ros_2_does() -> None:
     """Have rosbags hash ``char`` like ROS 2 in message files: as ``uint8``.
 
-    rosidl_adapter turns the one into the other before anything is hashed. rosbags takes it for
-    IDL's char, so that keys of such types would meet nobody, and bags with them be refused.
+    As rosidl_adapter does; rosbags' IDL char would make keys that meet nobody.
     """
     from rosbags.typesys.store import TIDMAP
 
@@ -49,7 +47,7 @@ class TypeStore:
     """Message types of a distribution of ROS 2.
 
     Args:
-        distribution: Whose definitions hold; a few differ (``sensor_msgs/msg/Range``).
+        distribution: Of ROS 2; a few definitions differ (``sensor_msgs/msg/Range``).
         definitions: Further types, with the ``.msg`` file of each.
 
     Raises:
@@ -84,14 +82,10 @@ class TypeStore:
                 ) from error
 
     def add(self, type_: str, definition: str) -> None:
-        """Add a message, or a service, be they part of an action or not.
+        """Add a message or service, also of an action, by its file's text without default values.
 
         A service's messages are ``…_Request`` and ``…_Response``; its hash is that of a type with
         these and an event as its fields (REP 2016).
-
-        Args:
-            type_: ``std_srvs/srv/Trigger``.
-            definition: As in its ``.msg`` or ``.srv`` file, without default values.
         """
         plain, node = f"{type_.split('/')[0]}/msg/Plain", self._node  # rosbags names it so
         if "---" not in definition:
@@ -204,7 +198,7 @@ class TypeStore:
 
 
 class Bag:
-    """Reads a bag of ROS 2 (a folder, or an MCAP or SQLite file), or of ROS 1.
+    """Reader of a bag of ROS 2 (a folder, or an MCAP or SQLite file), or of ROS 1.
 
     Raises:
         MissingDependencyError: rosbags is not installed.
@@ -251,8 +245,8 @@ class Bag:
         """Yield topic, type, time of receipt (ns) and message, in the order of receipt.
 
         Args:
-            start: Messages received before it (ns) are left out.
-            stop: So are those received at it and after.
+            start: First time of receipt (ns).
+            stop: Time of receipt (ns) before which messages end.
             newest: Only the last of all; no other is decoded.
 
         Raises:
@@ -282,11 +276,7 @@ Time = tuple[int, int]
 
 
 class Stamps(msgspec.Struct, frozen=True):
-    """Converts stamps of the run's clock to times in messages, and back.
-
-    Attributes:
-        offset: Nanoseconds to add on the way out.
-    """
+    """Converter of stamps of the run's clock to times in messages (`offset` in ns), and back."""
 
     offset: int = 0
 
@@ -299,11 +289,7 @@ class Stamps(msgspec.Struct, frozen=True):
         return int(seconds) * SECOND + int(nanoseconds) - self.offset
 
     def back(self, seconds: int, nanoseconds: int, now: int) -> int:
-        """Return a message's time on the run's clock (ns).
-
-        Args:
-            seconds: Of the message; both 0 stand for now.
-            now: On the run's clock (ns).
+        """Return a message's time on the run's clock (ns); both 0 stand for now (ns).
 
         Raises:
             ValueError: It lies before the run, or ahead of its clock.
@@ -320,10 +306,9 @@ class Stamps(msgspec.Struct, frozen=True):
 
 
 class MessageBuilder:
-    """Builds messages.
+    """Builder of messages.
 
     Args:
-        names: What ROS calls our frames.
         time: Returns the time in messages of a stamp (ns).
     """
 
@@ -352,10 +337,5 @@ class MessageBuilder:
         return self._store.message("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
 
     def header(self, stamp: int, frame_id: str, source: str = "") -> Any:
-        """Return a ``std_msgs/msg/Header``.
-
-        Args:
-            stamp: Nanoseconds of the run's clock.
-            source: Whose frame it is: each of several vehicles has its own ``base_link``.
-        """
+        """Return a ``std_msgs/msg/Header`` of a stamp (ns), and a frame of a source's vehicle."""
         return self._store.header(self._time(stamp), self._names.name(frame_id, source))

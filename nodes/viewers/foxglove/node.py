@@ -33,7 +33,7 @@ _REFUSALS = 10
 
 
 class FoxgloveServer(Node[FoxgloveConfig]):
-    """Shows a run, live, in Foxglove: *Open connection*, ``ws://localhost:8765``.
+    """Live view of a run in Foxglove: *Open connection*, ``ws://localhost:8765``.
 
     ::
 
@@ -41,10 +41,9 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         name = "foxglove"
         type = "FoxgloveServer"
 
-    Topics, types and frames are those of ROS 2, as of `nodes.ros2.bridge` and of a recording;
-    paths, bodies, features and the log are Foxglove's own. What is announced has its topics from
-    the start; what is not, from its first event. A viewer that connects late gets fixed
-    transforms, clouds and the paths flown so far.
+    Topics, types and frames are ROS 2's, as of the bridge and a recording; paths, bodies, features
+    and the log are Foxglove's own. Announced sources have topics from the start, others from their
+    first event. Late viewers get fixed transforms, clouds and paths.
     """
 
     reads_truth = "showing"
@@ -63,7 +62,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
 
         Raises:
             MissingDependencyError: foxglove is not installed.
-            FatalError: The port cannot be had.
+            FatalError: The port is taken.
         """
         if self.checking:
             return

@@ -1,9 +1,7 @@
-"""Messages of the server: ROS's as CDR, as the bridge sends them, and Foxglove's own.
+"""Messages of the server, in ROS's axes: ROS's as CDR, Foxglove's paths, bodies, features, log.
 
-Foxglove's own are paths and bodies, features, and the log; all are in ROS's frames and axes.
-
-Images and point clouds are put from threads beside the loop, one of each kind at a time; the
-rest takes some microseconds and is put at once.
+Images and point clouds are put from threads beside the loop, one of each kind at a time; the rest
+takes microseconds and is put at once.
 """
 
 from __future__ import annotations
@@ -60,11 +58,7 @@ from runtime.time.schedule import SECOND
 
 
 class Messages:
-    """Makes messages.
-
-    Args:
-        types: ``foxglove.messages``.
-    """
+    """Maker of messages of ``foxglove.messages``."""
 
     def __init__(self, types: Any) -> None:
         self._m = types
@@ -165,11 +159,7 @@ class RosTopics:
 
 
 class RosTopic:
-    """A topic of ROS messages.
-
-    Later viewers get the newest message of a transient-local topic, and of a cloud that is no
-    sensor's: a map.
-    """
+    """A topic of ROS messages; late viewers get the newest of a transient-local topic or a map."""
 
     def __init__(self, topics: RosTopics, topic: Topic) -> None:
         self.topic = topic
@@ -282,7 +272,6 @@ class Publishing:
                 self._put(event)
 
     def _odometry(self, event: Odometry) -> None:
-        """Put where a vehicle truly is, and draw its path."""
         source = event.source
         self._vehicle(source, event.child_frame_id)
         self._put(event)
@@ -291,10 +280,7 @@ class Publishing:
         self._extend(f"truth/{source}", event.frame_id, colour, event)
 
     def _estimate(self, event: PoseEstimate) -> None:
-        """Put an estimate, and its body's frame: ``<estimator>/<body>``.
-
-        Estimates that are not in ``map`` begin at the true pose of their time.
-        """
+        """Put an estimate, laid on the truth unless in ``map``, and ``<estimator>/<body>``."""
         source, body = event.source, f"{event.source}/{event.child_frame_id}"
         parent = self._estimators.get(source)
         if parent is None:
@@ -327,7 +313,6 @@ class Publishing:
     def _place(
         self, event: Event, parent: str, child: str, pose: Pose, *, static: bool = False
     ) -> None:
-        """Put a transform."""
         self._put(
             TransformStamped(
                 stamp=event.stamp,
@@ -347,7 +332,6 @@ class Publishing:
         colour: Colour,
         event: Odometry | PoseEstimate | PlannedPose | PositionSetpoint,
     ) -> None:
-        """Draw on at a path."""
         trail = self._trails.get(name)
         if trail is None:
             thickness = 0.04 if name.startswith("truth") else 0.02

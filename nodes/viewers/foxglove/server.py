@@ -1,12 +1,9 @@
 """Foxglove's library and server, and a gate before them: the only import of foxglove.
 
-The server has threads of its own. To make and log a small message takes about 4 µs where nobody
-looks, and 30 µs where somebody does (most of it to wake such a thread): done on the loop.
-
-The library takes every WebSocket, and a browser opens one for any page that asks. So the library
-listens on an address of this machine that nobody can guess (one of the 16 million of 127.0.0.0/8),
-and a gate on the port that is known: it reads each viewer's first request, decides who may come in,
-and then passes bytes in both directions, in threads that hold no lock of Python's while they wait.
+A small message costs about 4 µs without viewers, and 30 µs with one (mostly to wake a thread): done
+on the loop. The library takes any WebSocket, which browsers open for any page. So it listens on an
+unguessable address of 127.0.0.0/8, and a gate on the known port reads each viewer's first request,
+decides, and passes bytes in both directions, in threads without Python's lock.
 """
 
 from __future__ import annotations
@@ -48,12 +45,12 @@ class HttpError(Exception):
 
 
 class Gate:
-    """Lets in viewers of the right origin, and passes bytes between them and the server.
+    """Gate for viewers of the right origin: passes bytes between them and the server.
 
     Args:
-        port: The same; 0 for any that is free.
-        origins: Pages that may connect. Programs that are no browsers name none, and may.
-        refused: Called, in a thread, with why somebody was not let in.
+        port: 0 for any free one.
+        origins: Pages that may connect; programs other than browsers name none, and may.
+        refused: Called, in a thread, with the reason of a refusal.
 
     Raises:
         OSError: It cannot listen there.
@@ -88,7 +85,7 @@ class Gate:
         self._listener.close()
 
     def check(self, head: str) -> None:
-        """Look at a viewer's request.
+        """Check a viewer's request.
 
         Raises:
             HttpError: It may not come in; the text says why.
@@ -206,17 +203,16 @@ class FoxgloveConfig(NodeConfig):
     """Settings of the server.
 
     Attributes:
-        host: Where it listens. Whoever reaches it can see the run, except pages of other origins;
-            hence this machine only, unless the file says otherwise.
-        port: The same; 0: any that is free (the log has it).
-        origins: Pages that may connect, as browsers name them: Foxglove's own, in a browser and
-            as a program. What is no browser needs none.
-        image_rate: Images a second of each camera, on the run's clock; of a set (colours,
-            depth) all or none. 0: no images.
+        host: Address to listen on, by default of this machine only: whoever reaches it sees the
+            run, except pages of other origins.
+        port: Port; 0: any free one (the log has it).
+        origins: Pages that may connect, by default Foxglove's own; programs need none.
+        image_rate: Images a second of each camera, on the run's clock, in whole sets (colours,
+            depth); 0: none.
         jpeg_quality: 1 to 100; 0: images as they are.
         depth: Whether to show depth images, in millimetres.
-        clock_rate: How often a second viewers get the run's time.
-        backlog: Messages that wait for a viewer that is slow; the oldest is dropped.
+        clock_rate: Messages a second with the run's time.
+        backlog: Messages waiting for a slow viewer; the oldest is dropped.
     """
 
     host: str = "127.0.0.1"
@@ -240,7 +236,7 @@ class Server:
     """A WebSocket server (``foxglove.sdk.v1``) and its topics.
 
     Args:
-        refused: Called, in a thread, with why somebody was not let in.
+        refused: Called, in a thread, with the reason of a refusal.
 
     Raises:
         MissingDependencyError: foxglove is not installed.
@@ -326,8 +322,8 @@ class Server:
     def close(self) -> None:
         """End the server; may take a moment.
 
-        The library waits without end for whoever has connected and never sent a request, such as a
-        browser that connects in advance: we do not.
+        The library would wait without end for connections without a request, as browsers open in
+        advance.
         """
         stopping = threading.Thread(target=self._server.stop, name="foxglove stops", daemon=True)
         stopping.start()
@@ -342,7 +338,7 @@ class Server:
 
 
 class _Listener:
-    """Gets subscriptions, in the server's threads."""
+    """Listener to subscriptions, in the server's threads."""
 
     def __init__(self, subscribed: Callable[[str], None]) -> None:
         self._subscribed = subscribed

@@ -46,10 +46,7 @@ def world(*names: str) -> str:
 
 
 def camera(announced: CameraAnnouncement, vehicles: Sequence[str]) -> str:
-    """Return where a camera is: below its vehicle, or free in the world.
-
-    One whose source does not begin with its vehicle's is taken to be the first vehicle's.
-    """
+    """Return where a camera is: below its vehicle (by default the first), or free in the world."""
     source = announced.source
     if announced.parent_frame_id == "map":
         return path(WORLD, "cameras", source)
@@ -114,10 +111,10 @@ class Contents(msgspec.Struct):
     """Contents of the layout.
 
     Attributes:
-        trails: Entities shown with their whole past, up to the time that is shown.
+        trails: Entities shown with their whole past.
         cameras: By entity: its images (``rgb``, ``grey``, ``depth``, ``segmentation``).
         plots: By title: the entities plotted.
-        eye: Where to look from; None leaves it to the viewer.
+        eye: Viewpoint; None leaves it to the viewer.
     """
 
     trails: list[str] = []

@@ -31,11 +31,7 @@ from nodes.viewers.rerun.sdk import RerunConfig
 from runtime import Node, Stream, on
 
 _LARGE, _SMALL = 256, 16384
-"""Events waiting to be passed on: images and clouds, and the rest.
-
-In lockstep time waits for the recorder, and nothing ever has to be dropped; in real time the
-oldest is, and counted.
-"""
+"""Events waiting to be passed on: images and clouds, and the rest."""
 
 _PACK = 2048
 """Events passed on at once, at most."""
@@ -50,9 +46,9 @@ class RerunView(Node[RerunConfig]):
         name = "view"
         type = "RerunView"
 
-    The world, vehicles, cameras with their images, paths, estimates, clouds, errors and IMU have
-    their places in a layout that needs no arranging. First in the file, it also gets the events
-    that other nodes send as they end, such as the cloud of a mapping.
+    World, vehicles, cameras with images, paths, estimates, clouds, errors and IMU have places in a
+    ready layout. First in the file, it also gets the last events of other nodes, such as a
+    mapping's cloud.
     """
 
     reads_truth = "showing"
@@ -123,10 +119,7 @@ class RerunView(Node[RerunConfig]):
         self._small.offer((self._received, event))
 
     async def run(self) -> None:
-        """Pass on the waiting events, again and again.
-
-        In lockstep the run goes on for one period while a batch is logged.
-        """
+        """Pass on the waiting events; in lockstep the run goes on for one period meanwhile."""
         if self._recorder is None:
             return
         await self._begin()
@@ -162,7 +155,6 @@ class RerunView(Node[RerunConfig]):
             await self._recorder.call_for(0.0, Recorder.begin, self._announcements)
 
     def _take(self) -> list[Numbered[Event]]:
-        """Return the waiting events, in the order of arrival."""
         batch = [
             stream.receive_nowait()
             for stream in (self._large, self._small)

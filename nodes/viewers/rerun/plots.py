@@ -141,8 +141,8 @@ class ScenePoints:
     Args:
         rate: Sets a second at most; 0: none.
         stride: Take every n-th pixel of every n-th row.
-        max_distance: Metres; what is farther from the camera is left out.
-        max_height: Metres; what is so much higher than the camera is left out.
+        max_distance: Metres from the camera, beyond which points are left out.
+        max_height: Metres above the camera, likewise.
     """
 
     def __init__(

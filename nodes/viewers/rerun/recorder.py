@@ -49,11 +49,7 @@ _GATHERED = 500
 """Events written into a file together."""
 
 _TIMEOUT = 3.0
-"""Real seconds for a viewer to take the logged data.
-
-If it takes longer, all that comes is left out until it has: the library would first fill hundreds
-of megabytes, and then stand still.
-"""
+"""Real seconds for a viewer to take logged data; else new data are left out, lest memory grow."""
 
 _SECOND_TIMEOUT = 0.01
 """Real seconds for the same, after a first timeout."""
@@ -74,7 +70,7 @@ class Recorder:
 
     Raises:
         MissingDependencyError: rerun is not installed, or there is no screen for its window.
-        VisnavError: A port cannot be had.
+        VisnavError: A port is taken.
     """
 
     def __init__(self, config: RerunConfig, name: str, file: Path | None) -> None:
@@ -134,10 +130,7 @@ class Recorder:
         self._show()
 
     def log(self, batch: Sequence[Numbered[Event]]) -> None:
-        """Put events, in the order of arrival.
-
-        What goes into a file is gathered first: each entity's rows have a head of their own.
-        """
+        """Put events, in the order of arrival; a file's are gathered, for fewer heads of rows."""
         if self._viewer is not None and not self._taken():
             self._left_out += len(batch)
             return
@@ -229,7 +222,6 @@ class Recorder:
                     return
 
     def _show(self, eye: Eye | None = None) -> None:
-        """Send the layout if there is something new to show."""
         images = self._world.images
         found = (
             len(self._world.trails),

@@ -1,7 +1,4 @@
-"""The view's settings, and the library and its program, for a worker's process.
-
-The only module that imports rerun, and not before it is asked.
-"""
+"""The view's settings, and the library and its program, for a worker's process."""
 
 from __future__ import annotations
 
@@ -35,27 +32,26 @@ class RerunConfig(NodeConfig):
     """Settings of the view.
 
     Attributes:
-        mode: ``save``: into `file`. ``spawn``: in Rerun's own window. ``serve``: in the browser;
-            the log has the address.
+        mode: ``save``: into `file`; ``spawn``: in Rerun's window; ``serve``: in the browser (the
+            log has the address).
         file: In the run's folder; ``rerun`` opens it.
         web_port: Of the page, for ``serve``.
         port: Of the data, for ``serve`` and ``spawn``.
-        host: Where the viewer listens. Whoever reaches it sees all, and can send; hence this
-            machine only, unless the file says otherwise.
-        memory: What the server of ``serve`` keeps for browsers that come late.
-        image_rate: Images a second of each camera, on the run's clock; of a set (colours,
-            depth) all or none. 0: no images.
+        host: Address of the viewer, by default of this machine only: whoever reaches it sees all,
+            and can send.
+        memory: Memory of ``serve`` for late browsers.
+        image_rate: Images a second of each camera, on the run's clock, in whole sets (colours,
+            depth); 0: none.
         jpeg_quality: 1 to 100; 0: images as they are, which makes large files.
         depth: Whether to show depth images, to the centimetre.
         depth_stride: Show every n-th pixel of every n-th row of them.
-        points_rate: A second: depth images with colours are put into the world as points, where
-            the camera truly was. 0: never.
-        points_stride: Take every n-th pixel of every n-th row for that.
-        points_max_distance: Metres; what is farther is left out.
-        points_max_height: Metres above the camera; what is higher is left out, so that one can look
-            into a room from above.
-        update_rate: How often a second new events are passed on to the viewer. (What goes into a
-            file is gathered for longer, which makes it smaller.)
+        points_rate: Depth images a second shown as coloured points from the camera's true pose; 0:
+            none.
+        points_stride: Take every n-th pixel of every n-th row for these points.
+        points_max_distance: Metres from the camera, beyond which points are left out.
+        points_max_height: Metres above the camera, likewise, to look into rooms from above.
+        update_rate: Batches of events a second to the viewer (fewer into a file, which is smaller
+            so).
     """
 
     mode: Literal["save", "spawn", "serve"] = "save"
@@ -117,11 +113,10 @@ def check_display() -> None:
 class Viewer:
     """Rerun's program: a web server for the life of this process, or a lasting window.
 
-    The library's own functions for either listen on all of the machine's addresses; the program
-    has options for that.
+    The library's own functions for either listen on all addresses.
 
     Args:
-        config: Mode ``serve`` or ``spawn``; where to listen, and how much to remember.
+        config: Of mode ``serve`` or ``spawn``.
 
     Raises:
         MissingDependencyError: There is no program, or no screen for its window.

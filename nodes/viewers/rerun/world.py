@@ -171,11 +171,7 @@ class World:
         self._poses(entities.world(source), events)
 
     def estimates(self, source: str, events: Sequence[Numbered[PoseEstimate]]) -> None:
-        """Put an estimator's poses.
-
-        Those that are not in ``map`` begin at the true pose of their time, as evaluation aligns
-        them.
-        """
+        """Put an estimator's poses, laid on the truth unless in ``map``, as in the evaluation."""
         self.estimator(source)
         frame_entity = entities.world("estimates", source)
         first = events[0][1]
@@ -212,10 +208,7 @@ class World:
                 self._to.put(entities.world("wind", vehicle), arrow)
 
     def pose(self, number: int, event: PoseStamped) -> None:
-        """Put the pose of a free camera or of a self-moving body.
-
-        The pose of a vehicle's camera serves its depth images.
-        """
+        """Put the pose of a free camera or self-moving body, or of a camera, for depth images."""
         if event.source in self._moving:
             entity = entities.world(event.source)
             self._to.put(entity, self._transform(event.position, event.orientation))
