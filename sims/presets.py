@@ -61,7 +61,7 @@ DEPTH_SENSORS: dict[str, Preset] = {
         "disparity_noise": 0.08,
         "min_depth": 0.195,
         "min_contrast": 0.0,
-    },
+    }
 }
 
 

@@ -35,14 +35,7 @@ from sims.airsim.client.connection import (
     decode,
     requests,
 )
-from sims.airsim.wire import (
-    CameraInfo,
-    CollisionInfo,
-    ImuData,
-    MultirotorState,
-    Pose,
-    YawMode,
-)
+from sims.airsim.wire import CameraInfo, CollisionInfo, ImuData, MultirotorState, Pose, YawMode
 
 Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Kind = Literal["rgb", "depth", "segmentation"]

@@ -53,11 +53,7 @@ class Control:
     """
 
     def __init__(
-        self,
-        vehicles: Vehicles,
-        tasks: Tasks,
-        collisions: Collisions,
-        *resets: Callable[[], None],
+        self, vehicles: Vehicles, tasks: Tasks, collisions: Collisions, *resets: Callable[[], None]
     ) -> None:
         self._vehicles, self._tasks, self._collisions = vehicles, tasks, collisions
         self._resets = resets

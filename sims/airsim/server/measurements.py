@@ -71,11 +71,7 @@ class Sensors:
     """
 
     def __init__(
-        self,
-        vehicles: Vehicles,
-        world: SharedWorld,
-        names: Mapping[str, str],
-        lidar_frame: str,
+        self, vehicles: Vehicles, world: SharedWorld, names: Mapping[str, str], lidar_frame: str
     ) -> None:
         self._vehicles, self._world = vehicles, world
         self._names, self._lidar_frame = names, lidar_frame

@@ -369,9 +369,7 @@ class Collisions:
     """
 
     def __init__(
-        self,
-        vehicles: dict[str, ServedVehicle],
-        identify: Callable[[str], tuple[str, int]],
+        self, vehicles: dict[str, ServedVehicle], identify: Callable[[str], tuple[str, int]]
     ) -> None:
         self._vehicles, self._identify = vehicles, identify
         # By vehicle what it has touched, and how many looks ago.
