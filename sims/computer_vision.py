@@ -21,11 +21,8 @@ from sims.vehicle import State
 from sims.world import Rate, join_world
 from sims.worlds import Dynamics, Scene
 
-Course = Callable[[int], tuple[Vector3, Quaternion]]
-"""Poses in ``map`` at times (ns)."""
-
-MOMENT = 1e-3
-"""Interval of the camera's velocity, seconds, centred on the stamp."""
+Course = Callable[[int], tuple[Vector3, Quaternion]]  # poses in ``map`` at times (ns)
+MOMENT = 1e-3  # interval of the camera's velocity, seconds, centred on the stamp
 
 
 class FreeCameraConfig(SimulatorConfig):

@@ -47,11 +47,8 @@ from sims.vehicle.physics import Contact
 from sims.world import Rate, join_world
 from sims.worlds import Dynamics, Scene
 
-FRAME = "base_link"
-"""Frame of the vehicle's body."""
-
-DEEPEST = 100.0
-"""Greatest depth in a solid without divergence of the physics, metres."""
+FRAME = "base_link"  # frame of the vehicle's body
+DEEPEST = 100.0  # greatest depth in a solid without divergence of the physics, metres
 
 
 class MultirotorConfig(SensorsConfig):

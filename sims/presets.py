@@ -13,8 +13,7 @@ from typing import Any
 
 Preset = dict[str, Any]
 
-_G = 9.80665
-"""Standard gravity, m/s²."""
+_G = 9.80665  # standard gravity, m/s²
 
 
 def _imu(gyroscope: tuple[float, ...], accelerometer: tuple[float, ...]) -> Preset:

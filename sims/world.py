@@ -35,8 +35,7 @@ Floats = npt.NDArray[np.float64]
 class Inhabitant:
     """Mixin of nodes with a part in the world."""
 
-    vehicle: ClassVar[bool] = False
-    """Whether the node is moved by physics."""
+    vehicle: ClassVar[bool] = False  # whether the node is moved by physics
     alone: ClassVar[bool] = False
     """Whether the node has its own world, if `alone` holds for all inhabitants."""
 

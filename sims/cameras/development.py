@@ -38,11 +38,8 @@ from sims.cameras.spec import CameraSpec, DepthSensor, camera_info
 Depths = npt.NDArray[np.float32]
 Holes = npt.NDArray[np.bool_]
 
-_WINDOW = (7, 7)
-"""Window of a stereo camera's texture check, pixels."""
-
-_FARTHEST = 1e6
-"""Metres; stands for ``inf`` where its inverse has to be more than zero."""
+_WINDOW = (7, 7)  # window of a stereo camera's texture check, pixels
+_FARTHEST = 1e6  # metres; stands for ``inf`` where its inverse has to be more than zero
 
 
 class DepthMeter:
@@ -149,12 +146,9 @@ class DepthMeter:
 Image = npt.NDArray[np.uint8]
 Codes = npt.NDArray[np.uint16]
 
-_LINEAR = 65535.0
-"""Code of white in linear light."""
-_ROOT = 40000.0
-"""Code of the root of white: there is room for 2.7 times as much light."""
-_METERED = 4
-"""The exposure meter looks at every fourth row and column."""
+_LINEAR = 65535.0  # code of white in linear light
+_ROOT = 40000.0  # code of the root of white: there is room for 2.7 times as much light
+_METERED = 4  # the exposure meter looks at every fourth row and column
 
 
 class Development:

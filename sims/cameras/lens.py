@@ -27,8 +27,7 @@ FINER = 1.3
 
 MARGIN = 3
 
-LARGEST = 8192
-"""Pixels of a face's side, at most."""
+LARGEST = 8192  # pixels of a face's side, at most
 
 
 class Face(NamedTuple):
@@ -68,8 +67,7 @@ _CUBE = np.array(
         [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],
     ],
     dtype=np.float64,
-)
-"""Axes of a cube's faces: ahead, right, left, below, above, behind; shape (6, 3, 3)."""
+)  # axes of a cube's faces: ahead, right, left, below, above, behind; shape (6, 3, 3)
 
 
 def faces(info: CameraInfo) -> tuple[Face, ...]:

@@ -65,11 +65,8 @@ def noise_at(light: npt.NDArray[np.float64], level: int, noise: float, electrons
     return float(np.hypot(noise, shot))
 
 
-Image = npt.NDArray[np.uint16]
-"""Codes of linear light, shape (height, width, 3) or (height, width)."""
-
-MOST = 9
-"""Most renderings of an exposure: each costs as much as an image without motion blur."""
+Image = npt.NDArray[np.uint16]  # codes of linear light, shape (height, width, 3) or (height, width)
+MOST = 9  # most renderings of an exposure: each costs as much as an image without motion blur
 
 
 def defocused(image: Image, sigma: float) -> Image:
@@ -109,8 +106,7 @@ N = TypeVar("N", np.float32, np.int16)
 
 _TABLES_OF_16_BITS = int(cv2.__version__.partition(".")[0]) >= 5
 
-_FARTHEST = np.float32(1e9)
-"""Metres; stands for ``inf`` where its square has to be a number."""
+_FARTHEST = np.float32(1e9)  # metres; stands for ``inf`` where its square has to be a number
 
 
 def generator(seed: int, camera: str, stamp_ns: int) -> np.random.Generator:
@@ -192,8 +188,7 @@ def _steps(sigma: float, limit: int) -> npt.NDArray[np.int16]:
     return np.asarray(levels, dtype=np.int16)
 
 
-_MOST = 8.0
-"""Largest correction factor per image, either way: black gives no measure of darkness."""
+_MOST = 8.0  # largest correction factor per image, either way: black gives no measure of darkness
 
 
 class AutoExposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

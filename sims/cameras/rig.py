@@ -27,11 +27,8 @@ from sims.cameras.renderer import CameraRenderer, Frame, Motion, Shot, delay_of,
 from sims.cameras.response import ExposureControl
 from sims.cameras.spec import CameraSpec, announcement, eyes, optical_frame, optical_in_body
 
-STEP = 1_000_000
-"""Interval of the states recorded during an exposure, nanoseconds."""
-
-UNDISTORTED = "/undistorted"
-"""Ends the source of a camera's images without distortion."""
+STEP = 1_000_000  # interval of the states recorded during an exposure, nanoseconds
+UNDISTORTED = "/undistorted"  # ends the source of a camera's images without distortion
 
 
 class CameraOutputs(msgspec.Struct, frozen=True):
@@ -59,12 +56,9 @@ States = Callable[[int], npt.NDArray[np.float64]]
 
 class _Exposure(NamedTuple):
     spec: CameraSpec
-    shots: tuple[Shot, ...]
-    """Of each of its eyes."""
-    due: int
-    """Delivery time (ns), unless the previous exposure's is later."""
-    states: States | None
-    """Gives the states while the shutter is open, when they have come about."""
+    shots: tuple[Shot, ...]  # of each of its eyes
+    due: int  # delivery time (ns), unless the previous exposure's is later
+    states: States | None  # gives the states while the shutter is open, when they have come about
 
 
 class CameraRig:
@@ -105,8 +99,7 @@ class CameraRig:
             for spec in specs
             if spec.auto_exposure is not None
         }
-        self.lost = dict.fromkeys(self._specs, 0)
-        """Exposures lost by the camera's `loss` setting."""
+        self.lost = dict.fromkeys(self._specs, 0)  # exposures lost by the camera's `loss` setting
         self.skipped = dict.fromkeys(self._specs, 0)
         """Exposures left out because the renderer was behind; never in lockstep."""
 

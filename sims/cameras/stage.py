@@ -79,8 +79,7 @@ def set_fog(start: float, end: float) -> None:
 Floats = npt.NDArray[np.float64]
 Colours = npt.NDArray[np.uint8]
 Depths = npt.NDArray[np.float32]
-Size = tuple[int, int]
-"""Height and width, pixels."""
+Size = tuple[int, int]  # height and width, pixels
 
 NEAR = 0.02
 FAR = 20_000.0
@@ -94,13 +93,11 @@ depth; at the rim of the widest view (170°) that is a planar depth of some 600 
 _OUT_OF_VIEW = mujoco.mjNGROUP - 1
 """Group of the geoms outside an image; groups from 3 on are not drawn."""
 
-_SPARE = 1.001
-"""Factor on the size of boxes, so as to keep geoms at the edge of the view."""
+_SPARE = 1.001  # factor on the size of boxes, so as to keep geoms at the edge of the view
 
 _PLAIN = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
 
-LOOK = ".look"
-"""Suffix of looks: geom `<name>.look` is the image of geom `<name>`, with its number."""
+LOOK = ".look"  # suffix of looks: geom `<name>.look` is the image of geom `<name>`, with its number
 
 
 class Changing(Protocol):

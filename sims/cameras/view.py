@@ -17,8 +17,7 @@ from sims.cameras.stage import RANGE, Colours, Depths, Stage
 
 Numbers = npt.NDArray[np.int32]
 
-CREASE = 1e-3
-"""Least second difference of the inverse depth, as a share, between two surfaces."""
+CREASE = 1e-3  # least second difference of the inverse depth, as a share, between two surfaces
 
 
 class Drawn(NamedTuple):
@@ -154,17 +153,13 @@ def _drawn(stage: Stage, size: tuple[int, int], colour: bool, depth: bool, numbe
 
 Floats = npt.NDArray[np.float64]
 
-OFF = 0.25
-"""Largest shift of a row drawn at another row's time, pixels."""
+OFF = 0.25  # largest shift of a row drawn at another row's time, pixels
 
 FINER_FOR_DEPTH = 2.5
 """Times as many bands where depth is wanted: on a slanted floor a pixel is some centimetres."""
 
-MOST_BANDS = 128
-"""Most bands per image; beyond 64 pixels of motion in a readout, rows exceed `OFF`."""
-
-SAMPLES = 32
-"""Longer side of the small image for motion measurement, pixels."""
+MOST_BANDS = 128  # most bands per image; beyond 64 pixels of motion in a readout, rows exceed `OFF`
+SAMPLES = 32  # longer side of the small image for motion measurement, pixels
 
 
 def row_time(readout: float, row: float, height: int) -> float:

@@ -22,8 +22,7 @@ from runtime.units import Duration, Latency
 from sims.sensors.sensor import GaussMarkov, NonNegative, Place, Positive, Sensor, SensorSpec, Truth
 
 _SEA_LEVEL = 101325.0
-_RADIUS = 6378.137
-"""Radius of the earth in AirSim, kilometres."""
+_RADIUS = 6378.137  # radius of the earth in AirSim, kilometres
 
 
 class BarometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True):

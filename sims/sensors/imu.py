@@ -15,8 +15,7 @@ from events.frames import cross, inverse, multiply, rotate, rotate_inverse, sler
 from sims.presets import IMUS
 from sims.sensors.sensor import Mount, NonNegative
 
-_BLOCK = 512
-"""Samples per draw: a numpy call costs as much as a few hundred random numbers."""
+_BLOCK = 512  # samples per draw: a numpy call costs as much as a few hundred random numbers
 
 Floats = npt.NDArray[np.float64]
 
@@ -336,12 +335,10 @@ NOISES = (
     "gyroscope_random_walk",
     "accelerometer_noise_density",
     "accelerometer_random_walk",
-)
-"""Settings of the noise, all 0 of an ideal IMU."""
+)  # settings of the noise, all 0 of an ideal IMU
 
 _EYE = np.eye(3)
-_NO_ERRORS = ("sampling", "position", "orientation")
-"""Settings kept for an ideal IMU."""
+_NO_ERRORS = ("sampling", "position", "orientation")  # settings kept for an ideal IMU
 
 
 def _matrix(given: tuple[float, ...], scale: float, angle: float, numbers: Floats) -> Floats:

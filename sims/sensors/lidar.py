@@ -380,8 +380,7 @@ def _looks(model: Any) -> list[tuple[int, int]]:
     return pairs
 
 
-LATE = 1.0
-"""Longest delay of a turn's end in real time, seconds; later turns are skipped."""
+LATE = 1.0  # longest delay of a turn's end in real time, seconds; later turns are skipped
 
 
 class LidarRig:

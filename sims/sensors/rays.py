@@ -17,8 +17,7 @@ from sims.worlds import Dynamics
 
 Floats = npt.NDArray[np.float64]
 
-DRAWN = np.array([1, 1, 1, 0, 0, 0], np.uint8)
-"""Groups of geoms visible to cameras."""
+DRAWN = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # groups of geoms visible to cameras
 
 
 class Hits(NamedTuple):

@@ -56,21 +56,16 @@ class Truth(NamedTuple):
     """True state of a sensor's body at an instant."""
 
     stamp: int
-    position: Vector3
-    """Metres NED."""
-    orientation: Quaternion
-    """Rotation FRD → NED."""
-    velocity: Vector3
-    """Metres per second NED."""
-    qpos: Any
-    """The world's generalised positions, shape (nq,), for sensors of the surroundings."""
+    position: Vector3  # metres NED
+    orientation: Quaternion  # rotation FRD → NED
+    velocity: Vector3  # metres per second NED
+    qpos: Any  # the world's generalised positions, shape (nq,), for sensors of the surroundings
 
 
 class Place(NamedTuple):
     """Source, frame and geographic origin of a sensor."""
 
-    source: str
-    """Source of its measurements: ``drone/barometer``."""
+    source: str  # source of its measurements: ``drone/barometer``
     parent_frame_id: str
     origin: tuple[float, float, float]
     """Latitude and longitude (degrees) and altitude (metres) of the origin of ``map``."""
@@ -119,8 +114,7 @@ class Mounted(Generic[S]):
 class Sensor(Mounted[S], ABC):
     """Model of a sensor: from the truth to measurements, at its rate."""
 
-    port: ClassVar[str]
-    """Output of the vehicle's node for the measurements."""
+    port: ClassVar[str]  # output of the vehicle's node for the measurements
 
     def __init__(self, spec: S, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place)

@@ -65,8 +65,7 @@ from sims.vehicle.position import Gains, Limits
 _STOPPED: Motors = (0.0, 0.0, 0.0, 0.0)
 _IDLE: Motors = (0.05, 0.05, 0.05, 0.05)
 
-_FIRST_DT = 0.0025
-"""Time step assumed at the first update, seconds."""
+_FIRST_DT = 0.0025  # time step assumed at the first update, seconds
 
 
 class Phase(enum.Enum):
@@ -327,14 +326,9 @@ class Autopilot:
         return False
 
 
-DEPTH = 0.02
-"""Tolerated depth in a solid, metres: standing feet, a brushing propeller."""
-
-FALL = 0.05
-"""Greatest height above the ground of a standing vehicle, metres."""
-
-_SOLIDS = np.array([1, 0, 0, 0, 0, 0], np.uint8)
-"""Groups of geoms hit by rays: 0 alone."""
+DEPTH = 0.02  # tolerated depth in a solid, metres: standing feet, a brushing propeller
+FALL = 0.05  # greatest height above the ground of a standing vehicle, metres
+_SOLIDS = np.array([1, 0, 0, 0, 0, 0], np.uint8)  # groups of geoms hit by rays: 0 alone
 
 
 class Clearance:

@@ -95,8 +95,7 @@ class BodyRateController:
         "_kp", "_kpz", "_started", "_wx", "_wy",
     )  # fmt: skip
 
-    _INTEGRAL = 10.0
-    """Limit of an integrator, rad/s²."""
+    _INTEGRAL = 10.0  # limit of an integrator, rad/s²
 
     def __init__(self, parameters: VehicleParameters, gains: Gains) -> None:
         self._jx, self._jy, self._jz = parameters.inertia
@@ -154,8 +153,7 @@ class BodyRateController:
         )
 
 
-Motors = tuple[float, float, float, float]
-"""Motor commands, 0 to 1 of each motor's thrust."""
+Motors = tuple[float, float, float, float]  # motor commands, 0 to 1 of each motor's thrust
 
 
 class Controller:
@@ -295,8 +293,7 @@ def _clip(value: float, limit: float) -> float:
 Setpoint = PositionSetpoint | VelocitySetpoint | AttitudeSetpoint | BodyRateSetpoint | MotorSetpoint
 """Set-points accepted by the cascade."""
 
-MOST = 1e6
-"""In SI units; squares of much greater numbers would overflow in the control loops."""
+MOST = 1e6  # in SI units; squares of much greater numbers would overflow in the control loops
 
 
 def fault(setpoint: Setpoint) -> str | None:

@@ -13,20 +13,14 @@ from events import Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_yaw
 from sims.worlds import WorldError
 
-TIMESTEP_NS = 1_000_000
-"""Time step of the physics, nanoseconds."""
-
-GRAVITY = 9.81
-"""Metres per second squared."""
+TIMESTEP_NS = 1_000_000  # time step of the physics, nanoseconds
+GRAVITY = 9.81  # metres per second squared
 
 STANDING_HEIGHT = 0.1
 """Metres from the ground to the origin of ``base_link`` when the vehicle stands on its feet."""
 
-AIR_DENSITY = 1.225
-"""Kilograms per cubic metre, at sea level in the standard atmosphere."""
-
-AIR_VISCOSITY = 1.8e-5
-"""Pascal seconds."""
+AIR_DENSITY = 1.225  # kilograms per cubic metre, at sea level in the standard atmosphere
+AIR_VISCOSITY = 1.8e-5  # pascal seconds
 
 _OPTIONS: dict[str, Any] = {
     "timestep": TIMESTEP_NS * 1e-9,
@@ -36,8 +30,7 @@ _OPTIONS: dict[str, Any] = {
     "wind": [0.0, 0.0, 0.0],  # which is a setting of `World`
     # Semi-implicit Euler: nothing here is stiff, and MuJoCo's implicit integrators cost more.
     "integrator": int(mujoco.mjtIntegrator.mjINT_EULER),
-}
-"""MuJoCo options of a world with vehicles."""
+}  # MuJoCo options of a world with vehicles
 
 _VEHICLE = Path(__file__).with_name("vehicle.xml")
 

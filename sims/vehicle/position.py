@@ -100,8 +100,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             )
 
 
-_STILL = 0.2
-"""Speed of a braking vehicle at the start of position hold, metres per second."""
+_STILL = 0.2  # speed of a braking vehicle at the start of position hold, metres per second
 
 _LARGE = 0.5 * 0.5
 """Square of the velocity error (m/s) that halves the learning rate: a manoeuvre is no wind."""

@@ -35,9 +35,7 @@ WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {
     "office": office,
     "night": night,
     "forest": forest,
-}
-"""Built-in worlds by name: functions of a seed and `bare`; a `Scene` if parts move by themselves.
-"""
+}  # built-in worlds by name: functions of a seed and `bare`; a `Scene` if parts move by themselves
 
 
 class WorldError(VisnavError, ValueError):

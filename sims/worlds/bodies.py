@@ -30,8 +30,7 @@ SIZES: dict[Kind, Vector3] = {
     "car": (4.1, 1.75, 1.45),
     "door": (0.92, 0.045, 2.05),
     "box": (0.6, 0.6, 0.6),
-}
-"""Length along the heading, width, height, metres, unless the settings say another."""
+}  # length along the heading, width, height, metres, unless the settings say another
 
 COLOURS: dict[Kind, Vector3] = {
     "person": (0.75, 0.22, 0.14),

@@ -16,12 +16,10 @@ from sims.worlds import materials
 from sims.worlds.builder import WHOLE, Builder, Material, sides
 from sims.worlds.materials import Colour, Image, shade, smooth, specks
 
-MODULE = 2.6
-"""Metres from door to door, and the width of the corridor."""
+MODULE = 2.6  # metres from door to door, and the width of the corridor
 
 HEIGHT = 2.7
-NORTH, WEST = 9, 4
-"""Modules along the outer walls."""
+NORTH, WEST = 9, 4  # modules along the outer walls
 
 DENSITY = 128.0
 

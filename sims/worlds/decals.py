@@ -24,8 +24,7 @@ INKS: tuple[tuple[Colour, Colour, Colour], ...] = (
     ((0.22, 0.36, 0.27), (0.92, 0.84, 0.60), (0.80, 0.28, 0.22)),
     ((0.88, 0.78, 0.40), (0.20, 0.24, 0.38), (0.72, 0.24, 0.22)),
 )
-Box = tuple[int, int, int, int]
-"""Left, top, right, bottom; pixels."""
+Box = tuple[int, int, int, int]  # left, top, right, bottom; pixels
 
 
 def letters(image: Image, text: str, where: Box, colour: Colour, worn: Image | None) -> None:
@@ -202,8 +201,7 @@ def tile(number: int, columns: int, rows: int) -> tuple[float, float, float, flo
     return left, top, (column + 1) / columns - hair, (row + 1) / rows - hair
 
 
-STOREY = 3.1
-"""Height of a storey, metres."""
+STOREY = 3.1  # height of a storey, metres
 PAINTS: tuple[Colour, ...] = (
     (0.80, 0.70, 0.52), (0.70, 0.46, 0.36), (0.66, 0.72, 0.68), (0.84, 0.80, 0.70),
     (0.60, 0.64, 0.72), (0.78, 0.60, 0.44),

@@ -70,11 +70,8 @@ class Scene(NamedTuple):
     dynamics: Dynamics = Dynamics()
 
 
-_YAW_STEP = 0.02
-"""Interval of the precomputed headings, seconds."""
-
-_TURN = 0.25
-"""Standard deviation of the smoothing of headings, seconds."""
+_YAW_STEP = 0.02  # interval of the precomputed headings, seconds
+_TURN = 0.25  # standard deviation of the smoothing of headings, seconds
 
 
 def within(seconds: float, times: Sequence[float], loop: bool) -> float:
@@ -176,8 +173,7 @@ def _smoothed(
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
-HEADLIGHT = "headlight"
-"""MuJoCo's name for the light from everywhere, present in all worlds."""
+HEADLIGHT = "headlight"  # MuJoCo's name for the light from everywhere, present in all worlds
 
 
 class Changing(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

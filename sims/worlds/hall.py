@@ -17,8 +17,7 @@ from sims.worlds.builder import Builder, Material, sides
 from sims.worlds.materials import Image, cells, fractal, mix, shade, share, smooth, specks
 
 NORTH, WEST, HEIGHT = 8.0, 6.0, 5.0
-DENSITY = 96.0
-"""Pixels per metre of floor and walls."""
+DENSITY = 96.0  # pixels per metre of floor and walls
 
 CEILING_DENSITY = 64.0
 

@@ -21,8 +21,7 @@ DESKS = (  # x, y, turn
     (-5.8, -2.1, 0.0), (0.9, -2.2, 90.0),
 )  # fmt: skip
 COLUMNS = ((2.1, -1.9), (-2.4, -2.1), (1.4, 2.4))
-MEETING = (6.3, -4.5)
-"""The middle of the glazed room, 3.4 x 3 m in the north-east corner."""
+MEETING = (6.3, -4.5)  # the middle of the glazed room, 3.4 x 3 m in the north-east corner
 
 
 def office(seed: int = 0, bare: bool = False) -> Any:

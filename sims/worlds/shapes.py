@@ -16,8 +16,7 @@ Array = npt.NDArray[np.float64]
 Window = tuple[float, float, float, float]
 """A part of a texture: left, top, right, bottom, in 0..1, rows counted from the top."""
 
-STEP = 1.0
-"""Surfaces are cut at least this fine (metres): MuJoCo lights vertices, not pixels."""
+STEP = 1.0  # surfaces are cut at least this fine (metres): MuJoCo lights vertices, not pixels
 
 
 class Surface(NamedTuple):

@@ -34,8 +34,7 @@ _HERE = Path(__file__).parent
 _TABLE = _HERE / "leaps.toml"
 _LEAPS: dict[str, dict[str, tuple[int, int]]] = tomllib.loads(_TABLE.read_text(encoding="utf-8"))
 _DIGEST, _SIZE = 16, 4
-_UNUSED = 14 * 86400.0
-"""Age at removal of another version's unused textures, seconds."""
+_UNUSED = 14 * 86400.0  # age at removal of another version's unused textures, seconds
 
 
 def own_generator(

@@ -25,8 +25,7 @@ STRONGEST = 50.0
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT
 """Range of heights of the model, metres; other heights are clipped."""
 
-SLOWEST = 1.0
-"""Least airspeed assumed for turbulence, m/s; at 0 the turbulence would stand still."""
+SLOWEST = 1.0  # least airspeed assumed for turbulence, m/s; at 0 the turbulence would stand still
 
 
 def check_strength(*velocities: Vector3) -> None:
@@ -133,8 +132,7 @@ class Turbulence:
         start: Five numbers, normally distributed, from which the states are drawn.
     """
 
-    NUMBERS = 5
-    """Random numbers per step."""
+    NUMBERS = 5  # random numbers per step
 
     def __init__(self, start: list[float]) -> None:
         u, v1, v2, w1, w2 = start

@@ -46,7 +46,6 @@ Reply = asyncio.Future[bool]
 Order = Callable[..., Command | Setpoint]
 """Factory of an order, from a stamp, a source and the vehicle's name."""
 Thrust = Callable[[State], float]  # gives the thrust, 0 to 1 of what all motors can give together
-
 CLOSE = 0.5  # metres from the end within which a vehicle is not steered along the path any more
 _WINDOW = 64  # segments ahead among which the vehicle's place is sought, which bounds the work
 _SPACING = 0.05  # metres below which the next corner of a path is left out

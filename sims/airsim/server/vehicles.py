@@ -43,9 +43,7 @@ from sims.world import SharedWorld
 
 Floats = npt.NDArray[np.float64]
 
-FIRST: Any = ""
-"""Default vehicle in handlers' parameters: the vehicle for an empty name."""
-
+FIRST: Any = ""  # default vehicle in handlers' parameters: the vehicle for an empty name
 GAS_CONSTANT = 287.053  # of dry air, J/(kg K)
 LANDED_SPEED = 0.08  # as AirSim's: m/s and rad/s, of each component of the velocity of what stands
 APART = 10  # looks, of 20 ms each, without contact after which the next contact is a new one
