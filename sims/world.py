@@ -64,27 +64,23 @@ class SharedWorld:
         inhabitants: The nodes with a part in the world, in file order.
         bare: Whether to leave out images, as nobody is to see them; also left out if no inhabitant
             sees.
-
-    Attributes:
-        simulation: Physics shared by all vehicles. `None` if there is no vehicle.
-        air: The wind; `None` if there is none, or no vehicle.
-        vehicles: Names of the vehicles.
-        starts: State of each vehicle and free camera at its start, once that node has started up.
-        free_cameras: Gives the state of each free camera at a time (ns); no physics knows it.
     """
 
     model: Any
     dynamics: Dynamics
-    simulation: Simulation | None
-    air: Air | None
+    simulation: Simulation | None  # physics shared by all vehicles. `None` if there is no vehicle
+    air: Air | None  # the wind; `None` if there is none, or no vehicle
 
     def __init__(self, inhabitants: tuple[Sibling, ...], bare: bool, seed: int) -> None:
         named = [each for each in inhabitants if each.config.world]
         self.name = named[0].config.world if named else "hall"
         self.named_by = named[0].name if named else ""
         self._inhabitants = inhabitants
+        # Names of the vehicles.
         self.vehicles = [each.name for each in inhabitants if each.node.vehicle]
+        # State of each vehicle and free camera at its start, once that node has started up.
         self.starts: dict[str, State] = {}
+        # Gives the state of each free camera at a time (ns); no physics knows it.
         self.free_cameras: dict[str, Callable[[int], State]] = {}
         self._bare = bare or not any(each.node.sees(each.config) for each in inhabitants)
         self._seed = seed

@@ -31,29 +31,20 @@ LARGEST = 8192  # pixels of a face's side, at most
 
 
 class Face(NamedTuple):
-    """Pinhole drawing for a camera's image.
+    """Pinhole drawing for a camera's image."""
 
-    Attributes:
-        turn: Its axes (right, down, ahead) in the optical frame, shape (3, 3), a row each.
-        left: Coordinate x/z of the left edge of the first column, in the face's axes.
-        top: Coordinate y/z of the upper edge of the first row.
-        pitch: Width and height of a pixel, in these coordinates.
-        columns: Column of the face for each pixel of the image, shape (h, w); None if they are
-            equal.
-        mask: Pixels on this face, shape (h, w).
-        steepness: Planar depth in the optical frame for a planar depth of 1 in the face, shape (h,
-            w); ``inf`` where it would not be positive. None if it is 1.
-    """
-
-    turn: Floats
-    left: float
-    top: float
-    pitch: tuple[float, float]
+    turn: Floats  # its axes (right, down, ahead) in the optical frame, shape (3, 3), a row each
+    left: float  # coordinate x/z of the left edge of the first column, in the face's axes
+    top: float  # coordinate y/z of the upper edge of the first row
+    pitch: tuple[float, float]  # width and height of a pixel, in these coordinates
     width: int
     height: int
+    # Column of the face for each pixel of the image, shape (h, w); None if they are equal.
     columns: Maps | None = None
     rows: Maps | None = None
-    mask: npt.NDArray[np.bool_] | None = None
+    mask: npt.NDArray[np.bool_] | None = None  # pixels on this face, shape (h, w)
+    # Planar depth in the optical frame for a planar depth of 1 in the face, shape (h, w); ``inf``
+    # where it would not be positive. None if it is 1.
     steepness: Maps | None = None
 
 

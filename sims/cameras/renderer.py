@@ -37,36 +37,25 @@ from sims.cameras.view import (
 
 
 class Motion(NamedTuple):
-    """True states of the world while a shutter is open.
+    """True states of the world while a shutter is open."""
 
-    Attributes:
-        seconds: Times of the states after the exposure's stamp, rising, shape (k,).
-        qpos: Generalised positions at these times, shape (k, nq).
-    """
-
-    seconds: Floats
-    qpos: Floats
+    seconds: Floats  # times of the states after the exposure's stamp, rising, shape (k,)
+    qpos: Floats  # generalised positions at these times, shape (k, nq)
 
 
 class Shot(NamedTuple):
-    """Exposure to render: camera, stamp, world state, exposure time and gain.
-
-    Attributes:
-        stamp: Nanoseconds on the run's clock: the middle row's mid-exposure.
-        qpos: The model's generalised positions then, shape (nq,).
-        qvel: Its generalised velocities then, shape (nv,): constant while the shutter is open,
-            unless `motion` is known. None: at rest.
-        motion: The states from the beginning of the first row's exposure to the end of the last
-            one's; needed by a rolling shutter.
-        exposure: Seconds that the shutter is open.
-    """
+    """Exposure to render: camera, stamp, world state, exposure time and gain."""
 
     camera: str
-    stamp: int
-    qpos: Floats
+    stamp: int  # nanoseconds on the run's clock: the middle row's mid-exposure
+    qpos: Floats  # the model's generalised positions then, shape (nq,)
+    # Its generalised velocities then, shape (nv,): constant while the shutter is open, unless
+    # `motion` is known. None: at rest.
     qvel: Floats | None = None
+    # The states from the beginning of the first row's exposure to the end of the last one's; needed
+    # by a rolling shutter.
     motion: Motion | None = None
-    exposure: float = 0.0
+    exposure: float = 0.0  # seconds that the shutter is open
     gain: float = 1.0
 
     def moves(self) -> bool:
@@ -98,34 +87,24 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """Images and pose of an exposure, all of the same instant or read out alike.
 
     Images of kinds that the camera's settings do not name are None.
-
-    Attributes:
-        stamp: Nanoseconds on the run's clock: the middle of the middle row's exposure.
-        position: The optical frame's origin, metres in ``map`` (NED).
-        orientation: Rotation from the optical frame to ``map``.
-        ends: Of a rolling shutter, position and orientation at the exposure of the first and of
-            the last row; None of a global one.
-        exposure: Seconds that the shutter was open.
-        light: Mean light of the image, if it is metered (`Development.meter`).
-        depth: float32 metres along the optical z axis, shape (height, width); ``inf`` where
-            nothing was hit.
-        segmentation: int32 object numbers (geom ids), shape (height, width); -1 where nothing
-            was hit.
-        undistorted: The same images without distortion, if they are wanted.
     """
 
-    stamp: int
-    position: Vector3
-    orientation: Quaternion
+    stamp: int  # nanoseconds on the run's clock: the middle of the middle row's exposure
+    position: Vector3  # the optical frame's origin, metres in ``map`` (NED)
+    orientation: Quaternion  # rotation from the optical frame to ``map``
+    # Of a rolling shutter, position and orientation at the exposure of the first and of the last
+    # row; None of a global one.
     ends: tuple[tuple[Vector3, Quaternion], tuple[Vector3, Quaternion]] | None = None
-    exposure: float = 0.0
+    exposure: float = 0.0  # seconds that the shutter was open
     gain: float = 1.0
-    light: float | None = None
+    light: float | None = None  # mean light of the image, if it is metered (`Development.meter`)
     rgb: npt.NDArray[np.uint8] | None = None
     grey: npt.NDArray[np.uint8] | None = None
+    # float32 metres along the optical z axis, shape (height, width); ``inf`` where nothing was hit.
     depth: npt.NDArray[np.float32] | None = None
+    # int32 object numbers (geom ids), shape (height, width); -1 where nothing was hit.
     segmentation: npt.NDArray[np.int32] | None = None
-    undistorted: Frame | None = None
+    undistorted: Frame | None = None  # the same images without distortion, if they are wanted
 
 
 def delay_of(spec: CameraSpec, seed: int, stamp_ns: int) -> float | None:
@@ -164,20 +143,15 @@ Pose = tuple[Vector3, Quaternion]
 
 
 class Captured(NamedTuple):
-    """Light on a camera's sensor in an exposure, before the sensor's errors.
+    """Light on a camera's sensor in an exposure, before the sensor's errors."""
 
-    Attributes:
-        colours: uint8 images, shape (height, width, 3), of the moments that make up the exposure,
-            in order; empty if no colour is wanted.
-        depth: float32 metres, shape (height, width), if wanted.
-        numbers: int32 object numbers, shape (height, width), if wanted.
-        poses: The optical frame's position and orientation in ``map`` at the stamp; of a rolling
-            shutter at the first, the middle and the last row.
-    """
-
+    # uint8 images, shape (height, width, 3), of the moments that make up the exposure, in order;
+    # empty if no colour is wanted.
     colours: list[Colours]
-    depth: Depths | None
-    numbers: npt.NDArray[np.int32] | None
+    depth: Depths | None  # float32 metres, shape (height, width), if wanted
+    numbers: npt.NDArray[np.int32] | None  # int32 object numbers, shape (height, width), if wanted
+    # The optical frame's position and orientation in ``map`` at the stamp; of a rolling shutter at
+    # the first, the middle and the last row.
     poses: tuple[Pose, ...]
 
 

@@ -21,18 +21,13 @@ CREASE = 1e-3  # least second difference of the inverse depth, as a share, betwe
 
 
 class Drawn(NamedTuple):
-    """Requested images of a camera, for some of its rows.
+    """Requested images of a camera, for some of its rows."""
 
-    Attributes:
-        colours: uint8, shape (rows, width, 3); black where no ray falls on the image.
-        depth: float32 planar depth of the optical frame, metres, shape (rows, width); ``inf``
-            where nothing is, and 90° or more off the axis, where it would not be positive.
-        numbers: int32 object numbers, shape (rows, width); -1 where nothing is.
-    """
-
-    colours: Colours | None
+    colours: Colours | None  # uint8, shape (rows, width, 3); black where no ray falls on the image
+    # float32 planar depth of the optical frame, metres, shape (rows, width); ``inf`` where nothing
+    # is, and 90° or more off the axis, where it would not be positive.
     depth: Depths | None
-    numbers: Numbers | None
+    numbers: Numbers | None  # int32 object numbers, shape (rows, width); -1 where nothing is
 
 
 class View:

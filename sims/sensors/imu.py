@@ -286,15 +286,10 @@ class ImuModel:
 
 
 class Motion(msgspec.Struct, frozen=True, gc=False):
-    """How an IMU's place moves at an instant.
+    """How an IMU's place moves at an instant."""
 
-    Attributes:
-        orientation: Rotation from the IMU's frame to NED.
-        velocity: Metres per second NED.
-    """
-
-    orientation: Quaternion
-    velocity: Vector3
+    orientation: Quaternion  # rotation from the IMU's frame to NED
+    velocity: Vector3  # metres per second NED
 
 
 def motion_at(

@@ -95,15 +95,10 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Pattern(NamedTuple):
-    """Rays of a turn.
+    """Rays of a turn."""
 
-    Attributes:
-        directions: Unit vectors in the sensor's frame (FRD), shape (columns, channels, 3).
-        times: Seconds after the turn's start, not falling, shape (columns,).
-    """
-
-    directions: Floats
-    times: Floats
+    directions: Floats  # unit vectors in the sensor's frame (FRD), shape (columns, channels, 3)
+    times: Floats  # seconds after the turn's start, not falling, shape (columns,)
 
 
 def pattern_of(spec: LidarSpec, start: float) -> Pattern:

@@ -21,17 +21,11 @@ DRAWN = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # groups of geoms visible to cam
 
 
 class Hits(NamedTuple):
-    """Intersections of rays from a common origin.
+    """Intersections of rays from a common origin."""
 
-    Attributes:
-        distances: Metres; ``inf`` for those that meet nothing. Shape (n,).
-        geoms: Numbers of the geoms, or -1. Shape (n,).
-        normals: Unit vectors out of the surfaces, in the rays' axes (NWU). Shape (n, 3).
-    """
-
-    distances: Floats
-    geoms: npt.NDArray[np.int32]
-    normals: Floats
+    distances: Floats  # metres; ``inf`` for those that meet nothing. Shape (n,)
+    geoms: npt.NDArray[np.int32]  # numbers of the geoms, or -1. Shape (n,)
+    normals: Floats  # unit vectors out of the surfaces, in the rays' axes (NWU). Shape (n, 3)
 
 
 class Rays:

@@ -36,36 +36,23 @@ _VEHICLE = Path(__file__).with_name("vehicle.xml")
 
 
 class Motor(msgspec.Struct, frozen=True, kw_only=True):
-    """Rotor of a vehicle.
+    """Rotor of a vehicle."""
 
-    Attributes:
-        position: Metres from the centre of mass, FRD.
-        max_thrust: Newtons at full control, along the body's -z.
-        max_torque: Newton metres that the body feels about its z (FRD: positive turns the nose
-            right) at full control.
-    """
-
-    position: Vector3
-    max_thrust: float
+    position: Vector3  # metres from the centre of mass, FRD
+    max_thrust: float  # newtons at full control, along the body's -z
+    # Newton metres that the body feels about its z (FRD: positive turns the nose right) at full
+    # control.
     max_torque: float
 
 
 class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True):
-    """Parameters of a vehicle for its controller.
+    """Parameters of a vehicle for its controller."""
 
-    Attributes:
-        mass: Kilograms.
-        inertia: Principal moments about x, y, z (FRD), kg m².
-        motors: The motors, in the order of the commands.
-        motor_time_constant: Seconds.
-        gravity: Metres per second squared.
-    """
-
-    mass: float
-    inertia: Vector3
-    motors: tuple[Motor, Motor, Motor, Motor]
-    motor_time_constant: float
-    gravity: float
+    mass: float  # kilograms
+    inertia: Vector3  # principal moments about x, y, z (FRD), kg m²
+    motors: tuple[Motor, Motor, Motor, Motor]  # the motors, in the order of the commands
+    motor_time_constant: float  # seconds
+    gravity: float  # metres per second squared
 
     @property
     def max_thrust(self) -> float:

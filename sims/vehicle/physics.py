@@ -33,38 +33,25 @@ Floats = npt.NDArray[np.float64]
 
 
 class State(msgspec.Struct, frozen=True, gc=False):
-    """Pose and velocity of a vehicle.
+    """Pose and velocity of a vehicle."""
 
-    Attributes:
-        position: Metres NED.
-        orientation: Rotation FRD → NED.
-        velocity: Metres per second NED.
-        angular_velocity: Radians per second FRD.
-    """
-
-    position: Vector3
-    orientation: Quaternion
-    velocity: Vector3
-    angular_velocity: Vector3
+    position: Vector3  # metres NED
+    orientation: Quaternion  # rotation FRD → NED
+    velocity: Vector3  # metres per second NED
+    angular_velocity: Vector3  # radians per second FRD
 
 
 class Contact(msgspec.Struct, frozen=True, gc=False):
-    """Contact point of the vehicle with another object.
+    """Contact point of the vehicle with another object."""
 
-    Attributes:
-        other: Name of the vehicle, or of the body that moves by itself, that it touches; else of
-            the geom, or of its body if it has none.
-        position: Metres NED.
-        normal: Unit vector NED, from the other towards the vehicle.
-        speed: Metres per second at which the two close in along the normal; negative if they part.
-        depth: Metres by which the one is inside the other.
-    """
-
+    # Name of the vehicle, or of the body that moves by itself, that it touches; else of the geom,
+    # or of its body if it has none.
     other: str
-    position: Vector3
-    normal: Vector3
+    position: Vector3  # metres NED
+    normal: Vector3  # unit vector NED, from the other towards the vehicle
+    # Metres per second at which the two close in along the normal; negative if they part.
     speed: float
-    depth: float = 0.0
+    depth: float = 0.0  # metres by which the one is inside the other
 
 
 class Physics:
@@ -283,16 +270,14 @@ class Air:
     """Wind as an influence on a simulation.
 
     Mean wind and gusts are the same everywhere: MuJoCo's own fluid model takes them into account.
-    Turbulence is that of each vehicle's height and speed, all from one noise: vehicles side by
-    side feel the same. What it adds to the drag of the vehicle's body is applied as a force.
-
-    Attributes:
-        velocity: Mean wind, m/s NED; may be set, and holds from the next millisecond on.
+    Turbulence is that of each vehicle's height and speed, all from one noise: vehicles side by side
+    feel the same. What it adds to the drag of the vehicle's body is applied as a force.
     """
 
     def __init__(
         self, model: Any, spec: WindSpec, vehicles: Sequence[str], random: np.random.Generator
     ) -> None:
+        # Mean wind, m/s NED; may be set, and holds from the next millisecond on.
         self.velocity = spec.velocity
         self._spec = spec
         self._random = random

@@ -100,23 +100,15 @@ class BodySpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class BodyMotion(NamedTuple):
-    """Where a body is at each time.
+    """Where a body is at each time."""
 
-    Attributes:
-        name: Name of the MuJoCo body, which is a mocap body.
-        place: Where it stands, metres NED, if it has no path.
-        path: Its way, if it has one.
-        angles: Of a door, radians, at those times.
-        loop: Whether a door does the same again and again.
-    """
-
-    name: str
-    place: Vector3
+    name: str  # name of the MuJoCo body, which is a mocap body
+    place: Vector3  # where it stands, metres NED, if it has no path
     yaw: float
-    path: Path | None = None
+    path: Path | None = None  # its way, if it has one
     times: tuple[float, ...] = ()
-    angles: tuple[float, ...] = ()
-    loop: bool = False
+    angles: tuple[float, ...] = ()  # of a door, radians, at those times
+    loop: bool = False  # whether a door does the same again and again
 
     @property
     def solid(self) -> bool:

@@ -38,16 +38,12 @@ Vector = tuple[float, float, float]
 
 
 class Material(NamedTuple):
-    """A texture in the model.
-
-    Attributes:
-        module: Pieces that are cut out of it start at a multiple of this, metres down: a course
-            of bricks.
-    """
+    """A texture in the model."""
 
     name: str
     width: float
     height: float
+    # Pieces that are cut out of it start at a multiple of this, metres down: a course of bricks.
     module: float = 0.0
 
 

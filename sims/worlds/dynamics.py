@@ -39,14 +39,10 @@ class Motion(Protocol):
 
 
 class Dynamics(NamedTuple):
-    """All self-moving and changing parts of a world.
-
-    Attributes:
-        fog: Whether the world is drawn with fog, as MuJoCo's settings of it say.
-    """
+    """All self-moving and changing parts of a world."""
 
     motions: tuple[Motion, ...] = ()
-    fog: bool = False
+    fog: bool = False  # whether the world is drawn with fog, as MuJoCo's settings of it say
 
     def joined(self, other: Dynamics) -> Dynamics:
         """Return these dynamics combined with others."""
@@ -98,19 +94,13 @@ def interpolated(
 
 
 class Path(NamedTuple):
-    """A smooth way through places, with the heading of its direction.
+    """A smooth way through places, with the heading of its direction."""
 
-    Attributes:
-        times: When it is at each place, seconds, rising.
-        cubics: For each stretch the coefficients of (t - its start)³, ², ¹ and ⁰, each (x, y, z).
-        yaws: Headings, radians, at equal steps from the first time to the last.
-        loop: Whether it begins anew when it is over; else its end holds.
-    """
-
-    times: tuple[float, ...]
+    times: tuple[float, ...]  # when it is at each place, seconds, rising
+    # For each stretch the coefficients of (t - its start)³, ², ¹ and ⁰, each (x, y, z).
     cubics: tuple[Any, ...]
-    yaws: tuple[float, ...]
-    loop: bool
+    yaws: tuple[float, ...]  # headings, radians, at equal steps from the first time to the last
+    loop: bool  # whether it begins anew when it is over; else its end holds
 
     def at(self, seconds: float) -> tuple[Vector3, float]:
         """Return the place and the heading (radians) at a time."""

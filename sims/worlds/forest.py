@@ -31,13 +31,9 @@ SWING = np.repeat([[0.16, 0.16, 0.05], [0.07, 0.07, 0.03], [0.35, 0.35, 0.0]], G
 
 
 class Sway(NamedTuple):
-    """Leaves and shadows in the wind: some mocap bodies move to and fro, each at its own pace.
+    """Leaves and shadows in the wind: some mocap bodies move to and fro, each at its own pace."""
 
-    Attributes:
-        swing: Greatest distance from the place along x, y, z, metres, shape (n, 3).
-    """
-
-    swing: Points
+    swing: Points  # greatest distance from the place along x, y, z, metres, shape (n, 3)
 
     @property
     def solid(self) -> bool:

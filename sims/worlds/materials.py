@@ -22,15 +22,11 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Cells:
-    """A surface laid out in rows of cells: bricks, planks, tiles.
+    """A surface laid out in rows of cells: bricks, planks, tiles."""
 
-    Attributes:
-        index: int32 number of the cell that each pixel belongs to, shape (h, w).
-        edge: Distance to the cell's edge, pixels, shape (h, w).
-    """
-
+    # int32 number of the cell that each pixel belongs to, shape (h, w).
     index: npt.NDArray[np.int32]
-    edge: Image
+    edge: Image  # distance to the cell's edge, pixels, shape (h, w)
     count: int
 
 

@@ -20,19 +20,12 @@ STEP = 1.0  # surfaces are cut at least this fine (metres): MuJoCo lights vertic
 
 
 class Surface(NamedTuple):
-    """Triangle mesh for MuJoCo.
+    """Triangle mesh for MuJoCo."""
 
-    Attributes:
-        points: Metres, shape (n, 3).
-        normals: Outward unit vectors, shape (n, 3).
-        texture: Texture coordinates, shape (n, 2).
-        faces: Indices, anticlockwise from outside, shape (m, 3).
-    """
-
-    points: Array
-    normals: Array
-    texture: Array
-    faces: npt.NDArray[np.int32]
+    points: Array  # metres, shape (n, 3)
+    normals: Array  # outward unit vectors, shape (n, 3)
+    texture: Array  # texture coordinates, shape (n, 2)
+    faces: npt.NDArray[np.int32]  # indices, anticlockwise from outside, shape (m, 3)
 
 
 def grid(points: Array, texture: Array) -> Surface:

@@ -107,9 +107,6 @@ class Camera(msgspec.Struct):
 class Cameras:
     """All vehicles' cameras by name, and the methods to read and change them.
 
-    Attributes:
-        largest: Width and height of a buffer in which each of their images can be drawn, pixels.
-
     Raises:
         ValueError: A camera of the settings has no such vehicle, or is there twice.
     """
@@ -143,6 +140,7 @@ class Cameras:
         cameras = (camera for named in self._named.values() for camera in named.values())
         specs = [spec for camera in cameras for spec in camera.specs.values()]
         width, height = np.max([(1, 1), *(View(camera_info(s)).largest() for s in specs)], axis=0)
+        # Width and height of a buffer in which each of their images can be drawn, pixels.
         self.largest = int(width), int(height)
 
     def find(self, vehicle: ServedVehicle, name: str, external: object = False) -> Camera:

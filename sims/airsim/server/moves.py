@@ -201,17 +201,12 @@ def braked(velocity: float, remaining: float) -> float:
 class PathFollower:
     """A vehicle's progress along a path, never backwards, and the point running ahead.
 
-    The method is "pure pursuit" (R. C. Coulter, CMU-RI-TR-92-01, 1992); the rules of look-ahead
-    and ending are those of AirSim's ``moveOnPath``.
+    The method is "pure pursuit" (R. C. Coulter, CMU-RI-TR-92-01, 1992); the rules of look-ahead and
+    ending are those of AirSim's ``moveOnPath``.
 
     Args:
         path: Corners, metres; at least one. The first is where the vehicle starts.
         lookahead: Metres along the path from the vehicle's place to the lookahead point.
-
-    Attributes:
-        progress: Metres along the path up to the point next to the vehicle.
-        length: Of the path, metres.
-        is_last: Whether the lookahead point is at the end of the path.
     """
 
     def __init__(self, path: Sequence[Vector3], lookahead: float) -> None:
@@ -225,9 +220,9 @@ class PathFollower:
         steps = itertools.starmap(math.dist, itertools.pairwise(corners))
         self._along = [0.0, *itertools.accumulate(steps)]
         self._lookahead = lookahead
-        self.length = self._along[-1]
-        self.progress = 0.0
-        self.is_last = False
+        self.length = self._along[-1]  # of the path, metres
+        self.progress = 0.0  # metres along the path up to the point next to the vehicle
+        self.is_last = False  # whether the lookahead point is at the end of the path
 
     def advance(self, position: Vector3) -> Vector3:
         """Take a vehicle's position (m), and return where the lookahead point is."""

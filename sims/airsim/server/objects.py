@@ -62,9 +62,6 @@ class Objects:
 
     Args:
         spares: The objects that can be brought in, by the names of their bodies.
-
-    Attributes:
-        geoms: Numbers of each object's geoms in the model, by the object's name, sorted.
     """
 
     def __init__(
@@ -79,6 +76,7 @@ class Objects:
         self._warned: set[str] = set()
         model = world.model
         self._spares = {model.body(name).id: spec for name, spec in spares.items()}
+        # Numbers of each object's geoms in the model, by the object's name, sorted.
         self.geoms = {
             name: geoms
             for name, geoms in geoms_by_object(model).items()

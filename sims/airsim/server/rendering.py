@@ -37,28 +37,18 @@ BASELINE = 0.25  # metres between AirSim's default stereo cameras, to which disp
 
 
 class ImageType(IntEnum):
-    """Image types drawn here, by AirSim's numbers.
+    """Image types drawn here, by AirSim's numbers."""
 
-    Attributes:
-        SCENE: Colours.
-        DEPTH_PLANAR: Metres along the optical axis.
-        DEPTH_PERSPECTIVE: Metres along each pixel's ray.
-        DEPTH_VIS: Planar depth as a share of 100 m, at most 1.
-        DISPARITY: Disparity of cameras 0.25 m apart as a share of the image's width, at most 1.
-        SEGMENTATION: Colour of the object's segmentation ID, by `palette`.
-        SURFACE_NORMALS: Normal n towards the camera, in ``map``: red is (n_north + 1) / 2, green
-            that of n_east, blue that of n_down; black where nothing is.
-        INFRARED: The object's segmentation ID as a grey level.
-    """
-
-    SCENE = 0
-    DEPTH_PLANAR = 1
-    DEPTH_PERSPECTIVE = 2
-    DEPTH_VIS = 3
-    DISPARITY = 4
-    SEGMENTATION = 5
+    SCENE = 0  # colours
+    DEPTH_PLANAR = 1  # metres along the optical axis
+    DEPTH_PERSPECTIVE = 2  # metres along each pixel's ray
+    DEPTH_VIS = 3  # planar depth as a share of 100 m, at most 1
+    DISPARITY = 4  # disparity of cameras 0.25 m apart as a share of the image's width, at most 1
+    SEGMENTATION = 5  # colour of the object's segmentation ID, by `palette`
+    # Normal n towards the camera, in ``map``: red is (n_north + 1) / 2, green that of n_east, blue
+    # that of n_down; black where nothing is.
     SURFACE_NORMALS = 6
-    INFRARED = 7
+    INFRARED = 7  # the object's segmentation ID as a grey level
 
 
 OF_DEPTH = frozenset({1, 2, 3, 4, 6})  # types that are made of depth
