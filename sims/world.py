@@ -76,7 +76,6 @@ class SharedWorld:
         self.name = named[0].config.world if named else "hall"
         self.named_by = named[0].name if named else ""
         self._inhabitants = inhabitants
-        # Names of the vehicles.
         self.vehicles = [each.name for each in inhabitants if each.node.vehicle]
         # State of each vehicle and free camera at its start, once that node has started up.
         self.starts: dict[str, State] = {}

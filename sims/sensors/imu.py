@@ -117,9 +117,6 @@ class ImuNoise:
     the bias (J. Crassidis, *Sigma-point Kalman filtering for integrated GPS and inertial
     navigation*, 2006; the same as Kalibr's "IMU noise model").
 
-    Args:
-        bias: Bias at the start: rad/s, then m/s², shape (6,).
-
     Raises:
         ValueError: The rate is not positive, or a parameter is negative.
     """
@@ -129,7 +126,7 @@ class ImuNoise:
         parameters: ImuParameters,
         rate: float,
         generator: np.random.Generator,
-        bias: Floats | None = None,
+        bias: Floats | None = None,  # bias at the start: rad/s, then m/s², shape (6,)
     ) -> None:
         if not rate > 0.0:
             raise ValueError(f"rate: expected a number > 0, found {rate}")

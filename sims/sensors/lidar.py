@@ -162,15 +162,11 @@ class _Boxes:
 
 
 class Scanner:
-    """Ray-casting scanner for the lidars of a body.
-
-    Args:
-        model_bytes: The compiled world, from `sims.cameras.renderer.model_to_bytes`.
-    """
+    """Ray-casting scanner for the lidars of a body."""
 
     def __init__(
         self,
-        model_bytes: bytes,
+        model_bytes: bytes,  # the compiled world, from `sims.cameras.renderer.model_to_bytes`
         dynamics: Dynamics,
         specs: tuple[LidarSpec, ...],
         vehicle: str,

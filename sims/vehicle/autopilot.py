@@ -115,11 +115,6 @@ class Autopilot:
       `setpoint_timeout` is replaced by `Hover`: with a lost link the vehicle must not fly on. A
       position set-point holds for ever, since it ends at a position.
     - `Land` stops first, then goes down at `descent`.
-
-    Args:
-        setpoint_timeout: Age at which such set-points end, seconds.
-        climb: Metres per second during take-off.
-        descent: Metres per second during landing.
     """
 
     def __init__(
@@ -128,9 +123,9 @@ class Autopilot:
         gains: Gains | None = None,
         limits: Limits | None = None,
         *,
-        setpoint_timeout: float = 0.5,
-        climb: float = 1.0,
-        descent: float = 0.5,
+        setpoint_timeout: float = 0.5,  # age at which such set-points end, seconds
+        climb: float = 1.0,  # metres per second during take-off
+        descent: float = 0.5,  # metres per second during landing
     ) -> None:
         self.phase = Phase.DISARMED
         self._controller = Controller(parameters, gains, limits)

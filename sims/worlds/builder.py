@@ -206,20 +206,14 @@ class Builder:
         self,
         name: str,
         place: Vector,
-        colour: Vector,
+        colour: Vector,  # strength in red, green, blue
         *,
         towards: Vector = (0.0, 0.0, -1.0),
         sun: bool = False,
-        fall_off: float = 0.0,
-        cone: float = 0.0,
+        fall_off: float = 0.0,  # 1/m² in 1 / (1 + fall_off r²)
+        cone: float = 0.0,  # degrees to each side of its direction that it reaches; 0: to all sides
     ) -> None:
-        """Add a light.
-
-        Args:
-            colour: Strength in red, green, blue.
-            fall_off: 1/m² in 1 / (1 + fall_off r²).
-            cone: Degrees to each side of its direction that it reaches; 0: to all sides.
-        """
+        """Add a light."""
         kind = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL if sun else mujoco.mjtLightType.mjLIGHT_POINT
         if cone:
             kind = mujoco.mjtLightType.mjLIGHT_SPOT
@@ -399,21 +393,13 @@ class Builder:
         name: str,
         material: Material,
         *,
-        opening: tuple[float, float],
-        leg: float,
-        depth: float,
-        place: Vector,
-        turn: float = 0.0,
+        opening: tuple[float, float],  # clear width, and height of the legs, metres
+        leg: float,  # width of a leg and of the ring, metres
+        depth: float,  # thickness along x, metres
+        place: Vector,  # the middle of the opening, on the ground
+        turn: float = 0.0,  # about z, degrees
     ) -> None:
-        """Add a round arch, open along its x axis: ``<name>/left``, ``/right`` and ``/ring``.
-
-        Args:
-            opening: Clear width, and height of the legs, metres.
-            leg: Width of a leg and of the ring, metres.
-            depth: Thickness along x, metres.
-            place: The middle of the opening, on the ground.
-            turn: About z, degrees.
-        """
+        """Add a round arch, open along its x axis: ``<name>/left``, ``/right`` and ``/ring``."""
         inner, rise = opening[0] / 2.0, opening[1]
         side = (-math.sin(math.radians(turn)), math.cos(math.radians(turn)))
         for which, sign in (("left", 1.0), ("right", -1.0)):

@@ -64,19 +64,12 @@ def cells(
     shape: tuple[int, int],
     random: np.random.Generator,
     *,
-    high: float,
-    wide: float,
-    stagger: float = 0.0,
-    uneven: float = 0.0,
+    high: float,  # height of a row
+    wide: float,  # mean width of a cell
+    stagger: float = 0.0,  # shift of every other row, in cells; 1.0 shifts every row at random
+    uneven: float = 0.0,  # variation of the widths, in mean widths (less than 0.5)
 ) -> Cells:
-    """Lay out rows of cells.
-
-    Args:
-        high: Height of a row.
-        wide: Mean width of a cell.
-        stagger: Shift of every other row, in cells; 1.0 shifts every row at random.
-        uneven: Variation of the widths, in mean widths (less than 0.5).
-    """
+    """Lay out rows of cells."""
     height, width = shape
     row_of = (np.arange(height) / high).astype(np.int32)
     index = np.empty(shape, np.int32)

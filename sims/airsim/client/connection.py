@@ -233,20 +233,15 @@ class ImageSource:
 
     A float image comes as a list of numbers, which takes milliseconds to decode, of the loop's too
     if that were done in a thread.
-
-    Args:
-        cosys: Whether the server is one of Cosys-AirSim's.
-        wanted: Images of each request.
-        limit: Seconds after which a request is given up, and its connection closed.
     """
 
     def __init__(
         self,
         address: tuple[str, int],
         vehicle: str,
-        cosys: bool,
-        wanted: Sequence[Wanted],
-        limit: float,
+        cosys: bool,  # whether the server is one of Cosys-AirSim's
+        wanted: Sequence[Wanted],  # images of each request
+        limit: float,  # seconds after which a request is given up, and its connection closed
     ) -> None:
         self._address, self._bgr, self._limit = address, not cosys, limit
         self._wanted, self._arguments = wanted, requests(wanted, vehicle, cosys)

@@ -298,26 +298,19 @@ def collision(
 class Orders:
     """Orders to a vehicle, and their progress.
 
-    Phases and refusals are those of `sims.vehicle.Autopilot`, so that the same pilot flies both.
-    A take-off is AirSim's, and then a climb to the altitude asked for. A set-point holds on the
+    Phases and refusals are those of `sims.vehicle.Autopilot`, so that the same pilot flies both. A
+    take-off is AirSim's, and then a climb to the altitude asked for. A set-point holds on the
     server for three periods: some may be late, none may stay.
-
-    Args:
-        vehicle: Name of the vehicle on the server.
-        flying: Whether it is in the air already.
-        timeout: Age at which set-points end, ns; those of position hold.
-        period: Seconds between two calls of `obey`.
-        refused: Called with each refusal of the server.
     """
 
     def __init__(
         self,
         connection: Connection,
-        vehicle: str,
-        flying: bool,
-        timeout: int,
-        period: float,
-        refused: Callable[[str], None],
+        vehicle: str,  # name of the vehicle on the server
+        flying: bool,  # whether it is in the air already
+        timeout: int,  # age at which set-points end, ns; those of position hold
+        period: float,  # seconds between two calls of `obey`
+        refused: Callable[[str], None],  # called with each refusal of the server
     ) -> None:
         self.phase = "flying" if flying else "disarmed"
         self._connection, self._vehicle, self._refused = connection, vehicle, refused

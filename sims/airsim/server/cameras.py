@@ -374,17 +374,13 @@ class Images:
         self,
         requests: Sequence[ImageRequest],
         vehicle: ServedVehicle,
-        flavour: Flavour = "airsim",
+        flavour: Flavour = "airsim",  # whose structures, and order of colours, are wanted
         *,
-        external: bool = False,
+        external: bool = False,  # whether cameras that no vehicle carries are meant: there are none
     ) -> Awaitable[list[ImageResponse]]:
         """Take images of the present state, and return an awaitable of them.
 
         The state is that of the call. Simulated time does not wait for the images.
-
-        Args:
-            flavour: Whose structures, and order of colours, are wanted.
-            external: Whether cameras that no vehicle carries are meant: there are none.
 
         Raises:
             RpcError: There is no such camera or type, or it is too much.

@@ -65,11 +65,7 @@ class Incidents:
 
 
 class Connection:
-    """Connection of a client to the server.
-
-    Args:
-        on_close: Called once the connection is closed.
-    """
+    """Connection of a client to the server."""
 
     def __init__(
         self,
@@ -78,7 +74,7 @@ class Connection:
         table: Table,
         flavour: Flavour,
         incidents: Incidents,
-        on_close: Callable[[Connection], None],
+        on_close: Callable[[Connection], None],  # called once the connection is closed
     ) -> None:
         self.address = address
         self.flavour: Flavour = flavour

@@ -75,9 +75,6 @@ class Tasks:
     A task reaches its vehicle by set-points and commands only. After its last order has stood for
     `HOVER_AFTER`, the vehicle is told to hover. A task ends when its vehicle is disarmed: with
     `True` if it was landing.
-
-    Args:
-        owed: Gives the reply for a task's; see `Time.owed`.
     """
 
     def __init__(
@@ -85,7 +82,7 @@ class Tasks:
         clock: Clock,
         source: str,
         send: Callable[[Command | Setpoint], None],
-        owed: Callable[[Reply], Reply],
+        owed: Callable[[Reply], Reply],  # gives the reply for a task's; see `Time.owed`
     ) -> None:
         self._clock, self._source, self._send, self._owed = clock, source, send, owed
         self._slots: dict[str, _Slot] = {}
