@@ -77,11 +77,7 @@ class Result(msgspec.Struct, eq=False):
 
 
 def subjects(config: Config) -> list[NodeSpec]:
-    """Return a file's simulators of vehicles or cameras, recognised by their ports.
-
-    Raises:
-        ConfigError: There is none.
-    """
+    """Return simulators of vehicles or cameras, by their ports; a `ConfigError` if none."""
     found = [
         spec
         for spec in config.nodes
@@ -176,7 +172,6 @@ def _alone(config: Config, spec: NodeSpec) -> dict[str, Any]:
 
 
 def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Return the nodes of the flight: still, then up, then moving about all axes."""
     if "trajectory" in table:
         path = folder.resolve() / "path.tum"
         path.write_text("".join(_path()), encoding="utf-8")
@@ -273,8 +268,7 @@ def lint(
     config: ConfigFile,
     overrides: Overrides = None,
     ignore: Annotated[
-        list[str] | None,
-        typer.Option(metavar="RULE", help="Leave a rule out; may be repeated."),
+        list[str] | None, typer.Option(metavar="RULE", help="Leave a rule out; may be repeated.")
     ] = None,
 ) -> None:
     """Report doubtful settings of a rig: a line for each finding.
@@ -299,11 +293,7 @@ def lint(
 
 
 def write_page(path: Path, name: str, results: Sequence[Result]) -> None:
-    """Write the self-test page, with its plots in the same folder.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
+    """Write the self-test page and its plots; an `OSError` says if a file cannot be written."""
     with style.drawing():
         plots = {r.vehicle: [embedded(plot, path.parent) for plot in _plots(r)] for r in results}
     page = page_of(Path(__file__).with_name("selftest.html.jinja")).render(

@@ -188,7 +188,6 @@ def _camera(rig: Rig, camera: CameraAnnouncement, name: str, *, ros: bool) -> di
 
 
 def _coefficients(camera: CameraAnnouncement, name: str) -> tuple[float, ...]:
-    """Return a lens's coefficients in a format's order."""
     info, most = camera.info, FORMATS[name].radtan if name else 8
     if info.distortion_model == "equidistant":
         return info.distortion
@@ -299,11 +298,7 @@ def export_calibration(
 
 
 def announcements(run: Path) -> list[Announcement]:
-    """Return the announcements of cameras and IMUs in a run's summary.
-
-    Raises:
-        ValueError: There are none, as of a killed run.
-    """
+    """Return a run's announced cameras and IMUs; a `ValueError` if it was killed before."""
     path = run / "summary.json"
     try:
         found = msgspec.json.decode(path.read_bytes())["announcements"]

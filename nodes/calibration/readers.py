@@ -50,11 +50,7 @@ class ReadCamera(msgspec.Struct, frozen=True, eq=False):
 
 
 def read(form: str, folder: Path) -> list[ReadCamera]:
-    """Read the cameras of a calibration in a folder.
-
-    Raises:
-        ValueError: A file is not as the format's documentation says.
-    """
+    """Read a calibration's cameras from a folder; a `ValueError` says what is unlike the format."""
     return READERS[form](folder)
 
 

@@ -201,9 +201,7 @@ def cameras(announced: Announced) -> list[CameraAnnouncement]:
     return [each for each in announced if isinstance(each, CameraAnnouncement)]
 
 
-def stereo_pairs(
-    announced: Announced,
-) -> Iterator[tuple[CameraAnnouncement, CameraAnnouncement]]:
+def stereo_pairs(announced: Announced) -> Iterator[tuple[CameraAnnouncement, CameraAnnouncement]]:
     """Yield the left and the right camera of each stereo rig."""
     for right in cameras(announced):
         yield from ((left, right) for left in cameras(announced) if right.stereo == left.source)

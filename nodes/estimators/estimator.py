@@ -45,11 +45,7 @@ from runtime.extras import why_missing
 from runtime.node import matchers
 from runtime.units import Latency
 
-WORKER_ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
+WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Environment of an estimator's process: a single core, so that sums always have one order."""
 
 
@@ -242,7 +238,6 @@ class Estimator(Node[C], ABC):
             self._narrow_to("frames", choice.lidar.source)
 
     def _take(self, cameras: tuple[CameraAnnouncement, ...]) -> None:
-        """Read the images of these cameras, rectified if they are of no use as they are."""
         self.cameras, self._rectification = cameras, None
         if self._choice.rectified:
             self._rectification = Rectification(cameras)
@@ -262,7 +257,6 @@ class Estimator(Node[C], ABC):
         return await self.offload(self._rectification.frame, frame)
 
     def _refusals(self, cameras: Sequence[CameraAnnouncement], rectified: bool) -> dict[str, str]:
-        """Return why images are of no use, as they are or rectified, by their cameras' sources."""
         if rectified:
             try:
                 cameras = Rectification(cameras).cameras if self.config.rectify else cameras
@@ -308,21 +302,13 @@ class Estimator(Node[C], ABC):
         """Track the images."""
 
     def the_camera(self) -> CameraAnnouncement:
-        """Return the announcement of the camera whose images are read.
-
-        Raises:
-            FatalError: No camera gives what is needed.
-        """
+        """Return the camera whose images are read; a `FatalError` if none gives what is needed."""
         if self.camera is None:
             self.log.fatal("%s", self._missing())
         return self.camera
 
     def the_lidar(self) -> LidarAnnouncement:
-        """Return the announcement of the lidar whose scans are read.
-
-        Raises:
-            FatalError: There is none.
-        """
+        """Return the lidar whose scans are read; a `FatalError` if there is none."""
         if self._choice.lidar is None:
             self.log.fatal("%s", self._missing())
         return self._choice.lidar
@@ -437,7 +423,6 @@ class Estimator(Node[C], ABC):
         return mount
 
     def _mounting(self, origin: int) -> Mount:
-        """Return the mount for a tracker whose poses start at an image of this stamp."""
         camera = self._sensor()
         vehicles = (v for v in self._vehicles if camera.source.startswith(f"{v.source}/"))
         vehicle = next(vehicles, None) if self.config.origin == "announced" else None
@@ -457,7 +442,6 @@ class Estimator(Node[C], ABC):
         return Mount.of(camera, None if self.scale_free else vehicle, self._odom())
 
     def _at_announced_pose(self, vehicle: VehicleAnnouncement, stamp: int) -> bool:
-        """Return whether a vehicle is known to have been at its announced pose at a time (ns)."""
         camera = self._sensor()
         if self.restarts or self._armed_at.get(vehicle.source, stamp) < stamp:
             return False
@@ -465,7 +449,6 @@ class Estimator(Node[C], ABC):
         return vehicle.control_rate > 0 or abs(stamp - vehicle.stamp) <= first * 1e9
 
     def _odom(self) -> str:
-        """Return the frame of estimates whose origin is unknown."""
         number = self._frame_number()
         return f"odom_{number}" if number else "odom"
 

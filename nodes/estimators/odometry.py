@@ -34,11 +34,7 @@ def refuse_distortion(info: CameraInfo) -> None:
 
 
 def grey_image(info: CameraInfo, image: npt.NDArray[np.uint8]) -> Grey:
-    """Return an image, shape (h, w, 3) red, green, blue, or (h, w), as grey.
-
-    Raises:
-        ValueError: The image's size is not that of the camera.
-    """
+    """Return an image, (h, w, 3) or (h, w), as grey; a `ValueError` if not of the camera's size."""
     _check_size(info, "image", image, {(), (3,)})
     if image.ndim == 2:
         return image
@@ -48,11 +44,7 @@ def grey_image(info: CameraInfo, image: npt.NDArray[np.uint8]) -> Grey:
 def grey_and_depth(
     info: CameraInfo, image: npt.NDArray[np.uint8], depth: Depth
 ) -> tuple[Grey, Depth]:
-    """Return an image as grey, and its depth, both of the camera's size.
-
-    Raises:
-        ValueError: One of them has another size.
-    """
+    """Return grey image and depth; a `ValueError` if one is not of the camera's size."""
     _check_size(info, "depth", depth, {()})
     return grey_image(info, image), depth
 

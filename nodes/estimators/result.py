@@ -43,11 +43,7 @@ _NOT_RIGID = 1e-2
 
 
 def check_result(result: Any) -> str:
-    """Return a complaint about the first non-finite number of a result; empty if none.
-
-    Raises:
-        ValueError: It is no such result.
-    """
+    """Return a complaint on the first non-finite number, or nothing; or raise a `ValueError`."""
     if not isinstance(result, TrackingResult):
         raise ValueError(f"expected a TrackingResult, found {_kind(result)}")
     if result.lost:

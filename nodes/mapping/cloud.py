@@ -45,10 +45,7 @@ class Cloud(msgspec.Struct, frozen=True, eq=False):
 
 
 def write_ply(
-    path: Path,
-    points: npt.NDArray[np.float32],
-    colours: npt.NDArray[np.uint8],
-    frame_id: str,
+    path: Path, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8], frame_id: str
 ) -> None:
     """Write a whole PLY file or none; missing folders are created.
 
@@ -118,7 +115,6 @@ def read_ply(path: Path, most: int) -> Cloud:
 
 
 def _vertices(header: list[str]) -> tuple[int, np.dtype[np.void]]:
-    """Return the number of vertices and the layout of a vertex."""
     if "format binary_little_endian 1.0" not in header:
         form = next((line for line in header if line.startswith("format")), "no format")
         raise ValueError(f"expected format binary_little_endian 1.0, found {form!r}")

@@ -153,7 +153,6 @@ class Mapping(Node[MappingConfig]):
         )
 
     def _the_camera(self) -> CameraAnnouncement:
-        """Return the camera to map with."""
         if self._camera is None:
             self.log.fatal("%s", self._lacking())
         return self._camera

@@ -74,11 +74,7 @@ class Keys(NodeConfig):
         self.actions()
 
     def actions(self) -> dict[str, str]:
-        """Return each key's action.
-
-        Raises:
-            ValueError: A key is unknown, or has two actions.
-        """
+        """Return each key's action; a `ValueError` if a key is unknown, or has two."""
         found: dict[str, str] = {}
         for action in self.__struct_fields__:
             for key in getattr(self, action).split():
@@ -184,7 +180,6 @@ class Teleop(Node[TeleopConfig]):
             self._stop()
 
     def _requested(self) -> tuple[Vector3, float]:
-        """Return the velocity and yaw rate commanded by the held keys."""
         actions = {self._actions[key] for key in self._held}
         x, y, z, turn = (
             sum(signs) for signs in zip(*map(_MOTIONS.__getitem__, actions), strict=True)

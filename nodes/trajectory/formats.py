@@ -55,11 +55,7 @@ def read_tum(path: Path, *, whole: bool = True, in_order: bool = True) -> Trajec
 
 
 def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write a TUM file, with the lines of a comment before.
-
-    Raises:
-        OSError: It cannot be written.
-    """
+    """Write a TUM file, with the lines of a comment before; may raise `OSError`."""
     header = "timestamp[s] tx ty tz[m] qx qy qz qw"
     rows = (tum_row(*pose) for pose in trajectory.poses())
     _write(path, [*_comment(comment), f"# {header}\n", *rows])
@@ -74,22 +70,14 @@ def tum_row(stamp: int, position: Vector3, orientation: Quaternion) -> str:
 
 
 def read_euroc(path: Path) -> Trajectory:
-    """Read a EuRoC ground truth of 17 columns, or its first 8 columns (as in TUM VI).
-
-    Raises:
-        ValueError: It cannot be read or holds something else; the message names the line.
-    """
+    """Read a EuRoC ground truth of 17 or 8 (TUM VI) columns; a `ValueError` names a wrong line."""
     return _trajectory([(row, stamp, v[:7]) for row, stamp, v in euroc_rows(path, (17, 8))])
 
 
 def euroc_rows(
     path: Path, columns: tuple[int, ...] = (17,), tolerance: float = UNIT_LENGTH
 ) -> Iterator[tuple[Row, int, list[float]]]:
-    """Yield the rows of a EuRoC ground truth with their stamps (ns) and all other values.
-
-    Raises:
-        ValueError: It cannot be read or holds something else; the message names the line.
-    """
+    """Yield a EuRoC ground truth's rows, stamps (ns), values; a `ValueError` names a wrong line."""
     for row in read_rows(path, ",", columns, "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3"):
         values = row.numbers(1, 17)
         _check_quaternion(row, values[3:7], tolerance)
@@ -110,11 +98,7 @@ def read_vslamlab(path: Path) -> Trajectory:
 
 
 def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write a EuRoC ground truth; velocities by differences, biases zero, a comment before.
-
-    Raises:
-        OSError: It cannot be written.
-    """
+    """Write a EuRoC ground truth; velocities by differences, biases zero; may raise `OSError`."""
     velocities = [(x, y, z) for x, y, z in trajectory.velocities().tolist()]
     rows = (
         euroc_row(*pose, velocity)
@@ -137,11 +121,7 @@ def euroc_row(
 
 
 def read_kitti(path: Path) -> Floats:
-    """Read a KITTI file: transforms child to parent, shape (n, 4, 4).
-
-    Raises:
-        ValueError: It cannot be read or holds something else; the message names the line.
-    """
+    """Read a KITTI file: child to parent, (n, 4, 4); a `ValueError` names a wrong line."""
     rows = list(read_rows(path, None, (12,), "r11 r12 r13 tx r21 … tz"))
     matrices = np.zeros((len(rows), 4, 4))
     matrices[:, 3, 3] = 1.0
@@ -152,11 +132,7 @@ def read_kitti(path: Path) -> Floats:
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
-    """Write a KITTI file: poses only, no stamps, no comments.
-
-    Raises:
-        OSError: It cannot be written.
-    """
+    """Write a KITTI file: poses only, no stamps, no comments; may raise `OSError`."""
     rows = trajectory.matrices()[:, :3, :].reshape(-1, 12).tolist()
     _write(path, [" ".join(f"{value:.12f}" for value in row) + "\n" for row in rows])
 

@@ -64,11 +64,7 @@ class Row:
         self.fields = fields
 
     def numbers(self, start: int, end: int) -> list[float]:
-        """Return fields as finite numbers.
-
-        Raises:
-            ValueError: One of them is none.
-        """
+        """Return fields as finite numbers; a `ValueError` if one is none."""
         try:
             values = [float(field) for field in self.fields[start:end]]
         except ValueError:
@@ -78,11 +74,7 @@ class Row:
         return values
 
     def seconds(self) -> int:
-        """Return the first field, a number of seconds, as whole nanoseconds: no float between.
-
-        Raises:
-            ValueError: It is none.
-        """
+        """Return the first field (seconds) in exact whole nanoseconds, or raise a `ValueError`."""
         try:
             stamp = int((decimal.Decimal(self.fields[0]) * SECOND).to_integral_value())
         except (decimal.InvalidOperation, ValueError, OverflowError):
@@ -93,11 +85,7 @@ class Row:
         return stamp
 
     def nanoseconds(self) -> int:
-        """Return the first field, a whole number.
-
-        Raises:
-            ValueError: It is none.
-        """
+        """Return the first field, a whole number; a `ValueError` if it is none."""
         try:
             stamp = int(self.fields[0])
         except ValueError:

@@ -150,11 +150,7 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         return matrices
 
     def take(self, rows: npt.NDArray[Any] | slice) -> Trajectory:
-        """Return some of the rows: a mask of shape (n,), rising row numbers, or a slice.
-
-        Raises:
-            ValueError: Nothing is left, or the order of time is.
-        """
+        """Return rows by mask (n,), rising numbers or slice; a `ValueError` if none are left."""
         return Trajectory(self.stamps[rows], self.positions[rows], self.orientations[rows])
 
     def covers(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
@@ -221,11 +217,7 @@ class PoseRows:
             self._spill()
 
     def trajectory(self) -> Trajectory:
-        """Return the poses so far, in order of time; of several for a stamp the latest.
-
-        Raises:
-            ValueError: There are none, or a pose is invalid.
-        """
+        """Return the poses so far in order, of equal stamps the latest; may raise `ValueError`."""
         made, written = self._whole, self._written
         parts = [*self._blocks, np.array(self._rows, _ROW)]
         if made is not None and not (written or any(map(len, parts))):
@@ -308,11 +300,7 @@ def associate(
 
 
 def quaternions(rotations: Floats) -> Floats:
-    """Return rotation matrices, shape (n, 3, 3), as quaternions w, x, y, z, shape (n, 4).
-
-    Raises:
-        ValueError: One of them is no rotation.
-    """
+    """Return rotation matrices (n, 3, 3) as w, x, y, z (n, 4); a `ValueError` if one is none."""
     if wrong := not_rotations(rotations):
         raise ValueError(
             f"trajectory: row {wrong[0]}: expected a rotation matrix, "

@@ -139,8 +139,6 @@ class GlfwWindow:
 
 
 class _Canvas:
-    """A textured rectangle in the current OpenGL context."""
-
     def __init__(self, *, wayland: bool) -> None:
         # PyOpenGL must look for functions where GLFW made the context; a MUJOCO_GL or
         # PYOPENGL_PLATFORM of "egl" or "osmesa" is meant for the renderers.
@@ -212,7 +210,6 @@ def _import_glfw() -> Any:
 
 
 def _no_display(expected: str, error: str) -> str:
-    """Return a line on the missing display, and on how to do without."""
     displays = [f"{n}={os.environ[n]}" for n in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(n)]
     if displays or sys.platform != "linux":
         why = ", ".join([*displays, error.strip()])
@@ -274,11 +271,7 @@ class ImageWindow(Node[ImageWindowConfig]):
         self._warned = False
 
     async def on_startup(self) -> None:
-        """Open the window.
-
-        Raises:
-            MissingDependencyError: There is no display.
-        """
+        """Open the window; a `MissingDependencyError` if there is no display."""
         settings = self.config
         self._window: Worker[GlfwWindow] = await self.worker(
             GlfwWindow, settings.title, settings.width, settings.height

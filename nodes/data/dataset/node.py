@@ -18,11 +18,7 @@ from runtime import Input, Node, NodeConfig, Stream, on
 from runtime.errors import ConfigError
 from runtime.paths import OutputPath
 
-_LAYOUTS: dict[str, type[Recording]] = {
-    "euroc": Euroc,
-    "tum_rgbd": TumRgbd,
-    "tum_mono": TumMono,
-}
+_LAYOUTS: dict[str, type[Recording]] = {"euroc": Euroc, "tum_rgbd": TumRgbd, "tum_mono": TumMono}
 _AT_ONCE = 4
 """Image files written concurrently."""
 

@@ -104,11 +104,7 @@ class ImageFile:
         self._lock = threading.Lock()
 
     def __call__(self) -> None:
-        """Write the file if not yet written; wait for another thread's write.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
+        """Write the file if not yet written, or wait for another thread; may raise `OSError`."""
         with self._lock:
             if self._data is not None:
                 image = self._convert(self._data)
@@ -129,11 +125,7 @@ def in_grey(data: Pixels) -> Pixels:
 
 
 class RowFile:
-    """A text file of rows with rising stamps, after the lines of a header.
-
-    Raises:
-        OSError: It cannot be written.
-    """
+    """A text file of rows with rising stamps, after the lines of a header; may raise `OSError`."""
 
     def __init__(self, path: Path, header: str) -> None:
         self.path = path

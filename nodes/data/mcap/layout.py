@@ -53,22 +53,14 @@ class TornError(ValueError):
 
 
 def pieces(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
-    """Yield the records of some opcodes from a file, up to its footer.
-
-    Raises:
-        TornError: There is no footer, or no record before it.
-    """
+    """Yield records of some opcodes up to the footer; a `TornError` if there is none."""
     for opcode, length in _heads(file):
         if opcode in wanted:
             yield opcode, file.read(length)
 
 
 def check_chunks(file: IO[bytes]) -> None:
-    """Check the claimed sizes of all chunks, on behalf of readers without such a check.
-
-    Raises:
-        ValueError: One of them claims more than `LARGEST`.
-    """
+    """Check the claimed sizes of all chunks; a `ValueError` if one is above `LARGEST`."""
     try:
         for opcode, length in _heads(file):
             if opcode == _IS_CHUNK:
@@ -78,11 +70,7 @@ def check_chunks(file: IO[bytes]) -> None:
 
 
 def check_chunk(content: bytes) -> None:
-    """Check the sizes claimed at a chunk's beginning: by its head, and by its frame.
-
-    Raises:
-        ValueError: More than `LARGEST`, or no such beginning.
-    """
+    """Check the sizes in a chunk's head and frame; a `ValueError` if above `LARGEST` or missing."""
     try:
         _, _, size, _, length = _CHUNK.unpack_from(content)
         size = max(size, frame_size(content[_CHUNK.size + length + 8 :]))
@@ -193,11 +181,7 @@ class WholeWrites(io.BufferedIOBase):
         return self._at
 
     def flush(self) -> None:
-        """Write the piece.
-
-        Raises:
-            OSError: Nothing of the piece is in the file.
-        """
+        """Write the piece, or raise an `OSError` with nothing of it in the file."""
         piece, self._piece = self._piece, []
         try:
             for data in piece:
@@ -222,11 +206,7 @@ class WholeWrites(io.BufferedIOBase):
 
 
 def open_anew(path: Path) -> IO[bytes]:
-    """Open a file for writing from the beginning, locked against other writers.
-
-    Raises:
-        OSError: It cannot be opened, or is being written.
-    """
+    """Open a file for writing, locked against other writers; an `OSError` if it cannot be."""
     file = open(  # noqa: SIM115
         path,
         "wb",

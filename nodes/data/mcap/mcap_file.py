@@ -218,11 +218,7 @@ class McapWriter:
 
 
 def contents(path: Path) -> Contents:
-    """Return a file's writer, state and metadata.
-
-    Raises:
-        RecordingError: It is no MCAP file.
-    """
+    """Return a file's writer, state and metadata; a `RecordingError` if it is no MCAP file."""
     with records.open_file(path) as file:
         ours = records.header_of(file).library == LIBRARY
         summary = records.summary_of(file)

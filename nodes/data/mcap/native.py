@@ -54,21 +54,13 @@ def message(frame: bytes | bytearray | memoryview, arrays: bool = True) -> bytes
 
 
 def describe(frame: bytes | bytearray | memoryview) -> tuple[str, str]:
-    """Return the kind and the source of a frame's event.
-
-    Raises:
-        WireError: It is no frame.
-    """
+    """Return the kind and the source of a frame's event; a `WireError` if it is no frame."""
     kind, _, found, _ = _head(memoryview(frame), _source)
     return kind, found.source
 
 
 def lacking(data: bytes) -> list[Shape]:
-    """Return the arrays lacking in a message: none, or all.
-
-    Raises:
-        WireError: It is no message of ours.
-    """
+    """Return the arrays lacking in a message, none or all; a `WireError` if it is none of ours."""
     shapes, begin, end = _shapes(data)
     content = any(0 not in shape for _, shape, _ in shapes)
     if not shapes or len(data) - _HEAD.size > end or (not content and begin == end):
@@ -77,21 +69,13 @@ def lacking(data: bytes) -> list[Shape]:
 
 
 def fields(data: bytes) -> dict[str, Any]:
-    """Return the fields of a message's event as msgpack has them; arrays are numbers.
-
-    Raises:
-        WireError: It is no message of ours.
-    """
+    """Return an event's fields as msgpack has them, arrays as numbers; may raise `WireError`."""
     found: dict[str, Any] = _head(memoryview(data)[_HEAD.size :], msgspec.msgpack.decode)[2]
     return found
 
 
 def event(data: bytes, arrays: Sequence[npt.NDArray[Any]] = ()) -> Event:
-    """Return the event of a message.
-
-    Raises:
-        WireError: The two do not fit, or the event's type is unknown.
-    """
+    """Return a message's event; a `WireError` if arrays do not fit, or its type is unknown."""
     if not arrays:
         return unpack(memoryview(data)[_HEAD.size :])
     shapes, begin, end = _shapes(data)
@@ -149,11 +133,7 @@ HOLDERS = {
 def arrays(
     store: TypeStore, data: bytes, type_: str, shapes: list[Shape], axes: Axes
 ) -> list[Array]:
-    """Return an event's arrays.
-
-    Raises:
-        ValueError: The message has no such arrays.
-    """
+    """Return an event's arrays; a `ValueError` if the message has no such arrays."""
     message = store.deserialize(data, type_)
     try:
         if type_.endswith("PointCloud2"):
@@ -260,11 +240,7 @@ def open_file(path: Path) -> IO[bytes]:
 
 
 def check() -> None:
-    """Check for mcap.
-
-    Raises:
-        MissingDependencyError: mcap is missing.
-    """
+    """Raise a `MissingDependencyError` if mcap is missing."""
     if _MISSING is not None:
         raise MissingDependencyError(
             f"recordings need mcap: {install_command('record')}"
@@ -402,7 +378,6 @@ def _parsed(opcode: int, content: bytes) -> Any:
 
 
 def _broken_up(content: bytes, damaged: Callable[[str], None]) -> list[Any]:
-    """Return the records of a chunk; none if damaged."""
     stream = ReadDataStream(BytesIO(content))
     try:
         layout.check_chunk(content)

@@ -117,7 +117,6 @@ class McapRecorder(Node[McapRecorderConfig]):
             self.log.fatal("%s", process.error)
 
     def _finish(self, _: Path) -> None:
-        """Give a slow disk more time, after the run."""
         process = self._process
         if process is None or self._unfinished is None:
             return
@@ -126,7 +125,6 @@ class McapRecorder(Node[McapRecorderConfig]):
             raise process.error
 
     def _log_result(self, process: WriterProcess) -> None:
-        """Log the size of the recording, and count lost events."""
         backlog, result = self._backlog, process.result
         lost = backlog.dropped + process.unwritten
         self.events.dropped += lost
@@ -175,14 +173,12 @@ class McapRecorder(Node[McapRecorderConfig]):
             self._failed.set_result(error)
 
     async def _watch(self) -> None:
-        """End the run when nothing can be recorded any more."""
         assert self._failed is not None
         error = await self._failed
         self._ended_run = True
         self.log.fatal("%s", error)
 
     async def _wait(self) -> None:
-        """Have simulated time wait until there is room."""
         if not self._waits:
             self.log.info(
                 "the disk is slower than the run: simulated time waits, now and again, with "

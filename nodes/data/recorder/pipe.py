@@ -119,11 +119,7 @@ class Piece(NamedTuple):
 
 
 def write(file: IO[bytes], time: int, what: int, event: Packed | None = None) -> None:
-    """Write a piece to a buffered pipe; the GIL is free while blocked.
-
-    Raises:
-        OSError: The reader is gone.
-    """
+    """Write a piece to a buffered pipe, without the GIL; an `OSError` if the reader is gone."""
     file.write(_HEAD.pack(time, 0 if event is None else event.size, what))
     for part in () if event is None else event.parts():
         view = memoryview(part)

@@ -84,11 +84,7 @@ class EventWriter:
         """Topic holding the arrays of the current event."""
 
     def write(self, time: int, frame: bytes | bytearray, announcement: bool) -> None:
-        """Write an event, a frame of `runtime.wire`, published at a time (ns).
-
-        Raises:
-            WireError: It is no frame.
-        """
+        """Write a frame of `runtime.wire`, published at a time (ns); or raise a `WireError`."""
         self._time = time
         self._holder = ""
         kind, source = native.describe(frame)

@@ -17,15 +17,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from events import (
-    CameraAnnouncement,
-    CameraInfo,
-    DepthImage,
-    Image,
-    Imu,
-    ImuAnnouncement,
-    Odometry,
-)
+from events import CameraAnnouncement, CameraInfo, DepthImage, Image, Imu, ImuAnnouncement, Odometry
 from events.base import UNIT_TOLERANCE
 from events.frames import flip_yz, rotate_inverse, rotation_to_ned
 from events.geometry import pose_tuples
@@ -57,11 +49,7 @@ class Sensor(msgspec.Struct, frozen=True):
     lists: dict[str, list[float]]
 
     def number(self, key: str, default: float | None = None) -> float:
-        """Return a number.
-
-        Raises:
-            ReplayError: There is none.
-        """
+        """Return a number; a `ReplayError` if there is none."""
         try:
             return float(self.texts[key])
         except (KeyError, ValueError):
@@ -71,11 +59,7 @@ class Sensor(msgspec.Struct, frozen=True):
             raise ReplayError(f"{self.path}: {key}: expected a number, found {found}") from None
 
     def list(self, key: str, *lengths: int) -> list[float]:
-        """Return a list of numbers.
-
-        Raises:
-            ReplayError: There is none of such a length.
-        """
+        """Return a list of numbers; a `ReplayError` if there is none of such a length."""
         found = self.lists.get(key, [])
         if len(found) not in lengths:
             counts = " or ".join(map(str, lengths))
@@ -83,11 +67,7 @@ class Sensor(msgspec.Struct, frozen=True):
         return found
 
     def converted(self, values: dict[str, Any], kind: type[T]) -> T:
-        """Return values as a struct.
-
-        Raises:
-            ReplayError: They are none.
-        """
+        """Return values as a struct; a `ReplayError` if they do not fit."""
         try:
             return msgspec.convert(values, kind)
         except msgspec.ValidationError as error:
@@ -137,7 +117,6 @@ class Euroc(FolderReader):
             self._announcements.insert(0, vehicle_at(self._odometry(*row)))
 
     def _rows(self) -> Iterator[Rows]:
-        """Yield IMU, truth and images, all at their own stamps."""
         yield Rows(Imu, f"{self._vehicle}/imu0", self._imu, self._measurement)
         yield Rows(Odometry, self._vehicle, self._truth, self._odometry)
         for source, (rows, factor) in self._depths.items():
@@ -225,11 +204,7 @@ class Euroc(FolderReader):
 
 
 def noted_epoch(path: Path) -> list[int]:
-    """Return the epoch (ns) noted in a file of our own data sets; empty if none.
-
-    Raises:
-        ReplayError: It is no number.
-    """
+    """Return the noted epoch (ns) of our own data sets, or nothing; may raise `ReplayError`."""
     text = read_sensor(path).texts.get("epoch_ns") if path.is_file() else None
     if text is not None and not (text.isdecimal() and len(text) <= 19):
         raise ReplayError(f"{path}: epoch_ns: expected whole nanoseconds, found {text!r:.80}")
@@ -237,11 +212,7 @@ def noted_epoch(path: Path) -> list[int]:
 
 
 def read_sensor(path: Path) -> Sensor:
-    """Read a sensor.yaml: plain ``key: value`` lines, and lists in brackets.
-
-    Raises:
-        ReplayError: It cannot be read.
-    """
+    """Read a sensor.yaml of ``key: value`` lines with bracketed lists; may raise `ReplayError`."""
     try:
         text = re.sub(r"#.*", "", path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:

@@ -166,11 +166,7 @@ class FolderReader(Reader):
 
 
 def read_image(path: Path, stamp: int, source: str, frame_id: str) -> Image:
-    """Read a colour or grey image.
-
-    Raises:
-        ReplayError: It is none.
-    """
+    """Read a colour or grey image; a `ReplayError` if it is none."""
     pixels = _pixels(path)
     if pixels.dtype == np.uint16:
         raise ReplayError(f"{path}: expected an image of 8 bits, found one of 16")

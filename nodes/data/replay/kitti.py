@@ -92,7 +92,6 @@ class Kitti(FolderReader):
         self._announcements += cameras.values()
 
     def _count(self, where: Path, what: str, found: int) -> None:
-        """Raise an error if there are not as many as stamps."""
         if found != len(self._stamps):
             raise ReplayError(
                 f"{where}: expected {len(self._stamps)} {what}, as many as times.txt has stamps, "

@@ -345,7 +345,6 @@ class Replay(Node[ReplayConfig]):
         return (now - self._timeline.shift) / SECOND
 
     async def _play(self, start: int, end: int | None) -> int | None:
-        """Send the events of an interval; return the time of the last, if any."""
         assert self._reader is not None
         await self._close_ahead()
         events = self._reader.events(start, end, self._choice)
@@ -388,7 +387,6 @@ class Replay(Node[ReplayConfig]):
             self._announcements = [self._starting(reader, each) for each in self._announcements]
 
     def _starting(self, reader: Reader, announcement: Announcement) -> Announcement:
-        """Return a vehicle's announcement with its pose at the start."""
         if not isinstance(announcement, VehicleAnnouncement):
             return announcement
 

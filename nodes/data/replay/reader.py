@@ -11,14 +11,7 @@ from typing import Annotated, Literal, NamedTuple, Protocol
 
 import msgspec
 
-from events import (
-    Announcement,
-    CameraInfo,
-    Category,
-    EstimatorAnnouncement,
-    Event,
-    PoseEstimate,
-)
+from events import Announcement, CameraInfo, Category, EstimatorAnnouncement, Event, PoseEstimate
 from events.camera_info import DistortionModel
 from runtime import Changeable, Duration, NodeConfig
 from runtime.paths import InputPath
@@ -59,11 +52,7 @@ class Reader(ABC):
 
     @abstractmethod
     def announcements(self) -> Sequence[Announcement]:
-        """Return the recorded announcements, or their equivalent from the data.
-
-        Raises:
-            ReplayError: It cannot be read.
-        """
+        """Return the recorded announcements, or equivalents from data; may raise `ReplayError`."""
 
     @abstractmethod
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
@@ -204,11 +193,7 @@ class Pinhole(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         self.info(1, 1)
 
     def info(self, width: int, height: int) -> CameraInfo:
-        """Return the intrinsics of images of a size.
-
-        Raises:
-            ValueError: The number of coefficients is not that of the model.
-        """
+        """Return the intrinsics of images of a size; a `ValueError` if coefficients are missing."""
         return CameraInfo(width=width, height=height, **msgspec.structs.asdict(self))
 
 

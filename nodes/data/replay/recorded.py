@@ -82,7 +82,6 @@ class Recorded(Reader):
         return native.event(record.data, found)
 
     def _read_announcements(self) -> Iterator[Announcement]:
-        """Yield the announcements; all precede the events."""
         for record in read(self._path):
             if record.metadata.get("announcement"):
                 try:
@@ -97,11 +96,7 @@ class Recorded(Reader):
 
 
 def is_ours(path: Path) -> bool:
-    """Return whether a file is our recording, possibly rewritten by another tool.
-
-    Raises:
-        ReplayError: It is no MCAP file.
-    """
+    """Return whether a file is our recording, or one rewritten; a `ReplayError` if no MCAP file."""
     try:
         if contents(path).ours:
             return True

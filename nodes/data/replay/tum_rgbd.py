@@ -14,15 +14,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from events import (
-    Announcement,
-    DepthImage,
-    Image,
-    Odometry,
-    PoseStamped,
-    Quaternion,
-    Vector3,
-)
+from events import Announcement, DepthImage, Image, Odometry, PoseStamped, Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD, flip_yz, inverse, multiply, rotation_to_ned
 from nodes.data.replay.euroc import noted_epoch, read_sensor
 from nodes.data.replay.folders import (
@@ -92,7 +84,6 @@ class TumRgbd(FolderReader):
         self._announcements = self._announced(camera, rate)
 
     def _rows(self) -> Iterator[Rows]:
-        """Yield truth (as the body's pose and as the camera's), depth and colour."""
         source = self._source
         yield Rows(Odometry, self._vehicle, self._truth, self._odometry)
         yield Rows(PoseStamped, source, self._truth, self._camera_pose)
@@ -105,10 +96,7 @@ class TumRgbd(FolderReader):
 
     def _camera_pose(self, stamp: int, position: Vector3, optical: Quaternion) -> PoseStamped:
         return PoseStamped(
-            stamp=stamp - self._origin,
-            source=self._source,
-            position=position,
-            orientation=optical,
+            stamp=stamp - self._origin, source=self._source, position=position, orientation=optical
         )
 
     def _paired(self, depth: _Images) -> _Images:

@@ -141,11 +141,7 @@ class InertialFilter:
     """
 
     def __init__(
-        self,
-        imu: ImuModel,
-        camera: Floats,
-        capacity: int,
-        common: tuple[float, float] = (0.0, 0.0),
+        self, imu: ImuModel, camera: Floats, capacity: int, common: tuple[float, float] = (0.0, 0.0)
     ) -> None:
         self._imu, self.camera, self._common = imu, camera, common
         self._capacity = capacity

@@ -133,10 +133,7 @@ def linearise(
     )
     by_camera *= scale[:, None]
     turning = np.stack(
-        [
-            np.stack([-x * y, 1.0 + x * x, -y], axis=1),
-            np.stack([-1.0 - y * y, x * y, x], axis=1),
-        ],
+        [np.stack([-x * y, 1.0 + x * x, -y], axis=1), np.stack([-1.0 - y * y, x * y, x], axis=1)],
         axis=1,
     )
     turning *= scale[:, None]

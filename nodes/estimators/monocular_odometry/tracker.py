@@ -147,7 +147,6 @@ class MonocularTracker:
         )
 
     def _continue_from(self, world: LocalMap) -> None:
-        """Store the map's newest key frame, and continue from there."""
         keyframe = world.keyframe()
         self._pose = self._guess = keyframe.pose
         self._before = keyframe.image, keyframe.landmarks, keyframe.pixels

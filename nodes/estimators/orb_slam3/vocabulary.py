@@ -180,11 +180,7 @@ def cached_vocabulary(shape: TreeShape) -> Path:
 
 
 def find_vocabulary(setting: str) -> Path:
-    """Return the vocabulary of a node's setting: a file, or the cached file if empty.
-
-    Raises:
-        ValueError: There is none, or it is not in DBoW2's text format.
-    """
+    """Return a setting's vocabulary, by default the cached one; a `ValueError` if unusable."""
     path = Path(setting).expanduser() if setting else cached_vocabulary(TreeShape())
     if not path.exists():
         raise ValueError(

@@ -242,12 +242,7 @@ class FeatureTracker:
             return solution.pose
         cv2.setRNGSeed(1)
         found, rotation, translation, _ = cv2.solvePnPRansac(
-            places,
-            there,
-            self._matrix,
-            None,
-            flags=cv2.SOLVEPNP_EPNP,
-            reprojectionError=2.0,
+            places, there, self._matrix, None, flags=cv2.SOLVEPNP_EPNP, reprojectionError=2.0
         )
         if not found:
             return None
@@ -258,11 +253,7 @@ class FeatureTracker:
         return np.asarray(cv2.pyrDown(grey), np.uint8) if self._reduction > 1 else grey
 
     def _find(
-        self,
-        grey: Grey,
-        inverse_of: Depth,
-        expected: Floats,
-        information: Floats | None = None,
+        self, grey: Grey, inverse_of: Depth, expected: Floats, information: Floats | None = None
     ) -> MapMatch | None:
         """Find the map near an expected pose; given its information, few landmarks suffice."""
         settings, landmarks = self._settings, self._map

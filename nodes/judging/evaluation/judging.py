@@ -101,7 +101,6 @@ def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory)
 
 
 def _path_at(truth: Trajectory, stamps: Stamps) -> Floats:
-    """Return the path length from the start of the truth to each time, metres."""
     return interpolated(truth.stamps, truth.distances()[:, None], stamps)[:, 0]
 
 
@@ -282,7 +281,6 @@ def _aligned_as_a_whole(truth: Trajectory, estimate: Trajectory) -> dict[str, fl
 
 
 def _held(errors: Floats, path: float, prefix: str = "") -> dict[str, float | None]:
-    """Return the figures of errors over the whole flight."""
     known = len(errors) > 0
     return {
         f"{prefix}flight_ate_rmse_m": rms(errors) if known else None,

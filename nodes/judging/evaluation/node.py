@@ -384,7 +384,6 @@ class Evaluation(Node[EvaluationConfig]):
     def _seen(
         self, vehicle: str, sensors: dict[str, array[int]]
     ) -> dict[str, npt.NDArray[np.int64]]:
-        """Return the stamps of a vehicle's sensors; of all, if alone."""
         several = len(self._vehicles.names) > 1
         return {
             sensor: np.array(stamps, np.int64)

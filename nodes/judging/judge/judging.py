@@ -123,10 +123,7 @@ def write(
 
 
 def in_memory(
-    truth: Source,
-    judgements: dict[str, Judgement],
-    verdict: Verdict,
-    notes: Sequence[str],
+    truth: Source, judgements: dict[str, Judgement], verdict: Verdict, notes: Sequence[str]
 ) -> Run:
     """Return what `read_run` finds in the folder that `write` writes."""
     estimators = [

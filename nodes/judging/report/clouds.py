@@ -173,7 +173,6 @@ def _shown(name: str, cloud: Cloud, height: float | None) -> Shown:
 
 
 def _views(cloud: Shown) -> list[View]:
-    """Choose the views (from above, oblique, detail) by the first cloud."""
     some = slice(None, None, -(-len(cloud.points) // _ENOUGH))
     points = cloud.points[some].astype(np.float64)
     low, high = np.percentile(points, (0.3, 99.7), axis=0)
@@ -220,7 +219,6 @@ def _busiest(points: Floats, colors: npt.NDArray[np.uint8]) -> Floats:
 
 
 def _draw(clouds: list[Shown], views: list[View], number: int, height: float | None) -> Plot:
-    """Draw clouds side by side: a column per cloud, a row per view."""
     across = (WIDTH - 0.6) / len(clouds)
     heights = [min(across * _aspect(view), _TALLEST) + _TITLE for view in views]
     figure = sheet(sum(heights))
@@ -285,7 +283,6 @@ def _caption(clouds: list[Shown], height: float | None) -> str:
 
 
 def _bar(axis: Any, view: View) -> None:
-    """Replace the axes by a bar of a round length."""
     axis.set(xticks=[], yticks=[])
     for spine in axis.spines.values():
         spine.set_visible(False)

@@ -11,15 +11,7 @@ from matplotlib.ticker import NullFormatter
 
 from nodes.judging.evaluation.metrics import path_pairs, relative_errors
 from nodes.judging.report.folder import Floats, broken
-from nodes.judging.report.style import (
-    Plot,
-    label,
-    legend_above,
-    number,
-    sheet,
-    thin,
-    wide_range,
-)
+from nodes.judging.report.style import Plot, label, legend_above, number, sheet, thin, wide_range
 from nodes.judging.report.tables import Estimator, Run
 from nodes.trajectory import Trajectory
 
@@ -82,7 +74,6 @@ def _shade(run: Run, axis: Any) -> None:
 
 
 def _known(run: Run) -> list[tuple[Estimator, Trajectory, Trajectory]]:
-    """Return the estimators with poses, those poses, and the true ones of the same stamps."""
     found = []
     for each in run.estimators:
         truth = run.truth_of(each)

@@ -36,11 +36,7 @@ _FARTHEST = 1e12
 
 
 def read_poses(path: Path) -> Trajectory:
-    """Read a TUM file, whose last line may be cut off as by a killed run.
-
-    Raises:
-        ValueError: It cannot be read or holds something else.
-    """
+    """Read a TUM file, perhaps cut off as by a killed run; may raise `ValueError`."""
     poses = read_tum(path, whole=False, in_order=False)
     if (far := np.abs(poses.positions).max()) > _FARTHEST:
         raise ValueError(f"expected positions within {_FARTHEST:g} m, found {far:g} m")
@@ -77,11 +73,7 @@ _LOUD = {"WARNING", "ERROR", "CRITICAL"}
 
 
 def read_run(folder: Path) -> Run:
-    """Read a run's folder.
-
-    Raises:
-        ResultsError: The folder is missing, or is no run's.
-    """
+    """Read a run's folder; a `ResultsError` if it is missing or no run's."""
     return _Reader(run_folder(folder)).run()
 
 
@@ -217,13 +209,11 @@ class _Reader:
 
 
 def _first_vehicle(facts: Facts) -> str:
-    """Return the source of the first announced vehicle; empty if none."""
     vehicles = (a["source"] for a in facts.announcements if a.get("type") == "VehicleAnnouncement")
     return str(next(vehicles, ""))
 
 
 def _places(path: Path) -> npt.NDArray[np.float64]:
-    """Read where collisions were, shape (n, 3)."""
     rows = [line.split(",")[-4:-1] for line in path.read_text(encoding="utf-8").splitlines()[1:]]
     return np.array(rows, np.float64).reshape(-1, 3)
 
@@ -248,7 +238,6 @@ def _errors(path: Path) -> Errors:
 
 
 def _intervals(path: Path) -> list[Interval]:
-    """Read a file of rows ``start_ns,end_ns`` under a header."""
     rows = [line.split(",") for line in path.read_text(encoding="ascii").splitlines()[1:]]
     return [Interval(int(start), int(end)) for start, end in rows]
 
@@ -261,7 +250,6 @@ def _frames(folder: Path) -> dict[str, list[Path]]:
 
 
 def _loud(log: str) -> list[str]:
-    """Return the last warnings and errors of a log, with their continuation lines."""
     found: list[str] = []
     loud = False
     for line in log.splitlines():

@@ -146,7 +146,6 @@ def embedded(plot: Plot, folder: Path, formats: Sequence[str] = ()) -> dict[str,
 
 
 def _judged(run: Run) -> list[tuple[str, dict[str, Any], str]]:
-    """Return name, figures and colour of each estimator and of all other judged sources."""
     found = [(each.name, each.figures, each.color) for each in run.estimators]
     verdict = run.facts.verdict
     summary = {} if verdict is None else dict(verdict.estimators)
@@ -158,7 +157,6 @@ def _judged(run: Run) -> list[tuple[str, dict[str, Any], str]]:
 
 
 def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
-    """Return the entry of an estimator at the top of the page."""
     passed = figures.get("passed")
     failed = figures.get("failed")
     if passed is None and "why" in figures:

@@ -18,16 +18,7 @@ from matplotlib.figure import Figure
 
 Floats = npt.NDArray[np.float64]
 
-COLORS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#6a3d7c",
-    "#6b5b00",
-)
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6a3d7c", "#6b5b00")
 """For estimators. The first six are told apart by the colour-blind as well (M. Okabe and K. Ito,
 "Color universal design", 2008)."""
 TRUTHS = ("#3a3a3a", "#8a6d3b", "#4f6f52", "#6b5b7a")
@@ -113,11 +104,7 @@ def drawing() -> Iterator[None]:
 
 
 def sheet(
-    height: float,
-    *,
-    names: Sequence[str] = (),
-    constrained: bool = True,
-    width: float = WIDTH,
+    height: float, *, names: Sequence[str] = (), constrained: bool = True, width: float = WIDTH
 ) -> Figure:
     """Return an empty figure.
 

@@ -274,7 +274,6 @@ def _sheet(run: Run, paths: list[Path]) -> Figure | None:
 
 
 def _frames_caption(run: Run, path: Path) -> str:
-    """Return the time of an image, from the stamp at the end of its name."""
     stamp = path.stem.rpartition("_")[2]
     if not stamp.isdecimal():
         return label(path.stem)

@@ -16,13 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from events import (
-    Announcement,
-    CameraAnnouncement,
-    EstimatorAnnouncement,
-    Event,
-    PilotAnnouncement,
-)
+from events import Announcement, CameraAnnouncement, EstimatorAnnouncement, Event, PilotAnnouncement
 from nodes.ros2.bridge.keys import Complaints, Message
 from nodes.ros2.bridge.session import Publisher, Session
 from nodes.ros2.bridge.settings import (
@@ -158,11 +152,7 @@ class IncomingTopic:
 
 
 def topic(store: TypeStore, name: str, type_: str, qos: Qos) -> Topic:
-    """Return a topic with the hash of its type.
-
-    Raises:
-        ValueError: The type is not known.
-    """
+    """Return a topic with the hash of its type; a `ValueError` if the type is unknown."""
     try:
         return Topic(name=name, type=type_, hash=store.hash(type_), qos=qos)
     except ValueError as error:

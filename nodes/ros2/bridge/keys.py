@@ -60,11 +60,7 @@ _TOKEN = re.compile(
 
 
 def parse_token(key: str) -> Token:
-    """Read a liveliness token.
-
-    Raises:
-        ValueError: It is none that rmw_zenoh_cpp would declare.
-    """
+    """Read a liveliness token; a `ValueError` if none of rmw_zenoh_cpp's."""
     found = _TOKEN.fullmatch(key)
     if found is None or (found[3] != "NN" and found[6] is None):
         raise ValueError(f"expected a liveliness token of ROS, found {key!r:.200}")
@@ -163,22 +159,14 @@ def gid(token: str) -> bytes:
 
 
 def pack(attachment: Attachment) -> bytes:
-    """Return the attachment's 33 bytes.
-
-    Raises:
-        ValueError: The GID has not 16 bytes.
-    """
+    """Return the attachment's 33 bytes; a `ValueError` if the GID has not 16 bytes."""
     if len(attachment.gid) != 16:
         raise ValueError(f"gid: expected 16 bytes, found {len(attachment.gid)}")
     return _LAYOUT.pack(attachment.sequence, attachment.stamp, 16, attachment.gid)
 
 
 def unpack(data: bytes) -> Attachment:
-    """Read an attachment.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """Read an attachment; a `ValueError` if it is none."""
     if len(data) != SIZE or data[16] != 16:
         raise ValueError(f"attachment: expected {SIZE} bytes with a GID of 16, found {data!r:.80}")
     sequence, stamp, _, gid = _LAYOUT.unpack(data)

@@ -285,7 +285,6 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             self._publish(self._publishing.clock, self.clock.now())
 
     def _declare_mapped_events(self) -> None:
-        """Have `publications` called with the events of the file's publications."""
         try:
             events = tuple({event_type(each) for each in self.config.publications})
         except ValueError as error:
@@ -346,7 +345,6 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         getattr(self, port).send(event)
 
     async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
-        """Wait for a camera's calibration, and keep the announcement."""
         timeout, most = incoming.subscription.timeout, self.config.max_message_size
         kinds = {"image": "rgb", "depth": "depth"}
         uses = [each.subscription.use for each in self._incoming if each.source == incoming.source]

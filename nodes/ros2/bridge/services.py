@@ -418,7 +418,6 @@ class VehicleServices:
                 waiter.set_result(None)
 
     async def _give(self, vehicle: str, order: _Order) -> tuple[bool, str]:
-        """Send a command; return whether the vehicle completed the command, and a message."""
         if self._armed.get(vehicle) is order.superfluous is not None:
             return True, f"{vehicle} is {'armed' if order.superfluous else 'disarmed'} already"
         waiter = asyncio.get_running_loop().create_future()

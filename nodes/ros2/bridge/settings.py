@@ -238,11 +238,7 @@ class Ros2BridgeConfig(PublishingConfig):
 
 
 def import_mapping(topic: str, path: str) -> Callable[[Any, Any], Any]:
-    """Return a function of the form ``module:function``.
-
-    Raises:
-        ValueError: It cannot be imported, or is no function.
-    """
+    """Import a function ``module:function``; a `ValueError` if there is no such function."""
     found = _imported(topic, "mapping", path)
     if not callable(found):
         raise ValueError(f"{topic}: mapping: expected a function, found {found!r}")
@@ -251,11 +247,7 @@ def import_mapping(topic: str, path: str) -> Callable[[Any, Any], Any]:
 
 
 def event_type(publication: OwnPublication) -> type[Event]:
-    """Return the type of a publication's events.
-
-    Raises:
-        ValueError: It cannot be imported, or is no event's.
-    """
+    """Import the type of a publication's events; a `ValueError` if there is none."""
     found = _imported(publication.topic, "event", publication.event)
     if not (isinstance(found, type) and issubclass(found, Event)):
         raise ValueError(f"{publication.topic}: event: expected a type of event, found {found!r}")

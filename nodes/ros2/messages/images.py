@@ -124,10 +124,7 @@ class ImageWriter:
 
 
 def cloud(
-    store: TypeStore,
-    header: Any,
-    points: npt.NDArray[np.float32],
-    kind: np.dtype[np.void],
+    store: TypeStore, header: Any, points: npt.NDArray[np.float32], kind: np.dtype[np.void]
 ) -> tuple[bytearray, npt.NDArray[np.void]]:
     """Return a ``sensor_msgs/msg/PointCloud2`` with points (metres in ROS's axes), and its rows."""
     count = len(points)
@@ -194,11 +191,7 @@ def depth_pixels(message: Any) -> npt.NDArray[np.float32]:
 
 
 def decoded_pixels(code: npt.NDArray[np.uint8]) -> npt.NDArray[Any]:
-    """Return the pixels of an encoded image, RGB if in colours.
-
-    Raises:
-        ValueError: It is no image.
-    """
+    """Return the pixels of an encoded image, RGB if in colours; a `ValueError` if it is none."""
     pixels = cv2.imdecode(code, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("not an image")

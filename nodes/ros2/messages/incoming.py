@@ -65,11 +65,7 @@ class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
     vehicle: str = ""
 
     def stamp(self, header: Any) -> int:
-        """Return the time of a message with a header.
-
-        Raises:
-            ValueError: It is no time of this run.
-        """
+        """Return a header's time as a stamp; a `ValueError` if it is no time of this run."""
         return self.stamps.back(header.stamp.sec, header.stamp.nanosec, self.now)
 
     def frame(self, header: Any, default: str) -> str:
@@ -207,11 +203,7 @@ def magnetic_field(message: Any, context: MessageContext) -> Event:
 
 
 def fix(message: Any, context: MessageContext) -> Event:
-    """Read a NavSatFix.
-
-    Raises:
-        ValueError: The receiver has no fix.
-    """
+    """Read a NavSatFix; a `ValueError` if the receiver has no fix."""
     if message.status.status < 0:
         raise ValueError("status: expected a fix, found none")
     known = message.position_covariance_type != message.COVARIANCE_TYPE_UNKNOWN
@@ -307,11 +299,7 @@ def camera_announcement(
 
 
 def camera_info(message: Any) -> CameraInfo:
-    """Read the intrinsics of a CameraInfo.
-
-    Raises:
-        ValueError: It describes no camera with a distortion that `CameraInfo` knows.
-    """
+    """Read the intrinsics of a CameraInfo; a `ValueError` if its distortion is unknown."""
     fx, skew, cx, _, fy, cy, *_ = (float(value) for value in message.k)
     coefficients = tuple(float(value) for value in message.d)
     sizes = 1 <= message.width <= 16384 and 1 <= message.height <= 16384

@@ -35,13 +35,7 @@ from events import (
     Vector3,
     Wind,
 )
-from events.frames import (
-    Axes,
-    convert_covariance,
-    convert_points,
-    convert_rotation,
-    convert_vector,
-)
+from events.frames import Axes, convert_covariance, convert_points, convert_rotation, convert_vector
 from nodes.ros2.messages import images
 from nodes.ros2.messages.images import COMPRESSED, LIDAR_POINT, POINT, ImageWriter
 from nodes.ros2.messages.paths import Paths

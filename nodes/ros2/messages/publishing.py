@@ -65,11 +65,7 @@ class Publishing(Generic[P]):
     """
 
     def __init__(
-        self,
-        sink: Sink[P],
-        store: TypeStore,
-        config: PublishingConfig,
-        time: Callable[[int], Time],
+        self, sink: Sink[P], store: TypeStore, config: PublishingConfig, time: Callable[[int], Time]
     ) -> None:
         self._sink = sink
         self._store = store

@@ -78,11 +78,7 @@ def dds_type(type_: str) -> str:
 
 
 def topic_name(namespace: str, name: str) -> str:
-    """Return a topic's full name; a name with a leading slash is full already.
-
-    Raises:
-        ValueError: ROS would not allow the name.
-    """
+    """Return a topic's full name, as with a leading slash; a `ValueError` if ROS forbids it."""
     full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     if not all(_NAME.fullmatch(part) for part in full[1:].split("/")):
         raise ValueError(
@@ -186,11 +182,7 @@ class PublishingConfig(NodeConfig):
 
 
 def check_name(where: str, name: str) -> None:
-    """Check a name by the rules of ROS.
-
-    Raises:
-        ValueError: Not allowed; the message begins with `where`.
-    """
+    """Raise a `ValueError`, beginning with `where`, for a name that ROS does not allow."""
     try:
         topic_name("/", name)
     except ValueError as error:

@@ -111,11 +111,7 @@ class TypeStore:
         self._store.register(types)
 
     def check(self, type_: str) -> None:
-        """Check for a type, and for the types of its fields.
-
-        Raises:
-            ValueError: It is not known.
-        """
+        """Raise a `ValueError` if a type, or one of its fields' types, is unknown."""
         if type_ not in self._store.types:
             raise ValueError(
                 f"expected a known message type, found {type_!r}"
@@ -127,20 +123,12 @@ class TypeStore:
             raise ValueError(f"{type_}: expected a definition of {error} too, found none") from None
 
     def hash(self, type_: str) -> str:
-        """Return a type's hash for keys (REP 2011: ``RIHS01_`` and 64 digits).
-
-        Raises:
-            ValueError: The type is not known.
-        """
+        """Return a known type's hash for keys (REP 2011: ``RIHS01_`` and 64 digits)."""
         self.check(type_)
         return self._store.hash_rihs01(type_) if self._hashed else NO_HASH
 
     def definition(self, type_: str) -> str:
-        """Return a type's definition with those of its fields' types, as in recordings.
-
-        Raises:
-            ValueError: The type is not known.
-        """
+        """Return a known type's definition with those of its fields' types, as in recordings."""
         self.check(type_)
         text: str = self._store.generate_msgdef(type_, ros_version=2)[0]
         return text
@@ -155,17 +143,12 @@ class TypeStore:
         return self.message("std_msgs/msg/Header")(stamp=stamp, frame_id=frame_id)
 
     def zero(self, type_: str) -> Any:
-        """Return a message of zeros, empty texts and empty sequences.
-
-        Raises:
-            ValueError: The type is not known.
-        """
+        """Return a message of a known type, with zeros, empty texts and empty sequences."""
         self.check(type_)
         _, fields = self._store.fielddefs[type_]
         return self._store.types[type_](**{name: self._zero(*each) for name, each in fields})
 
     def _zero(self, kind: Any, of: Any) -> Any:
-        """Return a field's zero, by its description in rosbags."""
         if kind.name == "NAME":
             return self.zero(of)
         if kind.name == "BASE":
@@ -185,11 +168,7 @@ class TypeStore:
         return buffer if isinstance(buffer, bytearray) else bytearray(written)
 
     def deserialize(self, data: bytes, type_: str) -> Any:
-        """Read a message. Its arrays are views of `data`.
-
-        Raises:
-            MessageError: The bytes are no message of that type.
-        """
+        """Read a message, its arrays views of `data`; a `MessageError` if it is of no such type."""
         try:
             return self._store.deserialize_cdr(data, type_)
         # rosbags means to raise its own error only; what comes from outside had better not test it.

@@ -7,15 +7,7 @@ import contextlib
 from collections.abc import Callable
 from typing import Any
 
-from events import (
-    Announcement,
-    DepthImage,
-    Event,
-    Image,
-    LidarScan,
-    PointCloud,
-    TrackedFeatures,
-)
+from events import Announcement, DepthImage, Event, Image, LidarScan, PointCloud, TrackedFeatures
 from nodes.viewers.common import ImageSelection
 from nodes.viewers.foxglove.publishing import SMALL, Publishing
 from nodes.viewers.foxglove.server import FoxgloveConfig, Server

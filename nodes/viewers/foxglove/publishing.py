@@ -344,7 +344,6 @@ class Publishing:
             self._server.log("/scene", self._make.scene(line), event.stamp)
 
     def _whole_scene(self) -> Any:
-        """Return the whole scene so far, for a new viewer; in any thread."""
         bodies = [make() for make in list(self._bodies.values())]
         lines = [
             self._make.line(trail, name, piece)

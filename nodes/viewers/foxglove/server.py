@@ -85,11 +85,7 @@ class Gate:
         self._listener.close()
 
     def check(self, head: str) -> None:
-        """Check a viewer's request.
-
-        Raises:
-            HttpError: It may not come in; the text says why.
-        """
+        """Check a viewer's request; an `HttpError` says why it may not come in."""
         first, _, fields = head.partition("\r\n")
         if len(first.split(" ")) != 3 or " HTTP/1." not in first:
             raise HttpError(400, "expected a request of HTTP/1.1")
@@ -338,8 +334,6 @@ class Server:
 
 
 class _Listener:
-    """Listener to subscriptions, in the server's threads."""
-
     def __init__(self, subscribed: Callable[[str], None]) -> None:
         self._subscribed = subscribed
 

@@ -163,11 +163,7 @@ class Recorder:
         return self._left_out
 
     def close(self) -> str:
-        """Write the rest, and end; return a viewer's trouble, or nothing.
-
-        Raises:
-            RuntimeError: The file could not be written.
-        """
+        """Write the rest, and end; return a viewer's trouble, or raise a file's `RuntimeError`."""
         if self._closed:
             return ""
         self._closed = True

@@ -82,11 +82,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def load() -> Any:
-    """Import the library.
-
-    Raises:
-        MissingDependencyError: It is not installed.
-    """
+    """Import the library; a `MissingDependencyError` if it is missing."""
     try:
         import rerun
         import rerun.blueprint
@@ -98,11 +94,7 @@ def load() -> Any:
 
 
 def check_display() -> None:
-    """Check for a screen to show a window.
-
-    Raises:
-        MissingDependencyError: There is none.
-    """
+    """Raise a `MissingDependencyError` if there is no screen to show a window."""
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise MissingDependencyError(
             'mode: "spawn" expects a display, found none (DISPLAY is not set): use "serve" or '
