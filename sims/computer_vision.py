@@ -187,10 +187,7 @@ def _velocity_on(course: Course, stamp: int) -> npt.NDArray[np.float64]:
 
 
 def read_tum(path: Path) -> npt.NDArray[np.float64]:
-    """Read a TUM trajectory.
-
-    Returns:
-        Rows of time since the first (s), x, y, z, qx, qy, qz, qw; shape (n, 8), n ≥ 2, in order.
+    """Return a TUM file's rows: time since the first (s), x, y, z, qx, qy, qz, qw; n ≥ 2, rising.
 
     Raises:
         ValueError: The file is missing or holds something else.

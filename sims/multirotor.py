@@ -290,10 +290,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         self.rig.expose(camera, stamp, qpos, qvel, self._world.past_state)
 
     def _advance(self, tick: Tick) -> int:
-        """Step the physics up to a tick, and return the stamp of the state then.
-
-        It is later than the tick's if a later one has been served before, as in real time.
-        """
+        """Step the physics up to a tick; return the state's stamp, in real time maybe later."""
         self._physics.advance_to(tick.stamp)
         return max(tick.stamp, self._physics.time_ns)
 

@@ -67,8 +67,7 @@ C = TypeVar("C", bound=SimulatorConfig, default=SimulatorConfig)
 class Simulator(Inhabitant, Node[C], ABC):
     """Base of the simulators' nodes: their common outputs, and the cameras.
 
-    A subclass compiles the model in `on_startup`, after that of this class, and then starts the
-    rig; the rest of the cameras' work is done here.
+    A subclass's `on_startup` calls this one's, compiles the model and starts the rig.
     """
 
     flies = True
@@ -122,11 +121,10 @@ Order = Command | Setpoint | PathAnnouncement | PilotAnnouncement
 
 
 class Addressee:
-    """Routing of orders to vehicles and free cameras.
+    """Routing of orders to vehicles, or to free cameras if there are none.
 
     An order that names a vehicle is for that one. One that names none is for the only vehicle of
-    the run, and for those whose ports are narrowed to its source. A free camera is a vehicle here
-    if there is no other.
+    the run, and for those whose ports are narrowed to its source.
     """
 
     def __init__(self, name: str, simulators: Sequence[Sibling], ports: Mapping[str, str]) -> None:
@@ -148,10 +146,7 @@ class Addressee:
         return bool(narrowed) or self._vehicles == [self._name]
 
     def refusal(self, order: Order) -> str:
-        """Return the reason against an order for nobody, the first time; else empty.
-
-        Only the first of several vehicles does so.
-        """
+        """Return, only of the first vehicle, the reason against an order for nobody, once."""
         key = (order.source, order.vehicle)
         if self._vehicles[0] != self._name or key in self._refused:
             return ""

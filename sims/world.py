@@ -62,8 +62,7 @@ class SharedWorld:
 
     Args:
         inhabitants: The nodes with a part in the world, in file order.
-        bare: Whether to leave out images, as nobody is to see them; also left out if no inhabitant
-            sees.
+        bare: Leave out images; also left out if no inhabitant sees.
     """
 
     model: Any
@@ -103,9 +102,8 @@ class SharedWorld:
         """Step the physics up to a time if necessary, and return the world's state.
 
         Returns:
-            The state's time: that asked for, or that of the physics if it is further, as may
-            happen in real time. Copies of the generalised positions, shape (nq,), and velocities,
-            shape (nv,).
+            The state's time, in real time perhaps a later one; copies of the generalised positions,
+            shape (nq,), and velocities, shape (nv,).
         """
         if self.simulation is None:
             return stamp_ns, self.model.qpos0.copy(), np.zeros(self.model.nv)
@@ -223,11 +221,7 @@ class World(Inhabitant, Node[WorldConfig]):
     wind = Output(Wind)
 
     async def on_startup(self) -> None:
-        """Build the world, unless a vehicle before has done so.
-
-        Raises:
-            WorldError: There is another node of a world.
-        """
+        """Build the world, or find the built world; `WorldError` beside another such node."""
         first, *others = (each.name for each in self.siblings(World))
         if others and self.name != first:
             raise WorldError(f"expected one node of a world, found {first} besides")

@@ -48,10 +48,7 @@ _HOLDS = {
 
 
 def parse(text: str, where: str) -> tuple[dict[str, Any], str, list[str]]:
-    """Parse lenient JSON: comments, trailing commas, NaN and infinities are accepted.
-
-    Args:
-        where: Begins the message of an error.
+    """Parse JSON with comments, trailing commas, NaN and infinities; errors begin with `where`.
 
     Returns:
         Its values; the text as strict JSON; notes on what AirSim would not have taken.

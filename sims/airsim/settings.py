@@ -61,14 +61,7 @@ _UNITS = {"NoiseSigma": 1e-4, "NoiseBias": 1e-4}  # Gauss in tesla
 
 
 def default_mount(name: str, free: bool) -> tuple[Vector3, Vector3]:
-    """Return where AirSim's camera of a name is.
-
-    Args:
-        name: Any of its names; of one that AirSim does not have, the body's origin, forward.
-
-    Returns:
-        Position, metres FRD; roll, pitch, yaw, degrees.
-    """
+    """Return position (m FRD) and roll, pitch, yaw (degrees) of AirSim's camera; else 0."""
     for names, (x, y, z), orientation in DEFAULT_CAMERAS:
         if name in names:
             return (0.0, y, 0.0) if free else (x, y, z), orientation
@@ -81,11 +74,9 @@ def read(text: str, path: str, warn: Callable[[str], None], world: str = "hall")
     Args:
         path: Its name, for messages.
         warn: Called with a line on each oddity, and each setting not honoured.
-        world: Name or path of the world.
 
     Raises:
-        ConfigError: It is no JSON, a value is of the wrong type, or it asks for what is not
-            simulated here.
+        ConfigError: It is no JSON, or a value's type or request is not supported.
     """
     name = Path(path).name
     found, strict, oddities = parse(text, name)
@@ -235,10 +226,9 @@ def _recording(keys: Keys) -> Table:
 
 
 def _cameras(vehicle_name: str, vehicle: Keys, settings: Keys, free: bool) -> list[Table]:
-    """Return a vehicle's Cameras as the server's setting `cameras`.
+    """Return a vehicle's Cameras as the server's setting `cameras`; `free` without a vehicle.
 
-    AirSim's default ones, which the server knows, are among them only if ``CameraDefaults`` says
-    how they take images; `free` is true of vehicles of the computer-vision mode.
+    AirSim's default ones are among them only if ``CameraDefaults`` says how they take images.
     """
     defaults = settings.table("CameraDefaults")
     usual = _captures(defaults)
@@ -284,11 +274,10 @@ def _captures(keys: Keys) -> dict[int, Table]:
 
 
 def _sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str, Any]:
-    """Return a multirotor's sensor settings, and add the sensor settings of the server.
+    """Return a multirotor's sensors; add `sensor_names` and `lidar_frame` to the server.
 
-    A sensor that is listed, even if it is not enabled, replaces the default ones of its type: a
-    barometer, an IMU, a satellite receiver and a magnetometer, or those of ``DefaultSensors``. The
-    server gets `sensor_names`, where AirSim's are not ours, and `lidar_frame`.
+    A listed sensor, even if not enabled, replaces the default ones of its type: a barometer, an
+    IMU, a satellite receiver and a magnetometer, or those of ``DefaultSensors``.
     """
     usual: Iterable[tuple[str, Keys]] = settings.tables("DefaultSensors")
     if "DefaultSensors" not in settings:

@@ -52,13 +52,9 @@ class Reply(NamedTuple):
 
 
 class Decoder:
-    """Decoder of a connection's bytes into messages, however the bytes are split.
+    """Decoder of a connection's bytes into messages of up to `longest` bytes, however split.
 
-    A message is decoded once it is complete: until then it takes no more memory than its bytes,
-    whatever lengths it claims.
-
-    Args:
-        longest: Bytes of a message beyond which it is refused.
+    A message is decoded once complete: until then it takes no more memory than its bytes.
     """
 
     def __init__(self, longest: int = LONGEST) -> None:
@@ -68,11 +64,7 @@ class Decoder:
         self._begin = 0  # where in the stream `_bytes` begins
 
     def feed(self, data: bytes) -> Iterator[Request | Reply]:
-        """Yield the messages completed by these bytes, in order.
-
-        Raises:
-            WireFormatError: They are no messages, or one is longer than allowed.
-        """
+        """Yield the messages completed by these bytes; `WireFormatError` if invalid or too long."""
         self._bytes += data
         try:
             self._splitter.feed(data)
@@ -98,11 +90,7 @@ class Decoder:
 
 
 def decode(message: bytes) -> Request | Reply:
-    """Return the message in these bytes; invalid UTF-8 in text is replaced.
-
-    Raises:
-        WireFormatError: There is none.
-    """
+    """Return the message in these bytes, invalid UTF-8 replaced, or raise a `WireFormatError`."""
     left = MOST_LISTS
 
     def count(each: Any) -> Any:
@@ -145,20 +133,12 @@ def request(id_: int, method: str, arguments: tuple[Any, ...] | list[Any]) -> by
 
 
 def reply(id_: int, error: str | None, result: Any) -> bytes:
-    """Return the bytes of an answer; structs become maps, and bytes ``bin``.
-
-    Raises:
-        TypeError: The result has something that msgpack cannot hold.
-    """
+    """Return an answer's bytes: structs as maps, bytes as ``bin``; `TypeError` for others."""
     return _encode((REPLY, id_, error, result))
 
 
 def float_array(numbers: npt.NDArray[Any]) -> msgspec.Raw:
-    """Return an array of float32, as rpclib packs a ``std::vector<float>``, ready for `reply`.
-
-    Args:
-        numbers: Any shape; taken in C order.
-    """
+    """Return any array as rpclib packs a ``std::vector<float>``, in C order, for `reply`."""
     flat = np.ascontiguousarray(numbers, np.float32).ravel()
     packed = np.empty(len(flat), [("kind", "u1"), ("value", ">f4")])
     packed["kind"], packed["value"] = 0xCA, flat
@@ -273,10 +253,7 @@ class ImageRequest(msgspec.Struct, frozen=True):
 
 
 class ImageResponse(msgspec.Struct, frozen=True):
-    """An image; either `image_data_uint8` or `image_data_float` is empty.
-
-    On our side, `image_data_float` is what `sims.airsim.wire.float_array` returns.
-    """
+    """An image as bytes, or as floats (`sims.airsim.wire.float_array`); the other is empty."""
 
     image_data_uint8: bytes = b""
     image_data_float: Any = ()

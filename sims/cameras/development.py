@@ -43,11 +43,7 @@ _FARTHEST = 1e6  # metres; stands for ``inf`` where its inverse has to be more t
 
 
 class DepthMeter:
-    """Depth measurement of a camera's exposures.
-
-    Args:
-        light: Factor on the lights of the scene in the images: the projector's is the same.
-    """
+    """Depth measurement; `light` is a factor on the scene's lights, not on the projector's."""
 
     def __init__(self, sensor: DepthSensor, info: CameraInfo, light: float = 1.0) -> None:
         self._sensor = sensor
@@ -65,14 +61,11 @@ class DepthMeter:
     def measure(
         self, depth: Depths, colour: npt.NDArray[np.uint8] | None, random: np.random.Generator
     ) -> Depths:
-        """Return the sensor's measurement of true depth.
+        """Return the measured depth in `min_depth` to `max_depth`, metres, float32; else ``inf``.
 
         Args:
             depth: Metres along the optical axis, shape (height, width); ``inf`` for none.
             colour: What the camera sees, shape (height, width, 3), if `needs_colours`.
-
-        Returns:
-            Metres, float32; within `min_depth` and `max_depth`, or ``inf``.
         """
         sensor = self._sensor
         inverse = np.clip(depth, 1e-6, _FARTHEST)
@@ -156,8 +149,7 @@ class Development:
 
     In this order: mean over the moments of the exposure (motion blur), defocus, vignette, exposure
     time and gain, shot noise, response, and noise of the same size at all grey levels. All but the
-    last two are in linear light. What is off costs nothing: an image of an ideal camera stays
-    as it is, byte for byte.
+    last two are in linear light. An ideal camera's image stays as it is, byte for byte.
 
     Raises:
         ValueError: The file of its response is missing or holds something else.
@@ -185,12 +177,7 @@ class Development:
         exposure: float = 0.0,
         gain: float = 1.0,
     ) -> Image:
-        """Return the developed image of an exposure.
-
-        Args:
-            images: What was drawn at equally spaced moments of it, each of shape (height, width, 3)
-                or (height, width).
-        """
+        """Return an exposure's image, of drawings (h, w, 3) or (h, w) at even moments."""
         reference = self._spec.reference_exposure
         factor = gain * (exposure / reference if reference else 1.0)
         through_root = self._vignette is not None or self._spec.full_well > 0.0
@@ -205,11 +192,7 @@ class Development:
     def measure(
         self, depth: Depths, images: Sequence[Image], random: np.random.Generator
     ) -> Depths:
-        """Return the measurement of true depth.
-
-        Args:
-            depth: Metres, shape (height, width); ``inf`` where nothing was hit.
-        """
+        """Return measured depth of the true one, metres, shape (h, w); ``inf`` for nothing."""
         if self._depth_meter is None:
             return noisy_depth(depth, self._spec.depth_noise, random)
         middle = images[len(images) // 2] if images else None

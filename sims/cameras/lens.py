@@ -82,11 +82,10 @@ def faces(info: CameraInfo) -> tuple[Face, ...]:
 
 
 def undistorted(info: CameraInfo) -> tuple[CameraInfo, Maps, Maps]:
-    """Return the pinhole camera of the same focal length and principal point as a lens.
+    """Return a lens's pinhole camera of equal focal length and principal point, and its lookup.
 
-    Returns:
-        The pinhole camera; column and row of the lens's image on which each of its pixels falls,
-        shape (h, w) each, outside it where the lens does not see.
+    The lookup is column and row of the lens's image for each pixel, shape (h, w) each, outside it
+    where the lens does not see.
     """
     pinhole = CameraInfo(
         width=info.width, height=info.height, fx=info.fx, fy=info.fy, cx=info.cx, cy=info.cy
@@ -190,8 +189,8 @@ def intrinsics(
     """Return the intrinsics for a camera's settings.
 
     Args:
-        fov: Horizontal field of view, degrees, with what the lens does to it; of no effect beside
-            `given`. Pixels are square then, and the principal point is the centre.
+        fov: Horizontal field of view, degrees, through the lens, for square pixels and a principal
+            point in the centre; of no effect beside `given`.
 
     Raises:
         ValueError: The lens does not reach that far, or sees nothing.

@@ -84,10 +84,7 @@ class Shot(NamedTuple):
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Images and pose of an exposure, all of the same instant or read out alike.
-
-    Images of kinds that the camera's settings do not name are None.
-    """
+    """Images (None: not in the camera's settings) and pose of an exposure, of the same instant."""
 
     stamp: int  # nanoseconds on the run's clock: the middle of the middle row's exposure
     position: Vector3  # the optical frame's origin, metres in ``map`` (NED)
@@ -131,11 +128,7 @@ def model_to_bytes(model: Any) -> bytes:
 
 
 def model_from_bytes(data: bytes) -> Any:
-    """Return the model written by `model_to_bytes`.
-
-    Raises:
-        ValueError: The bytes are none, or were written by another version of MuJoCo.
-    """
+    """Return the model of `model_to_bytes`; `ValueError` for other bytes or another MuJoCo's."""
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": data})
 
 
@@ -238,10 +231,7 @@ class CameraRenderer:
         self._stage.close()
 
     def _capture(self, shot: Shot, spec: CameraSpec, number: int) -> Captured:
-        """Draw the light on the sensor, for each band of rows exposed at its own time.
-
-        Colours are drawn at each of the moments that make up the exposure, all else in its middle.
-        """
+        """Draw light on the sensor, in bands: colours at each moment, all else in the middle."""
         kinds, stage, view = set(spec.images), self._stage, self._views[spec.name]
         coloured = not kinds.isdisjoint({"rgb", "grey"})
         exposure = shot.exposure if coloured and shot.moves() else 0.0

@@ -30,8 +30,8 @@ def read_response(name: str) -> tuple[float, ...]:
     """Return the light of the 256 grey levels, as in `CameraAnnouncement.response`.
 
     Args:
-        name: ``srgb``, for which the result is empty; ``linear``; ``gamma``, of 2.2; or the path of
-            a ``pcalib.txt`` of TUM's monoVO data set: 256 rising numbers.
+        name: ``srgb`` (an empty result), ``linear``, ``gamma`` (of 2.2), or the path of a
+            ``pcalib.txt`` of TUM's monoVO data set: 256 rising numbers.
 
     Raises:
         ValueError: The file is missing or holds something else.
@@ -57,8 +57,8 @@ def noise_at(light: npt.NDArray[np.float64], level: int, noise: float, electrons
 
     Args:
         light: Of each grey level, shape (256,).
-        noise: What is the same at all levels, grey levels.
-        electrons: Of a white pixel, for the shot noise; 0 if there is none.
+        noise: Common to all levels, grey levels.
+        electrons: Of a white pixel, for the shot noise; 0 for none.
     """
     levels_per_light = 2.0 / (light[level + 1] - light[level - 1])
     shot = levels_per_light * np.sqrt(light[level] / electrons) if electrons else 0.0
@@ -77,15 +77,13 @@ def defocused(image: Image, sigma: float) -> Image:
 
 
 def moments(exposure: float, shift: float) -> list[float]:
-    """Return the moments to draw for motion blur, about a pixel of motion apart.
+    """Return the moments to draw for motion blur, seconds from the middle of the exposure.
+
+    They are the middles of an odd number of equal parts of it, about a pixel of motion apart.
 
     Args:
         exposure: Seconds that the shutter is open.
         shift: Pixels by which the image moves meanwhile.
-
-    Returns:
-        An odd number of moments, seconds from the middle of the exposure, in order: the middles
-        of as many equal parts of it.
     """
     count = 2 * math.ceil((min(shift, MOST) - 1.0) / 2.0) + 1 if shift > 1.0 else 1
     return [exposure * ((k + 0.5) / count - 0.5) for k in range(count)]
@@ -226,8 +224,8 @@ class AutoExposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class ExposureControl:
     """Automatic exposure time and gain of a camera, image by image.
 
-    The exposure an image asks for is computed from its own exposure time and gain, so late images
-    slow the control, but do not make it oscillate: it never goes beyond an image's request.
+    What an image asks for is computed from its own exposure time and gain: late images slow the
+    control, but it never goes beyond an image's request.
     """
 
     def __init__(self, settings: AutoExposure, exposure: float) -> None:
@@ -240,11 +238,9 @@ class ExposureControl:
         self._seen.append((stamp, exposure * gain, light))
 
     def next(self, stamp: int) -> tuple[float, float]:
-        """Return exposure time (seconds) and gain of an exposure beginning at `stamp`.
+        """Return exposure time (seconds) and gain of an exposure beginning at a rising `stamp`, ns.
 
-        Args:
-            stamp: Nanoseconds; above that of the call before. The last image that was delivered
-                *before* it counts, whenever this is called.
+        The last image delivered *before* it counts, whenever this is called.
         """
         settings = self._settings
         before = [seen for seen in self._seen if seen[0] < stamp]

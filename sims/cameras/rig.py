@@ -65,11 +65,11 @@ class CameraRig:
     """All cameras of a body.
 
     Every image has the stamp of its exposure (with the error of the camera's clock), and is sent
-    `latency` seconds, and up to `jitter` more, after it. Just before, the pose of the camera is
-    sent, with the same stamp and source; of a rolling shutter also those of the first and the last
-    row, with their stamps. The images of a stereo rig's cameras are sent together. A
-    camera with both ``rgb`` and ``grey`` sends the grey images as ``<source>/grey``; one with
-    ``undistorted`` sends all a second time, as ``<source>/undistorted``.
+    `latency` seconds, and up to `jitter` more, after it. Just before, the camera's pose is sent,
+    with the same stamp and source; of a rolling shutter also those of the first and the last row.
+    The images of a stereo rig's cameras are sent together. A camera with both ``rgb`` and ``grey``
+    sends the grey images as ``<source>/grey``; one with ``undistorted`` sends all a second time, as
+    ``<source>/undistorted``.
 
     Args:
         node: The node that carries the cameras; a camera's source is ``<node>/<camera>``.
@@ -104,11 +104,7 @@ class CameraRig:
         """Exposures left out because the renderer was behind; never in lockstep."""
 
     async def start(self, world: DrawnWorld) -> None:
-        """Start the renderers.
-
-        Raises:
-            GraphicsError: This machine cannot render.
-        """
+        """Start the renderers, or raise a `GraphicsError`."""
         if not self._specs:
             return
         self._seed = int(self._node.rng.integers(1 << 31))
@@ -200,8 +196,8 @@ class CameraRig:
             stamp: Time of the state (ns).
             qpos: The state, shape (nq,); not copied.
             qvel: Its velocity, shape (nv,), for motion blur; not copied. None: at rest.
-            states: Gives the state at other times, for a rolling shutter or a second eye that is
-                exposed later: it is asked as soon as all rows have been exposed.
+            states: State at other times, for a rolling shutter or a second eye: asked once all rows
+                have been exposed.
         """
         spec = self._specs[camera]
         exposure, gain = float(spec.exposure), spec.gain

@@ -317,11 +317,7 @@ def _info(
 
 
 def camera_info(spec: CameraSpec) -> events.CameraInfo:
-    """Return the camera's intrinsics.
-
-    Raises:
-        ValueError: The lens does not reach as far as the field of view.
-    """
+    """Return the camera's intrinsics; `ValueError` if the lens is narrower than `fov`."""
     return _info(spec.width, spec.height, spec.fov, spec.intrinsics, spec.lens)
 
 
@@ -394,11 +390,7 @@ def vertical_fov(spec: CameraSpec) -> float:
 
 
 def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: str) -> None:
-    """Mount a camera, or both of a stereo rig, on a body of the world.
-
-    Args:
-        body_name: The body that carries it; its axes are forward, left, up (FLU), as are all
-            bodies' in MuJoCo, whose half turn about x is our FRD.
+    """Mount a camera, or both of a stereo rig, on a body, whose axes are MuJoCo's: FLU.
 
     Raises:
         ValueError: The world has no such body, or has a camera of that name already.
@@ -425,10 +417,7 @@ def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: s
 
 
 def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ...]) -> str:
-    """Add a body with cameras, without collisions and gravity.
-
-    Returns:
-        The prefix of the cameras' names, as `CameraRenderer` takes it.
+    """Add a body with cameras, without collisions and gravity; return their names' prefix.
 
     Raises:
         ValueError: The world has a body of that name, or two specs share theirs.
@@ -447,14 +436,7 @@ def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ..
 
 
 def pose_to_qpos(position: Vector3, orientation: Quaternion) -> npt.NDArray[np.float64]:
-    """Return a free camera's qpos, shape (7,), from its body's pose.
-
-    Args:
-        orientation: Rotation from the body (FRD) to ``map``; needn't be of unit length.
-
-    Raises:
-        ValueError: The quaternion is zero.
-    """
+    """Return a body's (FRD, any length of quaternion but 0) pose as a free joint's, shape (7,)."""
     turn = flip_yz_rotation(normalize(orientation))
     return np.array([*flip_yz(position), *turn])
 

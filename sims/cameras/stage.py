@@ -28,10 +28,9 @@ class GraphicsError(MissingDependencyError, RuntimeError):
 
 
 def keep_memory() -> None:
-    """Make the allocator keep the freed memory of images for reuse.
+    """Make glibc's allocator, if here, keep the freed memory of images for reuse.
 
-    glibc maps a large array anew, page by page: for each image that took a tenth of the time of a
-    plain camera, and a third of that of one with all effects. Does nothing where there is no glibc.
+    glibc maps a large array anew, page by page: a tenth of the time of a plain camera's image.
     """
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(-1, 1 << 30)  # M_TRIM_THRESHOLD of malloc.h
@@ -114,10 +113,7 @@ class Changing(Protocol):
 class Stage:
     """Off-screen stage for the geoms of groups 0 to 2 (MuJoCo's default) of a model.
 
-    Not thread-safe: stay in the thread that made it.
-
-    Args:
-        model: The compiled model, which is changed so that it is drawn quickly.
+    Not thread-safe: stay in the thread that made it. The model is changed to be drawn quickly.
 
     Raises:
         GraphicsError: There is no GL; the message names what to install.
@@ -302,10 +298,9 @@ class Stage:
 
 
 def metric_depth(buffer: Depths) -> Depths:
-    """Return planar depth in metres from a reversed depth buffer, shape (h, w).
+    """Return planar depth in metres from a reversed depth buffer, shape (h, w), exact to float32.
 
-    With reversed z the projection writes ``d = near (far - z) / (z (far - near))``, which is 1 at
-    the near plane and 0 at the far one; solved for z. Exact to float32.
+    The projection writes ``d = near (far - z) / (z (far - near))``, solved here for z.
     """
     depth = buffer * np.float32(FAR - NEAR)
     depth += np.float32(NEAR)

@@ -31,11 +31,7 @@ class Drawn(NamedTuple):
 
 
 class View:
-    """Images of a camera, assembled from drawings.
-
-    Args:
-        framed: Whether the model's camera has just this frame, so that nothing is aimed.
-    """
+    """Images of a camera, assembled from drawings; `framed`: the model's has just this frame."""
 
     def __init__(self, info: CameraInfo, framed: bool = False) -> None:
         self.info = info
@@ -163,14 +159,7 @@ def row_time(readout: float, row: float, height: int) -> float:
 
 
 def row_bands(height: int, shift: float) -> list[tuple[int, int]]:
-    """Return bands of rows, each to be drawn at the time of its middle.
-
-    Args:
-        shift: Pixels by which the image moves during the readout.
-
-    Returns:
-        First row, and the one after the last, of each band; at least one.
-    """
+    """Return bands of rows (first, last + 1) for an image's shift in the readout (pixels)."""
     count = min(max(math.ceil(0.5 * shift / OFF), 1), height, MOST_BANDS)
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
     return list(itertools.pairwise(edges))
@@ -199,15 +188,11 @@ def image_speeds(
     poses: list[Floats],
     seconds: float,
 ) -> Floats:
-    """Return the speeds of visible points in the image, pixels per second.
+    """Return the greatest speed of each point that stays in sight, pixels per second, shape (n,).
 
     Args:
         depth: Planar depth as the small camera sees it at the middle pose, shape (h, w).
-        poses: The optical frame in ``map`` at an odd number of times at equal intervals, shape
-            (4, 4) each.
-
-    Returns:
-        The greatest speed of each point that stays in sight, shape (n,); zero if there is none.
+        poses: The optical frame in ``map``, (4, 4), at an odd number of times at equal intervals.
     """
     rays = pixel_rays(small).reshape(-1, 3)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -110,12 +110,12 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class ImuNoise:
-    """Adds noise to true samples taken at a fixed rate.
+    """Noise for true samples taken at a fixed rate.
 
-    The continuous model, truth + bias + white noise with the bias a random walk, sampled at
-    intervals dt: standard deviation density/√dt for the noise and random_walk·√dt for each step of
-    the bias (J. Crassidis, *Sigma-point Kalman filtering for integrated GPS and inertial
-    navigation*, 2006; the same as Kalibr's "IMU noise model").
+    Truth + bias + white noise with the bias a random walk, sampled at intervals dt: standard
+    deviation density/√dt for the noise and random_walk·√dt for each step of the bias (J. Crassidis,
+    *Sigma-point Kalman filtering for integrated GPS and inertial navigation*, 2006; Kalibr's "IMU
+    noise model").
 
     Raises:
         ValueError: The rate is not positive, or a parameter is negative.
@@ -147,12 +147,7 @@ class ImuNoise:
         self._next = 0
 
     def add(self, angular_velocity: Vector3, specific_force: Vector3) -> tuple[Vector3, Vector3]:
-        """Return the IMU's measurement at its next sample.
-
-        Args:
-            angular_velocity: True, rad/s.
-            specific_force: True, m/s², in the same frame.
-        """
+        """Return the next sample of true angular velocity (rad/s) and specific force (m/s²)."""
         if self._next == len(self._errors):
             self._draw()
         ex, ey, ez, fx, fy, fz = self._errors[self._next]
@@ -224,11 +219,9 @@ class ImuModel:
     def measure(
         self, angular_velocity: Vector3, specific_force: Vector3, thrusts: Any
     ) -> tuple[Vector3, Vector3]:
-        """Return the next sample.
+        """Return the next sample of true rad/s and m/s², in the IMU's frame.
 
         Args:
-            angular_velocity: True, rad/s, in the IMU's frame.
-            specific_force: True, m/s², in the IMU's frame.
             thrusts: Thrust of each of the four rotors, 0 to 1 of its greatest.
         """
         rates, force = angular_velocity, specific_force
@@ -309,8 +302,8 @@ def mean_between(
 ) -> tuple[Vector3, Vector3]:
     """Return mean angular velocity and specific force between two instants, in the IMU's frame.
 
-    They are those of a constant angular velocity that leads from one to the other, and of a
-    constant specific force in the frame halfway: integrated so, they give back the motion.
+    Constant angular velocity, and constant force in the frame halfway: integrated they give back
+    the motion.
     """
     turn = multiply(inverse(before.orientation), after.orientation)
     w, *axis = turn if turn[0] >= 0.0 else tuple(-x for x in turn)

@@ -188,15 +188,11 @@ class Scanner:
         self._boxes = _Boxes(self._rays)
 
     def scan(self, name: str, start: int, states: Floats) -> LidarScan:
-        """Scan a single turn.
+        """Return the scan of a turn from `start` (ns) on. The same arguments give the same bits.
 
         Args:
-            start: Stamp of the first ray (ns).
             states: The world's generalised positions at each millisecond from then on, shape
                 (milliseconds, nq); the last for what comes later, too.
-
-        Returns:
-            The scan. The same arguments give the same bits.
         """
         spec = self._specs[name]
         directions, times = pattern_of(spec, start / 1e9)
@@ -242,8 +238,8 @@ class Scanner:
     ) -> npt.NDArray[np.bool_]:
         """Return a mask of geoms no ray of a group can meet, shape (groups, geoms).
 
-        Four planes through the group's origin have all its rays on one side; a geom whose box is
-        wholly on the other side of one of them, behind the origin or out of reach, is aside.
+        Four planes through the group's origin have all its rays on one side; a geom is aside if its
+        box is beyond one of them, behind the origin or out of reach.
         """
         middle = rays[:, 0] + rays[:, rays.shape[1] // 2] + rays[:, -1]
         ahead = _unit(np.add.reduceat(middle, borders, axis=0))
@@ -325,8 +321,7 @@ def _put_first(model: Any, met: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
 def solids(model: Any) -> npt.NDArray[np.bool_]:
     """Return a mask of geoms met by light, shape (ngeom,): drawn and not transparent.
 
-    Where a built-in world has a solid and its look, which coincide, it is the solid: rays meet its
-    plain shape in less time than the look's mesh.
+    Of a solid and its look, the solid: rays meet its plain shape in less time than the look's mesh.
     """
     met = np.isin(model.geom_group, (0, 1, 2)) & (model.geom_rgba[:, 3] > 0.0)
     for look, solid in _looks(model):
@@ -377,11 +372,9 @@ LATE = 1.0  # longest delay of a turn's end in real time, seconds; later turns a
 class LidarRig:
     """All lidars of a vehicle.
 
-    A turn begins at one tick and ends at the next. It is then made from the states in which the
-    vehicle was meanwhile, and sent `latency` after its end, with the stamp of its first ray.
-
-    Args:
-        advance: Steps the physics up to a tick, and returns the stamp of the state then.
+    A turn, from one tick to the next, is made from the vehicle's states meanwhile, and sent
+    `latency` after its end, with the stamp of its first ray; `advance` steps the physics up to a
+    tick.
     """
 
     def __init__(

@@ -29,10 +29,9 @@ class Hits(NamedTuple):
 
 
 class Rays:
-    """Ray casting in a model, state by state.
+    """Ray casting in a model, state by state; its dynamics change lights and colours of it.
 
     Args:
-        model: The compiled world; lights and colours of it are changed by its dynamics.
         body: Name of the body whose geoms rays pass through.
     """
 

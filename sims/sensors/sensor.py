@@ -131,8 +131,8 @@ class GaussMarkov:
     Args:
         sigma: Standard deviation that it tends to; of AirSim's, the factor of its input.
         tau: Time constant, seconds; 0 is a process that stays zero.
-        airsim: Take AirSim's recursion, whose input is weighted with 1 - e^(-dt/τ) instead of
-            √(1 - e^(-2 dt/τ)): its deviation tends to σ √(dt / 2τ) only.
+        airsim: AirSim's recursion, with an input weighted by 1 - e^(-dt/τ), not √(1 - e^(-2 dt/τ)):
+            its deviation tends to σ √(dt / 2τ) only.
     """
 
     def __init__(

@@ -129,14 +129,12 @@ class VehicleImu:
 
 
 class SensorSuite:
-    """All sensors of a vehicle but its cameras.
+    """All sensors of a vehicle, a source ``<node>/<sensor>`` each, but its cameras.
 
-    Every measurement has the stamp of the state that it is of, and is sent `latency` later. A
-    sensor's random numbers depend on the run's seed, its node's name and its own only.
+    Every measurement has the stamp of its state, and is sent `latency` later. A sensor's random
+    numbers depend on the run's seed, its node's name and its own only.
 
     Args:
-        node: The node that carries the sensors, with their outputs; a sensor's source is
-            ``<node>/<sensor>``.
         physics: The vehicle, in a world that `mount_imu` has seen.
         advance: Steps the physics up to a tick, and returns the stamp of the state then.
     """

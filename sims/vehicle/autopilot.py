@@ -146,22 +146,14 @@ class Autopilot:
         self._standing_ns: int | None = None
 
     def command(self, event: Event) -> str | None:
-        """Take an order or a set-point for the next update.
-
-        Returns:
-            None if it is obeyed, else why not.
-        """
+        """Take an order or a set-point for the next update, or return the reason for refusal."""
         reason = self._refusal(event)
         if reason is None:
             self._accept(event)
         return reason
 
     def update(self, stamp_ns: int, state: State, touching: bool) -> Motors:
-        """Return the motor commands for now.
-
-        Args:
-            stamp_ns: Nanoseconds on the run's clock; not before the last update's.
-        """
+        """Return the motor commands at a run's time (ns) not before the last update's."""
         last = self._last_ns
         self._last_ns = stamp_ns
         dt = _FIRST_DT if last is None or stamp_ns <= last else (stamp_ns - last) * 1e-9
@@ -342,12 +334,10 @@ class Clearance:
         self._no_hits = np.where(solid & (np.array(self._movers) == ""), 0, 1)
 
     def at(self, place: Vector3, *, now: bool = False) -> str:
-        """Return the obstacle's name for a level vehicle at a place; empty for none.
+        """Return the obstacle's name for a level vehicle at a place (m NED); empty for none.
 
         Args:
-            place: Metres NED.
-            now: Whether it would be there at the start, when other vehicles and what moves by
-                itself are where they begin; later they are elsewhere.
+            now: At the start, when other vehicles and self-moving bodies are where they begin.
         """
         self._place[:] = flip_yz(place)
         mujoco.mj_fwdPosition(self._model, self._data)

@@ -41,11 +41,7 @@ class AttitudeController:
         self._yaw_rate = limits.yaw_rate
 
     def update(self, orientation: Quaternion, target: Quaternion, yaw_rate: float) -> Vector3:
-        """Return the body rates (rad/s, FRD) to turn `orientation` to `target`.
-
-        Args:
-            yaw_rate: Feed-forward, rad/s about the world's z (down).
-        """
+        """Return the body rates (rad/s, FRD) to a target, a yaw rate about down fed forward."""
         w, x, y, z = orientation
         tw, tx, ty, tz = target
         # error = orientation⁻¹ ⊗ target: the turn still to make, seen from the body
@@ -192,10 +188,7 @@ class Controller:
         self._in_velocity = False
 
     def follow(self, setpoint: Setpoint, state: State) -> None:
-        """Follow a set-point in place of the last.
-
-        Args:
-            state: The vehicle now: a velocity set-point without yaw rate keeps its heading.
+        """Follow a set-point; of velocity without yaw rate, with the heading of `state`.
 
         Raises:
             ValueError: The set-point has a `setpoints.fault`.

@@ -98,11 +98,7 @@ def attach_vehicle(world: mujoco.MjSpec, name: str, position: Vector3, yaw: floa
 
 
 def read_parameters(model: mujoco.MjModel, name: str) -> VehicleParameters:
-    """Read a vehicle's parameters from a compiled model.
-
-    Raises:
-        ValueError: The model has no vehicle of this name.
-    """
+    """Read a vehicle's parameters from a compiled model, or raise `ValueError`."""
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{name}/base_link")
     if body < 0:
         raise ValueError(f"expected a vehicle named {name!r} in the world, found no such body")
@@ -146,14 +142,11 @@ class Mixer:
 
     When a motor would leave 0 to 1, yaw is given up first, then thrust; roll and pitch are kept as
     long as any thrust allows them, and beyond that shortened together, keeping their direction.
-    Without roll and pitch a multirotor falls over; without yaw it merely looks elsewhere.
-    (Compare PX4's "airmode" for roll and pitch, and M. Faessler, D. Falanga, D. Scaramuzza,
-    *Thrust mixing, saturation, and body-rate control for accurate aggressive quadrotor flight*,
-    RA-L 2017.)
+    (Compare PX4's "airmode" for roll and pitch, and M. Faessler, D. Falanga, D. Scaramuzza, *Thrust
+    mixing, saturation, and body-rate control for accurate aggressive quadrotor flight*, RA-L 2017.)
 
     Raises:
-        ValueError: The motors cannot make all four of thrust and torques, or equal thrust from
-            all would turn the vehicle.
+        ValueError: The motors cannot make all of thrust and torques, or turn at equal thrust.
     """
 
     def __init__(self, parameters: VehicleParameters) -> None:

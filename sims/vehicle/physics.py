@@ -62,7 +62,6 @@ class Physics:
     Args:
         world: The simulation, which several vehicles may share; or a compiled world with the
             vehicle, attached by `model.attach_vehicle`, for a simulation of its own.
-        name: The vehicle's name in it.
 
     Raises:
         ValueError: The world has no such vehicle, or another time step.
@@ -116,14 +115,7 @@ class Physics:
         return self.state_at(self.time_ns)[0]
 
     def state_at(self, stamp_ns: int) -> tuple[State, Floats, Floats]:
-        """Return the state at a time from `time_ns` up to a whole step later.
-
-        Returns:
-            The vehicle's state; the world's, as `Simulation.state_at` returns it, for a renderer.
-
-        Raises:
-            ValueError: The time is before `time_ns`, or more than a step later.
-        """
+        """Return the vehicle's state, and the world's as from `Simulation.state_at`."""
         qpos, qvel = self.simulation.state_at(stamp_ns)
         return self.state_in(qpos, qvel), qpos, qvel
 
@@ -132,13 +124,10 @@ class Physics:
         return _state(qpos[self._of_pose], qvel[self._of_twist])
 
     def imu(self, stamp_ns: int = 0) -> tuple[Vector3, Vector3]:
-        """Return the true angular velocity (rad/s) and specific force (m/s²) of the IMU.
+        """Return angular velocity (rad/s) and specific force (m/s²), true, of the site `imu`.
 
-        They are those at the vehicle's site `imu`, along its axes turned to FRD: the centre of
-        mass and the body's axes unless it was moved. At rest the specific force is (0, 0, -9.81).
-
-        Args:
-            stamp_ns: As of `state_at`; before `time_ns` it is that.
+        They are along its axes turned to FRD: centre of mass and body's axes unless moved. At rest
+        the force is (0, 0, -9.81). A `stamp_ns` is as of `state_at`, at least `time_ns`.
         """
         ahead = max(stamp_ns - self.time_ns, 0)
         rates = self.state_at(self.time_ns + ahead)[0].angular_velocity
@@ -194,9 +183,9 @@ class Physics:
     def settle(self) -> None:
         """Let the vehicle rest on the ground, its weight carried, if starting there.
 
-        Feet that only just touch the ground are pushed by nothing: the vehicle would begin with a
-        free fall of 0.1 mm. A vehicle that does not come to rest within 1 cm and half a second
-        stays where it is; so does all else in the world. Call it before the first step.
+        Feet that only just touch are not pushed: the vehicle would fall by 0.1 mm. One that does
+        not come to rest within 1 cm and half a second stays, as all else in the world. Call it
+        before the first step.
         """
         trial = self.simulation.trial(0.5)
         pose, twist = trial.qpos[self._of_pose], trial.qvel[self._of_twist]
@@ -269,9 +258,9 @@ STEP = TIMESTEP_NS * 1e-9
 class Air:
     """Wind as an influence on a simulation.
 
-    Mean wind and gusts are the same everywhere: MuJoCo's own fluid model takes them into account.
-    Turbulence is that of each vehicle's height and speed, all from one noise: vehicles side by side
-    feel the same. What it adds to the drag of the vehicle's body is applied as a force.
+    Mean wind and gusts are the same everywhere, by MuJoCo's own fluid model. Turbulence is that of
+    each vehicle's height and speed, all from one noise; what it adds to the drag is applied as a
+    force.
     """
 
     def __init__(
@@ -344,12 +333,7 @@ def equivalent_box(model: Any, body: int) -> Vector3:
 
 
 def drag(model: Any, box: Vector3, velocity: Vector3) -> Vector3:
-    """Return the air's force on a box, as in MuJoCo's inertia-box fluid model.
-
-    Args:
-        box: Its edges, metres.
-        velocity: Of the box through the air, m/s along its edges.
-    """
+    """Return MuJoCo's inertia-box fluid force on a box of edges (m) at a velocity along them."""
     x, y, z = box
     viscous = math.pi * (x + y + z) * model.opt.viscosity  # Stokes on a sphere of mean diameter
     dense = 0.5 * model.opt.density

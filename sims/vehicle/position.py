@@ -109,9 +109,9 @@ _LARGE = 0.5 * 0.5
 class PositionController:
     """Controller of position or velocity, with a single target at a time.
 
-    The thrust vector becomes an attitude as in D. Mellinger, V. Kumar, *Minimum snap trajectory
-    generation and control for quadrotors*, ICRA 2011, with the x axis taken so that the heading is
-    the yaw of the ZYX angles even when tilted, as in PX4.
+    Thrust vector to attitude: D. Mellinger, V. Kumar, *Minimum snap trajectory generation and
+    control for quadrotors*, ICRA 2011, with the yaw of the ZYX angles as heading even when tilted,
+    as in PX4.
     """
 
     __slots__ = (
@@ -166,10 +166,9 @@ class PositionController:
     def to_velocity(
         self, velocity: Vector3, yaw: float, yaw_rate: float = 0.0, heading_frame: bool = False
     ) -> None:
-        """Move at a velocity (m/s), looking to `yaw` and turning on from there at `yaw_rate`.
+        """Move at a velocity (m/s NED), looking to `yaw` and turning on from there at `yaw_rate`.
 
-        Args:
-            velocity: In NED, or with `heading_frame` x along the vehicle's heading, y to its right.
+        With `heading_frame`, x of the velocity is along the vehicle's heading, y to its right.
         """
         self._vx, self._vy, self._vz = velocity
         self._ax = self._ay = self._az = 0.0

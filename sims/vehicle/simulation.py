@@ -47,8 +47,7 @@ class History:
         """Return the world's state at a stored time, or up to a step ahead.
 
         On a whole millisecond positions are those of that step, between two as the step carried
-        them (semi-implicit Euler); velocities are as of `Simulation.state_at`. Before time 0 all
-        is as it was then.
+        them (semi-implicit Euler); velocities are as of `Simulation.state_at`. Time begins with 0.
 
         Returns:
             Generalised positions, shape (nq,), and velocities, shape (nv,); not to be written to.
@@ -94,14 +93,12 @@ class Simulation:
     """A world, stepped by whole milliseconds.
 
     What is read is exactly that of `time_ns`: the accelerometer too. MuJoCo's ``mj_step`` leaves
-    sensors and contacts of *before* its last integration behind, so the forward pass for the
-    present instant is made when they are first asked for, and the next advance starts from it
-    with ``mj_step2`` instead of computing it again. The motors' thrust is a state of its own
-    (their lag), so a new command changes nothing at the instant at which it is given: of several
-    vehicles it does not matter which is controlled first.
+    sensors and contacts of *before* its last integration behind, so the present forward pass is
+    made when they are first asked for, and the next advance starts from it with ``mj_step2``. The
+    motors' thrust is a state of its own (their lag), so a new command changes nothing at its
+    instant: the order in which vehicles are controlled does not matter.
 
     Attributes:
-        history: The states of the past.
         mocap_velocities: Of the bodies that move by themselves, m/s NWU, shape (nmocap, 3).
         diverged: Whether its state was no longer finite once: it is of no use any more.
 
@@ -129,9 +126,7 @@ class Simulation:
         return self._steps * TIMESTEP_NS
 
     def advance_to(self, stamp_ns: int) -> None:
-        """Step with the present motor commands to the last whole millisecond ≤ `stamp_ns`.
-
-        Does nothing if it is there already, or later.
+        """Step, with the present motor commands, to the last whole millisecond ≤ `stamp_ns`.
 
         Raises:
             PhysicsDivergedError: The state is no longer finite.
@@ -158,14 +153,12 @@ class Simulation:
     def state_at(self, stamp_ns: int) -> tuple[Floats, Floats]:
         """Return the state at a time from `time_ns` up to a whole step later.
 
-        Between two steps the world is carried on as the next step will carry it: a whole step
-        later this is what `advance_to` gives. (Damped joints of other bodies, which MuJoCo steps
-        implicitly, may differ slightly.)
+        Between two steps the world is carried on as the next step will carry it. (Damped joints of
+        other bodies, which MuJoCo steps implicitly, may differ slightly.)
 
         Returns:
-            Copies of the generalised positions, shape (nq,), and of the velocities with which
-            these change, shape (nv,). MuJoCo's own velocities are half a step old: the position
-            goes with one of them through the whole step before, so it is that of its middle.
+            Copies of the generalised positions, shape (nq,), and of the velocities with which these
+            change, shape (nv,): MuJoCo's own are half a step old, of the middle of the step before.
 
         Raises:
             ValueError: The time is before `time_ns`, or more than a step later.

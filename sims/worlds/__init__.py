@@ -48,16 +48,13 @@ def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
 
 
 def load_scene(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> Scene:
-    """Return a world, ready for vehicles and cameras to be added.
-
-    What MuJoCo warns of from then on goes to the log.
+    """Return a world, ready for vehicles and cameras; MuJoCo's warnings go to the log from then on.
 
     Args:
         name_or_path: A name in `WORLDS`, or the path of an MJCF file (what ends in ``.xml``,
             contains a slash, or is a `Path`).
-        seed: Seed of a built-in world's textures; its geometry is the same for every seed, but for
-            what lies on shelves. A file has none.
-        bare: Leave out a built-in world's images, which nobody is to see.
+        seed: Seed of a built-in world's textures, and of what lies on shelves. A file has none.
+        bare: Leave out a built-in world's images.
 
     Raises:
         WorldError: No such name or file, or the file is no MJCF that compiles.

@@ -149,11 +149,7 @@ def motion_of(spec: BodySpec, name: str) -> BodyMotion:
 
 
 def add_bodies(scene: Scene, node: str, specs: tuple[BodySpec, ...]) -> Dynamics:
-    """Put bodies into a world, each called ``<node>/<name>``, and return how they move.
-
-    Raises:
-        ValueError: Two have one name.
-    """
+    """Put bodies into a world, each ``<node>/<name>``, or raise `ValueError` for equal names."""
     motions = []
     for spec in specs:
         name = f"{node}/{spec.name}"

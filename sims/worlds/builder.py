@@ -110,10 +110,7 @@ class Builder:
         self._texture("sky", draw, mujoco.mjtTexture.mjTEXTURE_SKYBOX)
 
     def cut(self, material: Material, width: float, height: float) -> Window:
-        """Return a piece of a material from a random place, of a size in metres.
-
-        A piece larger than the material is all of it, drawn larger.
-        """
+        """Return a piece of a material, metres, from a random place, or the whole."""
         width, height = min(width, material.width), min(height, material.height)
         left = self.random.uniform(0.0, material.width - width)
         top = self.random.uniform(0.0, material.height - height)

@@ -165,8 +165,6 @@ def arch(
     """Return a half ring standing on its feet, with the opening along x.
 
     Args:
-        inner: Radius of the opening, metres.
-        outer: Radius of the outer edge, metres.
         per_metre: Texture coordinates of a metre, across and down.
     """
     turn = np.linspace(np.pi, 0.0, angles + 1)

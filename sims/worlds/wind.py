@@ -29,11 +29,7 @@ SLOWEST = 1.0  # least airspeed assumed for turbulence, m/s; at 0 the turbulence
 
 
 def check_strength(*velocities: Vector3) -> None:
-    """Refuse air too fast for a step of the physics.
-
-    Raises:
-        ValueError: The velocities (m/s) are more than `STRONGEST` together.
-    """
+    """Refuse velocities (m/s) beyond `STRONGEST` together, with a `ValueError`."""
     total = sum(math.hypot(*velocity) for velocity in velocities)
     if not total <= STRONGEST:
         raise ValueError(
@@ -125,8 +121,8 @@ def scales(height: float, w20: float) -> tuple[Vector3, Vector3]:
 class Turbulence:
     """Exactly discretised Dryden filters of white noise, for a place in the air.
 
-    Their states have no unit: what they are at a height is them times that height's intensity, so
-    that a change of height or speed changes nothing suddenly but the velocity's scale.
+    Their states have no unit and are scaled by each height's intensity, so a change of height or
+    speed changes only the velocity's scale suddenly.
 
     Args:
         start: Five numbers, normally distributed, from which the states are drawn.
@@ -145,16 +141,13 @@ class Turbulence:
     def step(
         self, seconds: float, speed: float, height: float, w20: float, noise: list[float]
     ) -> Vector3:
-        """Go on by seconds at a speed through the air and a height; return the velocity, m/s.
+        """Return the velocity along, across, vertical (m/s) after some seconds more.
 
         Args:
-            speed: Metres per second.
+            speed: Through the air, metres per second.
             height: Metres above the ground.
             w20: Wind at a height of 20 feet, m/s.
             noise: Five normal numbers.
-
-        Returns:
-            Along, across, vertical.
         """
         sigma, length = scales(height, w20)
         way = max(speed, SLOWEST) * seconds

@@ -62,11 +62,7 @@ class RpcClient(asyncio.Protocol):
             self._transport.abort()
 
     def send(self, method: str, *arguments: Any) -> asyncio.Future[Any]:
-        """Send a call at once, and return the future of its result.
-
-        Raises:
-            OSError: The connection is lost.
-        """
+        """Send a call at once, and return its result's future; `OSError` without connection."""
         if self._lost is not None:
             raise self._lost
         id_ = next(self._ids) % (1 << 30)
@@ -103,11 +99,7 @@ class Connection:
         self._client: RpcClient | None = None
 
     async def connect(self, seconds: float) -> None:
-        """Connect, retrying as often as needed, and wait for a first reply.
-
-        Raises:
-            OSError: There is no server in so many real seconds.
-        """
+        """Connect, trying again, and wait for a first reply; `OSError` after real seconds."""
         offload, until = self._node.offload, time.monotonic() + seconds
         while True:
             self.close()
@@ -124,11 +116,7 @@ class Connection:
             await offload(time.sleep, _AGAIN)
 
     def send(self, method: str, *arguments: Any) -> asyncio.Future[Any]:
-        """Send a call, and return the future of its result.
-
-        Raises:
-            OSError: The connection is lost.
-        """
+        """Send a call, and return its result's future; `OSError` if the connection is lost."""
         if self._client is None:
             raise ConnectionResetError("not connected")
         future = self._client.send(method, *arguments)
@@ -157,7 +145,7 @@ class Connection:
     async def settle(self) -> None:
         """In lockstep, wait until all calls before have started, and replies due by now are here.
 
-        A server starts the requests of one connection in order, and so it replies.
+        A server starts the requests of a connection in order.
         """
         if self._node.clock.kind == "lockstep":
             await self.call("ping")

@@ -298,9 +298,8 @@ def collision(
 class Orders:
     """Orders to a vehicle, and their progress.
 
-    Phases and refusals are those of `sims.vehicle.Autopilot`, so that the same pilot flies both. A
-    take-off is AirSim's, and then a climb to the altitude asked for. A set-point holds on the
-    server for three periods: some may be late, none may stay.
+    Phases and refusals are those of `sims.vehicle.Autopilot`, for the same pilot. A take-off is
+    AirSim's, then a climb to the altitude. A set-point holds on the server for three periods.
     """
 
     def __init__(
@@ -345,11 +344,7 @@ class Orders:
             self._queue.append(ev.Land(stamp=0, source=""))
 
     async def obey(self, now: int, pose: ev.Odometry) -> list[type[ev.VehicleEvent]]:
-        """Pass on the orders since the last call, and return the vehicle's new events.
-
-        Raises:
-            OSError: The connection is lost.
-        """
+        """Pass on new orders, and return new events; `OSError` without connection."""
         happened: list[type[ev.VehicleEvent]] = []
         queue, self._queue = self._queue, []
         for order in queue:

@@ -144,11 +144,7 @@ class Cameras:
         self.largest = int(width), int(height)
 
     def find(self, vehicle: ServedVehicle, name: str, external: object = False) -> Camera:
-        """Return a vehicle's camera.
-
-        Raises:
-            RpcError: It has none of that name.
-        """
+        """Return a vehicle's camera by name, or raise `RpcError`."""
         if external is True:
             raise RpcError("not supported by visnav-runtime: external cameras")
         named = self._named[vehicle.name]
@@ -226,13 +222,9 @@ class Cameras:
 def cameras_by_name(
     files: Iterable[CameraSpec], entries: Sequence[ServedCamera], body: int, free: bool
 ) -> dict[str, Camera]:
-    """Return a vehicle's cameras by all their names.
+    """Return a vehicle's cameras by all their names; `entries` are the server's, and go first.
 
-    A camera that has one of the names of one of AirSim's cameras takes its other names over,
-    unless they are given, too.
-
-    Args:
-        entries: Those of the server's settings, which go before its own of the same name.
+    A camera named as one of AirSim's cameras takes its other names over, unless they are given.
 
     Raises:
         ValueError: Two entries have one name.
@@ -295,11 +287,7 @@ class _Exposure(NamedTuple):
 
 
 class Images:
-    """Images on clients' requests.
-
-    Args:
-        segmentation_ids: Gives the ID of each geom, and last that of nothing.
-    """
+    """Images on clients' requests, with a segmentation ID for each geom, and last for nothing."""
 
     def __init__(
         self,
@@ -378,9 +366,7 @@ class Images:
         *,
         external: bool = False,  # whether cameras that no vehicle carries are meant: there are none
     ) -> Awaitable[list[ImageResponse]]:
-        """Take images of the present state, and return an awaitable of them.
-
-        The state is that of the call. Simulated time does not wait for the images.
+        """Take images of the state at the call, awaitable; simulated time does not wait.
 
         Raises:
             RpcError: There is no such camera or type, or it is too much.

@@ -40,7 +40,7 @@ class Incidents:
     def refused(self, address: str, text: str) -> None:
         """Log a refused call, once for each host and kind: texts equal but for numbers.
 
-        Scripts do not see the errors of calls that they do not join, so the log must tell them.
+        Scripts do not see the errors of calls that they do not join.
         """
         self.counts["refused"] += 1
         key = address.rpartition(":")[0], re.sub(r"[\d.]+", "#", text)
@@ -105,11 +105,7 @@ class Connection:
         return time.monotonic() - self._heard - (IDLE if self._spoke else SILENT)
 
     def close(self, reason: str = "") -> None:
-        """Close the connection and cancel its waiting calls; a vehicle's task goes on.
-
-        Args:
-            reason: Why, for the log; empty if the client closed it, or the run ends.
-        """
+        """Close the connection and cancel its calls, not vehicles' tasks; log a `reason`."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -248,14 +244,9 @@ def _thrown(request: wire.Request, text: str) -> str:
 
 
 class Listener:
-    """Lets clients in.
+    """Listener on a port (0: any) for at most `most` clients, served from `serve` on.
 
-    Clients may connect as soon as it is made; they are served from `serve` on.
-
-    Args:
-        port: Port to listen on; 0 for any that is free.
-        most: Connections that may be open at once.
-        on_change: Called whenever a client has come or left, with whether any is there.
+    `on_change` gets whether any client is there, whenever one has come or left.
 
     Raises:
         ValueError: The port is not free.

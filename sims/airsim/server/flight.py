@@ -46,11 +46,7 @@ class Corner(msgspec.Struct, frozen=True):
 
 
 class Control:
-    """Control of vehicles, and where clients put them.
-
-    Args:
-        resets: What else `reset` brings back to the start.
-    """
+    """Control of vehicles, and where clients put them; `reset` calls `resets`, too."""
 
     def __init__(
         self, vehicles: Vehicles, tasks: Tasks, collisions: Collisions, *resets: Callable[[], None]

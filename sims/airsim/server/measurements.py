@@ -60,9 +60,7 @@ HEADER = "VehicleName TimeStamp POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile".rep
 
 
 class Sensors:
-    """The sensors of all vehicles, known by their announcements.
-
-    Before a sensor's first sample all its numbers and its stamp are 0.
+    """Sensors of all vehicles, by their announcements; all numbers are 0 before a first sample.
 
     Args:
         world: Keeps the poses of vehicles while a lidar turns.
@@ -166,8 +164,8 @@ class Sensors:
     ) -> wire.LidarData | wire.CosysLidarData:
         """Return the newest whole turn of a lidar, channel by channel, freed of the motion's skew.
 
-        Each ray is placed by where the sensor was at its own time. The stamp and the pose are of
-        the first ray. `segmentation` is -1, and Cosys' `groundtruth` is empty text, for all points.
+        Each ray is placed by its own time; stamp and pose are of the first. `segmentation` is -1,
+        and Cosys' `groundtruth` is empty text, for all points.
         """
         sensor, scan = self._read(announcements.LidarAnnouncement, "lidar", name, vehicle)
         is_cosys = caller.flavour == "cosys"
@@ -193,11 +191,7 @@ class Sensors:
     def _read(
         self, kind: type, called: str, name: str, vehicle: ServedMultirotor
     ) -> tuple[Any, Any]:
-        """Return a sensor's announcement and newest sample; of an empty name the first's.
-
-        Raises:
-            RpcError: There is none.
-        """
+        """Return a sensor (the first, if unnamed) and its newest sample, or raise `RpcError`."""
         name = self._names.get(name, name)
         for source, sensor in self._announced.items():
             carrier, _, own = source.partition("/")
@@ -373,10 +367,7 @@ class RecordingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class Recording:
-    """Starts and stops recordings.
-
-    Unlike AirSim's, a row's pose is that of its images' instant (in real time, within 1 ms).
-    """
+    """Recordings; a row's pose is that of its images' instant (within 1 ms in real time)."""
 
     def __init__(
         self, config: RecordingConfig, node: Node[Any], vehicles: Vehicles, images: Images

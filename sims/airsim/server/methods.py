@@ -104,15 +104,14 @@ class Named:
 def rpc(name: str, *, cosys: int | None = None) -> Callable[[F], F]:
     """Mark a function of a group as the handler of a method.
 
-    Its parameters are converted as annotated (whole numbers to floats; maps to structures; names to
-    what has them). One that is annotated with `Caller` gets the client and is no argument. Defaults
-    stand for arguments that one of the flavours does not have. What a handler does before its first
-    wait is done when it is called, in the order in which the requests came: one that waits is a
-    plain function that returns an awaitable.
+    Its parameters are converted as annotated (whole numbers to floats, maps to structures, names to
+    what has them); one annotated with `Caller` gets the client. Defaults stand for arguments that a
+    flavour lacks. What a handler does before its first wait is done when it is called, in the order
+    of the requests: one that waits is a plain function that returns an awaitable.
 
     Args:
-        cosys: Number of arguments of Cosys-AirSim's clients, if it is another than AirSim's; a call
-            then tells whose client it is.
+        cosys: Number of arguments of Cosys-AirSim's clients, if another; a call then tells whose
+            client it is.
     """
 
     def mark(function: F) -> F:
@@ -138,11 +137,10 @@ class Method(NamedTuple):
 
 
 class Table:
-    """All methods by name.
+    """All methods by name, of groups with functions marked by `rpc`.
 
     Args:
-        groups: Objects with functions that are marked with `rpc`.
-        finders: What gives that which has a name, by the kinds that handlers ask for.
+        finders: Functions from a name to its object, by the kinds that handlers ask for.
     """
 
     def __init__(
@@ -168,8 +166,7 @@ class Table:
         """Call a method, and return its result or an awaitable of the result.
 
         Raises:
-            RpcError: There is no such method, the arguments are wrong, or it cannot be served; the
-                text is that of rpclib.
+            RpcError: With rpclib's text: no such method, wrong arguments, or it cannot be served.
         """
         method = self.methods.get(name)
         count = len(arguments)

@@ -247,9 +247,8 @@ def _held(spec: Any, name: str, **options: Any) -> Any:
 def whole_matches(expression: str, texts: Iterable[str], *, ignore_case: bool = False) -> list[str]:
     """Return the texts matched by a client's regular expression from beginning to end.
 
-    None may keep the run waiting. Python's own search goes back and tries again. What makes that
-    long are repetitions: the time grows with the text's length to the power of their number, and
-    without bounds if one is in another. Each alternative in groups may double it.
+    None may keep the run waiting: the time of Python's search grows with the text's length to the
+    power of the repetitions, without bounds if nested; each alternative in groups may double it.
 
     Raises:
         ValueError: It is no expression; or it is longer, has more repetitions (``*``, ``+``, ``?``,

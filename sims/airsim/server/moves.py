@@ -72,9 +72,8 @@ class Task(NamedTuple):
 class Tasks:
     """Running task of each vehicle. A new task ends the older with result `False`.
 
-    A task reaches its vehicle by set-points and commands only. After its last order has stood for
-    `HOVER_AFTER`, the vehicle is told to hover. A task ends when its vehicle is disarmed: with
-    `True` if it was landing.
+    Orders are set-points and commands. `HOVER_AFTER` a task's last order, the vehicle is told to
+    hover. Disarming ends a task: with `True` if the vehicle was landing.
     """
 
     def __init__(
@@ -92,10 +91,10 @@ class Tasks:
         self._send(order(stamp=self._clock.now(), source=self._source, vehicle=vehicle.name))
 
     def start(self, vehicle: ServedMultirotor, task: Task) -> Reply:
-        """Start a task now, and return the reply to come; its first order is the next update's.
+        """Start a task now, in place of another, and return the reply to come.
 
-        The older task of the vehicle, if any, is cancelled first. A vehicle whose motors are
-        stopped is armed; whether the client may is asked before.
+        Its first order is the next update's. Stopped motors are armed: ask before whether they may
+        be.
         """
         slot = self._slots.setdefault(vehicle.name, _Slot(vehicle))
         slot.finish(False)
@@ -174,11 +173,7 @@ class _Slot:
 
 
 def lookahead_of(lookahead: float, adaptive: float, velocity: float) -> float:
-    """Return the look-ahead distance (m), by default for a negative one.
-
-    Raises:
-        ValueError: It is zero.
-    """
+    """Return the look-ahead distance (m), by default for a negative one; `ValueError` for zero."""
     if lookahead == 0.0:
         raise ValueError("lookahead distance cannot be 0")
     if lookahead > 0.0:
@@ -187,19 +182,15 @@ def lookahead_of(lookahead: float, adaptive: float, velocity: float) -> float:
 
 
 def braked(velocity: float, remaining: float) -> float:
-    """Return the speed (m/s) to fly at with some metres to go.
-
-    Before the end it falls to 1 m/s, by 3 m/s². (AirSim brakes later, and only from above 3 m/s,
-    and overshoots.)
-    """
+    """Return the speed (m/s), falling to 1 m/s by 3 m/s² (AirSim brakes later, and overshoots)."""
     return min(velocity, math.sqrt(1.0 + 2.0 * 3.0 * max(remaining - CLOSE, 0.0)))
 
 
 class PathFollower:
     """A vehicle's progress along a path, never backwards, and the point running ahead.
 
-    The method is "pure pursuit" (R. C. Coulter, CMU-RI-TR-92-01, 1992); the rules of look-ahead and
-    ending are those of AirSim's ``moveOnPath``.
+    "Pure pursuit" (R. C. Coulter, CMU-RI-TR-92-01, 1992), with look-ahead and end as in AirSim's
+    ``moveOnPath``.
 
     Args:
         path: Corners, metres; at least one. The first is where the vehicle starts.
@@ -269,8 +260,8 @@ class Heading:
     """Where to look on the way.
 
     Args:
-        follows: Whether to look where the vehicle goes (AirSim's ``ForwardOnly``), unless at a
-            rate; the angle is then added.
+        follows: Look where the vehicle goes (AirSim's ``ForwardOnly``) plus the angle, unless a
+            rate.
         is_rate: Whether the angle is a rate, in radians per second.
     """
 
@@ -307,9 +298,8 @@ def along_path(
 ) -> Task:
     """Fly along a path (m) from its first point, where the vehicle is, to its last.
 
-    It has succeeded when there is no progress any more within 0.5 m of the end, and hardly any
-    speed; it has failed if there is no progress for 5 s elsewhere (where AirSim waits for the
-    timeout), or at the timeout.
+    It has succeeded when progress has stopped within 0.5 m of the end at hardly any speed; failed
+    after 5 s without progress elsewhere (where AirSim waits for the timeout), or at the timeout.
     """
     follower, least, idle = PathFollower(path, lookahead), min(_STILL, 0.1 * speed) / RATE, 0
 

@@ -287,13 +287,10 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
 
 class Time:
-    """Pausing and stepping.
+    """Pausing and stepping; `frame_rate` is that of the fastest camera, Hz.
 
-    With the server's setting ``time = "awaited"`` time runs while at least one future of a
-    vehicle's task is not done (see `owed`) and no client has paused it, and stands otherwise.
-
-    Args:
-        frame_rate: Images per second of the fastest camera.
+    With ``time = "awaited"`` time runs while a vehicle's task goes on (see `owed`) and no client
+    has paused it.
     """
 
     def __init__(self, mode: str, clock: Clock, stepping: Stepping, frame_rate: float) -> None:
@@ -303,24 +300,17 @@ class Time:
         self._owed = 0
 
     async def begin(self) -> None:
-        """Pause time, unless set to run from the start; return once time stands.
-
-        Raises:
-            CommandError: Time cannot be controlled.
-        """
+        """Pause time, unless set to run, until time stands; `CommandError` if out of control."""
         if self._awaited or self._paused:
             self._stepping.pause()
             await self._stepping.stands()
 
     def owed(self, task: asyncio.Future[R]) -> asyncio.Future[R]:
-        """Return a future for the reply to a vehicle's task.
+        """Return a future for the reply to a vehicle's task; cancelling it leaves the task.
 
         With ``time = "awaited"`` time runs until the task is done, and the reply comes once time
-        stands at that instant, so that what a client does next finds all that was due by then
-        done. While another task goes on, time runs on and the reply comes at once.
-
-        Args:
-            task: Done when the vehicle's task ends; cancelling the returned future leaves it.
+        stands at that instant, with all that was due by then done. While another task goes on, the
+        reply comes at once.
         """
         if not self._awaited:
             return task

@@ -56,13 +56,7 @@ def initial_id(name: str) -> int:
 
 
 class Objects:
-    """Objects of the world, and their segmentation IDs, hence colours, in images.
-
-    Changes take effect at the instant of the request.
-
-    Args:
-        spares: The objects that can be brought in, by the names of their bodies.
-    """
+    """Objects of the world, `spares` by their bodies' names, with their segmentation IDs."""
 
     def __init__(
         self,
@@ -373,11 +367,7 @@ class Scenery:
 
 
 def _qpos(pose: Pose) -> Any:
-    """Return a pose for a free joint, shape (7,).
-
-    Raises:
-        ValueError: It is not finite, or no pose, or beyond all worlds.
-    """
+    """Return a free joint's pose, shape (7,); `ValueError` if not finite, a pose, or in reach."""
     place, turn = astuple(pose.position), astuple(pose.orientation)
     length = math.hypot(*turn)
     if not (math.hypot(*place) < FARTHEST and 1e-3 < length < 1e3):

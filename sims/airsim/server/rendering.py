@@ -66,11 +66,11 @@ class Seen(NamedTuple):
 
 
 def palette() -> Colours:
-    """Return the colour of each segmentation ID, RGB, shape (256, 3).
+    """Return the colour of each segmentation ID, RGB, shape (256, 3): PASCAL VOC's colour map.
 
     Bits 0, 3 and 6 of an ID are the highest bits of red, the lowest one first; bits 1, 4 and 7
-    those of green; bits 2 and 5 those of blue. This is the colour map of PASCAL VOC (M. Everingham,
-    J. Winn, "The PASCAL Visual Object Classes Challenge 2012 Development Kit"); AirSim's differs.
+    those of green; bits 2 and 5 those of blue (M. Everingham, J. Winn, "The PASCAL Visual Object
+    Classes Challenge 2012 Development Kit"); AirSim's differs.
     """
     ids, colours = np.arange(256), np.zeros((256, 3), np.uint8)
     for bit in range(8):
@@ -134,11 +134,8 @@ def as_colours(kind: ImageType, seen: Seen) -> Colours:
 def surface_normals(depth: Depths, info: CameraInfo) -> Depths:
     """Return the unit normals, towards the camera, in its optical frame, shape (h, w, 3).
 
-    On a plane the inverse of the depth is affine in the pixel, and its gradient gives the normal.
-    Where nothing is they mean nothing.
-
-    Args:
-        depth: Planar depth, metres, shape (h, w); ``inf`` where nothing is.
+    On a plane the inverse of the depth (planar, metres, ``inf`` for nothing) is affine in the
+    pixel, and its gradient gives the normal. Where nothing is they mean nothing.
     """
     inverse = np.reciprocal(depth)
     columns, rows = _slopes(info)
@@ -150,10 +147,7 @@ def surface_normals(depth: Depths, info: CameraInfo) -> Depths:
 
 
 def _slope_along(values: Depths) -> Depths:
-    """Return the difference of each value to its neighbour on the pixel's own surface.
-
-    Of a row's two neighbours, that is the side that changes less further on.
-    """
+    """Return the difference of each value to the flatter side's neighbour in its row."""
     if values.shape[1] < 2:
         return np.zeros_like(values)
     steps = np.pad(np.diff(values), ((0, 0), (2, 2)), "edge")
@@ -211,9 +205,7 @@ class Renderer:
     def take(
         self, stamp: int, qpos: Floats, ids: npt.NDArray[np.uint8], wanted: Sequence[Wanted]
     ) -> list[npt.NDArray[np.uint8]]:
-        """Return images of a single state, encoded for sending, in the given order.
-
-        The view from one place is drawn once for all of them.
+        """Return images of a single state, encoded for sending; each view is drawn once.
 
         Args:
             ids: Segmentation ID of each object number, and last of nothing, shape (ngeom + 1,).

@@ -52,17 +52,9 @@ _ANYTHING: dict[str, int] = {"": 0}
 
 
 class ServedVehicle(Named, ABC):
-    """Vehicle of the run, as seen by AirSim's methods.
+    """Vehicle of the run, as seen by AirSim's methods, at a time that `now` gives, ns.
 
     Its local frame has the axes of ``map`` and its origin where the vehicle is at the start.
-
-    Args:
-        now: Gives the run's time (ns).
-
-    Attributes:
-        api_control: Whether clients may command it.
-        armed: Whether clients have it armed.
-        collision: Its last collision.
     """
 
     def __init__(self, name: str, world: SharedWorld, config: Any, now: Callable[[], int]) -> None:
@@ -207,22 +199,14 @@ class Vehicles(dict[str, ServedVehicle]):
         self._world, self._default, self._settings, self._node = world, default, settings, node
 
     def find(self, name: str) -> ServedVehicle:
-        """Return a vehicle of either kind.
-
-        Raises:
-            RpcError: There is none of that name.
-        """
+        """Return a vehicle of either kind by name, or raise `RpcError`."""
         found = self.get(name or self._default or min(self, default=""))
         if found is None:
             raise _unknown("Vehicle Sim-API", name)
         return found
 
     def find_multirotor(self, name: str) -> ServedMultirotor:
-        """Return a multirotor; an empty name may stand for the first by name.
-
-        Raises:
-            RpcError: There is none of that name.
-        """
+        """Return a multirotor, unnamed the first by name; an `RpcError` if there is none."""
         flying = (each for each in self if isinstance(self[each], ServedMultirotor))
         found = self.get(name or self._default or min(flying, default=""))
         if not isinstance(found, ServedMultirotor):
@@ -230,12 +214,7 @@ class Vehicles(dict[str, ServedVehicle]):
         return found
 
     def find_commanded(self, name: str) -> ServedMultirotor:
-        """Return a multirotor open to clients' commands.
-
-        Raises:
-            RpcError: They may not, where AirSim would do nothing, or wait for ever; or there is
-                none of that name.
-        """
+        """Return a multirotor open to commands; an `RpcError` where AirSim would wait."""
         vehicle = self.find_multirotor(name)
         if not vehicle.api_control:
             raise RpcError(
@@ -246,10 +225,10 @@ class Vehicles(dict[str, ServedVehicle]):
         return vehicle
 
     def drawn_state(self, now: int) -> tuple[int, Floats]:
-        """Return the world's state to draw now: time (ns), and positions.
+        """Return time (ns) and generalised positions, shape (nq,), a copy, to draw now.
 
-        These are of the last whole millisecond, so exactly the state that methods tell of; in them
-        free cameras are where they have been put, if only just now. Shape (nq,), a copy.
+        They are of the last whole millisecond, as methods tell; free cameras are where they were
+        put.
         """
         if self._world.simulation is None:
             stamp, qpos = now, self._world.model.qpos0.copy()
@@ -356,14 +335,10 @@ class Vehicles(dict[str, ServedVehicle]):
 
 
 class Collisions:
-    """The last collision of each vehicle.
+    """The last collision of each vehicle, with names and IDs by `identify`, of a geom or body.
 
-    That is what its node tells of as such; and, since with AirSim contact with the ground counts,
-    however gentle, any contact with a thing after a while without one. So standing at the start
-    does not count, and landing does; and the ground under it does not hide a wall.
-
-    Args:
-        identify: Gives name and segmentation ID of the object that a geom or body is of.
+    It is one of its node's; or, as AirSim counts the ground, any contact with a thing after a while
+    without: landing counts, standing at the start does not, and the ground hides no wall.
     """
 
     def __init__(
