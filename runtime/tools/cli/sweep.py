@@ -128,9 +128,6 @@ def end(rows: Sequence[Row], *, judged: bool = True) -> None:
 def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> list[Row]:
     """Run the missing jobs of a plan on this machine, and show the progress.
 
-        jobs: Runs at the same time; if not given, as many as there are cores if they share their
-            flights, else half of that.
-
     Raises:
         typer.Exit: With 130, after Ctrl-C or another signal that ends it.
     """
