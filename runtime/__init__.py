@@ -27,7 +27,7 @@ import sys as _sys
 if _sys.argv[:1] == ["-m"] and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
     _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
-from runtime import neighbours as _neighbours  # noqa: F401  # first, as it checks `events`
+from runtime import extras as _extras  # noqa: F401  # first, as it checks `events`
 from runtime.channels.bundles import Bundle
 from runtime.channels.ports import Input, Output, every, on
 from runtime.channels.streams import Stream

@@ -1,13 +1,43 @@
-"""Optional libraries, as extras of the package, and their installation."""
+"""Packages beside ours: `events`, and optional libraries, as extras of the package."""
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
+
+def check_events() -> None:
+    """Check where the package `events` comes from.
+
+    Raises:
+        ImportError: It is another project's; `name` is then ``runtime``, so that
+            ``python -m runtime`` prints one line instead of a traceback.
+    """
+    expected = Path(__file__).resolve().parents[1] / "events" / "__init__.py"
+    try:
+        events = importlib.import_module("events")
+        found = Path(events.__file__ or "?").resolve()
+        ours = found == expected and hasattr(events, "PoseEstimate")
+    except ModuleNotFoundError as error:
+        if error.name != "events":
+            raise
+        found, ours = Path("none"), False
+    if not ours:
+        over = " installed over it" if found == expected else ""
+        raise ImportError(
+            f"expected the package events of visnav-runtime in {expected.parent}, found {found}"
+            f"{over}: another package of this name stands in the way; remove or rename it",
+            name="runtime",
+        )
+
+
+check_events()  # an import of the runtime reports it before anything else fails
+
 
 _PROJECT = Path(__file__).parents[1] / "pyproject.toml"
 

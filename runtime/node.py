@@ -27,8 +27,8 @@ from runtime.channels.sender import Listener, Sender
 from runtime.channels.streams import Stream
 from runtime.errors import DeclarationError, suggest
 from runtime.host import Host, RunEnd, Sibling
-from runtime.json_values import plain
 from runtime.logs import NodeLogger
+from runtime.summary import plain
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND, Tick, Ticker
 from runtime.time.stepping import Stepping

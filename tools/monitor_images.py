@@ -43,8 +43,7 @@ def main() -> None:
 
 
 async def _look(folder: Path, browser: str) -> None:
-    from runtime.tools.monitor.client import Client, runs
-    from runtime.tools.monitor.protocol import Set
+    from runtime.tools.monitor.protocol import Client, Set, runs
     from runtime.tools.monitor.screen import Screen
 
     deadline = time.monotonic() + 120

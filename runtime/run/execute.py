@@ -11,6 +11,7 @@ import logging
 import signal
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -27,7 +28,7 @@ from runtime.logs import file_handler, logging_to
 from runtime.node import Node
 from runtime.run import event_loop, results
 from runtime.run.node_runner import log_error, with_place, wrap
-from runtime.run.results import private_results
+from runtime.run.results import Folder, private_results
 from runtime.run.summarise import summarise
 from runtime.run.supervisor import Supervisor
 from runtime.run.watchdogs import LoopWatchdog, ProgressWatchdog
@@ -39,14 +40,17 @@ from runtime.time.lockstep import LockstepClock, LockstepLoop
 log = logging.getLogger("visnav.runtime")
 events_log = logging.getLogger("visnav.events")
 
+Watch = Callable[[Supervisor], contextlib.AbstractContextManager[None]]
+"""Given the supervisor, returns a context that lasts as long as the run: a monitor, a trace."""
+
 
 def execute(
     config: Config,
-    out: Path | results.Folder | None = None,
+    out: Path | Folder | None = None,
     *,
     handlers: list[logging.Handler] | None = None,
     log_events: bool = False,
-    watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None = None,
+    watch: Watch | None = None,
     only: Collection[str] = (),
     stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
     digest: Digest | None = None,
@@ -56,8 +60,6 @@ def execute(
 
     Args:
         out: Folder for results, or its path; `None` writes nothing.
-        watch: Given the supervisor, returns a context that lasts as long as the run: a progress
-            bar, a monitor.
         only: Nodes to run here; the others run in other processes. All, if empty.
         stand_ins: Classes that run in the place of some nodes' own, by the node's name.
         complete: Called with the summary before it is written; returns what is.
@@ -69,7 +71,7 @@ def execute(
     handlers = list(handlers or [])
     programs = any(spec.node.starts_programs for spec in config.nodes)
     with contextlib.ExitStack() as stack:
-        folder = results.Folder(out) if isinstance(out, Path) else out
+        folder = Folder(out) if isinstance(out, Path) else out
         if folder is not None:
             stack.enter_context(folder)
             results.write_config(folder.path, config)
@@ -112,49 +114,44 @@ def make_clock(run: RunConfig, loop: asyncio.AbstractEventLoop) -> Clock:
     return RealClock(loop, speed=1.0 if run.speed in {None, "max"} else run.speed)  # type: ignore[arg-type]
 
 
+@dataclass
 class _Run:
-    supervisor: Supervisor
+    config: Config
+    folder: Folder | None
+    log_events: bool
+    watch: Watch | None
+    only: Collection[str]
+    stand_ins: Mapping[str, type[Node[Any]]]
+    digest: Digest | None
+    supervisor: Supervisor = field(init=False)
+    clock: Clock | None = None
     private: Path | None = None
     """Output folder of nodes starting no programs; `None` for the run's folder."""
 
-    def __init__(
-        self,
-        config: Config,
-        folder: results.Folder | None,
-        log_events: bool,
-        watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
-        only: Collection[str],
-        stand_ins: Mapping[str, type[Node[Any]]],
-        digest: Digest | None,
-    ) -> None:
-        self.loop = make_loop(config.run)
-        self._clock: Clock | None = None
-        self._config = config
-        self._folder = folder
-        self._watch = watch or contextlib.nullcontext
-        self._only = only
-        self._stand_ins = stand_ins
-        wanted = config.run.clock == "lockstep" if config.run.digest is None else config.run.digest
-        self._digest = digest or (Digest() if wanted else None)
-        self._taps: list[Tap] = [self._digest] if self._digest else []
-        if log_events:
-            self._taps.append(_log_event)
+    def __post_init__(self) -> None:
+        run = self.config.run
+        self.loop = make_loop(run)
+        wanted = run.clock == "lockstep" if run.digest is None else run.digest
+        self.digest = self.digest or (Digest() if wanted else None)
 
     def now(self) -> int:
         """Return the time of the run's clock (ns); 0 before there is a clock."""
-        return self._clock.now() if self._clock is not None else 0
+        return self.clock.now() if self.clock is not None else 0
 
     async def main(self) -> Summary:
         """Run the nodes to their end, and return the run's summary."""
-        loop, run = asyncio.get_running_loop(), self._config.run
+        loop, run = asyncio.get_running_loop(), self.config.run
         event_loop.install(loop)
-        clock = self._clock = make_clock(run, loop)
-        out = None if self._folder is None else self._folder.path
+        clock = self.clock = make_clock(run, loop)
+        out = None if self.folder is None else self.folder.path
+        taps: list[Tap] = [self.digest] if self.digest else []
+        if self.log_events:
+            taps.append(_log_event)
         self.supervisor = supervisor = Supervisor(
-            self._config, clock, self._taps, self.private or out, self._only, self._stand_ins, out
+            self.config, clock, taps, self.private or out, self.only, self.stand_ins, out
         )
-        if self._folder is not None:
-            supervisor.state.before_first_update = self._folder.flown
+        if self.folder is not None:
+            supervisor.state.before_first_update = self.folder.flown
         # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
         level = logging.DEBUG if run.clock == "lockstep" else logging.WARNING
         watchdog = LoopWatchdog(loop, run.stall, functools.partial(_report_stall, level))
@@ -163,7 +160,7 @@ class _Run:
             _signals_stop(supervisor, loop),
             _no_long_collections(),
             progress,
-            self._watch(supervisor),
+            (self.watch or contextlib.nullcontext)(supervisor),
         ):
             watchdog.start()
             try:
@@ -172,7 +169,7 @@ class _Run:
                 watchdog.stop()
             summary = summarise(
                 supervisor.state,
-                digest=self._digest,
+                digest=self.digest,
                 stalls=watchdog.stalls,
                 longest_stalls=watchdog.longest,
             )
@@ -292,3 +289,55 @@ def _brief(value: Any) -> str:
     if isinstance(value, tuple) and value and isinstance(value[0], float):
         return "(" + ", ".join(f"{v:.4g}" for v in value) + ")"
     return f"{value:.6g}" if isinstance(value, float) else repr(value)
+
+
+class ThreadedRun(threading.Thread):
+    """Thread of one run, for a caller whose own loop goes on; the arguments are those of `execute`.
+
+    A notebook has a loop that runs already, and a script may start several runs at a time.
+    """
+
+    def __init__(
+        self, config: Config, out: Folder, handlers: list[logging.Handler], watch: Watch
+    ) -> None:
+        super().__init__(name=f"run {config.run.name}", daemon=True)
+        self._config = config
+        self._out = out
+        self._handlers = handlers
+        self._watch = watch
+        self._end: Callable[[], object] | None = None
+        self._interrupted = False
+        self._error: BaseException | None = None
+        self._over = threading.Event()
+
+    def run(self) -> None:
+        """Run to the end; called by the thread."""
+        try:
+            execute(self._config, self._out, handlers=self._handlers, watch=self._watching)
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._over.set()
+
+    @contextlib.contextmanager
+    def _watching(self, supervisor: Supervisor) -> Iterator[None]:
+        loop = asyncio.get_running_loop()
+        self._end = lambda: loop.call_soon_threadsafe(supervisor.stop, "Ctrl-C")
+        if self._interrupted:
+            self._end()
+        with self._watch(supervisor):
+            yield
+
+    def wait(self) -> None:
+        """Wait for the end; raise what went wrong. Ctrl-C ends the run, a second is raised."""
+        try:
+            self._over.wait()
+        except BaseException:
+            self._interrupted = True
+            if self._end is not None:
+                with contextlib.suppress(RuntimeError):  # the loop is closed
+                    self._end()
+            self._over.wait()
+            raise
+        if self._error is not None:
+            raise self._error

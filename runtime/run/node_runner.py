@@ -32,8 +32,8 @@ from runtime.errors import (
     VisnavError,
 )
 from runtime.host import Host
-from runtime.json_values import plain
 from runtime.node import Node, make_node, streams
+from runtime.summary import plain
 from runtime.time.schedule import Ticker
 from runtime.time.time_limits import ended
 from runtime.workers.worker import Worker

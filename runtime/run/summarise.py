@@ -16,7 +16,6 @@ from typing import Any
 
 from runtime.channels.answers import Answers
 from runtime.channels.digest import Digest
-from runtime.json_values import plain
 from runtime.node import matchers, senders, streams
 from runtime.run.run_state import RunState
 from runtime.summary import (
@@ -27,6 +26,7 @@ from runtime.summary import (
     Summary,
     TickSummary,
     WorkerSummary,
+    plain,
     verdict_of,
 )
 from runtime.time.schedule import SECOND

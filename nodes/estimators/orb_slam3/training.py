@@ -107,8 +107,8 @@ def vocabulary(
     from runtime.errors import ConfigError
     from runtime.logs import terminal_handler
     from runtime.run.execute import execute
+    from runtime.tools.cli.brief import progress
     from runtime.tools.cli.run import leave_behind
-    from runtime.tools.cli.tables import progress
     from runtime.units import Duration
 
     if out is not None and out.suffix != ".txt":  # ORB-SLAM3 would read it as binary

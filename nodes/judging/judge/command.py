@@ -64,9 +64,8 @@ def judge(
     from runtime.config.messages import given
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
-    from runtime.tools.cli.brief import print_verdict
+    from runtime.tools.cli.brief import print_verdict, verdict_table
     from runtime.tools.cli.commands import warn
-    from runtime.tools.cli.tables import verdict_table
 
     with writing(name, junit, json) as outcomes:
         try:

@@ -96,8 +96,7 @@ def vslamlab(
     from nodes.judging.judge import judging, sources
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
-    from runtime.tools.cli.brief import print_verdict
-    from runtime.tools.cli.tables import verdict_table
+    from runtime.tools.cli.brief import print_verdict, verdict_table
 
     sequence, runs = sequence.absolute(), out.absolute().with_name(f"{out.name}_runs")
     found, failed = [], {}

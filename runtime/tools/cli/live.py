@@ -28,7 +28,7 @@ def top(
     settings and log. Keys pause the run, step it, change its speed or a setting, restart a node
     and end the run. Quitting does not affect the run.
     """
-    from runtime.tools.monitor.client import Client, find
+    from runtime.tools.monitor.protocol import Client, find
     from runtime.tools.monitor.screen import Screen
 
     _check_terminal()
@@ -66,7 +66,7 @@ def web(
     and until the run ends.
     """
     from runtime.errors import CommandError
-    from runtime.tools.monitor.client import find
+    from runtime.tools.monitor.protocol import find
     from runtime.tools.monitor.web import PageServer, serve
 
     path = find(run)
@@ -90,8 +90,7 @@ def set_(
     The value is checked as in the file. The change is an event of the run, so that its log, its
     digest and its recordings have it. "python -m runtime nodes" says which settings can change.
     """
-    from runtime.tools.monitor.client import ask, find
-    from runtime.tools.monitor.protocol import Set
+    from runtime.tools.monitor.protocol import Set, ask, find
 
     found = find(run)
     print(f"run {found.stem.rpartition('-')[0]}: {ask(found, Set(text=change))}")

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -21,11 +21,9 @@ from runtime.tools.cli.outcomes import Json, JUnit, of_verdict, writing
 
 if TYPE_CHECKING:
     from runtime.config.model import Config
+    from runtime.run.execute import Watch
     from runtime.run.supervisor import Supervisor
     from runtime.tools.monitor.observer import LastRecords
-
-Watch = Callable[["Supervisor"], contextlib.AbstractContextManager[None]]
-"""Type of `execute`'s `watch`: from a supervisor to a context around the run."""
 
 _LAST_WAIT = 1.0
 """Real seconds for all threads together to end by themselves."""
@@ -222,7 +220,7 @@ def observed(
     from rich.console import Console
 
     from runtime.logs import terminal_handler
-    from runtime.tools.cli.tables import progress
+    from runtime.tools.cli.brief import progress
     from runtime.tools.monitor.observer import LastRecords
     from runtime.tools.tracing.record import tracing
 

@@ -15,12 +15,12 @@ from rich.text import Text
 
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.extras import install_command
-from runtime.tools.monitor.client import Client
 from runtime.tools.monitor.protocol import (
     COLUMNS,
     QUICKEST,
     SLOWEST,
     STACKS,
+    Client,
     Command,
     Pause,
     Points,

@@ -24,7 +24,6 @@ import numpy.typing as npt
 
 from events import TrackedFeatures
 from runtime.errors import CommandError, VisnavError
-from runtime.tools.monitor.client import socket_of
 from runtime.tools.monitor.observer import Observer, describe
 from runtime.tools.monitor.protocol import (
     LONGEST_COMMAND,
@@ -36,6 +35,7 @@ from runtime.tools.monitor.protocol import (
     Watch,
     decode_request,
     encode,
+    socket_of,
 )
 
 R = TypeVar("R")

@@ -23,7 +23,6 @@ from urllib.parse import parse_qs, quote, urlsplit
 import jinja2
 import msgspec
 
-from runtime.tools.monitor.client import request
 from runtime.tools.monitor.protocol import (
     COLUMNS,
     QUICKEST,
@@ -34,6 +33,7 @@ from runtime.tools.monitor.protocol import (
     Watch,
     encode,
     is_number,
+    request,
 )
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret

@@ -24,8 +24,8 @@ from nodes.calibration.formats import FORMATS, export_calibration, write_files
 from nodes.calibration.readers import READERS, ReadCamera, read
 from nodes.data.dataset.recording import Rig
 from runtime.config.reading import parse
-from runtime.json_values import plain
 from runtime.run.execute import execute
+from runtime.summary import plain
 from tests.nodes.calibration.samples import IMU, LENSES, camera, stereo
 
 SAYS = {

@@ -19,7 +19,7 @@ from runtime.errors import VisnavError
 from runtime.run.execute import execute
 from runtime.summary import Summary
 from runtime.testing import spec
-from runtime.tools.cli.tables import run_tables
+from runtime.tools.cli.brief import run_tables
 from runtime.units import Latency
 from tests.runtime.samples import Ping, Pong, Speaker
 

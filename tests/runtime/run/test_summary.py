@@ -17,7 +17,7 @@ from runtime.run.execute import execute
 from runtime.run.summarise import command_line, commit
 from runtime.summary import Summary
 from runtime.testing import run_nodes, spec
-from runtime.tools.cli.tables import run_tables
+from runtime.tools.cli.brief import run_tables
 from tests.runtime.samples import Diarist, Failing, Painter, Ping, Reader, Speaker
 
 

@@ -18,7 +18,7 @@ from runtime.config.model import Config, RunConfig
 from runtime.run.execute import execute
 from runtime.summary import WORKER_COLUMNS, Summary, WorkerSummary
 from runtime.testing import spec
-from runtime.tools.cli.tables import run_tables
+from runtime.tools.cli.brief import run_tables
 from runtime.tools.sweep import write_tables
 from runtime.workers.costs import Costs
 from tests.runtime.samples_workers import Plant

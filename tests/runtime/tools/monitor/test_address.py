@@ -12,7 +12,7 @@ import pytest
 
 from runtime.errors import VisnavError
 from runtime.paths import user_folder
-from runtime.tools.monitor.client import find, runs, socket_of
+from runtime.tools.monitor.protocol import find, runs, socket_of
 
 
 @pytest.fixture

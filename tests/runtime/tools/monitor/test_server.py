@@ -17,10 +17,10 @@ from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
-from runtime.tools.monitor import client, server
-from runtime.tools.monitor.client import Client, ask, find, request, runs, socket_of
+from runtime.tools.monitor import protocol, server
 from runtime.tools.monitor.observer import LastRecords, Observer
 from runtime.tools.monitor.protocol import (
+    Client,
     Command,
     LogLine,
     Look,
@@ -30,7 +30,12 @@ from runtime.tools.monitor.protocol import (
     Snapshot,
     Speed,
     Stop,
+    ask,
     encode,
+    find,
+    request,
+    runs,
+    socket_of,
 )
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
 
@@ -301,7 +306,7 @@ def test_an_error_of_the_monitors_own_is_an_answer(monkeypatch: pytest.MonkeyPat
 async def test_who_does_not_answer_is_not_waited_for_for_ever(
     monkeypatch: pytest.MonkeyPatch, sockets: Path
 ) -> None:
-    monkeypatch.setattr(client, "ANSWER_TIMEOUT", 0.01)
+    monkeypatch.setattr(protocol, "ANSWER_TIMEOUT", 0.01)
     with socket.socket(socket.AF_UNIX) as silent:
         path = socket_of("silent")
         silent.bind(str(path))

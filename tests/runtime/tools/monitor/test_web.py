@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 
 from runtime.tools.monitor import web
-from runtime.tools.monitor.client import socket_of
 from runtime.tools.monitor.protocol import (
     Answer,
     Look,
@@ -26,6 +25,7 @@ from runtime.tools.monitor.protocol import (
     Watch,
     decode_request,
     encode,
+    socket_of,
 )
 from runtime.tools.monitor.web import PageServer
 from tests.runtime.tools.monitor.samples import snapshot
