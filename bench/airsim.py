@@ -27,10 +27,8 @@ from bench.system import free_port
 from sims.airsim.client.connection import RpcClient
 from sims.airsim.wire import ImageRequest
 
-WINDOW = 1.0
-"""Seconds."""
-START = 12.0
-"""Seconds from the start of the run until the first window at the latest."""
+WINDOW = 1.0  # seconds
+START = 12.0  # seconds from the start of the run until the first window at the latest
 
 IMAGE = ImageRequest("0", 0, False, False)
 CASES: dict[str, tuple[Any, ...]] = {

@@ -35,12 +35,10 @@ from runtime.config.model import Config
 from runtime.config.reading import parse
 from runtime.run.execute import execute
 
-BLOCK = 50
-"""Round trips of a side in each of its turns."""
+BLOCK = 50  # round trips of a side in each of its turns
 
 WARM_UP = 50
-ENCODED_FIRST = 20
-"""Images encoded by both sides before the first measurement."""
+ENCODED_FIRST = 20  # images encoded by both sides before the first measurement
 
 IMAGE = "sensor_msgs/msg/Image"
 FRAME = "camera_optical_frame"

@@ -23,8 +23,7 @@ import numpy as np
 
 from bench.system import Case, CaseName, Mode, Samples, System, in_turns
 
-_LIMIT = 120.0
-"""Time limit of a measurement, seconds."""
+_LIMIT = 120.0  # time limit of a measurement, seconds
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):

@@ -31,12 +31,10 @@ from nodes.ros2.messages.topics import Topic
 from nodes.ros2.messages.typestore import TypeStore
 
 TWIST = "geometry_msgs/msg/Twist"
-BURST = 0.001
-"""Seconds between bursts of messages."""
+BURST = 0.001  # seconds between bursts of messages
 
 RATE = 10_000.0
-WINDOW = 1.0
-"""Seconds."""
+WINDOW = 1.0  # seconds
 
 
 class FloodRow(LateRow, frozen=True, kw_only=True):

@@ -54,8 +54,7 @@ class Beat(NamedTuple):
 EDGE_NS = 30_000_000
 """Margin at both ends of a window whose ticks are left out, ns: messages may be late."""
 
-BEATS: list[Beat] = []
-"""Ticks of this process's probe; the measuring code clears the list."""
+BEATS: list[Beat] = []  # ticks of this process's probe; the measuring code clears the list
 
 
 class TakeoffNode(Node[C]):
@@ -142,8 +141,7 @@ class _Run(msgspec.Struct):
     dropped: int = 0
 
 
-WARM_UP = 1_500_000_000
-"""Nanoseconds left out at the start of each run."""
+WARM_UP = 1_500_000_000  # nanoseconds left out at the start of each run
 
 CASES: dict[str, dict[str, object] | None] = {
     "no recorder": None,

@@ -41,11 +41,8 @@ from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_b
 from sims.worlds import load_world
 
 Mode = Literal["none", "inline", "thread", "worker", "fetch inline", "fetch"]
-DELAY = 0.08
-"""Response time of the server, seconds."""
-
-WARM_UP = 1_000_000_000
-"""Nanoseconds left out at the start of each run."""
+DELAY = 0.08  # response time of the server, seconds
+WARM_UP = 1_000_000_000  # nanoseconds left out at the start of each run
 MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker", "fetch inline", "fetch")
 
 

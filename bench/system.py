@@ -26,8 +26,7 @@ CaseName = Literal["small", "large", "large-shared"]
 Mode = Literal["handler", "stream", "routed"]
 Place = Literal["one process", "processes"]
 
-LARGE_SHAPE = (1080, 1080)
-"""Of the large message: float32, 4.67 MB."""
+LARGE_SHAPE = (1080, 1080)  # of the large message: float32, 4.67 MB
 
 NODES = (2, 4, 8, 10, 16, 32, 50, 64, 100, 128)
 

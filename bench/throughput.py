@@ -56,8 +56,7 @@ class IdleRow(msgspec.Struct, frozen=True, kw_only=True):
     cpu_percent: float
 
 
-BATCH = 256
-"""Events of a burst: as many as a reader may take before the loop gets a turn."""
+BATCH = 256  # events of a burst: as many as a reader may take before the loop gets a turn
 
 
 class Unchecked(Event):

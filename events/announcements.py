@@ -398,8 +398,7 @@ class Vehicles:
     """
 
     def __init__(self) -> None:
-        self.names: list[str] = []
-        """Names of the vehicles, in the order of their announcements."""
+        self.names: list[str] = []  # names of the vehicles, in the order of their announcements
         self._cameras: dict[str, str] = {}
         self._followed: dict[str, str] = {}
         self._estimated: dict[str, str] = {}

@@ -94,8 +94,7 @@ class ParameterChanged(Event):
     value: str
 
 
-UNIT_TOLERANCE = 1e-3
-"""By how much the norm of a quaternion may differ from 1."""
+UNIT_TOLERANCE = 1e-3  # by how much the norm of a quaternion may differ from 1
 
 _LEAST, _MOST = 1.0 - UNIT_TOLERANCE, 1.0 + UNIT_TOLERANCE
 _LENGTHS = {

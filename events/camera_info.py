@@ -21,8 +21,7 @@ COEFFICIENTS: dict[str, int] = {"plumb_bob": 5, "rational_polynomial": 8, "equid
 """Number of coefficients of each model."""
 
 _HALF_TURN = {"plumb_bob": math.pi / 2, "rational_polynomial": math.pi / 2, "equidistant": math.pi}
-_STEPS = 2048
-"""Number of sampled angles along a model's curve, from 0 to the widest."""
+_STEPS = 2048  # number of sampled angles along a model's curve, from 0 to the widest
 
 
 class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):

@@ -26,8 +26,7 @@ import numpy.typing as npt
 
 from events.base import Quaternion, Vector3
 
-IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
-"""Identity rotation."""
+IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)  # identity rotation
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -237,8 +236,7 @@ def convert_covariance(axes: Axes, covariance: npt.NDArray[np.float64]) -> npt.N
 Geodetic = tuple[float, float, float]
 """Latitude and longitude, degrees north and east, and metres above the WGS 84 ellipsoid."""
 
-SEMI_MAJOR = 6378137.0
-"""Metres (NIMA TR8350.2, table 3.1)."""
+SEMI_MAJOR = 6378137.0  # metres (NIMA TR8350.2, table 3.1)
 
 FLATTENING = 1.0 / 298.257223563
 

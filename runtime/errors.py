@@ -34,8 +34,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-_LONGEST = 1500
-"""Characters of a message."""
+_LONGEST = 1500  # characters of a message
 
 
 class VisnavError(Exception):
@@ -72,8 +71,7 @@ class NodeError(VisnavError):
     def __init__(self, node: str, what: str) -> None:
         super().__init__(f"{node}: {what}")
         self.node = node
-        self.place = ""
-        """Line of the node where an exception other than ours was raised, if known."""
+        self.place = ""  # line of the node where an exception other than ours was raised, if known
 
 
 class FatalError(NodeError):

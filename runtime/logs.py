@@ -36,11 +36,8 @@ LEVELS = {
 }
 
 
-LONGEST = 65_536
-"""Characters of a message in ``log.txt``."""
-
-LONGEST_SHOWN = 2_000
-"""Characters of a message in the terminal."""
+LONGEST = 65_536  # characters of a message in ``log.txt``
+LONGEST_SHOWN = 2_000  # characters of a message in the terminal
 
 LONGEST_HIGHLIGHTED = 400
 """Most characters of a message in colour: the cost grows with the square of a word's length."""
@@ -48,8 +45,7 @@ LONGEST_HIGHLIGHTED = 400
 MOST_WAITING = 64 << 20
 """Most characters of lines and their metadata waiting to be written; more are dropped."""
 
-PATIENCE = 2.0
-"""Real seconds for a terminal to show the waiting lines after the end of a run."""
+PATIENCE = 2.0  # real seconds for a terminal to show the waiting lines after the end of a run
 
 _OF_RECORD = 300  # what a record takes besides its message, in characters
 

@@ -58,8 +58,7 @@ class LinkSummary(msgspec.Struct, frozen=True):
     thinned: int
 
 
-SLOWER = 1.5
-"""Ratio of measured to declared latency of a worker to be warned of, medians."""
+SLOWER = 1.5  # ratio of measured to declared latency of a worker to be warned of, medians
 
 
 class WorkerSummary(msgspec.Struct, frozen=True):

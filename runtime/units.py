@@ -59,8 +59,7 @@ class Latency(Duration):
         return latency
 
 
-LONGEST_BARE = 1.0
-"""Longest `Latency` (s) as a number without a unit."""
+LONGEST_BARE = 1.0  # longest `Latency` (s) as a number without a unit
 
 
 def plain(value: Any) -> float | str:

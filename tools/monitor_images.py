@@ -18,10 +18,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs" / "images"
-SIZE = (150, 46)
-"""Columns and lines of the terminal."""
-FLYING = 20.0
-"""Seconds of the run before the images are made."""
+SIZE = (150, 46)  # columns and lines of the terminal
+FLYING = 20.0  # seconds of the run before the images are made
 
 
 def main() -> None:

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LONGEST, SHORTEST = 500, 80
-"""Limits of a file's lines; a file beyond them needs a reason."""
+LONGEST, SHORTEST = 500, 80  # limits of a file's lines; a file beyond them needs a reason
 
 
 def main() -> None:

@@ -29,14 +29,9 @@ from websockets.sync.client import ClientConnection, connect
 from nodes.viewers.rerun.sdk import program
 
 WIDTH, HEIGHT = 1440, 900
-TOP = 32
-"""Height of the viewer's own bar, cut off, pixels."""
-
-TIMEOUT = 240.0
-"""Seconds until the image must be there."""
-
-STILL = 4
-"""Number of equal captures in a row, two seconds apart, for a still page."""
+TOP = 32  # height of the viewer's own bar, cut off, pixels
+TIMEOUT = 240.0  # seconds until the image must be there
+STILL = 4  # number of equal captures in a row, two seconds apart, for a still page
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 

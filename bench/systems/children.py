@@ -31,23 +31,12 @@ import numpy as np
 
 from bench.system import Case, CaseName, Samples
 
-PING = struct.Struct("<qiii")
-"""Stamp, sender, receiver, number."""
-
-PONG = struct.Struct("<qi")
-"""Stamp, number."""
-
-ALL = 0
-"""Receiver number of a roll call: each node answers with minus its own number."""
-
-TIMEOUT = 60.0
-"""Seconds without an answer before a measurement is given up."""
-
-GRACE = 2.0
-"""Seconds for a child to clean up after SIGTERM, before a forced exit."""
-
-Send = Callable[[int, int, int], None]
-"""Sends a ping to all nodes: its stamp, receiver and number."""
+PING = struct.Struct("<qiii")  # stamp, sender, receiver, number
+PONG = struct.Struct("<qi")  # stamp, number
+ALL = 0  # receiver number of a roll call: each node answers with minus its own number
+TIMEOUT = 60.0  # seconds without an answer before a measurement is given up
+GRACE = 2.0  # seconds for a child to clean up after SIGTERM, before a forced exit
+Send = Callable[[int, int, int], None]  # sends a ping to all nodes: its stamp, receiver and number
 
 Receive = Callable[[], int | None]
 """Waits a second at most for a pong and returns its number, or `None` if none came."""

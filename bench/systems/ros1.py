@@ -39,8 +39,7 @@ from bench.systems.compiled import (
 
 MASTER = Path("/usr/bin/rosmaster")
 
-CLOSING = 10.0
-"""Seconds for the other nodes to end after node 1."""
+CLOSING = 10.0  # seconds for the other nodes to end after node 1
 
 
 class GraphError(RuntimeError):

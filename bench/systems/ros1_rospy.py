@@ -18,14 +18,9 @@ from typing import Any
 PING = "uint32 sender\nuint32 receiver\nint64 number\nint64 stamp\nfloat32[] payload\n"
 PONG = "uint32 sender\nuint32 receiver\nint64 number\nint64 stamp\n"
 
-EVERYBODY = 0
-"""Receiver of the last ping, whose number is the count of those before."""
-
-HELLO = -1
-"""Number of pings before the exchange."""
-
-TIMEOUT = 10.0
-"""Seconds to wait for a pong."""
+EVERYBODY = 0  # receiver of the last ping, whose number is the count of those before
+HELLO = -1  # number of pings before the exchange
+TIMEOUT = 10.0  # seconds to wait for a pong
 
 FLOATS = 1080 * 1080
 

@@ -37,14 +37,12 @@ B = TypeVar("B", bound=tuple[Any, ...])
 
 Kind = Literal["one", "maybe", "all"]
 
-HISTORY = 256
-"""Most events of a field waiting for their partners; beyond, the oldest is dropped."""
+HISTORY = 256  # most events of a field waiting for their partners; beyond, the oldest is dropped
 
 WAITING_BYTES = 64 << 20
 """Most bytes of arrays in these events, but at least 1 event; the first limit counts."""
 
-GATHERED = 16_384
-"""Most events of a field gathering a tuple."""
+GATHERED = 16_384  # most events of a field gathering a tuple
 
 
 class Field(NamedTuple):

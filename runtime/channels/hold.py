@@ -41,8 +41,7 @@ from runtime.units import Duration
 
 T = TypeVar("T")
 
-LET_GO: Any = object()
-"""Result of a wait released without an answer; the answer may still come."""
+LET_GO: Any = object()  # result of a wait released without an answer; the answer may still come
 
 
 class Owed(Generic[T]):
@@ -88,11 +87,8 @@ BEHIND = 2.0
 IN_A_ROW = 3
 """Frames lost in a row for a system to count as hung, not waited for until its next answer."""
 
-_LOOK = 0.02
-"""Real seconds between two checks for overdue answers."""
-
-_REMEMBERED = 4096
-"""Settled frames remembered by stamp, to recognise answers to them."""
+_LOOK = 0.02  # real seconds between two checks for overdue answers
+_REMEMBERED = 4096  # settled frames remembered by stamp, to recognise answers to them
 
 
 class HoldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -182,8 +182,7 @@ def every(*, hz: float | str) -> Callable[[F], F]:
     return declare
 
 
-MAX_HZ = 100_000
-"""Above this a tick takes longer than its period on any machine."""
+MAX_HZ = 100_000  # above this a tick takes longer than its period on any machine
 
 
 def check_event_type(where: str, event: Any) -> None:

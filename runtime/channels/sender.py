@@ -27,8 +27,7 @@ from runtime.errors import (
 
 T = TypeVar("T", bound=Event)
 
-Deliver = Callable[[Any], Any]
-"""A handler, or a stream's `offer`; a true result ends the delivery."""
+Deliver = Callable[[Any], Any]  # a handler, or a stream's `offer`; a true result ends the delivery
 
 Tap = Callable[["Sender[Any] | None", Event], None]
 """Sees every event before its listeners do: the digest, the event log. (An announcement has no

@@ -23,11 +23,8 @@ T = TypeVar("T")
 
 Overflow = Literal["error", "drop_oldest", "wait"]
 
-TURN = 256
-"""Events read in a row without waiting until the loop gets a turn."""
-
-_WOKEN: Any = None
-"""Sent into a reader instead of an event: look again at the buffer."""
+TURN = 256  # events read in a row without waiting until the loop gets a turn
+_WOKEN: Any = None  # sent into a reader instead of an event: look again at the buffer
 
 
 class StreamStatistics(msgspec.Struct, frozen=True):

@@ -15,8 +15,7 @@ import msgspec
 from runtime.errors import ConfigError, suggest
 from runtime.paths import GivenHere
 
-_LONGEST_TEXT = 300
-"""Most characters of a text shown in a message."""
+_LONGEST_TEXT = 300  # most characters of a text shown in a message
 
 _NAMES = {
     "float": "a number",

@@ -29,8 +29,7 @@ from pathlib import Path
 from runtime.errors import CommandError, PeerError, WireError
 from runtime.paths import user_folder
 
-VERSION = 3
-"""Of the messages of `runtime.peers.messages`; processes of different ones do not meet."""
+VERSION = 3  # of the messages of `runtime.peers.messages`; processes of different ones do not meet
 
 NONCE = 16
 _HEAD = struct.Struct("<BQI")
@@ -131,8 +130,7 @@ def is_hello(sealed: bytes) -> bool:
     return sealed[1:9] == bytes(8)
 
 
-SHORTEST = 16
-"""Characters of a secret at least."""
+SHORTEST = 16  # characters of a secret at least
 
 
 def secret_of(setting: str) -> bytes:

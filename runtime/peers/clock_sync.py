@@ -16,11 +16,8 @@ from runtime.peers.messages import Ping
 from runtime.time.clock import RealClock
 from runtime.time.schedule import SECOND
 
-PERIOD = 0.1
-"""Seconds between two exchanges."""
-
-EXCHANGES = 10
-"""Exchanges for each correction of our clock; the quickest gives its lateness."""
+PERIOD = 0.1  # seconds between two exchanges
+EXCHANGES = 10  # exchanges for each correction of our clock; the quickest gives its lateness
 
 LIMIT = 500e-6
 """Greatest relative change of our clock's rate, as in NTP; quartzes differ by a tenth of this."""

@@ -29,11 +29,8 @@ from runtime.peers.zenoh_session import OnMessage, Session
 
 log = logging.getLogger("visnav.runtime")
 
-GREET_EVERY = 0.2
-"""Seconds between two greetings of a process without an answer yet."""
-
-STRANGERS = 256
-"""Most processes greeted without a session; further processes are not seen."""
+GREET_EVERY = 0.2  # seconds between two greetings of a process without an answer yet
+STRANGERS = 256  # most processes greeted without a session; further processes are not seen
 
 
 class Contact:

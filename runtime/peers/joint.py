@@ -210,14 +210,9 @@ log = logging.getLogger("visnav.runtime")
 _PARTS = msgspec.json.Decoder(Summary)
 """Made once: msgspec crashes if two threads learn a type at the same time."""
 
-BUSY_EVERY = 2.0
-"""Seconds between two `StillWorking` messages while a node here ends."""
-
-SILENCE = 8.0
-"""Seconds without a message until the run ends without the silent processes."""
-
-PARTING = 5.0
-"""Seconds for the processes to exchange their summaries."""
+BUSY_EVERY = 2.0  # seconds between two `StillWorking` messages while a node here ends
+SILENCE = 8.0  # seconds without a message until the run ends without the silent processes
+PARTING = 5.0  # seconds for the processes to exchange their summaries
 
 
 class JointShutdown:

@@ -40,14 +40,9 @@ from runtime.wire import Packed, pack, unpack
 
 Put = Callable[[bytes, bytes], None]
 
-BOUND = 1024
-"""Most events waiting for the network: as many as an input keeps."""
-
-SMALL = 8192
-"""Most bytes of a message written by the loop itself: copying takes a microsecond."""
-
-AT_ONCE = 1 << 20
-"""Most bytes of an event put into common memory by the loop: copying takes 0.1 ms."""
+BOUND = 1024  # most events waiting for the network: as many as an input keeps
+SMALL = 8192  # most bytes of a message written by the loop itself: copying takes a microsecond
+AT_ONCE = 1 << 20  # most bytes of an event put into common memory by the loop: copying takes 0.1 ms
 
 UNDER_WAY = 32768
 """Most unconfirmed bytes for writing at once; Zenoh's queue holds four times as many."""
@@ -205,8 +200,7 @@ class _Waiting:
         self.skip = skip
 
 
-KEPT = 20
-"""Number of remembered exchanges."""
+KEPT = 20  # number of remembered exchanges
 
 
 class Exchange(NamedTuple):
@@ -237,11 +231,8 @@ class Exchanges:
         return min(list(self._latest)[-latest:], default=None)
 
 
-ACK_EVERY = 8192
-"""Received bytes between two acknowledgements."""
-
-FREE_EVERY = 4
-"""Released frames of the other's memory between two acknowledgements."""
+ACK_EVERY = 8192  # received bytes between two acknowledgements
+FREE_EVERY = 4  # released frames of the other's memory between two acknowledgements
 
 
 class Member:

@@ -14,8 +14,7 @@ Key = tuple[int, int, int]
 NEVER: Key = (1 << 62, 3, 0)
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
-AT_ONCE = -1
-"""Serial number of a message handled on arrival, not at a turn."""
+AT_ONCE = -1  # serial number of a message handled on arrival, not at a turn
 
 
 class Message(msgspec.Struct, frozen=True, tag=True, omit_defaults=True):

@@ -28,8 +28,7 @@ from runtime.workers.shared_memory import Arena, MappedFile, anonymous_file
 
 log = logging.getLogger("visnav.runtime")
 
-LIMIT = 1 << 28
-"""Most bytes of a file; events without room cross the network."""
+LIMIT = 1 << 28  # most bytes of a file; events without room cross the network
 
 KEY = 32
 

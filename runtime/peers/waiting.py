@@ -18,8 +18,7 @@ from runtime.time.time_limits import real_time_limit
 
 log = logging.getLogger("visnav.runtime")
 
-NAMED_EVERY = 5.0
-"""Real seconds between two log lines naming the awaited processes."""
+NAMED_EVERY = 5.0  # real seconds between two log lines naming the awaited processes
 
 
 class Waiting:

@@ -30,8 +30,7 @@ OnMessage = Callable[[str, bytes, bytes], None]
 OnPresence = Callable[[str, bool], None]
 """Called in Zenoh's thread when a process appears (True) or disappears."""
 
-CLOSING = 3.0
-"""Real seconds for a session to close; a hung peer keeps Zenoh waiting for longer."""
+CLOSING = 3.0  # real seconds for a session to close; a hung peer keeps Zenoh waiting for longer
 
 _ENDPOINT = re.compile(r"(\w+)/\[?([^\]#?]+?)\]?:(\d+)([#?].*)?")
 

@@ -157,8 +157,7 @@ def _task_factory(
 
 R = TypeVar("R")
 
-GRACE = 1.0
-"""Real seconds for tasks and asynchronous generators to end when the loop is closed."""
+GRACE = 1.0  # real seconds for tasks and asynchronous generators to end when the loop is closed
 
 _MOST_ESCAPES = 100
 

@@ -17,11 +17,8 @@ from runtime.channels.sender import Deliver, Listener, Tap, Voices
 from runtime.channels.tasks import Fault
 from runtime.node import Node, senders
 
-Sources = Mapping[str, Mapping[str, str]]
-"""Source of each narrowed port, by node and port."""
-
-Links = Mapping[str, Mapping[str, Link]]
-"""Link before each port, by node and port."""
+Sources = Mapping[str, Mapping[str, str]]  # source of each narrowed port, by node and port
+Links = Mapping[str, Mapping[str, Link]]  # link before each port, by node and port
 
 Wrap = Callable[[str, Deliver], Deliver]
 """Wrapper of handlers: from a node's name and a handler to the function called instead."""

@@ -40,8 +40,7 @@ from runtime.workers.worker import Worker
 
 log = logging.getLogger("visnav.runtime")
 
-GRACE = 0.5
-"""Real seconds for a step to end after its cancellation, such as over its limit."""
+GRACE = 0.5  # real seconds for a step to end after its cancellation, such as over its limit
 
 Create = Callable[[Coroutine[Any, Any, Any], str], asyncio.Task[Any]]
 
@@ -60,8 +59,7 @@ class NodeRunner:
         self.started = False
         self.starts = 0
         self.failures = 0
-        self.running_since = 0
-        """Start of the node's ticks and `run`, on the run's clock (ns)."""
+        self.running_since = 0  # start of the node's ticks and `run`, on the run's clock (ns)
         self.restarting = False
         self.shutting_down = False
         self.shutdown_lock = asyncio.Lock()
@@ -318,8 +316,7 @@ def _is_cancelled() -> bool:
 
 Phase = Literal["on_startup", "announce", "check", "on_ready"]
 
-Announced = dict[str, list[Announcement]]
-"""Announcements of each node, by name."""
+Announced = dict[str, list[Announcement]]  # announcements of each node, by name
 
 Step = Callable[[NodeRunner], Awaitable[None]]
 

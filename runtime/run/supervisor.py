@@ -46,11 +46,8 @@ log = logging.getLogger("visnav.runtime")
 FIRST_BACKOFF = 0.5
 """Seconds of the clock before the first restart of a node; doubled at each failure."""
 
-LONGEST_BACKOFF = 30.0
-"""Seconds of the clock before a restart at most."""
-
-HEALTHY = 60.0
-"""Seconds of the clock without failure until a node's failures are forgotten."""
+LONGEST_BACKOFF = 30.0  # seconds of the clock before a restart at most
+HEALTHY = 60.0  # seconds of the clock without failure until a node's failures are forgotten
 
 
 class Supervisor:

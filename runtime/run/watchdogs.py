@@ -36,8 +36,7 @@ from runtime.time.lockstep import LockstepLoop
 from runtime.time.stepping import Stepping
 from runtime.time.time_limits import Starvation
 
-_LONGEST_PAUSE = 0.05
-"""Seconds between two looks at most; a run's end waits for the last of them."""
+_LONGEST_PAUSE = 0.05  # seconds between two looks at most; a run's end waits for the last of them
 
 _WAITING = {selectors.__file__, lockstep.__file__}
 """Modules with the wait of an idle loop, if called from `_LOOPS`."""
@@ -124,13 +123,11 @@ def idle(frame: FrameType | None) -> bool:
 log = logging.getLogger("visnav.runtime")
 
 _LONGEST_LOOK = 0.25
-_LOOK = 0.01
-"""Real seconds between two looks at a busy loop."""
+_LOOK = 0.01  # real seconds between two looks at a busy loop
 
 _MOST_NAMED = 3
 
-_PATIENCE = 3.0
-"""Real seconds after Ctrl-C until a start-up blocking the loop is interrupted."""
+_PATIENCE = 3.0  # real seconds after Ctrl-C until a start-up blocking the loop is interrupted
 
 
 class ProgressWatchdog:

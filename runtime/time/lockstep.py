@@ -34,8 +34,7 @@ from runtime.errors import UnsupportedInterpreterError
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND, Once, Schedule
 
-LIMIT = 20.0
-"""Real seconds until an unfinished test has failed; busy machines take their time."""
+LIMIT = 20.0  # real seconds until an unfinished test has failed; busy machines take their time
 
 PYTHON = f"{platform.python_implementation()} {platform.python_version()}"
 
@@ -75,8 +74,7 @@ _Held = tuple[int, int, _Work, asyncio.Future[Any]]
 """Work done elsewhere: due time (ns), order, outcome, and the awaiting future."""
 
 _NEVER = 1 << 62
-_POLL_EVERY = 64
-"""Jumps between two looks at real files (signals, sockets) while time runs freely."""
+_POLL_EVERY = 64  # jumps between two looks at real files (signals, sockets) while time runs freely
 
 
 class _JumpingSelector(selectors.DefaultSelector):

@@ -91,8 +91,7 @@ class Schedule:
 
     def __init__(self) -> None:
         self.heap: list[tuple[int, int, Entry]] = []
-        self.order = 0
-        """Number of the next entry added; the lowest comes first among equal times."""
+        self.order = 0  # number of the next entry added; the lowest comes first among equal times
         self.on_sooner: Callable[[int], None] = _ignore
         """Called when an entry is added with a due time (ns) before all others."""
 

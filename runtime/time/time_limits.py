@@ -14,8 +14,7 @@ from collections.abc import AsyncIterator, Iterable
 from pathlib import Path
 from typing import Any
 
-LOOK_EVERY = 1.0
-"""Real seconds between two looks at how busy the machine is."""
+LOOK_EVERY = 1.0  # real seconds between two looks at how busy the machine is
 
 
 @contextlib.asynccontextmanager

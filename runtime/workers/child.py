@@ -24,11 +24,8 @@ from runtime.workers.shared_memory import SharedPipe
 _LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
 """Folders of libraries: code not of the worker's own."""
 
-_GRACE = 5.0
-"""Seconds for a call to end, and the object to close, once the run has gone."""
-
-_MOST_STARVED = 10
-"""How many times longer a call may take on a busy machine."""
+_GRACE = 5.0  # seconds for a call to end, and the object to close, once the run has gone
+_MOST_STARVED = 10  # how many times longer a call may take on a busy machine
 
 
 def main(socket_fd: int, in_fd: int, out_fd: int, limit: float) -> None:

@@ -9,14 +9,9 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
-_LONGEST = 4096
-"""Bytes of a line at most; a longer line is cut into several."""
-
-_KEPT = 20
-"""Last lines reported of an ended process."""
-
-LINES = 100
-"""Lines handed on per real second of a process; lines beyond are only counted."""
+_LONGEST = 4096  # bytes of a line at most; a longer line is cut into several
+_KEPT = 20  # last lines reported of an ended process
+LINES = 100  # lines handed on per real second of a process; lines beyond are only counted
 
 # A lone carriage return, as of a progress bar, ends a line, too; the next byte may be its "\n".
 _LINE_END = re.compile(rb"\r?\n|\r(?!\Z)")

@@ -26,14 +26,9 @@ import threading
 import weakref
 from typing import Any
 
-INLINE = 4096
-"""Buffers smaller than this (bytes) travel inside the message."""
-
-MAPPED = 1 << 24
-"""First length of a file (bytes); doubled from there on."""
-
-LIMIT = 1 << 30
-"""Maximum length of a file (bytes); buffers without room travel inside the message."""
+INLINE = 4096  # buffers smaller than this (bytes) travel inside the message
+MAPPED = 1 << 24  # first length of a file (bytes); doubled from there on
+LIMIT = 1 << 30  # maximum length of a file (bytes); buffers without room travel inside the message
 
 _LENGTH = struct.Struct("<Q")
 

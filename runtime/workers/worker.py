@@ -43,14 +43,9 @@ P = ParamSpec("P")
 Called = Callable[[str, str, concurrent.futures.Future[Any]], None]
 """Callback for a call: names of process and method, and the future of the answer."""
 
-_GRACE = 2.0
-"""Seconds a process gets to end by itself once its connection is closed."""
-
-_LOOK = 0.25
-"""Seconds without data until a thread checks whether its process is still there."""
-
-_LONGEST = 1e8
-"""Seconds of the longest limit given to the kernel."""
+_GRACE = 2.0  # seconds a process gets to end by itself once its connection is closed
+_LOOK = 0.25  # seconds without data until a thread checks whether its process is still there
+_LONGEST = 1e8  # seconds of the longest limit given to the kernel
 
 
 class Worker(Generic[W]):
@@ -96,8 +91,7 @@ class Worker(Generic[W]):
         self.costs = costs or Costs()
         self.costs.latency = latency
         self.costs.processes = processes
-        self.called: Called | None = None
-        """Callback for every call, if set."""
+        self.called: Called | None = None  # callback for every call, if set
         self._clock = clock
         self._latency = latency
         self._processes: list[_Process] = []

@@ -112,8 +112,7 @@ def of_comparison(each: Comparison, margin: float) -> list[Outcome]:
     return found
 
 
-WIDTH = 120
-"""Of the table where there is no terminal, in letters."""
+WIDTH = 120  # of the table where there is no terminal, in letters
 
 
 def print_table(compared: Compared) -> None:

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from runtime.run.supervisor import Supervisor
     from runtime.tools.monitor.observer import LastRecords
 
-_LAST_WAIT = 1.0
-"""Real seconds for all threads together to end by themselves."""
+_LAST_WAIT = 1.0  # real seconds for all threads together to end by themselves
 
 
 class Log(Enum):

@@ -27,8 +27,7 @@ from runtime.tools.sweep.plan import Parameter
 from runtime.tools.sweep.process import Ended
 from runtime.tools.sweep.tables import decode_rows
 
-Fly = Callable[[Plan], Sequence[Row]]
-"""Carries out a plan: returns a row for each of its jobs."""
+Fly = Callable[[Plan], Sequence[Row]]  # carries out a plan: returns a row for each of its jobs
 
 Looks = dict[str, list[int]]
 """Numbers of flights that were looked at, by what was compared; kept for later calls."""

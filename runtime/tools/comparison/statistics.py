@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from runtime.tools.sweep import Row
 
 Floats = npt.NDArray[np.float64]
-Key = tuple[str, int]
-"""Flight of a pair: scenario and seed."""
+Key = tuple[str, int]  # flight of a pair: scenario and seed
 
 USUAL = ("flight_ate_percent", "rpe_1m_trans_percent", "rot_rmse_deg", "frame_coverage_percent")
 """Figures compared by default: errors with lost time as drift, drift, rotation, coverage."""

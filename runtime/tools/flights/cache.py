@@ -24,8 +24,7 @@ from runtime.tools.flights.recorder import record as fly
 
 _LOG = logging.getLogger("visnav.flights")
 
-LIMIT = 20.0
-"""Gigabytes, unless ``VISNAV_FLIGHTS_GB`` says otherwise."""
+LIMIT = 20.0  # gigabytes, unless ``VISNAV_FLIGHTS_GB`` says otherwise
 
 
 class Kept(NamedTuple):

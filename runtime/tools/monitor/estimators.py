@@ -35,14 +35,9 @@ from runtime.tools.monitor.protocol import Points, Rows
 GAP = SECOND // 2
 """Silence that counts as lost, nanoseconds; as an evaluation's, if its file sets no other."""
 
-MOST_POINTS = 500
-"""Points of a path at most."""
-
-_RECENT = 1000
-"""True poses of a vehicle that are kept, for estimates that come late."""
-
-_IMAGES = 4
-"""Newest images of a camera that are kept, for features that come late."""
+MOST_POINTS = 500  # points of a path at most
+_RECENT = 1000  # true poses of a vehicle that are kept, for estimates that come late
+_IMAGES = 4  # newest images of a camera that are kept, for features that come late
 
 
 class Path:

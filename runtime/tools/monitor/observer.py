@@ -44,8 +44,7 @@ from runtime.tools.monitor.protocol import (
     Stop,
 )
 
-KEPT = 5
-"""How many intervals between snapshots figures cover."""
+KEPT = 5  # how many intervals between snapshots figures cover
 
 
 class Amount(msgspec.Struct):
@@ -117,8 +116,7 @@ class Meter(Instrument):
         self._amounts: dict[str, Amount] = collections.defaultdict(Amount)
         self._follow = measured.follow
         self._clock = clock
-        self._inner = 0
-        """Nanoseconds taken by the steps nested in the running step."""
+        self._inner = 0  # nanoseconds taken by the steps nested in the running step
         self.event_sent = self._tap
 
     def take(self) -> Mapping[str, Amount]:

@@ -22,8 +22,7 @@ import msgspec
 from runtime.errors import CommandError, suggest
 from runtime.paths import user_folder
 
-SLOWEST, QUICKEST = 1e-3, 1e6
-"""Limits of the speed, in simulated seconds per real second."""
+SLOWEST, QUICKEST = 1e-3, 1e6  # limits of the speed, in simulated seconds per real second
 
 Rows = list[tuple[str, ...]]
 Points = list[tuple[float, ...]]
@@ -175,15 +174,13 @@ decode_snapshot = msgspec.json.Decoder(Snapshot).decode
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
 """Exceptions of decoding: invalid JSON or UTF-8, another type, too deep nesting."""
 
-LONGEST_COMMAND = 256 << 10
-"""Bytes of a line to a run at most."""
+LONGEST_COMMAND = 256 << 10  # bytes of a line to a run at most
 
 LONGEST_LINE = 16 << 20
 """Bytes of a line from a run at most; a snapshot of a hundred nodes has some tens of thousands."""
 
 
-ANSWER_TIMEOUT = 10.0
-"""Real seconds for a run to answer a command."""
+ANSWER_TIMEOUT = 10.0  # real seconds for a run to answer a command
 
 
 class Client:
@@ -246,8 +243,7 @@ def _not_listening(path: Path, error: Exception) -> CommandError:
     return CommandError(f"expected a run that listens at {path}: {reason}")
 
 
-_LONGEST = 100
-"""Bytes of a Unix socket's path at most (108 on Linux, 104 elsewhere)."""
+_LONGEST = 100  # bytes of a Unix socket's path at most (108 on Linux, 104 elsewhere)
 
 
 def socket_of(run: str) -> Path:

@@ -45,8 +45,7 @@ except ImportError:
         f"the monitor's screen needs textual: {install_command('monitor')}"
     ) from None
 
-CONFIRM = 3.0
-"""Seconds for pressing the key to end a run a second time."""
+CONFIRM = 3.0  # seconds for pressing the key to end a run a second time
 
 _COLOURS = {"WARNING": "yellow", "ERROR": "red", "CRITICAL": "red bold"}
 _PATHS = ("white", "bright_magenta", "bright_cyan", "bright_yellow", "bright_green", "bright_red")

@@ -42,20 +42,14 @@ R = TypeVar("R")
 
 log = logging.getLogger("visnav.runtime")
 
-PERIOD = 0.2
-"""Real seconds between two snapshots."""
+PERIOD = 0.2  # real seconds between two snapshots
 
 IMAGE_PERIOD = 0.5
 """Real seconds between two encoded images of a camera at least, however many pages ask."""
 
-CLOSING_TIMEOUT = 1.0
-"""Real seconds for clients to receive the last snapshot."""
-
-MAX_SIDE = 480
-"""Pixels of an encoded image's longer side at most."""
-
-QUALITY = 75
-"""Quality of the JPEG, of 100."""
+CLOSING_TIMEOUT = 1.0  # real seconds for clients to receive the last snapshot
+MAX_SIDE = 480  # pixels of an encoded image's longer side at most
+QUALITY = 75  # quality of the JPEG, of 100
 
 
 class Kept:

@@ -37,8 +37,7 @@ from runtime.tools.monitor.protocol import (
 )
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
-LONGEST_BODY = 64 << 10
-"""Bytes of a command at most."""
+LONGEST_BODY = 64 << 10  # bytes of a command at most
 
 _HOSTS = {"127.0.0.1", "localhost"}
 _ONCE = ("host", "origin", "content-length", TOKEN_HEADER)

@@ -207,8 +207,7 @@ class _State(ProgressColumn):
         return Text(self._display.state())
 
 
-WIDTH = 100
-"""Of a table in a terminal, in letters, at most."""
+WIDTH = 100  # of a table in a terminal, in letters, at most
 
 
 class Column(msgspec.Struct, frozen=True):

@@ -27,10 +27,8 @@ PLOTTED = {each.name: each.plot for each in FIGURES.values() if each.plot}
 _SHARES = "failures (% of the runs)"
 _MOST_LINES = 8
 _MARKS = "os^Dv*Xp"
-_ACROSS = 2
-"""Panels side by side: as many as a page has room for at full size."""
-_LETTERS = 70
-"""Letters of a legend below one panel."""
+_ACROSS = 2  # panels side by side: as many as a page has room for at full size
+_LETTERS = 70  # letters of a legend below one panel
 
 
 class Line(msgspec.Struct, frozen=True):

@@ -59,8 +59,7 @@ class Children:
     def __init__(self) -> None:
         self._lock = threading.RLock()  # a signal may interrupt an interruption
         self._running: set[subprocess.Popen[bytes]] = set()
-        self.ending = False
-        """Whether they were interrupted."""
+        self.ending = False  # whether they were interrupted
 
     def __len__(self) -> int:
         return len(self._running)

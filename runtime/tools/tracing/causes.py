@@ -20,11 +20,8 @@ import msgspec
 
 from runtime.tools.tracing.spool import EventKind, EventNote
 
-REMEMBERED = 512
-"""How many stamps of received events are kept per node."""
-
-IDENTITIES = 8192
-"""How many events are kept by identity."""
+REMEMBERED = 512  # how many stamps of received events are kept per node
+IDENTITIES = 8192  # how many events are kept by identity
 
 How = Literal["begins", "follows", "holds"]
 

@@ -21,8 +21,7 @@ from events import Category, Event, Image, Setpoint
 
 log = logging.getLogger("visnav.runtime")
 
-CHUNK = 1024
-"""Notes per list, about; encoding a list takes some tenths of a millisecond."""
+CHUNK = 1024  # notes per list, about; encoding a list takes some tenths of a millisecond
 
 _LENGTH_BYTES = 4
 
@@ -98,8 +97,7 @@ class Spool:
         self.receivers: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.origin = time.perf_counter_ns()
         """Begin of the notes: `time.perf_counter_ns` before all of them."""
-        self.failed: OSError | None = None
-        """Why there can be no trace any more."""
+        self.failed: OSError | None = None  # why there can be no trace any more
         self._file = path.open("wb", buffering=0)
         self._lists: queue.SimpleQueue[list[tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._encode = msgspec.msgpack.Encoder().encode

@@ -21,11 +21,8 @@ from runtime.run.results import replacing
 from runtime.tools.tracing.causes import Causes, SentEvent
 from runtime.tools.tracing.spool import ClockRate, EventNote, Spool
 
-MADE_BY = "python -m runtime run --trace"
-"""Mark of a trace made by this project."""
-
-LOOP, THREADS, WORKERS, SENSORS = 1, 2, 3, 4
-"""Process numbers of the trace's groups of tracks."""
+MADE_BY = "python -m runtime run --trace"  # mark of a trace made by this project
+LOOP, THREADS, WORKERS, SENSORS = 1, 2, 3, 4  # process numbers of the trace's groups of tracks
 
 _TITLES = {
     LOOP: "nodes on the event loop",
