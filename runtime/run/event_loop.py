@@ -177,8 +177,6 @@ def run_to_end(
     Args:
         escaped: Called with errors of the loop while `main` is not done; the loop then goes on,
             unless this raises.
-
-        BaseException: Whatever `main` raises.
     """
     try:
         task = RunTask(0, main, loop=loop, name="the run")
