@@ -19,9 +19,7 @@ from nodes.calibration.proofs import Figure, judged
 
 Floats = npt.NDArray[np.float64]
 
-ALLOWED = 0.10
-"""Permitted relative difference between measured and announced density."""
-
+ALLOWED = 0.10  # permitted relative difference between measured and announced density
 _TRIALS = 24
 
 

@@ -47,29 +47,20 @@ TITLES = {
 _KEPT = {
     *("name", "images", "width", "height", "fov", "intrinsics", "lens", "undistorted", "stereo"),
     *("position", "orientation", "rate", "latency", "readout", "time_offset"),
-}
-"""Camera settings kept in the self-test (optics, pose, timing); defects default to off."""
+}  # camera settings kept in the self-test (optics, pose, timing); defects default to off
 
-_SECONDS, _RATE = 9.0, 5.0
-"""Length of the flight; images a second, about."""
-
+_SECONDS, _RATE = 9.0, 5.0  # length of the flight; images a second, about
 _COLLECTOR = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
 
 
 class Result(msgspec.Struct, eq=False):
-    """Self-test results of a vehicle.
-
-    Attributes:
-        figures: By number of the proof.
-        notes: What was switched off, or cannot be shown.
-        points: By source of the camera.
-    """
+    """Self-test results of a vehicle."""
 
     vehicle: str
-    figures: dict[int, list[Figure]]
-    notes: list[str]
+    figures: dict[int, list[Figure]]  # by number of the proof
+    notes: list[str]  # what was switched off, or cannot be shown
     curves: list[Curve]
-    points: dict[str, Points]
+    points: dict[str, Points]  # by source of the camera
 
     def passed(self) -> bool:
         """Whether every figure is within its limit."""

@@ -51,30 +51,21 @@ from nodes.ros2.messages.topics import PublishingConfig
 from nodes.trajectory.table import EPOCH, epoch_of
 from runtime.run.results import claim
 
-DEPTH_FACTOR = 5000.0
-"""Steps of an exported depth image per metre, as TUM's."""
-
-GRAVITY = 9.81
-"""Gravity, m/s², as measured by an `Imu` at rest."""
+DEPTH_FACTOR = 5000.0  # steps of an exported depth image per metre, as TUM's
+GRAVITY = 9.81  # gravity, m/s², as measured by an `Imu` at rest
 
 
 class Format(msgspec.Struct, frozen=True):
-    """Files and capabilities of a calibration format.
-
-    Attributes:
-        radtan: Coefficients of its radial-tangential lens: 4 (k1, k2, p1, p2), 5 (k3) or 8 (k4, k5,
-            k6 in the denominator).
-        pair_only: Limited to one camera or one stereo pair.
-        camera_file: A file of each camera, with ``{}`` for its number; empty for none.
-        topics: Whether its files name the topics of ROS.
-    """
+    """Files and capabilities of a calibration format."""
 
     files: tuple[str, ...]
+    # Coefficients of its radial-tangential lens: 4 (k1, k2, p1, p2), 5 (k3) or 8 (k4, k5, k6 in the
+    # denominator).
     radtan: int
-    pair_only: bool = False
+    pair_only: bool = False  # limited to one camera or one stereo pair
     needs_imu: bool = False
-    camera_file: str = ""
-    topics: bool = False
+    camera_file: str = ""  # a file of each camera, with ``{}`` for its number; empty for none
+    topics: bool = False  # whether its files name the topics of ROS
 
 
 FORMATS = {
@@ -89,8 +80,7 @@ FORMATS = {
     "basalt": Format(("calibration.json",), 8),
     "orbslam3": Format(("orbslam3.yaml",), 5, pair_only=True),
     "vslamlab": Format(("calibration.yaml",), 5),
-}
-"""Calibration formats by their names in ``export``."""
+}  # calibration formats by their names in ``export``
 
 
 def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
@@ -245,20 +235,17 @@ def pair(rig: Rig) -> tuple[CameraAnnouncement, ...]:
 
 def export_calibration(
     run: Path,
-    form: str,
-    out: Path | None = None,
+    form: str,  # one of `nodes.calibration.formats.FORMATS`
+    out: Path | None = None,  # folder for the files; ``export/<form>`` in the run's folder if None
     epoch: int | str = EPOCH,
-    camera: str | None = None,
+    camera: str | None = None,  # source of a camera or of its body; the first camera's body if None
 ) -> list[Path]:
     """Export a run's announced cameras and IMU as another program's calibration.
 
     ``vslamlab`` also gets images, IMU and ground truth, if the run has a recording.
 
     Args:
-        form: One of `nodes.calibration.formats.FORMATS`.
-        out: Folder for the files; ``export/<form>`` in the run's folder if None.
         epoch: The run's time 0 in the data: a date (ISO 8601), or nanoseconds of Unix time.
-        camera: Source of a camera or of its body; the first camera's body if None.
 
     Raises:
         ValueError: The run has no announcements or no such camera, or the format cannot express it.

@@ -19,8 +19,7 @@ from nodes.calibration.readers import read
 from nodes.calibration.room import NEAREST, Floats, Motion, _Collector, hits, spheres
 from nodes.data.dataset.recording import Rig
 
-INTEGRATED = 5.0
-"""Seconds of IMU integration."""
+INTEGRATED = 5.0  # seconds of IMU integration
 
 _POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.005, 0.1, 0.3, 0.005, 1e-5
 """Metres; pixels, global and rolling shutter; metres; pixels."""
@@ -34,19 +33,14 @@ _LATE, _PLACE, _TURN = 2e-4, 5e-4, 5e-4
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """Measured number of a proof, with its limit.
-
-    Attributes:
-        limit: Greatest allowed; None if nothing is.
-        remark: Fault, or why nothing can be shown, in a sentence.
-    """
+    """Measured number of a proof, with its limit."""
 
     subject: str
     name: str
     value: float
-    limit: float | None = None
+    limit: float | None = None  # greatest allowed; None if nothing is
     unit: str = ""
-    remark: str = ""
+    remark: str = ""  # fault, or why nothing can be shown, in a sentence
 
     @property
     def passed(self) -> bool:
@@ -60,17 +54,11 @@ def judged(subject: str, name: str, value: float, limit: float, unit: str, wrong
 
 
 class Points(msgspec.Struct, frozen=True, eq=False):
-    """Discs of a camera's images: where they are, where they should be, and how they move.
+    """Discs of a camera's images: where they are, where they should be, and how they move."""
 
-    Attributes:
-        pixels: Expected centroids, columns and rows, shape (n, 2).
-        off: Measured less expected, shape (n, 2).
-        flow: Pixels per second, shape (n, 2).
-    """
-
-    pixels: Floats
-    off: Floats
-    flow: Floats
+    pixels: Floats  # expected centroids, columns and rows, shape (n, 2)
+    off: Floats  # measured less expected, shape (n, 2)
+    flow: Floats  # pixels per second, shape (n, 2)
 
 
 def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, begin: int) -> Figure:

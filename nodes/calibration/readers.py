@@ -24,20 +24,13 @@ Floats = npt.NDArray[np.float64]
 
 
 class ReadCamera(msgspec.Struct, frozen=True, eq=False):
-    """Camera of a calibration file.
+    """Camera of a calibration file."""
 
-    Attributes:
-        in_imu: Pose of its optical frame in the IMU's frame, shape (4, 4).
-        matrix: K, shape (3, 3).
-        lens: Coefficients in OpenCV's order.
-        fisheye: Whether they are those of OpenCV's fisheye model.
-        time_offset: Seconds from an image's stamp to the IMU's clock, if the file says.
-    """
-
-    in_imu: Floats
-    matrix: Floats
-    lens: Floats
-    fisheye: bool
+    in_imu: Floats  # pose of its optical frame in the IMU's frame, shape (4, 4)
+    matrix: Floats  # K, shape (3, 3)
+    lens: Floats  # coefficients in OpenCV's order
+    fisheye: bool  # whether they are those of OpenCV's fisheye model
+    # Seconds from an image's stamp to the IMU's clock, if the file says.
     time_offset: float | None = None
 
     def project(self, points: Floats) -> Floats:

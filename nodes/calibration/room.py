@@ -33,15 +33,12 @@ from runtime import Node, on
 Floats = npt.NDArray[np.float64]
 
 
-CENTRE = np.array([0.0, 0.0, -1.5])
-"""About where the vehicle flies, metres in ``map``."""
+CENTRE = np.array([0.0, 0.0, -1.5])  # about where the vehicle flies, metres in ``map``
 
 LOW, HIGH = np.array([-6.0, -6.0, -5.0]), np.array([6.0, 6.0, 0.0])
 """Corners of the room, metres in ``map``: the floor is at 0, the ceiling at -5."""
 
-NEAREST = 0.45
-"""Depth, metres; only the vehicle itself is nearer to a camera."""
-
+NEAREST = 0.45  # depth, metres; only the vehicle itself is nearer to a camera
 _COUNT = 130
 
 
@@ -121,8 +118,7 @@ def _text(vector: Floats, sign: int = 1) -> str:
     return f"{x:.9f} {sign * y:.9f} {sign * z:.9f}"
 
 
-_SAMPLES = 1500
-"""Pixels kept of each depth image."""
+_SAMPLES = 1500  # pixels kept of each depth image
 
 
 class _Collector(Node):

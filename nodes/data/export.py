@@ -32,9 +32,7 @@ from runtime.run.results import run_folder
 FORMATS = ("tum", "euroc", "kitti")
 
 TRUTH = "truth"
-PLAN = "plan"
-"""With `TRUTH`, the names of files without an estimate."""
-
+PLAN = "plan"  # with `TRUTH`, the names of files without an estimate
 _COMMENT = {
     ("tum", TRUTH): "ground truth: base_link (FRD) in map (NED: x north, y east, z down)",
     ("tum", ""): "estimate, as it was sent: base_link (FRD) in the estimator's frame",

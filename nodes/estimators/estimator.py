@@ -70,9 +70,7 @@ class EstimatorConfig(NodeConfig):
     not_finite: Literal["error", "lost"] = "error"
 
 
-_KINDS = ("rgb", "grey", "depth", "segmentation", "lidar")
-"""Kinds of data an estimator may need."""
-
+_KINDS = ("rgb", "grey", "depth", "segmentation", "lidar")  # kinds of data an estimator may need
 F = TypeVar("F", bound=tuple[Any, ...])
 C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
 

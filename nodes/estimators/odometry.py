@@ -67,8 +67,7 @@ def _check_size(
 
 FLOW_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 """When the iterations of optical flow end: after 20, or at a step of 0.01 pixels."""
-_ROUND_TRIP = 0.5
-"""Largest error of a corner followed there and back, pixels."""
+_ROUND_TRIP = 0.5  # largest error of a corner followed there and back, pixels
 
 
 def follow_both_ways(
@@ -102,28 +101,19 @@ def follow_both_ways(
     return found, good & inside(found, image.shape, 3)
 
 
-_HUBER = 2.0
-"""Huber threshold of a residual, standard deviations."""
+_HUBER = 2.0  # Huber threshold of a residual, standard deviations
 _STEPS = 8
 _SMALL = 1e-7
-_DAMPING = 1e-9
-"""Damping of each motion, relative to its own information."""
+_DAMPING = 1e-9  # damping of each motion, relative to its own information
 
 
 class Observations(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks observed in a single image.
+    """Landmarks observed in a single image."""
 
-    Attributes:
-        landmarks: Metres in the world, shape (n, 3).
-        pixels: Column and row, shape (n, 2).
-        inverse: Measured inverse depth, 1/m, shape (n,).
-        measured: Mask of measured inverse depths, shape (n,).
-    """
-
-    landmarks: Floats
-    pixels: Floats
-    inverse: Floats
-    measured: npt.NDArray[np.bool_]
+    landmarks: Floats  # metres in the world, shape (n, 3)
+    pixels: Floats  # column and row, shape (n, 2)
+    inverse: Floats  # measured inverse depth, 1/m, shape (n,)
+    measured: npt.NDArray[np.bool_]  # mask of measured inverse depths, shape (n,)
 
     @classmethod
     def without_depth(cls, landmarks: Floats, pixels: Floats) -> Observations:
@@ -133,33 +123,23 @@ class Observations(msgspec.Struct, frozen=True, eq=False):
 
 
 class Solution(msgspec.Struct, frozen=True, eq=False):
-    """Pose, and the errors of the landmarks.
+    """Pose, and the errors of the landmarks."""
 
-    Attributes:
-        pose: World to camera, shape (4, 4).
-        errors: Reprojection errors in standard deviations, shape (n,).
-    """
-
-    pose: Floats
-    errors: Floats
+    pose: Floats  # world to camera, shape (4, 4)
+    errors: Floats  # reprojection errors in standard deviations, shape (n,)
 
 
 def solve_pose(
-    seen: Observations,
-    start: Floats,
-    matrix: Floats,
-    pixel_noise: float,
-    depth_noise: float,
+    seen: Observations,  # at least four landmarks, or fewer with `information`
+    start: Floats,  # initial pose, world to camera, shape (4, 4)
+    matrix: Floats,  # K, shape (3, 3)
+    pixel_noise: float,  # standard deviation of a coordinate, pixels
+    depth_noise: float,  # standard deviation of inverse depth, 1/m
     information: Floats | None = None,
 ) -> Solution:
     """Return the pose with the least sum of robust squared residuals.
 
     Args:
-        seen: At least four landmarks, or fewer with `information`.
-        start: Initial pose, world to camera, shape (4, 4).
-        matrix: K, shape (3, 3).
-        pixel_noise: Standard deviation of a coordinate, pixels.
-        depth_noise: Standard deviation of inverse depth, 1/m.
         information: Inverse covariance of the initial pose, if known: of a small motion of the
             camera's frame, translation, then rotation, shape (6, 6).
     """
@@ -248,24 +228,16 @@ def from_rotation_vector(rotation: npt.NDArray[Any], translation: npt.NDArray[An
 
 Descriptors = npt.NDArray[np.uint8]
 
-_MAX_ERROR = 3.0
-"""Largest error of a point in the found pose, pixels."""
-_MIN_INLIERS = 15
-"""Least number of agreeing points; a pose from fewer may be chance."""
-_RADIUS = 15
-"""Radius of the patch for a corner's orientation, pixels, as in ORB."""
+_MAX_ERROR = 3.0  # largest error of a point in the found pose, pixels
+_MIN_INLIERS = 15  # least number of agreeing points; a pose from fewer may be chance
+_RADIUS = 15  # radius of the patch for a corner's orientation, pixels, as in ORB
 
 
 class DescribedPoints(msgspec.Struct, frozen=True, eq=False):
-    """World points with their descriptors.
+    """World points with their descriptors."""
 
-    Attributes:
-        points: Metres (or the map's unit) in the world, shape (n, 3).
-        descriptors: uint8, shape (n, 32).
-    """
-
-    points: Floats
-    descriptors: Descriptors
+    points: Floats  # metres (or the map's unit) in the world, shape (n, 3)
+    descriptors: Descriptors  # uint8, shape (n, 32)
 
 
 def detect_and_describe(image: Grey, count: int) -> tuple[Floats, Descriptors]:
@@ -295,20 +267,13 @@ def describe(image: Grey, pixels: Floats, points: Floats) -> DescribedPoints:
 
 
 def relocalize(
-    pixels: Floats,
-    descriptors: Descriptors,
+    pixels: Floats,  # points of the image, as of `detect_and_describe`, shape (n, 2)
+    descriptors: Descriptors,  # theirs, shape (n, 32)
     known: DescribedPoints,
-    matrix: Floats,
-    method: int = cv2.SOLVEPNP_ITERATIVE,
+    matrix: Floats,  # K, shape (3, 3)
+    method: int = cv2.SOLVEPNP_ITERATIVE,  # OpenCV's solver of a pose from points
 ) -> Floats | None:
-    """Return an image's pose by known points, world to camera; `None` if not found.
-
-    Args:
-        pixels: Points of the image, as of `detect_and_describe`, shape (n, 2).
-        descriptors: Theirs, shape (n, 32).
-        matrix: K, shape (3, 3).
-        method: OpenCV's solver of a pose from points.
-    """
+    """Return an image's pose by known points, world to camera; `None` if not found."""
     if min(len(pixels), len(known.points)) < _MIN_INLIERS:
         return None
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)

@@ -26,29 +26,19 @@ from events.geometry import pose_matrix, pose_tuples
 Floats = npt.NDArray[np.float64]
 F = TypeVar("F", bound=tuple[Any, ...])
 
-WIDEST = math.radians(110.0)
-"""Greatest field of view of a new image, along its longer side."""
-
-ALIGNED = 0.1
-"""Largest violation of the rule above by a point's images in a rectified pair, pixels."""
-
+WIDEST = math.radians(110.0)  # greatest field of view of a new image, along its longer side
+ALIGNED = 0.1  # largest violation of the rule above by a point's images in a rectified pair, pixels
 _NO_MAP: Any = None  # both coordinates stand in one
 
-_NARROWEST = 2.0
-"""Largest ratio of the new focal length to the old."""
+_NARROWEST = 2.0  # largest ratio of the new focal length to the old
 
 
 class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
-    """A camera and its pinhole replacement.
-
-    Attributes:
-        pinhole: Intrinsics of the rectified images.
-        turn: Rotation from the rectified to the announced optical frame, shape (3, 3).
-    """
+    """A camera and its pinhole replacement."""
 
     lens: CameraInfo
-    pinhole: CameraInfo
-    turn: Floats
+    pinhole: CameraInfo  # intrinsics of the rectified images
+    turn: Floats  # rotation from the rectified to the announced optical frame, shape (3, 3)
 
     def original(self, pixels: npt.ArrayLike) -> Floats:
         """Return the announced camera's pixels, NaN outside, of rectified pixels, shape (n, 2)."""
@@ -100,9 +90,6 @@ class Rectification:
     Args:
         cameras: One, or the left and the right one.
 
-    Attributes:
-        cameras: The same with the pinhole cameras' intrinsics and orientations.
-
     Raises:
         ValueError: No pinhole image shows enough, or both eyes are not side by side; says why.
     """
@@ -129,7 +116,7 @@ class Rectification:
         orientation = pose_tuples(frame)[1]
         self.cameras = tuple(
             msgspec.structs.replace(each, info=info, orientation=orientation) for each in cameras
-        )
+        )  # the same with the pinhole cameras' intrinsics and orientations
 
     def frame(self, frame: F) -> F:
         """Return the fields of a frame with rectified images; those of a right eye are `right`."""

@@ -38,8 +38,7 @@ class TrackingResult(msgspec.Struct, frozen=True, eq=False):
     map: int = 0
 
 
-_NOT_RIGID = 1e-2
-"""By how much a rotation's columns may miss length 1 and right angles."""
+_NOT_RIGID = 1e-2  # by how much a rotation's columns may miss length 1 and right angles
 
 
 def check_result(result: Any) -> str:

@@ -32,30 +32,25 @@ class SensorChoice:
     """Choice of a camera or stereo rig with an IMU, or of a lidar, from announcements.
 
     Args:
-        needs: Kinds of image that each camera must give.
-        eyes: Number of cameras, 1 or 2.
         named: Ports to the sources named in the file: ``frames`` or ``frames.left`` (the first
             camera), ``frames.right``, ``frames.imu``; beside a lidar ``imu``.
         refusals: Reasons, by source, why images of one or both eyes are unusable; called with
             False, as they are, and with True, as they can be rectified.
-
-    Attributes:
-        cameras: The chosen ones, the left one first, usable images before those to be rectified;
-            empty while there are none.
-        rectified: Whether their images have to be.
-        imu: On the vehicle of the lidar or first camera; `None` while there is none.
     """
 
     def __init__(
         self,
-        needs: Collection[str],
-        eyes: int,
+        needs: Collection[str],  # kinds of image that each camera must give
+        eyes: int,  # number of cameras, 1 or 2
         inertial: bool,
         named: Mapping[str, str],
         refusals: Callable[[Sequence[CameraAnnouncement], bool], Mapping[str, str]],
     ) -> None:
+        # The chosen ones, the left one first, usable images before those to be rectified; empty
+        # while there are none.
         self.cameras: tuple[CameraAnnouncement, ...] = ()
-        self.rectified = False
+        self.rectified = False  # whether their images have to be
+        # On the vehicle of the lidar or first camera; `None` while there is none.
         self.imu: ImuAnnouncement | None = None
         self.lidar: LidarAnnouncement | None = None
         self.named = named
@@ -216,33 +211,25 @@ Floats = npt.NDArray[np.float64]
 
 
 class Mount(msgspec.Struct, frozen=True, eq=False):
-    """Pose of a camera on a body, and pose of the body at the first image.
+    """Pose of a camera on a body, and pose of the body at the first image."""
 
-    Attributes:
-        frame_id: Parent frame of the estimates: ``map``, or ``odom``, ``odom_1``, …
-        child_frame_id: Frame of the body.
-        start: The body at the first image in the parent frame, shape (4, 4).
-        camera: The optical frame in the body's frame, shape (4, 4).
-    """
-
-    frame_id: str
-    child_frame_id: str
-    start: Floats
-    camera: Floats
+    frame_id: str  # parent frame of the estimates: ``map``, or ``odom``, ``odom_1``, …
+    child_frame_id: str  # frame of the body
+    start: Floats  # the body at the first image in the parent frame, shape (4, 4)
+    camera: Floats  # the optical frame in the body's frame, shape (4, 4)
 
     @classmethod
     def of(
         cls,
         camera: CameraAnnouncement | SensorAnnouncement,
         vehicle: VehicleAnnouncement | None,
-        frame_id: str = "odom",
+        frame_id: str = "odom",  # parent frame of the estimates if the pose is unknown
     ) -> Mount:
         """Make the mount of an announced camera, or of another sensor in its place.
 
         Args:
             vehicle: The vehicle, if the body had the announced pose at the first image; else
                 `None`.
-            frame_id: Parent frame of the estimates if the pose is unknown.
         """
         return cls(
             frame_id=frame_id if vehicle is None else "map",

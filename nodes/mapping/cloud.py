@@ -31,17 +31,12 @@ _LONGEST_HEADER = 1 << 16
 
 
 class Cloud(msgspec.Struct, frozen=True, eq=False):
-    """Coloured points.
+    """Coloured points."""
 
-    Attributes:
-        points: Metres in ``map`` (NED), float32, shape (n, 3).
-        colors: Red, green, blue, uint8, shape (n, 3); `None` if the file has none.
-        total: Points in the file.
-    """
-
-    points: npt.NDArray[np.float32]
+    points: npt.NDArray[np.float32]  # metres in ``map`` (NED), float32, shape (n, 3)
+    # Red, green, blue, uint8, shape (n, 3); `None` if the file has none.
     colors: npt.NDArray[np.uint8] | None
-    total: int
+    total: int  # points in the file
 
 
 def write_ply(
@@ -138,8 +133,7 @@ Floats = npt.NDArray[np.float64]
 Points = npt.NDArray[np.float32]
 Colours = npt.NDArray[np.uint8]
 
-_BITS = 21
-"""Bits of a voxel's index along an axis; three indices make a key of 63 bits."""
+_BITS = 21  # bits of a voxel's index along an axis; three indices make a key of 63 bits
 
 
 def rays_of(info: CameraInfo, stride: int) -> Points:
@@ -182,9 +176,6 @@ class VoxelCloud:
     Args:
         voxel: Edge of a voxel, metres.
 
-    Attributes:
-        keys: Numbers of the voxels with a point, int64, rising, shape (n,).
-
     Raises:
         ValueError: The edge is not above zero.
     """
@@ -193,6 +184,7 @@ class VoxelCloud:
         if not voxel > 0.0:
             raise ValueError(f"voxel: expected an edge above 0 m, found {voxel}")
         self.voxel = voxel
+        # Numbers of the voxels with a point, int64, rising, shape (n,).
         self.keys = np.empty(0, np.int64)
         self._slots = np.empty(0, np.int64)
         self._points = np.empty((0, 3), np.float32)
@@ -294,16 +286,11 @@ class Mapper:
     def add(
         self,
         info: CameraInfo,
-        depth: npt.NDArray[np.float32],
-        image: npt.NDArray[np.uint8],
-        pose: npt.NDArray[np.float64],
+        depth: npt.NDArray[np.float32],  # metres along the optical z axis, shape (h, w)
+        image: npt.NDArray[np.uint8],  # its colours, shape (h, w, 3), or greys, shape (h, w)
+        pose: npt.NDArray[np.float64],  # the optical frame in the cloud's, shape (4, 4)
     ) -> int:
         """Add the points of an exposure to the cloud; return its number of points.
-
-        Args:
-            depth: Metres along the optical z axis, shape (h, w).
-            image: Its colours, shape (h, w, 3), or greys, shape (h, w).
-            pose: The optical frame in the cloud's, shape (4, 4).
 
         Raises:
             ValueError: The shapes do not fit, or the pose is not finite.

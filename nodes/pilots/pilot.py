@@ -104,8 +104,7 @@ C = TypeVar("C", bound=PilotConfig, default=PilotConfig)
 E = TypeVar("E")
 
 
-_REMINDER = 5.0
-"""Seconds without a first pose after which that is said."""
+_REMINDER = 5.0  # seconds without a first pose after which that is said
 
 
 class Pilot(Node[C], ABC):

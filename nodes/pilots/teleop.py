@@ -39,8 +39,7 @@ _MOTIONS: dict[str, tuple[int, int, int, int]] = {
     "down": (0, 0, 1, 0),
     "turn_left": (0, 0, 0, -1),
     "turn_right": (0, 0, 0, 1),
-}
-"""Signs of x, y, z and yaw rate in the ``heading`` frame: x ahead, y to the right, z down."""
+}  # signs of x, y, z and yaw rate in the ``heading`` frame: x ahead, y to the right, z down
 
 _COMMANDS: dict[str, type[Command]] = {
     "takeoff": Takeoff, "land": Land, "hover": Hover, "arm": Arm, "disarm": Disarm

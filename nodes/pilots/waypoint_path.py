@@ -16,11 +16,8 @@ from runtime import Duration
 
 Floats = npt.NDArray[np.float64]
 
-_SPACING = 0.02
-"""Spacing of the points of a computed path, metres."""
-
-_REST = 1.0
-"""Seconds at rest at both ends, lest smoothing cut the path short or start with a jerk."""
+_SPACING = 0.02  # spacing of the points of a computed path, metres
+_REST = 1.0  # seconds at rest at both ends, lest smoothing cut the path short or start with a jerk
 
 
 _COLUMNS = ("position", "velocity", "acceleration", "yaw", "yaw_rate")
@@ -28,23 +25,14 @@ _COLUMNS = ("position", "velocity", "acceleration", "yaw", "yaw_rate")
 
 
 class WaypointPath(msgspec.Struct, frozen=True, eq=False):
-    """A path with a position and a heading for each moment, at regular steps.
+    """A path with a position and a heading for each moment, at regular steps."""
 
-    Attributes:
-        step: Seconds between two rows.
-        position: Metres, shape (n, 3).
-        velocity: Metres per second, shape (n, 3).
-        acceleration: Metres per second squared, shape (n, 3).
-        yaw: Radians, continuous (not wrapped), shape (n,).
-        yaw_rate: Radians per second, shape (n,).
-    """
-
-    step: float
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    yaw: Floats
-    yaw_rate: Floats
+    step: float  # seconds between two rows
+    position: Floats  # metres, shape (n, 3)
+    velocity: Floats  # metres per second, shape (n, 3)
+    acceleration: Floats  # metres per second squared, shape (n, 3)
+    yaw: Floats  # radians, continuous (not wrapped), shape (n,)
+    yaw_rate: Floats  # radians per second, shape (n,)
 
     def row(self, index: int) -> dict[str, Any]:
         """Return position, velocity, … of a row: tuples and numbers, by name."""
@@ -63,26 +51,16 @@ class WaypointPath(msgspec.Struct, frozen=True, eq=False):
 
 
 def plan(
-    waypoints: Floats,
+    waypoints: Floats,  # metres in ``map``, shape (n, 3), n ≥ 2, no two neighbours alike
     *,
-    speed: float,
-    acceleration: float,
-    radius: float,
-    yaw: float,
-    turn_time: float,
-    step: float,
+    speed: float,  # highest, metres per second
+    acceleration: float,  # metres per second squared, along the path and across it
+    radius: float,  # metres from a corner at which its rounding begins, at most
+    yaw: float,  # heading at the start, radians
+    turn_time: float,  # seconds over which the direction of flight is smoothed to the heading
+    step: float,  # seconds between rows
 ) -> WaypointPath:
-    """Return a path along straight lines between waypoints, at rest at both ends.
-
-    Args:
-        waypoints: Metres in ``map``, shape (n, 3), n ≥ 2, no two neighbours alike.
-        speed: Highest, metres per second.
-        acceleration: Metres per second squared, along the path and across it.
-        radius: Metres from a corner at which its rounding begins, at most.
-        yaw: Heading at the start, radians.
-        turn_time: Seconds over which the direction of flight is smoothed to the heading.
-        step: Seconds between rows.
-    """
+    """Return a path along straight lines between waypoints, at rest at both ends."""
     points, along = _resample(_round_corners(waypoints, radius), _SPACING)
     pace = _speeds(points, along, speed, acceleration)
     # Time at each point: each stretch at the mean of its ends' speeds.
@@ -176,8 +154,7 @@ Heading = Literal["path", "fixed", "sweep"]
 _SWEEP_ANGLE, _SWEEP_PERIOD = np.radians(40.0), 6.0
 """Radians to each side, and seconds, of a sweeping heading."""
 
-_MOST = 4.0
-"""Highest acceleration for a multirotor to follow an excitation closely, m/s²."""
+_MOST = 4.0  # highest acceleration for a multirotor to follow an excitation closely, m/s²
 
 
 class Excitation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

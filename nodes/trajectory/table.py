@@ -18,17 +18,12 @@ from typing import Any, NoReturn
 from runtime import Node
 from runtime.time.schedule import SECOND
 
-_TOO_LATE = 1 << 63
-"""First number of nanoseconds beyond 64 bits."""
-
+_TOO_LATE = 1 << 63  # first number of nanoseconds beyond 64 bits
 EPOCH = "2020-01-01T00:00:00Z"
 """Default start of a run in files of other tools, which expect Unix time with 19 digits."""
 
-_LATEST = 7 << 60
-"""Latest epoch (ns), with room for a run of decades."""
-
-_SHOWN = 60
-"""Characters of a wrong line shown in a message."""
+_LATEST = 7 << 60  # latest epoch (ns), with room for a run of decades
+_SHOWN = 60  # characters of a wrong line shown in a message
 
 
 def epoch_of(given: int | str) -> int:
@@ -102,20 +97,14 @@ class Row:
 
 def read_rows(
     path: Path,
-    separator: str | None,
-    columns: Collection[int],
+    separator: str | None,  # between fields; None for blanks
+    columns: Collection[int],  # allowed numbers of fields
     meaning: str,
     *,
-    whole: bool = True,
-    header: bool = False,
+    whole: bool = True,  # whether a last line without its end counts
+    header: bool = False,  # whether to skip a first line that begins with a letter
 ) -> Iterator[Row]:
     """Yield the rows of a file.
-
-    Args:
-        separator: Between fields; None for blanks.
-        columns: Allowed numbers of fields.
-        whole: Whether a last line without its end counts.
-        header: Whether to skip a first line that begins with a letter.
 
     Raises:
         ValueError: The file cannot be read, has no rows, or a row of another length.
@@ -149,8 +138,7 @@ def seconds_text(stamp: int) -> str:
     return f"{'-' if stamp < 0 else ''}{whole}.{rest:09d}"
 
 
-_INTERVAL = 500_000_000
-"""Nanoseconds of the run's clock between two writes."""
+_INTERVAL = 500_000_000  # nanoseconds of the run's clock between two writes
 
 
 def part_name(node: Node[Any], name: str) -> str:
@@ -169,8 +157,7 @@ class GrowingFile:
     def __init__(self, node: Node[Any], path: Path, head: str = "") -> None:
         self._node = node
         self._file = path.open("ab" if node.restarts else "wb", buffering=0)
-        self.begin = self._file.tell()
-        """Bytes there before."""
+        self.begin = self._file.tell()  # bytes there before
         self._lines = deque([] if self.begin else [head])
         self._due = 0
         self._writing = False

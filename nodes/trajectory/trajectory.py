@@ -19,33 +19,26 @@ from events.geometry import Pose
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
-UNIT_LENGTH = 0.01
-"""Tolerated deviation of a quaternion's length from 1, for files of few decimals."""
+UNIT_LENGTH = 0.01  # tolerated deviation of a quaternion's length from 1, for files of few decimals
 
 
 _CALENDAR = 10**17
 """Least stamp (ns) taken for Unix time (1973); stamps below count from some beginning."""
 
 _ROW = np.dtype([("stamp", "i8"), ("position", "f8", 3), ("orientation", "f8", 4)])
-_BLOCK = 1024
-"""Rows of a pose, and how many are written at once: 64 KiB take the loop 30 µs."""
+_BLOCK = 1024  # rows of a pose, and how many are written at once: 64 KiB take the loop 30 µs
 
 
 class Trajectory(msgspec.Struct, frozen=True, eq=False):
     """Poses of a body in a frame, in order of time. The arrays are read-only copies.
 
-    Attributes:
-        stamps: Nanoseconds, int64, shape (n,), n ≥ 1, strictly rising.
-        positions: Metres in the parent frame, float64, shape (n, 3).
-        orientations: Unit quaternions w, x, y, z, child to parent, float64, shape (n, 4).
-
     Raises:
         ValueError: The arrays differ; the message names the first row.
     """
 
-    stamps: Stamps
-    positions: Floats
-    orientations: Floats
+    stamps: Stamps  # nanoseconds, int64, shape (n,), n ≥ 1, strictly rising
+    positions: Floats  # metres in the parent frame, float64, shape (n, 3)
+    orientations: Floats  # unit quaternions w, x, y, z, child to parent, float64, shape (n, 4)
 
     def __post_init__(self) -> None:
         stamps = np.array(self.stamps)
@@ -334,8 +327,7 @@ def _floats(name: str, array: Any, shape: tuple[int, int]) -> Floats:
     return copy
 
 
-HISTORY = 10_000_000_000
-"""Nanoseconds of recent poses to keep, back from the newest."""
+HISTORY = 10_000_000_000  # nanoseconds of recent poses to keep, back from the newest
 
 
 class RecentPoses:

@@ -13,9 +13,7 @@ from events.geometry import pose_matrix, pose_tuples
 from nodes.trajectory import RecentPoses
 from runtime.time.schedule import SECOND
 
-Colour = tuple[int, int, int]
-"""Red, green, blue, 0 to 255."""
-
+Colour = tuple[int, int, int]  # red, green, blue, 0 to 255
 TRUTH: Colour = (80, 220, 120)
 _TRUTHS: list[Colour] = [TRUTH, (60, 200, 190), (170, 215, 70), (40, 160, 110)]
 PLAN: Colour = (140, 140, 150)
@@ -48,8 +46,7 @@ VEHICLE = [
         for x in (-0.14, 0.14)
         for y in (-0.14, 0.14)
     ),
-]
-"""A body with a nose and four rotors."""
+]  # a body with a nose and four rotors
 
 
 _SIZES: dict[str, Vector3] = {"person": (0.5, 0.5, 1.8), "car": (4.2, 1.8, 1.5)}
@@ -76,14 +73,9 @@ def describe(event: Event) -> str:
     return type(event).__name__ + (f" ({more})" if more else "")
 
 
-SPAN = 250_000_000
-"""Duration of a piece, nanoseconds."""
-
-GAP = 500_000_000
-"""Time without a pose to break a path, nanoseconds."""
-
-GRAIN = 0.01
-"""Metres: poses nearer than this to the last are left out."""
+SPAN = 250_000_000  # duration of a piece, nanoseconds
+GAP = 500_000_000  # time without a pose to break a path, nanoseconds
+GRAIN = 0.01  # metres: poses nearer than this to the last are left out
 
 
 class PathPieces:
@@ -134,8 +126,7 @@ def estimate_frame(
     return pose_tuples(pose_matrix(*found) @ np.linalg.inv(estimated))
 
 
-_KEPT = 4000
-"""Pieces of a path; older ones are forgotten. A piece covers a quarter of a second."""
+_KEPT = 4000  # pieces of a path; older ones are forgotten. A piece covers a quarter of a second.
 
 
 class Trail:
@@ -166,8 +157,7 @@ class Trail:
         return [(f"{self.name}/{first + i}", piece) for i, piece in enumerate(pieces)]
 
 
-REMEMBERED = 64
-"""Images of a camera whose features may still come."""
+REMEMBERED = 64  # images of a camera whose features may still come
 
 
 class ImageSelection:

@@ -34,15 +34,10 @@ WORLD_AXES = "world: x north, y west, z up; origin on the ground"
 
 
 class Rig(msgspec.Struct, frozen=True):
-    """Sensors of a body.
+    """Sensors of a body."""
 
-    Attributes:
-        body: Source of its odometry.
-        cameras: One or more, in the order of their announcements.
-    """
-
-    body: str
-    cameras: tuple[CameraAnnouncement, ...]
+    body: str  # source of its odometry
+    cameras: tuple[CameraAnnouncement, ...]  # one or more, in the order of their announcements
     imu: ImuAnnouncement | None
 
 
@@ -129,10 +124,8 @@ class RowFile:
 
     def __init__(self, path: Path, header: str) -> None:
         self.path = path
-        self.count = 0
-        """Rows so far."""
-        self.left_out = 0
-        """Rows left out because their stamp did not rise, as readers expect."""
+        self.count = 0  # rows so far
+        self.left_out = 0  # rows left out because their stamp did not rise, as readers expect
         self._last: int | None = None
         self._file = path.open("w", encoding="utf-8", newline="\n")
         self._file.write(header)

@@ -22,17 +22,13 @@ from runtime.errors import VisnavError
 
 MAGIC = b"\x89MCAP0\r\n"
 
-HEAD = struct.Struct("<BQ")
-"""Head of each record: opcode, length of the content."""
-
+HEAD = struct.Struct("<BQ")  # head of each record: opcode, length of the content
 _FOOTER = struct.Struct("<BQQQI")
 """With its head: where the summary begins, where its offsets do, checksum of the summary."""
 
 _IS_FOOTER, _IS_CHUNK, _IS_DATA_END, _LAST, _PRIVATE = 0x02, 0x06, 0x0F, 0x0F, 0x80
 
-LARGEST = 1 << 29
-"""Largest permitted size of an unpacked chunk, bytes: far above any writer's."""
-
+LARGEST = 1 << 29  # largest permitted size of an unpacked chunk, bytes: far above any writer's
 _CHUNK = struct.Struct("<QQQII")
 """First and last time, size when unpacked, checksum, length of the compression's name."""
 
@@ -167,8 +163,7 @@ class WholeWrites(io.BufferedIOBase):
         self._raw = raw
         self._piece: list[bytes | bytearray] = []
         self._at = 0
-        self.size = 0
-        """Bytes of whole pieces so far."""
+        self.size = 0  # bytes of whole pieces so far
 
     def write(self, data: Any) -> int:
         """Add to the piece; nothing is copied, so the bytes must not change."""

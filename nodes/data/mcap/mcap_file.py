@@ -22,45 +22,30 @@ from nodes.data.mcap.layout import WholeWrites, open_anew, unwritable
 
 Compression = Literal["zstd", "lz4", "none"]
 
-LIBRARY = "visnav-runtime"
-"""Writer library in a file's header."""
+LIBRARY = "visnav-runtime"  # writer library in a file's header
 
 
 class Record(NamedTuple):
-    """A message of a recording.
-
-    Attributes:
-        time: Of publication, nanoseconds.
-        sequence: Number in its channel, from 0; a gap means a loss.
-    """
+    """A message of a recording."""
 
     topic: str
     type: str
     metadata: Mapping[str, str]
-    time: int
-    sequence: int
+    time: int  # of publication, nanoseconds
+    sequence: int  # number in its channel, from 0; a gap means a loss
     data: bytes
 
 
 class Contents(msgspec.Struct, frozen=True):
-    """Writer, state and metadata of a file.
+    """Writer, state and metadata of a file."""
 
-    Attributes:
-        ours: Whether `McapWriter` wrote it.
-        complete: Whether it was closed, and has an index.
-    """
-
-    ours: bool
-    complete: bool
+    ours: bool  # whether `McapWriter` wrote it
+    complete: bool  # whether it was closed, and has an index
     metadata: dict[str, dict[str, str]]
 
 
 class McapWriter:
     """Writes an MCAP file with ROS 2's profile.
-
-    Args:
-        chunk_size: Bytes after which a chunk is full.
-        fsync: Wait for the disk at the end of each chunk.
 
     Raises:
         RecordingError: It cannot be made.
@@ -72,8 +57,8 @@ class McapWriter:
         path: Path,
         *,
         compression: Compression = "zstd",
-        chunk_size: int = 4 << 20,
-        fsync: bool = False,
+        chunk_size: int = 4 << 20,  # bytes after which a chunk is full
+        fsync: bool = False,  # wait for the disk at the end of each chunk
         open_file: Callable[[Path], IO[bytes]] | None = None,
     ) -> None:
         records.check()
@@ -107,16 +92,11 @@ class McapWriter:
     def channel(
         self,
         topic: str,
-        type_: str,
-        definition: Callable[[str], str],
+        type_: str,  # ``sensor_msgs/msg/Image``
+        definition: Callable[[str], str],  # returns the text of the type and of those it is made of
         metadata: Mapping[str, str] | None = None,
     ) -> int:
-        """Add a topic of CDR messages; return its number.
-
-        Args:
-            type_: ``sensor_msgs/msg/Image``.
-            definition: Returns the text of the type and of those it is made of.
-        """
+        """Add a topic of CDR messages; return its number."""
         if type_ not in self._schemas:
             text = definition(type_).encode()
             self._schemas[type_] = self._writer.register_schema(type_, "ros2msg", text)

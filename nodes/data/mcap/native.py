@@ -126,8 +126,7 @@ HOLDERS = {
     "sensor_msgs/msg/Image",
     "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/PointCloud2",
-}
-"""Message types with room for an event's arrays."""
+}  # message types with room for an event's arrays
 
 
 def arrays(
@@ -196,8 +195,7 @@ __all__ = [
 _DAMAGED = (struct.error, EOFError, ValueError, OSError, OverflowError, MemoryError, LookupError)
 """Exceptions of mcap on damaged records, besides its own errors."""
 
-_TIMES = struct.Struct("<QQ")
-"""At the beginning of a chunk: of its first message, and of its last."""
+_TIMES = struct.Struct("<QQ")  # at the beginning of a chunk: of its first message, and of its last
 
 
 def writer(
@@ -279,18 +277,12 @@ def metadata_of(file: IO[bytes], summary: Summary) -> dict[str, dict[str, str]]:
 
 def records(
     path: Path,
-    start: int,
-    end: int | None,
-    damaged: Callable[[str], None],
-    everything: bool = False,
+    start: int,  # earlier messages (ns) may be left out
+    end: int | None,  # so may those from this time on
+    damaged: Callable[[str], None],  # called for parts that cannot be read, which are passed over
+    everything: bool = False,  # yield metadata and attachments, too
 ) -> Iterator[Any]:
     """Yield schemas, channels and messages; of a file with an index, by its chunks in the range.
-
-    Args:
-        start: Earlier messages (ns) may be left out.
-        end: So may those from this time on.
-        damaged: Called for parts that cannot be read, which are passed over.
-        everything: Yield metadata and attachments, too.
 
     Raises:
         RecordingError: It is no MCAP file.

@@ -15,14 +15,9 @@ from nodes.trajectory.table import part_name
 from runtime import Input, Node
 from runtime.workers.worker import spare_cores
 
-_WAITING = 1 << 16
-"""Event queue length while simulated time waits: above any number sent at a time."""
-
-_LOOK = 0.5
-"""Real seconds between checks of the process while simulated time waits."""
-
-_END_TIMEOUT = 8.0
-"""Real seconds for the end of the run; `run.shutdown_limit` is 10 by default."""
+_WAITING = 1 << 16  # event queue length while simulated time waits: above any number sent at a time
+_LOOK = 0.5  # real seconds between checks of the process while simulated time waits
+_END_TIMEOUT = 8.0  # real seconds for the end of the run; `run.shutdown_limit` is 10 by default
 
 
 class McapRecorder(Node[McapRecorderConfig]):

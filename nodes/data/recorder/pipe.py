@@ -66,21 +66,14 @@ class McapRecorderConfig(NodeConfig):
 
 
 class WriteRequest(msgspec.Struct, frozen=True):
-    """A file to write, and how.
-
-    Attributes:
-        attachment: A file to add, if it is there.
-        niceness: Of the process, as of nice(1).
-        cores: To run on; all if empty.
-        metadata: File beside it that makes their folder a bag of ROS 2; none if empty.
-    """
+    """A file to write, and how."""
 
     path: str
     config: McapRecorderConfig = McapRecorderConfig()
-    attachment: str = ""
-    niceness: int = 0
-    cores: tuple[int, ...] = ()
-    metadata: str = ""
+    attachment: str = ""  # a file to add, if it is there
+    niceness: int = 0  # of the process, as of nice(1)
+    cores: tuple[int, ...] = ()  # to run on; all if empty
+    metadata: str = ""  # file beside it that makes their folder a bag of ROS 2; none if empty
 
     def command(self) -> list[str]:
         """Return the command to start the writing process."""
@@ -89,25 +82,20 @@ class WriteRequest(msgspec.Struct, frozen=True):
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Line sent by the writing process.
+    """Line sent by the writing process."""
 
-    Attributes:
-        what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``; ``gone``
-            stands for a process that ended without a reply.
-        size: Bytes of the file.
-    """
-
+    # ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``; ``gone`` stands for
+    # a process that ended without a reply.
     what: str
     text: str = ""
     written: int = 0
-    size: int = 0
+    size: int = 0  # bytes of the file
 
 
 EVENT, ANNOUNCEMENT, END = 0, 1, 2
 
 _HEAD = struct.Struct("<qIB")
-_PART = 1 << 16
-"""Bytes written at once: the kernel does not let go of the core meanwhile."""
+_PART = 1 << 16  # bytes written at once: the kernel does not let go of the core meanwhile
 
 
 class Piece(NamedTuple):

@@ -38,12 +38,8 @@ from nodes.ros2.messages.typestore import Stamps, TypeStore
 from runtime.errors import MissingDependencyError, WireError
 from runtime.wire import event_type, unpack
 
-PREFIX = "/visnav"
-"""Before the topics of events as they are."""
-
-_LEFT_OUT = ("clock", "paths")
-"""Topic groups left out, as they only repeat other topics."""
-
+PREFIX = "/visnav"  # before the topics of events as they are
+_LEFT_OUT = ("clock", "paths")  # topic groups left out, as they only repeat other topics
 _LATCHED = (
     "- history: keep_last\n  depth: 1\n  reliability: reliable\n  durability: transient_local\n"
     "  deadline: {sec: 9223372036, nsec: 854775807}\n"
@@ -80,8 +76,7 @@ class EventWriter:
         self._own: dict[tuple[str, str, str], int] = {}
         self._begun = False
         self._time = 0
-        self._holder = ""
-        """Topic holding the arrays of the current event."""
+        self._holder = ""  # topic holding the arrays of the current event
 
     def write(self, time: int, frame: bytes | bytearray, announcement: bool) -> None:
         """Write a frame of `runtime.wire`, published at a time (ns); or raise a `WireError`."""
@@ -162,8 +157,7 @@ def _type_of(kind: str) -> type[Event] | None:
     return None
 
 
-LONGEST = 0.4
-"""Longest duration of a chunk: seconds, real and of the run's clock."""
+LONGEST = 0.4  # longest duration of a chunk: seconds, real and of the run's clock
 
 
 class FileWriter:

@@ -15,24 +15,17 @@ from nodes.data.mcap import native as records
 from nodes.data.mcap.layout import RecordingError, is_being_written, unwritable
 from nodes.data.mcap.mcap_file import contents
 
-MENDED = "visnav_mended"
-"""Metadata record of a mended file: the unreadable parts, by number."""
+MENDED = "visnav_mended"  # metadata record of a mended file: the unreadable parts, by number
 
 
 class Recovery(msgspec.Struct, frozen=True):
-    """Result of mending a file.
-
-    Attributes:
-        trouble: Parts unread, now or when mended before; empty if the file was whole.
-        mended: Whether there was anything to do.
-        partial: Whether messages are missing before the last one, too.
-    """
+    """Result of mending a file."""
 
     path: Path
     messages: int
-    trouble: list[str]
-    mended: bool
-    partial: bool
+    trouble: list[str]  # parts unread, now or when mended before; empty if the file was whole
+    mended: bool  # whether there was anything to do
+    partial: bool  # whether messages are missing before the last one, too
 
 
 def recover_file(path: Path, out: Path | None = None) -> Recovery:

@@ -31,32 +31,21 @@ from nodes.data.recorder.pipe import Reply, WhenFull, WriteRequest
 from runtime.errors import MissingDependencyError, WireError
 from runtime.wire import pack
 
-SMALL = 512
-"""Assumed size of an event without arrays, bytes."""
-
-_LARGE = 1 << 14
-"""Least size of an event dropped by ``drop_images``, bytes."""
-
+SMALL = 512  # assumed size of an event without arrays, bytes
+_LARGE = 1 << 14  # least size of an event dropped by ``drop_images``, bytes
 _PAUSE = 0.005
 """Seconds between two looks at an empty backlog: cheaper than waking the thread at every event."""
 
-_AT_ONCE = 1 << 16
-"""Bytes handed over together."""
-
-_IN_A_ROW = 16
-"""Events in a row before the loop gets the GIL."""
-
+_AT_ONCE = 1 << 16  # bytes handed over together
+_IN_A_ROW = 16  # events in a row before the loop gets the GIL
 STANDSTILL = 10.0
 """Real seconds without any sign of life before the process is given up.
 
 A slow disk shows a sign of life in the file's size.
 """
 
-_LOOK = 0.5
-"""Real seconds between checks of the process."""
-
-_PIPE = 1 << 20
-"""Size of the pipe, bytes: Linux's maximum without privileges."""
+_LOOK = 0.5  # real seconds between checks of the process
+_PIPE = 1 << 20  # size of the pipe, bytes: Linux's maximum without privileges
 
 
 class Waiting(NamedTuple):
@@ -87,8 +76,7 @@ class Backlog:
         self._queue: deque[Waiting] = deque()
         # One counter for each side, so that no addition is ever lost between the two.
         self._put = self._dropped_bytes = self._written = 0
-        self._arrays: dict[type[Event], list[str]] = {}
-        """Names of fields."""
+        self._arrays: dict[type[Event], list[str]] = {}  # names of fields
         self._room = threading.Event()
 
     @property
@@ -163,12 +151,9 @@ class WriterProcess:
     """Process for writing a recording, fed from a backlog.
 
     Args:
-        failed: Called in a thread, once, with the error.
         complain: Called in a thread with events that could not be recorded.
 
     Attributes:
-        error: What ended the writing.
-        result: The last reply of the process.
         unwritten: Events that are not in the file.
 
     Raises:
@@ -180,13 +165,13 @@ class WriterProcess:
         self,
         request: WriteRequest,
         backlog: Backlog,
-        failed: Callable[[RecordingError], None],
+        failed: Callable[[RecordingError], None],  # called in a thread, once, with the error
         complain: Callable[[str], None],
     ) -> None:
         self.path = request.path
         self.backlog = backlog
-        self.error: RecordingError | None = None
-        self.result = Reply("")
+        self.error: RecordingError | None = None  # what ended the writing
+        self.result = Reply("")  # the last reply of the process
         self.unwritten = self._handed = 0
         self._seen: tuple[object, ...] = ()
         self._seen_at = time.monotonic()

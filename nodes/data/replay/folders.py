@@ -116,8 +116,7 @@ class FolderReader(Reader):
         super().__init__()
         self._folder = folder
         self._vehicle = vehicle
-        self._origin = 0
-        """Stamp in the data set (ns) of the run's time 0."""
+        self._origin = 0  # stamp in the data set (ns) of the run's time 0
         self._announcements: list[Announcement] = []
 
     def announcements(self) -> Sequence[Announcement]:

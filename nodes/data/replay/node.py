@@ -25,9 +25,7 @@ from runtime.time.schedule import SECOND
 
 Batch = list[Timed]
 
-MOST = 64
-"""Events of a batch."""
-
+MOST = 64  # events of a batch
 LARGEST = 4 << 20
 """Bytes of a batch, but for its last event. Where batches end depends on the recording only."""
 
@@ -42,8 +40,7 @@ class ReadAhead:
         self._limit = limit
         self._batches: deque[tuple[Batch, int]] = deque()
         self._waiting = 0
-        self.peak = 0
-        """Largest number of bytes waiting so far."""
+        self.peak = 0  # largest number of bytes waiting so far
         self._change = threading.Condition()
         self._ended = False
         self._closed = False
@@ -170,8 +167,7 @@ class Timeline:
     def __init__(self) -> None:
         self._stretches: list[tuple[int, int, bool]] = []
         """Begin (recording), begin (run), whether the previous stretch continues."""
-        self.shift = 0
-        """The run's clock less the recording's time now (ns)."""
+        self.shift = 0  # the run's clock less the recording's time now (ns)
 
     def go_on(self, position: int, now: int, *, pause: bool = False) -> None:
         """Start a stretch: the recording is played from `position` at `now` (run, ns)."""
@@ -222,8 +218,7 @@ class Timeline:
         return known, found
 
 
-_SLICE = SECOND // 10
-"""In real time, how long a sleep may keep `seek` waiting (ns)."""
+_SLICE = SECOND // 10  # in real time, how long a sleep may keep `seek` waiting (ns)
 
 
 class Replay(Node[ReplayConfig]):

@@ -16,8 +16,7 @@ from events.camera_info import DistortionModel
 from runtime import Changeable, Duration, NodeConfig
 from runtime.paths import InputPath
 
-MOST_TROUBLE = 20
-"""Largest number of different complaints kept about a recording."""
+MOST_TROUBLE = 20  # largest number of different complaints kept about a recording
 
 
 class ReplayError(ValueError):
@@ -39,16 +38,11 @@ class Wants(Protocol):
 
 
 class Reader(ABC):
-    """Reader of a recording.
-
-    Attributes:
-        trouble: Parts unread so far, in words.
-        left_out: Number of events unread so far.
-    """
+    """Reader of a recording."""
 
     def __init__(self) -> None:
-        self.trouble: list[str] = []
-        self.left_out = 0
+        self.trouble: list[str] = []  # parts unread so far, in words
+        self.left_out = 0  # number of events unread so far
 
     @abstractmethod
     def announcements(self) -> Sequence[Announcement]:
@@ -88,13 +82,12 @@ class Choice:
     Args:
         only: Types and sources that events must be of; if empty, the usual categories, without
             estimators.
-        skip: Types and sources left out.
     """
 
     def __init__(
         self,
         only: Sequence[str] = (),
-        skip: Sequence[str] = (),
+        skip: Sequence[str] = (),  # types and sources left out
         announcements: Iterable[Announcement] = (),
     ) -> None:
         types = {each.__name__ for each in _types(Event)}
@@ -105,8 +98,7 @@ class Choice:
             each.source for each in announcements if isinstance(each, EstimatorAnnouncement)
         }
         self._known: dict[tuple[type[Event], str], bool] = {}
-        self.unmatched = {*only, *skip}
-        """Names without a matching event so far."""
+        self.unmatched = {*only, *skip}  # names without a matching event so far
 
     def __call__(self, kind: type[Event], source: str) -> bool:
         """Return whether events of a type from a source are wanted."""

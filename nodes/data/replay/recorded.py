@@ -17,8 +17,7 @@ from nodes.ros2.messages.typestore import TypeStore
 from runtime.errors import WireError
 from runtime.wire import event_type
 
-_LOOK = 64
-"""Messages searched for our own metadata, in files rewritten by other tools."""
+_LOOK = 64  # messages searched for our own metadata, in files rewritten by other tools
 
 
 class Recorded(Reader):

@@ -124,9 +124,7 @@ def _source(topic: BagTopic, vehicle: str) -> str:
     return "/".join((vehicle, *(parts or ["camera"])))
 
 
-LONGEST = 16
-"""Transforms between a camera and the body, at most: more would go in circles."""
-
+LONGEST = 16  # transforms between a camera and the body, at most: more would go in circles
 _HERE: Pose = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -161,13 +159,10 @@ class Mountings:
         return None
 
 
-_SAME_CLOCK = 60 * SECOND
-"""Largest difference of stamp and receipt on a common clock, nanoseconds."""
-
+_SAME_CLOCK = 60 * SECOND  # largest difference of stamp and receipt on a common clock, nanoseconds
 _EVENTS = {use: row.becomes or row.events[0] for (_, use), row in READERS.items() if use in TYPES}
 
-_LATER = 1 << 62
-"""Placeholder for the stamp of a message without a stamp."""
+_LATER = 1 << 62  # placeholder for the stamp of a message without a stamp
 
 
 class RosBag(Reader):

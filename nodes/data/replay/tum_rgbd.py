@@ -29,9 +29,7 @@ from nodes.data.replay.reader import Pinhole, ReplayError
 from nodes.trajectory.formats import read_tum
 from nodes.trajectory.table import read_rows
 
-FARTHEST = 20_000_000
-"""Nanoseconds between a depth image and its colour image."""
-
+FARTHEST = 20_000_000  # nanoseconds between a depth image and its colour image
 _Images = list[tuple[int, Path]]
 
 

@@ -29,56 +29,38 @@ from nodes.estimators.inertial_odometry.preintegration import (
 
 THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))
 """Slices of the error state; orientation errors are small rotations in the IMU's frame."""
-G = slice(15, 17)
-"""Slice of gravity's direction: small rotations about the two level axes."""
+G = slice(15, 17)  # slice of gravity's direction: small rotations about the two level axes
 POSE = slice(0, 6)
-_FRAME = 7
-"""States considered of a key frame: pose, and mean error of its inverse depths, 1/m."""
+_FRAME = 7  # states considered of a key frame: pose, and mean error of its inverse depths, 1/m
 _SIZE = 17
 GRAVITY = 9.81
-_SPEED = 3.0
-"""Standard deviation of the unknown velocity at the start, m/s."""
+_SPEED = 3.0  # standard deviation of the unknown velocity at the start, m/s
 _TILT = 0.35
 """Standard deviation of gravity's direction from first samples, radians: that of 3.5 m/s²."""
-_NO_TILT = 1.5
-"""The same without samples."""
-_UNSTATED = np.array([0.01, 0.1])
-"""Standard deviations of unannounced biases: rad/s, m/s²."""
+_NO_TILT = 1.5  # the same without samples
+_UNSTATED = np.array([0.01, 0.1])  # standard deviations of unannounced biases: rad/s, m/s²
 _STEPS = 2
 _HUBER = 2.0
-_FLOOR = 1e-3
-"""Pose error accepted as no surprise: metres, radians."""
+_FLOOR = 1e-3  # pose error accepted as no surprise: metres, radians
 _IMPLAUSIBLE = 60.0
 """Largest squared Mahalanobis distance (6 degrees of freedom) of a plausible map pose."""
-_AHEAD = 0.8
-"""Least share of a sighting's landmarks ahead of the camera in each step."""
-_BESIDE = 2
-"""Images remembered beside the key frames, numbered -1 and -2."""
+_AHEAD = 0.8  # least share of a sighting's landmarks ahead of the camera in each step
+_BESIDE = 2  # images remembered beside the key frames, numbered -1 and -2
 _ORIGIN = 2e-4
 """Standard deviation of the pose at the start, metres and radians: the camera is the world."""
-_VAGUE = 0.1
-"""Standard deviation of a key frame's pose without landmarks: metres, radians."""
-
+_VAGUE = 0.1  # standard deviation of a key frame's pose without landmarks: metres, radians
 Measurement = Callable[["State"], tuple[Floats, Floats] | None]
 """Returns Λ and Aᵀr about a state, by its pose and by those of key frames; `None`: impossible."""
 
 
 class State(msgspec.Struct, frozen=True, eq=False):
-    """Estimated state.
+    """Estimated state."""
 
-    Attributes:
-        rotation: From the IMU to the world, shape (3, 3).
-        position: Of the IMU in the world, metres, shape (3,).
-        velocity: In the world, m/s, shape (3,).
-        bias: Of gyroscope (rad/s) and accelerometer (m/s²), shape (6,).
-        level: From a level frame, whose third axis is down, to the world, shape (3, 3).
-    """
-
-    rotation: Floats
-    position: Floats
-    velocity: Floats
-    bias: Floats
-    level: Floats
+    rotation: Floats  # from the IMU to the world, shape (3, 3)
+    position: Floats  # of the IMU in the world, metres, shape (3,)
+    velocity: Floats  # in the world, m/s, shape (3,)
+    bias: Floats  # of gyroscope (rad/s) and accelerometer (m/s²), shape (6,)
+    level: Floats  # from a level frame, whose third axis is down, to the world, shape (3, 3)
 
     @property
     def gravity(self) -> Floats:
@@ -112,19 +94,13 @@ class State(msgspec.Struct, frozen=True, eq=False):
 
 
 class Sighting(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks seen in a single image.
+    """Landmarks seen in a single image."""
 
-    Attributes:
-        places: Metres in the world, shape (n, 3).
-        keyframes: Number of the key frame that each was first seen in, shape (n,).
-        measured: x/z, y/z and 1/z in the camera, shape (n, 3).
-        scale: One by their standard deviations; 0 where nothing was measured, shape (n, 3).
-    """
-
-    places: Floats
+    places: Floats  # metres in the world, shape (n, 3)
+    # Number of the key frame that each was first seen in, shape (n,).
     keyframes: npt.NDArray[np.int64]
-    measured: Floats
-    scale: Floats
+    measured: Floats  # x/z, y/z and 1/z in the camera, shape (n, 3)
+    scale: Floats  # one by their standard deviations; 0 where nothing was measured, shape (n, 3)
 
 
 class InertialFilter:
@@ -135,9 +111,6 @@ class InertialFilter:
         capacity: Number of remembered key frames.
         common: Shares of variance common to all landmarks in one image, of sightings and of places:
             many landmarks tell no more than its inverse.
-
-    Attributes:
-        covariance: Of the state's error, shape (17, 17).
     """
 
     def __init__(
@@ -148,7 +121,7 @@ class InertialFilter:
         back = inverse(camera)
         none = np.zeros(3)
         self.state = State(back[:3, :3], back[:3, 3], none, np.zeros(6), _level(none))
-        self.covariance = np.zeros((_SIZE, _SIZE))
+        self.covariance = np.zeros((_SIZE, _SIZE))  # of the state's error, shape (17, 17)
         self.forget()
 
     def start(self, force: Floats, pose: Floats | None = None) -> None:

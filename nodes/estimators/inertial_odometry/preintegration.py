@@ -22,52 +22,40 @@ from nodes.estimators.odometry import Depth, rays
 
 Floats = npt.NDArray[np.float64]
 
-_GAP = 3.0
-"""Sampling intervals; the motion in a longer gap between samples is unknown."""
+_GAP = 3.0  # sampling intervals; the motion in a longer gap between samples is unknown
 _UNKNOWN = np.array([1.0, 5.0])
 """Standard deviations then: of the angular velocity, rad/s, and of the acceleration, m/s²."""
 
 
 class Preintegrated(msgspec.Struct, frozen=True, eq=False):
-    """Preintegrated IMU motion, without gravity and initial velocity.
-
-    Attributes:
-        rotation: The frame at the end in that at the start, shape (3, 3).
-        velocity: Change of velocity in the frame at the start, m/s, shape (3,).
-        position: Change of position in the frame at the start, metres, shape (3,).
-        by_bias: Derivatives of the three (of the rotation: of a small one at its end) by the biases
-            of gyroscope and accelerometer, shape (9, 6).
-        covariance: Of the three, shape (9, 9).
-    """
+    """Preintegrated IMU motion, without gravity and initial velocity."""
 
     seconds: float
-    rotation: Floats
-    velocity: Floats
-    position: Floats
+    rotation: Floats  # the frame at the end in that at the start, shape (3, 3)
+    velocity: Floats  # change of velocity in the frame at the start, m/s, shape (3,)
+    position: Floats  # change of position in the frame at the start, metres, shape (3,)
+    # Derivatives of the three (of the rotation: of a small one at its end) by the biases of
+    # gyroscope and accelerometer, shape (9, 6).
     by_bias: Floats
-    covariance: Floats
+    covariance: Floats  # of the three, shape (9, 9)
 
 
 class ImuModel:
-    """IMU parameters for the filter, from an announcement.
-
-    Attributes:
-        pose: The IMU in the frame of its parent, shape (4, 4).
-        interval: Seconds between two samples.
-        noise: Densities of the noise of gyroscope and accelerometer, shape (2,).
-        walk: Densities of the random walks of their biases, shape (2,).
-        turn_on: Standard deviations of their biases at the start, shape (2,).
-    """
+    """IMU parameters for the filter, from an announcement."""
 
     def __init__(self, imu: ImuAnnouncement) -> None:
+        # The IMU in the frame of its parent, shape (4, 4).
         self.pose = pose_matrix(imu.position, imu.orientation)
-        self.interval = 1.0 / imu.rate
+        self.interval = 1.0 / imu.rate  # seconds between two samples
         accelerometer = np.hypot(
             imu.accelerometer_noise_density, imu.vibration * np.sqrt(self.interval)
         )
         # Samples of a moving body are also samples of what happens between them.
+        # Densities of the noise of gyroscope and accelerometer, shape (2,).
         self.noise = 2.0 * np.array([imu.gyroscope_noise_density, accelerometer]) + (1e-5, 1e-4)
+        # Densities of the random walks of their biases, shape (2,).
         self.walk = np.array([imu.gyroscope_random_walk, imu.accelerometer_random_walk]) + 1e-6
+        # Standard deviations of their biases at the start, shape (2,).
         self.turn_on = np.array([imu.gyroscope_turn_on_bias, imu.accelerometer_turn_on_bias])
         self._averaged = imu.averaged
         self._undo = [
@@ -153,8 +141,7 @@ def crosses(vectors: Floats) -> Floats:
     return found
 
 
-_STEP = 8
-"""Spacing of the computed shifts, pixels."""
+_STEP = 8  # spacing of the computed shifts, pixels
 
 
 class Rows:

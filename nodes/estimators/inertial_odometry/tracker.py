@@ -32,10 +32,8 @@ from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces,
 
 _KNOWN = 0.3, 0.03
 """Standard deviations of velocity (m/s) and gravity (radians) required to use the IMU."""
-_READING = 0.8
-"""Noise of a depth reading, relative to a single pixel's; errors of place included."""
-_BENT = 0.003
-"""Noise of depth on surfaces not quite planar, relative to inverse depth."""
+_READING = 0.8  # noise of a depth reading, relative to a single pixel's; errors of place included
+_BENT = 0.003  # noise of depth on surfaces not quite planar, relative to inverse depth
 _PLACED = 0.5, 0.5
 """Constant noise of a landmark's place, relative to a sighting: of pixel, of depth."""
 _COMMON, _COMMON_BY_EYES = (0.02, 0.0), (0.02, 0.1)
@@ -43,8 +41,7 @@ _COMMON, _COMMON_BY_EYES = (0.02, 0.0), (0.02, 0.1)
 
 None of a depth sensor's noise; the slope and texture of a surface shift all its disparities.
 """
-_MISFIT = 1.5
-"""Largest median error of the landmarks, in standard deviations of a pixel."""
+_MISFIT = 1.5  # largest median error of the landmarks, in standard deviations of a pixel
 _PATIENCE, _DOUBTED = 0.4, 0.6
 """Averaging time (s) and limit of the share of images contradicting the filter.
 
@@ -52,8 +49,7 @@ Beyond the limit the filter begins anew, in a frame of its own.
 """
 _PREDICTED = np.diag(np.repeat([0.05**-2, 0.02**-2], 3))
 """Information of the predicted pose in the choice of landmarks: 5 cm, 0.02 radians."""
-_SLOTS = (-1, -2)
-"""Numbers of possible reference images of an alignment, beside the key frames'."""
+_SLOTS = (-1, -2)  # numbers of possible reference images of an alignment, beside the key frames'
 
 
 class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -72,17 +68,13 @@ class InertialTracker(FeatureTracker):
     """Tracker of a camera with depth, or a stereo rig, and an IMU on the same body.
 
     Equal images and samples give equal poses, to the bit.
-
-    Args:
-        camera: The camera, or the left one of a rectified rig.
-        baseline: Metres to the right camera; 0 if there is none.
     """
 
     def __init__(
         self,
-        camera: CameraAnnouncement,
+        camera: CameraAnnouncement,  # the camera, or the left one of a rectified rig
         imu: ImuAnnouncement,
-        baseline: float,
+        baseline: float,  # metres to the right camera; 0 if there is none
         features: FeatureSettings,
         inertial: InertialSettings,
         stereo: StereoSettings,
@@ -112,16 +104,14 @@ class InertialTracker(FeatureTracker):
 
     def fuse(
         self,
-        stamp: int,
-        image: npt.NDArray[np.uint8],
+        stamp: int,  # exposure on the clock of the IMU (ns)
+        image: npt.NDArray[np.uint8],  # grey or colour, of the (left) camera
         other: npt.NDArray[np.uint8] | Depth,
         samples: Floats,
     ) -> TrackingResult:
         """Return the pose of the next image.
 
         Args:
-            stamp: Exposure on the clock of the IMU (ns).
-            image: Grey or colour, of the (left) camera.
             other: Its depth in metres, or the image of the right camera.
             samples: Of the IMU since the image before: stamp (ns), angular velocity, specific
                 force; shape (n, 7).

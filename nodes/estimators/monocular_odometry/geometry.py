@@ -20,35 +20,27 @@ from nodes.estimators.odometry import Floats, Grey
 
 Indices = npt.NDArray[np.int64]
 
-_HUBER = 2.0
-"""Huber threshold of a residual, standard deviations."""
+_HUBER = 2.0  # Huber threshold of a residual, standard deviations
 _DAMPING = 1e-4
 
 
 def adjust(
-    poses: Floats,
-    landmarks: Floats,
-    frame: Indices,
+    poses: Floats,  # world to camera, shape (k, 4, 4)
+    landmarks: Floats,  # points in the world, shape (l, 3)
+    frame: Indices,  # index of the pose of each observation, shape (m,)
     landmark: Indices,
-    pixels: Floats,
-    matrix: Floats,
+    pixels: Floats,  # column and row of each observation, shape (m, 2)
+    matrix: Floats,  # K, shape (3, 3)
     *,
-    fixed: int,
-    noise: float,
+    fixed: int,  # number of first poses that stay; two fix position, rotation and scale
+    noise: float,  # standard deviation of an observation, pixels
     steps: int = 4,
 ) -> tuple[Floats, Floats, Floats]:
     """Return poses and landmarks after bundle adjustment, and reprojection errors (pixels, (m,)).
 
     Args:
-        poses: World to camera, shape (k, 4, 4).
-        landmarks: Points in the world, shape (l, 3).
-        frame: Index of the pose of each observation, shape (m,).
         landmark: Index of its landmark, ascending, shape (m,): each has observations, at most one
             in each frame.
-        pixels: Column and row of each observation, shape (m, 2).
-        matrix: K, shape (3, 3).
-        fixed: Number of first poses that stay; two fix position, rotation and scale.
-        noise: Standard deviation of an observation, pixels.
     """
     poses, landmarks = poses.copy(), landmarks.copy()
     free = len(poses) - fixed
@@ -103,14 +95,10 @@ def linearise(
     landmarks: Floats,
     frame: Indices,
     landmark: Indices,
-    target: Floats,
-    scale: Floats,
+    target: Floats,  # each observation as a ray with z = 1, shape (m, 2)
+    scale: Floats,  # standard deviations in its unit, shape (2,)
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the residuals of all observations (see `adjust`), and their derivatives.
-
-    Args:
-        target: Each observation as a ray with z = 1, shape (m, 2).
-        scale: Standard deviations in its unit, shape (2,).
 
     Returns:
         Residuals in standard deviations, shape (m, 2); their derivatives by a small motion of the
@@ -144,10 +132,8 @@ def linearise(
     return residuals, by_pose, by_point, weights
 
 
-_PLANE = 3.0
-"""Inlier threshold of a corner under a homography, pixels."""
-_EPIPOLAR = 1.0
-"""Inlier threshold of a corner under an essential matrix, pixels."""
+_PLANE = 3.0  # inlier threshold of a corner under a homography, pixels
+_EPIPOLAR = 1.0  # inlier threshold of a corner under an essential matrix, pixels
 
 
 def triangulate(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
@@ -225,24 +211,17 @@ def _pose(turn: npt.NDArray[Any], shift: npt.NDArray[Any]) -> Floats:
 
 
 class Keyframe(msgspec.Struct, frozen=True, eq=False):
-    """An image and its landmarks.
-
-    Attributes:
-        pose: World to camera, shape (4, 4).
-        landmarks: Points in the world, shape (n, 3).
-        pixels: Their pixels in the image, shape (n, 2).
-    """
+    """An image and its landmarks."""
 
     image: Grey
-    pose: Floats
-    landmarks: Floats
-    pixels: Floats
+    pose: Floats  # world to camera, shape (4, 4)
+    landmarks: Floats  # points in the world, shape (n, 3)
+    pixels: Floats  # their pixels in the image, shape (n, 2)
 
 
 BORDER = 12
 """Pixels at the edge of the image without new corners: optical flow needs a neighbourhood."""
-SPACING = 12
-"""Pixels between corners."""
+SPACING = 12  # pixels between corners
 _QUALITY = 0.005
 
 

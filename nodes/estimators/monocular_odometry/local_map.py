@@ -20,26 +20,17 @@ from nodes.estimators.monocular_odometry.geometry import (
 )
 from nodes.estimators.odometry import Floats, Grey, Observations, follow_both_ways, rays, solve_pose
 
-_SNAPSHOT = 5.0
-"""Median motion between stored views, pixels."""
-_GOOD = 2.0
-"""Largest reprojection error of a corner in agreement with a motion, pixels."""
+_SNAPSHOT = 5.0  # median motion between stored views, pixels
+_GOOD = 2.0  # largest reprojection error of a corner in agreement with a motion, pixels
 
 
 class InitialMap(msgspec.Struct, frozen=True, eq=False):
-    """Two key frames and their common landmarks; the median depth from the first is 1.
+    """Two key frames and their common landmarks; the median depth from the first is 1."""
 
-    Attributes:
-        first: The first image; its camera is the world.
-        second: Pose of the second, world to camera, shape (4, 4).
-        pixels: Pixels in the first and in the second image, shape (2, n, 2).
-        points: Landmarks in the world, shape (n, 3).
-    """
-
-    first: Grey
-    second: Floats
-    pixels: Floats
-    points: Floats
+    first: Grey  # the first image; its camera is the world
+    second: Floats  # pose of the second, world to camera, shape (4, 4)
+    pixels: Floats  # pixels in the first and in the second image, shape (2, n, 2)
+    points: Floats  # landmarks in the world, shape (n, 3)
 
 
 class Initialization:
@@ -167,17 +158,13 @@ View = tuple[float, float]
 
 
 class Tracks:
-    """Corners followed from image to image.
-
-    Attributes:
-        pixels: Column and row in the newest key frame, shape (n, 2).
-        points: Points in the world, shape (n, 3); not a number while they are unknown.
-        views: Pixels of each by key frame.
-    """
+    """Corners followed from image to image."""
 
     def __init__(self, pixels: Floats, keyframe: int) -> None:
-        self.pixels = pixels
+        self.pixels = pixels  # column and row in the newest key frame, shape (n, 2)
+        # Points in the world, shape (n, 3); not a number while they are unknown.
         self.points = np.full((len(pixels), 3), np.nan)
+        # Pixels of each by key frame.
         self.views: list[dict[int, View]] = [{keyframe: (x, y)} for x, y in pixels.tolist()]
 
     def __len__(self) -> int:
@@ -243,21 +230,14 @@ class LocalMap:
     @classmethod
     def first(
         cls,
-        found: InitialMap,
-        image: Grey,
-        start: Floats,
-        unit: float,
+        found: InitialMap,  # in a frame and a unit of its own
+        image: Grey,  # the second of its images, grey
+        start: Floats,  # pose of its first camera: camera to world, shape (4, 4)
+        unit: float,  # its unit of length in that of the world
         matrix: Floats,
         settings: MonocularSettings,
     ) -> LocalMap:
-        """Make a map of its first two key frames.
-
-        Args:
-            found: In a frame and a unit of its own.
-            image: The second of its images, grey.
-            start: Pose of its first camera: camera to world, shape (4, 4).
-            unit: Its unit of length in that of the world.
-        """
+        """Make a map of its first two key frames."""
         second = found.second.copy()
         second[:3, 3] *= unit
         tracks = Tracks(found.pixels[0], 0)

@@ -42,14 +42,10 @@ from nodes.estimators.odometry import (
 )
 from runtime import Bundle
 
-_AGREES = 6.0
-"""Inlier threshold of a landmark, standard deviations."""
-_FEW = 120
-"""Number of corners sufficient for an approximate pose."""
-_STORED = 6
-"""Number of newest key frames searched to relocalize a lost camera."""
-_ORB_POINTS = 1000
-"""Number of points describing a lost camera's image."""
+_AGREES = 6.0  # inlier threshold of a landmark, standard deviations
+_FEW = 120  # number of corners sufficient for an approximate pose
+_STORED = 6  # number of newest key frames searched to relocalize a lost camera
+_ORB_POINTS = 1000  # number of points describing a lost camera's image
 
 
 class MonocularTracker:

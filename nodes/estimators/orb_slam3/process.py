@@ -35,15 +35,10 @@ Floats = npt.NDArray[np.float64]
 
 
 class KeyFrame(NamedTuple):
-    """A key frame of the present map.
+    """A key frame of the present map."""
 
-    Attributes:
-        stamp: Seconds, to a microsecond; tells key frames apart.
-        pose: The camera in ORB-SLAM3's world now, shape (4, 4).
-    """
-
-    stamp: float
-    pose: Floats
+    stamp: float  # seconds, to a microsecond; tells key frames apart
+    pose: Floats  # the camera in ORB-SLAM3's world now, shape (4, 4)
 
 
 class Anchor:
@@ -54,15 +49,12 @@ class Anchor:
     world upright. The map's first key frame stays; its present pose is read whenever the world may
     have changed. A map after a loss is put at the camera's last known pose: the motion in between
     is missing until a merge.
-
-    Attributes:
-        last: The last known pose; identity before the first.
     """
 
     def __init__(self) -> None:
         self._first: dict[float, Floats] = {}  # first key frames of all maps, in our frame
         self._from_world = np.eye(4)
-        self.last = np.eye(4)
+        self.last = np.eye(4)  # the last known pose; identity before the first
         self._doubted = False
         self._map = 0.0  # stamp of its first key frame
 
@@ -120,11 +112,9 @@ INSTALL = (
     f"make orbslam3, or: {install_command('orbslam3')}, on Debian and Ubuntu "
     "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6, and then "
     "python -m runtime vocabulary config.toml"
-)
-"""Installation of ORB-SLAM3 with its vocabulary; `make` serves in a checkout."""
+)  # installation of ORB-SLAM3 with its vocabulary; `make` serves in a checkout
 
-_REACH = 6.0
-"""Largest distance of a projected map point from its corner, pixels."""
+_REACH = 6.0  # largest distance of a projected map point from its corner, pixels
 
 
 class OrbSlam3Result(TrackingResult, frozen=True, eq=False):
@@ -132,19 +122,14 @@ class OrbSlam3Result(TrackingResult, frozen=True, eq=False):
 
     The pose is in the optical camera at the first key frame; points are all undistorted corners,
     inliers those that agree with the map.
-
-    Attributes:
-        state: ORB-SLAM3's own word (OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …), or RESET for a
-            map just discarded.
-        matches: Number of map points found.
-        first_keyframe: Stamp of the first key frame (ns); -1 before there is one.
-        maps: Number of maps so far; see `Anchor`.
     """
 
+    # ORB-SLAM3's own word (OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …), or RESET for a map just
+    # discarded.
     state: str = ""
-    matches: int = 0
-    first_keyframe: int = -1
-    maps: int = 0
+    matches: int = 0  # number of map points found
+    first_keyframe: int = -1  # stamp of the first key frame (ns); -1 before there is one
+    maps: int = 0  # number of maps so far; see `Anchor`
 
 
 class OrbSlam3Process:
@@ -185,20 +170,18 @@ class OrbSlam3Process:
 
     def track(
         self,
-        stamp: int,
+        stamp: int,  # of the exposure (ns), rising
         image: npt.NDArray[np.uint8],
         depth: npt.NDArray[np.float32] | None = None,
-        right: npt.NDArray[np.uint8] | None = None,
+        right: npt.NDArray[np.uint8] | None = None,  # the right image, for stereo modes only
         imu: Floats | None = None,
     ) -> OrbSlam3Result:
         """Return the pose of the next image.
 
         Args:
-            stamp: Of the exposure (ns), rising.
             image: Shape (h, w, 3) red, green, blue, or (h, w) grey; of a stereo rig the left one.
             depth: Metres along the optical axis, shape (h, w); ``inf`` for none. For modes with
                 depth only.
-            right: The right image, for stereo modes only.
             imu: For inertial modes: measurements since the last call, shape (n, 7): stamp (ns),
                 angular velocity (rad/s), specific force (m/s²). Those after the image wait for the
                 next.
@@ -373,15 +356,9 @@ def _naps() -> dict[str, tuple[bool, str]]:
     return found
 
 
-_QUIET = 0.0025
-"""Seconds between two looks; three are longer than the threads' naps."""
-
-_FIRST = 1.0
-"""Seconds of computing for the other threads after the first image of a map."""
-
-_LAST = 10.0
-"""Seconds of computing for the other threads after the last image."""
-
+_QUIET = 0.0025  # seconds between two looks; three are longer than the threads' naps
+_FIRST = 1.0  # seconds of computing for the other threads after the first image of a map
+_LAST = 10.0  # seconds of computing for the other threads after the last image
 _SENSORS = {
     "rgbd": "RGBD",
     "monocular": "MONOCULAR",
@@ -398,5 +375,4 @@ _REASONS = {
     "RESET": "the map has been discarded: it did not give the IMU's scale or gravity",
     "RECENTLY_LOST": "too few matches with the map; looking for a place seen before",
     "LOST": "too few matches with the map",
-}
-"""Meanings of ORB-SLAM3's states, for the log."""
+}  # meanings of ORB-SLAM3's states, for the log

@@ -67,20 +67,14 @@ class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Start-up settings of an ORB-SLAM3 process.
+    """Start-up settings of an ORB-SLAM3 process."""
 
-    Attributes:
-        mode: The sensors used.
-        text: The settings file, as YAML.
-        intrinsics: fx, fy, cx, cy, in pixels.
-        camera_on_imu: The (left) camera in the IMU's frame, shape (4, 4); identity without an IMU.
-    """
-
-    mode: Mode
-    text: str
+    mode: Mode  # the sensors used
+    text: str  # the settings file, as YAML
     width: int
     height: int
-    intrinsics: tuple[float, float, float, float]
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy, in pixels
+    # The (left) camera in the IMU's frame, shape (4, 4); identity without an IMU.
     camera_on_imu: npt.NDArray[np.float64]
 
 

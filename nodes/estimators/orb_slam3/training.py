@@ -80,8 +80,7 @@ def describe(image: Bytes, features: int) -> Bytes:
     return np.empty((0, 32), np.uint8) if descriptors is None else np.asarray(descriptors)
 
 
-_SHUTDOWN_LIMIT = 300.0
-"""Seconds; the training is done as the node shuts down."""
+_SHUTDOWN_LIMIT = 300.0  # seconds; the training is done as the node shuts down
 
 
 def vocabulary(

@@ -24,17 +24,13 @@ from runtime.run.results import replacing
 Bytes = npt.NDArray[np.uint8]
 Integers = npt.NDArray[np.int64]
 
-_BYTES = 32
-"""Bytes of an ORB descriptor."""
-
-_ITERATIONS = 10
-"""Of moving the centres, at most; later ones change next to nothing."""
+_BYTES = 32  # bytes of an ORB descriptor
+_ITERATIONS = 10  # of moving the centres, at most; later ones change next to nothing
 
 _SCORING, _WEIGHTING = 0, 0
 """L1 norm and tf-idf, as expected by ORB-SLAM3 (DBoW2's ScoringType, WeightingType)."""
 
-_FIELDS = 2 + _BYTES + 1
-"""Numbers on a node's line: parent, leaf or not, descriptor, weight."""
+_FIELDS = 2 + _BYTES + 1  # numbers on a node's line: parent, leaf or not, descriptor, weight
 
 
 class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,22 +55,14 @@ class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Vocabulary(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """A tree of visual words; parents come before their children.
+    """A tree of visual words; parents come before their children."""
 
-    Attributes:
-        branching: k of the file.
-        depth: L of the file.
-        parents: int64 (n,): parent's index; -1 for the root, which is node 0.
-        leaves: bool (n,): True for a word.
-        descriptors: uint8 (n, 32).
-        weights: float64 (n,): a word's inverse document frequency; 0 for other nodes.
-    """
-
-    branching: int
-    depth: int
-    parents: Integers
-    leaves: npt.NDArray[np.bool_]
-    descriptors: Bytes
+    branching: int  # k of the file
+    depth: int  # L of the file
+    parents: Integers  # int64 (n,): parent's index; -1 for the root, which is node 0
+    leaves: npt.NDArray[np.bool_]  # bool (n,): True for a word
+    descriptors: Bytes  # uint8 (n, 32)
+    # Float64 (n,): a word's inverse document frequency; 0 for other nodes.
     weights: npt.NDArray[np.float64]
 
 

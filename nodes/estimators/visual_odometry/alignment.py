@@ -31,52 +31,32 @@ from nodes.estimators.odometry import (
 from nodes.estimators.visual_odometry.surfaces import surfaces_at
 
 _LEVELS = 4
-_CELL = 4
-"""Side of the squares of the half-sized image with at most a single edge pixel each."""
-_EDGE = 2.0
-"""Least gradient of an edge in the half-sized image, grey levels per pixel."""
+_CELL = 4  # side of the squares of the half-sized image with at most a single edge pixel each
+_EDGE = 2.0  # least gradient of an edge in the half-sized image, grey levels per pixel
 _EDGES = 1000
-_SPACING = 16
-"""Distance of the surface points, pixels."""
-_OUTLINE = 0.05
-"""Relative difference of inverse depth around an outline."""
-_BRIGHTNESS_NOISE = 3.0
-"""Least standard deviation of a difference of brightness, grey levels."""
+_SPACING = 16  # distance of the surface points, pixels
+_OUTLINE = 0.05  # relative difference of inverse depth around an outline
+_BRIGHTNESS_NOISE = 3.0  # least standard deviation of a difference of brightness, grey levels
 _HUBER = 1.5
-_STEPS = 6
-"""Steps with each size of image, at most."""
-_RIM = 4
-"""Pixels at the edge of the image without points."""
-_CORRELATED = 9.0
-"""Number of correlated residuals counted as a single residual."""
-_AGREES = 3.0
-"""Inlier threshold of a point, standard deviations."""
-_OFF = 0.5
-"""Additional tolerance of an edge, pixels."""
-_FEW = 30
-"""Least number of edges for a meaningful agreement."""
+_STEPS = 6  # steps with each size of image, at most
+_RIM = 4  # pixels at the edge of the image without points
+_CORRELATED = 9.0  # number of correlated residuals counted as a single residual
+_AGREES = 3.0  # inlier threshold of a point, standard deviations
+_OFF = 0.5  # additional tolerance of an edge, pixels
+_FEW = 30  # least number of edges for a meaningful agreement
 _OTHER, _OTHER_SHARE = 6.0, 0.1
 """Least difference of another surface: standard deviations, share of inverse depth."""
-_HIDDEN = 1.15
-"""Least inverse depth of a surface hiding an edge, relative to the edge's."""
-_ORDINARY = np.diag([1e2, 1e-2])
-"""Prior information on gain and offset, about equal exposures."""
-_SMALL = 2e-4
-"""Convergence threshold of a step in full images: metres, radians."""
+_HIDDEN = 1.15  # least inverse depth of a surface hiding an edge, relative to the edge's
+_ORDINARY = np.diag([1e2, 1e-2])  # prior information on gain and offset, about equal exposures
+_SMALL = 2e-4  # convergence threshold of a step in full images: metres, radians
 
 
 class View(msgspec.Struct, frozen=True, eq=False):
-    """An image made ready to be aligned.
+    """An image made ready to be aligned."""
 
-    Attributes:
-        greys: Grey float32 images, each half as large as the one before.
-        inverse_of: As of `inverse_depth`, shape (h, w).
-        smooth: The same, a mean of more pixels.
-    """
-
-    greys: tuple[Depth, ...]
-    inverse_of: Depth
-    smooth: Depth
+    greys: tuple[Depth, ...]  # grey float32 images, each half as large as the one before
+    inverse_of: Depth  # as of `inverse_depth`, shape (h, w)
+    smooth: Depth  # the same, a mean of more pixels
 
     @classmethod
     def of(cls, grey: Grey, inverse_of: Depth) -> View:
@@ -88,21 +68,13 @@ class View(msgspec.Struct, frozen=True, eq=False):
 
 
 class Reference(msgspec.Struct, frozen=True, eq=False):
-    """Points of an image as the reference of alignments.
+    """Points of an image as the reference of alignments."""
 
-    Attributes:
-        pose: World to camera, shape (4, 4).
-        edges: Points at edges of brightness, in the camera, metres, shape (3, n).
-        brightness: Theirs, by size of image, shape (levels, n).
-        surfaces: Points of surfaces, in the camera, metres, shape (3, m).
-        planes: Their planes: vectors p with p · x = 1 for all points x, shape (3, m).
-    """
-
-    pose: Floats
-    edges: Floats
-    brightness: Floats
-    surfaces: Floats
-    planes: Floats
+    pose: Floats  # world to camera, shape (4, 4)
+    edges: Floats  # points at edges of brightness, in the camera, metres, shape (3, n)
+    brightness: Floats  # theirs, by size of image, shape (levels, n)
+    surfaces: Floats  # points of surfaces, in the camera, metres, shape (3, m)
+    planes: Floats  # their planes: vectors p with p · x = 1 for all points x, shape (3, m)
 
     @classmethod
     def of(cls, view: View, pose: Floats, matrix: Floats, noise: float) -> Reference:
@@ -132,26 +104,17 @@ class Reference(msgspec.Struct, frozen=True, eq=False):
 
 
 class Alignment(NamedTuple):
-    """Result of an alignment.
+    """Result of an alignment."""
 
-    Attributes:
-        pose: World to camera, shape (4, 4).
-        reference: The same of the reference.
-        information: Inverse covariance of a small motion of the camera's frame (translation,
-            rotation) by the image alone, shape (6, 6).
-        share: Share of the reference's points in the image that agree.
-        sharp: Share of visible edges with agreeing brightness; 1 if too few.
-        pixels: Of the reference's points in the image, shape (n, 2).
-        agree: Mask of those that agree, shape (n,).
-    """
-
-    pose: Floats
-    reference: Floats
+    pose: Floats  # world to camera, shape (4, 4)
+    reference: Floats  # the same of the reference
+    # Inverse covariance of a small motion of the camera's frame (translation, rotation) by the
+    # image alone, shape (6, 6).
     information: Floats
-    share: float
-    sharp: float
-    pixels: Floats
-    agree: npt.NDArray[np.bool_]
+    share: float  # share of the reference's points in the image that agree
+    sharp: float  # share of visible edges with agreeing brightness; 1 if too few
+    pixels: Floats  # of the reference's points in the image, shape (n, 2)
+    agree: npt.NDArray[np.bool_]  # mask of those that agree, shape (n,)
 
     def deviation(self) -> float:
         """Return the largest standard deviation of the position in any direction, metres."""
@@ -174,19 +137,12 @@ class _Residuals(NamedTuple):
 def align(
     reference: Reference,
     view: View,
-    start: Floats,
-    matrix: Floats,
-    noise: float,
-    prior: tuple[float, float],
+    start: Floats,  # expected pose, world to camera, shape (4, 4)
+    matrix: Floats,  # K, shape (3, 3)
+    noise: float,  # standard deviation of inverse depth at a point, 1/m
+    prior: tuple[float, float],  # standard deviations of the expected pose: metres, radians
 ) -> Alignment:
-    """Return the alignment of an image with a reference.
-
-    Args:
-        start: Expected pose, world to camera, shape (4, 4).
-        matrix: K, shape (3, 3).
-        noise: Standard deviation of inverse depth at a point, 1/m.
-        prior: Standard deviations of the expected pose: metres, radians.
-    """
+    """Return the alignment of an image with a reference."""
     expected = start @ inverse(reference.pose)
     pose, brightness = expected.copy(), np.array([1.0, 0.0])
     sure = np.diag(np.repeat(1.0 / np.square(prior), 3))
@@ -332,8 +288,7 @@ def _distances(
     return _Residuals(residual, weights, by, pixels, close & (errors < _AGREES), len(good))
 
 
-_FADES = 0.5
-"""Decay time (to 1/e) of the expected velocity without a measurement, seconds."""
+_FADES = 0.5  # decay time (to 1/e) of the expected velocity without a measurement, seconds
 
 
 class Motion:

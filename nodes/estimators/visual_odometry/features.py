@@ -53,30 +53,21 @@ from nodes.estimators.visual_odometry.surfaces import (
 )
 
 _FLOW_WINDOW = 15
-_LARGE = 320
-"""Least side (pixels) of images halved before following corners."""
-_AGREES = 4.0
-"""Inlier threshold of a landmark, standard deviations."""
-_FEW = 120
-"""Number of corners sufficient for an approximate pose, at most."""
+_LARGE = 320  # least side (pixels) of images halved before following corners
+_AGREES = 4.0  # inlier threshold of a landmark, standard deviations
+_FEW = 120  # number of corners sufficient for an approximate pose, at most
 _ENOUGH = 60 / 512**2
 """Agreeing landmarks per pixel sufficient for a pose; else edges and surfaces are aligned."""
 BELIEVED = 0.03
 """Weight of an alignment beside landmarks: neighbouring pixels' errors are not independent."""
-_FEWEST = 4
-"""Least number of agreeing landmarks beside an alignment."""
-_SEARCHED = 20
-"""Number of newest key frames searched to relocalize a lost camera."""
+_FEWEST = 4  # least number of agreeing landmarks beside an alignment
+_SEARCHED = 20  # number of newest key frames searched to relocalize a lost camera
 _SEARCHED_PER_IMAGE = 2
 """Key frames tried with each image, because each takes as long as tracking does."""
-_SURE = 0.6
-"""Least share of agreeing landmarks, among those searched, in a relocalized pose."""
-_NEAR = 64.0
-"""Margin around the image for landmarks soon in view, pixels."""
-_SOON = 8
-"""Images between updates of the list of such landmarks."""
-_READING = 0.5
-"""Noise of a depth reading, a mean of many pixels, relative to a single pixel's."""
+_SURE = 0.6  # least share of agreeing landmarks, among those searched, in a relocalized pose
+_NEAR = 64.0  # margin around the image for landmarks soon in view, pixels
+_SOON = 8  # images between updates of the list of such landmarks
+_READING = 0.5  # noise of a depth reading, a mean of many pixels, relative to a single pixel's
 
 
 class FeatureTracker:

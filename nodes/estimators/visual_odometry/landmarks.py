@@ -28,22 +28,13 @@ from nodes.estimators.visual_odometry.surfaces import Surfaces, surfaces_at
 
 _SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5
 """Limits of how much smaller, larger or more slanted a landmark may look than at first."""
-_MEAN_OF = 20.0
-"""Depth readings in the mean of a landmark's depth; a moving mean beyond."""
-_CONTRADICTS = 5.0
-"""Largest difference of a depth reading from a landmark's, standard deviations."""
-_HIDES = 0.05
-"""Least difference of another surface from a landmark, relative to inverse depth."""
+_MEAN_OF = 20.0  # depth readings in the mean of a landmark's depth; a moving mean beyond
+_CONTRADICTS = 5.0  # largest difference of a depth reading from a landmark's, standard deviations
+_HIDES = 0.05  # least difference of another surface from a landmark, relative to inverse depth
 
 
 class Landmarks:
-    """Points of the world, by rows.
-
-    Attributes:
-        places: Metres in the world, shape (n, 3).
-        keyframes: Number of each's first key frame, ascending, shape (n,).
-        pixels: Pixels there, shape (n, 2).
-    """
+    """Points of the world, by rows."""
 
     _COLUMNS = (
         "places",
@@ -60,9 +51,10 @@ class Landmarks:
 
     def __init__(self, matrix: Floats) -> None:
         self._matrix = matrix
-        self.places = np.empty((0, 3))
+        self.places = np.empty((0, 3))  # metres in the world, shape (n, 3)
+        # Number of each's first key frame, ascending, shape (n,).
         self.keyframes: Rows = np.empty(0, np.int64)
-        self.pixels = np.empty((0, 2))
+        self.pixels = np.empty((0, 2))  # pixels there, shape (n, 2)
         # In the world: the change by one column, that by one row, and the ray.
         self._directions = np.empty((0, 3, 3))
         self._origins = np.empty((0, 3))
@@ -209,19 +201,12 @@ class Landmarks:
 
 
 class MapMatch(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks of the map found in an image, and the pose from them.
+    """Landmarks of the map found in an image, and the pose from them."""
 
-    Attributes:
-        pose: World to camera, shape (4, 4).
-        rows: Landmarks found, shape (n,).
-        pixels: Their pixels, shape (n, 2).
-        agree: Mask of those that agree with the pose, shape (n,).
-    """
-
-    pose: Floats
-    rows: Rows
-    pixels: Floats
-    agree: npt.NDArray[np.bool_]
+    pose: Floats  # world to camera, shape (4, 4)
+    rows: Rows  # landmarks found, shape (n,)
+    pixels: Floats  # their pixels, shape (n, 2)
+    agree: npt.NDArray[np.bool_]  # mask of those that agree with the pose, shape (n,)
     missed: Rows
 
     @classmethod
@@ -236,8 +221,7 @@ class MapMatch(msgspec.Struct, frozen=True, eq=False):
         return float(self.agree.sum()) / (len(self.rows) + len(self.missed))
 
 
-ORB_POINTS = 500
-"""Number of points describing an image."""
+ORB_POINTS = 500  # number of points describing an image
 
 
 class Keyframe(msgspec.Struct, frozen=True, eq=False):
@@ -273,13 +257,10 @@ class Described:
         return DescribedPoints(points @ back[:3, :3].T + back[:3, 3], descriptors[continuous])
 
 
-RIM = 12
-"""Pixels at the edge of the image without corners: patches need a neighbourhood."""
-_APART = 10
-"""Least distance of a new corner from another, pixels."""
+RIM = 12  # pixels at the edge of the image without corners: patches need a neighbourhood
+_APART = 10  # least distance of a new corner from another, pixels
 _BLOCK = 5
-_TEXTURE = 1.5e-4
-"""Least eigenvalue of a corner in OpenCV's scale: above noise of two grey levels."""
+_TEXTURE = 1.5e-4  # least eigenvalue of a corner in OpenCV's scale: above noise of two grey levels
 
 
 def squares(pixels: Floats, spacing: int) -> Floats:

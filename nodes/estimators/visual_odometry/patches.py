@@ -17,29 +17,19 @@ import numpy.typing as npt
 from nodes.estimators.odometry import Depth, Floats, Grey, follow_both_ways
 from nodes.estimators.visual_odometry.alignment import Alignment, Reference, View, align
 
-SAME = 0.5
-"""Least correlation of a patch with its counterpart; flow alone would confirm any place."""
-
+SAME = 0.5  # least correlation of a patch with its counterpart; flow alone would confirm any place
 Rows = npt.NDArray[np.int64]
 
-MARGIN = 4
-"""Largest distance of a patch from its expected place, pixels."""
+MARGIN = 4  # largest distance of a patch from its expected place, pixels
 
 
 class Patches(msgspec.Struct, frozen=True, eq=False):
-    """Patches to look for.
+    """Patches to look for."""
 
-    Attributes:
-        source: Number of each's image, shape (n,).
-        pixels: Its centre there, column and row, shape (n, 2).
-        expected: Its centre in the new image, shape (n, 2).
-        warps: Pixels of the new image by pixels of the old one, shape (n, 2, 2).
-    """
-
-    source: Rows
-    pixels: Floats
-    expected: Floats
-    warps: Floats
+    source: Rows  # number of each's image, shape (n,)
+    pixels: Floats  # its centre there, column and row, shape (n, 2)
+    expected: Floats  # its centre in the new image, shape (n, 2)
+    warps: Floats  # pixels of the new image by pixels of the old one, shape (n, 2, 2)
 
     def take(self, rows: Rows) -> Patches:
         """Return some of them."""
@@ -120,20 +110,15 @@ def _cut_warped(patches: Patches, images: Mapping[int, Grey], centre: Floats, ha
     return cut.reshape(-1, side)
 
 
-_UNSURE = 0.1
-"""Largest standard deviation of position of a usable alignment, metres."""
-_AGREE = 0.6
-"""Least share of agreeing points in view."""
+_UNSURE = 0.1  # largest standard deviation of position of a usable alignment, metres
+_AGREE = 0.6  # least share of agreeing points in view
 _AGREE_AGAIN = 0.8
 """the same of edges after a loss, when the alignment may have found the wrong ones,"""
-_POINTS = 60
-"""and their least number."""
+_POINTS = 60  # and their least number
 _PRIOR = 0.02, 0.02
 """Standard deviations of the pose expected by constant velocity: metres, radians."""
-_PRIOR_LOST = 0.3, 0.2
-"""The same while tracking is lost."""
-_READING = 0.5
-"""Noise of a surface's distance, relative to a single pixel's."""
+_PRIOR_LOST = 0.3, 0.2  # the same while tracking is lost
+_READING = 0.5  # noise of a surface's distance, relative to a single pixel's
 
 
 class References:

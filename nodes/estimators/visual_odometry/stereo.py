@@ -31,25 +31,19 @@ from nodes.estimators.visual_odometry.patches import SAME, around, correlation
 from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces, surfaces_at
 from runtime import Bundle
 
-_LARGE = 320
-"""Least side (pixels) of images halved before block matching."""
+_LARGE = 320  # least side (pixels) of images halved before block matching
 _BLOCK = 11
 _WINDOW = 15
-_REFINED = 1.5
-"""Largest correction of block matching by flow, pixels."""
-_OFF_ROW = 0.6
-"""Largest distance of a corner from its row, pixels."""
-_COARSE = 2.0
-"""Noise of block matching, relative to flow."""
+_REFINED = 1.5  # largest correction of block matching by flow, pixels
+_OFF_ROW = 0.6  # largest distance of a corner from its row, pixels
+_COARSE = 2.0  # noise of block matching, relative to flow
 _STEP, _DISTINCT = 3.0, 1.5
 """Pixels beside a disparity, and least ratio of the difference there to its own.
 
 The disparity is then known to 3 / 15 / √0.5 = 0.3 pixels, if all difference is noise.
 """
-_LEVELS = 3
-"""Halvings of the images for flow, where block matching found nothing."""
-_ASIDE = 4
-"""Distance of such a corner from the neighbours defining its plane, pixels."""
+_LEVELS = 3  # halvings of the images for flow, where block matching found nothing
+_ASIDE = 4  # distance of such a corner from the neighbours defining its plane, pixels
 _BESIDE = np.array([(_ASIDE, 0), (-_ASIDE, 0), (0, _ASIDE), (0, -_ASIDE)])
 _TORN, _BENT = 0.02, 0.15
 """Largest deviation from the neighbours' mean disparity: share of disparity, pixels."""
@@ -81,9 +75,6 @@ class StereoMatcher:
 
     Args:
         baseline: Metres from the left camera to the right one.
-
-    Attributes:
-        depth_noise: Standard deviation of a corner's inverse depth, 1/m.
     """
 
     def __init__(
@@ -92,6 +83,7 @@ class StereoMatcher:
         self._info = info
         settings = settings or StereoSettings()
         self._unit = info.fx * baseline  # disparity (pixels) times depth
+        # Standard deviation of a corner's inverse depth, 1/m.
         self.depth_noise = settings.noise / self._unit
         self._least = self._unit / settings.max_depth
         self._reduction = 2 if min(info.width, info.height) >= _LARGE else 1

@@ -15,35 +15,22 @@ import numpy.typing as npt
 
 from nodes.estimators.odometry import Depth, Floats
 
-REACH = 6
-"""Radius of continuous surface required around a corner by optical flow, pixels."""
-NEAREST = 0.05
-"""Least depth, metres; smaller values are ignored, as of dirt on the lens."""
-_FARTHEST = 0.02
-"""1/m: beyond 50 m depth says nothing about a motion of metres."""
-_HOLE = -200.0
-"""Placeholder for no depth, 1/m: so low, a smoothed neighbour stays below zero."""
-_TORN = 0.02
-"""Largest deviation of a neighbourhood from a plane, relative to inverse depth."""
-_NOISY = 2.0
-"""The same, in standard deviations of a reading."""
-
+REACH = 6  # radius of continuous surface required around a corner by optical flow, pixels
+NEAREST = 0.05  # least depth, metres; smaller values are ignored, as of dirt on the lens
+_FARTHEST = 0.02  # 1/m: beyond 50 m depth says nothing about a motion of metres
+_HOLE = -200.0  # placeholder for no depth, 1/m: so low, a smoothed neighbour stays below zero
+_TORN = 0.02  # largest deviation of a neighbourhood from a plane, relative to inverse depth
+_NOISY = 2.0  # the same, in standard deviations of a reading
 _GRID = np.array([(x, y) for y in range(-REACH, REACH + 1, 3) for x in range(-REACH, REACH + 1, 3)])
 _SPREAD = float((_GRID[:, 0] ** 2).sum())
 
 
 class Surfaces(msgspec.Struct, frozen=True, eq=False):
-    """The planes around some pixels.
+    """The planes around some pixels."""
 
-    Attributes:
-        inverse: Inverse depth at each, 1/m, shape (n,).
-        slope: Its change by column and by row, 1/m, shape (n, 2).
-        continuous: Mask, shape (n,): elsewhere depth is torn or missing.
-    """
-
-    inverse: Floats
-    slope: Floats
-    continuous: npt.NDArray[np.bool_]
+    inverse: Floats  # inverse depth at each, 1/m, shape (n,)
+    slope: Floats  # its change by column and by row, 1/m, shape (n, 2)
+    continuous: npt.NDArray[np.bool_]  # mask, shape (n,): elsewhere depth is torn or missing
 
     def take(self, rows: npt.NDArray[np.bool_]) -> Surfaces:
         """Return some of them."""

@@ -26,19 +26,12 @@ class Interval(NamedTuple):
 
 
 class Coverage(msgspec.Struct, frozen=True):
-    """Coverage of a flight by an estimator's poses.
+    """Coverage of a flight by an estimator's poses."""
 
-    Attributes:
-        flight: From the first image to the last.
-        frames: Number of images, missing ones of an early end included.
-        answered: Images with a pose within half an image's period.
-        lost: Disjoint intervals without a pose, in order.
-    """
-
-    flight: Interval
-    frames: int
-    answered: int
-    lost: list[Interval]
+    flight: Interval  # from the first image to the last
+    frames: int  # number of images, missing ones of an early end included
+    answered: int  # images with a pose within half an image's period
+    lost: list[Interval]  # disjoint intervals without a pose, in order
 
     @property
     def percent(self) -> float:
@@ -55,10 +48,10 @@ class Coverage(msgspec.Struct, frozen=True):
 
 
 def cover(
-    frames: Stamps,
-    poses: Stamps,
-    gap: int,
-    announced: Sequence[Interval] = (),
+    frames: Stamps,  # stamps of the images, strictly rising, shape (n,), n ≥ 1
+    poses: Stamps,  # stamps of the poses, strictly rising, shape (m,)
+    gap: int,  # silence that counts (ns)
+    announced: Sequence[Interval] = (),  # intervals reported as lost by the estimator, in any order
     planned: int | None = None,
 ) -> Coverage:
     """Return the coverage of a flight by poses.
@@ -67,10 +60,6 @@ def cover(
     word; a camera slower than `gap` makes nobody lost.
 
     Args:
-        frames: Stamps of the images, strictly rising, shape (n,), n ≥ 1.
-        poses: Stamps of the poses, strictly rising, shape (m,).
-        gap: Silence that counts (ns).
-        announced: Intervals reported as lost by the estimator, in any order.
         planned: Planned end of the flight (ns), if it was ended before: images at their usual rate
             until then are without a pose.
     """

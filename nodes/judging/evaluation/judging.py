@@ -112,42 +112,26 @@ _LATE = 5
 
 
 class Errors(msgspec.Struct, frozen=True, eq=False):
-    """Errors over time, a row per pose; all arrays of shape (n,).
+    """Errors over time, a row per pose; all arrays of shape (n,)."""
 
-    Attributes:
-        stamps: Of the image, or of the control tick, ns.
-        since: Arrival of the estimate, or stamp of a tick's pose, ns; shape (0,) if not known.
-        position: Metres, after alignment.
-        rotation: Radians, after alignment.
-    """
-
-    stamps: Stamps
-    since: Stamps
-    position: Floats
-    rotation: Floats
+    stamps: Stamps  # of the image, or of the control tick, ns
+    since: Stamps  # arrival of the estimate, or stamp of a tick's pose, ns; shape (0,) if not known
+    position: Floats  # metres, after alignment
+    rotation: Floats  # radians, after alignment
 
 
 class Judgement(msgspec.Struct, frozen=True, eq=False):
-    """Final judgement of an estimator.
+    """Final judgement of an estimator."""
 
-    Attributes:
-        figures: By name, which ends with the unit.
-        estimate: As sent.
-        aligned: The same in the truth's frame, where there is a truth; `None` if there are none.
-        of_images: Errors of each pose at the time of its image.
-        of_ticks: Errors of the newest pose at each control tick; of a long flight every second one,
-            fourth, ….
-        lost: Intervals without a pose.
-        final: Trajectory after loop closures in the truth's frame, if sent.
-    """
-
-    figures: dict[str, Any]
-    estimate: Trajectory | None
+    figures: dict[str, Any]  # by name, which ends with the unit
+    estimate: Trajectory | None  # as sent
+    # The same in the truth's frame, where there is a truth; `None` if there are none.
     aligned: Trajectory | None = None
-    of_images: Errors | None = None
+    of_images: Errors | None = None  # errors of each pose at the time of its image
+    # Errors of the newest pose at each control tick; of a long flight every second one, fourth, ….
     of_ticks: Errors | None = None
-    lost: list[Interval] = []
-    final: Trajectory | None = None
+    lost: list[Interval] = []  # intervals without a pose
+    final: Trajectory | None = None  # trajectory after loop closures in the truth's frame, if sent
 
 
 def judge(
@@ -155,12 +139,12 @@ def judge(
     truth: Trajectory,
     *,
     cameras: Mapping[str, Stamps] | None = None,
-    end: int | None = None,
-    planned: int | None = None,
-    body: str = "base_link",
-    alignment: How | Literal["auto"] = "auto",
-    rate: float = 400.0,
-    gap: float = 0.5,
+    end: int | None = None,  # end of the run (ns); of the truth if not given
+    planned: int | None = None,  # planned end (ns), if it ended before
+    body: str = "base_link",  # frame of the truth's body
+    alignment: How | Literal["auto"] = "auto",  # see `choose_alignment`
+    rate: float = 400.0,  # control ticks a second
+    gap: float = 0.5,  # seconds of silence that count as lost
 ) -> Judgement:
     """Judge an estimator against the truth of the same body.
 
@@ -168,12 +152,6 @@ def judge(
         record: Without arrivals, latencies and errors at control ticks are not among the figures.
         cameras: Stamps of the images (ns), strictly rising, by camera: the flight is that of the
             estimator's camera; without cameras that of the truth.
-        end: End of the run (ns); of the truth if not given.
-        planned: Planned end (ns), if it ended before.
-        body: Frame of the truth's body.
-        alignment: See `choose_alignment`.
-        rate: Control ticks a second.
-        gap: Seconds of silence that count as lost.
     """
     end = int(truth.stamps[-1]) if end is None else end
     estimate = record.rows.trajectory() if len(record) else None
@@ -402,19 +380,14 @@ def errors_at_ticks(
 
 
 class Flight:
-    """Flight of a vehicle so far: its true poses, the last of them, and collisions in order.
-
-    Attributes:
-        path: Length of the path, metres.
-        body: Frame of its body.
-    """
+    """Flight of a vehicle so far: its true poses, the last of them, and collisions in order."""
 
     def __init__(self) -> None:
         self.truth = PoseRows()
         self.recent = RecentPoses()
-        self.path = 0.0
+        self.path = 0.0  # length of the path, metres
         self._position: Vector3 | None = None
-        self.body = "base_link"
+        self.body = "base_link"  # frame of its body
         self.collisions: list[Collision] = []
         self._plan = PoseRows()
         self._setpoints = PoseRows()

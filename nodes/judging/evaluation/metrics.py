@@ -253,8 +253,7 @@ def rms(values: Floats) -> float:
     return math.sqrt(float(np.mean(values**2)))
 
 
-_SINGULAR = 1e-9
-"""Smallest eigenvalue of an invertible correlation matrix."""
+_SINGULAR = 1e-9  # smallest eigenvalue of an invertible correlation matrix
 _BLOCK = 4096
 _THREE_SIGMA = float(chdtri(3, math.erfc(3.0 / math.sqrt(2.0))))
 """NEES in three dimensions, as rarely exceeded as 3 sigma in a single dimension: 14.16."""
@@ -323,19 +322,12 @@ How = Literal["none", "origin", "se3", "sim3"]
 
 
 class Alignment(msgspec.Struct, frozen=True, eq=False):
-    """Aligned estimate, and its transform: position ``scale · R · p + t``.
+    """Aligned estimate, and its transform: position ``scale · R · p + t``."""
 
-    Attributes:
-        trajectory: The estimate, now in the truth's frame.
-        rotation: R, estimate's frame to the truth's, shape (3, 3).
-        translation: t, metres in the truth's frame, shape (3,).
-        scale: True length of the estimate's unit.
-    """
-
-    trajectory: Trajectory
-    rotation: Floats
-    translation: Floats
-    scale: float
+    trajectory: Trajectory  # the estimate, now in the truth's frame
+    rotation: Floats  # R, estimate's frame to the truth's, shape (3, 3)
+    translation: Floats  # t, metres in the truth's frame, shape (3,)
+    scale: float  # true length of the estimate's unit
 
 
 def align(estimate: Trajectory, truth: Trajectory, how: How) -> Alignment:

@@ -49,18 +49,6 @@ class EstimatorRecord:
     Args:
         scale_free: Whether its unit of length is arbitrary.
         reads: See `events.EstimatorAnnouncement`.
-
-    Attributes:
-        rows: Poses of the trajectory.
-        repeated: Poses with a stamp not later than the last.
-        future: Poses and tracking events stamped later than their arrival.
-        bodies: Number of poses by body (`child_frame_id`).
-        elsewhere: Poses in another frame than the first one.
-        restarts: Number of changes to another frame, one after each loss of tracking.
-        velocities: Velocities of the poses that carry one: 3 numbers.
-        covariances: Likewise: 36 numbers, row by row.
-        final: The last trajectory after loop closures; `None` for none, or an empty one.
-        final_frame_id: Frame of `final`.
     """
 
     def __init__(
@@ -70,16 +58,17 @@ class EstimatorRecord:
         self.method = method
         self.reads = reads
         self.frame_id = ""
-        self.rows = PoseRows()
-        self.repeated = 0
-        self.future = 0
-        self.elsewhere = 0
-        self.restarts = 0
-        self.bodies: Counter[str] = Counter()
-        self.velocities = Said(3)
-        self.covariances = Said(36)
+        self.rows = PoseRows()  # poses of the trajectory
+        self.repeated = 0  # poses with a stamp not later than the last
+        self.future = 0  # poses and tracking events stamped later than their arrival
+        self.elsewhere = 0  # poses in another frame than the first one
+        self.restarts = 0  # number of changes to another frame, one after each loss of tracking
+        self.bodies: Counter[str] = Counter()  # number of poses by body (`child_frame_id`)
+        self.velocities = Said(3)  # velocities of the poses that carry one: 3 numbers
+        self.covariances = Said(36)  # likewise: 36 numbers, row by row
+        # The last trajectory after loop closures; `None` for none, or an empty one.
         self.final: Trajectory | None = None
-        self.final_frame_id = ""
+        self.final_frame_id = ""  # frame of `final`
         self._last_stamp: int | None = None
         self._last_frame = ""
         self._arrivals = array("q")

@@ -94,8 +94,7 @@ def _write_errors(path: Path, since: str, errors: Errors) -> None:
     path.write_text("".join(lines), encoding="ascii")
 
 
-_WAITING = 30
-"""Images whose features may still come."""
+_WAITING = 30  # images whose features may still come
 _RECENT_GREEN, _OUTLIER_RED = (90, 255, 60), (60, 70, 255)  # blue, green, red
 
 

@@ -71,22 +71,18 @@ UNDECLARED = "reads_truth: expected it to announce that it reads the truth, foun
 
 
 def conclude(
-    found: Mapping[str, dict[str, Any]],
+    found: Mapping[str, dict[str, Any]],  # see `judge`
     thresholds: Thresholds,
-    faults: Sequence[str] = (),
+    faults: Sequence[str] = (),  # further reasons why all have failed
     end: RunEnd | None = None,
-    declared: Collection[str] = (),
+    declared: Collection[str] = (),  # estimators that announced that they read the truth
     flights: Mapping[str, dict[str, Any]] = MappingProxyType({}),
-    own: Mapping[str, Thresholds] = MappingProxyType({}),
+    own: Mapping[str, Thresholds] = MappingProxyType({}),  # thresholds of single estimators
 ) -> dict[str, Any]:
     """Return the verdict on figures by estimator, for ``evaluation/verdict.json``.
 
     Args:
-        found: See `judge`.
-        faults: Further reasons why all have failed.
-        declared: Estimators that announced that they read the truth.
         flights: Figures of the flights themselves, by vehicle.
-        own: Thresholds of single estimators.
 
     Returns:
         ``passed``, ``estimators``, ``flights``, ``thresholds``; ``failed`` has the reason if there

@@ -51,14 +51,13 @@ class JudgeConfig(EvaluationConfig):
 def judge_all(
     truth: Source,
     estimates: Sequence[Source],
-    frames: npt.NDArray[np.int64] | None,
+    frames: npt.NDArray[np.int64] | None,  # stamps of the images (ns), if known
     config: JudgeConfig,
     finals: Mapping[str, Trajectory] = MappingProxyType({}),
 ) -> tuple[dict[str, Judgement], Verdict, list[str]]:
     """Judge estimates against the truth, at the stamps of the images if known.
 
     Args:
-        frames: Stamps of the images (ns), if known.
         finals: The trajectories after loop closures, by estimate.
 
     Returns:

@@ -104,25 +104,19 @@ _FORMATS = (
     "a trajectory: rows of TUM (8 fields with blanks between), KITTI (12), EuRoC (17 with commas), "
     "or 8 with commas under a header that names the columns (EuRoC, VSLAM-LAB)"
 )
-_SCALAR = re.compile(r"q\w*w\b")
-"""Of a header: the column of a quaternion's scalar part."""
+_SCALAR = re.compile(r"q\w*w\b")  # of a header: the column of a quaternion's scalar part
 _FRAME = re.compile(r"# base_link \(FRD\) in (\S+), as it was sent")  # of a run's estimate
 _LONGEST_STEP = 10 * 86_400 * SECOND  # more are stamps of different units or clocks
 
 
 class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """A trajectory from outside: poses of the truth's body in a world NED.
-
-    Attributes:
-        frame_id: Of the poses, if the source says so.
-        counts: Figures that only a topic has: restarts and repeated stamps.
-    """
+    """A trajectory from outside: poses of the truth's body in a world NED."""
 
     name: str
     file: str
     poses: Trajectory
-    frame_id: str = ""
-    counts: dict[str, int] = {}
+    frame_id: str = ""  # of the poses, if the source says so
+    counts: dict[str, int] = {}  # figures that only a topic has: restarts and repeated stamps
 
 
 def read_truth(text: str, times: str) -> Source:

@@ -19,40 +19,28 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Painting = tuple[npt.NDArray[np.uint8], int]
 
-MOST = 1_000_000
-"""Points of a cloud drawn at most: their indices take 20 bits."""
-
+MOST = 1_000_000  # points of a cloud drawn at most: their indices take 20 bits
 _DEPTHS = 0xFFFFF
 _BACKGROUND = np.array([250, 250, 248], np.uint8)
 
 
 class Shown(msgspec.Struct, frozen=True, eq=False):
-    """A cloud prepared for drawing.
-
-    Attributes:
-        points: East, north, up, metres, float32, shape (n, 3).
-        colors: Red, green, blue, uint8, shape (n, 3).
-    """
+    """A cloud prepared for drawing."""
 
     name: str
-    points: npt.NDArray[np.float32]
-    colors: npt.NDArray[np.uint8]
+    points: npt.NDArray[np.float32]  # east, north, up, metres, float32, shape (n, 3)
+    colors: npt.NDArray[np.uint8]  # red, green, blue, uint8, shape (n, 3)
     total: int
 
 
 class View(msgspec.Struct, frozen=True, eq=False):
-    """An orthographic view.
-
-    Attributes:
-        axes: East, north, up to right, up on the image, towards the viewer; shape (3, 3).
-        low: Corner of the image, metres right and up, shape (2,).
-        labels: Of the axes, right and up; if empty, a scale bar instead.
-    """
+    """An orthographic view."""
 
     title: str
-    axes: Floats
-    low: Floats
+    axes: Floats  # east, north, up to right, up on the image, towards the viewer; shape (3, 3)
+    low: Floats  # corner of the image, metres right and up, shape (2,)
     high: Floats
+    # Of the axes, right and up; if empty, a scale bar instead.
     labels: tuple[str, str] | None = None
 
 
@@ -108,21 +96,15 @@ def _size(view: View, pixels: float) -> tuple[int, int]:
     return up, across
 
 
-ABREAST = 3
-"""Clouds side by side in a figure, at most."""
-
-_ENOUGH = 100_000
-"""Points of a cloud sampled to choose its views, at most."""
+ABREAST = 3  # clouds side by side in a figure, at most
+_ENOUGH = 100_000  # points of a cloud sampled to choose its views, at most
 _CLEARANCE = 0.4
 """Metres from the highest pose up to the cut-off of clouds, to show rooms below the ceiling."""
 _AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(42.0)
 """Of the oblique view: from the south-west, and from above."""
-_TALLEST, _TITLE = 6.0, 0.55
-"""Height of a view at most, and of its title and labels, inches."""
-_THINNEST = 0.15
-"""Least ratio of a view's shorter side to its longer side."""
-_DETAIL = 3.6
-"""Metres across of the detail."""
+_TALLEST, _TITLE = 6.0, 0.55  # height of a view at most, and of its title and labels, inches
+_THINNEST = 0.15  # least ratio of a view's shorter side to its longer side
+_DETAIL = 3.6  # metres across of the detail
 
 
 def draw_clouds(run: Run) -> list[Plot]:

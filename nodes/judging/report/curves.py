@@ -17,16 +17,12 @@ from nodes.trajectory import Trajectory
 
 SECOND = 1e9
 MILLISECOND = 1e6
-LENGTHS = (1.0, 2.0, 5.0, 10.0, 20.0)
-"""Path lengths of the relative errors, metres."""
-
+LENGTHS = (1.0, 2.0, 5.0, 10.0, 20.0)  # path lengths of the relative errors, metres
 _STYLES: dict[str, Any] = {"at image time": "-", "newest at control ticks": (0, (4, 2))}
 """Of the lines of distributions."""
 _LOST = "lost, in the estimator's colour"
-_SHOWN = 95
-"""Percentile of the errors at the end of the axis of distributions, at least."""
-_FEWEST = 5
-"""Least number of pose pairs for a box."""
+_SHOWN = 95  # percentile of the errors at the end of the axis of distributions, at least
+_FEWEST = 5  # least number of pose pairs for a box
 
 
 def draw_errors(run: Run) -> Plot | None:

@@ -28,11 +28,8 @@ from runtime.time.schedule import SECOND
 
 Floats = npt.NDArray[np.float64]
 
-GAP = SECOND // 2
-"""Silence counted as lost (ns)."""
-
-_FARTHEST = 1e12
-"""Limit of coordinates, metres: a diverged estimate overflows squares and plots."""
+GAP = SECOND // 2  # silence counted as lost (ns)
+_FARTHEST = 1e12  # limit of coordinates, metres: a diverged estimate overflows squares and plots
 
 
 def read_poses(path: Path) -> Trajectory:
@@ -67,8 +64,7 @@ T = TypeVar("T")
 
 _LOG_LINES = 200
 _NO_ESTIMATES = {"truth", "plan"}
-_ABOUT = 0.25
-"""Tolerated difference between two counts of lost time, seconds."""
+_ABOUT = 0.25  # tolerated difference between two counts of lost time, seconds
 _LOUD = {"WARNING", "ERROR", "CRITICAL"}
 
 

@@ -40,8 +40,7 @@ _OURS = (
     "relative",
     "frames_*",
     "clouds_*",
-)
-"""Names of the figures; those of an earlier report are removed."""
+)  # names of the figures; those of an earlier report are removed
 
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 88]
 
@@ -50,8 +49,7 @@ _ALIGNED = {
     "origin": "laid on the truth at its first pose",
     "se3": "laid on the truth as a whole (SE3)",
     "sim3": "laid on the truth as a whole, with scale (Sim3)",
-}
-"""How estimates and the truth were brought together, in words."""
+}  # how estimates and the truth were brought together, in words
 
 
 def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:

@@ -21,19 +21,14 @@ Floats = npt.NDArray[np.float64]
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6a3d7c", "#6b5b00")
 """For estimators. The first six are told apart by the colour-blind as well (M. Okabe and K. Ito,
 "Color universal design", 2008)."""
-TRUTHS = ("#3a3a3a", "#8a6d3b", "#4f6f52", "#6b5b7a")
-"""For the true paths of the vehicles."""
+TRUTHS = ("#3a3a3a", "#8a6d3b", "#4f6f52", "#6b5b7a")  # for the true paths of the vehicles
 HIT = "#b3261e"
 PLAN = "#111111"
-LINE = COLORS[0]
-"""Colour of data of no estimator."""
-
-WIDTH = 10.0
-"""Inches of a figure across the page."""
+LINE = COLORS[0]  # colour of data of no estimator
+WIDTH = 10.0  # inches of a figure across the page
 DPI = 110
 
-_MOST = 2500
-"""Points of a plotted line, at most."""
+_MOST = 2500  # points of a plotted line, at most
 
 _LETTERS, _HANDLE = 115, 8
 """Letters of a legend across the page; letters taken by a line sample and its margin."""
@@ -67,22 +62,14 @@ _STYLE: dict[Any, Any] = {
 
 
 class Plot(msgspec.Struct, frozen=True, eq=False):
-    """A figure of the report.
+    """A figure of the report."""
 
-    Attributes:
-        name: Of its files, without suffix.
-        title: What it shows.
-        caption: How to read it.
-        raster: Whether it is made of pixels: no SVG or PDF.
-        photo: Whether it is of camera images, which the page holds as JPEG.
-    """
-
-    name: str
+    name: str  # of its files, without suffix
     figure: Figure
-    title: str
-    caption: str = ""
-    raster: bool = False
-    photo: bool = False
+    title: str  # what it shows
+    caption: str = ""  # how to read it
+    raster: bool = False  # whether it is made of pixels: no SVG or PDF
+    photo: bool = False  # whether it is of camera images, which the page holds as JPEG
 
     def write(self, folder: Path, formats: Sequence[str]) -> Path:
         """Write the figure as PNG, and in other formats; return the PNG's path. Reproducible."""

@@ -79,29 +79,20 @@ class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """Contents of a run's folder, as far as read.
-
-    Attributes:
-        truths: True poses, by vehicle; the first vehicle's first.
-        plans: Poses intended by pilots, by vehicle.
-        collisions: North, east, down, metres, shape (n, 3).
-        frames: Sample images with features, by estimator's file name.
-        log: Its warnings and errors.
-        missing: Sentences on missing or unreadable files.
-    """
+    """Contents of a run's folder, as far as read."""
 
     folder: Path
     facts: Facts
     verdict: Verdict | None
-    truths: dict[str, Trajectory]
-    plans: dict[str, Trajectory]
-    collisions: npt.NDArray[np.float64]
+    truths: dict[str, Trajectory]  # true poses, by vehicle; the first vehicle's first
+    plans: dict[str, Trajectory]  # poses intended by pilots, by vehicle
+    collisions: npt.NDArray[np.float64]  # north, east, down, metres, shape (n, 3)
     estimators: list[Estimator]
-    frames: dict[str, list[Path]]
+    frames: dict[str, list[Path]]  # sample images with features, by estimator's file name
     clouds: list[Path]
     config: str | None
-    log: list[str]
-    missing: list[str]
+    log: list[str]  # its warnings and errors
+    missing: list[str]  # sentences on missing or unreadable files
 
     @property
     def name(self) -> str:
@@ -128,18 +119,13 @@ _NO_FIGURES = {"passed", "failed", "why"}
 
 
 class Row(msgspec.Struct, frozen=True):
-    """A row of a table of figures.
-
-    Attributes:
-        limit: Threshold; empty if there is none.
-        cells: By estimator: its value, and whether it is missed.
-    """
+    """A row of a table of figures."""
 
     name: str
     meaning: str
     unit: str
-    limit: str
-    cells: list[tuple[str, bool]]
+    limit: str  # threshold; empty if there is none
+    cells: list[tuple[str, bool]]  # by estimator: its value, and whether it is missed
 
 
 def figures(run: Run, *, main: bool) -> list[Row]:

@@ -34,17 +34,11 @@ from nodes.trajectory import Trajectory
 from runtime.paths import source_file, source_of
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 0.7, 0.2, 0.5, 0.5
-_ASIDE, _BETWEEN = 0.75, 0.8
-"""Inches around the axes, and between them."""
-_ROW = 0.2
-"""Inches of a row of the legend."""
-_TALLEST = 6.0
-"""Inches of the view from above, at most."""
-_TIME = 1.3
-"""Inches of the height over time, at least."""
-
-Rectangle = tuple[float, float, float, float]
-"""Left, bottom, width, height; inches."""
+_ASIDE, _BETWEEN = 0.75, 0.8  # inches around the axes, and between them
+_ROW = 0.2  # inches of a row of the legend
+_TALLEST = 6.0  # inches of the view from above, at most
+_TIME = 1.3  # inches of the height over time, at least
+Rectangle = tuple[float, float, float, float]  # left, bottom, width, height; inches
 
 
 class _Line(msgspec.Struct, frozen=True, eq=False):
@@ -206,10 +200,8 @@ def _ends(above: Any, beside: Any, line: _Line, *, main: bool) -> None:
 
 _COLUMNS = 4
 _MOST = 12
-_GAP = 6
-"""Pixels between images."""
-_CAPTION = 26
-"""Pixels above each."""
+_GAP = 6  # pixels between images
+_CAPTION = 26  # pixels above each
 
 
 def draw_frames(run: Run) -> list[Plot]:

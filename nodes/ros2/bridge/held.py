@@ -29,17 +29,12 @@ from runtime import Node
 from runtime.channels.hold import Hold, Owed
 from runtime.errors import MissingAnswerError, suggest
 
-WAITING = 64
-"""Messages waiting to be published in real time; beyond this, images are dropped."""
-
+WAITING = 64  # messages waiting to be published in real time; beyond this, images are dropped
 SETTLED = 0.3
 """Real seconds without a new subscription, after all needed ones, until publishing begins."""
 
-CLOSING = 2.0
-"""Real seconds for the remaining messages at the end of the run."""
-
-_LOOK = 0.01
-"""Real seconds between two polls of the subscriptions."""
+CLOSING = 2.0  # real seconds for the remaining messages at the end of the run
+_LOOK = 0.01  # real seconds between two polls of the subscriptions
 
 
 class HeldEstimator:
@@ -162,23 +157,16 @@ class HeldLine:
 
     In lockstep nothing is dropped: messages and simulated time wait for the estimators. In real
     time early messages are left out, and images when too many wait.
-
-    Args:
-        session: Declares the publishers as held.
-        deliver: Sends an answer's event, at its time.
-
-    Attributes:
-        dropped: Images left out.
     """
 
     def __init__(
         self,
         node: Node[Any],
-        session: Session,
+        session: Session,  # declares the publishers as held
         estimators: Sequence[HeldEstimator],
-        deliver: Callable[[Event], None],
+        deliver: Callable[[Event], None],  # sends an answer's event, at its time
     ) -> None:
-        self.dropped = 0
+        self.dropped = 0  # images left out
         self._node, self._session = node, session
         self._estimators, self._deliver = estimators, deliver
         self._publishers: list[Publisher] = []

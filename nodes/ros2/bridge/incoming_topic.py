@@ -159,8 +159,7 @@ def topic(store: TypeStore, name: str, type_: str, qos: Qos) -> Topic:
         raise ValueError(f"{name}: {error}") from None
 
 
-BUDGET = 0.0005
-"""Longest turn of the loop, seconds."""
+BUDGET = 0.0005  # longest turn of the loop, seconds
 
 
 class Inbox:
@@ -168,11 +167,7 @@ class Inbox:
 
     Args:
         deliver: Called on the loop with the bytes of each; must not raise.
-        depth: Messages that wait at most; the oldest is dropped.
-        max_rate: Messages a second at most, with bursts of `depth`.
-        max_size: Bytes of a message at most.
         complain: Called in the reading thread with the reason of a drop.
-        now: Real seconds.
     """
 
     def __init__(
@@ -180,11 +175,11 @@ class Inbox:
         loop: asyncio.AbstractEventLoop,
         deliver: Callable[[bytes], object],
         *,
-        depth: int,
-        max_rate: float,
-        max_size: int,
+        depth: int,  # messages that wait at most; the oldest is dropped
+        max_rate: float,  # messages a second at most, with bursts of `depth`
+        max_size: int,  # bytes of a message at most
         complain: Callable[[str, str], None],
-        now: Callable[[], float] = time.monotonic,
+        now: Callable[[], float] = time.monotonic,  # real seconds
     ) -> None:
         self._loop = loop
         self._deliver = deliver

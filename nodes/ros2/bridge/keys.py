@@ -35,21 +35,14 @@ class NodeName(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Token(msgspec.Struct, frozen=True, kw_only=True):
-    """Contents of a node's or endpoint's liveliness token.
+    """Contents of a node's or endpoint's liveliness token."""
 
-    Attributes:
-        key: The token itself; its `gid` stands in its owner's messages.
-        zid: The session's id as text.
-        topic: Name of its topic or service; empty for a node.
-        extra: The rest, as shareable buffers of newer releases.
-    """
-
-    key: str
+    key: str  # the token itself; its `gid` stands in its owner's messages
     kind: Kind
     node: NodeName
-    zid: str
-    topic: str = ""
-    extra: str = ""
+    zid: str  # the session's id as text
+    topic: str = ""  # name of its topic or service; empty for a node
+    extra: str = ""  # the rest, as shareable buffers of newer releases
 
 
 _TOKEN = re.compile(
@@ -117,28 +110,19 @@ SIZE = _LAYOUT.size
 
 
 class Attachment(NamedTuple):
-    """Contents of a message's attachment.
+    """Contents of a message's attachment."""
 
-    Attributes:
-        sequence: Number of the message from its publisher, from 1.
-        stamp: Wall clock, nanoseconds since 1970.
-        gid: Publisher's 16 bytes.
-    """
-
-    sequence: int
-    stamp: int
-    gid: bytes
+    sequence: int  # number of the message from its publisher, from 1
+    stamp: int  # wall clock, nanoseconds since 1970
+    gid: bytes  # publisher's 16 bytes
 
 
 class Message(NamedTuple):
-    """A received message; its bytes are copied only on request.
-
-    Attributes:
-        attached: Returns the attachment, to convert to bytes; `None` if there is none.
-    """
+    """A received message; its bytes are copied only on request."""
 
     size: int
     read: Callable[[], bytes]
+    # Returns the attachment, to convert to bytes; `None` if there is none.
     attached: Callable[[], Any] = bytes
 
     @property
@@ -173,8 +157,7 @@ def unpack(data: bytes) -> Attachment:
     return Attachment(sequence, stamp, gid)
 
 
-LOG_INTERVAL = 5.0
-"""Real seconds between two log lines about the same."""
+LOG_INTERVAL = 5.0  # real seconds between two log lines about the same
 
 
 class Complaints:

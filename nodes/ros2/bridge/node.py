@@ -42,8 +42,7 @@ from runtime import Node, Output, Stream, Tick, every, on
 from runtime.channels.ports import Handles
 from runtime.errors import FatalError, UncheckableError
 
-WAITING = 8
-"""Images of a kind waiting to be published; the oldest is dropped, and counted."""
+WAITING = 8  # images of a kind waiting to be published; the oldest is dropped, and counted
 
 
 class Ros2Bridge(Node[Ros2BridgeConfig]):
@@ -91,18 +90,15 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             for kind in LARGE
         }
         self._incoming: list[IncomingTopic] = []
-        self._unread: list[Stream[bytes]] = []
-        """Unread images from ROS."""
+        self._unread: list[Stream[bytes]] = []  # unread images from ROS
         self._outgoing: list[OutgoingTopic] = []
         self._cameras: list[CameraAnnouncement] = []
         self._vehicles: list[str] = []
         self._services: Services | None = None
         self._stamps: Stamps | None = None
         self._open = False
-        self._line: HeldLine | None = None
-        """Publishes everything in order, if estimators are held."""
-        self._rates: dict[str, float] = {}
-        """Of announced cameras and lidars."""
+        self._line: HeldLine | None = None  # publishes everything in order, if estimators are held
+        self._rates: dict[str, float] = {}  # of announced cameras and lidars
         if self.config.publications:
             self._declare_mapped_events()
         # Messages of ROS come at their own time, unless time waits for them.

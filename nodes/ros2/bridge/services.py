@@ -46,8 +46,7 @@ Serve = Callable[[Any], Awaitable[dict[str, Any]]]
 
 Finish = Callable[[bytearray | str], None]
 
-WAITING = 64
-"""Unanswered requests, at most."""
+WAITING = 64  # unanswered requests, at most
 
 
 class ServiceServer:
@@ -160,8 +159,7 @@ STOPPED, PLAYING, PAUSED, QUITTING = range(4)
 FEATURE_UNSUPPORTED, OK, OPERATION_FAILED = 0, 1, 4
 ALREADY_IN_TARGET_STATE, INCORRECT_TRANSITION = 101, 103
 
-LONGEST = 86_400 * SECOND
-"""Longest step of a single request, nanoseconds of the run's clock."""
+LONGEST = 86_400 * SECOND  # longest step of a single request, nanoseconds of the run's clock
 
 
 class SimulationServices:
@@ -170,8 +168,7 @@ class SimulationServices:
     def __init__(self, server: ServiceServer) -> None:
         self._server = server
         self._stepping = server.node.stepping
-        self.step = round(server.node.config.step * SECOND)
-        """Length of a step, nanoseconds."""
+        self.step = round(server.node.config.step * SECOND)  # length of a step, nanoseconds
 
     def declare(self) -> None:
         """Declare the services; called in any thread."""
@@ -393,8 +390,7 @@ class VehicleServices:
         self._server = server
         self._node = server.node
         self._send = send
-        self._armed: dict[str, bool] = {}
-        """Whether a vehicle is armed, by name, where known."""
+        self._armed: dict[str, bool] = {}  # whether a vehicle is armed, by name, where known
         self._waiting: set[tuple[str, type[VehicleEvent], asyncio.Future[None]]] = set()
 
     def declare(self, vehicle: str) -> None:

@@ -44,8 +44,6 @@ class Publisher:
     """Publisher of messages on a topic.
 
     Args:
-        matched: Tells whether somebody subscribes to the topic.
-        gid_: Of the endpoint; if ``None``, messages have no attachment.
         max_wait: Real seconds that `put` waits for a peer that does not read; the message is then
             lost.
 
@@ -53,8 +51,6 @@ class Publisher:
         sent: Number of messages out.
         failed: Number of messages lost: the session is closed, or a peer did not read for
             `max_wait`.
-        note: Called with each message put.
-        kept: The last messages and their attachments, if the topic is transient local.
         wanted: Whether messages are made even without subscribers.
     """
 
@@ -64,18 +60,20 @@ class Publisher:
         self,
         topic: Topic,
         put: Callable[..., object],
-        matched: Callable[[], bool],
-        gid_: bytes | None,
+        matched: Callable[[], bool],  # tells whether somebody subscribes to the topic
+        gid_: bytes | None,  # of the endpoint; if ``None``, messages have no attachment
         max_wait: float,
     ) -> None:
         self.topic = topic
         self.matched = matched
         self.sent = self.failed = 0
+        # Called with each message put.
         self.note: Callable[[Publisher, bytearray], None] | None = None
         self._put = put
         self._gid = gid_
         self._max_wait = max_wait
         depth = topic.qos.depth if topic.qos.transient_local else 0
+        # The last messages and their attachments, if the topic is transient local.
         self.kept: deque[tuple[bytes, bytes | None]] = deque(maxlen=depth)
 
     def put(self, message: bytearray) -> None:
@@ -98,24 +96,16 @@ class Publisher:
             self.note(self, message)
 
 
-Take = Callable[[Message], None]
-"""Called in a thread with each message."""
-
+Take = Callable[[Message], None]  # called in a thread with each message
 Answer = Callable[[bytearray | str, bytes], None]
 """Answers a request, in any thread: with a message and its attachment, or with an error."""
 
 WAIT_BEFORE_DROP = 300
 """Microseconds for a put to wait for a peer not reading; Zenoh's default is 1000."""
 
-WAITING = 64
-"""Unread messages kept by Zenoh; with more, the sender has to wait."""
-
-PAUSE = 0.001
-"""Seconds between two polls for messages; faster messages are taken in batches."""
-
-CLOSING = 3.0
-"""Seconds."""
-
+WAITING = 64  # unread messages kept by Zenoh; with more, the sender has to wait
+PAUSE = 0.001  # seconds between two polls for messages; faster messages are taken in batches
+CLOSING = 3.0  # seconds
 _QUEUE = "transport/link/tx/queue/congestion_control"
 _OURS: dict[str, Any] = {
     "mode": "peer",
@@ -126,8 +116,7 @@ _OURS: dict[str, Any] = {
     "connect/timeout_ms": -1,  # try for ever,
     "connect/exit_on_failure": False,  # but beside the run; and again if a router goes
     f"{_QUEUE}/drop/wait_before_drop": WAIT_BEFORE_DROP,
-}
-"""Replacements of Zenoh's defaults, such as listening on all addresses, and multicast."""
+}  # replacements of Zenoh's defaults, such as listening on all addresses, and multicast
 
 _IN_ZENOH = re.compile(r" at /\S+\.rs:\d+\.?")
 _IN_FILE = re.compile(r'Message \{ msg: "(.*)", location: .*line: (\d+), column: (\d+).*')
@@ -142,8 +131,6 @@ class Session:
     """Zenoh session of a single ROS node.
 
     Args:
-        keys: Naming of topics.
-        connect: Endpoints to connect to, until they answer.
         file: A Zenoh configuration; the default, also for endpoints of `None`, is rmw_zenoh_cpp's.
         max_wait: Real seconds that a held message waits for a peer that does not read; it then
             fails, and that connection ends.
@@ -156,8 +143,8 @@ class Session:
         self,
         node: NodeName,
         *,
-        keys: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh",
-        connect: tuple[str, ...] | None = None,
+        keys: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh",  # naming of topics
+        connect: tuple[str, ...] | None = None,  # endpoints to connect to, until they answer
         listen: tuple[str, ...] | None = None,
         file: str = "",
         max_wait: float = 5.0,

@@ -49,20 +49,13 @@ from nodes.ros2.messages.typestore import Stamps
 
 
 class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
-    """Input of a reader besides the message.
+    """Input of a reader besides the message."""
 
-    Attributes:
-        source: Of the event.
-        now: On the run's clock (ns).
-        frame_id: If set, replaces the message's.
-        vehicle: Of a set-point.
-    """
-
-    source: str
-    now: int
+    source: str  # of the event
+    now: int  # on the run's clock (ns)
     stamps: Stamps = Stamps()
-    frame_id: str = ""
-    vehicle: str = ""
+    frame_id: str = ""  # if set, replaces the message's
+    vehicle: str = ""  # of a set-point
 
     def stamp(self, header: Any) -> int:
         """Return a header's time as a stamp; a `ValueError` if it is no time of this run."""

@@ -57,9 +57,7 @@ from nodes.ros2.messages.topics import (
     topic_name,
 )
 
-TopicKind = str
-"""The `kind` of a mapping."""
-
+TopicKind = str  # the `kind` of a mapping
 Kind = type[Event]
 Events = tuple[Kind, ...]
 
@@ -88,41 +86,27 @@ def _always(_: PublishingConfig) -> bool:
 
 
 class Mapping(msgspec.Struct, frozen=True):
-    """Mapping between events and a type of ROS message: published, read, or both.
+    """Mapping between events and a type of ROS message: published, read, or both."""
 
-    Attributes:
-        kind: Name of the publication.
-        topic: With `{}` for the source of the events.
-        group: In the setting ``publish``.
-        events: Published events; an event of several rows goes by the order of the table.
-        announced: Announcements for which the topic is there from the start.
-        gives: Kinds of image of which a camera has to give at least one.
-        large: Whether a message takes long to make.
-        image: Whether an estimator may subscribe to it for its images.
-        source: Returns the text for `{}`; `None` for an event without such a message.
-        wanted: Whether settings let it be published, beside `group`.
-        use: Use of the messages, as settings name it.
-        becomes: Type of the events that are read, if it is not `events`.
-        bags: Whether only replays of bags read it.
-    """
-
-    kind: TopicKind = ""
-    topic: str = ""
+    kind: TopicKind = ""  # name of the publication
+    topic: str = ""  # with `{}` for the source of the events
     type: str = ""
-    group: TopicGroup = "transforms"
-    events: Events = ()
+    group: TopicGroup = "transforms"  # in the setting ``publish``
+    events: Events = ()  # published events; an event of several rows goes by the order of the table
     write: Callable[[Outgoing, Any], Any] = outgoing.nothing
-    announced: Events = ()
-    gives: tuple[str, ...] = ()
+    announced: Events = ()  # announcements for which the topic is there from the start
+    gives: tuple[str, ...] = ()  # kinds of image of which a camera has to give at least one
     qos: Qos = Qos()
-    large: bool = False
-    image: bool = False
+    large: bool = False  # whether a message takes long to make
+    image: bool = False  # whether an estimator may subscribe to it for its images
+    # Returns the text for `{}`; `None` for an event without such a message.
     source: Callable[[Outgoing, Any], str | None] = _source
+    # Whether settings let it be published, beside `group`.
     wanted: Callable[[PublishingConfig], object] = _always
-    use: str = ""
+    use: str = ""  # use of the messages, as settings name it
     read: Reader = incoming.nothing
-    becomes: Kind | None = None
-    bags: bool = False
+    becomes: Kind | None = None  # type of the events that are read, if it is not `events`
+    bags: bool = False  # whether only replays of bags read it
 
 
 # fmt: off
@@ -221,22 +205,16 @@ MAPPINGS = (
 )
 # fmt: on
 
-PUBLISHED = tuple(row for row in MAPPINGS if row.kind)
-"""Rows of the messages made of events."""
-
-READERS = {(row.type, row.use): row for row in MAPPINGS if row.use}
-"""By type of message and use."""
-
+PUBLISHED = tuple(row for row in MAPPINGS if row.kind)  # rows of the messages made of events
+READERS = {(row.type, row.use): row for row in MAPPINGS if row.use}  # by type of message and use
 LARGE: tuple[type[Event], ...] = tuple(
     dict.fromkeys(each for row in PUBLISHED if row.large for each in row.events)
-)
-"""Events with slow messages: made in threads, a thread for each of these types."""
+)  # events with slow messages: made in threads, a thread for each of these types
 
 SMALL: tuple[type[Event], ...] = (
     *dict.fromkeys(each for row in PUBLISHED if not row.large for each in row.events),
     TrackedFeatures,  # no message: it tells whose estimates an estimator's are
-)
-"""All other events with messages, and events with an effect on messages."""
+)  # all other events with messages, and events with an effect on messages
 
 
 @cache

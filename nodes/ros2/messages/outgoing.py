@@ -44,8 +44,7 @@ from nodes.ros2.messages.transforms import Transform, Transforms
 from nodes.ros2.messages.typestore import Time, TypeStore
 
 _ZEROS_9, _ZEROS_36 = np.zeros(9), np.zeros(36)
-_UNKNOWN = np.array([-1.0, *[0.0] * 8])
-"""Covariance of an unmeasured quantity (sensor_msgs/Imu)."""
+_UNKNOWN = np.array([-1.0, *[0.0] * 8])  # covariance of an unmeasured quantity (sensor_msgs/Imu)
 
 
 class Outgoing:
@@ -53,11 +52,6 @@ class Outgoing:
 
     Args:
         time: Returns the time in messages of a stamp (ns).
-
-    Attributes:
-        cameras: By source.
-        bodies: Sources of self-moving bodies.
-        sensors: Announcement of a topic, by its kind and source.
     """
 
     def __init__(
@@ -67,8 +61,9 @@ class Outgoing:
         self.names = FrameNames()
         self.transforms = Transforms(self.names, config.vehicle, config.tf)
         self.paths = Paths(store, self.names, config)
-        self.cameras: dict[str, CameraAnnouncement] = {}
-        self.bodies: set[str] = set()
+        self.cameras: dict[str, CameraAnnouncement] = {}  # by source
+        self.bodies: set[str] = set()  # sources of self-moving bodies
+        # Announcement of a topic, by its kind and source.
         self.sensors: dict[tuple[str, str], Any] = {}
         self._writers: dict[tuple[str, str, str], ImageWriter] = {}
 

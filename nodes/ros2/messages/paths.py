@@ -18,10 +18,8 @@ from nodes.ros2.messages.typestore import Time, TypeStore
 from runtime.time.schedule import SECOND
 
 _COUNT = struct.Struct("<I")
-_CDR = 4
-"""Bytes before a message, excluded from alignment."""
-_POSE = 56
-"""Seven float64: position, and the quaternion's x, y, z, w."""
+_CDR = 4  # bytes before a message, excluded from alignment
+_POSE = 56  # seven float64: position, and the quaternion's x, y, z, w
 
 
 class Paths:

@@ -17,25 +17,18 @@ from events.announcements import Vehicles
 from events.frames import Axes, axes_of
 from runtime import NodeConfig
 
-NO_HASH = "TypeHashNotSupported"
-"""Text of Humble in the place of a type's hash."""
-
+NO_HASH = "TypeHashNotSupported"  # text of Humble in the place of a type's hash
 _DEFAULT_DEPTH = 42
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class Qos(msgspec.Struct, frozen=True, kw_only=True):
-    """Quality of service, as far as used here.
-
-    Attributes:
-        transient_local: Whether late joiners get the last `depth` messages.
-        keep_all: Whether a publisher waits for slow readers rather than drop a message.
-    """
+    """Quality of service, as far as used here."""
 
     reliable: bool = True
-    transient_local: bool = False
+    transient_local: bool = False  # whether late joiners get the last `depth` messages
     depth: int = 10
-    keep_all: bool = False
+    keep_all: bool = False  # whether a publisher waits for slow readers rather than drop a message
 
     def text(self) -> str:
         """Return the text in a token; defaults of rmw_zenoh_cpp stay empty.
@@ -50,17 +43,11 @@ class Qos(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Topic(msgspec.Struct, frozen=True, kw_only=True):
-    """A topic from the view of an endpoint.
+    """A topic from the view of an endpoint."""
 
-    Attributes:
-        name: With its leading slash.
-        type: ``sensor_msgs/msg/Image``.
-        hash: ``RIHS01_…``, or `NO_HASH`; empty if not needed.
-    """
-
-    name: str
-    type: str
-    hash: str = ""
+    name: str  # with its leading slash
+    type: str  # ``sensor_msgs/msg/Image``
+    hash: str = ""  # ``RIHS01_…``, or `NO_HASH`; empty if not needed
     qos: Qos = Qos()
 
 
@@ -215,8 +202,7 @@ DEFINITIONS = {
     f"{STEPS}_SendGoal": f"{_ID}{STEPS}_Goal goal\n---\nbool accepted\n{_STAMP}",
     f"{STEPS}_GetResult": f"{_ID}---\nint8 status\n{STEPS}_Result result",
     CANCEL_GOAL: "GoalInfo goal_info\n---\nint8 return_code\nGoalInfo[] goals_canceling",
-}
-"""By type; request and response of a service are divided by ``---``."""
+}  # by type; request and response of a service are divided by ``---``
 
 
 class CameraFrames(msgspec.Struct, frozen=True):
@@ -238,8 +224,7 @@ class FrameNames:
         """Optical frame to the camera's source and its own name."""
         self.own: set[str] = set()
         """Frames whose names say already whose they are: ROS calls them the same."""
-        self.vehicles = Vehicles()
-        """Whose frames are distinguished."""
+        self.vehicles = Vehicles()  # whose frames are distinguished
 
     def add(self, camera: CameraAnnouncement) -> CameraFrames:
         """Add a camera: its frames have its own name, or its vehicle's too if taken."""

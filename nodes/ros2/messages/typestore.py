@@ -203,8 +203,7 @@ class Bag:
         except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
             raise ValueError(f"{path}: expected a bag of ROS, found: {error}") from error
         self._errors = (AnyReaderError, ValueError, ArithmeticError, LookupError, MemoryError)
-        self.start = int(self._reader.start_time)
-        """When the first message was received (ns)."""
+        self.start = int(self._reader.start_time)  # when the first message was received (ns)
         self.end = int(self._reader.end_time)
 
     def topics(self) -> dict[str, tuple[str, int]]:
@@ -217,16 +216,11 @@ class Bag:
     def messages(
         self,
         topics: Collection[str],
-        start: int | None = None,
-        stop: int | None = None,
-        newest: bool = False,
+        start: int | None = None,  # first time of receipt (ns)
+        stop: int | None = None,  # time of receipt (ns) before which messages end
+        newest: bool = False,  # only the last of all; no other is decoded
     ) -> Iterator[tuple[str, str, int, Any]]:
         """Yield topic, type, time of receipt (ns) and message, in the order of receipt.
-
-        Args:
-            start: First time of receipt (ns).
-            stop: Time of receipt (ns) before which messages end.
-            newest: Only the last of all; no other is decoded.
 
         Raises:
             ValueError: A message, or the bag, is damaged.
@@ -247,11 +241,8 @@ class Bag:
         self._reader.close()
 
 
-AHEAD = SECOND
-"""How far ahead of the run's clock a stamp from outside may be (ns)."""
-
-Time = tuple[int, int]
-"""The time in a message: seconds and nanoseconds."""
+AHEAD = SECOND  # how far ahead of the run's clock a stamp from outside may be (ns)
+Time = tuple[int, int]  # the time in a message: seconds and nanoseconds
 
 
 class Stamps(msgspec.Struct, frozen=True):

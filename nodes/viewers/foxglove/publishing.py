@@ -184,8 +184,7 @@ class RosTopic:
 SMALL: tuple[type[Event], ...] = (
     *(kind for kind in mappings.SMALL if kind is not TrackedFeatures),
     *(PlannedPose, PositionSetpoint, TrackingEvent, VehicleEvent),
-)
-"""Events whose messages are made at once."""
+)  # events whose messages are made at once
 
 _LEFT_OUT = {"clock", "paths", "camera_poses", "body_poses", "segmentation_images"}
 """Groups of ROS topics left out: shown in another way, or not at all by Foxglove."""

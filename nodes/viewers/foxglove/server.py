@@ -23,15 +23,9 @@ from runtime import NodeConfig
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.extras import install_command
 
-MOST = 64
-"""Viewers at a time, including those still to send their request."""
-
-_HEAD_TIMEOUT = 10.0
-"""Real seconds for a viewer to send its request."""
-
-_LONGEST_HEAD = 16 << 10
-"""Bytes of that request at most."""
-
+MOST = 64  # viewers at a time, including those still to send their request
+_HEAD_TIMEOUT = 10.0  # real seconds for a viewer to send its request
+_LONGEST_HEAD = 16 << 10  # bytes of that request at most
 _PART = 1 << 16
 
 
@@ -48,9 +42,7 @@ class Gate:
     """Gate for viewers of the right origin: passes bytes between them and the server.
 
     Args:
-        port: 0 for any free one.
         origins: Pages that may connect; programs other than browsers name none, and may.
-        refused: Called, in a thread, with the reason of a refusal.
 
     Raises:
         OSError: It cannot listen there.
@@ -59,10 +51,10 @@ class Gate:
     def __init__(
         self,
         host: str,
-        port: int,
+        port: int,  # 0 for any free one
         inside: tuple[str, int],
         origins: Collection[str],
-        refused: Callable[[str], None],
+        refused: Callable[[str], None],  # called, in a thread, with the reason of a refusal
     ) -> None:
         self._inside = inside
         self._origins = origins
@@ -221,11 +213,8 @@ class FoxgloveConfig(NodeConfig):
     backlog: Annotated[int, msgspec.Meta(ge=1)] = 1024
 
 
-Make = Callable[[], Any]
-"""Returns a message."""
-
-_CLOSING = 2.0
-"""Real seconds for viewers to leave."""
+Make = Callable[[], Any]  # returns a message
+_CLOSING = 2.0  # real seconds for viewers to leave
 
 
 class Server:

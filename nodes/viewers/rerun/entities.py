@@ -56,8 +56,7 @@ def camera(announced: CameraAnnouncement, vehicles: Sequence[str]) -> str:
 
 E = TypeVar("E", bound=Event)
 
-Numbered = tuple[int, E]
-"""How many events came before, and the event."""
+Numbered = tuple[int, E]  # how many events came before, and the event
 
 
 class EntityLog:
@@ -99,28 +98,20 @@ class EntityLog:
 Eye = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Position and target of the eye, metres in ``map``."""
 
-_SHOWN = 2
-"""Cameras whose images have a place of their own; those of more share tabs."""
+_SHOWN = 2  # cameras whose images have a place of their own; those of more share tabs
 
 
-_ABREAST = 4
-"""Plots with a place of their own, at most."""
+_ABREAST = 4  # plots with a place of their own, at most
 
 
 class Contents(msgspec.Struct):
-    """Contents of the layout.
+    """Contents of the layout."""
 
-    Attributes:
-        trails: Entities shown with their whole past.
-        cameras: By entity: its images (``rgb``, ``grey``, ``depth``, ``segmentation``).
-        plots: By title: the entities plotted.
-        eye: Viewpoint; None leaves it to the viewer.
-    """
-
-    trails: list[str] = []
+    trails: list[str] = []  # entities shown with their whole past
+    # By entity: its images (``rgb``, ``grey``, ``depth``, ``segmentation``).
     cameras: dict[str, list[str]] = {}
-    plots: dict[str, str] = {}
-    eye: Eye | None = None
+    plots: dict[str, str] = {}  # by title: the entities plotted
+    eye: Eye | None = None  # viewpoint; None leaves it to the viewer
 
 
 def layout(rrb: Any, contents: Contents) -> Any:
@@ -191,5 +182,4 @@ def _camera(rrb: Any, entity: str, kinds: list[str]) -> tuple[str, list[Any]]:
     return name, views
 
 
-_DARK = (22, 25, 31)
-"""Background of the world in every theme, matched to the colours of paths."""
+_DARK = (22, 25, 31)  # background of the world in every theme, matched to the colours of paths

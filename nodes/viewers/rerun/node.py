@@ -30,11 +30,8 @@ from nodes.viewers.rerun.recorder import Recorder
 from nodes.viewers.rerun.sdk import RerunConfig
 from runtime import Node, Stream, on
 
-_LARGE, _SMALL = 256, 16384
-"""Events waiting to be passed on: images and clouds, and the rest."""
-
-_PACK = 2048
-"""Events passed on at once, at most."""
+_LARGE, _SMALL = 256, 16384  # events waiting to be passed on: images and clouds, and the rest
+_PACK = 2048  # events passed on at once, at most
 
 
 class RerunView(Node[RerunConfig]):

@@ -33,9 +33,7 @@ from nodes.viewers.rerun import entities
 from nodes.viewers.rerun.entities import EntityLog, Numbered
 from runtime.time.schedule import SECOND
 
-_AXES = [(230, 80, 70), (90, 200, 90), (90, 140, 255)]
-"""Colours of x, y, z."""
-
+_AXES = [(230, 80, 70), (90, 200, 90), (90, 140, 255)]  # colours of x, y, z
 GROUPS: dict[type[Event], str] = {
     Imu: "imu",
     FluidPressure: "pressures",
@@ -43,8 +41,7 @@ GROUPS: dict[type[Event], str] = {
     NavSatFix: "fixes",
     Range: "ranges",
     Wind: "wind",
-}
-"""Parts of the tree of plots, by type of event."""
+}  # parts of the tree of plots, by type of event
 
 _HANDY = {"rad": ("°", 180.0 / np.pi), "s": ("ms", 1000.0)}
 """Unit to plot instead of a score's unit, and the factor."""
@@ -59,11 +56,9 @@ PLOTS = {
     "magnetic field (T)": "+ /magnetic_fields/magnetic_field/**",
     "satellite velocity (m/s)": "+ /fixes/velocity/**",
     "wind (m/s)": "+ /wind/velocity/**",
-}
-"""Plots with a place in the layout, by title, and their entities."""
+}  # plots with a place in the layout, by title, and their entities
 
-_TITLED = ("position_error", "rotation_error")
-"""Metrics whose plots have the unit in their title."""
+_TITLED = ("position_error", "rotation_error")  # metrics whose plots have the unit in their title
 
 
 class Plots:
@@ -122,17 +117,11 @@ class Plots:
 
 
 class ColouredPoints(msgspec.Struct, frozen=True, eq=False):
-    """Coloured points in the world.
+    """Coloured points in the world."""
 
-    Attributes:
-        stamp: Of the exposure (ns).
-        points: float32 metres, shape (n, 3), in the pose's parent frame.
-        colours: uint8 red, green, blue, shape (n, 3).
-    """
-
-    stamp: int
-    points: npt.NDArray[np.float32]
-    colours: npt.NDArray[np.uint8]
+    stamp: int  # of the exposure (ns)
+    points: npt.NDArray[np.float32]  # float32 metres, shape (n, 3), in the pose's parent frame
+    colours: npt.NDArray[np.uint8]  # uint8 red, green, blue, shape (n, 3)
 
 
 class ScenePoints:

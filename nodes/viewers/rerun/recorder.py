@@ -45,14 +45,11 @@ from nodes.viewers.rerun.plots import GROUPS, PLOTS, Plots
 from nodes.viewers.rerun.sdk import RerunConfig, Viewer, load
 from nodes.viewers.rerun.world import World
 
-_GATHERED = 500
-"""Events written into a file together."""
-
+_GATHERED = 500  # events written into a file together
 _TIMEOUT = 3.0
 """Real seconds for a viewer to take logged data; else new data are left out, lest memory grow."""
 
-_SECOND_TIMEOUT = 0.01
-"""Real seconds for the same, after a first timeout."""
+_SECOND_TIMEOUT = 0.01  # real seconds for the same, after a first timeout
 
 
 _NO_DISTORTION = (

@@ -71,14 +71,9 @@ class RerunConfig(NodeConfig):
     update_rate: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 20.0
 
 
-_TIMEOUT = 15.0
-"""Real seconds until a server must listen."""
-
-_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
-"""A terminal's codes for colours."""
-
-_PR_SET_PDEATHSIG = 1
-"""prctl(2) option: signal to a process at its parent's end."""
+_TIMEOUT = 15.0  # real seconds until a server must listen
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")  # a terminal's codes for colours
+_PR_SET_PDEATHSIG = 1  # prctl(2) option: signal to a process at its parent's end
 
 
 def load() -> Any:

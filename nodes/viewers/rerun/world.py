@@ -51,11 +51,9 @@ from nodes.viewers.rerun.sdk import RerunConfig
 CENTIMETRES = 100.0
 """Steps of a depth image per metre. Finer steps would show noise and make files large."""
 
-_WIND_PERIOD = 100_000_000
-"""Nanoseconds between two arrows of a vehicle's wind."""
+_WIND_PERIOD = 100_000_000  # nanoseconds between two arrows of a vehicle's wind
 
-_THICK, _THIN = 0.02, 0.01
-"""Metres: radii of paths."""
+_THICK, _THIN = 0.02, 0.01  # metres: radii of paths
 
 
 class World:
@@ -78,12 +76,9 @@ class World:
         self._paths: dict[str, tuple[PathPieces, Colour, float]] = {}
         self._latest: dict[str, tuple[int, int]] = {}
         self._plan = PlanSelection()
-        self.colours: dict[str, Colour] = {}
-        """Of estimators, by source."""
-        self.images: dict[str, list[str]] = {}
-        """Kinds of images there are, by camera's entity."""
-        self.trails: list[str] = []
-        """Entities to show with all logged data."""
+        self.colours: dict[str, Colour] = {}  # of estimators, by source
+        self.images: dict[str, list[str]] = {}  # kinds of images there are, by camera's entity
+        self.trails: list[str] = []  # entities to show with all logged data
         self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
         """Where vehicles have been: lowest and highest coordinates, metres in ``map``."""
         log.static(entities.WORLD, self._rr.ViewCoordinates.FRD)
