@@ -17,23 +17,14 @@ from typing import Any
 import numpy as np
 import uvloop
 
-from bench.system import (
-    Case,
-    Samples,
-    System,
-    free_port,
-    in_processes,
-    packaged,
-    zenoh_config,
-    zenoh_publisher,
-)
+from bench import system
 from bench.systems.children import ALL, Crew, Job, children, number_of, reply_to
 from bench.systems.zenoh_system import header, pinger
 
 
 async def _listen(node: int, session: Any, *, large: bool) -> None:
     afor: Any = importlib.import_module("asyncio_for_robotics.zenoh")
-    pongs = zenoh_publisher(session, "pong")
+    pongs = system.zenoh_publisher(session, "pong")
     pings = afor.Sub("ping", session)
     async for sample in pings.listen_reliable(queue_size=0):
         pong = reply_to(node, header(sample, large=large))
@@ -42,11 +33,11 @@ async def _listen(node: int, session: Any, *, large: bool) -> None:
 
 
 class _Sender:
-    def __init__(self, session: Any, case: Case, check: Callable[[int, str], None]) -> None:
+    def __init__(self, session: Any, case: system.Case, check: Callable[[int, str], None]) -> None:
         afor: Any = importlib.import_module("asyncio_for_robotics.zenoh")
         self._case = case
         self._check = check
-        self._put = pinger(zenoh_publisher(session, "ping"), case)
+        self._put = pinger(system.zenoh_publisher(session, "ping"), case)
         self._pongs = afor.Sub("pong", session).listen_reliable(queue_size=0)
         self._since = time.perf_counter_ns()
 
@@ -56,7 +47,7 @@ class _Sender:
             await asyncio.sleep(1.0)
             self._check(self._since, "pong")
 
-    async def exchange(self) -> Samples:
+    async def exchange(self) -> system.Samples:
         """Call the roll, then measure."""
         absent = set(range(2, self._case.nodes + 1))
         calls = asyncio.create_task(self._call_roll())
@@ -83,8 +74,8 @@ class _Sender:
 
 
 async def _run(
-    session: Any, case: Case, check: Callable[[int, str], None], nodes: range
-) -> Samples:
+    session: Any, case: system.Case, check: Callable[[int, str], None], nodes: range
+) -> system.Samples:
     afor: Any = importlib.import_module("asyncio_for_robotics.zenoh")
     async with afor.Scope() as scope:
         sender = _Sender(session, case, check)
@@ -102,34 +93,34 @@ async def _run(
 def serve(job: Job) -> None:
     """Be a node."""
     zenoh: Any = importlib.import_module("zenoh")
-    with zenoh.open(zenoh_config(connect=job.address)) as session:
+    with zenoh.open(system.zenoh_config(connect=job.address)) as session:
         uvloop.run(_listen(job.node, session, large=job.case != "small"))
 
 
-def measure(case: Case) -> Samples:
+def measure(case: system.Case) -> system.Samples:
     """Measure round trips through a single session."""
     zenoh: Any = importlib.import_module("zenoh")
-    with zenoh.open(zenoh_config()) as session:
+    with zenoh.open(system.zenoh_config()) as session:
         return uvloop.run(_run(session, case, Crew({}).check, range(2, case.nodes + 1)))
 
 
-def measure_processes(case: Case) -> Samples:
+def measure_processes(case: system.Case) -> system.Samples:
     """Measure round trips between processes."""
     zenoh: Any = importlib.import_module("zenoh")
-    locator = f"tcp/127.0.0.1:{free_port()}"
+    locator = f"tcp/127.0.0.1:{system.free_port()}"
     with (
-        zenoh.open(zenoh_config(listen=locator)) as session,
+        zenoh.open(system.zenoh_config(listen=locator)) as session,
         children(__name__, case, locator) as crew,
     ):
         return uvloop.run(_run(session, case, crew.check, range(0)))
 
 
-_PACKAGES = packaged(
+_PACKAGES = system.packaged(
     asyncio_for_robotics="asyncio-for-robotics", zenoh="eclipse-zenoh", uvloop="uvloop"
 )
 
 SYSTEMS = (
-    System(
+    system.System(
         "asyncio-for-robotics (one session)",
         ("stream",),
         measure,
@@ -137,5 +128,7 @@ SYSTEMS = (
         cases=("small", "large"),
         **_PACKAGES,
     ),
-    in_processes("asyncio-for-robotics (tcp)", ("stream",), measure_processes, 250, **_PACKAGES),
+    system.in_processes(
+        "asyncio-for-robotics (tcp)", ("stream",), measure_processes, 250, **_PACKAGES
+    ),
 )

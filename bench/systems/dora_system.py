@@ -22,16 +22,7 @@ from typing import Any
 
 import msgspec
 
-from bench.system import (
-    LARGE_SHAPE,
-    Case,
-    Samples,
-    free_port,
-    in_processes,
-    large_array,
-    needs,
-    versions,
-)
+from bench import system
 from bench.systems.children import (
     PING,
     TIMEOUT,
@@ -57,7 +48,7 @@ class _Address(msgspec.Struct, frozen=True):
     daemon: int
 
 
-def _dataflow(case: Case) -> bytes:
+def _dataflow(case: system.Case) -> bytes:
     others = range(2, case.nodes + 1)
     pongs = {f"pong{n}": {"source": f"node{n}/pong", "queue_size": 1000} for n in others}
     nodes: list[dict[str, object]] = [
@@ -146,7 +137,7 @@ def run(number: int, case: str) -> None:
         array = event["value"].to_numpy(zero_copy_only=True)
         header = array
         if case != "small":
-            array.reshape(LARGE_SHAPE)
+            array.reshape(system.LARGE_SHAPE)
             metadata = event["metadata"]
             header = PING.pack(metadata["stamp"], 1, metadata["receiver"], metadata["number"])
         pong = reply_to(number, header)
@@ -164,11 +155,11 @@ def _is_alive(process: int) -> bool:
     return True
 
 
-def measure(case: Case) -> Samples:
+def measure(case: system.Case) -> system.Samples:
     """Measure round trips."""
     with tempfile.TemporaryDirectory() as directory:
         Path(directory, "flow.yml").write_bytes(_dataflow(case))
-        address = _Address(directory, free_port(), free_port())
+        address = _Address(directory, system.free_port(), system.free_port())
         daemon = msgspec.structs.replace(case, nodes=2)
         with children(__name__, daemon, msgspec.json.encode(address).decode()) as crew:
             begin = time.perf_counter_ns()
@@ -178,12 +169,12 @@ def measure(case: Case) -> Samples:
             return _exchange(case, crew, address.daemon)
 
 
-def _exchange(case: Case, crew: Crew, port: int) -> Samples:
+def _exchange(case: system.Case, crew: Crew, port: int) -> system.Samples:
     dora: Any = importlib.import_module("dora")
     pyarrow: Any = importlib.import_module("pyarrow")
     os.environ["DORA_NODE_SHM_POOL_SIZE"] = str(_POOL)
     node = dora.Node("node1", daemon_port=port)
-    array = large_array().ravel()
+    array = system.large_array().ravel()
 
     def send(stamp: int, receiver: int, number: int) -> None:
         if case.case == "small":
@@ -202,13 +193,13 @@ def _exchange(case: Case, crew: Crew, port: int) -> Samples:
 
 
 SYSTEMS = (
-    in_processes(
+    system.in_processes(
         "dora",
         ("stream",),
         measure,
         slowness=400,
-        missing=needs(dora="dora-rs", dora_cli="dora-rs-cli", pyarrow="pyarrow"),
-        version=versions("dora-rs"),
+        missing=system.needs(dora="dora-rs", dora_cli="dora-rs-cli", pyarrow="pyarrow"),
+        version=system.versions("dora-rs"),
     ),
 )
 

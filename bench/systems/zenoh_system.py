@@ -22,28 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import (
-    LARGE_SHAPE,
-    Case,
-    Samples,
-    System,
-    free_port,
-    in_processes,
-    large_array,
-    packaged,
-    zenoh_config,
-    zenoh_publisher,
-    zenoh_subscriber,
-)
+from bench import system
 from bench.systems.children import PING, PONG, Job, PeerError, children, number_of, reply_to
 
 
-def pinger(pings: Any, case: Case) -> Callable[[int, int, int], None]:
+def pinger(pings: Any, case: system.Case) -> Callable[[int, int, int], None]:
     """Return a function to put a ping, given its stamp, receiver and number."""
     if case.case == "small":
         return lambda stamp, receiver, number: pings.put(PING.pack(stamp, 1, receiver, number))
     # Zenoh takes bytearrays, which an array may be a view of, but no arrays.
-    frame = bytearray(large_array().tobytes())
+    frame = bytearray(system.large_array().tobytes())
     return lambda stamp, receiver, number: pings.put(
         frame, attachment=PING.pack(stamp, 1, receiver, number)
     )
@@ -54,16 +42,16 @@ def header(sample: Any, *, large: bool) -> bytes:
     payload: bytes = sample.payload.to_bytes()
     if not large:
         return payload
-    np.frombuffer(payload, np.float32).reshape(LARGE_SHAPE)
+    np.frombuffer(payload, np.float32).reshape(system.LARGE_SHAPE)
     attachment: bytes = sample.attachment.to_bytes()
     return attachment
 
 
-def measure_callbacks(case: Case) -> Samples:
+def measure_callbacks(case: system.Case) -> system.Samples:
     """Measure round trips through the callbacks of a single session."""
     zenoh: Any = importlib.import_module("zenoh")
-    with zenoh.open(zenoh_config()) as session:
-        pings, pongs = (zenoh_publisher(session, key) for key in ("ping", "pong"))
+    with zenoh.open(system.zenoh_config()) as session:
+        pings, pongs = (system.zenoh_publisher(session, key) for key in ("ping", "pong"))
         large = case.case != "small"
         latest, landed = -1, 0
         now = time.perf_counter_ns
@@ -74,7 +62,7 @@ def measure_callbacks(case: Case) -> Samples:
                 if receiver == node:
                     pongs.put(PONG.pack(0, number))
 
-            return zenoh_subscriber(session, "ping", ping)
+            return system.zenoh_subscriber(session, "ping", ping)
 
         def pong(sample: Any) -> None:
             nonlocal latest, landed
@@ -82,7 +70,7 @@ def measure_callbacks(case: Case) -> Samples:
             landed = now()
 
         _kept = [listen(node) for node in range(2, case.nodes + 1)]
-        _kept.append(zenoh_subscriber(session, "pong", pong))
+        _kept.append(system.zenoh_subscriber(session, "pong", pong))
         put = pinger(pings, case)
         taken = np.empty(case.warm_up + case.samples, np.int64)
         for number in range(len(taken)):
@@ -98,8 +86,8 @@ def serve(job: Job) -> None:
     """Be a node."""
     zenoh: Any = importlib.import_module("zenoh")
     large = job.case != "small"
-    with zenoh.open(zenoh_config(connect=job.address)) as session:
-        pongs = zenoh_publisher(session, "pong")
+    with zenoh.open(system.zenoh_config(connect=job.address)) as session:
+        pongs = system.zenoh_publisher(session, "pong")
 
         def ping(sample: Any) -> None:
             pong = reply_to(job.node, header(sample, large=large))
@@ -110,12 +98,12 @@ def serve(job: Job) -> None:
         threading.Event().wait()
 
 
-def measure_processes(case: Case) -> Samples:
+def measure_processes(case: system.Case) -> system.Samples:
     """Measure round trips between processes."""
     zenoh: Any = importlib.import_module("zenoh")
-    locator = f"tcp/127.0.0.1:{free_port()}"
-    with zenoh.open(zenoh_config(listen=locator)) as session:
-        pings = zenoh_publisher(session, "ping")
+    locator = f"tcp/127.0.0.1:{system.free_port()}"
+    with zenoh.open(system.zenoh_config(listen=locator)) as session:
+        pings = system.zenoh_publisher(session, "ping")
         heard: queue.SimpleQueue[int] = queue.SimpleQueue()
 
         def pong(sample: Any) -> None:
@@ -133,10 +121,10 @@ def measure_processes(case: Case) -> Samples:
             return crew.exchange(case, pinger(pings, case), receive)
 
 
-_PACKAGE = packaged(zenoh="eclipse-zenoh")
+_PACKAGE = system.packaged(zenoh="eclipse-zenoh")
 
 SYSTEMS = (
-    System(
+    system.System(
         "zenoh (one session)",
         ("handler",),
         measure_callbacks,
@@ -144,5 +132,5 @@ SYSTEMS = (
         cases=("small", "large"),
         **_PACKAGE,
     ),
-    in_processes("zenoh (tcp)", ("handler",), measure_processes, 200, **_PACKAGE),
+    system.in_processes("zenoh (tcp)", ("handler",), measure_processes, 200, **_PACKAGE),
 )

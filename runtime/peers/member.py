@@ -23,17 +23,8 @@ import msgspec
 
 from events import Event
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
+from runtime.peers import messages
 from runtime.peers.authentication import Sealing
-from runtime.peers.messages import (
-    Ack,
-    Announcements,
-    EventMessage,
-    FirstUpdate,
-    Hello,
-    Message,
-    OfTheRun,
-    encode,
-)
 from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.summary import ProcessSummary, Summary
 from runtime.wire import Packed, pack, unpack
@@ -77,7 +68,7 @@ class Outbox:
         self._closed = False
         self._thread: threading.Thread | None = None
 
-    def send(self, message: Message, event: Event | None = None, skip: str = "") -> None:
+    def send(self, message: messages.Message, event: Event | None = None, skip: str = "") -> None:
         """Send a message now, or queue behind the waiting messages.
 
         Args:
@@ -124,16 +115,16 @@ class Outbox:
         return not (self._queue or self._writing) and self._under_way < UNDER_WAY
 
     def _in_bytes(
-        self, message: Message, packed: Packed | None, *, now: bool
+        self, message: messages.Message, packed: Packed | None, *, now: bool
     ) -> tuple[bytes, bytes] | None:
         """Return a message and its payload; `None` if making them takes too long for now."""
         if packed is None or packed.size <= SMALL:
-            return encode(message), b"" if packed is None else packed.frame()
+            return messages.encode(message), b"" if packed is None else packed.frame()
         if self.memory is not None and not (now and packed.size > AT_ONCE):
             place = self.memory.put(packed)
             if place is not None:
-                return encode(msgspec.structs.replace(message, place=place)), b""
-        return None if now else (encode(message), packed.frame())
+                return messages.encode(msgspec.structs.replace(message, place=place)), b""
+        return None if now else (messages.encode(message), packed.frame())
 
     def _put_now(self, head: bytes, frame: bytes) -> None:
         with self._lock:
@@ -179,7 +170,7 @@ class Outbox:
                 parts = self._in_bytes(waiting.message, waiting.packed, now=False)
                 assert parts is not None
             except Exception as error:  # the message goes without its event: others count it
-                parts = encode(waiting.message), b""
+                parts = messages.encode(waiting.message), b""
                 self._failed(PeerError(f"an event could not be sent: {_describe(error)}"))
             self._put_now(*parts)
             self._writing = False
@@ -194,7 +185,7 @@ def _describe(error: Exception) -> str:
 class _Waiting:
     __slots__ = ("message", "packed", "skip")
 
-    def __init__(self, message: Message, packed: Packed | None, skip: str) -> None:
+    def __init__(self, message: messages.Message, packed: Packed | None, skip: str) -> None:
         self.message = message
         self.packed = packed
         self.skip = skip
@@ -254,7 +245,7 @@ class Member:
     def __init__(
         self,
         id_: str,
-        hello: Hello,
+        hello: messages.Hello,
         sealing: Sealing,
         put: Put,
         failed: Callable[[VisnavError], None],
@@ -267,12 +258,12 @@ class Member:
         self.lost_at = 0.0
         self.running = hello.running
         self.unfit = True
-        self.held: list[tuple[OfTheRun, Event | None]] | None = None
+        self.held: list[tuple[messages.OfTheRun, Event | None]] | None = None
         self.exchanges = Exchanges()
         self.drift_ppm: float | None = None
-        self.announced: Announcements | None = None
+        self.announced: messages.Announcements | None = None
         self.ready = False
-        self.begin: FirstUpdate | None = None
+        self.begin: messages.FirstUpdate | None = None
         self._arrived = 0
         self.final_summary: Summary | None = None
         self.outgoing: Outgoing | None = None
@@ -282,7 +273,7 @@ class Member:
             id_, lambda message, payload: put(sealing.seal(message, payload), payload), failed
         )
 
-    def event(self, message: EventMessage, payload: bytes) -> Event:
+    def event(self, message: messages.EventMessage, payload: bytes) -> Event:
         """Return the event of a message, or raise `WireError`."""
         if message.place is None:
             return unpack(payload)
@@ -296,10 +287,10 @@ class Member:
         unread = 0 if self.incoming is None else self.incoming.unread
         if self._arrived >= ACK_EVERY or unread >= FREE_EVERY:
             freed = () if self.incoming is None else self.incoming.freed()
-            self.outbox.send(Ack(self._arrived, freed))
+            self.outbox.send(messages.Ack(self._arrived, freed))
             self._arrived = 0
 
-    def acknowledged(self, ack: Ack) -> None:
+    def acknowledged(self, ack: messages.Ack) -> None:
         """Handle an acknowledgement: bytes received, and frames read no more."""
         self.outbox.arrived(ack.arrived)
         if self.outgoing is not None:

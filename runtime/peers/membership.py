@@ -20,6 +20,7 @@ import msgspec
 from events import Event
 from runtime.config.model import Config
 from runtime.errors import PeerError, VisnavError, WireError
+from runtime.peers import messages
 from runtime.peers.authentication import ForgedError, derive, is_hello, secret_of
 from runtime.peers.handshake import (
     Handshakes,
@@ -30,19 +31,6 @@ from runtime.peers.handshake import (
     what_all_share,
 )
 from runtime.peers.member import Exchange, Member
-from runtime.peers.messages import (
-    Ack,
-    EventMessage,
-    Hello,
-    MemoryMapped,
-    MemoryOffer,
-    Message,
-    OfTheRun,
-    Ping,
-    Pong,
-    Stop,
-    decode,
-)
 from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.peers.waiting import Waiting
 from runtime.peers.zenoh_session import Session, certified
@@ -59,7 +47,7 @@ listening process ended just after we connected to it.
 class Reactions(Protocol):
     """Receiver of the other processes' messages, arrivals and losses, on the loop."""
 
-    def receive(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+    def receive(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
         """Take in a message."""
 
     def lost(self, member: Member) -> None:
@@ -95,7 +83,7 @@ class Membership:
         self.me = 0
         self.count = 0
         self._before = 0
-        self.hello = Hello(
+        self.hello = messages.Hello(
             nodes=self.here,
             config=what_all_share(config),
             place=f"{socket.gethostname()}, process {os.getpid()}",
@@ -106,7 +94,7 @@ class Membership:
         self._peers = peers
         self._loop = asyncio.get_running_loop()
         self._handshakes: Handshakes | None = None
-        self.ended: Stop | None = None
+        self.ended: messages.Stop | None = None
         self._unfit: list[str] = []
         self._numbers: dict[tuple[str, ...], int] = {}
         self._numbered: dict[int, Member] = {}
@@ -194,7 +182,7 @@ class Membership:
         assert self._handshakes is not None
         return self._handshakes.id
 
-    def broadcast(self, message: Message) -> None:
+    def broadcast(self, message: messages.Message) -> None:
         """Send a message to all other processes present."""
         for member in self.present():
             member.outbox.send(message)
@@ -226,7 +214,7 @@ class Membership:
                 handshakes.receive(sender, sealed)
                 return
             data = member.sealing.open(sealed, payload)
-            message = decode(data)
+            message = messages.decode(data)
         except ForgedError as error:
             handshakes.refuse(sender, error)
             return
@@ -237,30 +225,30 @@ class Membership:
             handshakes.end(sender, error)
             return
         event = None
-        if isinstance(message, EventMessage):
+        if isinstance(message, messages.EventMessage):
             try:
                 event = member.event(message, payload)
             except Exception as error:  # it is counted all the same: in lockstep, all are awaited
                 log.warning("from %s: %s", member.place, error)
-        if isinstance(message, Ack):
+        if isinstance(message, messages.Ack):
             member.acknowledged(message)
             return
         match message:
-            case Ping():  # answered here: a detour by the loop would take time
-                member.outbox.send(Pong(message.sent, received, self._peers.now()))
-            case Pong():
+            case messages.Ping():  # answered here: a detour by the loop would take time
+                member.outbox.send(messages.Pong(message.sent, received, self._peers.now()))
+            case messages.Pong():
                 half = (received - message.sent) // 2
                 offset = message.here - message.sent - half
                 late = message.now - self._peers.now(ago=half)
                 member.exchanges.add(Exchange(received - message.sent, offset, late))
                 self.soon(self.waiting.notify)
-            case Hello():
+            case messages.Hello():
                 pass
-            case MemoryOffer():
+            case messages.MemoryOffer():
                 member.incoming = Incoming.found(message) if self._network.shared else None
                 if member.incoming is not None:
-                    member.outbox.send(MemoryMapped())
-            case MemoryMapped():
+                    member.outbox.send(messages.MemoryMapped())
+            case messages.MemoryMapped():
                 member.outbox.memory = member.outgoing
             case _:
                 self.soon(self.take, member, message, event)
@@ -277,7 +265,7 @@ class Membership:
 
     # On the loop.
 
-    def take(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+    def take(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
         """Pass on a message, unless its session has ended; invalid messages are logged."""
         try:
             if member.held is not None:

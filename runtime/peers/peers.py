@@ -15,29 +15,12 @@ from runtime.channels.sender import Listener
 from runtime.channels.tasks import Fault
 from runtime.config.model import Config
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
+from runtime.peers import messages
 from runtime.peers.clock_sync import ClockFollower
 from runtime.peers.handshake import name_of
 from runtime.peers.joint import JointShutdown, JointStart
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
-from runtime.peers.messages import (
-    Announcements,
-    EventMessage,
-    FinalSummary,
-    FirstUpdate,
-    Message,
-    NodeEnded,
-    OfTheRun,
-    Ordered,
-    Ready,
-    StateReport,
-    StillWorking,
-    Stop,
-    Subscriptions,
-    SummaryReceived,
-    TimeToken,
-    TokenRequest,
-)
 from runtime.peers.others import Others
 from runtime.peers.remote_events import RemoteEvents, subscriptions
 from runtime.peers.time_token import TimeTokenHolder
@@ -78,7 +61,7 @@ class Peers(Others):
         self._remote: RemoteEvents | None = None
         self._loop: LockstepLoop | None = None
         self._token: TimeTokenHolder | None = None
-        self._early: list[tuple[Member, OfTheRun, Event | None]] = []
+        self._early: list[tuple[Member, messages.OfTheRun, Event | None]] = []
         self._begun = self._ends = False
         self._awaited: set[int] = set()  # in lockstep, time stands until they are back
         self._returning, self._new = set[int](), set[int]()  # not yet ready; not yet gathered
@@ -153,7 +136,7 @@ class Peers(Others):
             return
         self._remote.connect(listeners, fault)
         self._start.say(
-            Subscriptions(subscriptions(each for each in listeners if each.node != "run"))
+            messages.Subscriptions(subscriptions(each for each in listeners if each.node != "run"))
         )
 
     def stopping(self, reason: str, error: Exception | None, *, by: str, from_peer: bool) -> None:
@@ -163,14 +146,14 @@ class Peers(Others):
         """
         self._ends = True
         text = None if error is None else str(error)
-        stop = Stop(reason, text, apart=not self._begun, by=by)
+        stop = messages.Stop(reason, text, apart=not self._begun, by=by)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
         self._membership.waiting.absent.clear()
         if not self._begun:  # also its senders: they need not wait for our turn
             self._membership.broadcast(stop)
             early, self._early = self._early, []
             for member, message, _ in early:
-                if isinstance(message, NodeEnded):
+                if isinstance(message, messages.NodeEnded):
                     self._do(member.number, message, None)
         elif self._awaited:
             self._membership.broadcast(stop)
@@ -183,7 +166,7 @@ class Peers(Others):
         """Notify the others of the end of a node here."""
         self.shutdown.at_work = False
         self._ended_here.append(node)
-        self._broadcast_in_order(NodeEnded(node))
+        self._broadcast_in_order(messages.NodeEnded(node))
 
     async def wait_to_end(self, node: str) -> None:
         """Wait until all nodes after `node` have ended, in any process; "" precedes all."""
@@ -210,50 +193,54 @@ class Peers(Others):
 
     # What the membership notifies of.
 
-    def receive(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+    def receive(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
         """Take in a message of another process, or raise `WireError`."""
         self.shutdown.received_at = time.monotonic()
         match message:
-            case EventMessage() if self._begun and self._token is None:  # first: there are many
+            case messages.EventMessage() if (
+                self._begun and self._token is None
+            ):  # first: there are many
                 self._do(member.number, message, event)
-            case Announcements():
+            case messages.Announcements():
                 self._start.hear(member, message)
-            case FinalSummary() | SummaryReceived() | StillWorking():
+            case messages.FinalSummary() | messages.SummaryReceived() | messages.StillWorking():
                 self.shutdown.receive(member, message)
-            case FirstUpdate():
+            case messages.FirstUpdate():
                 member.begin = message
                 member.running = True
-            case Ready():
+            case messages.Ready():
                 member.ready = True
                 member.running = member.running or message.begun
                 if member.number in self._returning:
                     self._returning.discard(member.number)
                     self._take_back(member, begun=message.begun)
-            case Subscriptions():
+            case messages.Subscriptions():
                 if self._remote is None:  # the processes here have no numbers yet
                     self._early.append((member, message, event))
                     return
                 self._remote.wants(member.number, message.wanted)
                 if self._begun:
                     self._run.connect()
-            case Stop() if not self._begun or message.serial < 0:
+            case messages.Stop() if not self._begun or message.serial < 0:
                 if message.apart:
                     self._go_on_without(member)
                 elif self._awaited:  # it is no use to wait for a return
                     self._gather(at_once=True)
                 self._do(member.number, message, None)
-            case NodeEnded() if message.node not in member.nodes:
+            case messages.NodeEnded() if message.node not in member.nodes:
                 raise WireError(f"expected one of its nodes, found {message.node!r}")
-            case NodeEnded() if message.serial < 0 or (self._ends and not self._begun):
+            case messages.NodeEnded() if message.serial < 0 or (self._ends and not self._begun):
                 self._do(member.number, message, None)
             case _ if not self._begun:
                 if not self._ends:
                     self._early.append((member, message, event))
             case _ if self._token is not None:
                 self._token.take(member.number, message, event)
-            case EventMessage() | Stop() | NodeEnded():
+            case messages.EventMessage() | messages.Stop() | messages.NodeEnded():
                 self._do(member.number, message, event)
-            case TimeToken() | TokenRequest() | StateReport() if not self._ends:
+            case messages.TimeToken() | messages.TokenRequest() | messages.StateReport() if (
+                not self._ends
+            ):
                 raise WireError("expected the run to be in lockstep there, too")
 
     def lost(self, member: Member) -> None:
@@ -313,17 +300,17 @@ class Peers(Others):
         if not self._ends:
             log.warning("to %s: %s", name_of(member.nodes), error)
 
-    def _do(self, number: int, message: Ordered, event: Event | None) -> None:
+    def _do(self, number: int, message: messages.Ordered, event: Event | None) -> None:
         try:
             match message:
-                case EventMessage() if self._remote is not None and event is not None:
+                case messages.EventMessage() if self._remote is not None and event is not None:
                     self._remote.arrive(number, message.output, event)
-                case Stop():
+                case messages.Stop():
                     member = self._membership.numbered(number)
                     where = name_of(member.nodes) if member else "?"
                     failed = PeerError(f"at {where}: {message.error}") if message.error else None
                     self._run.stop(message.reason, failed, by=message.by, from_peer=True)
-                case NodeEnded():
+                case messages.NodeEnded():
                     self.shutdown.ended_nodes.add(message.node)
         except WireError as error:
             log.warning("from process %d: %s", number, error)
@@ -336,7 +323,7 @@ class Peers(Others):
         if not begun:
             now = self._clock.now()
             real = now / self._clock.speed if isinstance(self._clock, RealClock) else 0
-            member.outbox.send(FirstUpdate(time.monotonic_ns() - round(real), now))
+            member.outbox.send(messages.FirstUpdate(time.monotonic_ns() - round(real), now))
         elif member.number == self._followed:
             self._follow(member)
         self.shutdown.ended_nodes -= {*member.nodes}
@@ -367,12 +354,12 @@ class Peers(Others):
         """Exclude a process from the turns: not begun yet, or given up."""
         self._apart.add(member.number)
         for node in self._ended_here:  # what was to be sent at our turn is lost
-            member.outbox.send(NodeEnded(node))
+            member.outbox.send(messages.NodeEnded(node))
         self._gather()
 
     # Sending.
 
-    def _broadcast_in_order(self, message: Ordered) -> None:
+    def _broadcast_in_order(self, message: messages.Ordered) -> None:
         """Send a message to all, for handling in its place among the events."""
         for member in self._membership.present():
             if self._token is not None and self._begun and member.number not in self._apart:
@@ -382,13 +369,13 @@ class Peers(Others):
 
     def _leave(self, process: int, output: str, event: Event, skip: bool) -> None:
         if self._token is not None:
-            self._token.post(process, EventMessage(output), event)
+            self._token.post(process, messages.EventMessage(output), event)
         elif member := self._membership.numbered(process):
             try:
-                member.outbox.send(EventMessage(output), event, output if skip else "")
+                member.outbox.send(messages.EventMessage(output), event, output if skip else "")
             except ChannelFullError as error:
                 raise ChannelFullError(f"{output}: {error}") from None
 
-    def _send_to(self, number: int, message: Message, event: Event | None) -> None:
+    def _send_to(self, number: int, message: messages.Message, event: Event | None) -> None:
         if member := self._membership.numbered(number):
             member.outbox.send(message, event)

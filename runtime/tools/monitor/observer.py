@@ -29,20 +29,8 @@ from runtime.run.summarise import count_drops
 from runtime.run.supervisor import Supervisor
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND
+from runtime.tools.monitor import protocol
 from runtime.tools.monitor.estimators import Measured
-from runtime.tools.monitor.protocol import (
-    Command,
-    LogLine,
-    Pause,
-    Restart,
-    Resume,
-    Rows,
-    Set,
-    Snapshot,
-    Speed,
-    Step,
-    Stop,
-)
 
 KEPT = 5  # how many intervals between snapshots figures cover
 
@@ -163,7 +151,7 @@ class LastRecords(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self._lines: collections.deque[LogLine] = collections.deque(maxlen=RECORDS)
+        self._lines: collections.deque[protocol.LogLine] = collections.deque(maxlen=RECORDS)
         self._numbers = itertools.count()
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -171,14 +159,14 @@ class LastRecords(logging.Handler):
         seconds = getattr(record, "seconds", 0.0)
         name = getattr(record, "logger_name", record.name)
         self._lines.append(
-            LogLine(
+            protocol.LogLine(
                 number=next(self._numbers),
                 level=record.levelname,
                 text=f"{seconds:10.3f} {record.levelname:8} {name}: {record.getMessage()}",
             )
         )
 
-    def lines(self) -> list[LogLine]:
+    def lines(self) -> list[protocol.LogLine]:
         """Return the records, the oldest first."""
         return list(self._lines)
 
@@ -214,7 +202,7 @@ class Observer:
 
     # Snapshots.
 
-    def take(self) -> Snapshot:
+    def take(self) -> protocol.Snapshot:
         """Return a snapshot of now and of the last second or so."""
         sample = self._sample()
         self._recent.add(sample)
@@ -230,7 +218,7 @@ class Observer:
             f"{present:.2f} × real time ({'real' if clock.kind == 'real' else asked})",
             f"ends: {ended}" if ended else "paused" if paused else "runs",
         )
-        return Snapshot(
+        return protocol.Snapshot(
             headline="   ".join(headline),
             now=now,
             ended=ended,
@@ -259,7 +247,7 @@ class Observer:
                 sent[sender.name] += sender.sent().total()
         return Sample(time.perf_counter(), self._state.clock.now(), sent, self._meter.take())
 
-    def _tables(self, sample: Sample) -> dict[str, Rows]:
+    def _tables(self, sample: Sample) -> dict[str, protocol.Rows]:
         state, runners = self._state, self._state.runners
         return {
             "estimators": self._measured.rows(),
@@ -317,14 +305,14 @@ class Observer:
             return "starting"
         return "running" if self._state.running else "ready"
 
-    def _outputs(self, sample: Sample) -> Rows:
+    def _outputs(self, sample: Sample) -> protocol.Rows:
         events = {
             sender.name: sender.event.__name__
             for node in self._state.all_nodes
             for sender in senders(node).values()
         }
         last = self._meter.last
-        found: Rows = []
+        found: protocol.Rows = []
         for name, event in events.items():
             flow = self._recent.amount(name)
             found.append(
@@ -340,9 +328,9 @@ class Observer:
             )
         return found
 
-    def _inputs(self) -> Rows:
+    def _inputs(self) -> protocol.Rows:
         drops = count_drops(self._state)
-        found: Rows = []
+        found: protocol.Rows = []
         for runner in self._state.runners.values():
             for stream in streams(runner.node).values() if runner.node is not None else ():
                 of = drops[stream.name]
@@ -352,28 +340,28 @@ class Observer:
 
     # Commands.
 
-    def execute(self, command: Command) -> str:
+    def execute(self, command: protocol.Command) -> str:
         """Carry a command out, and return a text about its effect; or raise `VisnavError`."""
         stepping = self._supervisor.stepping
         match command:
-            case Pause():
+            case protocol.Pause():
                 stepping.pause()
                 return "paused"
-            case Resume():
+            case protocol.Resume():
                 stepping.resume()
                 return "runs"
-            case Step(seconds=seconds):
+            case protocol.Step(seconds=seconds):
                 stepping.step(None if seconds is None else max(round(seconds * SECOND), 1))
                 return "one step" if seconds is None else f"runs for {seconds:g} s"
-            case Speed(factor=factor):
+            case protocol.Speed(factor=factor):
                 stepping.pace(factor)
                 return "as fast as it can" if factor is None else f"{factor:g} × real time"
-            case Stop():
+            case protocol.Stop():
                 self._supervisor.stop("stopped by hand")
                 return "ends"
-            case Restart(node=node):
+            case protocol.Restart(node=node):
                 return self._restart(node)
-            case Set(text=text):
+            case protocol.Set(text=text):
                 values = self._supervisor.parameters.set(text)
                 return ", ".join(f"{key} = {value}" for key, value in values.items()) or "as it was"
 
@@ -390,7 +378,7 @@ class Observer:
         return f"{name} restarts"
 
 
-def describe(command: Command) -> str:
+def describe(command: protocol.Command) -> str:
     """Return a command as text, for the log."""
     words = [str(v) for v in msgspec.structs.astuple(command) if v is not None]
     return " ".join([type(command).__name__.lower(), *words])

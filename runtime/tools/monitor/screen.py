@@ -15,24 +15,7 @@ from rich.text import Text
 
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.extras import install_command
-from runtime.tools.monitor.protocol import (
-    COLUMNS,
-    QUICKEST,
-    SLOWEST,
-    STACKS,
-    Client,
-    Command,
-    Pause,
-    Points,
-    Restart,
-    Resume,
-    Set,
-    Snapshot,
-    Speed,
-    Step,
-    Stop,
-    is_number,
-)
+from runtime.tools.monitor import protocol
 
 try:
     from textual.app import App, ComposeResult
@@ -85,18 +68,18 @@ class Screen(App[str]):
     ]
     ENABLE_COMMAND_PALETTE = False
 
-    def __init__(self, connection: Client, leave: bool = False) -> None:
+    def __init__(self, connection: protocol.Client, leave: bool = False) -> None:
         super().__init__()
         self._connection = connection
         self._leave = leave
-        self.snapshot: Snapshot | None = None
+        self.snapshot: protocol.Snapshot | None = None
         self._shown = -1
         self._stop_asked = 0.0
 
     def compose(self) -> ComposeResult:
         """Lay the screen out."""
         yield Static(Text("waiting for the run …"), id="head")
-        above, left, right = STACKS
+        above, left, right = protocol.STACKS
         yield from map(_table, above)
         with Horizontal(id="tables"):
             with Vertical(id="left"):
@@ -113,10 +96,10 @@ class Screen(App[str]):
         """Begin to listen to the run."""
         self.query_one("#log").border_title = "log"
         self.query_one("#paths").border_title = "from above, north is up"
-        for name in COLUMNS:
+        for name in protocol.COLUMNS:
             table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
             table.border_title = name
-            for column, title in enumerate(COLUMNS[name]):
+            for column, title in enumerate(protocol.COLUMNS[name]):
                 table.add_column(_cell(name, column, title), key=title)
         self.query_one("#nodes").focus()
         self.run_worker(self._listen(), exclusive=True)
@@ -134,13 +117,13 @@ class Screen(App[str]):
         if self._leave:
             self.exit()
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, snapshot: protocol.Snapshot) -> None:
         """Show a snapshot, unless the screen is closing."""
         if not self.query("#head"):
             return
         self.snapshot = snapshot
         self.query_one("#head", Static).update(Text(snapshot.headline))
-        for name in COLUMNS:
+        for name in protocol.COLUMNS:
             self._fill(name, snapshot)
         paths = self.query_one("#paths", Static)
         paths.set_class(not snapshot.paths, "none")
@@ -151,7 +134,7 @@ class Screen(App[str]):
                 self._shown = line.number
                 log.write(Text(line.text, style=_COLOURS.get(line.level, "")), expand=True)
 
-    def _fill(self, name: str, snapshot: Snapshot) -> None:
+    def _fill(self, name: str, snapshot: protocol.Snapshot) -> None:
         """Update a table's rows in place, to keep the cursor."""
         table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
         found = snapshot.tables[name]
@@ -164,16 +147,16 @@ class Screen(App[str]):
         for row in found:
             for column, text in enumerate(row):
                 cell = _cell(name, column, text)
-                title = COLUMNS[name][column]
+                title = protocol.COLUMNS[name][column]
                 if table.get_cell(row[0], title) != cell:
                     table.update_cell(row[0], title, cell, update_width=True)
 
     # Keys.
 
-    def _ask(self, command: Command) -> None:
+    def _ask(self, command: protocol.Command) -> None:
         self.run_worker(self._send(command))
 
-    async def _send(self, command: Command) -> None:
+    async def _send(self, command: protocol.Command) -> None:
         answer = await self._connection.ask(command)
         severity = "information" if answer.done else "error"
         self.notify(answer.text, severity=severity, markup=False)  # type: ignore[arg-type]
@@ -182,27 +165,27 @@ class Screen(App[str]):
         """Pause or resume time."""
         if self.snapshot is not None:
             paused = self.snapshot.paused
-            self._ask(Resume() if paused else Pause())
+            self._ask(protocol.Resume() if paused else protocol.Pause())
             self._expect(paused=not paused)
 
     def action_step(self) -> None:
         """Step to the next due time."""
-        self._ask(Step())
+        self._ask(protocol.Step())
 
     def action_step_far(self) -> None:
         """Step by 1 s."""
-        self._ask(Step(seconds=1.0))
+        self._ask(protocol.Step(seconds=1.0))
 
     def action_speed(self, factor: float) -> None:
         """Multiply the speed of time."""
         if self.snapshot is not None:
-            asked = min(max(self.snapshot.speed * factor, SLOWEST), QUICKEST)
-            self._ask(Speed(factor=asked))
+            asked = min(max(self.snapshot.speed * factor, protocol.SLOWEST), protocol.QUICKEST)
+            self._ask(protocol.Speed(factor=asked))
             self._expect(speed=asked)
 
     def action_fastest(self) -> None:
         """Let time run as fast as possible."""
-        self._ask(Speed(factor=None))
+        self._ask(protocol.Speed(factor=None))
 
     def _expect(self, **changes: Any) -> None:
         """Assume a command's effect until the next snapshot, for keys pressed before."""
@@ -212,13 +195,13 @@ class Screen(App[str]):
     def action_restart(self) -> None:
         """Restart the node under the cursor."""
         if (node := self._selected_node()) is not None:
-            self._ask(Restart(node=node))
+            self._ask(protocol.Restart(node=node))
 
     def action_stop(self) -> None:
         """End the run, if the key is pressed twice."""
         now = time.monotonic()
         if now - self._stop_asked < CONFIRM:
-            self._ask(Stop())
+            self._ask(protocol.Stop())
         else:
             self.notify("press it again to end the run", severity="warning")
         self._stop_asked = now
@@ -246,7 +229,7 @@ class Screen(App[str]):
         """Set the typed setting."""
         self.action_leave_prompt()
         if event.value.strip():
-            self._ask(Set(text=event.value))
+            self._ask(protocol.Set(text=event.value))
 
     def _selected_node(self) -> str | None:
         table: DataTable[Text] = self.query_one("#nodes", DataTable)
@@ -260,10 +243,10 @@ def _table(name: str) -> DataTable[Text]:
 
 
 def _cell(table: str, column: int, text: str) -> Text:
-    return Text(text, justify="right" if is_number(table, column) else "left")
+    return Text(text, justify="right" if protocol.is_number(table, column) else "left")
 
 
-def drawn(paths: dict[str, Points], width: int, height: int) -> Text:
+def drawn(paths: dict[str, protocol.Points], width: int, height: int) -> Text:
     """Return paths in Braille dots, two by four to a character, and a line with their names.
 
     Args:

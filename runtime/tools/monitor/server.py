@@ -24,19 +24,8 @@ import numpy.typing as npt
 
 from events import TrackedFeatures
 from runtime.errors import CommandError, VisnavError
+from runtime.tools.monitor import protocol
 from runtime.tools.monitor.observer import Observer, describe
-from runtime.tools.monitor.protocol import (
-    LONGEST_COMMAND,
-    UNREADABLE,
-    Answer,
-    Command,
-    Look,
-    Set,
-    Watch,
-    decode_request,
-    encode,
-    socket_of,
-)
 
 R = TypeVar("R")
 
@@ -103,7 +92,7 @@ class Server:
         """Send the last snapshot to all who watch, and stop listening; called on the run's loop."""
         try:
             if self._watching:
-                self._last = encode(self._observer.take()) + b"\n"
+                self._last = protocol.encode(self._observer.take()) + b"\n"
             self._observer.end()
         except Exception:  # a monitor must not spoil a run's end
             log.exception("the monitor failed")
@@ -136,17 +125,17 @@ class Server:
     def _serve(self, client: socket.socket) -> None:
         ends = contextlib.suppress(OSError, CancelledError)
         with client, client.makefile("rb") as lines, ends:
-            while not self._end.is_set() and (line := lines.readline(LONGEST_COMMAND)):
+            while not self._end.is_set() and (line := lines.readline(protocol.LONGEST_COMMAND)):
                 try:
-                    request = decode_request(line)
-                except UNREADABLE as error:
-                    answer = Answer(done=False, text=f"expected a command: {error}")
+                    request = protocol.decode_request(line)
+                except protocol.UNREADABLE as error:
+                    answer = protocol.Answer(done=False, text=f"expected a command: {error}")
                 else:
-                    if isinstance(request, Watch):
+                    if isinstance(request, protocol.Watch):
                         self._watch(client)
                         break
                     answer = self._answer(request)
-                client.sendall(encode(answer) + b"\n")
+                client.sendall(protocol.encode(answer) + b"\n")
         self._clients.pop(threading.current_thread(), None)
 
     def _watch(self, client: socket.socket) -> None:
@@ -172,7 +161,7 @@ class Server:
 
     def _snapshot(self) -> bytes:
         try:
-            return encode(self._on_run_loop(self._observer.take)) + b"\n"
+            return protocol.encode(self._on_run_loop(self._observer.take)) + b"\n"
         except CancelledError:
             raise
         except Exception:
@@ -181,24 +170,24 @@ class Server:
             self._failed = True
             return b""
 
-    def _answer(self, request: Command | Look) -> Answer:
+    def _answer(self, request: protocol.Command | protocol.Look) -> protocol.Answer:
         try:
-            if isinstance(request, Look):
+            if isinstance(request, protocol.Look):
                 jpeg = self._kept.get(
                     request.camera, IMAGE_PERIOD, lambda: self._image(request.camera)
                 )
-                return Answer(done=True, text=request.camera, jpeg=jpeg)
+                return protocol.Answer(done=True, text=request.camera, jpeg=jpeg)
             text = self._on_run_loop(lambda: self._observer.execute(request))
         except VisnavError as error:
-            return Answer(done=False, text=str(error))
+            return protocol.Answer(done=False, text=str(error))
         except CancelledError:
-            return Answer(done=False, text="the run is over")
+            return protocol.Answer(done=False, text="the run is over")
         except Exception:
             log.exception("the monitor failed")
-            return Answer(done=False, text="the run could not do it, and its log says why")
-        if not isinstance(request, Set):  # which logs it itself
+            return protocol.Answer(done=False, text="the run could not do it, and its log says why")
+        if not isinstance(request, protocol.Set):  # which logs it itself
             log.info("asked by hand: %s", describe(request))
-        return Answer(done=True, text=text)
+        return protocol.Answer(done=True, text=text)
 
     def _image(self, camera: str) -> bytes:
         image, features = self._on_run_loop(lambda: self._observer.image(camera))
@@ -259,7 +248,7 @@ def small_jpeg(data: npt.NDArray[np.uint8], features: Sequence[TrackedFeatures] 
 def serving(observer: Observer, run: str) -> Iterator[Path | None]:
     """Serve a run's monitor on its loop; yield the socket's path, `None` without one."""
     try:
-        path = socket_of(run)
+        path = protocol.socket_of(run)
         server = Server(observer, asyncio.get_running_loop(), path)
     except (CommandError, OSError) as error:
         log.warning("no monitor can connect to this run: %s", error)

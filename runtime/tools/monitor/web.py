@@ -23,18 +23,7 @@ from urllib.parse import parse_qs, quote, urlsplit
 import jinja2
 import msgspec
 
-from runtime.tools.monitor.protocol import (
-    COLUMNS,
-    QUICKEST,
-    SLOWEST,
-    STACKS,
-    Answer,
-    Look,
-    Watch,
-    encode,
-    is_number,
-    request,
-)
+from runtime.tools.monitor import protocol
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
 LONGEST_BODY = 64 << 10  # bytes of a command at most
@@ -100,13 +89,13 @@ class _Handler(BaseHTTPRequestHandler):
             case "GET", "/events":
                 self._events()
             case "GET", "/image":
-                answer = self._ask(encode(Look(camera=query.get("camera", ""))))
+                answer = self._ask(protocol.encode(protocol.Look(camera=query.get("camera", ""))))
                 if not answer.done:
                     raise HttpError(404, answer.text)
                 self._send(200, answer.jpeg, "image/jpeg")
             case "POST", "/command":
                 answer = self._ask(self._body())
-                self._send(200, encode(answer), "application/json")
+                self._send(200, protocol.encode(answer), "application/json")
             case _, "/" | "/events" | "/image" | "/command":
                 raise HttpError(405, f"{url.path} takes no {self.command}")
             case _:
@@ -132,8 +121,8 @@ class _Handler(BaseHTTPRequestHandler):
             raise HttpError(413, f"expected at most {LONGEST_BODY} bytes")
         return self.rfile.read(int(length)).replace(b"\n", b" ")
 
-    def _ask(self, line: bytes) -> Answer:
-        return asyncio.run(request(self.server.run, line))
+    def _ask(self, line: bytes) -> protocol.Answer:
+        return asyncio.run(protocol.request(self.server.run, line))
 
     def _page(self) -> None:
         nonce = secrets.token_urlsafe(16)
@@ -141,13 +130,13 @@ class _Handler(BaseHTTPRequestHandler):
         page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
         content = page.from_string(text).render(
             nonce=nonce,
-            slowest=SLOWEST,
-            quickest=QUICKEST,
+            slowest=protocol.SLOWEST,
+            quickest=protocol.QUICKEST,
             token=self.server.token,
-            stacks=STACKS,
-            columns=COLUMNS,
+            stacks=protocol.STACKS,
+            columns=protocol.COLUMNS,
             first=msgspec.json.decode(next(self._snapshots(timeout=2.0), b"null")),
-            is_number=is_number,
+            is_number=protocol.is_number,
         )
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
@@ -166,7 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _snapshots(self, timeout: float | None = None) -> Iterator[bytes]:
         with contextlib.suppress(OSError), connected(self.server.run) as run:
             run.settimeout(timeout)
-            run.sendall(encode(Watch()) + b"\n")
+            run.sendall(protocol.encode(protocol.Watch()) + b"\n")
             with run.makefile("rb") as lines:
                 yield from lines
 
