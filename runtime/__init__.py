@@ -40,19 +40,6 @@ from runtime.units import Duration
 from runtime.workers.worker import Worker
 
 __all__ = [
-    "Bundle",
-    "Changeable",
-    "Clock",
-    "Duration",
-    "Input",
-    "Node",
-    "NodeConfig",
-    "Output",
-    "RefusedError",
-    "Stream",
-    "Tick",
-    "VisnavError",
-    "Worker",
-    "every",
-    "on",
-]
+    "Bundle", "Changeable", "Clock", "Duration", "Input", "Node", "NodeConfig", "Output",
+    "RefusedError", "Stream", "Tick", "VisnavError", "Worker", "every", "on",
+]  # fmt: skip

@@ -72,15 +72,9 @@ class Figure(msgspec.Struct, frozen=True):
 
 
 _UNITS = {
-    "_percent": "%",
-    "_deg_per_m": "°/m",
-    "_m_per_s": "m/s",
-    "_deg": "°",
-    "_ms": "ms",
-    "_hz": "Hz",
-    "_m": "m",
-    "_seconds": "s",
-}
+    "_percent": "%", "_deg_per_m": "°/m", "_m_per_s": "m/s", "_deg": "°", "_ms": "ms", "_hz": "Hz",
+    "_m": "m", "_seconds": "s",
+}  # fmt: skip
 
 
 def _error(name: str, meaning: str, **more: Any) -> Figure:

@@ -27,13 +27,9 @@ if TYPE_CHECKING:
 
 TRACE = 5
 LEVELS = {
-    "trace": TRACE,
-    "debug": logging.DEBUG,
-    "info": logging.INFO,
-    "warning": logging.WARNING,
-    "error": logging.ERROR,
-    "fatal": logging.CRITICAL,
-}
+    "trace": TRACE, "debug": logging.DEBUG, "info": logging.INFO, "warning": logging.WARNING,
+    "error": logging.ERROR, "fatal": logging.CRITICAL,
+}  # fmt: skip
 
 
 LONGEST = 65_536  # characters of a message in ``log.txt``

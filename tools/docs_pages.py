@@ -180,13 +180,9 @@ PLACES = {
 """Column and row of each room; a room may import only from rows below."""
 
 ABOUT = {
-    "bench": "benchmarks and their peers:",
-    "sims": "simulators:",
-    "nodes": "what else plugs in:",
-    "runtime.tools": "round the core:",
-    "runtime": "the core:",
-    "events": "frozen typed data",
-}
+    "bench": "benchmarks and their peers:", "sims": "simulators:", "nodes": "what else plugs in:",
+    "runtime.tools": "round the core:", "runtime": "the core:", "events": "frozen typed data",
+}  # fmt: skip
 
 
 def imports_between_rooms() -> set[tuple[str, str]]:

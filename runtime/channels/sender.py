@@ -100,26 +100,10 @@ class Sender(Generic[T]):
     """
 
     __slots__ = (
-        "_candidates",
-        "_deliver",
-        "_expected",
-        "_fault",
-        "_known",
-        "_listeners",
-        "_outside",
-        "_routes",
-        "_sent",
-        "_source",
-        "_sources",
-        "_taps",
-        "_thread",
-        "_to_streams",
-        "_voices",
-        "_waiting",
-        "event",
-        "name",
-        "send",
-    )
+        "_candidates", "_deliver", "_expected", "_fault", "_known", "_listeners", "_outside",
+        "_routes", "_sent", "_source", "_sources", "_taps", "_thread", "_to_streams", "_voices",
+        "_waiting", "event", "name", "send",
+    )  # fmt: skip
 
     def __init__(self, name: str, event: type[T], outside: Collection[Any] = ()) -> None:
         self.name = name

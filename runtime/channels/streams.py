@@ -59,21 +59,9 @@ class Stream(Generic[T]):
     """
 
     __slots__ = (
-        "_buffer",
-        "_closed",
-        "_room",
-        "_seen",
-        "_taken",
-        "bound",
-        "dropped",
-        "merge",
-        "name",
-        "offer",
-        "overflow",
-        "peak",
-        "soon",
-        "waiter",
-    )
+        "_buffer", "_closed", "_room", "_seen", "_taken", "bound", "dropped", "merge", "name",
+        "offer", "overflow", "peak", "soon", "waiter",
+    )  # fmt: skip
 
     def __init__(
         self, name: str, bound: int = 1024, overflow: Overflow = "error", soon: bool = False

@@ -76,18 +76,9 @@ class ResumableCoroutine(Coroutine[Any, Any, Any]):
     """Coroutine of a task, stepped by streams as well as by the task."""
 
     __slots__ = (
-        "__name__",
-        "_coro",
-        "_gate",
-        "_later",
-        "_loop",
-        "_nesting",
-        "_outcome",
-        "_run",
-        "_step",
-        "_stream",
-        "_task",
-    )
+        "__name__", "_coro", "_gate", "_later", "_loop", "_nesting", "_outcome", "_run", "_step",
+        "_stream", "_task",
+    )  # fmt: skip
 
     def __init__(
         self,

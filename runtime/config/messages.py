@@ -18,13 +18,9 @@ from runtime.paths import GivenHere
 _LONGEST_TEXT = 300  # most characters of a text shown in a message
 
 _NAMES = {
-    "float": "a number",
-    "int": "a whole number",
-    "str": "a text",
-    "bool": "true or false",
-    "array": "a list",
-    "object": "a table",
-}
+    "float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false",
+    "array": "a list", "object": "a table",
+}  # fmt: skip
 
 
 def explain(message: str, value: Any, type_: type[msgspec.Struct], where: str) -> str:

@@ -35,14 +35,8 @@ from runtime.time.schedule import SECOND
 def environment() -> dict[str, str]:
     """Return the environment of a run's figures: machine, Python and library versions."""
     libraries = [
-        "visnav-runtime",
-        "numpy",
-        "mujoco",
-        "opencv-python-headless",
-        "scipy",
-        "uvloop",
-        "msgspec",
-    ]
+        "visnav-runtime", "numpy", "mujoco", "opencv-python-headless", "scipy", "uvloop", "msgspec",
+    ]  # fmt: skip
     versions = {}
     for library in libraries:
         try:

@@ -163,19 +163,9 @@ class Ticker:
     """
 
     __slots__ = (
-        "_call",
-        "_fault",
-        "_function",
-        "_hz",
-        "_index",
-        "_period",
-        "_start",
-        "calls",
-        "late",
-        "missed",
-        "name",
-        "stopped",
-    )
+        "_call", "_fault", "_function", "_hz", "_index", "_period", "_start", "calls", "late",
+        "missed", "name", "stopped",
+    )  # fmt: skip
 
     def __init__(
         self,

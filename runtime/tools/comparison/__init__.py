@@ -15,13 +15,6 @@ from runtime.tools.comparison.statistics import (
 )
 
 __all__ = [
-    "ERROR",
-    "USUAL",
-    "Compared",
-    "Comparison",
-    "Key",
-    "compare",
-    "compare_rows",
-    "compare_values",
+    "ERROR", "USUAL", "Compared", "Comparison", "Key", "compare", "compare_rows", "compare_values",
     "read_folder",
-]
+]  # fmt: skip

@@ -30,20 +30,6 @@ from runtime.tools.sweep.process import Children, run_job
 from runtime.tools.sweep.tables import Row, records, summarise, write_tables
 
 __all__ = [
-    "Children",
-    "Job",
-    "Plan",
-    "Row",
-    "Watch",
-    "draw_plots",
-    "make_job",
-    "make_plan",
-    "records",
-    "run_here",
-    "run_job",
-    "sharing",
-    "summarise",
-    "sweep",
-    "write_page",
-    "write_tables",
-]
+    "Children", "Job", "Plan", "Row", "Watch", "draw_plots", "make_job", "make_plan", "records",
+    "run_here", "run_job", "sharing", "summarise", "sweep", "write_page", "write_tables",
+]  # fmt: skip
