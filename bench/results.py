@@ -53,11 +53,7 @@ class Change(msgspec.Struct, frozen=True):
 
 
 def read_rows(path: Path) -> dict[str, dict[str, Any]]:
-    """Return a result file's latency rows by case, system, mode and nodes.
-
-    Raises:
-        ConfigError: The file is missing or no result file.
-    """
+    """Return a file's latency rows by case, system, mode and nodes; or raise `ConfigError`."""
     try:
         content = msgspec.json.decode(path.read_bytes())
         rows = content["rows"]

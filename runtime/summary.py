@@ -383,11 +383,7 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
 
 
 def plain(value: Any, where: str) -> Any:
-    """Return a value in JSON types: numpy's numbers as numbers, its arrays as lists.
-
-    Raises:
-        TypeError: The value has no form in JSON.
-    """
+    """Return a value, numpy's too, in JSON types; raise `TypeError` if it has no form in JSON."""
     try:
         found = msgspec.to_builtins(value, enc_hook=_without_numpy, str_keys=True)
         msgspec.json.encode(found)

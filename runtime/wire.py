@@ -79,11 +79,7 @@ def event_type(kind: str) -> type[Event]:
 
 
 def pack(event: Event) -> Packed:
-    """Take an event apart. Its arrays are not copied, unless they are not contiguous.
-
-    Raises:
-        WireError: It holds something that is neither data of msgspec's nor an array.
-    """
+    """Take an event apart, contiguous arrays uncopied; `WireError` if it holds what is no data."""
     arrays: list[Array] = []
 
     def encode(value: Any) -> Any:
@@ -116,11 +112,7 @@ def pack(event: Event) -> Packed:
 
 
 def unpack(frame: Buffer) -> Event:
-    """Put an event together again. Its arrays stand in `frame`, read-only.
-
-    Raises:
-        WireError: The frame is not one, or of a kind that is not known here.
-    """
+    """Put an event together, its arrays in `frame`, read-only; `WireError` if it is none known."""
     view = memoryview(frame).cast("B").toreadonly()
     try:
         (length,) = _LENGTH.unpack_from(view)

@@ -214,11 +214,7 @@ def _folders(room: str) -> list[str]:
 
 
 def architecture(imports: set[tuple[str, str]]) -> str:
-    """Return the rooms and their imports as SVG, without implied arrows.
-
-    Raises:
-        PluginError: A room imports one that does not lie below it.
-    """
+    """Return the rooms and imports as SVG; `PluginError` for an import of a room not below."""
     for one, other in sorted(imports):
         if PLACES[one][1] >= PLACES[other][1]:
             raise PluginError(f"{one} imports {other}, which does not lie below it")

@@ -68,11 +68,7 @@ class Crew:
         self._nodes = nodes
 
     def check(self, since: int, awaited: str) -> None:
-        """Raise if waiting since `since` (`time.perf_counter_ns`) is of no more use.
-
-        Raises:
-            PeerError: A process has ended, or the waiting has taken too long.
-        """
+        """Raise `PeerError` if a process ended, or the wait since `since` (ns) is too long."""
         for node, (process, output) in self._nodes.items():
             if process.poll() is not None:
                 output.seek(0)
@@ -82,11 +78,7 @@ class Crew:
             raise PeerError(f"{awaited}: nothing came for {TIMEOUT:g} s")
 
     def exchange(self, case: Case, send: Send, receive: Receive) -> Samples:
-        """Call the roll, then measure.
-
-        Raises:
-            PeerError: Nodes did not answer.
-        """
+        """Call the roll, then measure; raise `PeerError` if nodes are silent."""
         now = time.perf_counter_ns
         taken = np.empty(case.warm_up + case.samples, np.int64)
         try:

@@ -83,11 +83,7 @@ def build(source: str, libraries: Sequence[str] = (), built_for: str = "") -> Pa
 
 
 def run(command: Sequence[str | Path], deadline: float, env: dict[str, str] | None = None) -> str:
-    """Run a program, ended with this process or at the deadline; return its output.
-
-    Raises:
-        CompiledError: It failed or did not end in time.
-    """
+    """Return a program's output; raise `CompiledError` if it fails, or is ended at the deadline."""
     try:
         done = subprocess.run(
             guarded(command),

@@ -87,11 +87,7 @@ class Graph:
         others: Sequence[subprocess.Popen[bytes]],
         deadline: float,
     ) -> None:
-        """Wait until node 1 has ended, and then the others, all well.
-
-        Raises:
-            GraphError: A node failed, or did not end in time.
-        """
+        """Wait for node 1, then for the others; raise `GraphError` if one fails or is late."""
         until = time.monotonic() + deadline
         while first.poll() is None:
             for process in others:
@@ -131,11 +127,7 @@ class Graph:
 
 @contextlib.contextmanager
 def graph() -> Iterator[Graph]:
-    """Run a master; the master and all nodes end with the block.
-
-    Raises:
-        GraphError: The master does not come up.
-    """
+    """Run a master, which ends with all nodes with the block; else raise `GraphError`."""
     with (
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as directory,
         contextlib.ExitStack() as stack,

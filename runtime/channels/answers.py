@@ -157,11 +157,7 @@ class Answers:
         ]
 
     def write(self, folder: Path, name: str) -> None:
-        """Write a row for each frame to ``answers/<name>.csv``, for replay in another run.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
+        """Write a row for each frame to ``answers/<name>.csv``, for replay in another run."""
         (folder / FOLDER).mkdir(exist_ok=True)
         file = folder / FOLDER / f"{source_file(name)}.csv"
         with file.open("w", newline="", encoding="utf-8") as out:

@@ -33,11 +33,7 @@ class Digest:
         self._outputs: dict[str, _Output] = {}
 
     def __call__(self, sender: Sender[Any] | None, event: Event) -> None:
-        """Add an event to the digest; a tap on every sender.
-
-        Raises:
-            ChannelTypeError: It holds an object that is no data.
-        """
+        """Add an event, as a tap on every sender; `ChannelTypeError` if it is no data."""
         name = self.name_of(sender, event)
         try:
             output = self._outputs[name]

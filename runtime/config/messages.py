@@ -142,11 +142,7 @@ def override(table: dict[str, Any], change: str) -> None:
 
 
 def given(text: str) -> Any:
-    """Return the value of a command-line text: parsed as TOML, or the text itself.
-
-    Raises:
-        ValueError: The text is no value that a file could have.
-    """
+    """Return a command-line text's value in TOML, or the text; else raise `ValueError`."""
     try:
         found = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:

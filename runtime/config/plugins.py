@@ -45,11 +45,7 @@ class Offer(NamedTuple):
     value: str
 
     def load(self) -> Any:
-        """Import the module and return the object of the entry point.
-
-        Raises:
-            CommandError: It cannot be imported, or is not there.
-        """
+        """Import the module and return the object of the entry point, or raise `CommandError`."""
         try:
             return EntryPoint(self.name, self.value, "").load()
         except Exception as error:  # whatever a package does when it is imported

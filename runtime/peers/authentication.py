@@ -134,10 +134,7 @@ SHORTEST = 16  # characters of a secret at least
 
 
 def secret_of(setting: str) -> bytes:
-    """Return the secret shared by all processes of a run, as `network.secret` describes it.
-
-    Raises:
-        PeerError: There is none, or others may read it.
+    """Return a run's secret by `network.secret`; `PeerError` if there is none, or others read it.
     """
     kind, _, name = setting.partition(":")
     if kind == "env":

@@ -237,11 +237,7 @@ def what_all_share(config: Config) -> dict[str, Any]:
 
 
 def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:
-    """Check the compatibility of another process with the run.
-
-    Raises:
-        PeerError: It runs another file, or a node that runs here, or left us out.
-    """
+    """Raise `PeerError` if another process has another file, nodes of ours, or left us out."""
     if place := _difference(mine.config, other.config):
         where, here, there = place
         raise PeerError(

@@ -164,11 +164,7 @@ class JointStart:
         self._said[Ready] = Ready(begun=True)
 
     def hear(self, member: Member, message: Announcements) -> None:
-        """Record a process's announcements; after a return they must equal the first.
-
-        Raises:
-            WireError: These are not announcements of its own nodes.
-        """
+        """Record a process's announcements, of its nodes only, or raise `WireError`."""
         if not message.by_node.keys() <= {*member.nodes}:
             raise WireError("expected announcements of its own nodes")
         member.announced = message

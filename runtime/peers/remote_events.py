@@ -33,11 +33,7 @@ class RemoteEvents:
                     self._arrivals[name] = (owners[spec.name], Sender(name, output.event))
 
     def wants(self, process: int, wanted: tuple[Subscription, ...]) -> None:
-        """Record the subscriptions of a process; empty for a process gone.
-
-        Raises:
-            WireError: It listens to a kind of event that is not known here.
-        """
+        """Record the subscriptions of a process, empty if gone; `WireError` for unknown events."""
         for each in wanted:
             for kind in each.kinds:
                 event_type(kind)
@@ -57,11 +53,7 @@ class RemoteEvents:
             sender.connect(listeners, fault=fault)
 
     def arrive(self, process: int, output: str, event: Event) -> None:
-        """Deliver an event of another process.
-
-        Raises:
-            WireError: It has no such output, or that sends no such event.
-        """
+        """Deliver an event of another process; `WireError` if it has no such output."""
         owner, sender = self._arrivals.get(output, (None, None))
         if sender is None or owner != process:
             raise WireError(f"expected an output of process {process}, found {output!r}")

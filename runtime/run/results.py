@@ -135,11 +135,7 @@ def time_of(folder: Path) -> float:
 
 
 def clear(out: Path) -> None:
-    """Make an empty folder for a run to come, in place of an earlier run's.
-
-    Raises:
-        ResultsError: A run uses the folder, or no run has made it.
-    """
+    """Make an empty folder in place of an earlier run's; raise `ResultsError` if it is not ours."""
     claim(out)
     os.close(_lock(out))
     shutil.rmtree(out)
@@ -147,11 +143,7 @@ def clear(out: Path) -> None:
 
 
 def claim(out: Path) -> None:
-    """Make a folder, if missing, and mark the folder as a run's.
-
-    Raises:
-        ResultsError: There is something in it, and no run has made it.
-    """
+    """Make a folder, or take an empty one or a run's, and mark it; else raise `ResultsError`."""
     out.mkdir(parents=True, exist_ok=True)
     marker = out / MARKER
     if marker.is_file():

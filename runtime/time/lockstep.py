@@ -287,11 +287,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
 
 @functools.cache
 def check_interpreter() -> None:
-    """Check by a self-test whether time can be simulated on this interpreter.
-
-    Raises:
-        UnsupportedInterpreterError: The test failed.
-    """
+    """Raise `UnsupportedInterpreterError` if time cannot be simulated here, by a self-test."""
     if not passes(LockstepLoop, _exercise):
         raise UnsupportedInterpreterError(
             f"expected an asyncio on which time can be simulated, such as Python's from 3.11 to "

@@ -88,11 +88,7 @@ _USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
 
 @contextlib.contextmanager
 def _plain_errors() -> Iterator[None]:
-    """Turn errors about arguments into a `ConfigError` of a single line.
-
-    Raises:
-        ConfigError: An argument is wrong.
-    """
+    """Turn errors about arguments into a `ConfigError` of a single line."""
     try:
         yield
     except _USAGE_ERROR as error:

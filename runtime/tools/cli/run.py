@@ -148,11 +148,7 @@ def run(
 
 
 def chosen(settings: Config, only: str | None) -> list[str]:
-    """Return the nodes named by ``--only``, in file order; none if all run here.
-
-    Raises:
-        ConfigError: It names a node that there is not, or none.
-    """
+    """Return the nodes of ``--only``, in file order; none if all; `ConfigError` if unknown."""
     from runtime.errors import ConfigError, suggest
 
     if only is None:
@@ -171,11 +167,7 @@ def chosen(settings: Config, only: str | None) -> list[str]:
 
 
 def look_at(settings: Config, only: Collection[str] = ()) -> None:
-    """Check the file before the run, and print the warnings.
-
-    Raises:
-        ConfigError: The run could not do what the file says.
-    """
+    """Check the file before the run: print the warnings, raise `ConfigError` for errors."""
     from runtime.errors import ConfigError
     from runtime.tools.preflight import of_file
 

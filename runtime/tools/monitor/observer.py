@@ -232,11 +232,7 @@ class Observer:
         )
 
     def image(self, camera: str) -> tuple[Image, list[TrackedFeatures]]:
-        """Return the newest image of a snapshot's camera, and features tracked in it.
-
-        Raises:
-            CommandError: It has sent no image, or nobody watches.
-        """
+        """Return a camera's newest image with its features, or raise `CommandError`."""
         return self._measured.image(camera)
 
     def _sample(self) -> Sample:

@@ -227,11 +227,7 @@ async def request(path: Path, line: bytes) -> Answer:
 
 
 def ask(path: Path, command: Command) -> str:
-    """Send a command to a run, without an event loop, and return the answer.
-
-    Raises:
-        CommandError: No run listens there, or it refused.
-    """
+    """Send a command to a run, without a loop, and return the answer; `CommandError` if refused."""
     answer = asyncio.run(request(path, encode(command)))
     if not answer.done:
         raise CommandError(answer.text)

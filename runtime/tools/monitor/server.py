@@ -60,11 +60,7 @@ class Kept:
 
 
 class Server:
-    """Server at a path for the clients of a run's monitor; `loop` is the run's.
-
-    Raises:
-        OSError: There can be no socket.
-    """
+    """Server at a path for the clients of a run's monitor, on the run's `loop`; else `OSError`."""
 
     def __init__(self, observer: Observer, loop: asyncio.AbstractEventLoop, path: Path) -> None:
         self._observer = observer

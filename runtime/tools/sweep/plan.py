@@ -52,11 +52,7 @@ class Axis(msgspec.Struct, frozen=True):
 
 
 def parameter(change: str) -> Parameter:
-    """Read ``PATH=V1,V2,…``.
-
-    Raises:
-        ConfigError: It is something else, or has a value twice.
-    """
+    """Read ``PATH=V1,V2,…``; raise `ConfigError` for all else, or a value given twice."""
     path, equals, text = change.partition("=")
     where = f"--vary {change}"
     if not equals or not path.strip():

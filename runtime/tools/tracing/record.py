@@ -133,11 +133,7 @@ class TraceInstrument(Instrument):
 
 @contextlib.contextmanager
 def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
-    """Trace a run from its begin while the block lasts, then write the trace (``.gz``: compressed).
-
-    Raises:
-        ConfigError: There can be no such file.
-    """
+    """Trace a run while the block lasts, then write (``.gz``: compressed); or `ConfigError`."""
     if not path.name or path.is_dir():
         raise ConfigError(f"{path}: expected the name of a file for a trace, found a folder")
     if path.exists() and not (path.is_file() or path.is_char_device()):
