@@ -134,8 +134,7 @@ SHORTEST = 16  # characters of a secret at least
 
 
 def secret_of(setting: str) -> bytes:
-    """Return a run's secret by `network.secret`; `PeerError` if there is none, or others read it.
-    """
+    """Return a run's secret by `network.secret`; `PeerError` without one, or if others read it."""
     kind, _, name = setting.partition(":")
     if kind == "env":
         found = os.environ.get(name, "")

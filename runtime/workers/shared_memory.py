@@ -195,8 +195,7 @@ class SharedPipe:
         return _LENGTH.pack(len(frame)) + frame
 
     def post(self, packed: bytes) -> None:
-        """Send the result of `pack` without ever waiting: a thread sends what is left; or `OSError`.
-        """
+        """Send the result of `pack` without waiting: a thread sends what is left; or `OSError`."""
         with self._sending:
             sent = 0
             if not self._unsent:
