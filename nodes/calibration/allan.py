@@ -32,13 +32,11 @@ class Curve(msgspec.Struct, frozen=True, eq=False):
     announced: Floats
 
 
-def variances(samples: Floats, rate: float) -> tuple[Floats, Floats]:
-    """Return averaging times (s) and overlapping Allan variances, mean of all axes.
-
-    Args:
-        samples: At equal intervals, shape (n, axes).
-        rate: Hertz.
-    """
+def variances(
+    samples: Floats,  # at equal intervals, shape (n, axes)
+    rate: float,  # hertz
+) -> tuple[Floats, Floats]:
+    """Return averaging times (s) and overlapping Allan variances, mean of all axes."""
     sums = np.vstack([np.zeros(samples.shape[1]), np.cumsum(samples - samples.mean(0), axis=0)])
     steps = np.unique(np.geomspace(1, len(samples) // 6, 22).astype(int))
     found = [((sums[2 * m :] - 2 * sums[m:-m] + sums[: -2 * m]) / m).var() / 2.0 for m in steps]

@@ -71,15 +71,14 @@ _ROUND_TRIP = 0.5  # largest error of a corner followed there and back, pixels
 
 
 def follow_both_ways(
-    image: Grey, other: Grey, pixels: Floats, guess: Floats, window: int, levels: int
+    image: Grey,
+    other: Grey,
+    pixels: Floats,  # column and row, shape (n, 2), n > 0
+    guess: Floats,  # their approximate pixels in the other image, shape (n, 2)
+    window: int,  # side of the compared neighbourhood, pixels
+    levels: int,  # halvings of the images
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
     """Follow corners from a guess, and back; good corners return to their start.
-
-    Args:
-        pixels: Column and row, shape (n, 2), n > 0.
-        guess: Their approximate pixels in the other image, shape (n, 2).
-        window: Side of the compared neighbourhood, pixels.
-        levels: Halvings of the images.
 
     Returns:
         Pixels in the other image, shape (n, 2), and a mask of the good ones, shape (n,).

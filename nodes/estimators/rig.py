@@ -270,15 +270,13 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
         )
 
     def trajectory(
-        self, stamp: int, source: str, stamps: npt.NDArray[np.int64], poses: Floats
+        self,
+        stamp: int,  # of the event (ns)
+        source: str,
+        stamps: npt.NDArray[np.int64],  # those of the poses (ns), shape (n,)
+        poses: Floats,  # the optical camera in its own first frame, shape (n, 4, 4)
     ) -> TrajectoryEstimate:
-        """Return the body's poses as an event.
-
-        Args:
-            stamp: Of the event (ns).
-            stamps: Those of the poses (ns), shape (n,).
-            poses: The optical camera in its own first frame, shape (n, 4, 4).
-        """
+        """Return the body's poses as an event."""
         bodies = self._bodies(poses)
         turns = Rotation.from_matrix(bodies[:, :3, :3])
         return TrajectoryEstimate(

@@ -40,14 +40,12 @@ class Cloud(msgspec.Struct, frozen=True, eq=False):
 
 
 def write_ply(
-    path: Path, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8], frame_id: str
+    path: Path,
+    points: npt.NDArray[np.float32],  # metres, shape (n, 3)
+    colours: npt.NDArray[np.uint8],  # red, green, blue, shape (n, 3)
+    frame_id: str,  # named in a comment of the header
 ) -> None:
     """Write a whole PLY file or none; missing folders are created.
-
-    Args:
-        points: Metres, shape (n, 3).
-        colours: Red, green, blue, shape (n, 3).
-        frame_id: Named in a comment of the header.
 
     Raises:
         ValueError: The arrays do not fit each other.
@@ -151,14 +149,11 @@ def rays_of(info: CameraInfo, stride: int) -> Points:
 
 
 def back_project(
-    depth: Points, rays: Points, max_depth: float
+    depth: Points,  # metres along the optical z axis, shape (h, w)
+    rays: Points,  # from `rays_of`, shape (h, w, 2)
+    max_depth: float,  # metres, beyond which pixels are left out
 ) -> tuple[Points, npt.NDArray[np.bool_]]:
     """Return a depth image's points in the optical frame, metres, (n, 3), and their mask, (h, w).
-
-    Args:
-        depth: Metres along the optical z axis, shape (h, w).
-        rays: From `rays_of`, shape (h, w, 2).
-        max_depth: Metres, beyond which pixels are left out.
 
     Raises:
         ValueError: The shapes do not fit.
@@ -270,15 +265,14 @@ class VoxelCloud:
 
 
 class Mapper:
-    """Builder of a cloud from depth images.
+    """Builder of a cloud from depth images."""
 
-    Args:
-        stride: Given images are every n-th pixel of the camera's.
-        voxel: Edge of a voxel, metres.
-        max_depth: Metres, beyond which points are left out.
-    """
-
-    def __init__(self, stride: int, voxel: float, max_depth: float) -> None:
+    def __init__(
+        self,
+        stride: int,  # given images are every n-th pixel of the camera's
+        voxel: float,  # edge of a voxel, metres
+        max_depth: float,  # metres, beyond which points are left out
+    ) -> None:
         self._rays = functools.lru_cache(maxsize=4)(lambda info: rays_of(info, stride))
         self._max_depth = max_depth
         self._cloud = VoxelCloud(voxel)

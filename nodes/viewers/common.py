@@ -161,13 +161,12 @@ REMEMBERED = 64  # images of a camera whose features may still come
 
 
 class ImageSelection:
-    """Selection of images by their stamps: all of an exposure are shown, or none.
+    """Selection of images by their stamps: all of an exposure are shown, or none."""
 
-    Args:
-        rate: Images a second at most; 0: none.
-    """
-
-    def __init__(self, rate: float) -> None:
+    def __init__(
+        self,
+        rate: float,  # images a second at most; 0: none
+    ) -> None:
         self._rate = rate
         self._last: dict[tuple[str, str], int] = {}
         self._selected: dict[str, deque[int]] = {}

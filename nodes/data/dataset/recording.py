@@ -146,16 +146,15 @@ class RowFile:
 
 
 class Recording(ABC):
-    """Base class of data sets being written.
+    """Base class of data sets being written."""
 
-    Args:
-        folder: Existing and empty.
-        rig: The sensors; other sources' events are ignored.
-        depth_factor: Steps of a depth image per metre.
-        epoch: The run's time 0 in the files, nanoseconds of Unix time.
-    """
-
-    def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
+    def __init__(
+        self,
+        folder: Path,  # existing and empty
+        rig: Rig,  # the sensors; other sources' events are ignored
+        depth_factor: float,  # steps of a depth image per metre
+        epoch: int,  # the run's time 0 in the files, nanoseconds of Unix time
+    ) -> None:
         self.folder = folder
         self.rig = rig
         self.depth_factor = depth_factor

@@ -51,14 +51,13 @@ _LATCHED = (
 
 
 class EventWriter:
-    """Writer of events to a file; as a `Sink`, target of `Publishing`'s ROS messages.
-
-    Args:
-        complain: Called for events not recorded as ROS's messages.
-    """
+    """Writer of events to a file; as a `Sink`, target of `Publishing`'s ROS messages."""
 
     def __init__(
-        self, writer: McapWriter, config: McapRecorderConfig, complain: Callable[[str], None]
+        self,
+        writer: McapWriter,
+        config: McapRecorderConfig,
+        complain: Callable[[str], None],  # called for events not recorded as ROS's messages
     ) -> None:
         self._writer = writer
         self._complain = complain

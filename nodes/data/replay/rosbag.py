@@ -46,13 +46,11 @@ _PARTS = {
 
 
 def chosen(
-    found: Mapping[str, tuple[str, int]], wanted: tuple[BagTopic, ...], vehicle: str
+    found: Mapping[str, tuple[str, int]],  # type and number of messages, by topic
+    wanted: tuple[BagTopic, ...],  # from the file; if empty, topics are taken by type and name
+    vehicle: str,
 ) -> dict[str, BagTopic]:
     """Return the topics to read, by name, with all sources filled in.
-
-    Args:
-        found: Type and number of messages, by topic.
-        wanted: From the file; if empty, topics are taken by type and name.
 
     Raises:
         ReplayError: A wanted topic is not there or of another type; or there is nothing to read.

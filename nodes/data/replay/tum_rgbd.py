@@ -36,18 +36,16 @@ _Images = list[tuple[int, Path]]
 class TumRgbd(FolderReader):
     """Reader of colour, depth and true poses; the camera looks ahead from the body's origin.
 
-    Args:
-        folder: The one with rgb.txt in it.
-        vehicle: Source of the truth; the camera is below it.
-        camera: Intrinsics; if `None`, those of camera.yaml.
-        depth_factor: Steps per metre.
-
     Raises:
         ReplayError: A file is not as published, or the intrinsics are missing.
     """
 
     def __init__(
-        self, folder: Path, vehicle: str, camera: Pinhole | None, depth_factor: float
+        self,
+        folder: Path,  # the one with rgb.txt in it
+        vehicle: str,  # source of the truth; the camera is below it
+        camera: Pinhole | None,  # intrinsics; if `None`, those of camera.yaml
+        depth_factor: float,  # steps per metre
     ) -> None:
         super().__init__(folder, vehicle)
         self._source = f"{vehicle}/camera"

@@ -84,13 +84,12 @@ class ImuModel:
         columns = (np.interp(times, samples[:, 0], column) for column in samples[:, 1:].T)
         return np.column_stack([times, *columns])
 
-    def preintegrate(self, samples: Floats, bias: Floats) -> Preintegrated:
-        """Return the motion from the first sample to the last.
-
-        Args:
-            samples: As of `corrected`, strictly rising in time, shape (n, 7), n > 1.
-            bias: Of gyroscope and accelerometer, shape (6,).
-        """
+    def preintegrate(
+        self,
+        samples: Floats,  # as of `corrected`, strictly rising in time, shape (n, 7), n > 1
+        bias: Floats,  # of gyroscope and accelerometer, shape (6,)
+    ) -> Preintegrated:
+        """Return the motion from the first sample to the last."""
         steps = np.diff(samples[:, 0])
         means = samples[1:] if self._averaged else (samples[1:] + samples[:-1]) / 2
         rates = means[:, 1:] - bias
@@ -145,16 +144,15 @@ _STEP = 8  # spacing of the computed shifts, pixels
 
 
 class Rows:
-    """The shifts of an image's rows.
+    """The shifts of an image's rows."""
 
-    Args:
-        info: Intrinsics, without distortion.
-        readout: Seconds from the first row's exposure to the last row's.
-        turn: Angular velocity of the camera in its own axes, rad/s, shape (3,).
-        velocity: Of the camera in its own axes, m/s, shape (3,).
-    """
-
-    def __init__(self, info: CameraInfo, readout: float, turn: Floats, velocity: Floats) -> None:
+    def __init__(
+        self,
+        info: CameraInfo,  # intrinsics, without distortion
+        readout: float,  # seconds from the first row's exposure to the last row's
+        turn: Floats,  # angular velocity of the camera in its own axes, rad/s, shape (3,)
+        velocity: Floats,  # of the camera in its own axes, m/s, shape (3,)
+    ) -> None:
         self._info, self._readout, self._turn, self._velocity = info, readout, turn, velocity
         columns, rows = (
             (np.arange(-(-size // _STEP)) + 0.5) * _STEP - 0.5 for size in (info.width, info.height)

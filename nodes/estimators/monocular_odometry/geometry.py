@@ -136,14 +136,13 @@ _PLANE = 3.0  # inlier threshold of a corner under a homography, pixels
 _EPIPOLAR = 1.0  # inlier threshold of a corner under an essential matrix, pixels
 
 
-def triangulate(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
-    """Return the midpoints (n, 3) between pairs of rays where closest; not finite if parallel.
-
-    Args:
-        second: Pose of the second camera.
-        a: Rays in the first, shape (n, 3).
-        b: Rays in the second, shape (n, 3).
-    """
+def triangulate(
+    first: Floats,
+    second: Floats,  # pose of the second camera
+    a: Floats,  # rays in the first, shape (n, 3)
+    b: Floats,  # rays in the second, shape (n, 3)
+) -> Floats:
+    """Return the midpoints (n, 3) between pairs of rays where closest; not finite if parallel."""
     centre_a, centre_b = centre(first), centre(second)
     u, v = a @ first[:3, :3], b @ second[:3, :3]
     u /= np.linalg.norm(u, axis=1, keepdims=True)

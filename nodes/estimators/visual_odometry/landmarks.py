@@ -269,13 +269,12 @@ def squares(pixels: Floats, spacing: int) -> Floats:
     return np.asarray(row * 65536 + column)
 
 
-def find_corners(image: Grey, spacing: int, taken: Floats) -> Floats:
-    """Return corners in empty squares, as whole pixels (column, row), shape (n, 2).
-
-    Args:
-        spacing: Side of a square, pixels.
-        taken: Other corners, column and row, shape (m, 2).
-    """
+def find_corners(
+    image: Grey,
+    spacing: int,  # side of a square, pixels
+    taken: Floats,  # other corners, column and row, shape (m, 2)
+) -> Floats:
+    """Return corners in empty squares, as whole pixels (column, row), shape (n, 2)."""
     strength = np.asarray(cv2.cornerMinEigenVal(image, _BLOCK))
     height, width = image.shape
     mask = np.zeros((height, width), bool)

@@ -42,15 +42,12 @@ def half_width(window: int) -> int:
 
 
 def find_patches(
-    patches: Patches, images: Mapping[int, Grey], image: Grey, window: int
+    patches: Patches,  # at least one; expected `half_width` or more from the image's edge
+    images: Mapping[int, Grey],  # their sources, by number
+    image: Grey,
+    window: int,  # side of the compared square, pixels; odd, 7 or more
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
-    """Return the places of patches, shape (n, 2), and a mask of the found, shape (n,).
-
-    Args:
-        patches: At least one; expected `half_width` or more from the image's edge.
-        images: Their sources, by number.
-        window: Side of the compared square, pixels; odd, 7 or more.
-    """
+    """Return the places of patches, shape (n, 2), and a mask of the found, shape (n,)."""
     half = half_width(window)
     side = 2 * half + 1
     centre = np.rint(patches.expected)

@@ -71,14 +71,13 @@ class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class StereoMatcher:
-    """Meter of depth in the left camera of a rectified pair without distortion.
-
-    Args:
-        baseline: Metres from the left camera to the right one.
-    """
+    """Meter of depth in the left camera of a rectified pair without distortion."""
 
     def __init__(
-        self, info: CameraInfo, baseline: float, settings: StereoSettings | None = None
+        self,
+        info: CameraInfo,
+        baseline: float,  # metres from the left camera to the right one
+        settings: StereoSettings | None = None,
     ) -> None:
         self._info = info
         settings = settings or StereoSettings()
@@ -117,14 +116,13 @@ class StereoMatcher:
         np.divide(self._unit, disparity, out=depth, where=disparity > self._least)
         return depth
 
-    def surfaces_at(self, inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
-        """Return the planes around pixels of the pair last given to `depth`.
-
-        Args:
-            inverse: Of its coarse depth, as of `surfaces.inverse_depth`, shape (h, w).
-            pixels: Column and row, shape (n, 2).
-            noise: Standard deviation of inverse depth, 1/m.
-        """
+    def surfaces_at(
+        self,
+        inverse: Depth,  # of its coarse depth, as of `surfaces.inverse_depth`, shape (h, w)
+        pixels: Floats,  # column and row, shape (n, 2)
+        noise: float,  # standard deviation of inverse depth, 1/m
+    ) -> Surfaces:
+        """Return the planes around pixels of the pair last given to `depth`."""
         found = surfaces_at(inverse, pixels, _COARSE * noise)
         if self._pair is None or not len(pixels):
             return found

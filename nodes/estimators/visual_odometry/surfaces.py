@@ -47,14 +47,12 @@ def inverse_depth(depth: Depth) -> Depth:
     return np.asarray(cv2.blur(inverse, (3, 3)))
 
 
-def surfaces_at(inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
-    """Fit a plane to inverse depth around each pixel.
-
-    Args:
-        inverse: As of `inverse_depth`, shape (h, w).
-        pixels: Column and row, shape (n, 2).
-        noise: Standard deviation of one pixel's inverse depth, 1/m.
-    """
+def surfaces_at(
+    inverse: Depth,  # as of `inverse_depth`, shape (h, w)
+    pixels: Floats,  # column and row, shape (n, 2)
+    noise: float,  # standard deviation of one pixel's inverse depth, 1/m
+) -> Surfaces:
+    """Fit a plane to inverse depth around each pixel."""
     height, width = inverse.shape
     centre = np.rint(pixels).astype(int)
     columns = np.clip(centre[:, 0, None] + _GRID[:, 0], 0, width - 1)

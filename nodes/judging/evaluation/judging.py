@@ -342,15 +342,14 @@ def choose_alignment(scale_free: bool, frame_id: str) -> How:
 
 
 def errors_at_ticks(
-    truth: Trajectory, estimate: Trajectory, arrivals: npt.NDArray[np.int64], rate: float
+    truth: Trajectory,
+    estimate: Trajectory,
+    arrivals: npt.NDArray[np.int64],  # of the estimates (ns), shape (n,)
+    rate: float,  # ticks a second, from the first arrival to the end of the truth
 ) -> tuple[Errors | None, dict[str, float]]:
     """Return the errors of the newest pose at each control tick, and their figures.
 
     The errors of a long flight are those of every second tick, fourth, …; `None` without ticks.
-
-    Args:
-        arrivals: Of the estimates (ns), shape (n,).
-        rate: Ticks a second, from the first arrival to the end of the truth.
     """
     first, last = max(int(arrivals.min()), int(truth.stamps[0])), int(truth.stamps[-1])
     ticks = np.arange(first, last + 1, SECOND / rate).astype(np.int64)

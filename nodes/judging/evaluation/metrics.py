@@ -154,15 +154,14 @@ def end_error_percent(truth: Trajectory, estimate: Trajectory) -> float:
     return 100.0 * float(shifts[0]) / length
 
 
-def path_pairs(distances: Floats, delta: float, tolerance: float = 0.1) -> tuple[Indices, Indices]:
+def path_pairs(
+    distances: Floats,  # path length from the start to each pose, metres, not falling, shape (n,)
+    delta: float,  # metres between the two, above 0
+    tolerance: float = 0.1,  # share by which a pair may miss it
+) -> tuple[Indices, Indices]:
     """Return all pairs of poses a given path length apart, as evo's `filter_pairs_by_path` does.
 
     Each pose's partner is the nearest in distance; the first of equals.
-
-    Args:
-        distances: Path length from the start to each pose, metres, not falling, shape (n,).
-        delta: Metres between the two, above 0.
-        tolerance: Share by which a pair may miss it.
 
     Returns:
         Row numbers of the first and of the second poses, each of shape (m,).
@@ -260,7 +259,9 @@ _THREE_SIGMA = float(chdtri(3, math.erfc(3.0 / math.sqrt(2.0))))
 
 
 def consistency(
-    truth: Trajectory, estimate: Trajectory, covariances: Floats
+    truth: Trajectory,
+    estimate: Trajectory,
+    covariances: Floats,  # of (x, y, z, roll, pitch, yaw) in the truth's frame, shape (n, 6, 6)
 ) -> dict[str, float | int | None]:
     """Return the consistency of pose errors with the received covariances.
 
@@ -270,9 +271,6 @@ def consistency(
     overconfident. Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to
     Tracking and Navigation" (2001), section 5.4. A pose's error is the difference of positions, and
     the rotation vector from true to estimated orientation, along the axes of the truth's frame.
-
-    Args:
-        covariances: Of (x, y, z, roll, pitch, yaw) in the truth's frame, shape (n, 6, 6).
 
     Returns:
         Means and shares by name. A covariance not symmetric and positive definite is counted as

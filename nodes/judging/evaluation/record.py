@@ -45,14 +45,13 @@ class EstimatorRecord:
 
     The trajectory has the poses in the first one's frame, with strictly rising stamps; others are
     only counted.
-
-    Args:
-        scale_free: Whether its unit of length is arbitrary.
-        reads: See `events.EstimatorAnnouncement`.
     """
 
     def __init__(
-        self, scale_free: bool = False, method: str = "", reads: tuple[str, ...] = ()
+        self,
+        scale_free: bool = False,  # whether its unit of length is arbitrary
+        method: str = "",
+        reads: tuple[str, ...] = (),  # see `events.EstimatorAnnouncement`
     ) -> None:
         self.scale_free = scale_free
         self.method = method

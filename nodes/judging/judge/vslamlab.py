@@ -18,16 +18,14 @@ import typer
 
 
 def arguments(
-    sequence: Path, run: Path, mode: str, settings: str = "", *, dashes: bool = False
+    sequence: Path,
+    run: Path,  # folder of the experiment, with the name of the run
+    mode: str,  # ``mono``, ``rgbd``, ``stereo``, ``mono-vi`` or ``stereo-vi``
+    settings: str = "",  # its settings_yaml, if it has one
+    *,
+    dashes: bool = False,  # for programs in Python; those in C++ lack it
 ) -> list[str]:
-    """Return a program's arguments: ``key:value``, or ``--key value`` with `dashes`.
-
-    Args:
-        run: Folder of the experiment, with the name of the run.
-        mode: ``mono``, ``rgbd``, ``stereo``, ``mono-vi`` or ``stereo-vi``.
-        settings: Its settings_yaml, if it has one.
-        dashes: For programs in Python; those in C++ lack it.
-    """
+    """Return a program's arguments: ``key:value``, or ``--key value`` with `dashes`."""
     values = {
         "sequence_path": sequence,
         "calibration_yaml": sequence / "calibration.yaml",

@@ -91,15 +91,13 @@ def drawing() -> Iterator[None]:
 
 
 def sheet(
-    height: float, *, names: Sequence[str] = (), constrained: bool = True, width: float = WIDTH
+    height: float,  # inches, with one row of the legend
+    *,
+    names: Sequence[str] = (),  # entries of the legend above all
+    constrained: bool = True,  # whether axes are placed automatically
+    width: float = WIDTH,
 ) -> Figure:
-    """Return an empty figure.
-
-    Args:
-        height: Inches, with one row of the legend.
-        names: Entries of the legend above all.
-        constrained: Whether axes are placed automatically.
-    """
+    """Return an empty figure."""
     rows = -(-len(names) // legend_columns(names))
     size = (width, height + 0.2 * max(rows - 1, 0))
     return Figure(figsize=size, layout="constrained" if constrained else None)

@@ -85,13 +85,12 @@ class ImageWriter:
         self._shape: tuple[int, ...] | None = None
         self._buffer = bytearray()
 
-    def write(self, time: Time, data: npt.NDArray[Any]) -> bytearray:
-        """Return the message, overwritten by the next call.
-
-        Args:
-            time: Seconds and nanoseconds.
-            data: Pixels, shape (height, width) or (height, width, channels).
-        """
+    def write(
+        self,
+        time: Time,  # seconds and nanoseconds
+        data: npt.NDArray[Any],  # pixels, shape (height, width) or (height, width, channels)
+    ) -> bytearray:
+        """Return the message, overwritten by the next call."""
         if self.encoding == "16UC1":
             data = depth_in_steps(data, 1000.0)
         if data.shape != self._shape:
@@ -210,14 +209,12 @@ def _rows(message: Any, pixel: int) -> npt.NDArray[np.uint8]:
 HEAD = struct.Struct("<iff")
 
 
-def inverse_depth(depth: npt.NDArray[np.float32], farthest: float, quantization: float) -> bytes:
-    """Return inverse depth as encoded by compressed_depth_image_transport.
-
-    Args:
-        depth: Metres, shape (height, width); ``inf`` where there is none.
-        farthest: Metres, beyond which depth is unknown.
-        quantization: Larger for finer steps; the least depth is about q² / 65535 m.
-    """
+def inverse_depth(
+    depth: npt.NDArray[np.float32],  # metres, shape (height, width); ``inf`` where there is none
+    farthest: float,  # metres, beyond which depth is unknown
+    quantization: float,  # larger for finer steps; the least depth is about q² / 65535 m
+) -> bytes:
+    """Return inverse depth as encoded by compressed_depth_image_transport."""
     most = np.float32(farthest)
     a = np.float32(quantization * (quantization + 1.0))
     b = np.float32(1.0) - a / most

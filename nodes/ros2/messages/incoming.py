@@ -264,13 +264,12 @@ def nothing(message: Any, context: MessageContext) -> None:
 
 
 def camera_announcement(
-    message: Any, source: str, images: tuple[str, ...], frame_id: str = ""
+    message: Any,
+    source: str,
+    images: tuple[str, ...],  # kinds of its images
+    frame_id: str = "",  # if set, replaces the message's
 ) -> CameraAnnouncement:
     """Return the announcement, by a CameraInfo, of a camera looking ahead from the body's origin.
-
-    Args:
-        images: Kinds of its images.
-        frame_id: If set, replaces the message's.
 
     Raises:
         ValueError: The message is no camera's calibration.

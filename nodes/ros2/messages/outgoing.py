@@ -48,14 +48,13 @@ _UNKNOWN = np.array([-1.0, *[0.0] * 8])  # covariance of an unmeasured quantity 
 
 
 class Outgoing:
-    """Context of outgoing messages: types, frames, settings, announcements.
-
-    Args:
-        time: Returns the time in messages of a stamp (ns).
-    """
+    """Context of outgoing messages: types, frames, settings, announcements."""
 
     def __init__(
-        self, store: TypeStore, config: PublishingConfig, time: Callable[[int], Time]
+        self,
+        store: TypeStore,
+        config: PublishingConfig,
+        time: Callable[[int], Time],  # returns the time in messages of a stamp (ns)
     ) -> None:
         self.store, self.config, self.time = store, config, time
         self.names = FrameNames()

@@ -125,17 +125,15 @@ class ColouredPoints(msgspec.Struct, frozen=True, eq=False):
 
 
 class ScenePoints:
-    """Points in the world from a camera's depth and colours, at a bounded rate.
-
-    Args:
-        rate: Sets a second at most; 0: none.
-        stride: Take every n-th pixel of every n-th row.
-        max_distance: Metres from the camera, beyond which points are left out.
-        max_height: Metres above the camera, likewise.
-    """
+    """Points in the world from a camera's depth and colours, at a bounded rate."""
 
     def __init__(
-        self, info: CameraInfo, rate: float, stride: int, max_distance: float, max_height: float
+        self,
+        info: CameraInfo,
+        rate: float,  # sets a second at most; 0: none
+        stride: int,  # take every n-th pixel of every n-th row
+        max_distance: float,  # metres from the camera, beyond which points are left out
+        max_height: float,  # metres above the camera, likewise
     ) -> None:
         self._rate, self._stride = rate, stride
         self._max_distance, self._max_height = max_distance, max_height
