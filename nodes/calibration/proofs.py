@@ -20,10 +20,8 @@ from nodes.calibration.room import NEAREST, Floats, Motion, _Collector, hits, sp
 from nodes.data.dataset.recording import Rig
 
 INTEGRATED = 5.0  # seconds of IMU integration
-
 _POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.005, 0.1, 0.3, 0.005, 1e-5
 """Metres; pixels, global and rolling shutter; metres; pixels."""
-
 _MOST = 0.99
 """Least share of points, and of depths, within the limit; the rest is within three times the limit.
 """

@@ -30,7 +30,6 @@ from runtime.paths import source_file
 from runtime.run.results import run_folder
 
 FORMATS = ("tum", "euroc", "kitti")
-
 TRUTH = "truth"
 PLAN = "plan"  # with `TRUTH`, the names of files without an estimate
 _COMMENT = {

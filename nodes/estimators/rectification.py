@@ -25,11 +25,9 @@ from events.geometry import pose_matrix, pose_tuples
 
 Floats = npt.NDArray[np.float64]
 F = TypeVar("F", bound=tuple[Any, ...])
-
 WIDEST = math.radians(110.0)  # greatest field of view of a new image, along its longer side
 ALIGNED = 0.1  # largest violation of the rule above by a point's images in a rectified pair, pixels
 _NO_MAP: Any = None  # both coordinates stand in one
-
 _NARROWEST = 2.0  # largest ratio of the new focal length to the old
 
 

@@ -153,7 +153,6 @@ Heading = Literal["path", "fixed", "sweep"]
 
 _SWEEP_ANGLE, _SWEEP_PERIOD = np.radians(40.0), 6.0
 """Radians to each side, and seconds, of a sweeping heading."""
-
 _MOST = 4.0  # highest acceleration for a multirotor to follow an excitation closely, m/s²
 
 

@@ -24,7 +24,6 @@ UNIT_LENGTH = 0.01  # tolerated deviation of a quaternion's length from 1, for f
 
 _CALENDAR = 10**17
 """Least stamp (ns) taken for Unix time (1973); stamps below count from some beginning."""
-
 _ROW = np.dtype([("stamp", "i8"), ("position", "f8", 3), ("orientation", "f8", 4)])
 _BLOCK = 1024  # rows of a pose, and how many are written at once: 64 KiB take the loop 30 µs
 

@@ -31,7 +31,6 @@ from runtime.extras import install_command
 from runtime.wire import ALIGNED, unpack
 
 TYPE = "std_msgs/msg/UInt8MultiArray"
-
 _LENGTH = struct.Struct("<I")
 _HEAD = struct.Struct("<4sIII")
 """CDR's header (little endian), no dimensions, no offset, and the number of bytes."""
@@ -194,7 +193,6 @@ __all__ = [
 
 _DAMAGED = (struct.error, EOFError, ValueError, OSError, OverflowError, MemoryError, LookupError)
 """Exceptions of mcap on damaged records, besides its own errors."""
-
 _TIMES = struct.Struct("<QQ")  # at the beginning of a chunk: of its first message, and of its last
 
 

@@ -93,7 +93,6 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 EVENT, ANNOUNCEMENT, END = 0, 1, 2
-
 _HEAD = struct.Struct("<qIB")
 _PART = 1 << 16  # bytes written at once: the kernel does not let go of the core meanwhile
 

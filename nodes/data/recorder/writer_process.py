@@ -35,7 +35,6 @@ SMALL = 512  # assumed size of an event without arrays, bytes
 _LARGE = 1 << 14  # least size of an event dropped by ``drop_images``, bytes
 _PAUSE = 0.005
 """Seconds between two looks at an empty backlog: cheaper than waking the thread at every event."""
-
 _AT_ONCE = 1 << 16  # bytes handed over together
 _IN_A_ROW = 16  # events in a row before the loop gets the GIL
 STANDSTILL = 10.0

@@ -37,7 +37,6 @@ from nodes.trajectory.table import read_rows
 _TRUTH = "state_groundtruth_estimate0"
 _MODELS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 """Kalibr's names of distortion models, and ours."""
-
 T = TypeVar("T")
 
 

@@ -28,7 +28,6 @@ Batch = list[Timed]
 MOST = 64  # events of a batch
 LARGEST = 4 << 20
 """Bytes of a batch, but for its last event. Where batches end depends on the recording only."""
-
 _SMALL = 512
 
 

@@ -159,7 +159,6 @@ class Mountings:
 
 _SAME_CLOCK = 60 * SECOND  # largest difference of stamp and receipt on a common clock, nanoseconds
 _EVENTS = {use: row.becomes or row.events[0] for (_, use), row in READERS.items() if use in TYPES}
-
 _LATER = 1 << 62  # placeholder for the stamp of a message without a stamp
 
 

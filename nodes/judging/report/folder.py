@@ -61,7 +61,6 @@ def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interva
 
 
 T = TypeVar("T")
-
 _LOG_LINES = 200
 _NO_ESTIMATES = {"truth", "plan"}
 _ABOUT = 0.25  # tolerated difference between two counts of lost time, seconds

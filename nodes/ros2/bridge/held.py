@@ -32,7 +32,6 @@ from runtime.errors import MissingAnswerError, suggest
 WAITING = 64  # messages waiting to be published in real time; beyond this, images are dropped
 SETTLED = 0.3
 """Real seconds without a new subscription, after all needed ones, until publishing begins."""
-
 CLOSING = 2.0  # real seconds for the remaining messages at the end of the run
 _LOOK = 0.01  # real seconds between two polls of the subscriptions
 

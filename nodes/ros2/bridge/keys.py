@@ -105,7 +105,6 @@ def _token(node: NodeName, zid: str, node_id: int, id_: int, kind: Kind) -> str:
 
 _LAYOUT = struct.Struct("<qqB16s")
 """Two numbers, and a buffer of 16 bytes after its length, in Zenoh's own serialisation."""
-
 SIZE = _LAYOUT.size
 
 

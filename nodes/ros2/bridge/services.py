@@ -158,7 +158,6 @@ STOPPED, PLAYING, PAUSED, QUITTING = range(4)
 # Of Result.msg, and of SetSimulationState.srv.
 FEATURE_UNSUPPORTED, OK, OPERATION_FAILED = 0, 1, 4
 ALREADY_IN_TARGET_STATE, INCORRECT_TRANSITION = 101, 103
-
 LONGEST = 86_400 * SECOND  # longest step of a single request, nanoseconds of the run's clock
 
 
@@ -249,7 +248,6 @@ class SimulationServices:
 # Of GoalStatus.msg, and of CancelGoal.srv.
 UNKNOWN, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = 0, 2, 3, 4, 5, 6
 NO_ERROR, UNKNOWN_GOAL, GOAL_TERMINATED = 0, 2, 3
-
 KEPT, PERIOD = 16, 0.2
 """Goals whose results can be asked for; real seconds between two messages of feedback."""
 

@@ -102,7 +102,6 @@ Answer = Callable[[bytearray | str, bytes], None]
 
 WAIT_BEFORE_DROP = 300
 """Microseconds for a put to wait for a peer not reading; Zenoh's default is 1000."""
-
 WAITING = 64  # unread messages kept by Zenoh; with more, the sender has to wait
 PAUSE = 0.001  # seconds between two polls for messages; faster messages are taken in batches
 CLOSING = 3.0  # seconds

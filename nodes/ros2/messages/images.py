@@ -44,23 +44,17 @@ def encode_depth(steps: npt.NDArray[np.uint16]) -> bytes:
 
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
-
 _STAMP = struct.Struct("<iI")
 _STAMP_AT = 4  # a header is the first field of each of these messages, and begins with the stamp
 _LENGTH = struct.Struct("<I")
-
 _NONE = np.zeros(0, np.uint8)
-
 POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
 """Point of a cloud's PointCloud2: colour in a single field, ``rgb``, as PCL packs colours."""
-
 LIDAR_POINT = np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
 """Point of a lidar's PointCloud2, as of Velodyne's driver; ``time``: seconds after the stamp."""
-
 _FLOAT32, _UINT16 = 7, 4  # of sensor_msgs/msg/PointField
 _XYZ = [("x", 0, _FLOAT32), ("y", 4, _FLOAT32), ("z", 8, _FLOAT32)]
 _MEASURED = [("intensity", 12, _FLOAT32), ("ring", 16, _UINT16), ("time", 18, _FLOAT32)]
-
 _PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
 _TURNS = {
     "bgr8": cv2.COLOR_BGR2RGB,

@@ -16,7 +16,6 @@ from runtime.errors import MissingDependencyError, VisnavError
 
 _QUEUED = (Image, DepthImage, PointCloud, LidarScan, TrackedFeatures)
 """Events whose messages take long to make."""
-
 WAITING = 8  # images of a kind waiting to be passed on; the oldest is dropped, and counted
 _REFUSALS = 10  # different refusals to log, at most
 

@@ -48,7 +48,6 @@ from nodes.viewers.rerun.world import World
 _GATHERED = 500  # events written into a file together
 _TIMEOUT = 3.0
 """Real seconds for a viewer to take logged data; else new data are left out, lest memory grow."""
-
 _SECOND_TIMEOUT = 0.01  # real seconds for the same, after a first timeout
 
 

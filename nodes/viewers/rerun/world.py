@@ -50,9 +50,7 @@ from nodes.viewers.rerun.sdk import RerunConfig
 
 CENTIMETRES = 100.0
 """Steps of a depth image per metre. Finer steps would show noise and make files large."""
-
 _WIND_PERIOD = 100_000_000  # nanoseconds between two arrows of a vehicle's wind
-
 _THICK, _THIN = 0.02, 0.01  # metres: radii of paths
 
 
