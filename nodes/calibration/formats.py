@@ -196,11 +196,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def camera_in_imu(rig: Rig, camera: CameraAnnouncement) -> Floats:
-    """Return the pose of a camera's optical frame in the IMU's frame (or the body's), shape (4, 4).
-
-    Raises:
-        ValueError: They are not mounted on one body.
-    """
+    """Return an optical frame's pose in the IMU's (or body's) frame, (4, 4), if on one body."""
     if rig.imu is not None and rig.imu.parent_frame_id != camera.parent_frame_id:
         raise ValueError(
             f"{camera.source}: expected a camera mounted on {rig.imu.parent_frame_id}, as "

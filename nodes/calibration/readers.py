@@ -1,8 +1,4 @@
-"""The calibration files of other programs, read as their documentation says.
-
-Independent of `nodes.calibration.formats` and on OpenCV's functions, so a mistake in a file does
-not cancel out.
-"""
+"""Readers of other programs' calibration files, independent of `formats`, on OpenCV's functions."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The calibration room: its surfaces, the sensor data sent there, and the true motion.
-
-Black walls, and white spheres in every direction; rays are intersected here and not by a renderer.
-"""
+"""The calibration room of black walls and white spheres: rays' hits, sensor data, true motion."""
 
 from __future__ import annotations
 
@@ -41,11 +38,7 @@ _COUNT = 130
 
 
 def spheres(angle: float) -> tuple[Floats, Floats]:
-    """Return the spheres' centres (metres in ``map``, shape (n, 3)) and radii (metres, (n,)).
-
-    They lie on a spiral of equal areas around the room's centre, each half `angle` (radians) wide
-    there.
-    """
+    """Return spheres' centres (``map``, m, (n, 3)) and radii (m), each half `angle` (rad) wide."""
     number = np.arange(_COUNT) + 0.5
     down = 1.0 - 2.0 * number / _COUNT
     around = np.pi * (1.0 + 5.0**0.5) * number

@@ -78,11 +78,7 @@ def follow_both_ways(
     window: int,  # side of the compared neighbourhood, pixels
     levels: int,  # halvings of the images
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
-    """Follow corners from a guess, and back; good corners return to their start.
-
-    Returns:
-        Pixels in the other image, shape (n, 2), and a mask of the good ones, shape (n,).
-    """
+    """Follow corners from a guess, and back; return pixels (n, 2), and a mask of good ones (n,)."""
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
     options: Any = {
         "winSize": (window, window),

@@ -140,10 +140,7 @@ class Rectification:
 
 
 def misalignment(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
-    """Return the largest row or disparity error of a pair of pinhole images as aligned, pixels.
-
-    Disparity should be f · baseline / z; ``inf`` if nothing is seen by both, or sizes differ.
-    """
+    """Return the largest row or disparity error (px) of a pinhole pair; ``inf`` if incomparable."""
     info = left.info
     if (info.width, info.height) != (right.info.width, right.info.height):
         return math.inf

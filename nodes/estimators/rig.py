@@ -241,11 +241,7 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
         )
 
     def estimate(self, stamp: int, source: str, result: TrackingResult) -> PoseEstimate:
-        """Return the body's pose, from that of the optical camera in its first frame, as an event.
-
-        The body's velocity is the camera's, without the lever's share (0.1 m/s at 1 rad/s and 0.1
-        m).
-        """
+        """Return the body's pose as an event; its velocity is the camera's (lever ignored)."""
         body = self._bodies(result.pose)
         position, orientation = pose_tuples(body)
         turn = (self.start @ self.camera)[:3, :3]

@@ -1,7 +1,4 @@
-"""SVO in a worker's process, and its node: images in, estimates out.
-
-Under the GPL, and able to crash its process; imported only when an object is made.
-"""
+"""SVO in a worker's process, and its node: images in, estimates out; GPL, and able to crash."""
 
 from __future__ import annotations
 
@@ -199,11 +196,7 @@ def _threads() -> set[str]:
 
 
 def _wait_for(threads: Iterable[str]) -> None:
-    """Return when threads of this process sleep: then they wait for work.
-
-    How many frames SVO's thread has in its filters would else depend on the machine; a frame before
-    the third last is done would be skipped.
-    """
+    """Return when threads of this process sleep, with all their frames done, on any machine."""
     files = [Path(f"/proc/self/task/{thread}/stat") for thread in threads]
     asleep = 0
     while asleep < 2:

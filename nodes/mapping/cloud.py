@@ -153,11 +153,7 @@ def back_project(
     rays: Points,  # from `rays_of`, shape (h, w, 2)
     max_depth: float,  # metres, beyond which pixels are left out
 ) -> tuple[Points, npt.NDArray[np.bool_]]:
-    """Return a depth image's points in the optical frame, metres, (n, 3), and their mask, (h, w).
-
-    Raises:
-        ValueError: The shapes do not fit.
-    """
+    """Return a depth image's points (optical frame, m, (n, 3)), and their mask (h, w)."""
     if rays.shape != (*depth.shape, 2):
         raise ValueError(f"depth: expected shape {rays.shape[:2]}, found {depth.shape}")
     seen = (depth > 0.0) & (depth <= max_depth) & np.isfinite(rays[..., 0])

@@ -1,7 +1,4 @@
-"""Scripted flights: take off, follow a path, land, end the run.
-
-`WaypointFollower` flies by the vehicle's true pose, `VisualPilot` by an estimator's.
-"""
+"""Scripted flights by the true pose, or an estimator's: take off, follow a path, land, end."""
 
 from __future__ import annotations
 
@@ -238,10 +235,7 @@ class Pilot(Node[C], ABC):
 
 
 class WaypointFollower(Pilot[PilotConfig]):
-    """Pilot along waypoints by the true pose, its nose in the direction of flight.
-
-    Takes off, follows the path, lands, and ends the run.
-    """
+    """Pilot along waypoints by the true pose, its nose in the direction of flight."""
 
     setpoints = Output(PositionSetpoint)
 

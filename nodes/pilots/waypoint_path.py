@@ -1,7 +1,4 @@
-"""Timed paths through waypoints: rounded corners, limited speed and acceleration, smooth heading.
-
-Also excitation, a figure eight, and a sweeping heading. Pure numpy.
-"""
+"""Timed paths: rounded corners, limited speed and acceleration, smooth heading, excitation."""
 
 from __future__ import annotations
 

@@ -85,11 +85,7 @@ def euroc_rows(
 
 
 def read_vslamlab(path: Path) -> Trajectory:
-    """Read a CSV file of VSLAM-LAB under its header ``ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw``.
-
-    Raises:
-        ValueError: It cannot be read or holds something else; the message names the line.
-    """
+    """Read VSLAM-LAB's ``ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw``; may raise `ValueError`."""
     rows = [
         (row, row.nanoseconds(), row.numbers(1, 8))
         for row in read_rows(path, ",", (8,), "ts, t x 3, qx, qy, qz, qw", header=True)

@@ -26,11 +26,7 @@ _SHOWN = 60  # characters of a wrong line shown in a message
 
 
 def epoch_of(given: int | str) -> int:
-    """Return an epoch in nanoseconds of Unix time, given as such or by ISO 8601 (default UTC).
-
-    Raises:
-        ValueError: It is neither, before 1970 or after 2225.
-    """
+    """Return nanoseconds of Unix time (1970 to 2225), from such or ISO 8601, or `ValueError`."""
     expected = "expected nanoseconds of Unix time or a date as 2020-01-01T00:00:00Z"
     try:
         if isinstance(given, int) or given.isdecimal():
@@ -103,11 +99,7 @@ def read_rows(
     whole: bool = True,  # whether a last line without its end counts
     header: bool = False,  # whether to skip a first line that begins with a letter
 ) -> Iterator[Row]:
-    """Yield the rows of a file.
-
-    Raises:
-        ValueError: The file cannot be read, has no rows, or a row of another length.
-    """
+    """Yield the rows of a file; a `ValueError` if unreadable, empty, or of another length."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -148,10 +140,7 @@ def part_name(node: Node[Any], name: str) -> str:
 
 
 class GrowingFile:
-    """A file of lines: added on the loop, and written beside the loop twice a second.
-
-    A restarted node goes on with its file.
-    """
+    """A file of lines (a restarted node's goes on): added on the loop, written beside it."""
 
     def __init__(self, node: Node[Any], path: Path, head: str = "") -> None:
         self._node = node

@@ -78,11 +78,7 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
 
     @classmethod
     def from_matrices(cls, stamps: Stamps, matrices: Floats) -> Trajectory:
-        """Make a trajectory of transforms child to parent (metres, (n, 4, 4)) at stamps (ns, (n,)).
-
-        Raises:
-            ValueError: They are no rigid transforms.
-        """
+        """Make a trajectory of rigid transforms child to parent, metres, (n, 4, 4), at stamps."""
         matrices = np.asarray(matrices, dtype=np.float64)
         if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
             raise ValueError(

@@ -87,10 +87,7 @@ class PathPieces:
         self._last = 0
 
     def add(self, stamp: int, position: Vector3) -> list[Vector3] | None:
-        """Add a pose (ns, metres); return a piece when complete.
-
-        Pieces are joined, unless there was a gap.
-        """
+        """Add a pose (ns, metres); return a complete piece, joined to the last but for gaps."""
         piece = None
         if self._points and not 0 <= stamp - self._last <= GAP:
             piece = self.rest()
@@ -115,10 +112,7 @@ class PathPieces:
 def estimate_frame(
     event: PoseEstimate, truth: RecentPoses | None
 ) -> tuple[Vector3, Quaternion] | None:
-    """Return the pose of an estimate's frame in ``map``, from its first estimate.
-
-    The first pose lies on the true one, as in the evaluation; `None` if unknown.
-    """
+    """Return an estimate's frame in ``map``: its first pose laid on the true one, or `None`."""
     found = None if truth is None else truth.at(event.stamp)
     if found is None:
         return None

@@ -1,7 +1,4 @@
-"""A window as a node: shows a camera's images and turns keys into events.
-
-GLFW and OpenGL run in a worker process, imported here only, when a `GlfwWindow` is made.
-"""
+"""A window as a node, by GLFW and OpenGL in a process of its own: images shown, keys as events."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Common parts of all data set layouts: a rig, events in, rows and images out.
-
-Rows are written at once; an image is returned as an `ImageFile`, to be written later.
-"""
+"""Common parts of all data set layouts: a rig, events in, rows and images (written later) out."""
 
 from __future__ import annotations
 

@@ -127,11 +127,7 @@ class McapWriter:
         return self._pending >= self._chunk_size
 
     def end_chunk(self) -> None:
-        """Compress the pending messages and write them as a chunk.
-
-        Raises:
-            RecordingError: The disk is full, or the like; earlier chunks are readable.
-        """
+        """Compress and write the pending messages; a `RecordingError` if the disk is full."""
         self._pending = 0
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
@@ -141,11 +137,7 @@ class McapWriter:
             raise unwritable(self.path, error) from error
 
     def close(self, metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
-        """Write the index, and close the file.
-
-        Raises:
-            RecordingError: As for `end_chunk`; the file is open still, for `abandon`.
-        """
+        """Write the index, and close the file; a `RecordingError` leaves it open, for `abandon`."""
         try:
             self.end_chunk()
             for name, entries in (metadata or {}).items():

@@ -280,11 +280,7 @@ def records(
     damaged: Callable[[str], None],  # called for parts that cannot be read, which are passed over
     everything: bool = False,  # yield metadata and attachments, too
 ) -> Iterator[Any]:
-    """Yield schemas, channels and messages; of a file with an index, by its chunks in the range.
-
-    Raises:
-        RecordingError: It is no MCAP file.
-    """
+    """Yield schemas, channels and messages; of a file with an index, by its chunks in the range."""
     with open_file(path) as file:
         summary = summary_of(file)
         if summary is not None and summary.chunk_indexes and summary.channels:

@@ -48,12 +48,7 @@ class McapRecorder(Node[McapRecorderConfig]):
         self._waited = 0.0
 
     async def on_startup(self) -> None:
-        """Open the file.
-
-        Raises:
-            MissingDependencyError: mcap or rosbags is not installed.
-            FatalError: It cannot be written.
-        """
+        """Open the file; a `FatalError` if it cannot be written."""
         if self.out is None:
             if not self.checking:
                 self.log.warning("the run writes no files, so nothing is recorded")
@@ -91,11 +86,7 @@ class McapRecorder(Node[McapRecorderConfig]):
                 await self._wait()
 
     async def on_shutdown(self) -> None:
-        """Write queued events and the index; on a slow disk, continue after the run.
-
-        Raises:
-            FatalError: The disk is full, or the like.
-        """
+        """Write queued events and the index, on a slow disk after the run, or end with an error."""
         process, backlog = self._process, self._backlog
         if process is None:
             return

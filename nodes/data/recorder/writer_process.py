@@ -38,10 +38,7 @@ _PAUSE = 0.005
 _AT_ONCE = 1 << 16  # bytes handed over together
 _IN_A_ROW = 16  # events in a row before the loop gets the GIL
 STANDSTILL = 10.0
-"""Real seconds without any sign of life before the process is given up.
-
-A slow disk shows a sign of life in the file's size.
-"""
+"""Real seconds without a sign of life (such as the file's growth) until the process is given up."""
 
 _LOOK = 0.5  # real seconds between checks of the process
 _PIPE = 1 << 20  # size of the pipe, bytes: Linux's maximum without privileges

@@ -34,11 +34,7 @@ R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
 
 
 def while_seen(truth: list[R], first: int, last: int) -> list[R]:
-    """Return the truth during the sensors' time, with the row before and the row after.
-
-    Args:
-        truth: Rows in order, each with its stamp (ns) first.
-    """
+    """Return the truth's ordered rows (stamp (ns) first) in the sensors' time, and one beside."""
     begin = bisect.bisect_right(truth, first, key=lambda row: row[0]) - 1
     end = bisect.bisect_left(truth, last, key=lambda row: row[0]) + 1
     return truth[max(begin, 0) : end]
@@ -106,11 +102,7 @@ class Rows(NamedTuple):
 
 
 class FolderReader(Reader):
-    """Reader of a data set in a folder, whose stamps are its times too.
-
-    Args:
-        vehicle: Source of the truth; sensors are below it.
-    """
+    """Reader of a data set in a folder, with its stamps as times; sensors are below `vehicle`."""
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         super().__init__()

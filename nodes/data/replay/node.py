@@ -1,7 +1,4 @@
-"""A recording in the place of the simulator: the same announcements, events, stamps and sources.
-
-A thread reads ahead of the loop, bounded by bytes, so that the loop never decodes an image.
-"""
+"""A recording in the place of the simulator: the same announcements, events, stamps and sources."""
 
 from __future__ import annotations
 
@@ -253,12 +250,7 @@ class Replay(Node[ReplayConfig]):
             self.pause()
 
     async def on_startup(self) -> None:
-        """Open the recording.
-
-        Raises:
-            FatalError: It cannot be read.
-            MissingDependencyError: A library is not installed.
-        """
+        """Open the recording; a `FatalError` if it cannot be read."""
         try:
             await self.offload(self._open)
         except ReplayError as error:

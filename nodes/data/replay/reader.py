@@ -1,7 +1,4 @@
-"""Recordings as seen by a replay, in any format; choice of their events; settings.
-
-All for threads beside the loop; times count from the recording's beginning.
-"""
+"""Readers of recordings of any format, beside the loop; choice of their events; settings."""
 
 from __future__ import annotations
 

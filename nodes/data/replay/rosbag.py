@@ -50,11 +50,7 @@ def chosen(
     wanted: tuple[BagTopic, ...],  # from the file; if empty, topics are taken by type and name
     vehicle: str,
 ) -> dict[str, BagTopic]:
-    """Return the topics to read, by name, with all sources filled in.
-
-    Raises:
-        ReplayError: A wanted topic is not there or of another type; or there is nothing to read.
-    """
+    """Return the topics to read, by name, with all sources; a `ReplayError` if one is missing."""
     there = ", ".join(f"{name} ({type_})" for name, (type_, _) in sorted(found.items()))
     for topic in wanted:
         if topic.topic not in found:

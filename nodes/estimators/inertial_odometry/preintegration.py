@@ -64,20 +64,14 @@ class ImuModel:
         ]
 
     def corrected(self, samples: Floats) -> Floats:
-        """Return samples, shape (n, 7), without the announced scale and misalignment.
-
-        Rows are seconds, angular velocity (rad/s), specific force (m/s²).
-        """
+        """Return samples (s, rad/s, m/s²; (n, 7)) without announced scale and misalignment."""
         turn, force = (
             s @ u.T for s, u in zip((samples[:, 1:4], samples[:, 4:]), self._undo, strict=True)
         )
         return np.hstack([samples[:, :1], turn, force])
 
     def at(self, samples: Floats, times: Floats) -> Floats:
-        """Return samples, shape (m, 7), at times (s, shape (m,)): interpolated, or held outside.
-
-        Samples are as of `corrected`, strictly rising in time, shape (n, 7), n > 0.
-        """
+        """Return samples (m, 7) at times (s, (m,)), interpolated or held, of `corrected` ones."""
         if self._averaged:
             rows = np.searchsorted(samples[:, 0], times).clip(max=len(samples) - 1)
             return np.column_stack([times, samples[rows, 1:]])

@@ -37,16 +37,10 @@ _BENT = 0.003  # noise of depth on surfaces not quite planar, relative to invers
 _PLACED = 0.5, 0.5
 """Constant noise of a landmark's place, relative to a sighting: of pixel, of depth."""
 _COMMON, _COMMON_BY_EYES = (0.02, 0.0), (0.02, 0.1)
-"""Correlated shares of the landmarks' variance in an image: of sightings, of places.
-
-None of a depth sensor's noise; the slope and texture of a surface shift all its disparities.
-"""
+"""Shares common to all landmarks' variance in an image, of depth, of stereo: sightings, places."""
 _MISFIT = 1.5  # largest median error of the landmarks, in standard deviations of a pixel
 _PATIENCE, _DOUBTED = 0.4, 0.6
-"""Averaging time (s) and limit of the share of images contradicting the filter.
-
-Beyond the limit the filter begins anew, in a frame of its own.
-"""
+"""Averaging time (s) and limit of the share of contradicting images; the filter then restarts."""
 _PREDICTED = np.diag(np.repeat([0.05**-2, 0.02**-2], 3))
 """Information of the predicted pose in the choice of landmarks: 5 cm, 0.02 radians."""
 _SLOTS = (-1, -2)  # numbers of possible reference images of an alignment, beside the key frames'
@@ -65,10 +59,7 @@ class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 class InertialTracker(FeatureTracker):
-    """Tracker of a camera with depth, or a stereo rig, and an IMU on the same body.
-
-    Equal images and samples give equal poses, to the bit.
-    """
+    """Tracker of a camera with depth or a stereo rig, and an IMU; reproducible to the bit."""
 
     def __init__(
         self,

@@ -45,10 +45,7 @@ class Initialization:
         self._count = 0
 
     def add(self, image: Grey) -> InitialMap | None:
-        """Add the next image, grey; return a map once available.
-
-        Starts again with this image if too few corners are left, or a long motion gave no map.
-        """
+        """Add the next image, grey, or start again with it; return a map once available."""
         if self._first is None or self._before is None:
             self._restart(image)
             return None

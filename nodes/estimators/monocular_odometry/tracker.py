@@ -49,11 +49,7 @@ _ORB_POINTS = 1000  # number of points describing a lost camera's image
 
 
 class MonocularTracker:
-    """Tracker of a single camera without distortion; equal images give equal poses, to the bit.
-
-    Raises:
-        ValueError: The images are distorted.
-    """
+    """Tracker of a camera without distortion (else a `ValueError`); reproducible to the bit."""
 
     def __init__(self, info: CameraInfo, settings: MonocularSettings | None = None) -> None:
         refuse_distortion(info)

@@ -308,11 +308,7 @@ def check_arrays(
     right: npt.NDArray[np.uint8] | None,
     imu: Floats | None,
 ) -> None:
-    """Reject arrays ORB-SLAM3 would exit on, or silently misread.
-
-    Raises:
-        ValueError: An array is missing, superfluous, or of the wrong shape.
-    """
+    """Raise a `ValueError` for arrays that ORB-SLAM3 would exit on, or silently misread."""
     mode, size = settings.mode, (settings.height, settings.width)
     for name, array, part, shapes in (
         ("image", image, "", (size, (*size, 3))),
@@ -330,10 +326,7 @@ def check_arrays(
 
 
 def _wait_for_other_threads(until: float) -> None:
-    """Return when the other threads have nothing to do, or at an amount of `time.process_time`.
-
-    They poll for work every 3 and 5 ms.
-    """
+    """Return when the other threads, polling every 3 and 5 ms, rest, or at a `process_time`."""
     quiet, naps = 0, _naps()
     while quiet < 3 and time.process_time() < until:
         time.sleep(_QUIET)

@@ -192,11 +192,7 @@ def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def check_vocabulary(path: Path) -> tuple[int, int]:
-    """Check quickly whether ORB-SLAM3 can read a file, fatal to it otherwise; return k and L.
-
-    Raises:
-        ValueError: It is missing, or its beginning is not in DBoW2's text format.
-    """
+    """Check whether a file is in DBoW2's text format, else a `ValueError`; return k and L."""
     try:
         with path.open(encoding="ascii") as lines:
             header, first = lines.readline(), lines.readline()

@@ -71,11 +71,7 @@ _READING = 0.5  # noise of a depth reading, a mean of many pixels, relative to a
 
 
 class FeatureTracker:
-    """Tracker of an RGB-D camera without distortion; equal images give equal poses, to the bit.
-
-    Args:
-        surfaces: Reads depth at pixels, as `surfaces_at` does.
-    """
+    """Tracker of an RGB-D camera without distortion; reproducible to the bit."""
 
     _aligns: bool = True
     """Whether edges and surfaces are aligned where landmarks are few."""
@@ -204,10 +200,7 @@ class FeatureTracker:
         return frames[start : start + _SEARCHED_PER_IMAGE]
 
     def _expect(self, grey: Grey) -> Floats | None:
-        """Return the approximate pose, by following a few corners from the previous image.
-
-        Coarse to fine, without a guess, which could follow a repeated texture.
-        """
+        """Return the approximate pose by flow of a few corners, without a misleading guess."""
         image, rows, pixels = self._before
         if len(rows) < self._settings.min_inliers:
             return None

@@ -142,10 +142,7 @@ class Landmarks:
         return np.asarray(rows[self._inactive_until[rows] <= now])
 
     def patches(self, pose: Floats, rows: Rows) -> tuple[Rows, Patches]:
-        """Return the rows whose view has not changed too much, and their patches.
-
-        Warps are derivatives, at the landmark, of its plane's homography.
-        """
+        """Return rows whose view is alike enough, and patches, warped by planes' homographies."""
         fx, fy, *_ = intrinsics(self._matrix)
         expected, z = self.project(pose, rows)
         x = (self.places[rows] @ pose[:3, :3].T + pose[:3, 3]) / z[:, None]

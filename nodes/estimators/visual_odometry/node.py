@@ -51,10 +51,7 @@ class DenseSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class DenseTracker:
-    """Tracker of an RGB-D camera without distortion, from key frame to key frame.
-
-    Equal images give equal poses.
-    """
+    """Tracker of an RGB-D camera without distortion, by key frames; reproducible."""
 
     def __init__(self, info: CameraInfo, settings: DenseSettings | None = None) -> None:
         refuse_distortion(info)

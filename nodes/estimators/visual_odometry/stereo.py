@@ -38,10 +38,7 @@ _REFINED = 1.5  # largest correction of block matching by flow, pixels
 _OFF_ROW = 0.6  # largest distance of a corner from its row, pixels
 _COARSE = 2.0  # noise of block matching, relative to flow
 _STEP, _DISTINCT = 3.0, 1.5
-"""Pixels beside a disparity, and least ratio of the difference there to its own.
-
-The disparity is then known to 3 / 15 / √0.5 = 0.3 pixels, if all difference is noise.
-"""
+"""Pixels beside a disparity, least ratio of the difference there: then 0.3 px of pure noise."""
 _LEVELS = 3  # halvings of the images for flow, where block matching found nothing
 _ASIDE = 4  # distance of such a corner from the neighbours defining its plane, pixels
 _BESIDE = np.array([(_ASIDE, 0), (-_ASIDE, 0), (0, _ASIDE), (0, -_ASIDE)])

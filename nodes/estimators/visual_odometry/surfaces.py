@@ -1,8 +1,4 @@
-"""Settings of the features, and inverse depth at corners where the surface is continuous.
-
-On a plane, inverse depth is affine in the pixel, and a triangulating sensor's noise is uniform in
-it.
-"""
+"""Settings of the features, and (affine) inverse depth at corners on continuous surfaces."""
 
 from __future__ import annotations
 

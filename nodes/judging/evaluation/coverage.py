@@ -85,10 +85,7 @@ def cover(
 
 
 def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
-    """Return a mask, shape (n,), of images with a pose within half the image period.
-
-    Rounded stamps still count.
-    """
+    """Return a mask, shape (n,), of images with a pose within half the image period."""
     if not len(poses):
         return np.zeros(len(frames), np.bool_)
     period = int(np.median(np.diff(frames))) if len(frames) > 1 else 0

@@ -318,10 +318,7 @@ def _said_with_poses(
 
 
 def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
-    """Return root mean square and maximum of the vehicle's distances from its planned path, metres.
-
-    Empty if the truth covers no stamp of the plan, which is in the same frame.
-    """
+    """Return root mean square and maximum of distances from the plan, m; empty without overlap."""
     rows = np.flatnonzero(truth.covers(plan.stamps))
     if not len(rows):
         return {}
@@ -331,11 +328,7 @@ def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
 
 
 def choose_alignment(scale_free: bool, frame_id: str) -> How:
-    """Return the alignment implied by an estimate's frame.
-
-    ``sim3`` for a unit of its own, ``none`` in ``map``, else ``origin``: first pose on the true
-    one.
-    """
+    """Return ``sim3`` for a unit of its own, ``none`` in ``map``, else ``origin`` (first pose)."""
     if scale_free:
         return "sim3"
     return "none" if frame_id == "map" else "origin"

@@ -80,11 +80,7 @@ def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> 
 
 
 def frame_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
-    """Return the relative errors from each pose to the next: evo's default, ``evo_rpe``.
-
-    Raises:
-        ValueError: The stamps of the two differ, or there are less than two poses.
-    """
+    """Return the relative errors from pose to pose, evo's default; a `ValueError` below two."""
     same_stamps(truth, estimate)
     if len(truth) < 2:
         raise ValueError(f"relative error: expected two poses, found {len(truth)}")
@@ -233,10 +229,7 @@ def same_stamps(truth: Trajectory, estimate: Trajectory) -> None:
 def relative_errors(
     truth: Trajectory, estimate: Trajectory, first: Indices, last: Indices
 ) -> tuple[Floats, Floats]:
-    """Return the errors of the motions between pairs of poses: metres and radians, shape (m,).
-
-    Pairs are given by row numbers of their first and last poses; see `path_pairs`.
-    """
+    """Return errors (m, rad; (m,)) of motions between pairs of row numbers; see `path_pairs`."""
     (r1, p1), (r2, p2) = (
         (t.rotations(), t.positions[last] - t.positions[first]) for t in (truth, estimate)
     )

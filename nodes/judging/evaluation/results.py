@@ -69,12 +69,7 @@ def write_results(
 
 
 def read_errors(path: Path) -> Errors:
-    """Read a file of errors.
-
-    Raises:
-        OSError: It cannot be read.
-        ValueError: It holds something else.
-    """
+    """Read a file of errors; may raise `OSError` or `ValueError`."""
     with path.open(encoding="ascii") as file:
         known = file.readline().count(",") == 3  # or else not when each came
     times, columns = ((0, 1), (2, 3)) if known else ((0,), (1, 2))

@@ -120,11 +120,7 @@ class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 def read_truth(text: str, times: str) -> Source:
-    """Read the true poses: a file, a topic, or those in a run's folder.
-
-    Raises:
-        ValueError: It cannot be read; the message names file and line.
-    """
+    """Read true poses of a file, a topic, or a run's folder; a `ValueError` names the line."""
     path = newest(Path(text))
     own = path / "trajectories" / "truth.tum"
     if path.is_dir() and not (path / "metadata.yaml").is_file():

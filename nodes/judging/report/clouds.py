@@ -1,7 +1,4 @@
-"""Point clouds side by side, with a common viewpoint and scale, to reveal smearing.
-
-Points are painted into an array of pixels, near over far; matplotlib only adds axes.
-"""
+"""Point clouds side by side, painted at one viewpoint and scale, to reveal smearing."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Lenient reader of a run's folder, for the report.
-
-Every file is optional: missing and unreadable ones are named in `Run.missing`.
-"""
+"""Lenient reader of a run's folder: missing and unreadable files are named in `Run.missing`."""
 
 from __future__ import annotations
 

@@ -19,8 +19,7 @@ from matplotlib.figure import Figure
 Floats = npt.NDArray[np.float64]
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6a3d7c", "#6b5b00")
-"""For estimators. The first six are told apart by the colour-blind as well (M. Okabe and K. Ito,
-"Color universal design", 2008)."""
+"""Of estimators; six are safe for the colour-blind (Okabe, Ito, "Color universal design", 2008)."""
 TRUTHS = ("#3a3a3a", "#8a6d3b", "#4f6f52", "#6b5b7a")  # for the true paths of the vehicles
 HIT = "#b3261e"
 PLAN = "#111111"

@@ -62,11 +62,7 @@ class Verdict(summary.Verdict, frozen=True):
 
 
 class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """An estimator of the report, judged or not; see `nodes.judging.evaluation.judging.Judgement`.
-
-    Attributes:
-        figures: From the verdict; empty if there is none.
-    """
+    """An estimator of the report, judged or not; see `Judgement`. Without verdict no `figures`."""
 
     name: str
     color: str

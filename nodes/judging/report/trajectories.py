@@ -158,10 +158,7 @@ def _bounds(lines: list[_Line]) -> tuple[Floats, Floats]:
 def _layout(
     east: float, north: float, up: float, top: float
 ) -> tuple[float, Rectangle, Rectangle, Rectangle]:
-    """Return the figure's height, and the places of: above, from the side, over time; inches.
-
-    Broad views are one below the other; tall ones side by side.
-    """
+    """Return the figure's height, and places of above, side (beside if tall), time; inches."""
     across = WIDTH - _LEFT - _RIGHT
     if north < 0.7 * east:
         scale = min(across / east, _TALLEST / north)
@@ -223,12 +220,7 @@ def draw_frames(run: Run) -> list[Plot]:
 
 
 def read_image(path: Path) -> npt.NDArray[Any]:
-    """Read an image: red, green, blue, shape (h, w, 3).
-
-    Raises:
-        OSError: It cannot be read.
-        ValueError: It is none.
-    """
+    """Read an image (h, w, 3), red, green, blue; may raise `OSError` or `ValueError`."""
     data = np.fromfile(path, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
     if image is None:

@@ -37,10 +37,7 @@ _LOOK = 0.01  # real seconds between two polls of the subscriptions
 
 
 class HeldEstimator:
-    """An estimator in ROS 2: its presence, the images owed an answer, and its answers.
-
-    `topics` are its estimates and ``done``, if any.
-    """
+    """An estimator in ROS 2: presence, images owed an answer, answers (estimates and ``done``)."""
 
     def __init__(
         self,
@@ -80,10 +77,7 @@ class HeldEstimator:
         return " and ".join(found)
 
     def owe(self, image: Event, matched: Callable[[], Sequence[str]]) -> Owed[Event] | None:
-        """Return the answer owed to an image about to go out; `None` if none is.
-
-        Of an exposure's images, the first is owed one.
-        """
+        """Return the answer owed to an image about to go out, the exposure's first, or `None`."""
         if image.source != self.subscription.answers_to or image.stamp <= self._owed:
             return None
         self._owed = image.stamp

@@ -34,11 +34,7 @@ from runtime import Stream
 
 
 class IncomingTopic:
-    """Reader of a subscription's messages as events.
-
-    Raises:
-        ValueError: The type is not known, or the mapping cannot be imported.
-    """
+    """Reader of a subscription's messages as events; a `ValueError` if its type is unknown."""
 
     def __init__(
         self,
@@ -107,10 +103,7 @@ class IncomingTopic:
         return None if message is None else self._event(message, now, stamps)
 
     def answer(self, data: bytes, stamps: Stamps) -> tuple[int, Event | None] | None:
-        """Return the stamp of the image answered by a message (ns), and the message's event.
-
-        The event is `None` if refused or useless: still an answer. In any thread.
-        """
+        """Return the answered image's stamp (ns), and the event or `None`. In any thread."""
         message = self._message(data)
         if message is None:
             return None
@@ -243,11 +236,7 @@ class Inbox:
 
 
 class OutgoingTopic:
-    """Writer of a publication's messages.
-
-    Raises:
-        ValueError: The type is not known, or the event or the mapping cannot be imported.
-    """
+    """Writer of a publication's messages; a `ValueError` if type, event or mapping is unknown."""
 
     def __init__(
         self,

@@ -134,10 +134,7 @@ class Message(NamedTuple):
 
 
 def gid(token: str) -> bytes:
-    """Return the GID of the owner of a liveliness token, as in rmw_zenoh_cpp.
-
-    It is the token's XXH3 hash of 128 bits, its low 64 bits first, little endian.
-    """
+    """Return a token owner's GID, as rmw_zenoh_cpp: its XXH3 hash, low 64 bits first."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 

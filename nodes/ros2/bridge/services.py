@@ -362,10 +362,7 @@ class SimulateSteps:
 
 
 class _Order(NamedTuple):
-    """A command, the event of its completion, and a time limit in seconds.
-
-    Superfluous if the vehicle is armed (true), or if not armed (false).
-    """
+    """Command, event of completion, time limit (s); superfluous if the vehicle is (not) armed."""
 
     command: type[Command]
     done: type[VehicleEvent]

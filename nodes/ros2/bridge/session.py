@@ -1,7 +1,4 @@
-"""Zenoh session as a ROS 2 node, and its publishers: the only import of zenoh.
-
-Zenoh's callbacks run in its own threads, and must not wait.
-"""
+"""Zenoh session as a ROS 2 node, and its publishers: the only import of zenoh and its threads."""
 
 from __future__ import annotations
 

@@ -144,11 +144,7 @@ def cloud(
 
 
 def image_pixels(message: Any) -> npt.NDArray[np.uint8]:
-    """Return the pixels of an Image: RGB, shape (height, width, 3), or grey.
-
-    Raises:
-        ValueError: The encoding is another, or sizes do not fit each other.
-    """
+    """Return an Image's pixels, RGB (height, width, 3) or grey; may raise `ValueError`."""
     channels = _PIXEL_BYTES.get(message.encoding)
     if channels is None:
         raise ValueError(
@@ -223,11 +219,7 @@ def depth_in_millimetres(depth: npt.NDArray[np.float32]) -> bytes:
 
 
 def decode_compressed(message: Any) -> npt.NDArray[Any]:
-    """Return the pixels of a CompressedImage: RGB, grey, or depth in metres.
-
-    Raises:
-        ValueError: It is no image, or depth in a form that is not known.
-    """
+    """Return a CompressedImage's pixels, RGB, grey, or depth in metres; may raise `ValueError`."""
     if "compressedDepth" in message.format:
         return _decoded_depth(message.data, message.format)
     return decoded_pixels(message.data)

@@ -1,7 +1,4 @@
-"""Table of all mappings between events and ROS messages, and lookups in the table.
-
-A new mapping is a row here, and a function in `outgoing` or `incoming`.
-"""
+"""Table of all mappings between events and ROS messages: a row, and its function elsewhere."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Events to ROS messages, in ROS's frames and axes: a function for each row of `mappings`.
-
-Functions take their common context (`Outgoing`) and an event, and return a message, its bytes, or
-`None`.
-"""
+"""Events to ROS messages, in ROS's frames and axes: a function for each row of `mappings`."""
 
 from __future__ import annotations
 

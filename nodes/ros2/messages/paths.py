@@ -1,7 +1,4 @@
-"""Path of a vehicle, or of an estimate, as ``nav_msgs/msg/Path`` for RViz.
-
-Poses are kept as sent, in the bytes of rosbags, because a path is sent whole again and again.
-"""
+"""Path of a vehicle, or of an estimate, as ``nav_msgs/msg/Path``, kept as bytes to send again."""
 
 from __future__ import annotations
 

@@ -58,11 +58,7 @@ class Sink(Protocol[P_co]):
 
 
 class Publishing(Generic[P]):
-    """Maker and publisher of events' messages.
-
-    Args:
-        time: Returns the time in messages of a stamp (ns).
-    """
+    """Maker and publisher of events' messages; `time` returns a stamp's time in messages."""
 
     def __init__(
         self, sink: Sink[P], store: TypeStore, config: PublishingConfig, time: Callable[[int], Time]

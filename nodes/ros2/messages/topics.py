@@ -52,11 +52,7 @@ class Topic(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def dds_type(type_: str) -> str:
-    """Return ``sensor_msgs::msg::dds_::Image_`` for ``sensor_msgs/msg/Image``.
-
-    Raises:
-        ValueError: It is not of the form ``package/msg/Type``.
-    """
+    """Return ``sensor_msgs::msg::dds_::Image_`` for ``sensor_msgs/msg/Image``, or `ValueError`."""
     parts = type_.split("/")
     if len(parts) != 3 or not all(_NAME.fullmatch(part) for part in parts):
         raise ValueError(f'expected a type such as "sensor_msgs/msg/Image", found {type_!r}')

@@ -30,10 +30,7 @@ Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 
 
 def _hash_as_ros_2_does() -> None:
-    """Have rosbags hash ``char`` like ROS 2 in message files: as ``uint8``.
-
-    As rosidl_adapter does; rosbags' IDL char would make keys that meet nobody.
-    """
+    """Have rosbags hash ``char`` as rosidl_adapter does, ``uint8``, lest keys meet nobody."""
     from rosbags.typesys.store import TIDMAP
 
     TIDMAP["char"] = TIDMAP["uint8"]
@@ -220,11 +217,7 @@ class Bag:
         stop: int | None = None,  # time of receipt (ns) before which messages end
         newest: bool = False,  # only the last of all; no other is decoded
     ) -> Iterator[tuple[str, str, int, Any]]:
-        """Yield topic, type, time of receipt (ns) and message, in the order of receipt.
-
-        Raises:
-            ValueError: A message, or the bag, is damaged.
-        """
+        """Yield topic, type, time of receipt (ns) and message in order; may raise `ValueError`."""
         chosen = [each for each in self._reader.connections if each.topic in topics]
         if not chosen:
             return
@@ -259,11 +252,7 @@ class Stamps(msgspec.Struct, frozen=True):
         return int(seconds) * SECOND + int(nanoseconds) - self.offset
 
     def back(self, seconds: int, nanoseconds: int, now: int) -> int:
-        """Return a message's time on the run's clock (ns); both 0 stand for now (ns).
-
-        Raises:
-            ValueError: It lies before the run, or ahead of its clock.
-        """
+        """Return a message's time (both 0: now) on the run's clock, ns, or raise `ValueError`."""
         if seconds == 0 and nanoseconds == 0:
             return now
         stamp = self.stamp(seconds, nanoseconds)
@@ -276,11 +265,7 @@ class Stamps(msgspec.Struct, frozen=True):
 
 
 class MessageBuilder:
-    """Builder of messages.
-
-    Args:
-        time: Returns the time in messages of a stamp (ns).
-    """
+    """Builder of messages; `time` returns a stamp's time in messages."""
 
     def __init__(self, store: TypeStore, names: FrameNames, time: Callable[[int], Time]) -> None:
         self._store = store

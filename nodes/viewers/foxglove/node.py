@@ -46,12 +46,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         }
 
     async def on_startup(self) -> None:
-        """Begin to listen.
-
-        Raises:
-            MissingDependencyError: foxglove is not installed.
-            FatalError: The port is taken.
-        """
+        """Begin to listen; a `FatalError` if the port is taken."""
         if self.checking:
             return
         loop, logged = asyncio.get_running_loop(), set[str]()

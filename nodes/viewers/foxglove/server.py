@@ -305,11 +305,7 @@ class Server:
         self._server.broadcast_time(now)
 
     def close(self) -> None:
-        """End the server; may take a moment.
-
-        The library would wait without end for connections without a request, as browsers open in
-        advance.
-        """
+        """End the server, also with connections without a request, which it would wait for."""
         stopping = threading.Thread(target=self._server.stop, name="foxglove stops", daemon=True)
         stopping.start()
         stopping.join(_CLOSING)
