@@ -45,7 +45,8 @@ def small(
     plots: Plots = None,
 ) -> None:
     """Measure the round trip from node 1 to N-1 listeners; the last listener replies."""
-    _latency("small", json, nodes, samples, warm_up, repeats, only, plots)
+    counts = {"samples": samples, "warm_up": warm_up, "repeats": repeats}
+    _latency("small", json, nodes, only, plots, **counts)
 
 
 @app.command()
@@ -63,7 +64,8 @@ def large(
 ) -> None:
     """Measure the same with 1080×1080 float32 (4.67 MB) in each ping."""
     case: CaseName = "large-shared" if shared else "large"
-    _latency(case, json, nodes, samples, warm_up, repeats, only, plots)
+    counts = {"samples": samples, "warm_up": warm_up, "repeats": repeats}
+    _latency(case, json, nodes, only, plots, **counts)
 
 
 @app.command()
@@ -235,11 +237,9 @@ def _latency(
     case: CaseName,
     json: Path | None,
     nodes: str,
-    samples: int,
-    warm_up: int,
-    repeats: int,
     only: list[str] | None,
     plots: Path | None,
+    **counts: int,
 ) -> None:
     from rich.console import Console
 
@@ -247,21 +247,13 @@ def _latency(
     from bench.results import write_json
     from bench.tables import latency
 
-    counts = _counts(nodes)
+    numbers = _numbers(nodes)
     with _status() as say:
-        outcome = measure_all(
-            case,
-            nodes=counts,
-            samples=samples,
-            warm_up=warm_up,
-            repeats=repeats,
-            only=only or (),
-            progress=say,
-        )
+        outcome = measure_all(case, nodes=numbers, only=only or (), progress=say, **counts)
     if plots is not None:
         from bench.page import draw
 
-        draw(outcome.rows, plots, counts)
+        draw(outcome.rows, plots, numbers)
     table, rows = latency(outcome.rows)
     Console().print(table.terminal(rows))
     for system, reason in outcome.missing.items():
@@ -270,7 +262,7 @@ def _latency(
         write_json(json, outcome.rows, missing=outcome.missing, versions=outcome.versions)
 
 
-def _counts(nodes: str) -> list[int]:
+def _numbers(nodes: str) -> list[int]:
     from runtime.errors import ConfigError
 
     try:

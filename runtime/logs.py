@@ -50,14 +50,14 @@ _HARMFUL = {
 } | {code: f"\\u{code:04x}" for code in (*range(0x2028, 0x202F), *range(0xD800, 0xE000))}
 
 
-def harmless(text: str, longest: int = LONGEST) -> str:
+def harmless(text: str) -> str:
     """Return a text unable to steer a terminal or to imitate other lines of a log.
 
-    It is cut to `longest` characters and says so; escapes and the like become visible, and lines
+    It is cut to `LONGEST` characters and says so; escapes and the like become visible, and lines
     after the first begin with a bar.
     """
-    if len(text) > longest:
-        text = f"{text[:longest]}… ({len(text):,} characters)"
+    if len(text) > LONGEST:
+        text = f"{text[:LONGEST]}… ({len(text):,} characters)"
     return text.translate(_HARMFUL).replace("\n", "\n    | ")
 
 

@@ -197,9 +197,7 @@ class Peers(Others):
         """Take in a message of another process, or raise `WireError`."""
         self.shutdown.received_at = time.monotonic()
         match message:
-            case messages.EventMessage() if (
-                self._begun and self._token is None
-            ):  # first: there are many
+            case messages.EventMessage() if self._begun and self._token is None:  # most of all
                 self._do(member.number, message, event)
             case messages.Announcements():
                 self._start.hear(member, message)

@@ -23,7 +23,7 @@ import contextlib
 import functools
 import logging
 import posixpath
-from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType
 from typing import Any, NoReturn
@@ -169,13 +169,13 @@ class _DryHost:
     checking = True
     out: Path | None = None
     out_of_programs: Path | None = None
+    run_end = None
 
     def __init__(self, config: Config, clock: Clock) -> None:
         self.seed = config.run.seed
         self.clock = clock
         self.siblings = siblings(config, {spec.name for spec in config.nodes})
         self.shared: dict[str, Any] = {}
-        self.run_end = None
         self.stepping = Stepping(clock)
         self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
@@ -200,19 +200,10 @@ class _DryHost:
     def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:  # noqa: ARG002
         return Hold(name, self.clock, config, latency)
 
-    def stop(self, node: Node[Any], reason: str) -> None:
+    def stop(self, *_: Any) -> None:
         pass
 
-    def note_environment(self, name: str, value: str) -> None:
-        pass
-
-    def conclude(
-        self, subject: str, figures: Mapping[str, Any], passed: bool | None, flight: bool
-    ) -> None:
-        pass
-
-    def after_run(self, call: Callable[[Path], Any]) -> None:
-        pass
+    note_environment = conclude = after_run = stop
 
 
 @contextlib.contextmanager
