@@ -286,7 +286,6 @@ def _status() -> Iterator[Callable[..., None]]:
 
 
 def _show(json: Path | None, **benchmarks: Callable[[Callable[..., None]], list[Any]]) -> None:
-    """Run benchmarks, by the names of their tables; write all rows to the file `json`, if any."""
     from rich.console import Console
 
     from bench.results import write_json

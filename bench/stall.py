@@ -65,8 +65,6 @@ class StallRow(LateRow, frozen=True, kw_only=True):
 
 
 class _Samples(msgspec.Struct):
-    """Samples of all runs of a mode, nanoseconds."""
-
     late: list[int] = []
     update: list[int] = []
     fetch: list[int] = []

@@ -207,7 +207,6 @@ def _room(module: str) -> str:
 
 
 def _folders(room: str) -> list[str]:
-    """Return a room's description and folders, in lines of a box's width."""
     folder = ROOT / room.replace(".", "/")
     inside = sorted(path.parent.name for path in folder.glob("*/__init__.py"))
     return textwrap.wrap(f"{ABOUT[room]} {', '.join(i for i in inside if i != 'tools')}", 56)

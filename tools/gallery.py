@@ -103,7 +103,6 @@ def _from_above(scan: LidarScan) -> Any:
 
 
 def _plotted(values: list[Any]) -> Any:
-    """Return the course of three values over the flight, each about a line of its own."""
     sheet = np.full((SIZE[1], SIZE[0], 3), 255, np.uint8)
     rows = np.array(values)[:: max(1, len(values) // SIZE[0])]
     across = np.linspace(4, SIZE[0] - 4, len(rows))

@@ -106,7 +106,6 @@ def _camera() -> CameraSpec:
 
 
 def _from_outside() -> Any:
-    """Return an image of the office without its ceiling, RGB, on the figure's ground."""
     world, dynamics = load_scene("office", 1)
     for geom in list(world.worldbody.geoms):
         if geom.name.startswith("ceiling"):

@@ -91,7 +91,6 @@ def _wait_for_port(port: int) -> None:
 
 
 def _start(address: _Address) -> None:
-    """Start the dataflow, as soon as the coordinator knows of the daemon."""
     arguments = ("start", "flow.yml", "--detach", "--coordinator-port", str(address.coordinator))
     until = time.monotonic() + TIMEOUT / 2
     while True:

@@ -83,7 +83,6 @@ def measure_pyee(case: Case) -> Samples:
 
 
 async def _exchange(case: Case, puts: Sequence[Put], receive: Callable[[], Awaitable[Any]]) -> Any:
-    """Return node 1's samples; each ping is put to all others, the reply awaited."""
     payload = payloads(case)
     now = time.perf_counter_ns
     taken = np.empty(case.warm_up + case.samples, np.int64)

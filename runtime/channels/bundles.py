@@ -292,7 +292,6 @@ class Slot:
 
 
 def _size(event: Event) -> int:
-    """Return how many bytes of arrays an event holds on to."""
     fields = event.__struct_fields__
     return sum(getattr(getattr(event, field), "nbytes", 0) for field in fields)
 

@@ -81,8 +81,6 @@ def combined(outputs: Mapping[str, str]) -> str:
 
 
 class _Output:
-    """Digest of an output: the hash, and bytes not yet hashed."""
-
     __slots__ = ("hash", "pending")
 
     def __init__(self) -> None:

@@ -339,7 +339,6 @@ class Hold(Generic[T]):
         return since + (owed.stamp - stamp) / SECOND + self._latency_at(owed.stamp)
 
     def _match(self, stamp: int) -> Owed[T] | None:
-        """Return the frame of an answer's stamp, within the tolerance."""
         near = _nearest(stamp, self._owed, self.config.tolerance_ns)
         return None if near is None else self._owed[near]
 
@@ -399,7 +398,6 @@ class Hold(Generic[T]):
         self._owed.clear()
 
     def _contradicted(self, stamp: int) -> None:
-        """Record a second, different answer: the order of the two is up to real time."""
         if self.answers.counts["contradicting"] == 1:
             self._log(
                 f"{self.name}: expected one answer to the frame of {_seconds(stamp)}, found a "

@@ -259,7 +259,6 @@ class Sender(Generic[T]):
     def _go_on(
         self, listeners: tuple[Deliver, ...], failed: Deliver, error: BaseException, event: T
     ) -> bool:
-        """Report the failed listener, and deliver to the remaining listeners."""
         if isinstance(error, RecursionError):
             if _sends(sys._getframe(2)):
                 raise error
@@ -338,7 +337,6 @@ _SENDING = {Sender._send_to_all.__code__, Sender._send_routed.__code__}
 
 
 def _sends(frame: FrameType | None) -> bool:
-    """Return whether this frame or any of its callers delivers to handlers."""
     while frame is not None and frame.f_code not in _SENDING:
         frame = frame.f_back
     return frame is not None

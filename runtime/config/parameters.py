@@ -92,7 +92,6 @@ def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
 
 
 def _checked(name: str, before: NodeConfig, after: NodeConfig) -> Change:
-    """Return the change between two settings, if all differences are changeable."""
     values = {}
     for path, value in _differences(_table(before), _table(after)):
         key = ".".join(path)
@@ -140,7 +139,6 @@ def _names(value: Any) -> list[str]:
 
 
 def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
-    """Tell whether the setting at a path, or a table around, is marked as changeable."""
     struct = type_
     for name in path:
         if struct is None:

@@ -82,7 +82,6 @@ def _put_in(value: Mapping[str, Any], extra: Mapping[str, Any], where: str) -> d
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Return two tables in one: the values of `above`, tables merged with those of `below`."""
     both = {**below, **above}
     for key in below.keys() & above.keys():
         old, new = below[key], above[key]

@@ -358,7 +358,6 @@ class Peers(Others):
     # Sending.
 
     def _broadcast_in_order(self, message: messages.Ordered) -> None:
-        """Send a message to all, for handling in its place among the events."""
         for member in self._membership.present():
             if self._token is not None and self._begun and member.number not in self._apart:
                 self._token.post(member.number, message)

@@ -114,7 +114,6 @@ class Waiting:
         return min(ends) - time.monotonic()
 
     def _name(self, whom: Callable[[Member], bool], limit: float, *, late: bool) -> None:
-        """Log the awaited processes."""
         slow = "; ".join(f"{name_of(m.nodes)} ({m.place})" for m in self._present() if whom(m))
         gone = "; ".join(_loss(member) for _, member in sorted(self.absent.items()))
         if late and gone:

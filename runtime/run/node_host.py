@@ -206,7 +206,6 @@ class NodeHost:
                 self._fault(node.name, error)
 
     def _has_run(self, node: Node[Any]) -> None:
-        """Log a warning if a node's `run` has returned and its inputs are read no more."""
         runner = self.state.runners[node.name]
         ports = [*node.declared.inputs, *node.declared.bundles]
         over = self.state.stopped is not None or runner.shutting_down or runner.restarting

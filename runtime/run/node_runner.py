@@ -236,7 +236,6 @@ class NodeRunner:
     async def _end_by(
         self, seconds: float, what: str, tasks: list[asyncio.Task[Any]], limit: float = 0.0
     ) -> list[NodeError]:
-        """Wait for tasks, leave late ones behind, and return an error for the first."""
         self.phase = what if tasks else ""
         late = await ended(tasks, max(seconds, 0.0))
         self.phase = ""

@@ -271,7 +271,6 @@ class ProgressWatchdog:
         return run.config.run.startup_limit if run.first_update is None else float("inf")
 
     def _interrupt(self) -> None:
-        """Raise an error in whatever blocks the loop, by a signal."""
         node, line = code_location.of_thread(frame_of(self._thread_id))
         if node == "runtime":  # it is not a node that blocks, or does no more
             return
@@ -292,7 +291,6 @@ def _doing(runner: NodeRunner) -> str:
 
 
 def _explain_time(loop: LockstepLoop, run: RunState) -> str:
-    """Explain a wait of simulated time, in the words of `_explain`."""
     if isinstance(loop.gate, Stepping):
         if loop.gate.state == "paused":
             return ""
@@ -310,7 +308,6 @@ def _explain_time(loop: LockstepLoop, run: RunState) -> str:
 
 
 def _all(run: RunState) -> str:
-    """Return where all nodes wait, as far as there is room."""
     found = [(runner.spec.name, task) for runner in run.runners.values() for task in runner.tasks]
     listed = ", ".join(f"{name}{_at([task])}" for name, task in found[:_MOST_NAMED])
     more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
@@ -318,6 +315,5 @@ def _all(run: RunState) -> str:
 
 
 def _at(tasks: Any) -> str:
-    """Return the waiting line of the first unfinished task, as a text to append."""
     waiting = [task for task in tasks if not task.done()]
     return f", at {code_location.short(code_location.of_task(waiting[0])[1])}" if waiting else ""

@@ -78,8 +78,6 @@ _POLL_EVERY = 64  # jumps between two looks at real files (signals, sockets) whi
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Selector to advance simulated time instead of sleeping."""
-
     advance: Callable[[float | None], _Ready]
 
     def select(self, timeout: float | None = None) -> _Ready:
@@ -343,7 +341,6 @@ def _is_over(held: _Held) -> bool:
 
 
 def _settle(future: asyncio.Future[Any], work: _Work) -> None:
-    """Give an awaited future the outcome of finished work."""
     if future.cancelled():
         return
     if work.cancelled():

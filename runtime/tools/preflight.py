@@ -226,7 +226,6 @@ def _warnings() -> Iterator[list[str]]:
 
 
 def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:
-    """Yield errors for files of two writers, or outside the run's folder."""
     writers = dict.fromkeys(RUN_FILES, "the run itself")
     for spec in nodes:
         files = dict.fromkeys(
@@ -244,7 +243,6 @@ def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:
 
 
 def _unread(cls: type[Node[Any]]) -> list[str]:
-    """Return the inputs not mentioned by any method of a class."""
     mentioned = mentioned_in(cls)
     return [port for port in (*cls.declared.inputs, *cls.declared.bundles) if port not in mentioned]
 

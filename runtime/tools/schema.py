@@ -83,8 +83,6 @@ def _head() -> Schema:
 
 
 class _Maker:
-    """Turns types into schemas; those of structs become definitions, each written once."""
-
     def __init__(self) -> None:
         self.definitions: dict[str, Schema] = {}
 

@@ -88,7 +88,6 @@ def interrupted() -> NoReturn:
 
 
 def _described(error: Exception) -> str:
-    """Return an error as a line: a `VisnavError`'s message; else with type and place."""
     from runtime.run.node_runner import with_place, wrap
 
     if isinstance(error, VisnavError):

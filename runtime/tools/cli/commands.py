@@ -88,7 +88,6 @@ _USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
 
 @contextlib.contextmanager
 def _plain_errors() -> Iterator[None]:
-    """Turn errors about arguments into a `ConfigError` of a single line."""
     try:
         yield
     except _USAGE_ERROR as error:

@@ -36,7 +36,6 @@ def top(
 
 
 def _check_terminal() -> None:
-    """Check for a terminal able to show the screen."""
     import codecs
     import sys
 

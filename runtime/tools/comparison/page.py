@@ -64,7 +64,6 @@ def write_page(found: Sequence[Comparison], out: Path, a: Sequence[str], b: Sequ
 
 
 def _slopes(found: Sequence[Comparison]) -> bytes:
-    """Draw each figure of each flight, from A to B; return the PNG."""
     from matplotlib.figure import Figure
 
     columns = min(max(len(found), 1), 4)

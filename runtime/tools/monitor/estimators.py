@@ -170,7 +170,6 @@ class Measured:
             estimator.add(event, self._truth(event))
 
     def _truth(self, event: PoseEstimate) -> Pose | None:
-        """Return the true pose of an estimate's vehicle at its stamp, if it is kept."""
         truths = self._truths.get(self._vehicles.of(event.source))
         for true in reversed(truths[1] if truths is not None else ()):
             if true.stamp <= event.stamp:

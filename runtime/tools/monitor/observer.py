@@ -236,7 +236,6 @@ class Observer:
         return self._measured.image(camera)
 
     def _sample(self) -> Sample:
-        """Return the counters, with the durations since the last sample."""
         sent: Counter[str] = Counter()
         for node in self._state.all_nodes:
             for sender in senders(node).values():

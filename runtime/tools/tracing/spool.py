@@ -151,7 +151,6 @@ class Spool:
             rest = rest[self._file.write(rest) :]
 
     def _plain(self, note: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Return the note of an event in words and numbers, and remember its receivers."""
         _, time, run, sender, event, source, stamp, identity, cause, listeners = note
         name = "run.announced" if sender is None else sender.name
         key = (name, event.__name__, source)

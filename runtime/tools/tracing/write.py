@@ -135,11 +135,9 @@ class _Writer:
             yield from self._flow(path)
 
     def _exposure(self, sent: SentEvent) -> int:
-        """Return when in real time a sensor's event was true."""
         return min(self._moments.of(sent.stamp, sent.time), sent.time)
 
     def _flow(self, path: list[SentEvent]) -> Iterator[dict[str, Any]]:
-        """Draw the arrows of a path: from an exposure over all events to a set-point."""
         self._flows += 1
         first = path[0]
         begin = self._exposure(first)
