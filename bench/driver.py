@@ -165,20 +165,10 @@ def _row(case: str, system: str, mode: str, nodes: int, place: str, runs: Sequen
     pooled = np.concatenate(runs) / 1e3
     q1, median, q3, p99 = np.percentile(pooled, [25, 50, 75, 99]).tolist()
     return Row(
-        case=case,
-        system=system,
-        mode=mode,
-        nodes=nodes,
-        place=place,
-        samples=len(pooled),
-        median_us=median,
-        mean_us=float(pooled.mean()),
-        q1_us=q1,
-        q3_us=q3,
-        p99_us=p99,
-        max_us=float(pooled.max()),
-        rounds_us=tuple(float(np.median(run)) / 1e3 for run in runs),
-    )
+        case=case, system=system, mode=mode, nodes=nodes, place=place, samples=len(pooled),
+        median_us=median, mean_us=float(pooled.mean()), q1_us=q1, q3_us=q3, p99_us=p99,
+        max_us=float(pooled.max()), rounds_us=tuple(float(np.median(run)) / 1e3 for run in runs),
+    )  # fmt: skip
 
 
 def find(module: str, name: str) -> System:

@@ -88,16 +88,12 @@ class WorkerSummary(msgspec.Struct, frozen=True):
         """Return the summary of a worker's costs."""
         return cls(
             latency_ms=None if costs.latency is None else round(costs.latency * 1e3, 6),
-            calls=costs.calls,
-            wall_p50_ms=costs.wall.quantile(0.5) / 1e6,
-            wall_p95_ms=costs.wall.quantile(0.95) / 1e6,
-            wall_max_ms=costs.wall.maximum / 1e6,
-            cpu_p50_ms=costs.cpu.quantile(0.5) / 1e6,
-            cpu_p95_ms=costs.cpu.quantile(0.95) / 1e6,
-            cpu_max_ms=costs.cpu.maximum / 1e6,
-            peak_rss_mb=costs.peak / 1e6 or None,
+            calls=costs.calls, wall_p50_ms=costs.wall.quantile(0.5) / 1e6,
+            wall_p95_ms=costs.wall.quantile(0.95) / 1e6, wall_max_ms=costs.wall.maximum / 1e6,
+            cpu_p50_ms=costs.cpu.quantile(0.5) / 1e6, cpu_p95_ms=costs.cpu.quantile(0.95) / 1e6,
+            cpu_max_ms=costs.cpu.maximum / 1e6, peak_rss_mb=costs.peak / 1e6 or None,
             processes=costs.processes,
-        )
+        )  # fmt: skip
 
     @property
     def slower(self) -> str:
@@ -187,19 +183,13 @@ class OutsideSummary(msgspec.Struct, frozen=True):
         p50, p99 = answers.latency_quantiles(0.5, 0.99)
         return cls(
             latency_ms=None if answers.latency is None else round(answers.latency * 1e3, 6),
-            sent=answers.sent,
-            received=answers.received,
-            says_lost=answers.says_lost,
+            sent=answers.sent, received=answers.received, says_lost=answers.says_lost,
             open=answers.sent - sum(counts[name] for name in get_args(Outcome)),
-            initialisation_s=answers.initialisation,
-            wall_p50_ms=None if p50 is None else p50 * 1e3,
-            wall_p99_ms=None if p99 is None else p99 * 1e3,
-            inputs=answers.inputs(),
-            answers=answers.outputs(),
-            reproducible=not answers.why_not,
-            why_not=list(answers.why_not),
-            **counts,
-        )
+            initialisation_s=answers.initialisation, wall_p50_ms=None if p50 is None else p50 * 1e3,
+            wall_p99_ms=None if p99 is None else p99 * 1e3, inputs=answers.inputs(),
+            answers=answers.outputs(), reproducible=not answers.why_not,
+            why_not=list(answers.why_not), **counts,
+        )  # fmt: skip
 
     def row(self) -> list[str]:
         """Return the cells of a table row, under `OUTSIDE_COLUMNS`."""

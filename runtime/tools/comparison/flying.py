@@ -160,16 +160,8 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
         ) from None
     verdict = ended.verdict
     row = Row(
-        id="",
-        parameters={},
-        seed=head["seed"],
-        exit_code=0,
-        error=head.get("error") or "",
-        passed=verdict.passed if verdict else None,
-        digest=None,
-        sim_seconds=ended.sim_seconds,
-        run_seconds=None,
-        wall_seconds=None,
-        estimators=verdict.estimators if verdict else {},
-    )
+        id="", parameters={}, seed=head["seed"], exit_code=0, error=head.get("error") or "",
+        passed=verdict.passed if verdict else None, digest=None, sim_seconds=ended.sim_seconds,
+        run_seconds=None, wall_seconds=None, estimators=verdict.estimators if verdict else {},
+    )  # fmt: skip
     return {("run", head["seed"]): [row]}

@@ -150,21 +150,13 @@ def compare_values(
         more = _more(len(differences), change, low, high, margin, error)
     values = np.array(known).reshape(-1, 2)
     return Comparison(
-        estimator=estimator,
-        figure=name,
+        estimator=estimator, figure=name,
         a=float(np.median([a for a, _ in known])) if known else None,
-        b=float(np.median(values[:, 1])) if known else None,
-        change=change,
-        low=low,
-        high=high,
-        relative=relative,
-        p=p,
-        pairs=len(pairs),
-        failures=(sum(a for a, _ in lost), sum(b for _, b in lost)),
-        verdict=verdict,
-        more=more,
+        b=float(np.median(values[:, 1])) if known else None, change=change, low=low, high=high,
+        relative=relative, p=p, pairs=len(pairs),
+        failures=(sum(a for a, _ in lost), sum(b for _, b in lost)), verdict=verdict, more=more,
         flights={f"{scenario}, seed {seed}": pair for (scenario, seed), pair in pairs.items()},
-    )
+    )  # fmt: skip
 
 
 def _ints(pair: tuple[bool, bool]) -> tuple[int, int]:

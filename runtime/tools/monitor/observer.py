@@ -219,17 +219,11 @@ class Observer:
             f"ends: {ended}" if ended else "paused" if paused else "runs",
         )
         return protocol.Snapshot(
-            headline="   ".join(headline),
-            now=now,
-            ended=ended,
-            paused=paused,
-            fixed=stepping.fixed(),
-            speed=max(round(present, 1), 1.0) if target is None else target,
-            tables=self._tables(sample),
-            paths=self._measured.paths(),
-            cameras=self._measured.cameras(),
-            log=self._records.lines(),
-        )
+            headline="   ".join(headline), now=now, ended=ended, paused=paused,
+            fixed=stepping.fixed(), speed=max(round(present, 1), 1.0) if target is None else target,
+            tables=self._tables(sample), paths=self._measured.paths(),
+            cameras=self._measured.cameras(), log=self._records.lines(),
+        )  # fmt: skip
 
     def image(self, camera: str) -> tuple[Image, list[TrackedFeatures]]:
         """Return a camera's newest image with its features, or raise `CommandError`."""

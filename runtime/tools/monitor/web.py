@@ -129,15 +129,11 @@ class _Handler(BaseHTTPRequestHandler):
         text = (Path(__file__).parent / "page.html.jinja").read_text(encoding="utf-8")
         page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
         content = page.from_string(text).render(
-            nonce=nonce,
-            slowest=protocol.SLOWEST,
-            quickest=protocol.QUICKEST,
-            token=self.server.token,
-            stacks=protocol.STACKS,
-            columns=protocol.COLUMNS,
+            nonce=nonce, slowest=protocol.SLOWEST, quickest=protocol.QUICKEST,
+            token=self.server.token, stacks=protocol.STACKS, columns=protocol.COLUMNS,
             first=msgspec.json.decode(next(self._snapshots(timeout=2.0), b"null")),
             is_number=protocol.is_number,
-        )
+        )  # fmt: skip
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
             "connect-src 'self'; img-src 'self'; frame-ancestors 'none'; base-uri 'none'; "

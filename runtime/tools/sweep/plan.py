@@ -284,13 +284,7 @@ def make_job(
     part = flight_of(config)
     key = hashlib.sha256(text.encode()).hexdigest()[:16] + f"-{repeat}" * (repeat > 1)
     return Job(
-        id=key,
-        text=text,
-        folder=str(folder),
-        settings=settings,
-        seed=seed,
-        out=str(out / "runs" / key),
-        flight=settings_key(part) if part is not None else "",
-        limit=LEAST_LIMIT + SLOWEST * (config.run.duration or USUAL),
-        repeat=repeat,
-    )
+        id=key, text=text, folder=str(folder), settings=settings, seed=seed,
+        out=str(out / "runs" / key), flight=settings_key(part) if part is not None else "",
+        limit=LEAST_LIMIT + SLOWEST * (config.run.duration or USUAL), repeat=repeat,
+    )  # fmt: skip

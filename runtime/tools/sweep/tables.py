@@ -60,19 +60,10 @@ class Row(TypedDict):
 def crashed(job: Job, error: str) -> Row:
     """Return the row of a crashed run."""
     return Row(
-        id=job.id,
-        parameters=dict(job.settings),
-        seed=job.seed,
-        repeat=job.repeat,
-        exit_code=None,
-        error=error,
-        passed=None,
-        digest=None,
-        sim_seconds=None,
-        run_seconds=None,
-        wall_seconds=None,
-        estimators={},
-    )
+        id=job.id, parameters=dict(job.settings), seed=job.seed, repeat=job.repeat, exit_code=None,
+        error=error, passed=None, digest=None, sim_seconds=None, run_seconds=None,
+        wall_seconds=None, estimators={},
+    )  # fmt: skip
 
 
 def decode_rows(text: bytes) -> dict[str, Row]:
@@ -270,16 +261,12 @@ def _combination(settings: tuple[str, ...], name: str, group: Sequence[Row]) -> 
         if found := numbers(f.get(main) for f in figures):
             spreads[main] = Spread.of(found)
     return Combination(
-        settings=settings,
-        estimator=name,
+        settings=settings, estimator=name,
         alignment=" or ".join(sorted({f["alignment"] for f in figures if f.get("alignment")})),
-        runs=len(group),
-        crashed=sum(bool(row["error"]) for row in group),
-        passed=sum(passed) if passed else None,
-        failed=passed.count(False),
-        repeatable=_repeatable(name, group),
-        figures=spreads,
-    )
+        runs=len(group), crashed=sum(bool(row["error"]) for row in group),
+        passed=sum(passed) if passed else None, failed=passed.count(False),
+        repeatable=_repeatable(name, group), figures=spreads,
+    )  # fmt: skip
 
 
 def _repeatable(name: str, group: Sequence[Row]) -> str:
