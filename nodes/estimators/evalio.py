@@ -8,6 +8,7 @@ poses are those of the IMU.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -155,7 +156,7 @@ class EvalioProcess:
         defaults = pipeline.default_params()
         fixed = {name: value for name, value in _FIXED.items() if name in defaults}
         usual = {name: value for name, value in _USUAL.items() if name in defaults}
-        given = _checked(config, {k: v for k, v in defaults.items() if k not in fixed})
+        given = _checked(config, defaults)
         pipeline.set_params(defaults | usual | given | fixed)
         pipeline.initialize()
         return pipeline
@@ -235,8 +236,13 @@ class EvalioProcess:
         return cloud
 
 
-def _checked(config: EvalioConfig, known: dict[str, Any]) -> dict[str, Any]:
-    """Return the given parameters in the types of the known ones."""
+def _checked(config: EvalioConfig, defaults: dict[str, Any]) -> dict[str, Any]:
+    """Return the given parameters in the types of the defaults.
+
+    Raises:
+        ValueError: The pipeline has no such parameter, or one of another type.
+    """
+    known = {name: value for name, value in defaults.items() if name not in _FIXED}
     given = {}
     for name, value in config.parameters.items():
         if name not in known:
@@ -278,6 +284,21 @@ class Evalio(Estimator[EvalioConfig]):
         """Keep samples until the next scan."""
         if self.inertial:
             self._samples.append(event)
+
+    def check(self) -> Iterable[str]:
+        """Yield an error for a missing sensor or library; in a mere check, for wrong parameters."""
+        yield from super().check()
+        if not self.checking or not self.config.parameters:
+            return
+        try:
+            from evalio import pipelines
+
+            library: Any = pipelines
+            _checked(self.config, library.get_pipeline(self.config.pipeline).default_params())
+        except ImportError:
+            return  # which is said already
+        except ValueError as error:
+            yield str(error)
 
     async def on_ready(self) -> None:
         """Start the pipeline, in a process of its own."""

@@ -271,7 +271,8 @@ class Hold(Generic[T]):
                 return
             self._gone = why
             if self.config.on_missing == "error":
-                self._fail(MissingAnswerError(f"{self.name}: {why} ({self._story()})"))
+                said = "\n" if "\n" in why else " "  # a program's last lines
+                self._fail(MissingAnswerError(f"{self.name}: {why}{said}({self._story()})"))
                 return
             self._log(f"{self.name}: {why}")
             if self.config.on_missing == "continue":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 
@@ -15,10 +16,11 @@ import pytest
 from nodes.outside.process.launch import ProcessConfig
 from runtime.config.reading import load
 from tests.examples.test_examples import ROOT, run
+from tests.nodes.outside.process.killing import SIGNALS, kill
 from tests.runs.test_check import check
 
 FOLDER = ROOT / "examples" / "systems"
-SYSTEMS = ("openvins", "basalt", "ekf2")
+SYSTEMS = ("openvins", "basalt", "dso", "ekf2")
 
 
 def process(name: str) -> ProcessConfig:
@@ -58,17 +60,32 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str
     return folder, found
 
 
+def command(name: str, built: tuple[Path, dict[str, str]]) -> str:
+    """Return the setting of a system's program; skip the test if that was left out."""
+    folder, found = built
+    if found[name].startswith("left out"):
+        assert not (folder / name).exists()
+        pytest.skip(found[name])
+    return f"{name}.command={json.dumps([str(folder / name), *process(name).command[1:]])}"
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_it_passes_its_thresholds(
     name: str, built: tuple[Path, dict[str, str]], tmp_path: Path
 ) -> None:
-    folder, found = built
-    if found[name].startswith("left out"):
-        assert not (folder / name).exists()
-        pytest.skip(found[name])
-    command = json.dumps([str(folder / name), *process(name).command[1:]])
-    changes = (f"{name}.command={command}", "run.startup_limit=300s", "report.figures=[]")
+    changes = (command(name, built), "run.startup_limit=300s", "report.figures=[]")
     summary = run(f"systems/{name}", tmp_path, *changes)
     assert summary["outside"][name]["reproducible"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_killed_at_a_random_frame_it_is_one_error(
+    name: str, number: signal.Signals, built: tuple[Path, dict[str, str]], tmp_path: Path
+) -> None:
+    text = (FOLDER / f"{name}.toml").read_text()
+    kill(text, f"/{name}", name, number, tmp_path / "killed", command(name, built))

@@ -32,12 +32,16 @@ from runtime.errors import MissingAnswerError, suggest
 WAITING = 64  # messages waiting to be published in real time; beyond this, images are dropped
 SETTLED = 0.3
 """Real seconds without a new subscription, after all needed ones, until publishing begins."""
+STORY = 0.5  # real seconds for a program of the run to end with an error of its own
 CLOSING = 2.0  # real seconds for the remaining messages at the end of the run
 _LOOK = 0.01  # real seconds between two polls of the subscriptions
 
 
 class HeldEstimator:
-    """An estimator in ROS 2: presence, images owed an answer, answers (estimates and ``done``)."""
+    """An estimator in ROS 2: presence, images owed an answer, answers (estimates and ``done``).
+
+    When nobody publishes any more, its hold is told after `patience` real seconds.
+    """
 
     def __init__(
         self,
@@ -45,8 +49,10 @@ class HeldEstimator:
         hold: Hold[Event],
         stamps: Stamps,
         config: Ros2BridgeConfig,
+        patience: float,
     ) -> None:
         self.hold = hold
+        self._patience = patience
         self.subscription = topics[0].subscription
         self._topics, self._stamps = topics, stamps
         self._max_size = config.max_message_size
@@ -127,6 +133,12 @@ class HeldEstimator:
             return
         self._there.pop(token.key, None)
         if self._came and not self._there:
+            late = threading.Timer(self._patience, self._miss)
+            late.daemon = True
+            late.start()
+
+    def _miss(self) -> None:
+        if not self._there:
             self._gone = True
             self.hold.gone(f"nobody publishes {self._topics[0].topic.name} any more")
 
@@ -136,12 +148,14 @@ def held_estimators(
 ) -> list[HeldEstimator]:
     """Return the estimators of a node's subscriptions with owed answers, each with its hold."""
     found = []
+    started = any(getattr(each.config, "feed", "") == "ros2" for each in node.siblings(Node))
     for each in incoming:
         given = each.subscription
         if given.use == "estimate" and given.answers_to:
             told = [other for other in incoming if given.is_told_by(other.subscription)]
             hold = node.hold(each.source, given.hold, given.latency)
-            found.append(HeldEstimator([each, *told], hold, stamps(), node.config))
+            patience = STORY if started else 0.0
+            found.append(HeldEstimator([each, *told], hold, stamps(), node.config, patience))
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import types
 from pathlib import Path
@@ -28,8 +29,10 @@ from events import (
 from nodes.estimators import TrackingResult
 from nodes.estimators.evalio import Evalio, EvalioConfig, EvalioProcess, Name
 from runtime import Node
+from runtime.config.model import Config, RunConfig
 from runtime.errors import MissingDependencyError, NodeError
 from runtime.testing import run_node, run_nodes, spec
+from runtime.tools.preflight import of_nodes
 from tests.nodes.estimators.conformance import in_process
 
 Floats = npt.NDArray[np.float64]
@@ -342,8 +345,12 @@ def test_parameters_and_the_lidars_range_reach_the_library_with_one_thread() -> 
     ],
 )
 def test_wrong_parameters_are_refused(parameters: dict[str, Any], said: str) -> None:
+    """At the start, and by a mere check."""
     with pytest.raises(ValueError, match=said):
         tracker(parameters=parameters)
+    wrong = spec(Evalio, "lo", {"parameters": parameters})
+    (error,) = of_nodes(Config(run=RunConfig(), nodes=(wrong,))).errors
+    assert re.search(said, error)
 
 
 def test_a_missing_library_is_an_error_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,104 @@
+// DSO, direct sparse odometry, as an estimator of a run with a single camera, by the native interface.
+//
+// It answers with the pose of the camera in DSO's world, whose unit of length is arbitrary. All is
+// computed in the caller's thread, one frame after the other. The mode is that of "perfect images":
+// the run's have one exposure and no vignette, so that no brightness is estimated.
+#define BOOST_BIND_GLOBAL_PLACEHOLDERS  // which DSO's headers use
+#include <boost/bind.hpp>
+
+#include <FullSystem/FullSystem.h>
+#include <FullSystem/HessianBlocks.h>
+#include <IOWrapper/Output3DWrapper.h>
+#include <util/FrameShell.h>
+#include <util/ImageAndExposure.h>
+#include <util/globalCalib.h>
+#include <util/settings.h>
+
+#include <iostream>
+#include <memory>
+
+#include "visnav_link.hpp"
+
+namespace {
+
+// Keyframes until DSO no longer takes its initialization back, as it may, and begins anew.
+constexpr int sure = 4;
+
+// Keeps what DSO says of the frame that it gets: its pose changes until the frame is done.
+struct Latest : dso::IOWrap::Output3DWrapper {
+    dso::FrameShell* frame = nullptr;
+    int keyframes = 0;
+
+    void publishCamPose(dso::FrameShell* tracked, dso::CalibHessian*) override { frame = tracked; }
+    void publishKeyframes(std::vector<dso::FrameHessian*>& frames, bool final,
+                          dso::CalibHessian*) override {
+        if (final) return;
+        frame = frames.back()->shell;
+        ++keyframes;
+    }
+};
+
+struct System {
+    Latest latest;
+    dso::FullSystem full;
+
+    System() {
+        full.setGammaFunction(nullptr);
+        full.linearizeOperation = true;  // else a thread of its own decides what is a keyframe
+        full.outputWrapper.push_back(&latest);
+    }
+    EIGEN_MAKE_ALIGNED_OPERATOR_NEW
+};
+
+void configure(const visnav::Camera& camera) {
+    for (double each : camera.distortion)
+        if (each != 0.0) throw visnav::Error("expected a camera without distortion");
+    dso::setting_photometricCalibration = 0;
+    dso::setting_affineOptModeA = dso::setting_affineOptModeB = -1;
+    dso::setting_minGradHistAdd = 3;
+    dso::multiThreading = false;
+    dso::disableAllDisplay = true;
+    dso::setting_logStuff = false;
+    dso::setting_debugout_runquiet = true;
+    Eigen::Matrix3f matrix;
+    matrix << float(camera.fx), 0, float(camera.cx), 0, float(camera.fy), float(camera.cy), 0, 0, 1;
+    dso::setGlobalCalib(camera.width, camera.height, matrix);
+}
+
+}  // namespace
+
+int main() try {
+    visnav::Link link("DSO");
+    const visnav::Camera camera = link.camera(0);
+    configure(camera);
+    auto system = std::make_unique<System>();
+    dso::ImageAndExposure image(camera.width, camera.height);
+    link.ready();
+    while (const auto frame = link.next()) {
+        const visnav::Image& grey = frame->image("mono8");
+        for (int v = 0; v < grey.height; ++v)
+            std::copy_n(grey.row<std::uint8_t>(v), grey.width, image.image + v * grey.width);
+        image.timestamp = 1e-9 * frame->stamp;
+        const int number = static_cast<int>(frame->sequence);
+        system->full.addActiveFrame(&image, number);
+
+        const Latest& latest = system->latest;
+        const bool begun = latest.keyframes >= sure;
+        if (!begun && (system->full.initFailed || system->full.isLost)) {
+            link.initialising(*frame);
+            system = std::make_unique<System>();
+        } else if (!begun) {
+            link.initialising(*frame);
+        } else if (system->full.isLost || latest.frame->incoming_id != number) {
+            link.lost(*frame);  // for good: DSO does not relocalize
+        } else {
+            visnav::Pose pose;
+            Eigen::Map<Eigen::Matrix<double, 3, 4, Eigen::RowMajor>>(pose.matrix.data()) =
+                latest.frame->camToWorld.matrix3x4();
+            link.pose(*frame, pose);
+        }
+    }
+} catch (const std::exception& error) {
+    std::cerr << error.what() << '\n';
+    return 1;
+}
