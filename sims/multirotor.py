@@ -7,26 +7,8 @@ import math
 from collections.abc import Iterable
 from typing import Any, Literal
 
-from events import (
-    Announcement,
-    Collision,
-    Command,
-    FluidPressure,
-    Imu,
-    LidarScan,
-    MagneticField,
-    NavSatFix,
-    Odometry,
-    PathAnnouncement,
-    PilotAnnouncement,
-    Range,
-    Reset,
-    Setpoint,
-    Teleport,
-    Vector3,
-    VehicleAnnouncement,
-    VehicleEvent,
-)
+import events as ev
+from events import Vector3
 from events.frames import rotate_inverse
 from runtime import Output, Tick, every, on
 from sims.cameras import CameraSpec, add_camera, check_cameras
@@ -88,13 +70,13 @@ class Multirotor(Simulator[MultirotorConfig]):
     are in one world: they collide, see one another, and obey what names them.
     """
 
-    imu = Output(Imu)
-    pressures = Output(FluidPressure)
-    fixes = Output(NavSatFix)
-    magnetic_fields = Output(MagneticField)
-    ranges = Output(Range)
-    lidar_scans = Output(LidarScan)
-    vehicle_events = Output(VehicleEvent)
+    imu = Output(ev.Imu)
+    pressures = Output(ev.FluidPressure)
+    fixes = Output(ev.NavSatFix)
+    magnetic_fields = Output(ev.MagneticField)
+    ranges = Output(ev.Range)
+    lidar_scans = Output(ev.LidarScan)
+    vehicle_events = Output(ev.VehicleEvent)
 
     frame_id = FRAME
     vehicle = True
@@ -119,7 +101,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         )
         self._suite = SensorSuite(self, config, FRAME, self._physics, self._advance, self._world)
         self._addressee = Addressee(self.name, self.siblings(Simulator), self.sources)
-        self._pilots: list[PilotAnnouncement] = []
+        self._pilots: list[ev.PilotAnnouncement] = []
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
         self._odometry_stamp = -1
@@ -155,10 +137,10 @@ class Multirotor(Simulator[MultirotorConfig]):
             add_camera(scene.spec, f"{name}/{FRAME}", camera, f"{name}/")
         return Dynamics()
 
-    def announce(self) -> Iterable[Announcement]:
+    def announce(self) -> Iterable[ev.Announcement]:
         """Announce the vehicle, its IMU and its cameras."""
         parameters, state = self._physics.parameters, self._physics.state()
-        yield VehicleAnnouncement(
+        yield ev.VehicleAnnouncement(
             stamp=0,
             source=self.name,
             mass=parameters.mass,
@@ -184,11 +166,11 @@ class Multirotor(Simulator[MultirotorConfig]):
         whole = round(periods) > 0 and math.isclose(periods, round(periods))
         return self.config.trigger == "imu" and whole
 
-    def on_announcement(self, announcement: Announcement) -> None:
+    def on_announcement(self, announcement: ev.Announcement) -> None:
         """Record pilots, and refuse a path the vehicle cannot fly."""
-        if isinstance(announcement, PilotAnnouncement):
+        if isinstance(announcement, ev.PilotAnnouncement):
             self._pilots.append(announcement)
-        if not isinstance(announcement, PathAnnouncement):
+        if not isinstance(announcement, ev.PathAnnouncement):
             return
         if not self._addressee.obeys(announcement, "setpoints"):
             return
@@ -207,17 +189,17 @@ class Multirotor(Simulator[MultirotorConfig]):
         elif (fall := self._clearance.ground_below(self._start) or 0.0) > FALL:
             self.log.warning("position, height: it starts %.2g m above the ground, and falls", fall)
 
-    @on(Command)
-    def commands(self, event: Command) -> None:
+    @on(ev.Command)
+    def commands(self, event: ev.Command) -> None:
         """Obey a command for this vehicle, or log the reason for refusal."""
         if not self._is_for_this(event, "commands"):
             return
-        jumps = isinstance(event, Teleport | Reset)
+        jumps = isinstance(event, ev.Teleport | ev.Reset)
         if reason := self._autopilot.command(event) or (jumps and self._jump(event)):
             self.log.warning("%s refused: %s", type(event).__name__, reason)
 
-    @on(Setpoint)
-    def setpoints(self, event: Setpoint) -> None:
+    @on(ev.Setpoint)
+    def setpoints(self, event: ev.Setpoint) -> None:
         """Follow a set-point for this vehicle, or log a reason for refusal, each in a row once."""
         if not self._is_for_this(event, "setpoints"):
             return
@@ -226,10 +208,10 @@ class Multirotor(Simulator[MultirotorConfig]):
             self.log.warning("%s refused: %s", type(event).__name__, reason)
         self._refused = reason
 
-    def _jump(self, order: Command) -> str:
+    def _jump(self, order: ev.Command) -> str:
         physics, suite = self._physics, self._suite
         physics.advance_to(self.clock.now())
-        if isinstance(order, Teleport):
+        if isinstance(order, ev.Teleport):
             before, velocities = physics.state(), (order.linear_velocity, order.angular_velocity)
             physics.put(State(order.position, order.orientation, *velocities))
             depth = max((contact.depth for contact in physics.contacts()), default=0.0)
@@ -245,7 +227,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         self._touched = frozenset()
         return ""
 
-    def _is_for_this(self, order: Command | Setpoint, port: str) -> bool:
+    def _is_for_this(self, order: ev.Command | ev.Setpoint, port: str) -> bool:
         if self._addressee.obeys(order, port):
             return True
         if reason := self._addressee.refusal(order):
@@ -299,7 +281,7 @@ class Multirotor(Simulator[MultirotorConfig]):
             return
         self._odometry_stamp = stamp
         self.odometry.send(
-            Odometry(
+            ev.Odometry(
                 stamp=stamp,
                 source=self.name,
                 position=state.position,
@@ -316,7 +298,7 @@ class Multirotor(Simulator[MultirotorConfig]):
             if contact.other not in self._touched:
                 self._touched |= {contact.other}
                 self.vehicle_events.send(
-                    Collision(
+                    ev.Collision(
                         stamp=self._physics.time_ns,
                         source=self.name,
                         other=contact.other,

@@ -9,19 +9,7 @@ from typing import Annotated, Any
 import msgspec
 from typing_extensions import TypeVar
 
-from events import (
-    Announcement,
-    Command,
-    DepthImage,
-    Image,
-    Odometry,
-    PathAnnouncement,
-    PilotAnnouncement,
-    PoseStamped,
-    SegmentationImage,
-    Setpoint,
-    TransformStamped,
-)
+import events as ev
 from runtime import Duration, Node, NodeConfig, Output
 from runtime.errors import suggest
 from runtime.host import Sibling
@@ -72,12 +60,12 @@ class Simulator(Inhabitant, Node[C], ABC):
 
     flies = True
 
-    images = Output(Image)
-    depth_images = Output(DepthImage)
-    segmentation_images = Output(SegmentationImage)
-    camera_poses = Output(PoseStamped)
-    transforms = Output(TransformStamped)
-    odometry = Output(Odometry)
+    images = Output(ev.Image)
+    depth_images = Output(ev.DepthImage)
+    segmentation_images = Output(ev.SegmentationImage)
+    camera_poses = Output(ev.PoseStamped)
+    transforms = Output(ev.TransformStamped)
+    odometry = Output(ev.Odometry)
 
     @property
     @abstractmethod
@@ -99,7 +87,7 @@ class Simulator(Inhabitant, Node[C], ABC):
             self, self.cameras, outputs, config.camera_processes, config.render_threads
         )
 
-    def announce(self) -> Iterable[Announcement]:
+    def announce(self) -> Iterable[ev.Announcement]:
         """Announce the cameras."""
         return self.rig.announcements(self.frame_id)
 
@@ -117,7 +105,7 @@ class Simulator(Inhabitant, Node[C], ABC):
         self.rig.log_missing()
 
 
-Order = Command | Setpoint | PathAnnouncement | PilotAnnouncement
+Order = ev.Command | ev.Setpoint | ev.PathAnnouncement | ev.PilotAnnouncement
 
 
 class Addressee:
@@ -155,7 +143,7 @@ class Addressee:
             self._refused.add(key)
         return reason
 
-    def complaints(self, pilots: Iterable[PilotAnnouncement]) -> Iterator[str]:
+    def complaints(self, pilots: Iterable[ev.PilotAnnouncement]) -> Iterator[str]:
         """Yield errors in the vehicles named by pilots, if this is the first vehicle."""
         for pilot in pilots:
             if reason := self.refusal(pilot):

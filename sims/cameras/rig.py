@@ -11,14 +11,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import (
-    CameraAnnouncement,
-    DepthImage,
-    Image,
-    PoseStamped,
-    SegmentationImage,
-    TransformStamped,
-)
+import events as ev
 from events.base import Quaternion, Vector3
 from runtime import Node, Worker
 from runtime.channels.sender import Sender
@@ -34,10 +27,10 @@ UNDISTORTED = "/undistorted"  # ends the source of a camera's images without dis
 class CameraOutputs(msgspec.Struct, frozen=True):
     """Outputs of a node with cameras."""
 
-    images: Sender[Image]
-    depth_images: Sender[DepthImage]
-    segmentation_images: Sender[SegmentationImage]
-    camera_poses: Sender[PoseStamped]
+    images: Sender[ev.Image]
+    depth_images: Sender[ev.DepthImage]
+    segmentation_images: Sender[ev.SegmentationImage]
+    camera_poses: Sender[ev.PoseStamped]
 
 
 class DrawnWorld(Protocol):
@@ -130,7 +123,7 @@ class CameraRig:
         """Take over latency, jitter and loss of these, from the next exposure on."""
         self._specs = {spec.name: spec for spec in specs}
 
-    def announcements(self, parent_frame_id: str) -> Iterable[CameraAnnouncement]:
+    def announcements(self, parent_frame_id: str) -> Iterable[ev.CameraAnnouncement]:
         """Return the announcements of the cameras."""
         name = self._node.name
         for spec in self._specs.values():
@@ -159,12 +152,12 @@ class CameraRig:
                         info=pinhole,
                     )
 
-    def transforms(self, parent_frame_id: str) -> Iterable[TransformStamped]:
+    def transforms(self, parent_frame_id: str) -> Iterable[ev.TransformStamped]:
         """Return the pose of each camera's optical frame in the body's, constant for the run."""
         name = self._node.name
         for spec in (eye for entry in self._specs.values() for eye in eyes(entry)):
             position, orientation = optical_in_body(spec)
-            yield TransformStamped(
+            yield ev.TransformStamped(
                 stamp=self._node.clock.now(),
                 source=f"{name}/{spec.name}",
                 frame_id=parent_frame_id,
@@ -281,15 +274,17 @@ class CameraRig:
         out = self._outputs
         for when, (position, orientation) in poses:
             out.camera_poses.send(
-                PoseStamped(stamp=when, source=source, position=position, orientation=orientation)
+                ev.PoseStamped(
+                    stamp=when, source=source, position=position, orientation=orientation
+                )
             )
         if frame.depth is not None:
             out.depth_images.send(
-                DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=frame.depth)
+                ev.DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=frame.depth)
             )
         if frame.segmentation is not None:
             out.segmentation_images.send(
-                SegmentationImage(
+                ev.SegmentationImage(
                     stamp=stamp, source=source, frame_id=frame_id, data=frame.segmentation
                 )
             )
@@ -298,7 +293,7 @@ class CameraRig:
                 continue
             second = encoding == "mono8" and frame.rgb is not None
             out.images.send(
-                Image(
+                ev.Image(
                     stamp=stamp,
                     source=f"{source}/grey" if second else source,
                     frame_id=frame_id,

@@ -8,15 +8,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from events import (
-    BarometerAnnouncement,
-    FluidPressure,
-    MagneticField,
-    MagnetometerAnnouncement,
-    NavSatAnnouncement,
-    NavSatFix,
-    Vector3,
-)
+import events as ev
+from events import Vector3
 from events.frames import multiply, rotate, rotate_inverse, to_geodetic
 from runtime.units import Duration, Latency
 from sims.sensors.sensor import GaussMarkov, NonNegative, Place, Positive, Sensor, SensorSpec, Truth
@@ -65,20 +58,20 @@ class Barometer(Sensor[BarometerSpec]):
     """Pressure at the sensor's place."""
 
     port = "pressures"
-    announced = BarometerAnnouncement
+    announced = ev.BarometerAnnouncement
 
     def __init__(self, spec: BarometerSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
         airsim = spec.model == "airsim"
         self._drift = GaussMarkov(spec.drift, spec.drift_time, 1.0 / spec.rate, airsim=airsim)
 
-    def measure(self, truth: Truth) -> FluidPressure:
+    def measure(self, truth: Truth) -> ev.FluidPressure:
         """Return the next pressure."""
         spec = self.spec
         down = truth.position[2] + rotate(truth.orientation, spec.position)[2]
         factor = 1.0 + float(self._drift.step(self.random)[0])
         noise = spec.noise * float(self.random.standard_normal())
-        return FluidPressure(
+        return ev.FluidPressure(
             stamp=truth.stamp,
             source=self.source,
             fluid_pressure=pressure_at(self.place.origin[2] - down) * factor + noise,
@@ -146,7 +139,7 @@ class Magnetometer(Sensor[MagnetometerSpec]):
     """The field at the origin, the same in the whole world."""
 
     port = "magnetic_fields"
-    announced = MagnetometerAnnouncement
+    announced = ev.MagnetometerAnnouncement
 
     def __init__(self, spec: MagnetometerSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
@@ -155,13 +148,13 @@ class Magnetometer(Sensor[MagnetometerSpec]):
         """Tesla NED."""
         self._bias = random.uniform(-1.0, 1.0, 3) * spec.bias
 
-    def measure(self, truth: Truth) -> MagneticField:
+    def measure(self, truth: Truth) -> ev.MagneticField:
         """Return the next field."""
         spec = self.spec
         true = rotate_inverse(multiply(truth.orientation, spec.rotation), self.field)
         noise = spec.noise * self.random.standard_normal(3)
         x, y, z = (np.multiply(true, spec.scale_factor) + noise + self._bias).tolist()
-        return MagneticField(
+        return ev.MagneticField(
             stamp=truth.stamp, source=self.source, frame_id=self.source, magnetic_field=(x, y, z)
         )
 
@@ -206,7 +199,7 @@ class Gnss(Sensor[GnssSpec]):
     """Position and velocity of the antenna."""
 
     port = "fixes"
-    announced = NavSatAnnouncement
+    announced = ev.NavSatAnnouncement
 
     def __init__(self, spec: GnssSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
@@ -214,7 +207,7 @@ class Gnss(Sensor[GnssSpec]):
         self._noises = np.array([spec.horizontal_noise] * 2 + [spec.vertical_noise])
         self._drifts = np.array([spec.horizontal_drift] * 2 + [spec.vertical_drift])
 
-    def measure(self, truth: Truth) -> NavSatFix:
+    def measure(self, truth: Truth) -> ev.NavSatFix:
         """Return the next fix."""
         spec = self.spec
         numbers = self.random.standard_normal((2, 3))
@@ -225,7 +218,7 @@ class Gnss(Sensor[GnssSpec]):
         vx, vy, vz = (np.array(truth.velocity) + spec.velocity_noise * numbers[1]).tolist()
         shown = self._uncertainty(truth.stamp / 1e9)
         covariance = np.diag(shown**2 + self._noises**2 + self._drifts**2)
-        return NavSatFix(
+        return ev.NavSatFix(
             stamp=truth.stamp,
             source=self.source,
             latitude=latitude,

@@ -35,27 +35,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from events import (
-    Arm,
-    Armed,
-    AttitudeSetpoint,
-    BodyRateSetpoint,
-    Disarm,
-    Disarmed,
-    Event,
-    Hover,
-    Land,
-    Landed,
-    MotorSetpoint,
-    PositionSetpoint,
-    Reset,
-    TakenOff,
-    Takeoff,
-    Teleport,
-    Vector3,
-    VehicleEvent,
-    VelocitySetpoint,
-)
+import events as ev
+from events import Vector3
 from events.frames import flip_yz, yaw_of
 from sims.vehicle.control import Controller, Motors, fault
 from sims.vehicle.model import STANDING_HEIGHT, VehicleParameters, mover_of, name_of
@@ -82,7 +63,7 @@ FARTHEST, FASTEST, FASTEST_TURN = 1e4, 50.0, 50.0
 """Limits of a teleport: m, m/s, rad/s; the physics would not bear much more."""
 
 
-def teleport_fault(event: Teleport) -> str | None:
+def teleport_fault(event: ev.Teleport) -> str | None:
     """Return the error in a `Teleport`, or None."""
     for field, limit, unit in (
         ("position", FARTHEST, "m"),
@@ -132,8 +113,8 @@ class Autopilot:
         self._timeout_ns = round(setpoint_timeout * 1e9)
         self._climb = climb
         self._descent = descent
-        self._events: list[type[VehicleEvent]] = []
-        self._order: Event | None = None
+        self._events: list[type[ev.VehicleEvent]] = []
+        self._order: ev.Event | None = None
         self._expires_ns: int | None = None
         self._last_ns: int | None = None
         # Take-off: where it goes up, how far it is told to be by now, and how fast.
@@ -145,7 +126,7 @@ class Autopilot:
         self._descending = False
         self._standing_ns: int | None = None
 
-    def command(self, event: Event) -> str | None:
+    def command(self, event: ev.Event) -> str | None:
         """Take an order or a set-point for the next update, or return the reason for refusal."""
         reason = self._refusal(event)
         if reason is None:
@@ -175,73 +156,73 @@ class Autopilot:
             return _STOPPED
         return self._controller.update(state, dt)
 
-    def take_events(self) -> list[type[VehicleEvent]]:
+    def take_events(self) -> list[type[ev.VehicleEvent]]:
         """Return the events since the last call (`Armed`, `TakenOff`, …), oldest first."""
         events = self._events
         if events:
             self._events = []
         return events
 
-    def _refusal(self, event: Event) -> str | None:
+    def _refusal(self, event: ev.Event) -> str | None:
         """Return the reason to refuse a command now, or None."""
         phase = self.phase
         grounded = phase in (Phase.DISARMED, Phase.ARMED)
         reason = None
         match event:
             case (
-                PositionSetpoint()
-                | VelocitySetpoint()
-                | AttitudeSetpoint()
-                | BodyRateSetpoint()
-                | MotorSetpoint()
+                ev.PositionSetpoint()
+                | ev.VelocitySetpoint()
+                | ev.AttitudeSetpoint()
+                | ev.BodyRateSetpoint()
+                | ev.MotorSetpoint()
             ):
                 reason = _NO_SETPOINTS.get(phase) or fault(event)
-            case Arm():
+            case ev.Arm():
                 reason = "already armed" if phase is not Phase.DISARMED else None
-            case Disarm():
+            case ev.Disarm():
                 reason = "already disarmed" if phase is Phase.DISARMED else None
-            case Takeoff():
+            case ev.Takeoff():
                 if not grounded:
                     reason = "already in the air"
                 elif not event.altitude > 0.0:
                     reason = f"Takeoff.altitude: expected a number > 0, found {event.altitude}"
-            case Land():
+            case ev.Land():
                 if grounded:
                     reason = "not in the air"
                 elif phase is Phase.LANDING:
                     reason = "already landing"
-            case Hover():
+            case ev.Hover():
                 reason = "not in the air" if grounded else None
-            case Teleport():
+            case ev.Teleport():
                 reason = teleport_fault(event)
-            case Reset():
+            case ev.Reset():
                 reason = None
             case _:
                 reason = f"{type(event).__name__} is no command of a vehicle"
         return reason
 
-    def _accept(self, event: Event) -> None:
+    def _accept(self, event: ev.Event) -> None:
         match event:
-            case Arm():
+            case ev.Arm():
                 self._arm()
                 return
-            case Disarm():
+            case ev.Disarm():
                 self._disarm()
                 return
-            case Reset():
+            case ev.Reset():
                 if self.phase is not Phase.DISARMED:
                     self._disarm()
                 return
-            case Teleport():
+            case ev.Teleport():
                 self._controller.reset()
                 if self.phase in (Phase.DISARMED, Phase.ARMED):
                     return
                 self.phase = Phase.FLYING
-            case Takeoff():
+            case ev.Takeoff():
                 if self.phase is Phase.DISARMED:
                     self._arm()
                 self.phase = Phase.TAKING_OFF
-            case Land():
+            case ev.Land():
                 self.phase = Phase.LANDING
             case _:
                 self.phase = Phase.FLYING
@@ -250,32 +231,37 @@ class Autopilot:
     def _arm(self) -> None:
         self.phase = Phase.ARMED
         self._controller.reset()
-        self._events.append(Armed)
+        self._events.append(ev.Armed)
 
     def _disarm(self) -> None:
         self.phase = Phase.DISARMED
         self._order = None
-        self._events.append(Disarmed)
+        self._events.append(ev.Disarmed)
 
-    def _begin(self, order: Event, state: State) -> None:
+    def _begin(self, order: ev.Event, state: State) -> None:
         self._expires_ns = None
         match order:
-            case PositionSetpoint():
+            case ev.PositionSetpoint():
                 self._controller.follow(order, state)
-            case VelocitySetpoint() | AttitudeSetpoint() | BodyRateSetpoint() | MotorSetpoint():
+            case (
+                ev.VelocitySetpoint()
+                | ev.AttitudeSetpoint()
+                | ev.BodyRateSetpoint()
+                | ev.MotorSetpoint()
+            ):
                 self._controller.follow(order, state)
                 self._expires_ns = order.stamp + self._timeout_ns
-            case Takeoff():
+            case ev.Takeoff():
                 self._yaw = yaw_of(state.orientation)
                 self._to_climb = order.altitude
                 self._speed = 0.0
                 x, y, z = state.position
                 self._place = (x, y, z - order.altitude)
-            case Land():
+            case ev.Land():
                 self._descending = False
                 self._standing_ns = None
                 self._controller.brake(state)
-            case Hover() | Teleport():
+            case ev.Hover() | ev.Teleport():
                 self._controller.brake(state)
 
     def _take_off(self, state: State, dt: float) -> None:
@@ -294,7 +280,7 @@ class Autopilot:
         ):
             self._controller.hold(self._place, (0.0, 0.0, 0.0), self._yaw)
             self.phase = Phase.FLYING
-            self._events.append(TakenOff)
+            self._events.append(ev.TakenOff)
 
     def _land(self, stamp_ns: int, state: State, touching: bool) -> bool:
         """Stop, go down, and return True once the vehicle stands and is disarmed."""
@@ -307,7 +293,7 @@ class Autopilot:
         elif self._standing_ns is None:
             self._standing_ns = stamp_ns
         elif stamp_ns - self._standing_ns >= 200_000_000:
-            self._events.append(Landed)
+            self._events.append(ev.Landed)
             self._disarm()
             return True
         return False

@@ -9,15 +9,8 @@ from __future__ import annotations
 
 from math import atan2, pi, sqrt
 
-from events import (
-    AttitudeSetpoint,
-    BodyRateSetpoint,
-    MotorSetpoint,
-    PositionSetpoint,
-    Quaternion,
-    Vector3,
-    VelocitySetpoint,
-)
+import events as ev
+from events import Quaternion, Vector3
 from events.frames import normalize, yaw_of
 from sims.vehicle.model import Mixer, VehicleParameters
 from sims.vehicle.physics import State
@@ -197,7 +190,7 @@ class Controller:
         if reason is not None:
             raise ValueError(reason)
         match setpoint:
-            case PositionSetpoint():
+            case ev.PositionSetpoint():
                 self._take_over()
                 self.position.to_position(
                     setpoint.position,
@@ -206,7 +199,7 @@ class Controller:
                     setpoint.yaw,
                     setpoint.yaw_rate,
                 )
-            case VelocitySetpoint():
+            case ev.VelocitySetpoint():
                 # Renewed set-points turn on from where the last one has turned to.
                 yaw = self.position.yaw if self._in_velocity else yaw_of(state.orientation)
                 self._take_over()
@@ -214,16 +207,16 @@ class Controller:
                 self.position.to_velocity(
                     setpoint.velocity, yaw, setpoint.yaw_rate, setpoint.frame_id == "heading"
                 )
-            case AttitudeSetpoint():
+            case ev.AttitudeSetpoint():
                 self._target = normalize(setpoint.orientation)
                 self._take_thrust(setpoint.thrust)
-            case BodyRateSetpoint():
+            case ev.BodyRateSetpoint():
                 tilt, yaw = self._limits.tilt_rate, self._limits.yaw_rate
                 x, y, z = setpoint.angular_velocity
                 self._target = None
                 self._target_rates = (_clip(x, tilt), _clip(y, tilt), _clip(z, yaw))
                 self._take_thrust(setpoint.thrust)
-            case MotorSetpoint():
+            case ev.MotorSetpoint():
                 a, b, c, d = setpoint.motor1, setpoint.motor2, setpoint.motor3, setpoint.motor4
                 self._take_thrust(0.0)
                 self._motors = (_share(a), _share(b), _share(c), _share(d))
@@ -283,7 +276,13 @@ def _clip(value: float, limit: float) -> float:
     return min(limit, max(-limit, value))
 
 
-Setpoint = PositionSetpoint | VelocitySetpoint | AttitudeSetpoint | BodyRateSetpoint | MotorSetpoint
+Setpoint = (
+    ev.PositionSetpoint
+    | ev.VelocitySetpoint
+    | ev.AttitudeSetpoint
+    | ev.BodyRateSetpoint
+    | ev.MotorSetpoint
+)
 """Set-points accepted by the cascade."""
 
 MOST = 1e6  # in SI units; squares of much greater numbers would overflow in the control loops
@@ -292,21 +291,21 @@ MOST = 1e6  # in SI units; squares of much greater numbers would overflow in the
 def fault(setpoint: Setpoint) -> str | None:
     """Return the error in a set-point, or None."""
     match setpoint:
-        case PositionSetpoint():
+        case ev.PositionSetpoint():
             numbers = [*setpoint.position, *setpoint.velocity, *setpoint.acceleration]
             numbers += [setpoint.yaw, setpoint.yaw_rate]
-        case VelocitySetpoint():
+        case ev.VelocitySetpoint():
             if setpoint.frame_id not in ("map", "heading"):
                 return (
                     "VelocitySetpoint.frame_id: expected 'map' or 'heading', "
                     f"found {setpoint.frame_id!r}"
                 )
             numbers = [*setpoint.velocity, setpoint.yaw_rate]
-        case AttitudeSetpoint():
+        case ev.AttitudeSetpoint():
             numbers = [setpoint.thrust]
-        case BodyRateSetpoint():
+        case ev.BodyRateSetpoint():
             numbers = [*setpoint.angular_velocity, setpoint.thrust]
-        case MotorSetpoint():
+        case ev.MotorSetpoint():
             numbers = [setpoint.motor1, setpoint.motor2, setpoint.motor3, setpoint.motor4]
     if not all(-MOST <= number <= MOST for number in numbers):
         return f"{type(setpoint).__name__}: expected numbers up to {MOST:g}, found {setpoint}"

@@ -18,19 +18,9 @@ import numpy as np
 
 from events.base import Vector3
 from events.frames import from_rpy
+from sims.worlds import shapes
 from sims.worlds.decals import tile
-from sims.worlds.shapes import (
-    FACES,
-    STEP,
-    Surface,
-    Window,
-    arch,
-    blob,
-    box,
-    cylinder,
-    face_size,
-    quad,
-)
+from sims.worlds.shapes import FACES, STEP, Surface, Window
 from sims.worlds.textures import Draw, own_generator, texture
 
 LOOK_GROUP, SOLID_GROUP = 0, 3
@@ -254,12 +244,14 @@ class Builder:
         if hidden is None:
             hidden = ("bottom",) if place[2] == 0.0 and tilt == 0.0 else ()
         faces = {
-            face: chosen[face] if face in chosen else self.cut(material, *face_size(face, size))
+            face: chosen[face]
+            if face in chosen
+            else self.cut(material, *shapes.face_size(face, size))
             for face in FACES
             if face not in hidden
         }
         middle = place if tilt else (place[0], place[1], place[2] + size[2] / 2.0)
-        self.look(f"{name}.look", box(size, faces), material, middle, turn, tilt)
+        self.look(f"{name}.look", shapes.box(size, faces), material, middle, turn, tilt)
         half = [length / 2.0 for length in size]
         self.solid(name, mujoco.mjtGeom.mjGEOM_BOX, half, middle, turn, tilt)
 
@@ -288,14 +280,16 @@ class Builder:
         side = side or self.cut(material, 2.0 * math.pi * radius, height)
         top = top or self.cut(material, 2.0 * radius, 2.0 * radius)
         middle = (place[0], place[1], place[2] + height / 2.0)
-        self.look(f"{name}.look", cylinder(radius, height, side, top, sides), material, middle)
+        self.look(
+            f"{name}.look", shapes.cylinder(radius, height, side, top, sides), material, middle
+        )
         self.solid(name, mujoco.mjtGeom.mjGEOM_CYLINDER, [radius, height / 2.0], middle)
 
     def crown(self, name: str, material: Material, radii: Vector, place: Vector) -> None:
         """Add a tree's crown: a bumpy ellipsoid about `place`, never outside its solid."""
         bumps = self.random.uniform(0.80, 1.0, (11, 19))
         window = self.cut(material, 4.0 * radii[0], 2.0 * radii[2])
-        self.look(f"{name}.look", blob(radii, bumps, window), material, place)
+        self.look(f"{name}.look", shapes.blob(radii, bumps, window), material, place)
         self.solid(name, mujoco.mjtGeom.mjGEOM_ELLIPSOID, radii, place)
 
     def wall(
@@ -357,7 +351,7 @@ class Builder:
         up: float,
         step: float,
     ) -> None:
-        surface = quad(
+        surface = shapes.quad(
             np.array([up * half[0], half[1], 0.0]),
             np.array([0.0, -2.0 * half[1], 0.0]),
             np.array([-2.0 * up * half[0], 0.0, 0.0]),
@@ -377,7 +371,7 @@ class Builder:
     ) -> None:
         """Hang up an image, without collisions, facing degrees from north to the west."""
         width, height = size
-        surface = quad(
+        surface = shapes.quad(
             np.array([0.0, -width / 2.0, height / 2.0]),
             np.array([0.0, width, 0.0]),
             np.array([0.0, 0.0, -height]),
@@ -405,7 +399,7 @@ class Builder:
             self.box(f"{name}/{which}", material, (depth, leg, rise), foot, turn=turn)
         spring = (place[0], place[1], place[2] + rise)
         scale = (1.0 / material.width, 1.0 / material.height)
-        ring = arch(inner, inner + leg, depth, 16, scale)
+        ring = shapes.arch(inner, inner + leg, depth, 16, scale)
         self.look(f"{name}/ring.look", ring, material, spring, turn)
         pieces = 12
         for piece in range(pieces):

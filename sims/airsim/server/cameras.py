@@ -22,19 +22,12 @@ from runtime import Worker
 from runtime.host import Sibling
 from runtime.logs import NodeLogger
 from runtime.node import Node
+from sims.airsim import wire
 from sims.airsim.server.methods import Caller, Flavour, RpcError, rpc
 from sims.airsim.server.rendering import Eye, Form, ImageType, Mount, Renderer, Wanted
 from sims.airsim.server.vehicles import ServedVehicle
 from sims.airsim.settings import DEFAULT_CAMERAS, default_mount
-from sims.airsim.wire import (
-    CameraInfo,
-    CosysImageResponse,
-    ImageRequest,
-    ImageResponse,
-    Pose,
-    ProjectionMatrix,
-    Quaternionr,
-)
+from sims.airsim.wire import Pose
 from sims.cameras import GraphicsError
 from sims.cameras.spec import CameraSpec, Pixels, camera_info, eyes
 from sims.cameras.view import View
@@ -50,7 +43,7 @@ ABANDONED = 8  # calls of clients that have left with more of which the renderer
 TIMEOUT = 600.0  # real seconds after which the renderer hangs; the longest call takes some 30
 LONGEST = 100_000_000  # bytes of all images of one call: Cosys-AirSim's client takes no more
 
-_RESPONSES = {"airsim": ImageResponse, "cosys": CosysImageResponse}
+_RESPONSES = {"airsim": wire.ImageResponse, "cosys": wire.CosysImageResponse}
 
 
 class Capture(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -161,20 +154,22 @@ class Cameras:
         body = flip_yz_rotation(normalize((turn[0], turn[1], turn[2], turn[3])))
         offset, orientation = rotate(body, eye.mount[0]), multiply(body, eye.mount[1])
         place = tuple(a + b for a, b in zip(flip_yz((x, y, z)), offset, strict=True))
-        return Pose(vehicle.local((place[0], place[1], place[2])), Quaternionr(*orientation))
+        return Pose(vehicle.local((place[0], place[1], place[2])), wire.Quaternionr(*orientation))
 
     @rpc("simGetCameraInfo", cosys=2)
-    def info(self, camera: str, vehicle: ServedVehicle, external: bool = False) -> CameraInfo:
+    def info(self, camera: str, vehicle: ServedVehicle, external: bool = False) -> wire.CameraInfo:
         """Return true pose, field of view and projection of a camera's scene images."""
         eye = self.find(vehicle, camera, external).eye(0)
         info = camera_info(eye.spec)
         tangent, longer = info.width / (2.0 * info.fx), max(info.width, info.height)
         across, down = (longer / (side * tangent) for side in (info.width, info.height))
         first, second = (0.0, across, 0.0, 0.0), (0.0, 0.0, -down, 0.0)
-        projection = ProjectionMatrix((first, second, (0.0, 0.0, 0.0, 10.0), (-1.0, 0.0, 0.0, 0.0)))
+        projection = wire.ProjectionMatrix(
+            (first, second, (0.0, 0.0, 0.0, 10.0), (-1.0, 0.0, 0.0, 0.0))
+        )
         _, qpos = self._drawn_state()
         fov = eye.spec.fov if eye.spec.intrinsics is None else math.degrees(2 * math.atan(tangent))
-        return CameraInfo(self.pose(vehicle, eye, qpos), fov, projection)
+        return wire.CameraInfo(self.pose(vehicle, eye, qpos), fov, projection)
 
     @rpc("simSetCameraPose", cosys=3)
     def set_pose(
@@ -283,7 +278,7 @@ class _Exposure(NamedTuple):
     qpos: npt.NDArray[np.float64]
     ids: npt.NDArray[np.uint8]
     wanted: list[Wanted]
-    known: list[ImageResponse]
+    known: list[wire.ImageResponse]
 
 
 class Images:
@@ -327,10 +322,10 @@ class Images:
     def get_images(
         self,
         caller: Caller,
-        requests: list[ImageRequest],
+        requests: list[wire.ImageRequest],
         vehicle: ServedVehicle,
         external: bool = False,
-    ) -> Awaitable[list[ImageResponse]]:
+    ) -> Awaitable[list[wire.ImageResponse]]:
         """Return images of a single instant: a common stamp, and true camera poses."""
         return self.take(requests, vehicle, caller.flavour, external=external)
 
@@ -346,7 +341,7 @@ class Images:
         """Return an image as PNG; empty if images of this type are not drawn."""
         caller.flavour = "airsim" if isinstance(external, bool) else "cosys"
         self._cameras.find(vehicle, camera, external)
-        requests = [ImageRequest(camera, image_type)]
+        requests = [wire.ImageRequest(camera, image_type)]
         if image_type not in ImageType.__members__.values():
             if not self._told:
                 self._node.log.warning("simGetImage: %s", _not_drawn(image_type))
@@ -360,12 +355,12 @@ class Images:
 
     def take(
         self,
-        requests: Sequence[ImageRequest],
+        requests: Sequence[wire.ImageRequest],
         vehicle: ServedVehicle,
         flavour: Flavour = "airsim",  # whose structures, and order of colours, are wanted
         *,
         external: bool = False,  # whether cameras that no vehicle carries are meant: there are none
-    ) -> Awaitable[list[ImageResponse]]:
+    ) -> Awaitable[list[wire.ImageResponse]]:
         """Take images of the state at the call, awaitable; simulated time does not wait.
 
         Raises:
@@ -375,7 +370,7 @@ class Images:
 
     def _expose(
         self,
-        requests: Sequence[ImageRequest],
+        requests: Sequence[wire.ImageRequest],
         vehicle: ServedVehicle,
         flavour: Flavour,
         external: bool = False,
@@ -410,7 +405,7 @@ class Images:
             raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")
         return exposure
 
-    async def _develop(self, exposure: _Exposure) -> list[ImageResponse]:
+    async def _develop(self, exposure: _Exposure) -> list[wire.ImageResponse]:
         abandoned = 0 if self._renderer is None else self._renderer.outstanding()
         if self._waiting >= MOST or abandoned > ABANDONED + self._processes:
             raise RpcError(f"expected at most {MOST} calls that wait for images")

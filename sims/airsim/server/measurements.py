@@ -21,16 +21,8 @@ import numpy as np
 from msgspec.structs import astuple
 from scipy.spatial.transform import Rotation, Slerp
 
-from events import (
-    Announcement,
-    EstimatorAnnouncement,
-    Event,
-    PoseEstimate,
-    Quaternion,
-    Vector3,
-    announcements,
-    sensors,
-)
+import events as ev
+from events import Quaternion, Vector3, announcements, sensors
 from events.frames import inverse, multiply, normalize, rotate
 from runtime.node import Node
 from runtime.time.schedule import SECOND
@@ -73,11 +65,11 @@ class Sensors:
     ) -> None:
         self._vehicles, self._world = vehicles, world
         self._names, self._lidar_frame = names, lidar_frame
-        self._announced: dict[str, Announcement] = {}
+        self._announced: dict[str, ev.Announcement] = {}
         self._newest: dict[str, Any] = {}
         self._orientations: dict[str, Quaternionr] = {}
 
-    def announced(self, announcement: Announcement) -> None:
+    def announced(self, announcement: ev.Announcement) -> None:
         """Take note of a vehicle's sensor."""
         vehicle = self._vehicles.get(announcement.source.partition("/")[0])
         if isinstance(vehicle, ServedMultirotor):
@@ -86,7 +78,7 @@ class Sensors:
                 # A turn, and one until the next is there.
                 self._world.remember(2.1 / announcement.rate + announcement.latency)
 
-    def note(self, sample: Event) -> None:
+    def note(self, sample: ev.Event) -> None:
         """Take note of a sample, and with an IMU's of the true orientation at its stamp."""
         if sample.source in self._announced:
             self._newest[sample.source] = sample
@@ -243,7 +235,7 @@ class Estimates:
         vehicles: Vehicles,
         cameras: Cameras,
         now: Callable[[], int],
-        send: Callable[[PoseEstimate], None],
+        send: Callable[[ev.PoseEstimate], None],
     ) -> None:
         self._vehicles, self._cameras, self._now, self._send = vehicles, cameras, now, send
         self._estimators: dict[str, ScriptEstimator] = {}
@@ -257,10 +249,10 @@ class Estimates:
             except RpcError as error:
                 raise ValueError(f"estimators: {each.name}: {error}") from None
 
-    def announce(self) -> Iterable[EstimatorAnnouncement]:
+    def announce(self) -> Iterable[ev.EstimatorAnnouncement]:
         """Announce the clients' estimators."""
         for each in self._estimators.values():
-            yield EstimatorAnnouncement(
+            yield ev.EstimatorAnnouncement(
                 stamp=0,
                 source=each.name,
                 method=each.method,
@@ -293,7 +285,7 @@ class Estimates:
             position = _sum(position, self._vehicles.find(found.vehicle).origin)
         self._last[estimator] = stamp
         self._send(
-            PoseEstimate(
+            ev.PoseEstimate(
                 stamp=stamp,
                 source=found.name,
                 frame_id=found.frame_id,

@@ -16,21 +16,8 @@ from collections.abc import Callable, Sequence
 from math import pi
 from typing import NamedTuple
 
-from events import (
-    Arm,
-    Armed,
-    AttitudeSetpoint,
-    BodyRateSetpoint,
-    Command,
-    Disarmed,
-    Hover,
-    Land,
-    PositionSetpoint,
-    Setpoint,
-    Vector3,
-    VehicleEvent,
-    VelocitySetpoint,
-)
+import events as ev
+from events import Vector3
 from events.frames import from_rpy, yaw_of
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND
@@ -43,7 +30,7 @@ HOVER_THROTTLE = 9.80665 / (4.0 * 4.18)
 """Hover throttle of AirSim's quadrotor: 1 kg on four rotors of 4.18 N."""
 
 Reply = asyncio.Future[bool]
-Order = Callable[..., Command | Setpoint]
+Order = Callable[..., ev.Command | ev.Setpoint]
 """Factory of an order, from a stamp, a source and the vehicle's name."""
 Thrust = Callable[[State], float]  # gives the thrust, 0 to 1 of what all motors can give together
 CLOSE = 0.5  # metres from the end within which a vehicle is not steered along the path any more
@@ -80,7 +67,7 @@ class Tasks:
         self,
         clock: Clock,
         source: str,
-        send: Callable[[Command | Setpoint], None],
+        send: Callable[[ev.Command | ev.Setpoint], None],
         owed: Callable[[Reply], Reply],  # gives the reply for a task's; see `Time.owed`
     ) -> None:
         self._clock, self._source, self._send, self._owed = clock, source, send, owed
@@ -105,9 +92,9 @@ class Tasks:
         slot.task, slot.started = task, self._clock.now()
         if not vehicle.motors_on:
             vehicle.motors_on = True
-            self._order(slot, Arm)
+            self._order(slot, ev.Arm)
         elif slot.is_landing:  # until it hovers, it would refuse set-points
-            self._order(slot, Hover)
+            self._order(slot, ev.Hover)
         return self._owed(result)
 
     def cancel(self, vehicle: ServedVehicle) -> None:
@@ -115,11 +102,13 @@ class Tasks:
         if slot := self._slots.get(vehicle.name):
             slot.finish(False)
 
-    def note(self, vehicle: ServedMultirotor, event: VehicleEvent) -> None:
+    def note(self, vehicle: ServedMultirotor, event: ev.VehicleEvent) -> None:
         """Update the state of a vehicle's motors from an event."""
-        if isinstance(event, Armed):
+        if isinstance(event, ev.Armed):
             vehicle.motors_on = True
-        elif isinstance(event, Disarmed):  # its task ends with the next update, unless armed again
+        elif isinstance(
+            event, ev.Disarmed
+        ):  # its task ends with the next update, unless armed again
             vehicle.motors_on = False
             if slot := self._slots.get(vehicle.name):
                 slot.ordered = None
@@ -134,7 +123,7 @@ class Tasks:
                 self._steer(slot, slot.task, stamp)
             is_over = slot.ordered is not None and stamp - slot.ordered >= HOVER_AFTER
             if is_over and not (slot.task and slot.is_landing):
-                self._order(slot, Hover)
+                self._order(slot, ev.Hover)
 
     def _steer(self, slot: _Slot, task: Task, stamp: int) -> None:
         elapsed = (stamp - slot.started) / SECOND
@@ -150,8 +139,8 @@ class Tasks:
     def _order(self, slot: _Slot, order: Order) -> None:
         stamp = self._clock.now()
         event = order(stamp=stamp, source=self._source, vehicle=slot.vehicle.name)
-        slot.is_landing = isinstance(event, Land)
-        slot.ordered = stamp if slot.is_landing or isinstance(event, Setpoint) else None
+        slot.is_landing = isinstance(event, ev.Land)
+        slot.ordered = stamp if slot.is_landing or isinstance(event, ev.Setpoint) else None
         self._send(event)
 
 
@@ -331,7 +320,7 @@ def landing(timeout: float) -> Task:
         if idle > 10:
             return None
         idle = idle + 1 if state.velocity[2] <= _STILL else 0
-        return Land if idle > 10 else _velocity((0.0, 0.0, 0.2), 0.0)
+        return ev.Land if idle > 10 else _velocity((0.0, 0.0, 0.2), 0.0)
 
     return Task(steer, timeout, at_limit=False)
 
@@ -343,14 +332,14 @@ def to_yaw(place: Vector3, yaw: float, margin: float, timeout: float) -> Task:
         error = abs(wrapped(yaw - yaw_of(state.orientation)))
         if error <= margin and abs(state.angular_velocity[2]) <= 0.01:
             return True
-        return functools.partial(PositionSetpoint, position=place, yaw=wrapped(yaw))
+        return functools.partial(ev.PositionSetpoint, position=place, yaw=wrapped(yaw))
 
     return Task(steer, timeout, at_limit=False)
 
 
 def by_yaw_rate(place: Vector3, yaw: float, rate: float, duration: float) -> Task:
     """Hold a place (m), and turn from a yaw at a rate (rad/s) for some seconds."""
-    turn = functools.partial(PositionSetpoint, position=place, yaw_rate=rate)
+    turn = functools.partial(ev.PositionSetpoint, position=place, yaw_rate=rate)
     return Task(
         lambda elapsed, _: functools.partial(turn, yaw=wrapped(yaw + rate * elapsed)), duration
     )
@@ -363,14 +352,14 @@ def by_attitude(
 
     def steer(elapsed: float, state: State) -> Order:
         attitude = from_rpy(roll, pitch, yaw + yaw_rate * elapsed)
-        return functools.partial(AttitudeSetpoint, orientation=attitude, thrust=thrust(state))
+        return functools.partial(ev.AttitudeSetpoint, orientation=attitude, thrust=thrust(state))
 
     return Task(steer, duration)
 
 
 def by_rates(rates: Vector3, thrust: Thrust, duration: float) -> Task:
     """Turn at body rates (rad/s) for some seconds."""
-    order = functools.partial(BodyRateSetpoint, angular_velocity=rates)
+    order = functools.partial(ev.BodyRateSetpoint, angular_velocity=rates)
     return Task(lambda _, state: functools.partial(order, thrust=thrust(state)), duration)
 
 
@@ -398,7 +387,7 @@ def wrapped(angle: float) -> float:
 
 
 def _velocity(velocity: Vector3, yaw_rate: float) -> Order:
-    return functools.partial(VelocitySetpoint, velocity=velocity, yaw_rate=yaw_rate)
+    return functools.partial(ev.VelocitySetpoint, velocity=velocity, yaw_rate=yaw_rate)
 
 
 def _to_height(state: State, height: float, fastest: float = _FASTEST) -> float:

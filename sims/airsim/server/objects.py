@@ -20,17 +20,8 @@ from msgspec.structs import astuple
 from events import Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_geodetic
 from runtime.logs import NodeLogger
+from sims.airsim.server import movables
 from sims.airsim.server.methods import RpcError, rpc
-from sims.airsim.server.movables import (
-    AWAY,
-    HELD,
-    Holder,
-    SpareObject,
-    have_met,
-    movable_bodies,
-    set_free,
-    whole_matches,
-)
 from sims.airsim.server.vehicles import FIRST, ServedVehicle, Vehicles
 from sims.airsim.wire import NAN, GeoPoint, Pose, Quaternionr, Vector3r
 from sims.cameras.stage import LOOK
@@ -61,7 +52,7 @@ class Objects:
     def __init__(
         self,
         world: SharedWorld,
-        spares: dict[str, SpareObject],
+        spares: dict[str, movables.SpareObject],
         now: Callable[[], int],
         log: NodeLogger,
     ) -> None:
@@ -76,14 +67,16 @@ class Objects:
             for name, geoms in geoms_by_object(model).items()
             if model.geom_bodyid[geoms[0]] not in self._spares
         }
-        bodies = movable_bodies(model)
+        bodies = movables.movable_bodies(model)
         self._bodies = {name: body for name, body in bodies.items() if name in self.geoms}
         armature = {body: model.dof_armature[model.body_dofadr[body]] for body in bodies.values()}
-        self._held = {body for body in armature if armature[body] == HELD or body in self._spares}
+        self._held = {
+            body for body in armature if armature[body] == movables.HELD or body in self._spares
+        }
         self._at_start = dict(self._bodies), dict(self.geoms), model.qpos0.copy()
         if self._held and world.simulation is not None:
-            have_met(model)
-            self._holder = Holder.of(world.simulation)
+            movables.have_met(model)
+            self._holder = movables.Holder.of(world.simulation)
         for body in self._held:
             self._put(body, self._home(body))
         self._ids = np.full(model.ngeom + 1, HIDDEN)
@@ -135,7 +128,7 @@ class Objects:
     def set_segmentation_id(self, name: str, object_id: int, is_regex: bool = False) -> bool:
         """Set the ID (at most 255) of the objects of a name; -1 leaves them out, in black."""
         if is_regex:
-            found = whole_matches(name, self.geoms, ignore_case=True)
+            found = movables.whole_matches(name, self.geoms, ignore_case=True)
         else:
             found = [name] if name in self.geoms else []
         for each in found:
@@ -145,7 +138,7 @@ class Objects:
     @rpc("simListSceneObjects")
     def names(self, expression: str) -> list[str]:
         """Return the object names matched entirely by a regular expression, sorted."""
-        return whole_matches(expression, self.geoms)
+        return movables.whole_matches(expression, self.geoms)
 
     @rpc("simGetObjectPose", cosys=2)
     def pose(self, name: str, ned: bool = True) -> Pose:  # noqa: ARG002  # Cosys only
@@ -222,7 +215,7 @@ class Objects:
         del self._bodies[name], self.geoms[name]
         away = self._home(body)
         if body not in self._spares:
-            away[2] += AWAY + 100.0 * (len(self._spares) + body)
+            away[2] += movables.AWAY + 100.0 * (len(self._spares) + body)
         self._put(body, away)
         return True
 
@@ -263,7 +256,7 @@ class Objects:
         if body in self._held:
             if keep:
                 free = model.dof_armature[dof] == 0.0
-            set_free(model, body, free)
+            movables.set_free(model, body, free)
             self._holder.hold(model, body, None if free else qpos)
         simulation.data.qpos[begin : begin + 7] = qpos
         simulation.data.qvel[dof : dof + 6] = 0.0

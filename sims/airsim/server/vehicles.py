@@ -20,20 +20,9 @@ import numpy.typing as npt
 from events import Collision, Vector3, VehicleEvent
 from events.frames import to_geodetic
 from runtime.node import Node
+from sims.airsim import wire
 from sims.airsim.server.methods import Named, RpcError, rpc
-from sims.airsim.wire import (
-    CollisionInfo,
-    ComputerVisionState,
-    EnvironmentState,
-    GeoPoint,
-    KinematicsState,
-    MultirotorState,
-    Pose,
-    Quaternionr,
-    RotorParameters,
-    RotorStates,
-    Vector3r,
-)
+from sims.airsim.wire import Pose, Quaternionr, Vector3r
 from sims.cameras import pose_to_qpos
 from sims.cameras.spec import CameraSpec, camera_info, eyes
 from sims.sensors.earth import pressure_at, temperature_at
@@ -66,7 +55,7 @@ class ServedVehicle(Named, ABC):
 
     def release(self) -> None:
         """Be as at the start for clients: not under control, armed, without a collision."""
-        self.api_control, self.armed, self.collision = False, True, CollisionInfo()
+        self.api_control, self.armed, self.collision = False, True, wire.CollisionInfo()
 
     @property
     def start(self) -> State:
@@ -106,11 +95,11 @@ class ServedVehicle(Named, ABC):
         state = self.state()
         return Pose(self.local(state.position), Quaternionr(*state.orientation))
 
-    def kinematics(self) -> KinematicsState:
+    def kinematics(self) -> wire.KinematicsState:
         """Return the kinematics as AirSim's: angular rates in FRD, all else local."""
         state = self.state()
         acceleration, angular = self.accelerations()
-        return KinematicsState(
+        return wire.KinematicsState(
             self.local(state.position),
             Quaternionr(*state.orientation),
             Vector3r(*state.velocity),
@@ -119,9 +108,9 @@ class ServedVehicle(Named, ABC):
             Vector3r(*angular),
         )
 
-    def geo_point(self, position: Vector3) -> GeoPoint:
+    def geo_point(self, position: Vector3) -> wire.GeoPoint:
         """Return where a position of ``map`` is on the earth."""
-        return GeoPoint(*to_geodetic(position, self.config.origin))
+        return wire.GeoPoint(*to_geodetic(position, self.config.origin))
 
 
 class ServedMultirotor(ServedVehicle):
@@ -265,17 +254,19 @@ class Vehicles(dict[str, ServedVehicle]):
         return read()
 
     @rpc("getMultirotorState")
-    def multirotor_state(self, vehicle: ServedMultirotor) -> MultirotorState:
+    def multirotor_state(self, vehicle: ServedMultirotor) -> wire.MultirotorState:
         """Return the true state, with its exact stamp, and the last collision."""
         kinematics = vehicle.kinematics()
         place = vehicle.geo_point(vehicle.in_map(kinematics.position))
         landed_state = 0 if vehicle.landed() else 1
-        return MultirotorState(vehicle.collision, kinematics, place, vehicle.stamp, landed_state)
+        return wire.MultirotorState(
+            vehicle.collision, kinematics, place, vehicle.stamp, landed_state
+        )
 
     @rpc("getComputerVisionState")
-    def computer_vision_state(self, vehicle: ServedVehicle) -> ComputerVisionState:
+    def computer_vision_state(self, vehicle: ServedVehicle) -> wire.ComputerVisionState:
         """Return a vehicle's true state, of either kind, with its exact stamp."""
-        return ComputerVisionState(vehicle.kinematics(), vehicle.stamp)
+        return wire.ComputerVisionState(vehicle.kinematics(), vehicle.stamp)
 
     @rpc("simGetVehiclePose")
     def pose(self, vehicle: ServedVehicle) -> Pose:
@@ -283,12 +274,12 @@ class Vehicles(dict[str, ServedVehicle]):
         return vehicle.pose()
 
     @rpc("simGetGroundTruthKinematics")
-    def kinematics(self, vehicle: ServedVehicle) -> KinematicsState:
+    def kinematics(self, vehicle: ServedVehicle) -> wire.KinematicsState:
         """Return how a vehicle truly moves; the accelerations are those of the physics."""
         return vehicle.kinematics()
 
     @rpc("simGetGroundTruthEnvironment")
-    def environment(self, vehicle: ServedVehicle) -> EnvironmentState:
+    def environment(self, vehicle: ServedVehicle) -> wire.EnvironmentState:
         """Return the standard atmosphere, and the world's gravity, where a vehicle is."""
         position = vehicle.state().position
         place = vehicle.geo_point(position)
@@ -296,28 +287,28 @@ class Vehicles(dict[str, ServedVehicle]):
         pressure, temperature = pressure_at(place.altitude), temperature_at(place.altitude)
         density = pressure / (GAS_CONSTANT * temperature)
         local = vehicle.local(position)
-        return EnvironmentState(local, place, gravity, pressure, temperature, density)
+        return wire.EnvironmentState(local, place, gravity, pressure, temperature, density)
 
     @rpc("getHomeGeoPoint")
-    def home(self, vehicle: ServedVehicle) -> GeoPoint:
+    def home(self, vehicle: ServedVehicle) -> wire.GeoPoint:
         """Return where on the earth a vehicle was at the start."""
         return vehicle.geo_point(vehicle.origin)
 
     @rpc("getRotorStates")
-    def rotors(self, vehicle: ServedMultirotor) -> RotorStates:
+    def rotors(self, vehicle: ServedMultirotor) -> wire.RotorStates:
         """Return speed (as in vibration), thrust and torque: front right, rear left, the others."""
         vehicle.state()
         fastest = math.tau * vehicle.config.imu.vibration.rotor_speed
         thrusts, motors = vehicle.physics.thrusts.tolist(), vehicle.physics.parameters.motors
         rotors = tuple(
-            RotorParameters(
+            wire.RotorParameters(
                 fastest * math.sqrt(max(share, 0.0)),
                 share * motor.max_thrust,
                 share * motor.max_torque,
             )
             for share, motor in zip(thrusts, motors, strict=True)
         )
-        return RotorStates(vehicle.stamp, rotors)
+        return wire.RotorStates(vehicle.stamp, rotors)
 
     def _described(self) -> dict[str, Any]:
         vehicles = {}
@@ -349,7 +340,7 @@ class Collisions:
         self._touched: dict[str, dict[str, int]] = {}
 
     @rpc("simGetCollisionInfo")
-    def collision_info(self, vehicle: ServedVehicle) -> CollisionInfo:
+    def collision_info(self, vehicle: ServedVehicle) -> wire.CollisionInfo:
         """Return a vehicle's last collision, and clear its ``has_collided``."""
         found = vehicle.collision
         vehicle.collision = msgspec.structs.replace(found, has_collided=False)
@@ -357,7 +348,7 @@ class Collisions:
 
     def forget(self, vehicle: ServedVehicle) -> None:
         """Forget a vehicle's collision, and count its present contacts as known."""
-        vehicle.collision = CollisionInfo()
+        vehicle.collision = wire.CollisionInfo()
         self._touched[vehicle.name] = _ANYTHING
 
     def note(self, vehicle: ServedMultirotor, event: VehicleEvent) -> None:
@@ -381,7 +372,7 @@ class Collisions:
 
     def _take(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
         contact = max(contacts, key=lambda each: each.depth)
-        vehicle.collision = CollisionInfo(
+        vehicle.collision = wire.CollisionInfo(
             True,
             contact.depth,
             vehicle.stamp,
