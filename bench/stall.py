@@ -38,6 +38,7 @@ from bench.system import in_turns
 from events import Odometry
 from runtime import Input, Node, NodeConfig, Tick, Worker, every
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
+from sims.cameras.renderer import Shot
 from sims.worlds import load_world
 
 Mode = Literal["none", "inline", "thread", "worker", "fetch inline", "fetch"]
@@ -112,19 +113,19 @@ class Camera(Node[CameraConfig]):
         arguments = (await self.offload(_model, config.world, spec), (spec,), "free/", 0)
         if config.mode == "worker":
             worker: Worker[CameraRenderer] = await self.worker(CameraRenderer, *arguments)
-            self._fetch = lambda *args: worker.call(CameraRenderer.render, *args)
+            self._fetch = lambda *args: worker.call(CameraRenderer.expose, *args)
             return
         # An OpenGL context belongs to one thread: the pool's, or the loop's for `inline`.
         self._pool = concurrent.futures.ThreadPoolExecutor(1)
         if config.mode == "thread":
             renderer = await self.clock.beside(self._pool.submit(CameraRenderer, *arguments))
-            self._fetch = lambda *args: self.clock.beside(self._pool.submit(renderer.render, *args))
+            self._fetch = lambda *args: self.clock.beside(self._pool.submit(renderer.expose, *args))
             self._close = renderer.close
         else:
             renderer = CameraRenderer(*arguments)
 
             async def render(*args: Any) -> Any:
-                return renderer.render(*args)
+                return renderer.expose(*args)
 
             self._fetch = render
             self._close = renderer.close
@@ -159,7 +160,8 @@ class Camera(Node[CameraConfig]):
         if self._fetch is None or here is None:
             return
         asked = time.monotonic_ns()
-        await self._fetch(here.stamp, pose_to_qpos(here.position, here.orientation), ("eye",))
+        pose = pose_to_qpos(here.position, here.orientation)
+        await self._fetch((Shot("eye", here.stamp, pose),))
         if tick.stamp > WARM_UP:
             self._samples.fetch.append(time.monotonic_ns() - asked)
 

@@ -26,7 +26,7 @@ from sims.vehicle.simulation import Influence
 from sims.worlds import Dynamics, Scene, WorldError, load_scene
 from sims.worlds.bodies import BodyMotion, BodySpec, add_bodies
 from sims.worlds.dynamics import FogSpec, LightSpec, add_fog, change_lights
-from sims.worlds.wind import WindSpec, check_strength
+from sims.worlds.wind import WindSpec
 
 Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Floats = npt.NDArray[np.float64]
@@ -283,14 +283,3 @@ class World(Inhabitant, Node[WorldConfig]):
             velocity = world.air.velocity_at(vehicle)
             source = f"{self.name}/{vehicle}"
             self.wind.send(Wind(stamp=world.simulation.time_ns, source=source, velocity=velocity))
-
-    def set_wind(self, velocity: tuple[float, float, float]) -> None:
-        """Set the mean wind, m/s NED, from the next millisecond on; gusts and turbulence stay.
-
-        Raises:
-            ValueError: The settings have no wind that could be changed, or it is too strong.
-        """
-        check_strength(velocity)
-        if self._world.air is None:
-            raise ValueError("wind: expected some in the world's settings, found none")
-        self._world.air.velocity = velocity

@@ -142,14 +142,8 @@ Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, pixels; whole coordinates are those of pixel centres."""
 
 _OTHERS_CALL_IT = {
-    "radtan": "plumb_bob",
-    "radtan4": "plumb_bob",
-    "radtan5": "plumb_bob",
-    "brown_conrady": "plumb_bob",
-    "kb4": "equidistant",
-    "kannala_brandt": "equidistant",
-    "fisheye": "equidistant",
-    "equi": "equidistant",
+    **dict.fromkeys(("radtan", "radtan4", "radtan5", "brown_conrady"), "plumb_bob"),
+    **dict.fromkeys(("kb4", "kannala_brandt", "fisheye", "equi"), "equidistant"),
 }
 
 

@@ -192,18 +192,6 @@ class CameraRenderer:
         width, height = np.max([(1, 1), *(v.largest() for v in self._views.values())], axis=0)
         self._stage = Stage(model, int(width), int(height), threads, dynamics)
 
-    def render(
-        self, stamp_ns: int, qpos: Floats, names: tuple[str, ...], qvel: Floats | None = None
-    ) -> dict[str, Frame]:
-        """Expose some cameras at a single state: `expose`, with a frame for each name."""
-        shots = []
-        for name in names:
-            spec, _ = self._cameras[name]
-            exposure = float(spec.reference_exposure if spec.auto_exposure else spec.exposure)
-            shots.append(Shot(name, stamp_ns, qpos, qvel, exposure=exposure, gain=spec.gain))
-        frames = self.expose(tuple(shots))
-        return dict(zip(names, frames, strict=True))
-
     def expose(self, shots: tuple[Shot, ...]) -> tuple[Frame, ...]:
         """Return the frames of some exposures. The same arguments give the same bits."""
         if self._stage.closed:

@@ -129,7 +129,7 @@ class Stage:
         self._dynamics = dynamics
         self._data = mujoco.MjData(model)
         _set_quality(model, width, height)
-        self._numbers = _object_numbers(model)
+        self._numbers = object_numbers(model)
         self._groups = model.geom_group.copy()
         self._nobody = mujoco.MjvPerturb()
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
@@ -333,7 +333,7 @@ def _surfaces_only() -> Any:
     return option
 
 
-def _object_numbers(model: Any) -> npt.NDArray[np.int32]:
+def object_numbers(model: Any) -> npt.NDArray[np.int32]:
     """Return each geom's object number: its own id, or for a look its solid's."""
     numbers = np.arange(model.ngeom, dtype=np.int32)
     for geom in range(model.ngeom):

@@ -130,14 +130,12 @@ class ImuNoise:
     ) -> None:
         if not rate > 0.0:
             raise ValueError(f"rate: expected a number > 0, found {rate}")
-        densities: list[float] = []
-        walks: list[float] = []
-        for sensor in ("gyroscope", "accelerometer"):
-            for field, into in (("noise_density", densities), ("random_walk", walks)):
-                value = getattr(parameters, f"{sensor}_{field}")
-                if not value >= 0.0:
-                    raise ValueError(f"{sensor}_{field}: expected a number >= 0, found {value}")
-                into.append(value)
+        for field in NOISES:
+            if not (value := getattr(parameters, field)) >= 0.0:
+                raise ValueError(f"{field}: expected a number >= 0, found {value}")
+        p = parameters
+        densities = p.gyroscope_noise_density, p.accelerometer_noise_density
+        walks = p.gyroscope_random_walk, p.accelerometer_random_walk
         root = sqrt(1.0 / rate)
         self._white = np.repeat([density / root for density in densities], 3)
         self._step = np.repeat([walk * root for walk in walks], 3)
@@ -155,15 +153,6 @@ class ImuNoise:
         wx, wy, wz = angular_velocity
         ax, ay, az = specific_force
         return (wx + ex, wy + ey, wz + ez), (ax + fx, ay + fy, az + fz)
-
-    def errors(self, count: int) -> Floats:
-        """Return errors of new samples, rad/s and m/s², shape (count, 6); ends `add`'s block."""
-        blocks = []
-        for _ in range(-(-count // _BLOCK)):
-            self._draw()
-            blocks.append(self._errors)
-        self._next = len(self._errors)
-        return np.concatenate(blocks)[:count]
 
     def _draw(self) -> None:
         numbers = self._generator.standard_normal((_BLOCK, 12))

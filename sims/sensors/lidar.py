@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
-import mujoco
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -19,7 +18,7 @@ from runtime import Node, Tick, Worker
 from sims.cameras.renderer import model_from_bytes
 from sims.cameras.response import generator
 from sims.cameras.rig import DrawnWorld
-from sims.cameras.stage import LOOK
+from sims.cameras.stage import object_numbers
 from sims.presets import LIDARS
 from sims.sensors.rays import Floats, Rays
 from sims.sensors.sensor import Mounted, Name, NonNegative, Positive, SensorSpec, generator_of
@@ -356,14 +355,8 @@ def _mean_of(model: Any, texture: int) -> Floats:
 
 
 def _looks(model: Any) -> list[tuple[int, int]]:
-    pairs = []
-    for look in range(model.ngeom):
-        name = model.geom(look).name
-        if name.endswith(LOOK):
-            solid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name.removesuffix(LOOK))
-            if solid >= 0:
-                pairs.append((look, solid))
-    return pairs
+    numbers = enumerate(object_numbers(model).tolist())
+    return [(look, solid) for look, solid in numbers if look != solid]
 
 
 LATE = 1.0  # longest delay of a turn's end in real time, seconds; later turns are skipped

@@ -170,7 +170,6 @@ class Mixer:
         self._roll: list[float] = inverse[:, 1].tolist()
         self._pitch: list[float] = inverse[:, 2].tolist()
         self._yaw: list[float] = inverse[:, 3].tolist()
-        self._effect = effect
 
     def mix(
         self, thrust: float, roll: float, pitch: float, yaw: float
@@ -217,11 +216,6 @@ class Mixer:
             n2 = min(1.0, max(0.0, m2 + share * c))
             n3 = min(1.0, max(0.0, m3 + share * d))
         return n0, n1, n2, n3
-
-    def wrench(self, motors: tuple[float, float, float, float]) -> tuple[float, Vector3]:
-        """Return the thrust (N) and torque (N m, FRD) of steady motor commands."""
-        thrust, roll, pitch, yaw = (self._effect @ motors).tolist()
-        return thrust, (roll, pitch, yaw)
 
 
 def _room(motor: float, change: float) -> float:

@@ -11,7 +11,7 @@ import math
 import pathlib
 import xml.etree.ElementTree as ET
 from itertools import accumulate, pairwise
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import msgspec
 import mujoco
@@ -19,7 +19,7 @@ import mujoco
 from events import Quaternion, Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_yaw
 from runtime.units import Duration
-from sims.worlds.dynamics import Dynamics, Path, Scene, interpolated, path_through
+from sims.worlds.dynamics import Dynamics, Motion, Path, Scene, interpolated, path_through
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -99,9 +99,10 @@ class BodySpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return self.waypoints + (self.waypoints[:1] if self.loop else ())
 
 
-class BodyMotion(NamedTuple):
+class BodyMotion(Motion, frozen=True):
     """Where a body is at each time."""
 
+    solid = True
     name: str  # name of the MuJoCo body, which is a mocap body
     place: Vector3  # where it stands, metres NED, if it has no path
     yaw: float
@@ -109,11 +110,6 @@ class BodyMotion(NamedTuple):
     times: tuple[float, ...] = ()
     angles: tuple[float, ...] = ()  # of a door, radians, at those times
     loop: bool = False  # whether a door does the same again and again
-
-    @property
-    def solid(self) -> bool:
-        """Whether vehicles can touch the body: always."""
-        return True
 
     def pose(self, seconds: float) -> tuple[Vector3, Quaternion]:
         """Return its foot's place, metres NED, and its rotation (FRD → NED) at a time."""

@@ -11,7 +11,7 @@ import zlib
 from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
 import mujoco
@@ -24,12 +24,10 @@ from runtime.errors import suggest
 from runtime.units import Duration
 
 
-class Motion(Protocol):
-    """Motion or change in a world. An implementation can be pickled."""
+class Motion(msgspec.Struct, frozen=True):
+    """Motion or change in a world; can be pickled."""
 
-    @property
-    def solid(self) -> bool:
-        """Whether vehicles can touch the moved part."""
+    solid: ClassVar[bool] = False  # whether vehicles can touch the moved part
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
         """Write the part's state at a time into model and data, whatever was there before.
@@ -239,17 +237,12 @@ class FogSpec(Changing, frozen=True, kw_only=True, forbid_unknown_fields=True):
     colour: tuple[Share, Share, Share] = (0.72, 0.75, 0.78)
 
 
-class LightMotion(NamedTuple):
+class LightMotion(Motion, frozen=True):
     """A light's strength and direction at each time."""
 
     name: str
     spec: LightSpec
     colours: tuple[tuple[float, ...], ...]
-
-    @property
-    def solid(self) -> bool:
-        """Whether vehicles can touch the light: never."""
-        return False
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
         """Set the light's strength and direction at a time."""
@@ -271,15 +264,10 @@ class LightMotion(NamedTuple):
             model.light_dir[light] = flip_yz((x / length, y / length, z / length))
 
 
-class FogMotion(NamedTuple):
+class FogMotion(Motion, frozen=True):
     """How thick the fog is at each time."""
 
     spec: FogSpec
-
-    @property
-    def solid(self) -> bool:
-        """Whether vehicles can touch the fog: never."""
-        return False
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
         """Set the fog's thickness at a time."""

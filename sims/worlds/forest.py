@@ -7,7 +7,7 @@ things stand is drawn once for all seeds, so that the tour's path stays free.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import mujoco
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from sims.worlds import materials
 from sims.worlds.builder import TOURS, Builder, Material, Vector
-from sims.worlds.dynamics import Dynamics, Scene
+from sims.worlds.dynamics import Dynamics, Motion, Scene
 from sims.worlds.materials import Image, fractal, mix, shade, share, smooth, specks
 from sims.worlds.shapes import Surface, cylinder
 
@@ -30,15 +30,10 @@ SWING = np.repeat([[0.16, 0.16, 0.05], [0.07, 0.07, 0.03], [0.35, 0.35, 0.0]], G
 """How far crowns, sprays of leaves and shadows move, in so many groups each, metres."""
 
 
-class Sway(NamedTuple):
+class Sway(Motion, frozen=True):
     """Leaves and shadows in the wind: some mocap bodies move to and fro, each at its own pace."""
 
     swing: Points  # greatest distance from the place along x, y, z, metres, shape (n, 3)
-
-    @property
-    def solid(self) -> bool:
-        """A vehicle flies through leaves."""
-        return False
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
         """Move the bodies from ``sway_0`` on."""

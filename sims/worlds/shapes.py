@@ -45,17 +45,17 @@ def grid(points: Array, texture: Array) -> Surface:
     return Surface(points.reshape(-1, 3), normals.reshape(-1, 3), texture.reshape(-1, 2), faces)
 
 
+def _stacked(*coordinates: Array) -> Array:
+    return np.stack(np.broadcast_arrays(*coordinates), axis=2)
+
+
 def join(surfaces: list[Surface]) -> Surface:
     """Return several surfaces joined."""
     starts = np.cumsum([0] + [len(surface.points) for surface in surfaces[:-1]])
-    return Surface(
-        np.concatenate([surface.points for surface in surfaces]),
-        np.concatenate([surface.normals for surface in surfaces]),
-        np.concatenate([surface.texture for surface in surfaces]),
-        np.concatenate(
-            [surface.faces + start for surface, start in zip(surfaces, starts, strict=True)]
-        ).astype(np.int32),
-    )
+    *arrays, faces = zip(*surfaces, strict=True)
+    moved = [each + start for each, start in zip(faces, starts, strict=True)]
+    points, normals, texture = map(np.concatenate, arrays)
+    return Surface(points, normals, texture, np.concatenate(moved).astype(np.int32))
 
 
 def quad(corner: Array, right: Array, down: Array, window: Window, step: float = STEP) -> Surface:
@@ -65,13 +65,8 @@ def quad(corner: Array, right: Array, down: Array, window: Window, step: float =
     across = np.linspace(0.0, 1.0, columns + 1)[None, :, None]
     along = np.linspace(0.0, 1.0, rows + 1)[:, None, None]
     left, top, far_right, bottom = window
-    texture = np.concatenate(
-        [
-            np.broadcast_to(left + (far_right - left) * across, (rows + 1, columns + 1, 1)),
-            np.broadcast_to(top + (bottom - top) * along, (rows + 1, columns + 1, 1)),
-        ],
-        axis=2,
-    )
+    places = left + (far_right - left) * across, top + (bottom - top) * along
+    texture = np.concatenate(np.broadcast_arrays(*places), axis=2)
     return grid(corner + right * across + down * along, texture)
 
 
@@ -109,18 +104,10 @@ def cylinder(
     """Return an upright cylinder about the origin, its top closed if `top` is given."""
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)[None, :]  # outside: to the right
     levels = np.linspace(0.5, -0.5, max(1, math.ceil(height / STEP)) + 1)[:, None]
-    ones = np.ones((len(levels), 1))
-    points = np.stack(
-        [
-            radius * np.cos(angle) * ones,
-            radius * np.sin(angle) * ones,
-            height * levels * np.ones_like(angle),
-        ],
-        axis=2,
-    )
-    u = side[0] + (side[2] - side[0]) * np.linspace(0, 1, sides + 1)[None, :] * ones
-    v = side[1] + (side[3] - side[1]) * (0.5 - levels) * np.ones_like(angle)
-    parts = [grid(points, np.stack([u, v], axis=2))]
+    points = _stacked(radius * np.cos(angle), radius * np.sin(angle), height * levels)
+    u = side[0] + (side[2] - side[0]) * np.linspace(0, 1, sides + 1)[None, :]
+    v = side[1] + (side[3] - side[1]) * (0.5 - levels)
+    parts = [grid(points, _stacked(u, v))]
     if top is not None:
         parts.append(disc(radius, height / 2.0, top))
     return join(parts)
@@ -146,17 +133,14 @@ def blob(radii: tuple[float, float, float], bumps: Array, window: Window) -> Sur
     bumps = bumps.copy()
     bumps[:, -1] = bumps[:, 0]
     bumps[0], bumps[-1] = bumps[0, 0], bumps[-1, 0]
-    points = np.stack(
-        [
-            radii[0] * bumps * np.sin(polar) * np.cos(angle),
-            radii[1] * bumps * np.sin(polar) * np.sin(angle),
-            radii[2] * bumps * np.cos(polar) * np.ones_like(angle),
-        ],
-        axis=2,
+    points = _stacked(
+        radii[0] * bumps * np.sin(polar) * np.cos(angle),
+        radii[1] * bumps * np.sin(polar) * np.sin(angle),
+        radii[2] * bumps * np.cos(polar),
     )
-    u = np.broadcast_to(np.linspace(window[0], window[2], columns)[None, :], bumps.shape)
-    v = np.broadcast_to(np.linspace(window[1], window[3], rows)[:, None], bumps.shape)
-    return grid(points, np.stack([u, v], axis=2))
+    u = np.linspace(window[0], window[2], columns)[None, :]
+    v = np.linspace(window[1], window[3], rows)[:, None]
+    return grid(points, _stacked(u, v))
 
 
 def arch(

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import mujoco
 
-from sims.cameras import CameraSpec, add_free_camera, model_to_bytes
+from sims.cameras import CameraRenderer, CameraSpec, Frame, add_free_camera, model_to_bytes
+from sims.cameras.renderer import Shot
 from sims.worlds import load_world
 
 ALL = CameraSpec(
@@ -56,3 +57,15 @@ def scene(name: str) -> Scene:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return Scene(model, data, prefix, model_to_bytes(model))
+
+
+def frames_of(
+    renderer: CameraRenderer, stamp: int, qpos: Any, names: tuple[str, ...], qvel: Any = None
+) -> dict[str, Frame]:
+    """Expose some cameras at a single state."""
+    shots = []
+    for name in names:
+        spec, _ = renderer._cameras[name]
+        exposure = float(spec.reference_exposure if spec.auto_exposure else spec.exposure)
+        shots.append(Shot(name, stamp, qpos, qvel, exposure=exposure, gain=spec.gain))
+    return dict(zip(names, renderer.expose(tuple(shots)), strict=True))

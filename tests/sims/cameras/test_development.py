@@ -32,6 +32,7 @@ from sims.cameras import (
 from sims.cameras.development import DepthMeter, Development
 from sims.cameras.response import generator
 from sims.cameras.spec import DepthSensor
+from tests.sims.cameras.scenes import frames_of
 
 Image = npt.NDArray[np.uint8]
 LIGHT = srgb_light()
@@ -410,7 +411,7 @@ def test_a_rendered_box_throws_its_shadow(images: Any) -> None:
         world.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=place, rgba=rgba)
     prefix = add_free_camera(world, "free", (spec,))
     renderer = CameraRenderer(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
-    depth = renderer.render(0, pose_to_qpos((0, 0, 0), (1, 0, 0, 0)), ("c",))["c"].depth
+    depth = frames_of(renderer, 0, pose_to_qpos((0, 0, 0), (1, 0, 0, 0)), ("c",))["c"].depth
     renderer.close()
     assert depth is not None
     row = depth[60]

@@ -33,6 +33,7 @@ from sims.cameras import (
 )
 from sims.cameras.development import Development
 from sims.cameras.response import AutoExposure, ExposureControl, generator, moments
+from tests.sims.cameras.scenes import frames_of
 
 EXPOSURE = 0.02
 PLAIN = CameraSpec(
@@ -93,7 +94,7 @@ def take(
     qpos: npt.NDArray[np.float64] = QPOS,
     qvel: npt.NDArray[np.float64] | None = None,
 ) -> Frame:
-    return renderer.render(0, qpos, (name,), qvel)[name]
+    return frames_of(renderer, 0, qpos, (name,), qvel)[name]
 
 
 def rgb(frame: Frame) -> npt.NDArray[np.uint8]:
@@ -189,7 +190,7 @@ def test_cameras_keep_their_own_light(renderer: CameraRenderer) -> None:
     """Drawn one after the other from one scene, each is as it is alone."""
     names = ("dim", "plain", "bright", "open")
     qvel = np.array([0.0, 10.0, 0.0, 0.0, 0.0, 0.0])
-    together = renderer.render(0, QPOS, names, qvel)
+    together = frames_of(renderer, 0, QPOS, names, qvel)
     for name in names:
         np.testing.assert_array_equal(
             rgb(together[name]), rgb(take(renderer, name, qvel=qvel)), err_msg=name
@@ -220,7 +221,7 @@ def test_a_heavy_scene_takes_real_time(
 
 def test_a_velocity_of_the_wrong_length_is_named(renderer: CameraRenderer) -> None:
     with pytest.raises(ValueError, match=r"qvel: expected shape \(6,\), found \(7,\)"):
-        renderer.render(0, QPOS, ("plain",), np.zeros(7))
+        frames_of(renderer, 0, QPOS, ("plain",), np.zeros(7))
 
 
 def test_velocity_between_two_poses() -> None:

@@ -25,6 +25,7 @@ from sims.cameras import (
     pose_to_qpos,
 )
 from sims.cameras.lens import LARGEST, Lens, faces, pixel_rays, undistorted
+from tests.sims.cameras.scenes import frames_of
 
 Array = npt.NDArray[np.float64]
 AHEAD = (1.0, 0.0, 0.0, 0.0)
@@ -62,7 +63,7 @@ def render(
 ) -> Frame:
     prefix = add_free_camera(world, "free", (spec,))
     renderer = CameraRenderer(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
-    frame = renderer.render(0, pose_to_qpos(position, AHEAD), (spec.name,))[spec.name]
+    frame = frames_of(renderer, 0, pose_to_qpos(position, AHEAD), (spec.name,))[spec.name]
     renderer.close()
     return frame
 

@@ -31,7 +31,7 @@ from sims.cameras import (
 )
 from sims.cameras.response import MOST, defocused, mean, moments
 from sims.worlds import TOURS
-from tests.sims.cameras.scenes import ALL, CAMERAS, Scene, scene
+from tests.sims.cameras.scenes import ALL, CAMERAS, Scene, frames_of, scene
 
 Array = npt.NDArray[np.float64]
 POSITION = (0.4, -0.3, -1.2)
@@ -108,7 +108,7 @@ def residuals(spec: CameraSpec, info: CameraInfo) -> Array:
         )
     prefix = add_free_camera(world, "body", (spec,))
     renderer = CameraRenderer(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
-    frame = renderer.render(0, pose_to_qpos(POSITION, ORIENTATION), (spec.name,))[spec.name]
+    frame = frames_of(renderer, 0, pose_to_qpos(POSITION, ORIENTATION), (spec.name,))[spec.name]
     renderer.close()
     assert frame.segmentation is not None
     assert frame.depth is not None
@@ -206,7 +206,7 @@ def exposures(renderer: CameraRenderer, name: str) -> Iterator[Frame]:
     for number, (a, b) in enumerate(pairwise(points)):
         yaw = math.atan2(b[1] - a[1], b[0] - a[0])
         turn = from_rpy(0.2 * math.cos(number), 0.15 * math.sin(number), yaw)
-        yield renderer.render(0, pose_to_qpos(a, turn), ("all",))["all"]
+        yield frames_of(renderer, 0, pose_to_qpos(a, turn), ("all",))["all"]
 
 
 def cast(built: Scene, frame: Frame, columns: Any, rows: Any, group: Any) -> tuple[Array, Any]:
@@ -275,7 +275,7 @@ def test_nothing_hit_is_infinite_and_has_no_number(
 ) -> None:
     """Depth is inf and the number -1 in the same pixels: in the sky, and only there."""
     _, renderer, name = world
-    up = renderer.render(0, pose_to_qpos((0.0, 0.0, -1.5), from_rpy(0.0, 0.9, 0.3)), ("all",))
+    up = frames_of(renderer, 0, pose_to_qpos((0.0, 0.0, -1.5), from_rpy(0.0, 0.9, 0.3)), ("all",))
     frame = up["all"]
     assert frame.depth is not None
     assert frame.segmentation is not None

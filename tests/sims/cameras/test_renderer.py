@@ -23,7 +23,7 @@ from sims.cameras import (
     pose_to_qpos,
 )
 from sims.cameras import stage as graphics
-from tests.sims.cameras.scenes import CAMERAS, scene
+from tests.sims.cameras.scenes import CAMERAS, frames_of, scene
 
 QPOS = pose_to_qpos((1.0, 0.4, -1.5), (0.9, 0.05, -0.1, 0.4))
 NAMES = ("all", "wide", "noisy")
@@ -51,9 +51,9 @@ def digest(frames: dict[str, Frame]) -> str:
 def elsewhere(packed: bytes, prefix: str) -> str:
     """Render in this process and return the hash; runs in a spawned one."""
     made = CameraRenderer(packed, CAMERAS, prefix, seed=3)
-    made.render(1, pose_to_qpos((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0)), ("noisy",))
+    frames_of(made, 1, pose_to_qpos((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0)), ("noisy",))
     try:
-        return digest(made.render(7, QPOS, NAMES))
+        return digest(frames_of(made, 7, QPOS, NAMES))
     finally:
         made.close()
 
@@ -61,9 +61,9 @@ def elsewhere(packed: bytes, prefix: str) -> str:
 @pytest.mark.slow
 def test_same_state_same_bits(renderer: CameraRenderer) -> None:
     """What was drawn in between leaves no trace."""
-    first = digest(renderer.render(7, QPOS, NAMES))
-    renderer.render(8, pose_to_qpos((-3.0, 1.0, -2.0), (0.2, 0.0, 0.0, 1.0)), NAMES)
-    assert digest(renderer.render(7, QPOS, NAMES)) == first
+    first = digest(frames_of(renderer, 7, QPOS, NAMES))
+    frames_of(renderer, 8, pose_to_qpos((-3.0, 1.0, -2.0), (0.2, 0.0, 0.0, 1.0)), NAMES)
+    assert digest(frames_of(renderer, 7, QPOS, NAMES)) == first
 
 
 @pytest.mark.slow
@@ -73,20 +73,20 @@ def test_same_bits_in_other_processes(renderer: CameraRenderer) -> None:
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         jobs = [pool.apply_async(elsewhere, (built.packed, built.prefix)) for _ in range(2)]
         found = {job.get(timeout=50) for job in jobs}
-    assert found == {digest(renderer.render(7, QPOS, NAMES))}
+    assert found == {digest(frames_of(renderer, 7, QPOS, NAMES))}
 
 
 def test_one_camera_is_drawn_the_same_alone_and_among_others(renderer: CameraRenderer) -> None:
     """A camera's image doesn't depend on which others were asked for, or in which order."""
-    together = renderer.render(7, QPOS, ("wide", "noisy", "all"))
+    together = frames_of(renderer, 7, QPOS, ("wide", "noisy", "all"))
     for name in NAMES:
-        alone = renderer.render(7, QPOS, (name,))
+        alone = frames_of(renderer, 7, QPOS, (name,))
         assert digest(alone) == digest({name: together[name]})
 
 
 def test_a_frame_holds_what_the_spec_asks_for(renderer: CameraRenderer) -> None:
     """Shapes and types are the announced ones, and what wasn't asked for is None."""
-    frames = renderer.render(7, QPOS, NAMES)
+    frames = frames_of(renderer, 7, QPOS, NAMES)
     everything, plain = frames["all"], frames["wide"]
     found = [
         None if image is None else (image.dtype, image.shape, image.flags.c_contiguous)
@@ -105,7 +105,7 @@ def test_a_frame_holds_what_the_spec_asks_for(renderer: CameraRenderer) -> None:
 
 def test_noise_has_the_announced_size(renderer: CameraRenderer) -> None:
     """Grey levels vary with the spec's sigma, depth with k z²; another stamp draws anew."""
-    shots = [renderer.render(stamp, QPOS, ("noisy",))["noisy"] for stamp in range(12)]
+    shots = [frames_of(renderer, stamp, QPOS, ("noisy",))["noisy"] for stamp in range(12)]
     rgb = np.array([shot.rgb for shot in shots], np.float64)
     middle = (rgb.mean(0) > 40) & (rgb.mean(0) < 215)
     assert rgb.std(0, ddof=1)[middle].mean() == pytest.approx(4.0, rel=0.05)
@@ -124,7 +124,7 @@ def test_rows_run_down_and_columns_right() -> None:
         world.worldbody.add_geom(type=ball, size=[0.4, 0, 0], pos=[x, -y, -z], rgba=colour)
     prefix = add_free_camera(world, "b", (spec,))
     made = CameraRenderer(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
-    image = made.render(0, pose_to_qpos((0, 0, 0), (1, 0, 0, 0)), ("c",))["c"].rgb
+    image = frames_of(made, 0, pose_to_qpos((0, 0, 0), (1, 0, 0, 0)), ("c",))["c"].rgb
     made.close()
     assert image is not None
     red, blue = image[31, 21].astype(int), image[42, 42].astype(int)
@@ -137,9 +137,9 @@ def test_wrong_arguments_are_named(renderer: CameraRenderer) -> None:
     """A state of the wrong length, an unknown camera and a closed renderer are told apart."""
     built = scene("hall")
     with pytest.raises(ValueError, match=r"expected shape \(7,\), found \(3,\)"):
-        renderer.render(0, np.zeros(3), ("all",))
+        frames_of(renderer, 0, np.zeros(3), ("all",))
     with pytest.raises(KeyError, match="nobody"):
-        renderer.render(0, QPOS, ("nobody",))
+        frames_of(renderer, 0, QPOS, ("nobody",))
     with pytest.raises(ValueError, match="camera free/other: expected one of the model's"):
         CameraRenderer(built.packed, (CameraSpec(name="other"),), built.prefix, seed=0)
     small = (CAMERAS[2],)
@@ -147,7 +147,7 @@ def test_wrong_arguments_are_named(renderer: CameraRenderer) -> None:
     closed.close()
     closed.close()
     with pytest.raises(RuntimeError, match="closed"):
-        closed.render(0, QPOS, ("noisy",))
+        frames_of(closed, 0, QPOS, ("noisy",))
 
 
 def test_missing_libraries_are_named_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> None:

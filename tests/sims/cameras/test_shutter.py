@@ -29,6 +29,7 @@ from sims.cameras import (
 from sims.cameras.lens import Lens
 from sims.cameras.renderer import Motion, Shot
 from sims.cameras.view import MOST_BANDS, OFF, row_bands, row_time
+from tests.sims.cameras.scenes import frames_of
 
 Array = npt.NDArray[np.float64]
 READOUT, EXPOSURE = 0.03, 0.006
@@ -211,7 +212,9 @@ def test_the_first_and_the_last_row_have_poses_of_their_own(renderer: CameraRend
 
 def test_at_rest_a_rolling_shutter_is_a_global_one(renderer: CameraRenderer) -> None:
     """Bit by bit."""
-    still, rolling = (renderer.render(0, pose(0.0), (name,))[name] for name in ("still", "plain"))
+    still, rolling = (
+        frames_of(renderer, 0, pose(0.0), (name,))[name] for name in ("still", "plain")
+    )
     np.testing.assert_array_equal(still.rgb, rolling.rgb)
     np.testing.assert_array_equal(still.depth, rolling.depth)
     np.testing.assert_array_equal(still.segmentation, rolling.segmentation)

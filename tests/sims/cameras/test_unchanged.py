@@ -17,6 +17,7 @@ import numpy.typing as npt
 from events.frames import from_rpy
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.cameras.spec import ImageKind
+from tests.sims.cameras.scenes import frames_of
 
 SAVED = Path(__file__).with_name("unchanged.npz")
 KINDS: tuple[ImageKind, ...] = ("rgb", "grey", "depth", "segmentation")
@@ -49,7 +50,7 @@ def drawn() -> dict[str, npt.NDArray[Any]]:
     renderer = CameraRenderer(model_to_bytes(world.compile()), CAMERAS, prefix, seed=5)
     qpos = pose_to_qpos((0.1, 0.2, -1.2), from_rpy(0.1, -0.05, 0.2))
     qvel = np.array([1.0, 0.4, 0.2, 0.3, -0.2, 1.0])
-    frames = renderer.render(123_456_789, qpos, tuple(spec.name for spec in CAMERAS), qvel)
+    frames = frames_of(renderer, 123_456_789, qpos, tuple(spec.name for spec in CAMERAS), qvel)
     renderer.close()
     return {
         f"{name}_{kind}": image

@@ -26,7 +26,7 @@ from sims.cameras import model_to_bytes
 from sims.sensors.lidar import LATE, LidarRig, LidarSpec, Scanner, pattern_of, solids
 from sims.sensors.rays import Rays
 from sims.vehicle import Physics, attach_vehicle
-from sims.worlds import Dynamics, load_scene
+from sims.worlds import Dynamics, Motion, load_scene
 from tests.sims.vehicle.flight import compiled
 
 Floats = npt.NDArray[np.float64]
@@ -128,7 +128,7 @@ def test_a_mounted_lidar_looks_from_its_own_place() -> None:
     assert low[:, 2].mean() > points[turn.rings == 15][:, 2].mean()
 
 
-class Away:
+class Away(Motion, frozen=True):
     """The cart stands beside the room until 0.35 s, and in it from then on."""
 
     solid = True

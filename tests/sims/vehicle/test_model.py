@@ -94,6 +94,16 @@ def test_options_of_a_world_that_would_be_ignored_are_refused(option: str) -> No
 PARAMETERS = read_parameters(compiled(), "drone")
 MIXER = Mixer(PARAMETERS)
 
+
+def wrench(motors: tuple[float, ...]) -> tuple[float, tuple[float, float, float]]:
+    """Return thrust (N) and torque (N m, FRD): a thrust F along -z at (x, y) has (-y F, x F)."""
+    pairs = list(zip(motors, PARAMETERS.motors, strict=True))
+    thrusts = [(share * each.max_thrust, each.position) for share, each in pairs]
+    roll, pitch = sum(-y * f for f, (_, y, _) in thrusts), sum(x * f for f, (x, _, _) in thrusts)
+    yaw = sum(share * each.max_torque for share, each in pairs)
+    return sum(f for f, _ in thrusts), (roll, pitch, yaw)
+
+
 thrusts = st.floats(-10.0, 40.0)
 tilts = st.floats(-4.0, 4.0)
 yaws = st.floats(-1.0, 1.0)
@@ -109,7 +119,7 @@ def test_roll_and_pitch_are_kept_whenever_some_thrust_allows_them(
     thrust: float, roll: float, pitch: float, yaw: float
 ) -> None:
     """And beyond that their direction is."""
-    _, (made_roll, made_pitch, _) = MIXER.wrench(MIXER.mix(thrust, roll, pitch, yaw))
+    _, (made_roll, made_pitch, _) = wrench(MIXER.mix(thrust, roll, pitch, yaw))
     arm_x, arm_y, _ = (abs(c) for c in PARAMETERS.motors[0].position)
     # At most: two motors full, two off.
     need = abs(roll) / (2 * 6.5 * arm_y) + abs(pitch) / (2 * 6.5 * arm_x)
@@ -122,10 +132,10 @@ def test_thrust_is_kept_unless_roll_and_pitch_need_it(
     thrust: float, roll: float, pitch: float, yaw: float
 ) -> None:
     """Yaw, in particular, never costs thrust."""
-    with_yaw, _ = MIXER.wrench(MIXER.mix(thrust, roll, pitch, yaw))
-    without, _ = MIXER.wrench(MIXER.mix(thrust, roll, pitch, 0.0))
+    with_yaw, _ = wrench(MIXER.mix(thrust, roll, pitch, yaw))
+    without, _ = wrench(MIXER.mix(thrust, roll, pitch, 0.0))
     assert with_yaw == pytest.approx(without, abs=1e-9)
-    upright, _ = MIXER.wrench(MIXER.mix(thrust, 0.0, 0.0, yaw))
+    upright, _ = wrench(MIXER.mix(thrust, 0.0, 0.0, yaw))
     assert upright == pytest.approx(thrust, abs=1e-9)
 
 
@@ -134,8 +144,8 @@ def test_yaw_is_made_as_far_as_there_is_room_and_never_the_other_way(
     thrust: float, roll: float, pitch: float, yaw: float
 ) -> None:
     motors = MIXER.mix(thrust, roll, pitch, yaw)
-    _, (_, _, made) = MIXER.wrench(motors)
-    _, (_, _, before) = MIXER.wrench(MIXER.mix(thrust, roll, pitch, 0.0))
+    _, (_, _, made) = wrench(motors)
+    _, (_, _, before) = wrench(MIXER.mix(thrust, roll, pitch, 0.0))
     gained = made - before
     assert gained * yaw >= -1e-12
     if abs(gained - yaw) > 1e-9:  # not all of it: then a motor stands at its end
@@ -146,7 +156,7 @@ def test_yaw_is_made_as_far_as_there_is_room_and_never_the_other_way(
 def test_what_can_be_had_is_had_exactly(
     thrust: float, roll: float, pitch: float, yaw: float
 ) -> None:
-    made, torque = MIXER.wrench(MIXER.mix(thrust, roll, pitch, yaw))
+    made, torque = wrench(MIXER.mix(thrust, roll, pitch, yaw))
     assert made == pytest.approx(thrust)
     assert torque == pytest.approx((roll, pitch, yaw), abs=1e-9)
 

@@ -27,7 +27,7 @@ from events.frames import from_rpy
 from nodes.pilots import FigureEight
 from sims.cameras import CameraRenderer, model_to_bytes, pose_to_qpos
 from sims.worlds import CLEARANCE, TOURS, WORLDS, WorldError, load_scene, load_world
-from tests.sims.cameras.scenes import CAMERAS, Scene, fresh, scene
+from tests.sims.cameras.scenes import CAMERAS, Scene, frames_of, fresh, scene
 
 ROOT = Path(__file__).parents[3]
 REACH = {"hall": (7.0, 5.0), "yard": (12.0, 12.0)}
@@ -202,7 +202,7 @@ def test_there_are_corners_everywhere(name: str) -> None:
     good = []
     for place, heading in views(name, measure):
         qpos = pose_to_qpos(place, from_rpy(0.0, 0.0, heading))
-        image = renderer.render(0, qpos, ("wide",))["wide"].rgb
+        image = frames_of(renderer, 0, qpos, ("wide",))["wide"].rgb
         assert image is not None
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         found: Any = cv2.goodFeaturesToTrack(grey, 1000, 0.01, 7)
@@ -259,7 +259,7 @@ def greys(name: str, views: list[tuple[Any, float]]) -> list[Any]:
     renderer = CameraRenderer(built.packed, CAMERAS, built.prefix, seed=0)
     images = []
     for place, heading in views:
-        frame = renderer.render(0, qpos(built, place, heading), ("wide",))["wide"]
+        frame = frames_of(renderer, 0, qpos(built, place, heading), ("wide",))["wide"]
         assert frame.rgb is not None
         images.append(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY))
     renderer.close()
@@ -329,7 +329,7 @@ def test_they_cost_at_most_half_as_much_again_as_the_others() -> None:
             tries = []
             for _ in range(3):
                 start = time.process_time()
-                renderer.render(number, state, ("wide",))
+                frames_of(renderer, number, state, ("wide",))
                 tries.append(time.process_time() - start)
             times[name].append(min(tries))
     medians = {name: statistics.median(each) for name, each in times.items()}

@@ -33,6 +33,7 @@ from sims.cameras import CameraRenderer, CameraSpec, add_camera, model_to_bytes
 from sims.cameras.lens import Lens
 from sims.cameras.view import Drawn
 from sims.vehicle import attach_vehicle
+from tests.sims.cameras.scenes import frames_of
 
 WORLD = """
 <mujoco>
@@ -115,7 +116,7 @@ def test_a_camera_of_the_file_gives_the_same_bytes(
     for turn in (0.0, 0.8):
         qpos = model.qpos0.copy()
         qpos[3:7] = math.cos(turn), math.sin(turn), 0.1, 0.0
-        frame = own.render(5, qpos, (spec.name,))[spec.name]
+        frame = frames_of(own, 5, qpos, (spec.name,))[spec.name]
         ids = np.arange(model.ngeom + 1, dtype=np.uint8)
         colour, depth, numbers, _ = renderer.take(5, qpos, ids, wanted(model, spec, *forms))
         assert frame.rgb is not None
