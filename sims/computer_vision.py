@@ -32,10 +32,9 @@ class FreeCameraConfig(SimulatorConfig):
         position: Position at the start, metres in ``map`` (NED).
         orientation: Roll, pitch, yaw at the start, degrees.
         rate: Updates per second; each exposes all cameras, whatever rate their own settings name.
-        cameras: The cameras that are carried. There may be none if others look from where it is,
-            as clients of an AirSim server do.
-        trajectory: TUM file (stamp x y z qx qy qz qw; NED, FRD) to follow from its first stamp
-            on; the run ends with it. Empty for none.
+        cameras: Cameras carried; there may be none if others look, as AirSim clients do.
+        trajectory: TUM file (stamp x y z qx qy qz qw; NED, FRD), followed to the run's end; or
+            empty.
     """
 
     position: Vector3 = (0.0, 0.0, -1.5)

@@ -27,18 +27,16 @@ class SimulatorConfig(NodeConfig):
     """Settings of every simulator.
 
     Attributes:
-        world: Name of a built-in world (``hall``, ``yard``, ``corridor``, ``office``, ``night``,
-            ``forest``), or path of an MJCF file; empty for that of the run's other vehicles, or
-            ``hall`` if none names one. In an MJCF file x is north, y is west and z is up; in all
-            settings and events x is north, y is east and z is down (NED). So a geom with
-            ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
+        world: Built-in world (``hall``, ``yard``, ``corridor``, ``office``, ``night``, ``forest``)
+            or path of an MJCF file; empty for the other vehicles', or ``hall``. In MJCF x is north,
+            y west, z up; in all settings and events x is north, y east, z down (NED): ``pos="1 2
+            3"`` is (1, -2, -3) in ``map``.
         origin: Where the origin of ``map`` is on the earth: latitude and longitude, degrees north
             and east, and altitude, metres above the WGS 84 ellipsoid, which here is sea level too.
         cameras: The cameras that are carried.
         camera_processes: Number of processes that render.
         render_threads: Threads of the software renderer in each of them.
-        setpoint_timeout: Age beyond which a set-point is ignored, unless it is one of position or
-            pose, which hold until the next.
+        setpoint_timeout: Age beyond which set-points are ignored, but of position or pose.
     """
 
     world: NameOrPath = ""

@@ -1,8 +1,7 @@
 """Intrinsics and lens of a camera, and lookup of its image's pixels in drawn pinhole images.
 
-A rasteriser draws straight lines as straight lines: pinhole images, here called faces. A lens's
-image is looked up in one of them that is wide enough, or, beyond 120°, in those faces of a cube
-that it sees. Pure numpy; the drawing is in `sims.cameras.view`.
+A rasteriser draws pinhole images, here called faces. A lens's image is looked up in one of them,
+or, beyond 120°, in the faces of a cube.
 """
 
 from __future__ import annotations
@@ -153,8 +152,8 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     Attributes:
         model: ``plumb_bob`` (others say radtan), ``rational_polynomial``, or ``equidistant``
             (Kannala-Brandt's fisheye, KB4), with the formulae of OpenCV.
-        coefficients: Of plumb_bob k1, k2, p1, p2 and, if not 0, k3; of rational_polynomial k1, k2,
-            p1, p2, k3, k4, k5, k6; of equidistant k1, k2, k3, k4.
+        coefficients: plumb_bob: k1, k2, p1, p2 and, if not 0, k3; rational_polynomial: k1, k2, p1,
+            p2, k3 to k6; equidistant: k1 to k4.
     """
 
     model: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(COEFFICIENTS)})]

@@ -1,8 +1,7 @@
 """Rendering of camera exposures, with the effects of lens, shutter and sensor.
 
-Made for a worker process (a GL context belongs to the thread that made it), but works in-process.
 A *shot* is *captured* (drawn, at each of its moments) and then *developed* (made a frame: the
-images of a sensor). The drawing is in `sims.cameras.stage`.
+images of a sensor); in the thread that made the GL context, in a worker process as a rule.
 """
 
 from __future__ import annotations

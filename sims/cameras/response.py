@@ -193,8 +193,7 @@ class AutoExposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Settings of automatic exposure, first by exposure time and then by gain.
 
     Attributes:
-        target: Mean light of a well-exposed image, as a share of white's; in linear light, where
-            0.18 is a middle grey.
+        target: Mean light of a well-exposed image, a share of white's in linear light; 0.18: grey.
         min_exposure: Shortest exposure time.
         max_exposure: Longest exposure time.
         exposure_step: Step of the exposure time, such as an image sensor's row time.

@@ -50,21 +50,17 @@ class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     Attributes:
         preset: Real sensor with its figures as defaults; keys beside it override them.
-        model: ``structured_light``: a projector; dark surfaces return too little of its light.
-            ``stereo``: a second camera; surfaces without texture cannot be matched, nor can the
-            band at the left which is out of its view.
+        model: ``structured_light``: a projector, too little for dark surfaces. ``stereo``: a second
+            camera, blind to surfaces without texture and to the band at the left.
         baseline: Distance to the second eye or projector, metres.
-        focal: Focal length of the sensor's own images, pixels, by which disparities are counted; 0
-            for that of this camera.
+        focal: Focal length by which disparities are counted, pixels; 0 for that of this camera.
         disparity_step: Disparities are whole multiples of it, pixels; 0: of nothing.
         disparity_noise: Standard deviation of disparities before that, pixels.
         min_depth: Metres; what is nearer is not measured.
         max_depth: Metres; what is farther is not measured.
-        max_slant: Greatest angle between the ray and the surface's normal, degrees; in 3×3 pixels,
-            so that edges of objects are lost, too. 90: any.
-        min_brightness: ``structured_light``: least light of a surface seen head-on, as a share
-            of white's, in linear light; aslant more by the angle's cosine. The camera's ``light``
-            makes no difference to it. 0: any.
+        max_slant: Greatest angle of ray and normal in 3×3 pixels, edges included, degrees; 90: any.
+        min_brightness: ``structured_light``: least light of a surface seen head-on, aslant more by
+            the angle's cosine, share of white in linear light, whatever the ``light``; 0: any.
         min_contrast: ``stereo``: least standard deviation of 7×7 pixels, grey levels. 0: any.
     """
 
@@ -124,53 +120,44 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         width: Width of its images, pixels.
         height: Height of its images, pixels.
         fov: **Horizontal** field of view, degrees, with what the lens does to it.
-        intrinsics: fx, fy, cx, cy in pixels, in place of `fov`; a pixel's centre has whole
-            coordinates.
-        lens: Distortion; none by default. Depth stays planar along the optical axis, and is
-            ``inf`` 90° or more off it. Pixels on which no ray falls are black.
+        intrinsics: fx, fy, cx, cy, pixels, in place of `fov`; pixel centres are whole numbers.
+        lens: Distortion; none by default. Depth stays planar along the optical axis, and is ``inf``
+            90° or more off it. Pixels on which no ray falls are black.
         undistorted: Whether the images are sent a second time without distortion, as those of a
             pinhole camera of the same intrinsics, with source ``<camera>/undistorted``.
         rate: Exposures per second, at equal intervals.
         position: Position on the body, metres forward, right, down (FRD).
         orientation: Roll, pitch, yaw of the camera in the body's frame, degrees, applied yaw first
             (Z-Y-X). Positive pitch is upwards: -90 looks straight down.
-        light: Factor on all lights of the scene. The sky, and surfaces that shine by themselves,
-            stay as they are.
-        exposure: Seconds that the shutter is open, half of them before the stamp: motion blurs
-            the image. Depth, segmentation and pose are those of the stamp.
+        light: Factor on all lights of the scene, but the sky and surfaces that shine.
+        exposure: Seconds that the shutter is open, half of them before the stamp: motion blurs the
+            image. Depth, segmentation and pose are those of the stamp.
         readout: Time from the first row's exposure to the last one's (rolling shutter); the stamp
             is that of the middle row. Depth and segmentation are read out alike.
-        gain: Factor on the light of an image, as of a sensor's amplifier; it makes the shot noise
-            stronger, too.
-        reference_exposure: Exposure time at which an image of gain 1 is as bright as the scene is
-            drawn; a shorter one makes it darker in proportion, in linear light. 0: exposure times
-            make no difference to the brightness.
-        auto_exposure: Exposure time and gain chosen for each image by the light of the last
-            delivered one, beginning with `reference_exposure`, which it needs; in the place of
-            `exposure` and `gain`.
-        vignette: Coefficients a1, a2, … of the share of light ``1 + a1 r² + a2 r⁴ + …`` at the
-            distance r from the principal point, in halves of the image's diagonal. cos⁴ of an angle
-            that is 45° in the corner is about ``[-2, 2.54, -1.86, 0.57]``.
+        gain: Factor on the light of an image, and so on its shot noise, as of an amplifier.
+        reference_exposure: Exposure time at which an image of gain 1 is as bright as drawn; shorter
+            ones darken in linear light. 0: exposure times make no difference to the brightness.
+        auto_exposure: Exposure time and gain chosen by the light of the last delivered image, from
+            `reference_exposure` on; in the place of `exposure` and `gain`.
+        vignette: Coefficients of the share of light ``1 + a1 r² + a2 r⁴ + …`` at r half diagonals
+            from the principal point; cos⁴ to 45° in the corner: about ``[-2, 2.54, -1.86, 0.57]``.
         full_well: Electrons that fill a pixel at gain 1 (white), typically 5000 to 50000: each
             pixel has the noise of their number (shot noise). 0: none.
-        response: Curve from light to grey levels: ``srgb``, ``linear``, ``gamma`` (of 2.2), or a
-            file of the light of each of the 256 grey levels, as the ``pcalib.txt`` of TUM's monoVO
-            data set. What is drawn is taken to be sRGB.
+        response: Curve from light to grey levels, sRGB as drawn: ``srgb``, ``linear``, ``gamma``
+            (of 2.2), or a file of 256 levels' light, as ``pcalib.txt`` of TUM's monoVO data set.
         blur: Standard deviation, in pixels, of the Gaussian that a point becomes out of focus.
         noise: Standard deviation of additive Gaussian noise, grey levels (0 to 255).
         depth_noise: k in sigma = k z²: standard deviation (metres) of the noise at depth z.
-        depth_sensor: A sensor that measures depth by triangulation, with steps, noise, limits and
-            holes; in the place of `depth_noise`.
+        depth_sensor: Measures depth by triangulation with its errors, in the place of
+            `depth_noise`.
         latency: Time from exposure to delivery.
         jitter: Greatest random delay in addition; the order of images is kept.
         loss: Share of exposures that are not delivered, chosen at random.
-        time_offset: Time by which the stamps are late on the clock of the IMU and the ground truth:
-            all that a camera sends of an exposure carries the same shifted stamp.
+        time_offset: Delay of all stamps of an exposure on the clock of the IMU and the ground
+            truth.
         time_jitter: Greatest random error of the stamps besides, either way.
-        stereo: Makes two cameras of this one, ``<name>_left`` and, a baseline to its right,
-            ``<name>_right``; none by default.
-        render_time: Least real time that a frame takes to draw, to test how a run copes with a
-            scene that is too heavy for the machine.
+        stereo: Makes two cameras: ``<name>_left`` and, a baseline to the right, ``<name>_right``.
+        render_time: Least real time to draw a frame, to test a run on a machine too slow for it.
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1, pattern="^[A-Za-z0-9_]+$")]

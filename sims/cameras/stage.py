@@ -1,8 +1,7 @@
 """Off-screen rendering of a model for a camera: ideal colour, depth, object numbers, pose.
 
-Here everything is ideal. What lens, shutter and sensor do to an image is put together in
-`sims.cameras.renderer`. Nothing happens on import: the environment is changed by `open_context`,
-which must run in the thread that will render, before any other GL context of the process.
+Nothing happens on import: `open_context` changes the environment, and must run in the thread that
+will render, before any other GL context of the process.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Sensors other than cameras: pure models, and the suite for a vehicle's node.
 
-A model is told the truth and returns what its sensor measures; it knows no clock and sends
-nothing. `SensorSuite` runs all of a vehicle's models at their rates, and sends what they measure
-when it is due.
+A model makes measurements of the truth; it knows no clock and sends nothing, as `SensorSuite` does.
 """
 
 from sims.sensors.imu import ImuModel, ImuNoise, ImuParameters

@@ -24,8 +24,7 @@ class BarometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields
     Attributes:
         noise: Standard deviation of the white noise, pascal (AirSim: ``UncorrelatedNoiseSigma``).
             At sea level 12 Pa are a metre.
-        drift: Standard deviation of the relative error that drifts (AirSim:
-            ``PressureFactorSigma``).
+        drift: Standard deviation of the drifting relative error (AirSim: ``PressureFactorSigma``).
         drift_time: Time constant of the drift (AirSim: ``PressureFactorTau``).
         model: ``gauss_markov``: the drift tends to its standard deviation, of 185 Pa with these
             defaults. ``airsim``: AirSim's recursion, which at 50 Hz tends to 0.3 Pa.
@@ -90,8 +89,7 @@ class MagnetometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fie
     """Settings of a magnetometer; by default the noise of AirSim's in the World Magnetic Model.
 
     Attributes:
-        noise: Standard deviation of the white noise of each axis, tesla (AirSim: ``NoiseSigma``,
-            in gauss, which are 1e-4 tesla).
+        noise: Standard deviation of each axis' white noise, tesla (AirSim: ``NoiseSigma``, gauss).
         bias: Greatest bias of each axis, tesla, drawn once and evenly (AirSim: ``NoiseBias``).
         scale_factor: Factor on the field (AirSim: ``ScaleFactor``).
         model: ``wmm``: the World Magnetic Model. ``airsim``: AirSim's dipole, which near Seattle is
@@ -173,9 +171,8 @@ class GnssSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True
         vertical_drift: Standard deviation of the slow error, down, metres.
         drift_time: Time constant of the slow error, a first-order Gauss-Markov process.
         velocity_noise: Standard deviation of the velocity's white noise, metres per second.
-        eph_initial: Reported uncertainty at the start, metres (AirSim: ``EphInitial`` and
-            ``EpvInitial``). It affects `position_covariance` only: the position itself is as good
-            at the start as later.
+        eph_initial: Reported uncertainty (`position_covariance` only) at the start, metres (AirSim:
+            ``EphInitial`` and ``EpvInitial``).
         eph_final: Final reported uncertainty, metres (AirSim: ``EphFinal``, ``EpvFinal``).
         eph_time_constant: Time constant of the decay between them (AirSim: ``EPH_TimeConstant``).
         eph_min_3d: Largest uncertainty of a fix with status 0, metres (AirSim: ``EphMin3d``).

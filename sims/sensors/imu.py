@@ -45,16 +45,14 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     Attributes:
         preset: Real sensor with its figures as defaults; keys beside it override them.
-        rate: Samples per second, and of the ground truth, in the place of the vehicle's `imu_rate`;
-            0: as that says.
-        gyroscope_noise_density: White noise of the angular velocity, rad/s/√Hz (AirSim:
-            ``AngularRandomWalk``, in °/√h).
-        gyroscope_random_walk: Random walk of its bias, rad/s²/√Hz (AirSim: ``GyroBiasStability``
-            / √``GyroBiasStabilityTau``).
-        accelerometer_noise_density: White noise of the acceleration, m/s²/√Hz (AirSim:
-            ``VelocityRandomWalk``, in mg/√Hz).
-        accelerometer_random_walk: Random walk of its bias, m/s³/√Hz (AirSim:
-            ``AccelBiasStability`` / √``AccelBiasStabilityTau``).
+        rate: Samples, and ground truths, per second; 0: the vehicle's `imu_rate`.
+        gyroscope_noise_density: White noise, rad/s/√Hz (AirSim: ``AngularRandomWalk``, in °/√h).
+        gyroscope_random_walk: Random walk of its bias, rad/s²/√Hz (AirSim: ``GyroBiasStability`` /
+            √``GyroBiasStabilityTau``).
+        accelerometer_noise_density: White noise, m/s²/√Hz (AirSim: ``VelocityRandomWalk``, in
+            mg/√Hz).
+        accelerometer_random_walk: Random walk of its bias, m/s³/√Hz (AirSim: ``AccelBiasStability``
+            / √``AccelBiasStabilityTau``).
         ideal: No errors at all, whatever the other settings say of them.
         gyroscope_turn_on_bias: Standard deviation of the bias at the start, rad/s.
         accelerometer_turn_on_bias: Standard deviation of the bias at the start, m/s².

@@ -47,15 +47,15 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         columns: Times in a turn at which they are sent.
         azimuths: First and last direction, degrees clockwise from ahead (AirSim:
             ``HorizontalFOVStart`` and ``End``). A spinning lidar is blind for the rest of the turn.
-        elevations: Lowest and highest direction, degrees above the sensor's x-y plane (AirSim:
-            ``VerticalFOVLower`` and ``Upper``).
+        elevations: Lowest and highest, degrees upwards (AirSim: ``VerticalFOVLower`` and
+            ``Upper``).
         min_range: Metres; what is nearer gives no point.
         max_range: Metres; what is farther gives no point (AirSim: ``Range``).
         noise: Standard deviation of the white noise along the ray, metres.
         dropout: Share of rays that give no point, at random.
         min_intensity: What returns less light than this gives no point.
-        full_range: Metres up to which a white surface that faces the sensor has intensity 1; beyond
-            it the intensity falls with the square of the range.
+        full_range: Metres up to which a facing white surface has intensity 1; falling by the
+            square.
     """
 
     name: Name

@@ -83,10 +83,9 @@ class RangeFinderSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fiel
         name: Name of the sensor, unique on its body.
         noise: Standard deviation of the white noise, metres (AirSim: always 0.2).
         min_range: Metres; below it the range is ``-inf`` (AirSim: ``MinDistance``, only reported).
-        max_range: Metres; beyond it the range is ``inf`` (AirSim: ``MaxDistance``, at which it
-            reports `max_range` itself).
-        field_of_view: Angle of the cone, degrees, in which the nearest surface counts, as of
-            ultrasound: found with 25 rays. 0 is a single ray, as of a laser.
+        max_range: Metres; beyond it the range is ``inf`` (AirSim: ``MaxDistance``, reported).
+        field_of_view: Angle of the cone in which the nearest surface counts, degrees: 25 rays, as
+            of ultrasound; 0: a single ray, as of a laser.
     """
 
     name: Name

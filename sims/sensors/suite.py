@@ -36,8 +36,7 @@ class SensorsConfig(SimulatorConfig):
     """Settings of a vehicle's sensors.
 
     Attributes:
-        imu_rate: Rate of the IMU and of the ground truth (`odometry`), Hz. The ground truth is also
-            sent at each exposure.
+        imu_rate: Rate of the IMU and of the ground truth (`odometry`; also at each exposure), Hz.
         imu: Noise of the IMU, or the name of a preset.
         barometer: The barometer; none if it is not set. ``{}`` is one with all its defaults.
         gnss: The satellite receiver; none if it is not set.

@@ -1,8 +1,6 @@
-"""The cascade: a checked set-point in, four motor commands out.
+"""The cascade's inner loops: attitude to body rates to torque, and four motor commands out.
 
-The inner loops are here: attitude to body rates, and body rates to torque. Where the vehicle should
-point is decided in `position`; whether it may fly at all is `autopilot`'s business. All floats, at
-the rate of the caller.
+The outer ones are in `position`; whether the vehicle may fly is `autopilot`'s business.
 """
 
 from __future__ import annotations

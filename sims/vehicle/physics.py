@@ -1,7 +1,6 @@
 """True state of a vehicle in a simulated world, and the forces of the air.
 
-Stepping is in `simulation`. No sensor noise (see `sims.sensors`), no control (see `control`), no
-images. Everything that comes out is in our frames: world NED, body FRD.
+All that comes out is in our frames, NED and FRD, without noise. Stepping is in `simulation`.
 """
 
 from __future__ import annotations

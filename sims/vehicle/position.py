@@ -1,8 +1,6 @@
-"""The outer loops: from position or velocity to attitude and thrust.
+"""The outer loops: from position or velocity to attitude and thrust; gains and limits.
 
-Position P with feed-forward → velocity PID → acceleration → thrust vector and yaw → attitude, in
-NED and all in floats. How the attitude is reached is in `attitude`. Settings of the controller:
-gains of the cascade and limits of the flight.
+Position P with feed-forward → velocity PID → acceleration → thrust vector and yaw → attitude, NED.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ class Simulation:
 
     Attributes:
         mocap_velocities: Of the bodies that move by themselves, m/s NWU, shape (nmocap, 3).
-        diverged: Whether its state was no longer finite once: it is of no use any more.
+        diverged: Whether its state was not finite once, and is of no use any more.
 
     Raises:
         ValueError: The world has another time step.

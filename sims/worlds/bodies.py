@@ -48,15 +48,12 @@ class BodySpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         kind: ``person``, ``car``, ``door`` or ``box``.
         waypoints: Points of a smooth curve for the middle of its foot, metres in ``map``. The body
             heads along the curve. A single point: it stands there. Of a door: its hinge.
-        times: Time at each waypoint, and in a loop once more at the first. From `speed` if left
-            out.
+        times: Time at each waypoint, in a loop again at the first; by `speed` if left out.
         speed: Mean speed on the straight lines between the waypoints, metres per second.
-        loop: Whether it returns from the last waypoint to the first and goes on for ever; else it
-            starts and ends at rest.
-        heading: Heading of a standing body, degrees clockwise from north; of a door: that of its
-            closed panel.
-        angles: Opening of a door at each of the `times`, degrees clockwise seen from above. In a
-            loop the last is the first.
+        loop: Return from the last waypoint to the first, for ever; else start and end at rest.
+        heading: Heading of a standing body or a closed door, degrees clockwise from north.
+        angles: Opening of a door at the `times`, degrees clockwise from above; a loop's ends are
+            equal.
         size: Length along its heading, width and height, metres; that of its kind if left out.
         colour: Red, green and blue, 0 to 1; that of its kind if left out.
     """

@@ -1,8 +1,7 @@
 """`corridor`: a closed corridor round a block, 57 m long, with doors all alike.
 
-Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres. The corridor runs round a
-rectangle, and the origin is in the middle of its east side. Walls, floor and ceiling repeat one
-image every 2.6 m to the pixel, so opposite places cannot be told from each other.
+Coordinates are MuJoCo's: x north, y **west**, z up, metres, from the middle of the east side. The
+image repeats every 2.6 m to the pixel, so opposite places cannot be told from each other.
 """
 
 from __future__ import annotations

@@ -195,12 +195,10 @@ class LightSpec(Changing, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Settings of a time-varying light of the world.
 
     Attributes:
-        name: The light's name in the world; ``headlight`` for the light from everywhere; ``*`` for
-            all lights.
+        name: The light's name; ``headlight`` for the light from everywhere; ``*`` for all.
         flicker: Share of its strength lost in flicker, at random but always alike.
         flicker_rate: Rate of the flicker, Hz.
-        directions: Directions of its rays at the `times`, north, east, down: a sun that moves.
-            Empty for that in the world.
+        directions: Rays' directions at the `times`, north, east, down; empty for the world's own.
     """
 
     name: str = "*"

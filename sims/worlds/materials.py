@@ -1,8 +1,7 @@
 """Materials and their patterns: noise, masonry, specks, drips, cracks.
 
 Images here are float32 in 0..1, shape (h, w) or (h, w, 3) RGB; sizes are pixels. Each material is
-drawn in any size, at `density` pixels per metre, and never twice alike. Things painted on them
-(posters, windows, letters) are in `sims.worlds.decals`.
+drawn in any size, at `density` pixels per metre, and never twice alike.
 """
 
 from __future__ import annotations

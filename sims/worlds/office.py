@@ -1,8 +1,7 @@
 """`office`: an open-plan office, 16 x 12 m, white and plain, with a glazed meeting room.
 
-Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres, from the middle of the
-floor. Paint is all there is on walls, desks and ceiling; colour shows what is behind the glass,
-depth shows the pane.
+Coordinates are MuJoCo's: x north, y **west**, z up, metres, from the middle of the floor. Colour
+shows things behind the glass, depth the pane.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Surfaces with texture coordinates, and the solids' outlines they are cut from.
 
-A surface is a grid of points seen from outside: rows run down, columns run to the right. The world
-here is MuJoCo's: z up, metres. Putting them into a model is in `sims.worlds.builder`.
+A surface is a grid of points seen from outside: rows run down, columns to the right; z up, metres.
 """
 
 from __future__ import annotations

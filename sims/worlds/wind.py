@@ -1,7 +1,6 @@
-"""Wind: a mean, discrete gusts, and turbulence after Dryden. Pure functions and filters.
+"""Wind: a mean, discrete gusts, and turbulence after Dryden; SI units, NED.
 
-After MIL-F-8785C, "Flying Qualities of Piloted Airplanes" (1980), section 3.7, the low-altitude
-model. Everything here is in SI units and NED.
+Source: MIL-F-8785C, "Flying Qualities of Piloted Airplanes" (1980), section 3.7, low altitude.
 """
 
 from __future__ import annotations
@@ -81,10 +80,9 @@ class WindSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     Attributes:
         velocity: Mean velocity of the air, m/s north, east, down: [5, 0, 0] blows to the north.
         gusts: Discrete gusts.
-        turbulence: Strength of the turbulence after Dryden (MIL-F-8785C, low altitude): ``none``,
-            ``light``, ``moderate``, ``severe``, or the wind at a height of 20 feet, m/s, which
-            makes it. Its scale depends on a vehicle's height above the world's zero, and how
-            quickly it is met on the vehicle's speed through the air.
+        turbulence: Strength of Dryden's turbulence (MIL-F-8785C, low altitude): ``none``,
+            ``light``, ``moderate``, ``severe``, or the wind at 20 feet, m/s. Its scale depends on a
+            vehicle's height above the world's zero and airspeed.
     """
 
     velocity: Vector3 = (0.0, 0.0, 0.0)

@@ -1,7 +1,6 @@
 """Vehicle of an AirSim server: requests at the start, measurements, and orders.
 
-Events are made of AirSim's structures out of the vehicle's local NED, into ``map``; that raises
-`ValueError` if a number is not finite, or a rotation is none.
+Events are made of its local NED, into ``map``, or a `ValueError` if no finite number or rotation.
 """
 
 from __future__ import annotations
@@ -63,8 +62,7 @@ class RemoteCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     Attributes:
         name: As the server has it: ``0``, ``front_center``.
-        images: What is asked for. Segmentation is asked for as the type "infrared", whose grey
-            level is the object's ID.
+        images: Kinds asked for; segmentation as "infrared", whose grey level is the object's ID.
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
@@ -82,19 +80,16 @@ class AirsimClientConfig(NodeConfig):
         host: Where the server is.
         port: The server's.
         vehicle: Name that the vehicle has there; empty for the first by name.
-        flavour: Whose server it is: ``airsim`` (and Colosseum's), ``cosys``, or ``auto``: by the
-            version that the server reports.
-        cameras: The cameras whose images are asked for; if none is given, those of the server's
-            settings, or else the camera ``0``.
+        flavour: Kind of server: ``airsim`` (and Colosseum's), ``cosys``, or ``auto``, by its
+            version.
+        cameras: Cameras asked for images; if empty, those of the server's settings, or ``0``.
         image_rate: Sets of images per second; in real time at most so many.
         imu_rate: Samples of the IMU and of the true state per second; in lockstep also steps.
         control_rate: Rate at which the newest set-point is sent, Hz.
-        takeover: Whether it takes API control and passes on commands and set-points; if not,
-            somebody else flies.
+        takeover: Take API control and pass on commands and set-points; else somebody else flies.
         setpoint_timeout: Age beyond which a set-point is ignored, unless it is one of position.
         start_timeout: Real time in which the server has to answer at the start, and after a loss.
-        call_timeout: Real time after which a call without a reply is given up, and its connection
-            is replaced.
+        call_timeout: Real time without a reply after which a call's connection is replaced.
         on_loss: What follows when a connection is lost: the run stops, or goes on with a new one.
     """
 

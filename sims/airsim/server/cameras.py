@@ -70,8 +70,8 @@ class ServedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     Attributes:
         name: Its name, unique on its vehicle.
         vehicle: The vehicle that carries it; empty for every vehicle.
-        position: Position on the body, metres forward, right, down (FRD); by default that of
-            AirSim's camera of this name, or the body's origin.
+        position: Position on the body, metres FRD; by default that of AirSim's camera of this name,
+            or 0.
         orientation: Roll, pitch, yaw, degrees, applied yaw first; positive pitch is upwards. By
             default that of AirSim's camera of this name, or forward.
         captures: Settings of each type of image; 256×144 pixels of 90° for others.

@@ -1,9 +1,8 @@
 """Readings, estimates and recordings of scripts.
 
-Scripts read the newest sample that a vehicle's node has sent, as AirSim has it; publish poses that
-they have estimated, so that these are judged, by a method that AirSim lacks; and record images
-with the vehicles' true poses in AirSim's format, whose source is ``RecordingFile`` and
-``FileSystem`` of AirSim 1.8.1.
+Scripts read the newest sample of a vehicle's node, publish estimated poses to be judged (a method
+that AirSim lacks), and record images and true poses in the format of AirSim 1.8.1's
+``RecordingFile`` and ``FileSystem``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Movable parts of a world for scripts: settings, and bodies of the model.
 
-Each is a body with a free joint, so its pose is part of the world's state, which physics, cameras
-and lidars have anyway. A held body is heavy, has no weight, and is put back at each millisecond:
-what flies against it meets a wall. It does not meet the world, which would push it out of whatever
-it was put into.
+Each is a body with a free joint, whose pose physics, cameras and lidars know anyway. A held body is
+heavy, has no weight, and is put back at each millisecond: it is a wall to others, and does not meet
+the world, which would push it out.
 """
 
 from __future__ import annotations
@@ -58,8 +57,8 @@ class SpareObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             upright), or a ``person``, ``car``, ``door`` or ``box``, which stands on its position.
         scale: Factors on length, width and height, which cannot be changed later.
         count: Maximum number of them at a time.
-        colour: Red, green and blue, 0 to 1; grey, or that of its kind, if left out. A cylinder is
-            as wide as it is long.
+        colour: Red, green, blue, 0 to 1; by default grey or the kind's. A cylinder is as wide as
+            long.
     """
 
     asset: Basic | Kind

@@ -1,8 +1,7 @@
 """Clients' tasks for vehicles: a single task each, 50 times a second of simulated time.
 
-A task is pure: time and state come in, set-points go out. Positions and velocities are of ``map``,
-angles in radians. The rules are AirSim's; what differs is in docs/reference/airsim.md. Which
-methods start a task is in `flight`.
+A task is pure: time and state (``map``, radians) come in, set-points go out. The rules are
+AirSim's; docs/reference/airsim.md has the differences. Methods that start a task are in `flight`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Server for scripts written for AirSim: its node, and its control of time.
 
-The node stands beside the vehicles in the run's world, reads their true state, and sends them
-commands and set-points as any pilot does.
+It reads the vehicles' true state, and sends them commands and set-points as any pilot does.
 """
 
 from __future__ import annotations
@@ -63,33 +62,27 @@ class AirsimServerConfig(NodeConfig):
     """Settings of the server.
 
     Attributes:
-        host: Address to listen on; ``0.0.0.0`` for all of this machine's. Whoever can connect can
-            fly.
+        host: Address to listen on; ``0.0.0.0`` for all of the machine's. Any client can fly.
         port: Port to listen on; 0 for any that is free.
         connections: Clients that may be connected at once.
-        flavour: Whose clients call: ``airsim`` (1.8.1, and Colosseum's) or ``cosys`` (Cosys-AirSim
-            3.5). They differ in the colours' order, among others.
-        time: ``running``: time runs, at the run's `speed`. ``paused``: it stands from the start,
-            and a script steps it. ``awaited``: it runs only while a vehicle does what a client has
-            told it to. With the last two, a script whose only waiting is for replies gives equal
-            runs; with ``awaited``, if it waits for each task before it asks for anything.
-        default_vehicle: Name of the vehicle that an empty name stands for; empty for the first by
-            name.
+        flavour: Kind of clients: ``airsim`` (1.8.1, Colosseum) or ``cosys`` (3.5; RGB for BGR, …).
+        time: ``running``: at the run's `speed`. ``paused``: from the start, stepped by a script.
+            ``awaited``: only while a vehicle does a client's task. The last two give equal runs to
+            scripts that wait only for replies; ``awaited``, if each task is waited for before
+            anything is asked.
+        default_vehicle: Vehicle that an empty name stands for; empty for the first by name.
         abandoned: Real time after which the run ends if time stands since the last client has left.
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.
         estimators: Estimators in clients' scripts, whose poses are judged.
-        settings: The settings.json that clients get when they ask for it: its text, or a file;
-            empty for one that says what runs.
-        cameras: Cameras that clients may ask for images, besides those of the vehicles, and
-            AirSim's default ones.
+        settings: The settings.json for clients: text, or a file; empty to describe the run.
+        cameras: Cameras for clients besides the vehicles' and AirSim's default ones.
         camera_processes: Number of processes that render what clients ask for.
         render_threads: Threads of the software renderer in each of them.
         lidar_frame: Frame of lidars' points, as AirSim's ``DataFrame``.
         recording: What `startRecording` records.
         sensor_names: Names of vehicles' sensors by those by which scripts call them.
         objects: Objects that clients can bring into the world, and take out again.
-        movable: Regular expressions: the geoms and bodies of the world, by their whole names, that
-            clients can move.
+        movable: Regular expressions of whole names of geoms and bodies that clients can move.
     """
 
     host: str = "127.0.0.1"

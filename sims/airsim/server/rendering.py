@@ -1,9 +1,7 @@
 """AirSim's types of image, and the worker process to draw clients' images.
 
-The types are made of what a camera sees: colours, depth and object numbers. As numbers, the types
-that are coloured give their red channel, 0 to 1. As colours, the types that are numbers are greys
-from black, 0, to white, 1 and more. Where nothing is, as in the sky, depth is `SKY`, the ID is 0,
-and there is no normal.
+As numbers, coloured types give their red channel, 0 to 1; as colours, types of numbers are greys
+from black, 0, to white, 1 and more. Where nothing is, depth is `SKY`, the ID 0, without normal.
 """
 
 from __future__ import annotations

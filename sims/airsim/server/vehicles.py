@@ -1,7 +1,4 @@
-"""Vehicles as seen by clients: poses, motion, and contacts.
-
-There are two kinds: multirotors, and the free cameras of computer-vision mode.
-"""
+"""Vehicles, multirotors and free cameras, as seen by clients: poses, motion, and contacts."""
 
 from __future__ import annotations
 
