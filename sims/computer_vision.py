@@ -186,11 +186,7 @@ def _velocity_on(course: Course, stamp: int) -> npt.NDArray[np.float64]:
 
 
 def read_tum(path: Path) -> npt.NDArray[np.float64]:
-    """Return a TUM file's rows: time since the first (s), x, y, z, qx, qy, qz, qw; n ≥ 2, rising.
-
-    Raises:
-        ValueError: The file is missing or holds something else.
-    """
+    """Return rows of stamp (from 0 s), x, y, z, qx, qy, qz, qw; `ValueError` for a wrong file."""
     try:
         rows = np.loadtxt(path, ndmin=2, comments="#")
     except (OSError, ValueError) as error:

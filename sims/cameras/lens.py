@@ -81,11 +81,7 @@ def faces(info: CameraInfo) -> tuple[Face, ...]:
 
 
 def undistorted(info: CameraInfo) -> tuple[CameraInfo, Maps, Maps]:
-    """Return a lens's pinhole camera of equal focal length and principal point, and its lookup.
-
-    The lookup is column and row of the lens's image for each pixel, shape (h, w) each, outside it
-    where the lens does not see.
-    """
+    """Return an equal pinhole camera, and columns and rows in the lens's image, (h, w)."""
     pinhole = CameraInfo(
         width=info.width, height=info.height, fx=info.fx, fy=info.fy, cx=info.cx, cy=info.cy
     )

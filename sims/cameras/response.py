@@ -133,11 +133,7 @@ def noise_steps(
 def noisy_depth(
     depth: npt.NDArray[np.float32], coefficient: float, random: np.random.Generator
 ) -> npt.NDArray[np.float32]:
-    """Return depth (metres) plus Gaussian noise with sigma = coefficient · depth².
-
-    Source: Khoshelham and Elberink, Sensors 2012, eq. 9. ``inf`` stays; nothing is nearer than
-    zero.
-    """
+    """Return depth (m; ``inf`` stays) plus noise of k depth² (Khoshelham, Elberink 2012, eq. 9)."""
     if coefficient <= 0.0:
         return depth
     noise = gaussian(depth.shape, coefficient, random)
@@ -237,10 +233,7 @@ class ExposureControl:
         self._seen.append((stamp, exposure * gain, light))
 
     def next(self, stamp: int) -> tuple[float, float]:
-        """Return exposure time (seconds) and gain of an exposure beginning at a rising `stamp`, ns.
-
-        The last image delivered *before* it counts, whenever this is called.
-        """
+        """Return exposure time (s) and gain at a rising stamp (ns), by the last image before."""
         settings = self._settings
         before = [seen for seen in self._seen if seen[0] < stamp]
         if before:

@@ -377,11 +377,7 @@ def vertical_fov(spec: CameraSpec) -> float:
 
 
 def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: str) -> None:
-    """Mount a camera, or both of a stereo rig, on a body, whose axes are MuJoCo's: FLU.
-
-    Raises:
-        ValueError: The world has no such body, or has a camera of that name already.
-    """
+    """Mount a camera, or a stereo rig, on a body (FLU); `ValueError` for a wrong or taken name."""
     body = world.body(body_name)
     for eye in eyes(spec):
         name = f"{prefix}{eye.name}"
@@ -404,11 +400,7 @@ def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: s
 
 
 def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ...]) -> str:
-    """Add a body with cameras, without collisions and gravity; return their names' prefix.
-
-    Raises:
-        ValueError: The world has a body of that name, or two specs share theirs.
-    """
+    """Add a body with cameras, without collisions; return their prefix; `ValueError` if taken."""
     if world.body(name) is not None:
         raise ValueError(f"free camera {name}: expected a name of its own, but the world has one")
     # A free joint, because the renderer takes qpos; a mass, because a free joint needs one.

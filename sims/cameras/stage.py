@@ -297,10 +297,7 @@ class Stage:
 
 
 def metric_depth(buffer: Depths) -> Depths:
-    """Return planar depth in metres from a reversed depth buffer, shape (h, w), exact to float32.
-
-    The projection writes ``d = near (far - z) / (z (far - near))``, solved here for z.
-    """
+    """Return planar depth, metres, from ``d = near (far - z) / (z (far - near))``, shape (h, w)."""
     depth = buffer * np.float32(FAR - NEAR)
     depth += np.float32(NEAR)
     np.divide(np.float32(NEAR * FAR), depth, out=depth)

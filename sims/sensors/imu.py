@@ -206,11 +206,7 @@ class ImuModel:
     def measure(
         self, angular_velocity: Vector3, specific_force: Vector3, thrusts: Any
     ) -> tuple[Vector3, Vector3]:
-        """Return the next sample of true rad/s and m/s², in the IMU's frame.
-
-        Args:
-            thrusts: Thrust of each of the four rotors, 0 to 1 of its greatest.
-        """
+        """Return the next sample, of true rad/s, m/s² in its frame, and rotors' thrusts, 0 to 1."""
         rates, force = angular_velocity, specific_force
         if self._shaken:
             rates, force = self._shake(rates, force, thrusts)

@@ -179,11 +179,7 @@ class Controller:
         self._in_velocity = False
 
     def follow(self, setpoint: Setpoint, state: State) -> None:
-        """Follow a set-point; of velocity without yaw rate, with the heading of `state`.
-
-        Raises:
-            ValueError: The set-point has a `setpoints.fault`.
-        """
+        """Follow a set-point (of velocity: heading of `state`); `ValueError` for a `fault`."""
         reason = fault(setpoint)
         if reason is not None:
             raise ValueError(reason)

@@ -164,10 +164,7 @@ class PositionController:
     def to_velocity(
         self, velocity: Vector3, yaw: float, yaw_rate: float = 0.0, heading_frame: bool = False
     ) -> None:
-        """Move at a velocity (m/s NED), looking to `yaw` and turning on from there at `yaw_rate`.
-
-        With `heading_frame`, x of the velocity is along the vehicle's heading, y to its right.
-        """
+        """Move at a velocity (m/s NED, or right of the heading), from `yaw` on at `yaw_rate`."""
         self._vx, self._vy, self._vz = velocity
         self._ax = self._ay = self._az = 0.0
         self.yaw = yaw

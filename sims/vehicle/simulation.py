@@ -126,11 +126,7 @@ class Simulation:
         return self._steps * TIMESTEP_NS
 
     def advance_to(self, stamp_ns: int) -> None:
-        """Step, with the present motor commands, to the last whole millisecond ≤ `stamp_ns`.
-
-        Raises:
-            PhysicsDivergedError: The state is no longer finite.
-        """
+        """Step to the last whole millisecond up to a time, or raise a `PhysicsDivergedError`."""
         steps = stamp_ns // TIMESTEP_NS - self._steps
         if steps <= 0:
             return

@@ -276,11 +276,7 @@ class FogMotion(Motion, frozen=True):
 
 
 def change_lights(scene: Scene, specs: tuple[LightSpec, ...]) -> Dynamics:
-    """Return how lights of a world change.
-
-    Raises:
-        ValueError: The world has no such light, or its direction cannot change.
-    """
+    """Return how lights change; `ValueError` if unknown, or of a direction for all or headlight."""
     world: Any = scene.spec
     lights = {light.name: light for light in world.lights if light.name}
     lights[HEADLIGHT] = world.visual.headlight

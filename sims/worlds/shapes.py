@@ -145,11 +145,7 @@ def blob(radii: tuple[float, float, float], bumps: Array, window: Window) -> Sur
 def arch(
     inner: float, outer: float, depth: float, angles: int, per_metre: tuple[float, float]
 ) -> Surface:
-    """Return a half ring standing on its feet, with the opening along x.
-
-    Args:
-        per_metre: Texture coordinates of a metre, across and down.
-    """
+    """Return a half ring on its feet, open along x, with texture coordinates of a metre."""
     turn = np.linspace(np.pi, 0.0, angles + 1)
     rims = {radius: np.stack([np.cos(turn), np.sin(turn)], 1) * radius for radius in (inner, outer)}
     around = turn[::-1] * (inner + outer) / 2.0 * per_metre[0]

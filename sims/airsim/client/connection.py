@@ -143,10 +143,7 @@ class Connection:
         return future.result()
 
     async def settle(self) -> None:
-        """In lockstep, wait until all calls before have started, and replies due by now are here.
-
-        A server starts the requests of a connection in order.
-        """
+        """In lockstep, wait until all calls before have started, and for replies due by now."""
         if self._node.clock.kind == "lockstep":
             await self.call("ping")
 

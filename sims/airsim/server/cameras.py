@@ -361,11 +361,7 @@ class Images:
         *,
         external: bool = False,  # whether cameras that no vehicle carries are meant: there are none
     ) -> Awaitable[list[wire.ImageResponse]]:
-        """Take images of the state at the call, awaitable; simulated time does not wait.
-
-        Raises:
-            RpcError: There is no such camera or type, or it is too much.
-        """
+        """Take images of the state at the call, awaitable, or raise `RpcError`; time goes on."""
         return self._develop(self._expose(requests, vehicle, flavour, external))
 
     def _expose(

@@ -38,10 +38,7 @@ class Incidents:
         self._logged: set[tuple[str, str]] = set()
 
     def refused(self, address: str, text: str) -> None:
-        """Log a refused call, once for each host and kind: texts equal but for numbers.
-
-        Scripts do not see the errors of calls that they do not join.
-        """
+        """Log a refusal, unseen by some scripts, once for each host and text but numbers."""
         self.counts["refused"] += 1
         key = address.rpartition(":")[0], re.sub(r"[\d.]+", "#", text)
         is_new = key not in self._logged and len(self._logged) < MOST_WARNINGS

@@ -76,11 +76,7 @@ def spare_objects(node: str, specs: tuple[SpareObject, ...]) -> dict[str, SpareO
 def add_movables(
     scene: Scene, node: str, specs: tuple[SpareObject, ...], movable: tuple[str, ...]
 ) -> None:
-    """Add spare objects to a world and free its movable parts, all of them held.
-
-    Raises:
-        ValueError: An expression matches nothing, or something that cannot be moved.
-    """
+    """Add spare and free movable parts, held; `ValueError` for an expression without any."""
     if not specs and not movable:
         return
     world = scene.spec.copy().compile()

@@ -77,11 +77,7 @@ class Tasks:
         self._send(order(stamp=self._clock.now(), source=self._source, vehicle=vehicle.name))
 
     def start(self, vehicle: ServedMultirotor, task: Task) -> Reply:
-        """Start a task now, in place of another, and return the reply to come.
-
-        Its first order is the next update's. Stopped motors are armed: ask before whether they may
-        be.
-        """
+        """Start a task, arming stopped motors, in place of another; return the reply to come."""
         slot = self._slots.setdefault(vehicle.name, _Slot(vehicle))
         slot.finish(False)
         slot.result = result = asyncio.get_running_loop().create_future()

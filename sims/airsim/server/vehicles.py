@@ -211,11 +211,7 @@ class Vehicles(dict[str, ServedVehicle]):
         return vehicle
 
     def drawn_state(self, now: int) -> tuple[int, Floats]:
-        """Return time (ns) and generalised positions, shape (nq,), a copy, to draw now.
-
-        They are of the last whole millisecond, as methods tell; free cameras are where they were
-        put.
-        """
+        """Return time (ns) and a copy of positions, shape (nq,), of the last whole millisecond."""
         if self._world.simulation is None:
             stamp, qpos = now, self._world.model.qpos0.copy()
         else:
