@@ -22,11 +22,8 @@ from nodes.data.dataset.recording import Rig
 INTEGRATED = 5.0  # seconds of IMU integration
 _POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.005, 0.1, 0.3, 0.005, 1e-5
 """Metres; pixels, global and rolling shutter; metres; pixels."""
-_MOST = 0.99
-"""Least share of points, and of depths, within the limit; others are within three times it."""
-
-_LATE, _PLACE, _TURN = 2e-4, 5e-4, 5e-4
-"""Largest errors of stamps and poses: seconds, metres, radians."""
+_MOST = 0.99  # least share of points, and of depths, within the limit; the rest: within 3 times
+_LATE, _PLACE, _TURN = 2e-4, 5e-4, 5e-4  # largest errors of stamps and poses: s, m, rad
 
 
 class Figure(msgspec.Struct, frozen=True):

@@ -31,8 +31,7 @@ Floats = npt.NDArray[np.float64]
 
 
 CENTRE = np.array([0.0, 0.0, -1.5])  # about where the vehicle flies, metres in ``map``
-LOW, HIGH = np.array([-6.0, -6.0, -5.0]), np.array([6.0, 6.0, 0.0])
-"""Corners of the room, metres in ``map``: the floor is at 0, the ceiling at -5."""
+LOW, HIGH = np.array([-6.0, -6.0, -5.0]), np.array([6.0, 6.0, 0.0])  # corners, metres in ``map``
 NEAREST = 0.45  # depth, metres; only the vehicle itself is nearer to a camera
 _COUNT = 130
 

@@ -82,8 +82,7 @@ class SvoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 Floats = npt.NDArray[np.float64]
 
-INSTALL = "make svo, or: pip install --no-deps 'svo-cpp>=1.5'"
-"""Installation of SVO without ``opencv-python``, which overwrites the headless one's files."""
+INSTALL = "make svo, or: pip install --no-deps 'svo-cpp>=1.5'"  # without ``opencv-python``
 
 
 class SvoProcess:

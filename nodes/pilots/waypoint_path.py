@@ -148,8 +148,7 @@ def _smooth(values: Floats, width: int) -> Floats:
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Heading = Literal["path", "fixed", "sweep"]
 
-_SWEEP_ANGLE, _SWEEP_PERIOD = np.radians(40.0), 6.0
-"""Radians to each side, and seconds, of a sweeping heading."""
+_SWEEP_ANGLE, _SWEEP_PERIOD = np.radians(40.0), 6.0  # of a sweep: radians to each side, seconds
 _MOST = 4.0  # highest acceleration for a multirotor to follow an excitation closely, m/s²
 
 

@@ -19,8 +19,7 @@ from runtime import Node
 from runtime.time.schedule import SECOND
 
 _TOO_LATE = 1 << 63  # first number of nanoseconds beyond 64 bits
-EPOCH = "2020-01-01T00:00:00Z"
-"""Default start of a run in files of other tools, which expect Unix time with 19 digits."""
+EPOCH = "2020-01-01T00:00:00Z"  # default start of a run in exported files: Unix time of 19 digits
 _LATEST = 7 << 60  # latest epoch (ns), with room for a run of decades
 _SHOWN = 60  # characters of a wrong line shown in a message
 

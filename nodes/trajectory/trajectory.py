@@ -22,8 +22,7 @@ Stamps = npt.NDArray[np.int64]
 UNIT_LENGTH = 0.01  # tolerated deviation of a quaternion's length from 1, for files of few decimals
 
 
-_CALENDAR = 10**17
-"""Least stamp (ns) taken for Unix time (1973); stamps below count from some beginning."""
+_CALENDAR = 10**17  # least stamp (ns) taken for Unix time (1973)
 _ROW = np.dtype([("stamp", "i8"), ("position", "f8", 3), ("orientation", "f8", 4)])
 _BLOCK = 1024  # rows of a pose, and how many are written at once: 64 KiB take the loop 30 µs
 

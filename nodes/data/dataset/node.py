@@ -20,8 +20,7 @@ from runtime.paths import OutputPath
 
 _LAYOUTS: dict[str, type[Recording]] = {"euroc": Euroc, "tum_rgbd": TumRgbd, "tum_mono": TumMono}
 _AT_ONCE = 4  # image files written concurrently
-_WAITING = 64
-"""Images of a kind waiting to be written; beyond, lockstep waits and real time drops the oldest."""
+_WAITING = 64  # images of a kind waiting for the disk: then lockstep waits, real time drops some
 
 
 class DatasetConfig(NodeConfig):

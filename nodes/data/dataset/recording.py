@@ -82,8 +82,7 @@ def _belongs(camera: CameraAnnouncement, named: str) -> bool:
 
 Pixels = npt.NDArray[Any]
 
-_DEPTH = (cv2.IMWRITE_PNG_COMPRESSION, 1)
-"""PNG options of depth: third of the default size, 1.5 times the time; not for colour."""
+_DEPTH = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # PNG options of depth: a third of the usual size
 
 
 class ImageFile:

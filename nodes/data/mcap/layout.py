@@ -22,12 +22,10 @@ from runtime.errors import VisnavError
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # head of each record: opcode, length of the content
-_FOOTER = struct.Struct("<BQQQI")
-"""With its head: where the summary begins, where its offsets do, checksum of the summary."""
+_FOOTER = struct.Struct("<BQQQI")  # with its head: begin of summary and of offsets, checksum
 _IS_FOOTER, _IS_CHUNK, _IS_DATA_END, _LAST, _PRIVATE = 0x02, 0x06, 0x0F, 0x0F, 0x80
 LARGEST = 1 << 29  # largest permitted size of an unpacked chunk, bytes: far above any writer's
-_CHUNK = struct.Struct("<QQQII")
-"""First and last time, size when unpacked, checksum, length of the compression's name."""
+_CHUNK = struct.Struct("<QQQII")  # first and last time, unpacked size, checksum, length of name
 _ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
 
 END_WITHOUT_INDEX = (

@@ -32,8 +32,7 @@ from runtime.wire import ALIGNED, unpack
 
 TYPE = "std_msgs/msg/UInt8MultiArray"
 _LENGTH = struct.Struct("<I")
-_HEAD = struct.Struct("<4sIII")
-"""CDR's header (little endian), no dimensions, no offset, and the number of bytes."""
+_HEAD = struct.Struct("<4sIII")  # CDR's header (little endian), no dimensions, no offset, size
 _CDR = b"\x00\x01\x00\x00"
 
 _decode = msgspec.msgpack.Decoder(tuple[str, list[tuple[str, list[int], int]], msgspec.Raw]).decode

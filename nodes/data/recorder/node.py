@@ -41,8 +41,7 @@ class McapRecorder(Node[McapRecorderConfig]):
         self._backlog = Backlog(self.config.memory, self.config.when_full)
         self._failed: asyncio.Future[RecordingError] | None = None
         self._ended_run = False
-        self._unfinished: int | None = None
-        """When the run ended (ns), while its end is yet to be written."""
+        self._unfinished: int | None = None  # end of the run (ns), while yet to be written
         self._warned_at = 1
         self._waits = 0
         self._waited = 0.0

@@ -183,8 +183,7 @@ class FileWriter:
         self._complaints: set[str] = set()
         self._written = 0
         self._in_chunk = 0
-        self._chunk_began: tuple[float, int] | None = None
-        """Real seconds, and the run's nanoseconds."""
+        self._chunk_began: tuple[float, int] | None = None  # real seconds, run's nanoseconds
 
     def run(self, file: int) -> Reply:
         """Write the pieces from a file descriptor, and close the file."""

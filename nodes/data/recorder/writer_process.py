@@ -33,13 +33,10 @@ from runtime.wire import pack
 
 SMALL = 512  # assumed size of an event without arrays, bytes
 _LARGE = 1 << 14  # least size of an event dropped by ``drop_images``, bytes
-_PAUSE = 0.005
-"""Seconds between two looks at an empty backlog: cheaper than waking the thread at every event."""
+_PAUSE = 0.005  # seconds between looks at an empty backlog: cheaper than waking at every event
 _AT_ONCE = 1 << 16  # bytes handed over together
 _IN_A_ROW = 16  # events in a row before the loop gets the GIL
-STANDSTILL = 10.0
-"""Real seconds without a sign of life (such as the file's growth) until the process is given up."""
-
+STANDSTILL = 10.0  # real seconds without growth or other signs of life, before giving up
 _LOOK = 0.5  # real seconds between checks of the process
 _PIPE = 1 << 20  # size of the pipe, bytes: Linux's maximum without privileges
 

@@ -23,8 +23,7 @@ from runtime.time.schedule import SECOND
 Batch = list[Timed]
 
 MOST = 64  # events of a batch
-LARGEST = 4 << 20
-"""Bytes of a batch, but for its last event. Where batches end depends on the recording only."""
+LARGEST = 4 << 20  # bytes of a batch, without its last event; fixed, for reproducible batches
 _SMALL = 512
 
 

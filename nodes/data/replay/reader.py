@@ -69,8 +69,7 @@ class Reader(ABC):
         """Release all resources."""
 
 
-USUAL = Category.SENSOR | Category.GEOMETRY | Category.VEHICLE
-"""Categories sent by default: reserved for simulators."""
+USUAL = Category.SENSOR | Category.GEOMETRY | Category.VEHICLE  # categories sent by default
 
 
 class Choice:

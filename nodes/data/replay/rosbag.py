@@ -42,7 +42,7 @@ _PARTS = {
     "image", "image_raw", "image_rect", "image_color", "image_rect_color", "image_mono",
     "camera_info", "compressed", "compressedDepth", "depth", "color", "rgb", "depth_registered",
 }  # fmt: skip
-"""Parts of topic names for the kind of data rather than its source."""
+"""Parts of topic names for the kind of data, not its source."""
 
 
 def chosen(

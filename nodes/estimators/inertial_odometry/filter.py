@@ -27,27 +27,23 @@ from nodes.estimators.inertial_odometry.preintegration import (
     crosses,
 )
 
-THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))
-"""Slices of the error state; orientation errors are small rotations in the IMU's frame."""
+THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))  # slices of the error state
 G = slice(15, 17)  # slice of gravity's direction: small rotations about the two level axes
 POSE = slice(0, 6)
 _FRAME = 7  # states considered of a key frame: pose, and mean error of its inverse depths, 1/m
 _SIZE = 17
 GRAVITY = 9.81
 _SPEED = 3.0  # standard deviation of the unknown velocity at the start, m/s
-_TILT = 0.35
-"""Standard deviation of gravity's direction from first samples, radians: that of 3.5 m/s²."""
+_TILT = 0.35  # standard deviation of gravity's first direction, rad: that of 3.5 m/s²
 _NO_TILT = 1.5  # the same without samples
 _UNSTATED = np.array([0.01, 0.1])  # standard deviations of unannounced biases: rad/s, m/s²
 _STEPS = 2
 _HUBER = 2.0
 _FLOOR = 1e-3  # pose error accepted as no surprise: metres, radians
-_IMPLAUSIBLE = 60.0
-"""Largest squared Mahalanobis distance (6 degrees of freedom) of a plausible map pose."""
+_IMPLAUSIBLE = 60.0  # largest squared Mahalanobis distance (6 degrees of freedom) of a pose
 _AHEAD = 0.8  # least share of a sighting's landmarks ahead of the camera in each step
 _BESIDE = 2  # images remembered beside the key frames, numbered -1 and -2
-_ORIGIN = 2e-4
-"""Standard deviation of the pose at the start, metres and radians: the camera is the world."""
+_ORIGIN = 2e-4  # standard deviation of the first pose, m, rad: the camera is the world
 _VAGUE = 0.1  # standard deviation of a key frame's pose without landmarks: metres, radians
 Measurement = Callable[["State"], tuple[Floats, Floats] | None]
 """Returns Λ and Aᵀr about a state, by its pose and by those of key frames; `None`: impossible."""

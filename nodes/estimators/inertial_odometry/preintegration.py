@@ -23,8 +23,7 @@ from nodes.estimators.odometry import Depth, rays
 Floats = npt.NDArray[np.float64]
 
 _GAP = 3.0  # sampling intervals; the motion in a longer gap between samples is unknown
-_UNKNOWN = np.array([1.0, 5.0])
-"""Standard deviations then: of the angular velocity, rad/s, and of the acceleration, m/s²."""
+_UNKNOWN = np.array([1.0, 5.0])  # standard deviations then: of rates (rad/s), acceleration
 
 
 class Preintegrated(msgspec.Struct, frozen=True, eq=False):

@@ -30,19 +30,15 @@ from nodes.estimators.visual_odometry.patches import Rows
 from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings
 from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces, surfaces_at
 
-_KNOWN = 0.3, 0.03
-"""Standard deviations of velocity (m/s) and gravity (radians) required to use the IMU."""
+_KNOWN = 0.3, 0.03  # largest deviations of velocity (m/s) and gravity (rad) to use the IMU
 _READING = 0.8  # noise of a depth reading, relative to a single pixel's; errors of place included
 _BENT = 0.003  # noise of depth on surfaces not quite planar, relative to inverse depth
-_PLACED = 0.5, 0.5
-"""Constant noise of a landmark's place, relative to a sighting: of pixel, of depth."""
+_PLACED = 0.5, 0.5  # constant noise of a landmark's place, of a sighting's: pixel, depth
 _COMMON, _COMMON_BY_EYES = (0.02, 0.0), (0.02, 0.1)
 """Shares common to all landmarks' variance in an image, of depth, of stereo: sightings, places."""
 _MISFIT = 1.5  # largest median error of the landmarks, in standard deviations of a pixel
-_PATIENCE, _DOUBTED = 0.4, 0.6
-"""Averaging time (s) and limit of the share of contradicting images; the filter then restarts."""
-_PREDICTED = np.diag(np.repeat([0.05**-2, 0.02**-2], 3))
-"""Information of the predicted pose in the choice of landmarks: 5 cm, 0.02 radians."""
+_PATIENCE, _DOUBTED = 0.4, 0.6  # averaging time (s), limit of contradicting share; then restart
+_PREDICTED = np.diag(np.repeat([0.05**-2, 0.02**-2], 3))  # of the predicted pose: 5 cm, 0.02 rad
 _SLOTS = (-1, -2)  # numbers of possible reference images of an alignment, beside the key frames'
 
 

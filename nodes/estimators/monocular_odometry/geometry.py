@@ -218,8 +218,7 @@ class Keyframe(msgspec.Struct, frozen=True, eq=False):
     pixels: Floats  # their pixels in the image, shape (n, 2)
 
 
-BORDER = 12
-"""Pixels at the edge of the image without new corners: optical flow needs a neighbourhood."""
+BORDER = 12  # pixels at the edge without new corners: flow needs a neighbourhood
 SPACING = 12  # pixels between corners
 _QUALITY = 0.005
 

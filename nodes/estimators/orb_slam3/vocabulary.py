@@ -26,8 +26,7 @@ Integers = npt.NDArray[np.int64]
 
 _BYTES = 32  # bytes of an ORB descriptor
 _ITERATIONS = 10  # of moving the centres, at most; later ones change next to nothing
-_SCORING, _WEIGHTING = 0, 0
-"""L1 norm and tf-idf, as expected by ORB-SLAM3 (DBoW2's ScoringType, WeightingType)."""
+_SCORING, _WEIGHTING = 0, 0  # L1 norm, tf-idf (DBoW2's ScoringType, WeightingType)
 _FIELDS = 2 + _BYTES + 1  # numbers on a node's line: parent, leaf or not, descriptor, weight
 
 

@@ -44,8 +44,7 @@ _CORRELATED = 9.0  # number of correlated residuals counted as a single residual
 _AGREES = 3.0  # inlier threshold of a point, standard deviations
 _OFF = 0.5  # additional tolerance of an edge, pixels
 _FEW = 30  # least number of edges for a meaningful agreement
-_OTHER, _OTHER_SHARE = 6.0, 0.1
-"""Least difference of another surface: standard deviations, share of inverse depth."""
+_OTHER, _OTHER_SHARE = 6.0, 0.1  # least difference of another surface: sigmas, share
 _HIDDEN = 1.15  # least inverse depth of a surface hiding an edge, relative to the edge's
 _ORDINARY = np.diag([1e2, 1e-2])  # prior information on gain and offset, about equal exposures
 _SMALL = 2e-4  # convergence threshold of a step in full images: metres, radians

@@ -56,14 +56,11 @@ _FLOW_WINDOW = 15
 _LARGE = 320  # least side (pixels) of images halved before following corners
 _AGREES = 4.0  # inlier threshold of a landmark, standard deviations
 _FEW = 120  # number of corners sufficient for an approximate pose, at most
-_ENOUGH = 60 / 512**2
-"""Agreeing landmarks per pixel sufficient for a pose; else edges and surfaces are aligned."""
-BELIEVED = 0.03
-"""Weight of an alignment beside landmarks: neighbouring pixels' errors are not independent."""
+_ENOUGH = 60 / 512**2  # agreeing landmarks per pixel for a pose without alignment of edges
+BELIEVED = 0.03  # weight of an alignment beside landmarks: its pixels' errors correlate
 _FEWEST = 4  # least number of agreeing landmarks beside an alignment
 _SEARCHED = 20  # number of newest key frames searched to relocalize a lost camera
-_SEARCHED_PER_IMAGE = 2
-"""Key frames tried with each image, because each takes as long as tracking does."""
+_SEARCHED_PER_IMAGE = 2  # key frames tried with each image: each takes as long as tracking
 _SURE = 0.6  # least share of agreeing landmarks, among those searched, in a relocalized pose
 _NEAR = 64.0  # margin around the image for landmarks soon in view, pixels
 _SOON = 8  # images between updates of the list of such landmarks

@@ -26,8 +26,7 @@ from nodes.estimators.odometry import (
 from nodes.estimators.visual_odometry.patches import Patches, Rows
 from nodes.estimators.visual_odometry.surfaces import Surfaces, surfaces_at
 
-_SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5
-"""Limits of how much smaller, larger or more slanted a landmark may look than at first."""
+_SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5  # limits of a landmark's look relative to the first
 _MEAN_OF = 20.0  # depth readings in the mean of a landmark's depth; a moving mean beyond
 _CONTRADICTS = 5.0  # largest difference of a depth reading from a landmark's, standard deviations
 _HIDES = 0.05  # least difference of another surface from a landmark, relative to inverse depth

@@ -109,11 +109,9 @@ def _cut_warped(patches: Patches, images: Mapping[int, Grey], centre: Floats, ha
 
 _UNSURE = 0.1  # largest standard deviation of position of a usable alignment, metres
 _AGREE = 0.6  # least share of agreeing points in view
-_AGREE_AGAIN = 0.8
-"""the same of edges after a loss, when the alignment may have found the wrong ones,"""
+_AGREE_AGAIN = 0.8  # the same of edges after a loss, when these may be the wrong ones
 _POINTS = 60  # and their least number
-_PRIOR = 0.02, 0.02
-"""Standard deviations of the pose expected by constant velocity: metres, radians."""
+_PRIOR = 0.02, 0.02  # standard deviations of the pose by constant velocity: m, rad
 _PRIOR_LOST = 0.3, 0.2  # the same while tracking is lost
 _READING = 0.5  # noise of a surface's distance, relative to a single pixel's
 

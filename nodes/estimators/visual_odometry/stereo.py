@@ -37,13 +37,11 @@ _WINDOW = 15
 _REFINED = 1.5  # largest correction of block matching by flow, pixels
 _OFF_ROW = 0.6  # largest distance of a corner from its row, pixels
 _COARSE = 2.0  # noise of block matching, relative to flow
-_STEP, _DISTINCT = 3.0, 1.5
-"""Pixels beside a disparity, least ratio of the difference there: then 0.3 px of pure noise."""
+_STEP, _DISTINCT = 3.0, 1.5  # pixels beside a disparity, least ratio of differences there
 _LEVELS = 3  # halvings of the images for flow, where block matching found nothing
 _ASIDE = 4  # distance of such a corner from the neighbours defining its plane, pixels
 _BESIDE = np.array([(_ASIDE, 0), (-_ASIDE, 0), (0, _ASIDE), (0, -_ASIDE)])
-_TORN, _BENT = 0.02, 0.15
-"""Largest deviation from the neighbours' mean disparity: share of disparity, pixels."""
+_TORN, _BENT = 0.02, 0.15  # largest deviation from the neighbours' mean: share, pixels
 
 
 class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -107,8 +107,7 @@ def _path_at(truth: Trajectory, stamps: Stamps) -> Floats:
 MILLISECOND = 1_000_000
 _MOST_TICKS = 100_000
 _BLOCK = 65_536
-_LATE = 5
-"""Largest delay of a pose, in image periods; two for the estimator, one or two for its camera."""
+_LATE = 5  # largest delay of a pose, image periods: two of the estimator, two of a camera
 
 
 class Errors(msgspec.Struct, frozen=True, eq=False):

@@ -247,8 +247,7 @@ def rms(values: Floats) -> float:
 
 _SINGULAR = 1e-9  # smallest eigenvalue of an invertible correlation matrix
 _BLOCK = 4096
-_THREE_SIGMA = float(chdtri(3, math.erfc(3.0 / math.sqrt(2.0))))
-"""NEES in three dimensions, as rarely exceeded as 3 sigma in a single dimension: 14.16."""
+_THREE_SIGMA = float(chdtri(3, math.erfc(3.0 / math.sqrt(2.0))))  # NEES of 3 sigma: 14.16
 
 
 def consistency(

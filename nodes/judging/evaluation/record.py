@@ -14,8 +14,7 @@ from nodes.trajectory import PoseRows, Trajectory
 
 Floats = npt.NDArray[np.float64]
 
-_AHEAD = 1_000_000
-"""Tolerated difference of clocks: nanoseconds between a stamp and an earlier arrival."""
+_AHEAD = 1_000_000  # tolerated difference of clocks (stamp and earlier arrival), ns
 
 
 class Said:

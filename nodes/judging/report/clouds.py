@@ -95,10 +95,8 @@ def _size(view: View, pixels: float) -> tuple[int, int]:
 
 ABREAST = 3  # clouds side by side in a figure, at most
 _ENOUGH = 100_000  # points of a cloud sampled to choose its views, at most
-_CLEARANCE = 0.4
-"""Metres from the highest pose up to the cut-off of clouds, to show rooms below the ceiling."""
-_AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(42.0)
-"""Of the oblique view: from the south-west, and from above."""
+_CLEARANCE = 0.4  # metres from the highest pose to the cut-off of clouds, below ceilings
+_AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(42.0)  # of the view from above south-west
 _TALLEST, _TITLE = 6.0, 0.55  # height of a view at most, and of its title and labels, inches
 _THINNEST = 0.15  # least ratio of a view's shorter side to its longer side
 _DETAIL = 3.6  # metres across of the detail

@@ -27,9 +27,7 @@ LINE = COLORS[0]  # colour of data of no estimator
 WIDTH = 10.0  # inches of a figure across the page
 DPI = 110
 _MOST = 2500  # points of a plotted line, at most
-_LETTERS, _HANDLE = 115, 8
-"""Letters of a legend across the page; letters taken by a line sample and its margin."""
-
+_LETTERS, _HANDLE = 115, 8  # letters of a legend's row; letters of a line sample
 _STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": "#777777",

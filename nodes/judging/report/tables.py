@@ -234,7 +234,7 @@ _PLACES = {
     "type", "source", "stamp", "rate", "info", "frame_id", "parent_frame_id", "position",
     "orientation",
 }  # fmt: skip
-"""Announcement fields shown elsewhere than in the table of sensors, or not at all."""
+"""Announcement fields not in the table of sensors."""
 
 
 def _said(value: Any) -> str:

@@ -30,8 +30,7 @@ from runtime.channels.hold import Hold, Owed
 from runtime.errors import MissingAnswerError, suggest
 
 WAITING = 64  # messages waiting to be published in real time; beyond this, images are dropped
-SETTLED = 0.3
-"""Real seconds without a new subscription, after all needed ones, until publishing begins."""
+SETTLED = 0.3  # real seconds without a new subscription until publishing begins
 STORY = 0.5  # real seconds for a program of the run to end with an error of its own
 CLOSING = 2.0  # real seconds for the remaining messages at the end of the run
 _LOOK = 0.01  # real seconds between two polls of the subscriptions

@@ -20,9 +20,7 @@ import xxhash
 
 from nodes.ros2.messages.topics import Topic, dds_type
 
-Kind = Literal["NN", "MP", "MS", "SS", "SC"]
-"""Node, publisher, subscription, service server, service client."""
-
+Kind = Literal["NN", "MP", "MS", "SS", "SC"]  # node, publisher, subscription, server, client
 ADMIN_SPACE = "@ros2_lv"
 
 
@@ -103,8 +101,7 @@ def _token(node: NodeName, zid: str, node_id: int, id_: int, kind: Kind) -> str:
     return f"{ADMIN_SPACE}/{node.domain_id}/{ids}/{kind}/%/{namespace}/{mangle(node.name)}"
 
 
-_LAYOUT = struct.Struct("<qqB16s")
-"""Two numbers, and a buffer of 16 bytes after its length, in Zenoh's own serialisation."""
+_LAYOUT = struct.Struct("<qqB16s")  # two numbers, and 16 bytes after their length (Zenoh's)
 SIZE = _LAYOUT.size
 
 

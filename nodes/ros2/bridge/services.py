@@ -41,9 +41,7 @@ from runtime import Node
 from runtime.errors import VisnavError
 from runtime.time.schedule import SECOND
 
-Serve = Callable[[Any], Awaitable[dict[str, Any]]]
-"""Given a request, returns the fields of the response; a `VisnavError` becomes an error reply."""
-
+Serve = Callable[[Any], Awaitable[dict[str, Any]]]  # response's fields by request, or `VisnavError`
 Finish = Callable[[bytearray | str], None]
 
 WAITING = 64  # unanswered requests, at most
@@ -248,8 +246,7 @@ class SimulationServices:
 # Of GoalStatus.msg, and of CancelGoal.srv.
 UNKNOWN, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = 0, 2, 3, 4, 5, 6
 NO_ERROR, UNKNOWN_GOAL, GOAL_TERMINATED = 0, 2, 3
-KEPT, PERIOD = 16, 0.2
-"""Goals whose results can be asked for; real seconds between two messages of feedback."""
+KEPT, PERIOD = 16, 0.2  # goals with kept results; real seconds between feedback messages
 
 
 class _Goal:
@@ -267,8 +264,7 @@ class SimulateSteps:
         self._server, self._simulation = server, simulation
         self._clock, self._stepping = server.node.clock, server.node.stepping
         self._message = server.store.message
-        self._goals: dict[bytes, _Goal] = {}
-        """Goals by id, the oldest first; at most a single goal is not over."""
+        self._goals: dict[bytes, _Goal] = {}  # by id, the oldest first; at most one is not over
 
     def declare(self) -> None:
         """Declare topics and services; called in any thread."""

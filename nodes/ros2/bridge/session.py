@@ -94,11 +94,8 @@ class Publisher:
 
 
 Take = Callable[[Message], None]  # called in a thread with each message
-Answer = Callable[[bytearray | str, bytes], None]
-"""Answers a request, in any thread: with a message and its attachment, or with an error."""
-
-WAIT_BEFORE_DROP = 300
-"""Microseconds for a put to wait for a peer not reading; Zenoh's default is 1000."""
+Answer = Callable[[bytearray | str, bytes], None]  # of a request: message and attachment, or error
+WAIT_BEFORE_DROP = 300  # microseconds of a put's wait for a peer; Zenoh's default is 1000
 WAITING = 64  # unread messages kept by Zenoh; with more, the sender has to wait
 PAUSE = 0.001  # seconds between two polls for messages; faster messages are taken in batches
 CLOSING = 3.0  # seconds

@@ -48,8 +48,7 @@ _STAMP = struct.Struct("<iI")
 _STAMP_AT = 4  # a header is the first field of each of these messages, and begins with the stamp
 _LENGTH = struct.Struct("<I")
 _NONE = np.zeros(0, np.uint8)
-POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
-"""Point of a cloud's PointCloud2: colour in a single field, ``rgb``, as PCL packs colours."""
+POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])  # with PCL's colour ``rgb``
 LIDAR_POINT = np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
 """Point of a lidar's PointCloud2, as of Velodyne's driver; ``time``: seconds after the stamp."""
 _FLOAT32, _UINT16 = 7, 4  # of sensor_msgs/msg/PointField

@@ -63,8 +63,7 @@ _COMPRESSED, _POINTS = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Point
 _ODOMETRY, _TREE = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 _POSE, _TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 _COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-_SENSOR = Qos(depth=5, reliable=False)
-"""QoS of rclcpp's ``SensorDataQoS``; reliable if the setting `sensor_qos` says so."""
+_SENSOR = Qos(depth=5, reliable=False)  # as of rclcpp's ``SensorDataQoS``; see `sensor_qos`
 _COLOURS, _DEPTH = ("rgb", "grey"), ("depth",)
 
 

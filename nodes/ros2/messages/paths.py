@@ -27,7 +27,7 @@ class Paths:
         self._names = names
         self._config = config
         self._paths: dict[str, tuple[PathMessage, int]] = {}
-        """Path and its next time of sending (ns), by source."""
+        """With the next sending (ns), by source."""
 
     def message(self, event: Odometry | PoseEstimate, time: Time) -> bytearray | None:
         """Add a pose to its source's path, at a message time (s, ns); return the path if due."""

@@ -216,10 +216,8 @@ class FrameNames:
     """
 
     def __init__(self) -> None:
-        self._cameras: dict[str, tuple[str, str]] = {}
-        """Optical frame to the camera's source and its own name."""
-        self.own: set[str] = set()
-        """Frames whose names say already whose they are: ROS calls them the same."""
+        self._cameras: dict[str, tuple[str, str]] = {}  # by optical frame: source, own name
+        self.own: set[str] = set()  # frames with their owner's name, which ROS calls the same
         self.vehicles = Vehicles()  # whose frames are distinguished
 
     def add(self, camera: CameraAnnouncement) -> CameraFrames:

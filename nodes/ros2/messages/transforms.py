@@ -51,14 +51,12 @@ class Transforms:
         self._only = vehicle
         self._body = body
         self._starts: dict[str, Pose] = {}  # by vehicle
-        self._fixed: dict[tuple[str, str], tuple[str, Pose]] = {}
-        """Vehicle (or sensor) and child to parent and pose; names are given when all are known."""
+        self._fixed: dict[tuple[str, str], tuple[str, Pose]] = {}  # to parent, pose; by vehicle
         self._mounted: dict[str, tuple[str, str, Pose] | None] = {}
         """Source, parent and pose of a mounted camera, by optical frame; `None` for a free camera.
         """
         self._free: dict[str, str] = {}  # optical frame of each free camera, by source
-        self._bodies: set[str] = set()
-        """Sources of self-moving bodies; each is also the name of a frame."""
+        self._bodies: set[str] = set()  # sources, and frames, of self-moving bodies
 
     def announced(self, announcement: Announcement) -> None:
         """Add where a vehicle starts, or where a camera is mounted."""

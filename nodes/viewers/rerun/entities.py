@@ -95,9 +95,7 @@ class EntityLog:
         )
 
 
-Eye = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Position and target of the eye, metres in ``map``."""
-
+Eye = tuple[tuple[float, float, float], tuple[float, float, float]]  # position, target, ``map``
 _SHOWN = 2  # cameras whose images have a place of their own; those of more share tabs
 
 

@@ -43,9 +43,7 @@ GROUPS: dict[type[Event], str] = {
     Wind: "wind",
 }  # parts of the tree of plots, by type of event
 
-_HANDY = {"rad": ("°", 180.0 / np.pi), "s": ("ms", 1000.0)}
-"""Unit to plot instead of a score's unit, and the factor."""
-
+_HANDY = {"rad": ("°", 180.0 / np.pi), "s": ("ms", 1000.0)}  # plotted unit and factor, by unit
 PLOTS = {
     "position error (m)": "+ /scores/position_error/**",
     "rotation error (°)": "+ /scores/rotation_error/**",

@@ -46,8 +46,7 @@ from nodes.viewers.rerun.sdk import RerunConfig, Viewer, load
 from nodes.viewers.rerun.world import World
 
 _GATHERED = 500  # events written into a file together
-_TIMEOUT = 3.0
-"""Real seconds for a viewer to take logged data; else new data are left out, lest memory grow."""
+_TIMEOUT = 3.0  # real seconds for a viewer to take data; else new ones are left out
 _SECOND_TIMEOUT = 0.01  # real seconds for the same, after a first timeout
 
 

@@ -48,8 +48,7 @@ from nodes.viewers.rerun.entities import EntityLog, Numbered
 from nodes.viewers.rerun.plots import ScenePoints
 from nodes.viewers.rerun.sdk import RerunConfig
 
-CENTIMETRES = 100.0
-"""Steps of a depth image per metre. Finer steps would show noise and make files large."""
+CENTIMETRES = 100.0  # steps of a depth image per metre; finer ones would be noise
 _WIND_PERIOD = 100_000_000  # nanoseconds between two arrows of a vehicle's wind
 _THICK, _THIN = 0.02, 0.01  # metres: radii of paths
 
@@ -77,8 +76,7 @@ class World:
         self.colours: dict[str, Colour] = {}  # of estimators, by source
         self.images: dict[str, list[str]] = {}  # kinds of images there are, by camera's entity
         self.trails: list[str] = []  # entities to show with all logged data
-        self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
-        """Where vehicles have been: lowest and highest coordinates, metres in ``map``."""
+        self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])  # lowest, highest (``map``, m)
         log.static(entities.WORLD, self._rr.ViewCoordinates.FRD)
 
     # What there is.
