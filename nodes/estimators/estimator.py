@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal
@@ -39,7 +39,7 @@ from events.camera_info import COEFFICIENTS
 from nodes.estimators.rectification import ALIGNED, Rectification, misalignment
 from nodes.estimators.result import TrackingResult, check_result, check_trajectory
 from nodes.estimators.rig import Mount, SensorChoice
-from runtime import Bundle, Node, NodeConfig, Output, on
+from runtime import Bundle, Node, NodeConfig, Output, Worker, on
 from runtime.errors import DeclarationError, NodeError, suggest
 from runtime.extras import why_missing
 from runtime.node import matchers
@@ -72,6 +72,7 @@ class EstimatorConfig(NodeConfig):
 
 _KINDS = ("rgb", "grey", "depth", "segmentation", "lidar")  # kinds of data an estimator may need
 F = TypeVar("F", bound=tuple[Any, ...])
+W = TypeVar("W")
 C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
 
 
@@ -298,6 +299,11 @@ class Estimator(Node[C], ABC):
     @abstractmethod
     async def run(self) -> None:
         """Track the images."""
+
+    async def start_tracker(self, make: Callable[..., W], *args: Any) -> Worker[W]:
+        """Start a tracker in a process of its own, with a single core and the latency set."""
+        latency = self.config.latency
+        return await self.worker(make, *args, latency=latency, env=WORKER_ENVIRONMENT)
 
     def the_camera(self) -> CameraAnnouncement:
         """Return the camera whose images are read; a `FatalError` if none gives what is needed."""

@@ -116,6 +116,11 @@ class Observations(msgspec.Struct, frozen=True, eq=False):
         count = len(landmarks)
         return cls(landmarks, pixels, np.zeros(count), np.zeros(count, np.bool_))
 
+    def take(self, rows: npt.NDArray[np.bool_]) -> Observations:
+        """Return some of them, by a mask (n,)."""
+        seen = self.landmarks[rows], self.pixels[rows]
+        return Observations(*seen, self.inverse[rows], self.measured[rows])
+
 
 class Solution(msgspec.Struct, frozen=True, eq=False):
     """Pose, and the errors of the landmarks."""

@@ -15,13 +15,7 @@ import numpy.typing as npt
 
 from events import CameraInfo
 from events.geometry import pose_matrix
-from nodes.estimators import (
-    WORKER_ENVIRONMENT,
-    Estimator,
-    EstimatorConfig,
-    MonocularFrame,
-    TrackingResult,
-)
+from nodes.estimators import Estimator, EstimatorConfig, MonocularFrame, TrackingResult
 from runtime import Bundle
 from runtime.errors import MissingDependencyError
 
@@ -232,13 +226,8 @@ class Svo(Estimator[SvoConfig]):
 
     async def on_ready(self) -> None:
         """Start SVO, in a process of its own."""
-        self._svo = await self.worker(
-            SvoProcess,
-            self.the_camera().info,
-            self.config.svo,
-            latency=self.config.latency,
-            env=WORKER_ENVIRONMENT,
-        )
+        info = self.the_camera().info
+        self._svo = await self.start_tracker(SvoProcess, info, self.config.svo)
 
     async def run(self) -> None:
         """Track each image; nothing is sent until there is a map."""

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
-
 from events import DepthImage, Image, Imu
 from nodes.estimators import (
-    WORKER_ENVIRONMENT,
     Estimator,
     EstimatorConfig,
     RgbdInertialFrame,
     StereoInertialFrame,
+    sample_rows,
 )
 from nodes.estimators.inertial_odometry.tracker import InertialSettings, InertialTracker
 from nodes.estimators.visual_odometry.stereo import StereoSettings, baseline
@@ -42,22 +39,16 @@ class _InertialOdometry(Estimator[InertialOdometryConfig]):
         camera, config = self.the_camera(), self.config
         if self.imu_announcement is None:
             self.log.fatal("%s", self._missing())
-        self._tracker = await self.worker(
-            InertialTracker,
-            camera,
-            self.imu_announcement,
-            baseline(*self.cameras) if self.eyes == 2 else 0.0,
-            config.features,
-            config.inertial,
-            config.stereo,
-            latency=config.latency,
-            env=WORKER_ENVIRONMENT,
+        apart = baseline(*self.cameras) if self.eyes == 2 else 0.0
+        settings = config.features, config.inertial, config.stereo
+        self._tracker = await self.start_tracker(
+            InertialTracker, camera, self.imu_announcement, apart, *settings
         )
 
     async def fuse(self, image: Image, other: Image | DepthImage, imu: tuple[Imu, ...]) -> None:
         """Track an image and publish the result."""
         result = await self._tracker.call(
-            InertialTracker.fuse, self.exposed_at(image), image.data, other.data, as_rows(imu)
+            InertialTracker.fuse, self.exposed_at(image), image.data, other.data, sample_rows(imu)
         )
         self.publish(image, result)
 
@@ -89,9 +80,3 @@ class StereoInertialOdometry(_InertialOdometry):
         """Track each pair; pairs arriving meanwhile are skipped, IMU samples are not."""
         async for left, right, imu in self.frames:
             await self.fuse(left, right, imu)
-
-
-def as_rows(imu: tuple[Imu, ...]) -> npt.NDArray[np.float64]:
-    """Return samples as rows: stamp (ns), angular velocity, specific force; shape (n, 7)."""
-    rows = [(each.stamp, *each.angular_velocity, *each.linear_acceleration) for each in imu]
-    return np.array(rows, np.float64).reshape(-1, 7)

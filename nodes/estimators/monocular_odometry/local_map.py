@@ -37,8 +37,7 @@ class Initialization:
     """Follower of corners from a first image until there is a map."""
 
     def __init__(self, matrix: Floats, settings: MonocularSettings) -> None:
-        self._matrix = matrix
-        self._settings = settings
+        self._matrix, self._settings = matrix, settings
         self._first: Grey | None = None
         self._before: Grey | None = None
         self._views: list[Floats] = []  # of the corners still followed; the first, …, the newest
@@ -216,13 +215,11 @@ class LocalMap:
         matrix: Floats,
         settings: MonocularSettings,
     ) -> None:
-        self.image = image
-        self.tracks = tracks
+        self.image, self.tracks = image, tracks
         self._poses = dict(enumerate(poses))  # by key frame, world to camera
         # Landmarks that are no longer followed: point and views of each.
         self._past: list[tuple[Floats, dict[int, View]]] = []
-        self._matrix = matrix
-        self._settings = settings
+        self._matrix, self._settings = matrix, settings
 
     @classmethod
     def first(

@@ -16,13 +16,7 @@ import numpy.typing as npt
 
 from events import CameraInfo
 from events.geometry import inverse
-from nodes.estimators import (
-    WORKER_ENVIRONMENT,
-    Estimator,
-    EstimatorConfig,
-    MonocularFrame,
-    TrackingResult,
-)
+from nodes.estimators import Estimator, EstimatorConfig, MonocularFrame, TrackingResult
 from nodes.estimators.monocular_odometry.geometry import Indices, Keyframe, MonocularSettings
 from nodes.estimators.monocular_odometry.local_map import Initialization, LocalMap
 from nodes.estimators.odometry import (
@@ -244,13 +238,8 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
 
     async def on_ready(self) -> None:
         """Start the tracker, in a process of its own."""
-        self._tracker = await self.worker(
-            make_tracker,
-            self.the_camera().info,
-            self.config.tracker,
-            latency=self.config.latency,
-            env=WORKER_ENVIRONMENT,
-        )
+        info = self.the_camera().info
+        self._tracker = await self.start_tracker(make_tracker, info, self.config.tracker)
 
     async def run(self) -> None:
         """Track each image; nothing is sent until there is a map."""

@@ -154,8 +154,7 @@ class OrbSlam3Process:
                 f"ORB-SLAM3 needs pyorbslam3 ({error}): {INSTALL}"
             ) from error
         check_vocabulary(vocabulary)
-        self._settings = settings
-        self._mapping_time = mapping_time
+        self._settings, self._mapping_time = settings, mapping_time
         self._left_alone = time.process_time()
         self._anchor = Anchor()
         self._was_ok = self._new = False

@@ -218,7 +218,7 @@ class FeatureTracker:
             return None
         places = self._map.places[rows[good]]
         there = self._reduction * there.reshape(-1, 2)[good].astype(np.float64)
-        solution = self._solve(places, there, self._pose)
+        solution = self._solve(Observations.without_depth(places, there), self._pose)
         if (solution.errors < 2 * _AGREES).mean() > 0.6:
             return solution.pose
         cv2.setRNGSeed(1)
@@ -258,43 +258,20 @@ class FeatureTracker:
         if len(rows) < least:
             return None
         read = self._surfaces_at(inverse_of, pixels, settings.depth_noise)
-        places = landmarks.places[rows]
-        first = self._solve(places, pixels, expected, read.inverse, read.continuous, information)
+        seen = Observations(landmarks.places[rows], pixels, read.inverse, read.continuous)
+        first = self._solve(seen, expected, information)
         agree = first.errors < _AGREES
         if agree.sum() < max(least, 0.4 * len(agree)):
             return None
-        last = self._solve(
-            places[agree],
-            pixels[agree],
-            first.pose if information is None else expected,
-            read.inverse[agree],
-            read.continuous[agree],
-            information,
-        )
+        start = first.pose if information is None else expected
+        last = self._solve(seen.take(agree), start, information)
         return MapMatch(last.pose, rows, pixels, agree, missed)
 
     def _solve(
-        self,
-        places: Floats,
-        pixels: Floats,
-        start: Floats,
-        read: Floats | None = None,
-        continuous: npt.NDArray[np.bool_] | None = None,
-        information: Floats | None = None,
+        self, seen: Observations, start: Floats, information: Floats | None = None
     ) -> Solution:
-        if read is None or continuous is None:
-            observations = Observations.without_depth(places, pixels)
-        else:
-            observations = Observations(places, pixels, read, continuous)
-        settings = self._settings
-        return solve_pose(
-            observations,
-            start,
-            self._matrix,
-            settings.pixel_noise,
-            _READING * settings.depth_noise,
-            information,
-        )
+        noise = self._settings.pixel_noise, _READING * self._settings.depth_noise
+        return solve_pose(seen, start, self._matrix, *noise, information)
 
     def _is_far(self, rows: Rows) -> bool:
         """Return whether the last key frame is nearly out of sight."""

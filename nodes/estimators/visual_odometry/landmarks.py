@@ -36,17 +36,9 @@ class Landmarks:
     """Points of the world, by rows."""
 
     _COLUMNS = (
-        "places",
-        "keyframes",
-        "pixels",
-        "_directions",
-        "_origins",
-        "_inverse",
-        "_slopes",
-        "_readings",
-        "_missed",
-        "_inactive_until",
-    )
+        "places", "keyframes", "pixels", "_directions", "_origins", "_inverse", "_slopes",
+        "_readings", "_missed", "_inactive_until",
+    )  # fmt: skip
 
     def __init__(self, matrix: Floats) -> None:
         self._matrix = matrix
@@ -238,8 +230,7 @@ class Described:
 
     def __init__(self, frame: Keyframe, inverse_of: Depth, matrix: Floats, noise: float) -> None:
         self._source: tuple[Keyframe, Depth] | None = frame, inverse_of
-        self._matrix = matrix
-        self._noise = noise
+        self._matrix, self._noise = matrix, noise
 
     @functools.cached_property
     def points(self) -> DescribedPoints:

@@ -17,13 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from nodes.estimators import (
-    WORKER_ENVIRONMENT,
-    Estimator,
-    EstimatorConfig,
-    RgbdFrame,
-    TrackingResult,
-)
+from nodes.estimators import Estimator, EstimatorConfig, RgbdFrame, TrackingResult
 from nodes.estimators.odometry import Depth, Floats, grey_and_depth, refuse_distortion
 from nodes.estimators.visual_odometry.features import FeatureTracker
 from nodes.estimators.visual_odometry.surfaces import FeatureSettings
@@ -180,13 +174,8 @@ class VisualOdometry(Estimator[VisualOdometryConfig]):
 
     async def on_ready(self) -> None:
         """Start the tracker, in a process of its own."""
-        self._tracker = await self.worker(
-            make_tracker,
-            self.config,
-            self.the_camera().info,
-            latency=self.config.latency,
-            env=WORKER_ENVIRONMENT,
-        )
+        info = self.the_camera().info
+        self._tracker = await self.start_tracker(make_tracker, self.config, info)
 
     async def run(self) -> None:
         """Track each image; images arriving meanwhile are skipped."""

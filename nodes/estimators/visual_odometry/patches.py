@@ -124,8 +124,7 @@ class References:
     """
 
     def __init__(self, matrix: Floats, noise: float) -> None:
-        self._matrix = matrix
-        self._noise = noise
+        self._matrix, self._noise = matrix, noise
         self._reference: Reference | None = None
         self._bridge: Reference | None = None
         self._known: tuple[Grey, Depth, Floats] | None = None

@@ -18,13 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, CameraInfo
-from nodes.estimators import (
-    WORKER_ENVIRONMENT,
-    Estimator,
-    EstimatorConfig,
-    StereoFrame,
-    TrackingResult,
-)
+from nodes.estimators import Estimator, EstimatorConfig, StereoFrame, TrackingResult
 from nodes.estimators.odometry import Depth, Floats, Grey, follow_both_ways, grey_image
 from nodes.estimators.visual_odometry.features import FeatureTracker
 from nodes.estimators.visual_odometry.patches import SAME, around, correlation
@@ -194,14 +188,9 @@ class StereoOdometry(Estimator[StereoOdometryConfig]):
     async def on_ready(self) -> None:
         """Start the tracker, in a process of its own."""
         left, right = self.the_camera(), self.cameras[1]
-        self._tracker = await self.worker(
-            StereoTracker,
-            left.info,
-            baseline(left, right),
-            self.config.stereo,
-            self.config.features,
-            latency=self.config.latency,
-            env=WORKER_ENVIRONMENT,
+        settings = self.config.stereo, self.config.features
+        self._tracker = await self.start_tracker(
+            StereoTracker, left.info, baseline(left, right), *settings
         )
 
     async def run(self) -> None:
