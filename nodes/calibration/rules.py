@@ -182,18 +182,9 @@ def needs(config: Config, announced: Announced) -> Iterator[Finding]:
 
 
 RULES = [
-    baseline,
-    square_pixels,
-    exposure,
-    imu_rate,
-    rates_divide,
-    extrinsics,
-    monotonic,
-    latency,
-    zero_noise,
-    stamps,
-    needs,
-]
+    baseline, square_pixels, exposure, imu_rate, rates_divide, extrinsics, monotonic, latency,
+    zero_noise, stamps, needs,
+]  # fmt: skip
 
 
 def cameras(announced: Announced) -> list[CameraAnnouncement]:

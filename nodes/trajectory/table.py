@@ -49,8 +49,7 @@ class Row:
     __slots__ = ("fields", "where")
 
     def __init__(self, where: str, fields: list[str]) -> None:
-        self.where = where
-        self.fields = fields
+        self.where, self.fields = where, fields
 
     def numbers(self, start: int, end: int) -> list[float]:
         """Return fields as finite numbers; a `ValueError` if one is none."""

@@ -127,10 +127,7 @@ class Trail:
     """Path flown so far; its thickness is in metres."""
 
     def __init__(self, name: str, frame_id: str, colour: Colour, thickness: float) -> None:
-        self.name = name
-        self.frame_id = frame_id
-        self.colour = colour
-        self.thickness = thickness
+        self.name, self.frame_id, self.colour, self.thickness = name, frame_id, colour, thickness
         self._path = PathPieces()
         self._pieces: deque[list[Vector3]] = deque(maxlen=_KEPT)
         self._number = 0

@@ -151,10 +151,7 @@ class Recording(ABC):
         depth_factor: float,  # steps of a depth image per metre
         epoch: int,  # the run's time 0 in the files, nanoseconds of Unix time
     ) -> None:
-        self.folder = folder
-        self.rig = rig
-        self.depth_factor = depth_factor
-        self.epoch = epoch
+        self.folder, self.rig, self.depth_factor, self.epoch = folder, rig, depth_factor, epoch
         self.files: list[RowFile] = []
 
     @abstractmethod

@@ -176,19 +176,9 @@ except ImportError as error:
     _MISSING = error
 
 __all__ = [
-    "Attachment",
-    "Channel",
-    "Message",
-    "Metadata",
-    "Schema",
-    "check",
-    "header_of",
-    "metadata_of",
-    "open_file",
-    "records",
-    "summary_of",
-    "writer",
-]
+    "Attachment", "Channel", "Message", "Metadata", "Schema", "check", "header_of", "metadata_of",
+    "open_file", "records", "summary_of", "writer",
+]  # fmt: skip
 
 _DAMAGED = (struct.error, EOFError, ValueError, OSError, OverflowError, MemoryError, LookupError)
 """Exceptions of mcap on damaged records, besides its own errors."""

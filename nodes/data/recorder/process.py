@@ -59,8 +59,7 @@ class EventWriter:
         config: McapRecorderConfig,
         complain: Callable[[str], None],  # called for events not recorded as ROS's messages
     ) -> None:
-        self._writer = writer
-        self._complain = complain
+        self._writer, self._complain = writer, complain
         self._store = TypeStore(config.distribution)
         published = PublishingConfig(
             publish=tuple(group for group in ALL_GROUPS if group not in _LEFT_OUT),

@@ -63,8 +63,7 @@ class Backlog:
     """
 
     def __init__(self, limit: int, when_full: WhenFull) -> None:
-        self.limit = limit
-        self.when_full = when_full
+        self.limit, self.when_full = limit, when_full
         self.dropped = self.peak = 0
         self._queue: deque[Waiting] = deque()
         # One counter for each side, so that no addition is ever lost between the two.
@@ -169,8 +168,7 @@ class WriterProcess:
         self._seen: tuple[object, ...] = ()
         self._seen_at = time.monotonic()
         self._cores = request.cores
-        self._failed = failed
-        self._complain = complain
+        self._failed, self._complain = failed, complain
         self._closing = threading.Event()
         self._end = 0
         self._child = subprocess.Popen(  # noqa: S603  # our own module

@@ -106,8 +106,7 @@ class FolderReader(Reader):
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         super().__init__()
-        self._folder = folder
-        self._vehicle = vehicle
+        self._folder, self._vehicle = folder, vehicle
         self._origin = 0  # stamp in the data set (ns) of the run's time 0
         self._announcements: list[Announcement] = []
 

@@ -31,8 +31,7 @@ class ReadAhead:
     """Events from a thread, batch by batch, up to a limit of bytes that may wait."""
 
     def __init__(self, events: Iterator[Timed], limit: int) -> None:
-        self._events = events
-        self._limit = limit
+        self._events, self._limit = events, limit
         self._batches: deque[tuple[Batch, int]] = deque()
         self._waiting = 0
         self.peak = 0  # largest number of bytes waiting so far

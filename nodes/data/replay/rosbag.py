@@ -69,12 +69,7 @@ def chosen(
     if not taken:
         raise ReplayError(f"expected topics of cameras, IMUs or poses, found: {there or 'none'}")
     return {
-        topic.topic: BagTopic(
-            topic=topic.topic,
-            use=topic.use,
-            source=topic.source or _source(topic, vehicle),
-            frame_id=topic.frame_id,
-        )
+        topic.topic: msgspec.structs.replace(topic, source=topic.source or _source(topic, vehicle))
         for topic in taken
     }
 
@@ -171,8 +166,7 @@ class RosBag(Reader):
 
     def __init__(self, path: Path, topics: tuple[BagTopic, ...], vehicle: str) -> None:
         super().__init__()
-        self._path = path
-        self._vehicle = vehicle
+        self._path, self._vehicle = path, vehicle
         with readable(path):
             self._bag = open_bag(path)
         try:

@@ -52,9 +52,7 @@ class EstimatorRecord:
         method: str = "",
         reads: tuple[str, ...] = (),  # see `events.EstimatorAnnouncement`
     ) -> None:
-        self.scale_free = scale_free
-        self.method = method
-        self.reads = reads
+        self.scale_free, self.method, self.reads = scale_free, method, reads
         self.frame_id = ""
         self.rows = PoseRows()  # poses of the trajectory
         self.repeated = 0  # poses with a stamp not later than the last

@@ -32,15 +32,9 @@ from runtime.summary import OUTSIDE_COLUMNS, WORKER_COLUMNS
 PAGE = "report.html"
 PLOTS = "plots"
 _OURS = (
-    "trajectories",
-    "errors",
-    "axes",
-    "distributions",
-    "latency",
-    "relative",
-    "frames_*",
+    "trajectories", "errors", "axes", "distributions", "latency", "relative", "frames_*",
     "clouds_*",
-)  # names of the figures; those of an earlier report are removed
+)  # fmt: skip  # names of the figures; those of an earlier report are removed
 
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 88]
 

@@ -49,8 +49,7 @@ class IncomingTopic:
         self.topic = topic(store, name, subscription.type, subscription.qos)
         self.source = subscription.source or f"{node}/{ros_name(subscription.topic)}"
         self.received = 0
-        self._store = store
-        self._complaints = complaints
+        self._store, self._complaints = store, complaints
         if subscription.use:
             self._read = READERS[subscription.type, subscription.use].read
         else:
@@ -174,13 +173,8 @@ class Inbox:
         complain: Callable[[str, str], None],
         now: Callable[[], float] = time.monotonic,  # real seconds
     ) -> None:
-        self._loop = loop
-        self._deliver = deliver
-        self._depth = depth
-        self._max_rate = max_rate
-        self._max_size = max_size
-        self._complain = complain
-        self._now = now
+        self._loop, self._deliver, self._depth, self._max_rate = loop, deliver, depth, max_rate
+        self._max_size, self._complain, self._now = max_size, complain, now
         self._waiting: deque[bytes] = deque()
         self._lock = threading.Lock()
         self._allowed, self._asked = float(depth), now()
@@ -250,8 +244,7 @@ class OutgoingTopic:
         self.publisher: Publisher | None = None
         name = topic_name(config.namespace, publication.topic)
         self.topic = topic(store, name, publication.type, publication.qos)
-        self._store = store
-        self._complaints = complaints
+        self._store, self._complaints = store, complaints
         self.event = event_type(publication)
         self._map = import_mapping(publication.topic, publication.mapping)
 

@@ -160,8 +160,7 @@ class Complaints:
         self, log: Callable[[str], None], now: Callable[[], float] = time.monotonic
     ) -> None:
         self.counts: Counter[tuple[str, str]] = Counter()
-        self._log = log
-        self._now = now
+        self._log, self._now = log, now
         self._logged: dict[tuple[str, str], tuple[float, int]] = {}
         self._lock = threading.Lock()
 

@@ -57,10 +57,7 @@ class ServiceServer:
         store: TypeStore,
         complaints: Complaints,
     ) -> None:
-        self.node = node
-        self.store = store
-        self._session = session
-        self._complaints = complaints
+        self.node, self.store, self._session, self._complaints = node, store, session, complaints
         self.loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
         self._waiting = self._answered = 0

@@ -61,14 +61,11 @@ class Publisher:
         gid_: bytes | None,  # of the endpoint; if ``None``, messages have no attachment
         max_wait: float,
     ) -> None:
-        self.topic = topic
-        self.matched = matched
+        self.topic, self.matched = topic, matched
         self.sent = self.failed = 0
         # Called with each message put.
         self.note: Callable[[Publisher, bytearray], None] | None = None
-        self._put = put
-        self._gid = gid_
-        self._max_wait = max_wait
+        self._put, self._gid, self._max_wait = put, gid_, max_wait
         depth = topic.qos.depth if topic.qos.transient_local else 0
         # The last messages and their attachments, if the topic is transient local.
         self.kept: deque[tuple[bytes, bytes | None]] = deque(maxlen=depth)
@@ -142,9 +139,7 @@ class Session:
         file: str = "",
         max_wait: float = 5.0,
     ) -> None:
-        self._node = node
-        self._keys = keys
-        self._max_wait = max_wait
+        self._node, self._keys, self._max_wait = node, keys, max_wait
         configuration = _configuration(connect, listen, file)
         configuration.insert_json5(f"{_QUEUE}/block/wait_before_close", f"{max_wait * 1e6:.0f}")
         try:

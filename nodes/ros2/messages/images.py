@@ -72,9 +72,7 @@ class ImageWriter:
     """
 
     def __init__(self, store: TypeStore, frame_id: str, encoding: str) -> None:
-        self._store = store
-        self.frame_id = frame_id
-        self.encoding = encoding
+        self._store, self.frame_id, self.encoding = store, frame_id, encoding
         self._shape: tuple[int, ...] | None = None
         self._buffer = bytearray()
 

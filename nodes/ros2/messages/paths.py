@@ -23,9 +23,7 @@ class Paths:
     """The paths of all vehicles and estimates."""
 
     def __init__(self, store: TypeStore, names: FrameNames, config: PublishingConfig) -> None:
-        self._store = store
-        self._names = names
-        self._config = config
+        self._store, self._names, self._config = store, names, config
         self._paths: dict[str, tuple[PathMessage, int]] = {}
         """With the next sending (ns), by source."""
 
@@ -60,9 +58,7 @@ class PathMessage:
     """
 
     def __init__(self, store: TypeStore, frame: str, step: float, length: int) -> None:
-        self.frame = frame
-        self.step = step
-        self._store = store
+        self.frame, self.step, self._store = frame, step, store
         name = frame.encode()
         head = 12 + len(name) + 1  # stamp, length of the name, the name, a zero
         self._row = np.dtype(

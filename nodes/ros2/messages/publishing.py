@@ -63,9 +63,7 @@ class Publishing(Generic[P]):
     def __init__(
         self, sink: Sink[P], store: TypeStore, config: PublishingConfig, time: Callable[[int], Time]
     ) -> None:
-        self._sink = sink
-        self._store = store
-        self._config = config
+        self._sink, self._store, self._config = sink, store, config
         self._out = Outgoing(store, config, time)
         self.names = self._out.names
         self.builder = MessageBuilder(store, self.names, time)

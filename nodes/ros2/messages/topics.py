@@ -78,26 +78,10 @@ def ros_name(source: str) -> str:
 
 
 TopicGroup = Literal[
-    "images",
-    "depth_images",
-    "segmentation_images",
-    "point_clouds",
-    "imu",
-    "odometry",
-    "camera_poses",
-    "transforms",
-    "estimates",
-    "scores",
-    "ranges",
-    "pressures",
-    "magnetic_fields",
-    "fixes",
-    "lidar_scans",
-    "wind",
-    "body_poses",
-    "clock",
-    "paths",
-]
+    "images", "depth_images", "segmentation_images", "point_clouds", "imu", "odometry",
+    "camera_poses", "transforms", "estimates", "scores", "ranges", "pressures", "magnetic_fields",
+    "fixes", "lidar_scans", "wind", "body_poses", "clock", "paths",
+]  # fmt: skip
 
 ALL_GROUPS: tuple[TopicGroup, ...] = TopicGroup.__args__  # type: ignore[attr-defined]
 

@@ -268,9 +268,7 @@ class MessageBuilder:
     """Builder of messages; `time` returns a stamp's time in messages."""
 
     def __init__(self, store: TypeStore, names: FrameNames, time: Callable[[int], Time]) -> None:
-        self._store = store
-        self._names = names
-        self._time = time
+        self._store, self._names, self._time = store, names, time
 
     def make(self, type_: str, **fields: Any) -> Any:
         """Return a message; fields not given are zero, empty or false.

@@ -162,8 +162,7 @@ class RosTopic:
     """A topic of ROS messages; late viewers get the newest of a transient-local topic or a map."""
 
     def __init__(self, topics: RosTopics, topic: Topic) -> None:
-        self.topic = topic
-        self._topics = topics
+        self.topic, self._topics = topic, topics
         cloud = topic.type == "sensor_msgs/msg/PointCloud2"
         self._kept = topic.qos.transient_local or (cloud and topic.qos.reliable)
 

@@ -56,9 +56,7 @@ class Gate:
         origins: Collection[str],
         refused: Callable[[str], None],  # called, in a thread, with the reason of a refusal
     ) -> None:
-        self._inside = inside
-        self._origins = origins
-        self._refused = refused
+        self._inside, self._origins, self._refused = inside, origins, refused
         self._lock = threading.Lock()
         self._open: set[socket.socket] = set()
         self._closed = False

@@ -63,8 +63,7 @@ class EntityLog:
     """Logs entities."""
 
     def __init__(self, rr: Any, stream: Any) -> None:
-        self.rr = rr
-        self.stream = stream
+        self.rr, self.stream = rr, stream
         stream.set_log_time_enabled(False)  # one's own time lines: ``run`` and ``event``
         stream.set_log_tick_enabled(False)
 
