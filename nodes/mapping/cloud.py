@@ -45,12 +45,7 @@ def write_ply(
     colours: npt.NDArray[np.uint8],  # red, green, blue, shape (n, 3)
     frame_id: str,  # named in a comment of the header
 ) -> None:
-    """Write a whole PLY file or none; missing folders are created.
-
-    Raises:
-        ValueError: The arrays do not fit each other.
-        OSError: It cannot be written.
-    """
+    """Write a whole PLY file or none, with its folders; a `ValueError` if arrays do not fit."""
     if points.ndim != 2 or points.shape[1] != 3 or colours.shape != points.shape:
         raise ValueError(
             f"{path}: expected points and colours of one shape (n, 3), "
@@ -280,11 +275,7 @@ class Mapper:
         image: npt.NDArray[np.uint8],  # its colours, shape (h, w, 3), or greys, shape (h, w)
         pose: npt.NDArray[np.float64],  # the optical frame in the cloud's, shape (4, 4)
     ) -> int:
-        """Add the points of an exposure to the cloud; return its number of points.
-
-        Raises:
-            ValueError: The shapes do not fit, or the pose is not finite.
-        """
+        """Add an exposure's points; return the cloud's number of points. May raise `ValueError`."""
         if image.shape[:2] != depth.shape:
             raise ValueError(
                 f"image: expected {depth.shape} pixels as of the depth, found {image.shape[:2]}"

@@ -182,8 +182,7 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
 class PoseRows:
     """Poses of events, in any order, until a trajectory is made of them.
 
-    All but the newest wait in a nameless temporary file, so that memory does not grow; without room
-    for the file, they stay in memory.
+    All but the newest wait in a nameless temporary file, if there is room, to save memory.
     """
 
     def __init__(self) -> None:

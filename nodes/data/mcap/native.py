@@ -207,12 +207,7 @@ def writer(
 
 
 def open_file(path: Path) -> IO[bytes]:
-    """Open an MCAP file.
-
-    Raises:
-        RecordingError: It is none.
-        MissingDependencyError: mcap is not installed.
-    """
+    """Open an MCAP file; a `RecordingError` if it is none."""
     check()
     try:
         file = path.open("rb")

@@ -115,11 +115,7 @@ def write(file: IO[bytes], time: int, what: int, event: Packed | None = None) ->
 
 
 def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator[Piece]:
-    """Yield pieces up to the end of the pipe; an incomplete last piece is left out.
-
-    Args:
-        idle: Seconds of silence after which `while_idle` is called, repeatedly.
-    """
+    """Yield pieces to the end of the pipe; call `while_idle` after `idle` seconds of silence."""
     while True:
         while not select.select([file], [], [], idle)[0]:
             while_idle()

@@ -159,12 +159,7 @@ LONGEST = 0.4  # longest duration of a chunk: seconds, real and of the run's clo
 
 
 class FileWriter:
-    """Writer of a recording.
-
-    Raises:
-        RecordingError: The file cannot be made.
-        MissingDependencyError: A library is not installed.
-    """
+    """Writer of a recording; a `RecordingError` if the file cannot be made."""
 
     def __init__(self, request: WriteRequest) -> None:
         config = request.config

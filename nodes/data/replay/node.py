@@ -111,12 +111,7 @@ def _size_of(timed: Timed) -> int:
 
 
 def open_reader(config: ReplayConfig, name: str) -> Reader:
-    """Return a reader of a recording.
-
-    Raises:
-        ReplayError: Nothing there can be read.
-        MissingDependencyError: A library is not installed.
-    """
+    """Return a reader of a recording; a `ReplayError` if nothing there can be read."""
     path = newest(Path(config.file))
     vehicle = config.vehicle or name
     if (path / "recording.mcap").is_file() and not config.topics:  # a run's folder

@@ -21,12 +21,7 @@ _LOOK = 64  # messages searched for our own metadata, in files rewritten by othe
 
 
 class Recorded(Reader):
-    """Reader of a recording of ours, torn ones too.
-
-    Raises:
-        ReplayError: It is no MCAP file.
-        MissingDependencyError: mcap or rosbags is not installed.
-    """
+    """Reader of a recording of ours, torn ones too; a `ReplayError` if it is no MCAP file."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()

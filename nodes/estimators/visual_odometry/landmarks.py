@@ -163,12 +163,7 @@ class Landmarks:
         self._inactive_until[missed] = now + 1 + self._missed[missed] ** 2
 
     def fuse(self, pose: Floats, rows: Rows, read: Surfaces, noise: float) -> None:
-        """Move landmarks along their first rays to the mean of all readings of their depth.
-
-        Args:
-            pose: World to camera, shape (4, 4).
-            noise: Standard deviation of a reading, 1/m.
-        """
+        """Move landmarks along their first rays to the mean of all readings (noise in 1/m)."""
         _, z = self.project(pose, rows)
         use = read.continuous & (np.abs(read.inverse - 1.0 / z) < _CONTRADICTS * noise)
         rows, now = rows[use], read.inverse[use]

@@ -117,11 +117,7 @@ _READING = 0.5  # noise of a surface's distance, relative to a single pixel's
 
 
 class References:
-    """Alignment of images with the last reference.
-
-    Args:
-        noise: Standard deviation of one pixel's inverse depth, 1/m.
-    """
+    """Alignment of images with the last reference; noise is of one pixel's inverse depth, 1/m."""
 
     def __init__(self, matrix: Floats, noise: float) -> None:
         self._matrix, self._noise = matrix, noise
@@ -130,12 +126,7 @@ class References:
         self._known: tuple[Grey, Depth, Floats] | None = None
 
     def note(self, grey: Grey, inverse_of: Depth, pose: Floats, aligned: bool) -> None:
-        """Remember a grey image of known pose (world to camera), as a possible reference.
-
-        Args:
-            inverse_of: As of `inverse_depth`.
-            aligned: Whether the present reference served, and shall be kept.
-        """
+        """Remember a grey image of known pose; `aligned` keeps the present reference."""
         self._known, self._bridge = (grey, inverse_of, pose), None
         if not aligned:
             self._reference = None
@@ -145,12 +136,7 @@ class References:
         self._reference = self._made(view, pose)
 
     def align(self, view: View, starts: list[Floats], lost: bool) -> Alignment | None:
-        """Return the alignment of a view with the reference, or with the last known image.
-
-        Args:
-            starts: Expected initial poses, world to camera, shape (4, 4) each.
-            lost: Whether these are guesses only.
-        """
+        """Return a view's alignment with the reference, or the last image, from initial poses."""
         found = None
         if self._reference is not None:
             found = self._best(self._reference, view, starts, lost)

@@ -203,11 +203,7 @@ class StereoOdometry(Estimator[StereoOdometryConfig]):
 
 
 class StereoTracker:
-    """Tracker of the left camera of a pair without distortion; equal images give equal poses.
-
-    Args:
-        baseline: Metres from the left camera to the right one.
-    """
+    """Tracker of a rectified pair's left camera, a baseline (m) apart; reproducible to the bit."""
 
     def __init__(
         self, info: CameraInfo, baseline: float, stereo: StereoSettings, features: FeatureSettings

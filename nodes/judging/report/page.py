@@ -177,10 +177,7 @@ class ReportConfig(NodeConfig):
 
 
 class Report(Node[ReportConfig]):
-    """Writer of ``report.html`` and its figures, from the files of all other nodes.
-
-    Runs last, with or without an evaluation. The command ``report`` writes the page anew.
-    """
+    """Writer of ``report.html`` and its figures, from all other nodes' files, at the very end."""
 
     files = ("plots", "report.html")
 

@@ -99,12 +99,7 @@ def sheet(
 
 
 def bounds(points: Floats, least: float | Sequence[float]) -> tuple[Floats, Floats]:
-    """Return the corners of plotted points, with a margin and a least side length.
-
-    Args:
-        points: Metres, shape (n, k); rows may be NaN.
-        least: Least share of the longest side for each side; one for all, or k.
-    """
+    """Return the corners of points (m; (n, k), NaN allowed), with margin and least side shares."""
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     middle, extent = (low + high) / 2, high - low
     longest = max(float(extent.max()), 0.5)

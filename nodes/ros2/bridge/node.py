@@ -107,12 +107,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self.deterministic = not steered  # type: ignore[misc]
 
     async def on_startup(self) -> None:
-        """Join the network, and wait for the cameras of ROS.
-
-        Raises:
-            MissingDependencyError: rosbags is not installed.
-            FatalError: The settings contradict each other, or there is no session.
-        """
+        """Join the network, and wait for ROS's cameras; a `FatalError` if that fails."""
         config = self.config
         if config.time == "wall" and self.clock.kind != "real":
             self.log.fatal('time = "wall" needs clock = "real", found "%s"', self.clock.kind)

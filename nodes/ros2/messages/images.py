@@ -64,12 +64,7 @@ _TURNS = {
 
 
 class ImageWriter:
-    """Writer of ``sensor_msgs/msg/Image``.
-
-    Args:
-        frame_id: Optical frame.
-        encoding: ``rgb8``, ``mono8``, ``32FC1``, ``32SC1``; ``16UC1``: metres to millimetres.
-    """
+    """Writer of ``sensor_msgs/msg/Image`` in an optical frame; ``16UC1`` from metres."""
 
     def __init__(self, store: TypeStore, frame_id: str, encoding: str) -> None:
         self._store, self.frame_id, self.encoding = store, frame_id, encoding

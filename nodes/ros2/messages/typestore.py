@@ -174,12 +174,7 @@ class TypeStore:
 
 
 class Bag:
-    """Reader of a bag of ROS 2 (a folder, or an MCAP or SQLite file), or of ROS 1.
-
-    Raises:
-        MissingDependencyError: rosbags is not installed.
-        ValueError: It cannot be read.
-    """
+    """Reader of a bag of ROS 2 (a folder, MCAP, SQLite) or ROS 1; may raise `ValueError`."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -271,12 +266,7 @@ class MessageBuilder:
         self._store, self._names, self._time = store, names, time
 
     def make(self, type_: str, **fields: Any) -> Any:
-        """Return a message; fields not given are zero, empty or false.
-
-        Raises:
-            ValueError: There is no such type.
-            TypeError: It has no such field.
-        """
+        """Return a message, zero but for given fields; a `ValueError` or `TypeError` if unknown."""
         message = self._store.zero(type_)
         for name, value in fields.items():
             if not hasattr(message, name):
