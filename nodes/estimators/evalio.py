@@ -33,9 +33,7 @@ Floats = npt.NDArray[np.float64]
 
 INSTALL = install_command("evalio")
 
-_INERTIAL = ("dlio", "liosam")
-"""Pipelines that cannot do without an IMU."""
-
+_INERTIAL = ("dlio", "liosam")  # pipelines that cannot do without an IMU
 _FIXED = {
     "ls_num_threads": 1,
     "max_num_threads": 1,
@@ -51,17 +49,14 @@ The sums of several threads have no fixed order, and ``realtime`` gives up by th
 _USUAL = {"deskew": True, "mappingProcessInterval": 0.0}
 """Defaults that are not the library's: LIO-SAM's, 0.15 s, repeats the pose before at 10 Hz."""
 
-_SCANS_LATE = {"liosam": 2}
-"""Scans that a pipeline holds back: a pose is that of an earlier scan."""
-
+_SCANS_LATE = {"liosam": 2}  # scans that a pipeline holds back: a pose is that of an earlier scan
 _TIME_OF_POSE = {"ct": 0.0, "dlio": 0.5, "form": 0.5, "liosam": 0.5, "loam": 0.5}
 """Time of a pose within its scan, from the first ray (0) to the last (1); found on ideal data.
 
 The others correct a scan to its last ray, or, told not to, give a mean over all.
 """
 
-_UP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From y right and z down to y left and z up, and back."""
+_UP = np.diag([1.0, -1.0, -1.0, 1.0])  # from y right and z down to y left and z up, and back
 
 
 class EvalioConfig(EstimatorConfig):
@@ -92,17 +87,16 @@ class EvalioConfig(EstimatorConfig):
 class EvalioProcess:
     """A pipeline of evalio.
 
-    Args:
-        lidar: Whose ranges are the limits.
-        imu: Whose samples it gets; `None` for none.
-
     Raises:
         MissingDependencyError: `evalio` cannot be imported.
         ValueError: The pipeline has no such parameter, or one of another type.
     """
 
     def __init__(
-        self, config: EvalioConfig, lidar: LidarAnnouncement, imu: ImuAnnouncement | None
+        self,
+        config: EvalioConfig,
+        lidar: LidarAnnouncement,  # whose ranges are the limits
+        imu: ImuAnnouncement | None,  # whose samples it gets; `None` for none
     ) -> None:
         try:
             from evalio import pipelines, types
@@ -163,10 +157,10 @@ class EvalioProcess:
 
     def track(
         self,
-        stamp: int,
+        stamp: int,  # of the scan's first ray, ns
         points: npt.NDArray[np.float32],
-        times: npt.NDArray[np.float32],
-        rings: npt.NDArray[np.uint16],
+        times: npt.NDArray[np.float32],  # of the rays after `stamp`, seconds, shape (n,)
+        rings: npt.NDArray[np.uint16],  # channels of the rays, shape (n,)
         samples: Floats,
     ) -> TrackingResult:
         """Take in samples and the next scan; return the pose of the lidar.
@@ -174,10 +168,7 @@ class EvalioProcess:
         It is that of this scan, or of one `_SCANS_LATE` before, in the lidar's frame at the first.
 
         Args:
-            stamp: Of the scan's first ray, ns.
             points: Each in the lidar's frame at the time of its ray, metres, shape (n, 3).
-            times: Of the rays after `stamp`, seconds, shape (n,).
-            rings: Channels of the rays, shape (n,).
             samples: Of the IMU up to the last ray, since the last call: stamp (ns), angular
                 velocity, specific force; shape (m, 7).
         """

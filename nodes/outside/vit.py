@@ -47,8 +47,7 @@ RESULTS = ("INVALID_VERSION", "INVALID_VALUE", "ALLOCATION_FAILURE", "NOT_SUPPOR
 NONE, RT4, RT5, RT8, KB4 = range(5)
 """Distortion: none, radial-tangential with 4, 5 or 8 coefficients, Kannala-Brandt's."""
 
-_L8 = 1
-"""Format of an image: 8 bits of grey."""
+_L8 = 1  # format of an image: 8 bits of grey
 
 
 class VitError(VisnavError):
@@ -182,12 +181,8 @@ class Library:
             raise VitError(f"{self._path}: expected vit_{name} to succeed, found VIT_ERROR_{found}")
 
 
-FOLDER = "$VISNAV_FOLDER"
-"""Stands in a configuration for the folder of the calibration's files."""
-
-_POLL = 0.0005
-"""Real seconds between two polls for a pose, as the interface does not wait."""
-
+FOLDER = "$VISNAV_FOLDER"  # stands in a configuration for the folder of the calibration's files
+_POLL = 0.0005  # real seconds between two polls for a pose, as the interface does not wait
 _TOLERANCE = 1000
 """Tolerated nanoseconds between stamps of pose and image: OpenVINS has seconds inside."""
 
@@ -223,18 +218,12 @@ class VitTracker:
 
     def track(
         self,
-        stamp: int,
-        images: list[npt.NDArray[np.uint8]],
-        samples: tuple[Imu, ...],
-        wait: float,
+        stamp: int,  # of the images (ns), on the clock of the IMU
+        images: list[npt.NDArray[np.uint8]],  # one of each camera, grey or red, green, blue
+        samples: tuple[Imu, ...],  # of the IMU since the last images, up to these
+        wait: float,  # real seconds to wait for the pose of this stamp, the last of the result
     ) -> list[tuple[int, TrackingResult]]:
         """Push samples, then images; return stamp and result of each available pose.
-
-        Args:
-            stamp: Of the images (ns), on the clock of the IMU.
-            images: One of each camera, grey or red, green, blue.
-            samples: Of the IMU since the last images, up to these.
-            wait: Real seconds to wait for the pose of this stamp, the last of the result.
 
         Raises:
             VitError: The library refuses something.
@@ -359,17 +348,15 @@ class VitConfig(EstimatorConfig):
     hold: HoldConfig = HoldConfig(initialise=Duration(10.0))
 
 
-LEAST = 0.1
-"""Least real seconds of patience for each image, if the setting has as many."""
+LEAST = 0.1  # least real seconds of patience for each image, if the setting has as many
 
 
-def patience_left(patience: float, image: float, now: float) -> float:
-    """Return the real seconds left to an image for a first pose.
-
-    Args:
-        image: Stamp of the image, seconds after that of the first.
-        now: Real seconds since the first image came.
-    """
+def patience_left(
+    patience: float,
+    image: float,  # stamp of the image, seconds after that of the first
+    now: float,  # real seconds since the first image came
+) -> float:
+    """Return the real seconds left to an image for a first pose."""
     return max(image + patience - now, min(patience, LEAST))
 
 

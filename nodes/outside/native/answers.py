@@ -26,15 +26,10 @@ from nodes.outside.native.client import (
 )
 from runtime.errors import VisnavError
 
-TOLERANCE = 1e-4
-"""Tolerated deviation from orthonormality, for rotations in single precision."""
+TOLERANCE = 1e-4  # tolerated deviation from orthonormality, for rotations in single precision
+FARTHEST = 1e9  # largest accepted coordinate of a pose, metres
 
-FARTHEST = 1e9
-"""Largest accepted coordinate of a pose, metres."""
-
-MATRIX, POINT = 12 * 8, 2 * 4 + 1
-"""Bytes of a pose, and of a point with its flag."""
-
+MATRIX, POINT = 12 * 8, 2 * 4 + 1  # bytes of a pose, and of a point with its flag
 FOLLOWS = (COVARIANCE, 36), (VELOCITY, 3)
 """Optional fields after a pose: flag, and count of numbers."""
 
@@ -44,54 +39,39 @@ class LinkError(VisnavError):
 
 
 class LinkOrder(msgspec.Struct, frozen=True):
-    """An order to the vehicle.
-
-    Attributes:
-        order: ``takeoff``, ``land``, ``position`` or ``velocity``.
-        axes: ``map`` or ``heading``, of a velocity.
-        position: Metres in ``map``.
-        velocity: Metres per second along the axes.
-        yaw: Radians.
-        yaw_rate: Radians per second.
-    """
+    """An order to the vehicle."""
 
     sequence: int
     stamp: int
-    order: str
-    axes: str
-    position: tuple[float, float, float]
-    velocity: tuple[float, float, float]
-    yaw: float
-    yaw_rate: float
+    order: str  # ``takeoff``, ``land``, ``position`` or ``velocity``
+    axes: str  # ``map`` or ``heading``, of a velocity
+    position: tuple[float, float, float]  # metres in ``map``
+    velocity: tuple[float, float, float]  # metres per second along the axes
+    yaw: float  # radians
+    yaw_rate: float  # radians per second
 
 
 class LinkAnswer(msgspec.Struct, frozen=True, eq=False):
-    """The answer to a frame.
+    """The answer to a frame."""
 
-    Attributes:
-        sequence: Number of the frame.
-        stamp: Stamp of the frame (ns).
-        status: ``done``: the program says no more about this frame.
-        pose: The optical camera 0 (the body, without a camera) in that of the program's first
-            pose, shape (4, 4); `None` if the status is not ``tracked``.
-        covariance: Of the error of that pose: a shift of the camera and a rotation about it, along
-            the axes of the camera (or body) of the first pose, shape (6, 6); `None` without any.
-        velocity: Along the same axes, m/s, shape (3,); `None` without any.
-        points: Features that were tracked: column and row, float32 pixels, shape (n, 2).
-        inliers: Which of them agree with the pose: bool, shape (n,).
-        output: Number of the output; 0 is the answer itself.
-        before: Further outputs and orders that came before the answer to the same frame.
-    """
-
-    sequence: int
-    stamp: int
+    sequence: int  # number of the frame
+    stamp: int  # stamp of the frame (ns)
+    # ``done``: the program says no more about this frame.
     status: Literal["tracked", "lost", "initialising", "done"]
+    # The optical camera 0 (the body, without a camera) in that of the program's first pose, shape
+    # (4, 4); `None` if the status is not ``tracked``.
     pose: npt.NDArray[np.float64] | None = None
+    # Of the error of that pose: a shift of the camera and a rotation about it, along the axes of
+    # the camera (or body) of the first pose, shape (6, 6); `None` without any.
     covariance: npt.NDArray[np.float64] | None = None
+    # Along the same axes, m/s, shape (3,); `None` without any.
     velocity: npt.NDArray[np.float64] | None = None
+    # Features that were tracked: column and row, float32 pixels, shape (n, 2).
     points: npt.NDArray[np.float32] = np.empty((0, 2), np.float32)
+    # Which of them agree with the pose: bool, shape (n,).
     inliers: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
-    output: int = 0
+    output: int = 0  # number of the output; 0 is the answer itself
+    # Further outputs and orders that came before the answer to the same frame.
     before: tuple[LinkAnswer | LinkOrder, ...] = ()
 
 
@@ -175,7 +155,7 @@ def describe(
     cameras: Sequence[tuple[CameraAnnouncement, Sequence[str]]],
     inputs: Sequence[tuple[str, str, Announcement]],
     clock: Mapping[str, Any],
-    outputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),  # names of the further outputs
 ) -> dict[str, Any]:
     """Return the description of a run: the announcements' fields, and transforms to the body (FRD).
 
@@ -183,7 +163,6 @@ def describe(
         cameras: Each with the kinds of image that will be sent of it (``rgb8``, ``depth32f``, …).
         inputs: Name, kind (one of `client.RECORDS`) and announcement of each.
         clock: ``kind`` of the run's clock (``lockstep`` or ``real``), and what else is known.
-        outputs: Names of the further outputs.
     """
     return {
         "clock": dict(clock),

@@ -79,8 +79,7 @@ KINDS: dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]] = {
     "rgb8": (2, np.dtype("u1"), (3,)),
     "depth32f": (3, np.dtype("<f4"), ()),
     "segmentation32i": (4, np.dtype("<i4"), ()),
-}
-"""Kinds of image: number, type of a value, values of a pixel."""
+}  # kinds of image: number, type of a value, values of a pixel
 
 ORDERS = {"takeoff": 0, "land": 1, "position": 2, "velocity": 3}
 AXES = {"map": 0, "heading": 1}
@@ -94,50 +93,31 @@ class ProtocolError(ConnectionError):
 
 
 class LinkImage(NamedTuple):
-    """An image in shared memory: valid until its frame has been answered, read-only.
+    """An image in shared memory: valid until its frame has been answered, read-only."""
 
-    Attributes:
-        camera: Index in the description's cameras.
-        kind: One of `KINDS`.
-        data: Shape (height, width), or (height, width, 3) for rgb8; depth32f is metres along z,
-            inf where there is none.
-    """
-
-    camera: int
-    kind: str
+    camera: int  # index in the description's cameras
+    kind: str  # one of `KINDS`
+    # Shape (height, width), or (height, width, 3) for rgb8; depth32f is metres along z, inf where
+    # there is none.
     data: npt.NDArray[Any]
 
 
 class LinkInput(NamedTuple):
-    """Measurements of a sensor in a row, a whole scan, or estimates of another node.
+    """Measurements of a sensor in a row, a whole scan, or estimates of another node."""
 
-    Attributes:
-        name: One of the description's inputs.
-        arrived: Time of the run's clock at which the last one came (ns): its stamp and latency.
-        rows: One of `RECORDS`.
-    """
-
-    name: str
-    arrived: int
-    rows: npt.NDArray[Any]
+    name: str  # one of the description's inputs
+    arrived: int  # time of the run's clock at which the last one came (ns): its stamp and latency
+    rows: npt.NDArray[Any]  # one of `RECORDS`
 
 
 class Frame(NamedTuple):
-    """Images of an exposure, or another occasion for an answer, and what came before.
+    """Images of an exposure, or another occasion for an answer, and what came before."""
 
-    Attributes:
-        sequence: 0, 1, 2, …
-        stamp: Time of the exposure, or of the measurement that asks for an answer (ns).
-        images: All images.
-        inputs: What came since the frame before, in the order in which it came.
-        kinds: Kind of each input, by name.
-    """
-
-    sequence: int
-    stamp: int
-    images: tuple[LinkImage, ...]
-    inputs: tuple[LinkInput, ...]
-    kinds: Mapping[str, str]
+    sequence: int  # 0, 1, 2, …
+    stamp: int  # time of the exposure, or of the measurement that asks for an answer (ns)
+    images: tuple[LinkImage, ...]  # all images
+    inputs: tuple[LinkInput, ...]  # what came since the frame before, in the order in which it came
+    kinds: Mapping[str, str]  # kind of each input, by name
 
     def rows(self, name: str) -> npt.NDArray[Any]:
         """Return what came of an input since the frame before; raise `LookupError` if unknown."""
@@ -283,7 +263,7 @@ class Link:
         pose: npt.ArrayLike,
         *,
         covariance: npt.ArrayLike | None = None,
-        velocity: npt.ArrayLike | None = None,
+        velocity: npt.ArrayLike | None = None,  # in that frame, metres per second, shape (3,)
         points: npt.ArrayLike = (),
         inliers: npt.ArrayLike | None = None,
         status: str = "tracked",
@@ -292,11 +272,10 @@ class Link:
         """Answer a frame with a pose.
 
         Args:
-            pose: Transform from the optical camera (or the body: see `ready`) to a frame that
-                stays the same, metres, shape (4, 4) or (3, 4).
+            pose: Transform from the optical camera (or the body: see `ready`) to a frame that stays
+                the same, metres, shape (4, 4) or (3, 4).
             covariance: Of the pose's error: a shift along x, y, z and a rotation about them, all in
                 that frame, m², m rad and rad², shape (6, 6).
-            velocity: In that frame, metres per second, shape (3,).
             points: Features that were tracked: column and row, pixels, shape (n, 2).
             inliers: Which of them agree with the pose, shape (n,); all if not given.
             status: ``tracked``, ``lost`` or ``initialising``; only ``tracked`` has a pose.
@@ -331,10 +310,10 @@ class Link:
         frame: Frame,
         order: str,
         *,
-        position: npt.ArrayLike = (0.0, 0.0, 0.0),
-        velocity: npt.ArrayLike = (0.0, 0.0, 0.0),
-        yaw: float = 0.0,
-        yaw_rate: float = 0.0,
+        position: npt.ArrayLike = (0.0, 0.0, 0.0),  # metres in ``map``: north, east, down
+        velocity: npt.ArrayLike = (0.0, 0.0, 0.0),  # metres per second along `axes`
+        yaw: float = 0.0,  # of a position: radians, clockwise from north seen from above
+        yaw_rate: float = 0.0,  # radians per second
         axes: str = "map",
     ) -> None:
         """Fly the vehicle, before the answer to a frame and from when that counts.
@@ -342,10 +321,6 @@ class Link:
         Args:
             order: ``takeoff`` (to the height -z of `position` above the ground), ``land``,
                 ``position`` (with a velocity along a path) or ``velocity``.
-            position: Metres in ``map``: north, east, down.
-            velocity: Metres per second along `axes`.
-            yaw: Of a position: radians, clockwise from north seen from above.
-            yaw_rate: Radians per second.
             axes: Of a velocity: ``map``, or ``heading`` (x ahead, y to the right, z down).
         """
         numbers = *np.asarray(position, float), *np.asarray(velocity, float), yaw, yaw_rate
@@ -385,12 +360,11 @@ def message(kind: int, *parts: bytes) -> bytes:
     return HEADER.pack(sum(map(len, parts)), kind) + b"".join(parts)
 
 
-def read_message(connection: Any, head: bytes = b"") -> tuple[int, bytearray]:
+def read_message(
+    connection: Any,  # a socket, or what has its `recv_into`
+    head: bytes = b"",  # the first bytes
+) -> tuple[int, bytearray]:
     """Wait for a message, whose first bytes may be there, and return its type and body.
-
-    Args:
-        connection: A socket, or what has its `recv_into`.
-        head: The first bytes.
 
     Raises:
         EOFError: The other side has closed the connection.

@@ -35,12 +35,8 @@ from nodes.outside.native.answers import (
 from runtime.workers.output import plain_lines
 from runtime.workers.shared_memory import anonymous_file
 
-_AT_ONCE = 1 << 16
-"""Size of the read buffer for a program's messages, bytes."""
-
-GREETING_TIME = 10.0
-"""Real seconds for a connection to send HELLO."""
-
+_AT_ONCE = 1 << 16  # size of the read buffer for a program's messages, bytes
+GREETING_TIME = 10.0  # real seconds for a connection to send HELLO
 GREETING = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
 
 READERS: dict[int, Callable[[bytearray], LinkAnswer | LinkOrder]] = {
@@ -51,9 +47,7 @@ READERS: dict[int, Callable[[bytearray], LinkAnswer | LinkOrder]] = {
 
 POSE_OF = {number.to_bytes(4, "little"): name for name, number in wire.POSE_OF.items()}
 
-MOST_BEFORE = 64
-"""Most outputs and orders before the answer to a frame."""
-
+MOST_BEFORE = 64  # most outputs and orders before the answer to a frame
 ALIGNMENT = 64
 """Images begin at multiples of this (bytes); a slot has room for the gaps between 16 of them."""
 
@@ -107,31 +101,24 @@ class Endpoint:
     gone, another may connect: `wait` for it again. Its frames are numbered from 0.
 
     Args:
-        path: The socket; at most 107 bytes.
-        description: Sent to the program: see `describe`.
-        slots: Unanswered frames of the program, at most.
-        slot_bytes: Size of a frame's images, of which there are 16 at most.
-        answered: Called with each answer, in the thread that reads.
         gone: Called once when the program is gone or is disconnected, with the reason; in the
             thread that reads. Not after `close`.
         logged: Called with each text for the log, unchecked and unlimited, in the thread that
             reads.
-        skips: Whether an answer also frees the slots of all earlier frames.
-        orders: Whether the program may send orders.
     """
 
     def __init__(
         self,
-        path: Path,
-        description: Mapping[str, Any],
+        path: Path,  # the socket; at most 107 bytes
+        description: Mapping[str, Any],  # sent to the program: see `describe`
         *,
-        slots: int,
-        slot_bytes: int,
-        answered: Callable[[LinkAnswer], None],
+        slots: int,  # unanswered frames of the program, at most
+        slot_bytes: int,  # size of a frame's images, of which there are 16 at most
+        answered: Callable[[LinkAnswer], None],  # called with each answer, in the thread that reads
         gone: Callable[[str], None],
         logged: Callable[[bytearray], None],
-        skips: bool = False,
-        orders: bool = False,
+        skips: bool = False,  # whether an answer also frees the slots of all earlier frames
+        orders: bool = False,  # whether the program may send orders
     ) -> None:
         self._path = path
         self._description = msgspec.json.encode(description)

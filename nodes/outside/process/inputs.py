@@ -34,8 +34,7 @@ from events.geometry import pose_matrix
 from nodes.outside.native.client import RECORDS
 from runtime.errors import suggest
 
-MOST_BYTES = 64 << 20
-"""Most bytes waiting for the next frame; beyond, the oldest are dropped."""
+MOST_BYTES = 64 << 20  # most bytes waiting for the next frame; beyond, the oldest are dropped
 
 
 class Sensor(NamedTuple):
@@ -71,8 +70,7 @@ SENSORS = {
         RangeAnnouncement, "range", Range, lambda e: (e.range, e.min_range, e.max_range)
     ),
     "lidar": Sensor(LidarAnnouncement, "lidar_scan", LidarScan, tuple),  # see `_points`
-}
-"""Kinds of sensor by their names in the setting ``reads``."""
+}  # kinds of sensor by their names in the setting ``reads``
 
 _BY_EVENT = {sensor.event: sensor for sensor in SENSORS.values()}
 
@@ -97,15 +95,12 @@ class Inputs:
 
     Args:
         names: Of each: a kind of sensor, the last part of a sensor's source, or an estimator.
-
-    Attributes:
-        chosen: Name, kind of the rows, and announcement of each; empty before `choose`.
-        dropped: Number of messages dropped for want of room.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
+        # Name, kind of the rows, and announcement of each; empty before `choose`.
         self.chosen: list[tuple[str, str, Announcement]] = []
-        self.dropped = 0
+        self.dropped = 0  # number of messages dropped for want of room
         self._names = names
         self._announced: list[Announcement] = []
         self._numbers: dict[str, int] = {}  # by source
@@ -119,13 +114,12 @@ class Inputs:
         if isinstance(announcement, (EstimatorAnnouncement, *kinds)):
             self._announced.append(announcement)
 
-    def choose(self, body: str, imu: ImuAnnouncement | None) -> Iterable[str]:
-        """Choose among what was announced, and yield an error for each that is missing.
-
-        Args:
-            body: Source of the body whose sensors are meant; empty for the first found.
-            imu: Comes first if the names mean no IMU.
-        """
+    def choose(
+        self,
+        body: str,  # source of the body whose sensors are meant; empty for the first found
+        imu: ImuAnnouncement | None,  # comes first if the names mean no IMU
+    ) -> Iterable[str]:
+        """Choose among what was announced, and yield an error for each that is missing."""
         self.chosen = []
         for name in self._names:
             found = self._find(name, body)

@@ -121,8 +121,7 @@ class ProcessConfig(EstimatorConfig):
                 raise ValueError(f"{name}: expected each once, found {getattr(self, name)}")
 
 
-_LONGEST = 100
-"""Bytes of a socket's path; Linux allows 107."""
+_LONGEST = 100  # bytes of a socket's path; Linux allows 107
 
 
 class ProgramError(VisnavError):
@@ -135,19 +134,16 @@ class Launch:
     Args:
         bridge: Settings of the bridge that feeds it, if one does.
         folder: Where it may write; `None` for a folder that is removed afterwards.
-
-    Attributes:
-        working: Its working folder.
-        socket: Where it has to connect: in its folder, if the path is not too long for one.
     """
 
     def __init__(self, config: ProcessConfig, bridge: Any, folder: Path | None) -> None:
-        self.working = Path(config.folder).absolute()
+        self.working = Path(config.folder).absolute()  # its working folder
         self._config = config
         self._processors: Sequence[int] = ()
         self._temporary: Path | None = None
         self._folder = folder and folder.absolute()
         self.folder = self._folder or Path("folder")
+        # Where it has to connect: in its folder, if the path is not too long for one.
         self.socket = self.folder / "link.socket"
         if bridge is None:
             self._ours = {}
@@ -169,12 +165,11 @@ class Launch:
             return ""
         return f"{what}: expected a program that can be executed, found none at {place}"
 
-    def take_processors(self, taken: list[int]) -> str:
-        """Choose the processors, the least used first; return an error if there are too few.
-
-        Args:
-            taken: Those chosen by others; this program's are added.
-        """
+    def take_processors(
+        self,
+        taken: list[int],  # those chosen by others; this program's are added
+    ) -> str:
+        """Choose the processors, the least used first; return an error if there are too few."""
         there, wanted = sorted(os.sched_getaffinity(0), reverse=True), self._config.cpus
         if wanted > len(there):
             return f"cpus: expected at most the {len(there)} there are, found {wanted}"

@@ -54,14 +54,9 @@ from runtime.channels.hold import Hold, Owed
 from runtime.channels.streams import Stream
 from runtime.workers.output import Throttle
 
-_BEYOND = 64
-"""Waiting frames beyond the slots, in lockstep with `on_missing = "continue"`."""
-
-_SLOTS = 256
-"""Unanswered frames without images, at most."""
-
-_STORY = 0.5
-"""Real seconds to wait for a program's exit code after its connection has closed."""
+_BEYOND = 64  # waiting frames beyond the slots, in lockstep with `on_missing = "continue"`
+_SLOTS = 256  # unanswered frames without images, at most
+_STORY = 0.5  # real seconds to wait for a program's exit code after its connection has closed
 
 
 _TOGETHER: Any = types.SimpleNamespace(_make=tuple)

@@ -30,12 +30,8 @@ from nodes.outside.process.inputs import Message
 from runtime.channels.hold import Hold
 from runtime.workers.output import Output, how_it_ended
 
-_AT_ONCE = 1 << 16
-"""Bytes of a single read."""
-
-_REST = 1.0
-"""Seconds to read the last output of an ended program, as others may still write."""
-
+_AT_ONCE = 1 << 16  # bytes of a single read
+_REST = 1.0  # seconds to read the last output of an ended program, as others may still write
 _LATE = 3.0
 """Seconds beyond the grace time until the guard is killed, and the program with the guard."""
 
@@ -46,16 +42,10 @@ class Program:
     Whichever way the run ends, the program ends with it, and all that it has started.
 
     Args:
-        command: A program and its arguments; no shell has a part in it.
-        grace: Seconds that it may take to end once it gets SIGTERM.
-        processors: Numbers of those that it may use; all if none.
         printed: Called in a thread with each line that it prints, at once: it writes to a terminal
             of its own, so that no library keeps its output back.
         ended: Called in a thread, at once, when it has ended by itself, with how and what it last
             printed.
-
-    Attributes:
-        code: Its exit code, once it has ended; below 0 the signal that killed it.
 
     Raises:
         OSError: The folder is missing.
@@ -63,15 +53,16 @@ class Program:
 
     def __init__(
         self,
-        command: Sequence[str],
+        command: Sequence[str],  # a program and its arguments; no shell has a part in it
         folder: Path,
         environment: Mapping[str, str],
         *,
-        grace: float,
-        processors: Sequence[int] = (),
+        grace: float,  # seconds that it may take to end once it gets SIGTERM
+        processors: Sequence[int] = (),  # numbers of those that it may use; all if none
         printed: Callable[[str], None],
         ended: Callable[[str], None] = lambda _: None,
     ) -> None:
+        # Its exit code, once it has ended; below 0 the signal that killed it.
         self.code: int | None = None
         self._grace = grace
         self._ended = ended
@@ -197,7 +188,6 @@ class Feed:
         description: What the program is told; see `nodes.outside.native.describe`.
         story: Called in a thread with why it is gone; returns what else is known.
         processes: Returns the numbers of the program's processes, whose costs are measured.
-        skips: Whether an answer says that none will come for the frames before it.
         options: Of the `Endpoint`: `slots`, `slot_bytes`, `logged`, `orders`.
     """
 
@@ -209,7 +199,7 @@ class Feed:
         story: Callable[[str], str],
         processes: Callable[[], Sequence[int]],
         *,
-        skips: bool,
+        skips: bool,  # whether an answer says that none will come for the frames before it
         **options: Any,
     ) -> None:
         self.unanswered: dict[int, int] = {}
