@@ -29,7 +29,6 @@ all summaries are exchanged. Processes that are silent for long are not waited f
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import threading
 import time
@@ -55,7 +54,7 @@ from runtime.peers.messages import (
 from runtime.summary import ProcessSummary, Summary, merged
 from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.time_limits import real_time_limit
+from runtime.time.time_limits import call_after, real_time_limit
 from runtime.wire import pack, unpack
 
 LEAD = 50_000_000
@@ -296,15 +295,7 @@ class JointShutdown:
         )
 
     def _watch(self) -> None:
-        loop = asyncio.get_running_loop()
-
-        def ring() -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(self._look)
-
-        self._timer = threading.Timer(BUSY_EVERY, ring)
-        self._timer.daemon = True
-        self._timer.start()
+        self._timer = call_after(BUSY_EVERY, asyncio.get_running_loop(), self._look)
 
     def _look(self) -> None:
         if self._timer is None:

@@ -17,7 +17,6 @@ import contextvars
 import functools
 import logging
 import sys
-import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
@@ -27,6 +26,7 @@ from runtime.channels.streams import Stream
 from runtime.channels.tasks import Nesting, ResumableCoroutine
 from runtime.errors import NodeError
 from runtime.time.lockstep import PYTHON, passes
+from runtime.time.time_limits import call_after
 
 log = logging.getLogger("visnav.runtime")
 
@@ -216,14 +216,7 @@ def _run_for(
 ) -> None:
     task = loop.create_task(coro)
     task.add_done_callback(lambda _: loop.stop())
-
-    def ring() -> None:
-        with contextlib.suppress(RuntimeError):  # closed
-            loop.call_soon_threadsafe(loop.stop)
-
-    timer = threading.Timer(seconds, ring)
-    timer.daemon = True
-    timer.start()
+    timer = call_after(seconds, loop, loop.stop)
     with contextlib.suppress(SystemExit, KeyboardInterrupt):
         loop.run_forever()
     timer.cancel()

@@ -10,17 +10,31 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 LOOK_EVERY = 1.0  # real seconds between two looks at how busy the machine is
 
 
+def call_after(
+    seconds: float, loop: asyncio.AbstractEventLoop, call: Callable[[], object]
+) -> threading.Timer:
+    """Call a function on a loop, unless closed, after real seconds; return the running timer."""
+
+    def ring() -> None:
+        with contextlib.suppress(RuntimeError):  # closed
+            loop.call_soon_threadsafe(call)
+
+    timer = threading.Timer(seconds, ring)
+    timer.daemon = True
+    timer.start()
+    return timer
+
+
 @contextlib.asynccontextmanager
 async def real_time_limit(seconds: float) -> AsyncIterator[None]:
     """Cancel the block and raise `TimeoutError` after `seconds` of real time."""
-    loop = asyncio.get_running_loop()
     task = asyncio.current_task()
     assert task is not None
     cancelled_before = task.cancelling()
@@ -32,14 +46,8 @@ async def real_time_limit(seconds: float) -> AsyncIterator[None]:
             expired = True
             task.cancel()
 
-    def ring() -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has been closed
-            loop.call_soon_threadsafe(expire)
-
     over = False
-    timer = threading.Timer(seconds, ring)
-    timer.daemon = True
-    timer.start()
+    timer = call_after(seconds, asyncio.get_running_loop(), expire)
     try:
         yield
     except asyncio.CancelledError:
