@@ -158,6 +158,15 @@ class WorkerTimeoutError(WorkerError):
     """A worker process did not answer within its limit and was killed."""
 
 
+def expect_known(
+    name: str, known: Iterable[str], message: str, error: type[VisnavError] = ConfigError
+) -> None:
+    """Raise an error with a message, and a suggestion, unless a name is known."""
+    known = list(known)
+    if name not in known:
+        raise error(message + suggest(name, known))
+
+
 def suggest(word: str, known: Iterable[str]) -> str:
     """Return ``" (did you mean 'x'?)"`` if something known is close to `word`, else ``""``."""
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)

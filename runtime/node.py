@@ -25,7 +25,7 @@ from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.ports import MAX_HZ
 from runtime.channels.sender import Listener, Sender
 from runtime.channels.streams import Stream
-from runtime.errors import DeclarationError, suggest
+from runtime.errors import DeclarationError, expect_known
 from runtime.host import Host, RunEnd, Sibling
 from runtime.logs import NodeLogger
 from runtime.summary import plain
@@ -178,11 +178,9 @@ class Node(Generic[C]):
             DeclarationError: The node's class declares no such port.
         """
         ports = [*self.declared.listening, *self.declared.bundle_fields()]
-        if port not in ports:
-            raise DeclarationError(
-                f"narrow: expected one of {', '.join(ports) or 'no ports'}, found {port!r}"
-                + suggest(port, ports)
-            )
+        listed = ", ".join(ports) or "no ports"
+        message = f"narrow: expected one of {listed}, found {port!r}"
+        expect_known(port, ports, message, DeclarationError)
         self.sources.setdefault(port, source)
 
     def on_change(self, before: C) -> None:

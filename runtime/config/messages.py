@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import msgspec
 
-from runtime.errors import ConfigError, suggest
+from runtime.errors import ConfigError, expect_known, suggest
 from runtime.paths import GivenHere
 
 _LONGEST_TEXT = 300  # most characters of a text shown in a message
@@ -179,11 +179,8 @@ def _part(nodes: dict[str, dict[str, Any]], name: str, where: str) -> dict[str, 
 
 def _entry(entries: list[Any], name: str, where: str) -> dict[str, Any]:
     named = _by_name(entries)
-    if name not in named:
-        listed = ", ".join(named) or "a table with a name"
-        raise ConfigError(
-            f"{where}: expected one of {listed}; found {show(name)}" + suggest(name, named)
-        )
+    listed = ", ".join(named) or "a table with a name"
+    expect_known(name, named, f"{where}: expected one of {listed}; found {show(name)}")
     return named[name]
 
 

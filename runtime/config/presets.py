@@ -24,7 +24,7 @@ from typing import Any, get_origin
 import msgspec
 
 from runtime.config.messages import show, struct_in
-from runtime.errors import ConfigError, suggest
+from runtime.errors import ConfigError, expect_known
 
 Presets = Mapping[str, Mapping[str, Any]]
 
@@ -65,11 +65,8 @@ def expanded(value: Any, type_: Any, where: str, at: str = "") -> Any:
 
 def _put_in(value: Mapping[str, Any], extra: Mapping[str, Any], where: str) -> dict[str, Any]:
     presets, name = presets_in(extra), value["preset"]
-    if name not in presets:
-        raise ConfigError(
-            f"{where}: expected one of {', '.join(presets)}, found {show(name)}"
-            + suggest(name, presets)
-        )
+    listed = ", ".join(presets)
+    expect_known(name, presets, f"{where}: expected one of {listed}, found {show(name)}")
     preset = presets[name]
     for key, other in extra.get("needed", {}).items():
         changed = key in value and value[key] != preset.get(key)

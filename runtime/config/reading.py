@@ -38,7 +38,7 @@ from runtime.config.messages import explain, override, show
 from runtime.config.model import Config, NetworkConfig, NodeSpec, OnError, RunConfig
 from runtime.config.plugins import CONFIGURATIONS, NODES, offers
 from runtime.config.presets import expanded
-from runtime.errors import ConfigError, DeclarationError, VisnavError, suggest
+from runtime.errors import ConfigError, DeclarationError, VisnavError, expect_known, suggest
 from runtime.node import Node
 from runtime.paths import resolve, unmarked
 from runtime.units import Duration
@@ -135,11 +135,8 @@ def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> C
     folder = folder or Path.cwd()
     _refuse_extremes(table, where)
     for key in table:
-        if key not in {"run", "network", "nodes"}:
-            raise ConfigError(
-                f"{where}: expected tables [run], [network] and [[nodes]], found {key!r}"
-                + suggest(key, ["run", "network", "nodes"])
-            )
+        message = f"{where}: expected tables [run], [network] and [[nodes]], found {key!r}"
+        expect_known(key, ["run", "network", "nodes"], message)
     run = convert(unmarked(table.get("run", {})), RunConfig, f"{where}: run")
     if not run.name.strip() or "/" in run.name or "\0" in run.name or run.name.startswith("."):
         raise ConfigError(
@@ -267,11 +264,8 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Node) and not is_base(value)
     }
-    if class_name not in known:
-        raise ConfigError(
-            f"{where}: expected a node of {module_name}, found {show(class_name)}"
-            + suggest(class_name, known)
-        )
+    message = f"{where}: expected a node of {module_name}, found {show(class_name)}"
+    expect_known(class_name, known, message)
     return known[class_name]
 
 
@@ -337,11 +331,8 @@ def _node(entry: Any, where: str, folder: Path) -> NodeSpec:
     config = convert(resolve(rest, cls.config_type, folder), cls.config_type, where)
     ports = [*cls.declared.listening, *cls.declared.bundle_fields()]
     for key, port in [("inputs", p) for p in head.inputs] + [("links", p) for p in head.links]:
-        if port not in ports:
-            raise ConfigError(
-                f"{where}: {key}: expected an input or handler of {head.type}, "
-                f"found {show(port)}" + suggest(port, ports)
-            )
+        expected = f"{where}: {key}: expected an input or handler of {head.type}"
+        expect_known(port, ports, f"{expected}, found {show(port)}")
     for method, ticks in cls.declared.ticks.items():
         if isinstance(ticks.hz, str):
             rate = getattr(config, ticks.hz, None)

@@ -18,7 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from runtime.config.plugins import COMMANDS, OURS, Offer, offers
-from runtime.errors import CommandError, ConfigError, suggest
+from runtime.errors import CommandError, ConfigError, expect_known
 
 ConfigFile = Annotated[Path, typer.Argument(help="The file that says what to run.")]
 Overrides = Annotated[
@@ -64,11 +64,8 @@ class Commands(TyperGroup):
             CommandError: It cannot be imported.
         """
         name, *rest = args
-        if name not in _commands():
-            raise ConfigError(
-                f"expected a command ({', '.join(_commands())}), found {name!r}"
-                + suggest(name, _commands())
-            )
+        listed = ", ".join(_commands())
+        expect_known(name, _commands(), f"expected a command ({listed}), found {name!r}")
         return name, load(_chosen(name)), rest
 
     def make_context(self, *args: Any, **options: Any) -> Any:

@@ -38,17 +38,14 @@ def example(
 
     The schema of configuration files is written beside it, for editors that complete and check.
     """
-    from runtime.errors import ConfigError, suggest
+    from runtime.errors import expect_known
 
     examples = example_files()
     if name is None:
         for each, path in examples.items():
             print(f"{each:18} {_about(path)}")
         return
-    if name not in examples:
-        raise ConfigError(
-            f"expected the name of an example, found {name!r}{suggest(name, examples)}"
-        )
+    expect_known(name, examples, f"expected the name of an example, found {name!r}")
     _copy(examples[name], out, {})
 
 

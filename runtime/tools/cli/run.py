@@ -149,18 +149,15 @@ def run(
 
 def chosen(settings: Config, only: str | None) -> list[str]:
     """Return the nodes of ``--only``, in file order; none if all; `ConfigError` if unknown."""
-    from runtime.errors import ConfigError, suggest
+    from runtime.errors import ConfigError, expect_known
 
     if only is None:
         return []
     names = [spec.name for spec in settings.nodes]
     wanted = [name.strip() for name in only.split(",") if name.strip()]
     for name in wanted:
-        if name not in names:
-            raise ConfigError(
-                f"--only {only}: expected nodes of the file ({', '.join(names)}), found {name}"
-                + suggest(name, names)
-            )
+        listed = f"--only {only}: expected nodes of the file ({', '.join(names)})"
+        expect_known(name, names, f"{listed}, found {name}")
     if not wanted:
         raise ConfigError("--only: expected names of nodes with commas between, found none")
     return [] if set(wanted) == set(names) else [name for name in names if name in wanted]

@@ -27,7 +27,7 @@ from events import (
 from events.announcements import Vehicles
 from events.frames import rotate
 from events.geometry import Pose, relative
-from runtime.errors import CommandError, suggest
+from runtime.errors import CommandError, expect_known
 from runtime.run.run_state import RunState
 from runtime.time.schedule import SECOND
 from runtime.tools.monitor.protocol import Points, Rows
@@ -229,11 +229,8 @@ class Measured:
         Raises:
             CommandError: The camera has sent no image.
         """
-        if camera not in self._images:
-            raise CommandError(
-                f"expected a camera that has sent images, found {camera!r}"
-                f"{suggest(camera, self._images)}"
-            )
+        message = f"expected a camera that has sent images, found {camera!r}"
+        expect_known(camera, self._images, message, CommandError)
         for image in reversed(self._images[camera]):
             key = image.stamp, image.frame_id
             found = [f for f in self._features.values() if (f.stamp, f.frame_id) == key]

@@ -21,7 +21,7 @@ from events import Event, Image, TrackedFeatures
 from runtime.channels.sender import Sender
 from runtime.config.model import Config
 from runtime.config.parameters import settings
-from runtime.errors import CommandError, suggest
+from runtime.errors import CommandError, expect_known
 from runtime.node import NodeConfig, senders, streams
 from runtime.run.instruments import Call, Instrument
 from runtime.run.node_runner import NodeRunner
@@ -356,10 +356,8 @@ class Observer:
 
     def _restart(self, name: str) -> str:
         runners = self._state.runners
-        if name not in runners:
-            raise CommandError(
-                f"expected the name of a node, found {name!r}{suggest(name, runners)}"
-            )
+        message = f"expected the name of a node, found {name!r}"
+        expect_known(name, runners, message, CommandError)
         condition = self._condition(runners[name])
         if condition not in {"running", "left out"}:
             raise CommandError(f"expected a node that runs, and {name} is {condition}")
