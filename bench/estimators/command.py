@@ -22,7 +22,7 @@ def suite(
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Flights of each scenario.")] = 1,
     repeat: Annotated[
-        int, typer.Option(min=1, help="Runs of each estimator with each flight.")
+        int, typer.Option(min=1, help="Runs of each estimator with the first flight of all.")
     ] = 2,
     out: Annotated[Path, typer.Option(help="Folder for the runs.")] = Path("sweeps/suite"),
     page: Annotated[

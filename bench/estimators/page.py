@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ import msgspec
 import numpy as np
 
 from bench.estimators.plan import Entrant, Suite
+from runtime.channels.digest import combined
+from runtime.errors import ConfigError
 from runtime.run.results import write
 from runtime.run.summarise import commit, environment
 from runtime.tools.sweep.plan import Plan
@@ -27,6 +30,7 @@ COLUMNS = {
     "coverage_percent": "coverage, %",
     "lost_seconds": "lost, s",
     "initialization_seconds": "first pose, s",
+    "nees_position": "NEES, position (3 is right)",
     "cpu_p50_ms": "CPU, ms a frame",
     "peak_rss_mb": "memory, MB",
 }
@@ -45,7 +49,6 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
         passed: Number of runs within the thresholds.
         reasons: Why runs failed, each once, with the figures of the first of them.
         figures: Figure to its spread over the runs that have it.
-        repeatable: Whether all repeats of a seed gave the same, in words.
     """
 
     entrant: Entrant
@@ -53,7 +56,6 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     passed: int
     reasons: tuple[str, ...]
     figures: Mapping[str, Spread]
-    repeatable: str
 
     @property
     def verdict(self) -> str:
@@ -73,24 +75,58 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def cells(suite: Suite, plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Cell]]:
-    """Return each estimator's results, by scenario and estimator."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
+    """Return each estimator's results, by scenario and estimator.
+
+    A run equal to another to the bit adds nothing, and is left out.
+    """
+    different: dict[tuple[Any, ...], Row] = {}
     for job, row in in_order(plan, rows):
-        groups.setdefault(tuple(text for _, text in job.settings), []).append(row)
-    repeatable = {each.settings: each.repeatable for each in summarise(plan, rows)}
+        (_, scenario), (_, name) = job.settings
+        digest = row.get("digests", {}).get(name, job.id)
+        different[scenario, name, job.seed, digest] = row
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for (scenario, name, _, _), row in different.items():
+        groups.setdefault((scenario, name), []).append(row)
     found: dict[str, dict[str, Cell]] = {}
     for scenario in suite.scenarios:
         for entrant in suite.estimators:
-            key = (scenario.name, entrant.name)
-            if group := groups.get(key):
+            if group := groups.get((scenario.name, entrant.name)):
                 found.setdefault(scenario.name, {})[entrant.name] = Cell(
                     entrant=entrant,
                     runs=len(group),
                     passed=sum(row["passed"] is True for row in group),
                     reasons=_reasons(entrant.name, group),
                     figures=_figures(entrant.name, group),
-                    repeatable=repeatable[key],
                 )
+    return found
+
+
+def repeating(plan: Plan, rows: Sequence[Row]) -> dict[str, str]:
+    """Return whether an estimator gave the same when run twice, in words, by its name."""
+    found = {}
+    for each in summarise(plan, rows):
+        *_, name = each.settings
+        if each.repeatable:
+            found[name] = "yes" if each.repeatable.endswith("equal") else f"no, {each.repeatable}"
+    return found
+
+
+def flights(suite: Suite, plan: Plan) -> dict[str, dict[int, str]]:
+    """Return the digest of all that the suite's vehicle sent, by scenario and seed.
+
+    Raises:
+        ConfigError: Two estimators were given flights that differ.
+    """
+    flying = {node["name"] for node in tomllib.loads(Path(suite.rig).read_text())["nodes"]}
+    found: dict[str, dict[int, str]] = {}
+    for job in plan.jobs:
+        with contextlib.suppress(OSError, ValueError):
+            summary = json.loads((Path(job.out) / "summary.json").read_text(encoding="utf-8"))
+            sent = {k: v for k, v in summary["digests"].items() if k.partition(".")[0] in flying}
+            scenario = dict(job.settings)["scenario"]
+            digest = found.setdefault(scenario, {}).setdefault(job.seed, combined(sent))
+            if digest != combined(sent):
+                raise ConfigError(f"{job}: expected the flight of the others, found another")
     return found
 
 
@@ -113,7 +149,7 @@ def _figures(name: str, group: Sequence[Row]) -> dict[str, Spread]:
 def _costs(name: str, row: Row) -> dict[str, float | None]:
     """Return the cost of an estimator's worker process, keyed as in `COLUMNS`."""
     for worker, costs in row.get("workers", {}).items():
-        if worker.startswith(f"{name}."):
+        if worker.partition(".")[0] == name:
             return {"cpu_p50_ms": costs.get("cpu_p50_ms"), "peak_rss_mb": costs.get("peak_rss_mb")}
     return {}
 
@@ -193,11 +229,12 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
         command=command,
         runs=len(rows),
         seeds=len({job.seed for job in plan.jobs}),
-        repeats=max(job.repeat for job in plan.jobs),
         scenarios=suite.scenarios,
         entrants=[each for each in suite.estimators if each.name in there],
         absent=[each for each in suite.estimators if each.name not in there],
         cells=found,
+        repeats=repeating(plan, rows),
+        flights=flights(suite, plan),
         columns=COLUMNS,
         thresholds=", ".join(f"{name} {value:g}" for name, value in suite.thresholds.items()),
         pictures=pictures(plan, folder),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,8 +43,8 @@ class Entrant(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         name: Of its node.
         node: The table of the node without its name.
         reads: What it computes from, for the page.
-        module: That must be there; empty if it is a part of the project.
-        install: The command that installs the module.
+        module: That must be there; empty if it is a part of the project, or a program.
+        install: The command that installs the module, or the page about the program.
     """
 
     name: str
@@ -52,10 +53,13 @@ class Entrant(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     module: str = ""
     install: str = ""
 
-    @property
-    def installed(self) -> bool:
-        """Whether the estimator's module is installed."""
-        return not self.module or importlib.util.find_spec(self.module) is not None
+    def installed(self, folder: Path) -> bool:
+        """Tell whether its module or program is there; paths are relative to `folder`."""
+        if self.module and importlib.util.find_spec(self.module) is None:
+            return False
+        program, *_ = self.node.get("command") or [""]
+        place = folder / self.node.get("folder", ".") / program if "/" in program else program
+        return not program or shutil.which(place) is not None
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -103,15 +107,18 @@ def read_suite(path: Path = FOLDER / "suite.toml") -> Suite:
 
 
 def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> Plan:
-    """Plan a run for each scenario, seed, installed estimator, and repeat.
+    """Plan a run for each scenario, seed and installed estimator.
 
     Those of one scenario and seed follow each other: they share one flight.
+
+    Args:
+        repeats: Runs with the first seed of the first scenario: whether an estimator repeats.
 
     Raises:
         ConfigError: A scenario or an estimator has settings that do not exist.
     """
-    entrants = [each for each in suite.estimators if each.installed]
     folder = Path(suite.rig).parent
+    entrants = [each for each in suite.estimators if each.installed(folder)]
     jobs = [
         make_job(
             parse(_table(suite, scenario, entrant), suite.rig, folder),
@@ -121,7 +128,7 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
         for scenario in suite.scenarios
         for seed in range(1, seeds + 1)
         for entrant in entrants
-        for repeat in range(1, repeats + 1)
+        for repeat in range(1, repeats + 1 if (scenario, seed) == (suite.scenarios[0], 1) else 2)
     ]
     parameters = (
         Parameter("scenario", tuple(each.name for each in suite.scenarios)),
