@@ -81,12 +81,11 @@ def cells(suite: Suite, plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, 
     """
     different: dict[tuple[Any, ...], Row] = {}
     for job, row in in_order(plan, rows):
-        (_, scenario), (_, name) = job.settings
-        digest = row.get("digests", {}).get(name, job.id)
-        different[scenario, name, job.seed, digest] = row
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for (scenario, name, _, _), row in different.items():
-        groups.setdefault((scenario, name), []).append(row)
+        place, name = (text for _, text in job.settings)
+        different[place, name, job.seed, row.get("digests", {}).get(name, job.id)] = row
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for key, row in different.items():
+        groups.setdefault(key[:2], []).append(row)
     found: dict[str, dict[str, Cell]] = {}
     for scenario in suite.scenarios:
         for entrant in suite.estimators:

@@ -100,11 +100,16 @@ class Input(_Port, Generic[T]):
 
 
 class Output(_Port, Generic[T]):
-    """An output: ``self.estimate.send(event)``. On an instance this is a `Sender`."""
+    """An output: ``self.estimate.send(event)``. On an instance this is a `Sender`.
 
-    def __init__(self, event: type[T]) -> None:
+    Args:
+        when: Setting without which the node sends nothing here; "" for none.
+    """
+
+    def __init__(self, event: type[T], *, when: str = "") -> None:
         check_event_type("Output", event)
         self.event = event
+        self.when = when
 
     @overload
     def __get__(self, node: None, owner: type) -> Self: ...

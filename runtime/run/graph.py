@@ -15,6 +15,7 @@ from events import Announcement, CameraAnnouncement, Odometry, PoseStamped, Vehi
 from runtime.channels.links import Link
 from runtime.channels.sender import Deliver, Listener, Tap, Voices
 from runtime.channels.tasks import Fault
+from runtime.config.model import NodeSpec
 from runtime.node import Node, senders
 
 Sources = Mapping[str, Mapping[str, str]]  # source of each narrowed port, by node and port
@@ -134,6 +135,18 @@ def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, 
                     if listener.may_receive(declared.event):
                         found.append((sender, output, declared.event.__name__, receiver, port))
     return found
+
+
+def edges_of(specs: Sequence[NodeSpec]) -> list[tuple[str, str, str, str, str]]:
+    """Return the graph of a file's nodes, without outputs that their settings leave unused."""
+    by_name = {spec.name: spec for spec in specs}
+
+    def used(sender: str, output: str) -> bool:
+        when = by_name[sender].node.declared.outputs[output].when
+        return not when or bool(getattr(by_name[sender].config, when))
+
+    found = edges([(spec.name, spec.node) for spec in specs])
+    return [each for each in found if used(each[0], each[1])]
 
 
 def input_types(cls: type[Node[Any]]) -> dict[str, tuple[Any, ...]]:

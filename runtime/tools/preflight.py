@@ -40,7 +40,7 @@ from runtime.node import Node
 from runtime.paths import written
 from runtime.run import event_loop
 from runtime.run.execute import make_clock, make_loop
-from runtime.run.graph import circles, edges, input_types, unconnected
+from runtime.run.graph import circles, edges_of, input_types, unconnected
 from runtime.run.node_host import siblings
 from runtime.run.node_runner import Announced, NodeRunner, Phase, start_up
 from runtime.time.clock import Clock
@@ -371,7 +371,7 @@ def no_end(config: Config, announced: Sequence[Announcement]) -> Iterator[Findin
 
 def idle(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:  # noqa: ARG001
     """Without a node to send its orders, a vehicle stands still."""
-    heard = {receiver for *_, receiver, _ in edges([(s.name, s.node) for s in config.nodes])}
+    heard = {receiver for *_, receiver, _ in edges_of(config.nodes)}
     for spec in config.nodes:
         handlers = spec.node.declared.handlers
         only = handlers and len(handlers) == len(spec.node.declared.listening)
@@ -383,7 +383,7 @@ def idle(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]
 
 def nobody_judged(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:
     """Without an estimator, there is nothing to judge."""
-    sent = edges([(spec.name, spec.node) for spec in config.nodes])
+    sent = edges_of(config.nodes)
     judged = {receiver for *_, receiver, port in sent if port == "estimates"}
     for spec in config.nodes:
         if "thresholds" in spec.config.__struct_fields__ and not (

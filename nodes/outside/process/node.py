@@ -85,8 +85,8 @@ class Process(Estimator[ProcessConfig]):
 
     starts_programs = True
 
-    setpoints = Output(Setpoint)
-    commands = Output(Command)
+    setpoints = Output(Setpoint, when="pilot")
+    commands = Output(Command, when="pilot")
 
     def __init__(self) -> None:
         config = self.config

@@ -28,7 +28,7 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     with 0, or with 2 if there is a mistake; what may be meant, as what lint finds, is a warning.
     """
     from runtime.config.reading import load_configuration
-    from runtime.run.graph import edges
+    from runtime.run.graph import edges_of
     from runtime.tools import preflight
     from runtime.tools.cli.run import leave_behind
     from runtime.tools.preflight import lint
@@ -45,7 +45,7 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     for error in errors:
         print(f"error: {config.name}: {error}", file=sys.stderr)
     if not errors:
-        connections = edges([(spec.name, spec.node) for spec in settings.nodes])
+        connections = edges_of(settings.nodes)
         print(f"{config}: {len(settings.nodes)} nodes, {len(connections)} connections: right")
     leave_behind(2 if errors else 0)
 
@@ -60,11 +60,11 @@ def graph(
 ) -> None:
     """Show the nodes, and the events sent between them."""
     from runtime.config.reading import load_configuration
-    from runtime.run.graph import edges
+    from runtime.run.graph import edges_of
 
     settings = load_configuration(config, overrides or [])
     names = [spec.name for spec in settings.nodes]
-    found = edges([(spec.name, spec.node) for spec in settings.nodes])
+    found = edges_of(settings.nodes)
     if out is None:
         print(mermaid(names, found))
         return

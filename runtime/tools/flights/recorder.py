@@ -29,7 +29,7 @@ from runtime.config.model import Config, NodeSpec, to_builtins
 from runtime.node import Node, NodeConfig
 from runtime.paths import written
 from runtime.run.execute import execute
-from runtime.run.graph import edges
+from runtime.run.graph import edges_of
 from runtime.run.instruments import Call, Instrument
 from runtime.run.summarise import environment
 from runtime.run.supervisor import Supervisor
@@ -251,7 +251,7 @@ def flight_of(config: Config) -> Config | None:
         not s.node.deterministic or s.node.files or [*written(s.config)] for s in flying.values()
     ):
         return None
-    for sender, _, _, receiver, port in edges([(spec.name, spec.node) for spec in config.nodes]):
+    for sender, _, _, receiver, port in edges_of(config.nodes):
         if receiver in flying and sender not in flying:
             source = _narrowed(flying[receiver], port)
             if source is None or source.partition("/")[0] not in flying:
