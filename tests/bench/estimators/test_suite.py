@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from bench.estimators.page import cells, write_page
-from bench.estimators.plan import FOLDER, LEVELS, Suite, make_plan, read_suite
+from bench.estimators.page import cells, flights, write_page
+from bench.estimators.plan import FOLDER, LEVELS, Entrant, Suite, make_plan, read_suite
 from runtime.errors import CommandError, ConfigError
 from runtime.tools.sweep.tables import Row, crashed
 from tests.runtime.tools.samples_cli import command
@@ -73,13 +74,13 @@ def small(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_the_projects_own_suite_is_right() -> None:
-    """Every scenario's and estimator's settings exist; the scenarios rise from easy to brutal."""
+def test_the_projects_own_suite_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All settings exist, scenarios rise from easy to brutal, and all share their flights."""
     suite = read_suite()
-    everybody = [msgspec.structs.replace(e, module="") for e in suite.estimators]
-    suite = msgspec.structs.replace(suite, estimators=tuple(everybody))
-    plan = make_plan(suite, out=Path("out"), repeats=2)
-    assert len(plan.jobs) == 2 * len(suite.scenarios) * len(suite.estimators)
+    monkeypatch.setattr(Entrant, "installed", lambda *_: True)
+    plan = make_plan(suite, out=Path("out"), seeds=3, repeats=2)
+    assert len(plan.jobs) == (3 * len(suite.scenarios) + 1) * len(suite.estimators)
+    assert len({job.flight for job in plan.jobs}) == 3 * len(suite.scenarios)
     levels = [LEVELS.index(each.level) for each in suite.scenarios]
     assert levels == sorted(levels)
     assert {*levels} == {*range(len(LEVELS))}
@@ -90,7 +91,9 @@ def test_runs_of_one_flight_follow_each_other(small: Path) -> None:
     plan = make_plan(read_suite(small), out=Path("out"), seeds=2, repeats=2)
     order = [(dict(j.settings)["scenario"], j.seed) for j in plan.jobs]
     assert order == sorted(order, key=lambda each: (each[0] != "slow", each[1]))
-    assert len({job.id for job in plan.jobs}) == len(plan.jobs) == 16
+    assert len({job.id for job in plan.jobs}) == len(plan.jobs) == 10
+    twice = [(dict(j.settings)["scenario"], j.seed) for j in plan.jobs if j.repeat == 2]
+    assert twice == [("slow", 1)] * 2
     assert {dict(j.settings)["estimator"] for j in plan.jobs} == {"good", "bad"}
 
 
@@ -122,13 +125,15 @@ def test_a_part_of_it_is_chosen_by_name(small: Path) -> None:
 
 def page_of(suite: Suite, tmp_path: Path, change: Any) -> str:
     """Return the page of rows of which one estimator's are changed."""
-    plan = make_plan(suite, out=tmp_path / "out")
+    plan = make_plan(suite, out=tmp_path / "out", seeds=2, repeats=2)
     rows: list[Row] = []
     for job in plan.jobs:
         name = dict(job.settings)["estimator"]
         row = crashed(job, "")
-        figures = {"flight_ate_percent": 0.5 * job.repeat, "coverage_percent": 100.0}
+        figures = {"flight_ate_percent": 0.5 * job.seed, "coverage_percent": 100.0}
+        digest = f"{name}{job.seed}" + f"-{job.repeat}" * (name == "bad")
         row |= {"passed": True, "estimators": {name: {"passed": True, **figures}}}
+        row |= {"digests": {name: digest}}
         rows.append(change(row) if name == "bad" else row)
     write_page(suite, plan, rows, tmp_path / "SUITE.md", "runtime suite")
     return (tmp_path / "SUITE.md").read_text(encoding="utf-8")
@@ -151,15 +156,15 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
         return row | {"passed": None, "estimators": {}, "error": "its worker died"}
 
     def once(row: Row) -> Row:
-        return crashed(row) if row["repeat"] == 2 else row
+        return crashed(row) if row["seed"] == 2 else row
 
     suite = read_suite(small)
     page = page_of(suite, tmp_path, missed)
-    assert line_of(page, "good") == "| good | truth | 0.75 (0.5 to 1) | 0.75 (0.5 to 1) |"
-    assert line_of(page, "bad") == "| bad | truth | 40 **failed** | 40 **failed** |"
+    assert line_of(page, "good") == "| good | truth | yes | 0.75 (0.5 to 1) | 0.75 (0.5 to 1) |"
+    assert line_of(page, "bad") == "| bad | truth | no, differs | 40 **failed** | 40 **failed** |"
     assert page.count("- bad: lost: for 9 s\n") == 2
     page = page_of(suite, tmp_path, crashed)
-    assert line_of(page, "bad") == "| bad | truth | **failed** | **failed** |"
+    assert line_of(page, "bad") == "| bad | truth | unknown | **failed** | **failed** |"
     assert page.count("- bad: its worker died") == 2
     page = page_of(suite, tmp_path, once)
     assert "**failed** 1 of 2" in line_of(page, "bad")
@@ -168,6 +173,39 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
 def test_who_is_not_installed_is_named(small: Path, tmp_path: Path) -> None:
     page = page_of(read_suite(small), tmp_path, lambda row: row)
     assert "- elsewhere: `make elsewhere` installs it." in page
+
+
+def test_a_program_that_is_there_is_installed(small: Path) -> None:
+    """Its command is looked for in its folder, relative to the suite's."""
+
+    def installed(command: str) -> bool:
+        node = {"type": "Process", "folder": "bin", "command": [command]}
+        return Entrant(name="slam", reads="stereo", node=node).installed(small.parent)
+
+    program = small.parent / "bin" / "slam"
+    program.parent.mkdir()
+    program.write_text("")
+    assert not installed("./slam")
+    program.chmod(0o755)
+    assert installed("./slam")
+    assert installed("true")
+    assert not installed("no_such_program_anywhere")
+
+
+def test_flights_that_differ_are_refused(small: Path, tmp_path: Path) -> None:
+    """Digests of what the rig's nodes sent are equal for all estimators of a flight."""
+    suite = read_suite(small)
+    plan = make_plan(suite, out=tmp_path / "out", repeats=1)
+    for job in plan.jobs:
+        sent = {"drone.images": "a", "pilot.setpoints": "b", f"{job.id}.estimates": job.id}
+        Path(job.out).mkdir(parents=True)
+        (Path(job.out) / "summary.json").write_text(json.dumps({"digests": sent}))
+    found = flights(suite, plan)
+    assert {name: [*each] for name, each in found.items()} == {"slow": [1], "quick": [1]}
+    assert len({digest for each in found.values() for digest in each.values()}) == 1
+    (Path(plan.jobs[1].out) / "summary.json").write_text(json.dumps({"digests": {"drone.x": "c"}}))
+    with pytest.raises(ConfigError, match="bad seed=1: expected the flight of the others"):
+        flights(suite, plan)
 
 
 def test_an_estimator_without_rows_has_no_cell(small: Path) -> None:
@@ -183,8 +221,9 @@ def test_the_command_runs_a_suite_and_runs_it_on(small: Path, tmp_path: Path) ->
     done = command(*words, folder=tmp_path, limit=300)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "out" / "SUITE.md").read_text(encoding="utf-8")
-    assert "2 runs: 1 seed, each 1 time" in page
-    assert re.search(r"\| good \| truth \| 0\.\d+ \|", page)
+    assert "2 runs: 1 seed." in page
+    assert re.search(r"Digest of the flight: seed 1 `[0-9a-f]{16}`\.", page)
+    assert re.search(r"\| good \| truth \| unknown \| 0\.\d+ \|", page)
     assert "**failed**" in line_of(page, "bad")
     assert (tmp_path / "out" / "suite" / "suite.png").stat().st_size > 1000
     again = command(*words, folder=tmp_path, limit=300)
