@@ -109,9 +109,9 @@ def test_what_else_has_an_influence_is_not_recorded(tmp_path: Path) -> None:
     assert [spec.name for spec in part.nodes] == ["craft", "captain"]
     assert flight_of(flown(tmp_path, "run.clock=real")) is None
     assert flight_of(load(ROOT / "examples" / "closed_loop.toml")) is None
-    process = ROOT / "examples" / "outside_python.toml"
+    process = ROOT / "examples" / "outside_cpp.toml"
     assert flight_of(load(process)) is not None
-    assert flight_of(load(process, ["estimator.pilot=true"])) is None
+    assert flight_of(load(process, ["slam.pilot=true"])) is None
     tour = flight_of(load(ROOT / "config.toml"))
     assert tour is not None
     assert [spec.name for spec in tour.nodes] == ["drone", "pilot"]
