@@ -217,7 +217,7 @@ def test_nodes_describes_ports_and_settings(tmp_path: Path) -> None:
         "images  Image (output)",
         "control  at the setting control_rate",
         "imu_rate  = 200 (float, > 0, ≤ 1000)",
-        "Rate of the IMU and of the ground truth (`odometry`), Hz.",
+        "Rate of the IMU and of the ground truth (`odometry`; also at each exposure), Hz.",
     ):
         assert line in done.stdout
 
