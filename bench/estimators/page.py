@@ -93,7 +93,7 @@ def cells(suite: Suite, plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, 
                 found.setdefault(scenario.name, {})[entrant.name] = Cell(
                     entrant=entrant,
                     runs=len(group),
-                    passed=sum(row["passed"] is True for row in group),
+                    passed=sum(_passed(entrant.name, row) for row in group),
                     reasons=_reasons(entrant.name, group),
                     figures=_figures(entrant.name, group),
                 )
@@ -113,6 +113,8 @@ def repeating(plan: Plan, rows: Sequence[Row]) -> dict[str, str]:
 def flights(suite: Suite, plan: Plan) -> dict[str, dict[int, str]]:
     """Return the digest of all that the suite's vehicle sent, by scenario and seed.
 
+    Of runs that came to their end.
+
     Raises:
         ConfigError: Two estimators were given flights that differ.
     """
@@ -121,12 +123,30 @@ def flights(suite: Suite, plan: Plan) -> dict[str, dict[int, str]]:
     for job in plan.jobs:
         with contextlib.suppress(OSError, ValueError):
             summary = json.loads((Path(job.out) / "summary.json").read_text(encoding="utf-8"))
+            if summary.get("error"):  # it ended early: its digest is that of a part
+                continue
             sent = {k: v for k, v in summary["digests"].items() if k.partition(".")[0] in flying}
             scenario = dict(job.settings)["scenario"]
             digest = found.setdefault(scenario, {}).setdefault(job.seed, combined(sent))
             if digest != combined(sent):
                 raise ConfigError(f"{job}: expected the flight of the others, found another")
     return found
+
+
+def flaws(plan: Plan, rows: Sequence[Row]) -> dict[str, tuple[str, ...]]:
+    """Return what is wrong with the flights themselves, as a collision, by scenario."""
+    found: dict[str, dict[str, None]] = {}
+    for job, row in in_order(plan, rows):
+        for vehicle, flight in row.get("flights", {}).items():
+            for reason in flight["failed"]:
+                words = f"seed {job.seed}, {vehicle}: {reason}"
+                found.setdefault(dict(job.settings)["scenario"], {})[words] = None
+    return {scenario: tuple(reasons) for scenario, reasons in found.items()}
+
+
+def _passed(name: str, row: Row) -> bool:
+    """Tell whether an estimator passed: a flaw of the flight is not its own."""
+    return not row["error"] and row["estimators"].get(name, {}).get("passed") is True
 
 
 def _reasons(name: str, group: Sequence[Row]) -> tuple[str, ...]:
@@ -234,6 +254,7 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
         cells=found,
         repeats=repeating(plan, rows),
         flights=flights(suite, plan),
+        flaws=flaws(plan, rows),
         columns=COLUMNS,
         thresholds=", ".join(f"{name} {value:g}" for name, value in suite.thresholds.items()),
         pictures=pictures(plan, folder),

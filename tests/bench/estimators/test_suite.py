@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import visnav
 from bench.estimators.page import cells, flights, write_page
-from bench.estimators.plan import FOLDER, LEVELS, Entrant, Suite, make_plan, read_suite
+from bench.estimators.plan import FOLDER, LEVELS, Entrant, Scenario, Suite, make_plan, read_suite
+from runtime.config.messages import override
 from runtime.errors import CommandError, ConfigError
 from runtime.tools.sweep.tables import Row, crashed
 from tests.runtime.tools.samples_cli import command
@@ -149,6 +152,7 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
 
     def missed(row: Row) -> Row:
         row["estimators"]["bad"] |= {"flight_ate_percent": 40.0, "failed": ["lost: for 9 s"]}
+        row["estimators"]["bad"] |= {"passed": False}
         return row | {"passed": False}
 
     def crashed(row: Row) -> Row:
@@ -167,6 +171,42 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
     assert page.count("- bad: its worker died") == 2
     page = page_of(suite, tmp_path, once)
     assert "**failed** 1 of 2" in line_of(page, "bad")
+
+
+def test_a_flaw_of_the_flight_is_told_and_is_not_the_estimators(
+    small: Path, tmp_path: Path
+) -> None:
+    """A vehicle that met somebody has missed a threshold of its own."""
+
+    def collided(row: Row) -> Row:
+        missed = {"passed": False, "collisions": 1, "failed": ["collisions: expected at most 0"]}
+        return row | {"passed": False, "flights": {"drone": missed}}
+
+    page = page_of(read_suite(small), tmp_path, collided)
+    assert "failed**" not in line_of(page, "bad")
+    flaw = "**The flight itself is flawed**: seed 1, drone: collisions: expected at most 0; seed 2,"
+    assert page.count(flaw) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("scenario", read_suite().scenarios, ids=lambda each: each.name)
+def test_every_scenario_is_flown_to_its_end_and_meets_nothing(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Without its sensors: whether the way is free of walls, and of people at that time."""
+    monkeypatch.chdir(tmp_path)
+    table = tomllib.loads((FOLDER / "rig.toml").read_text(encoding="utf-8"))
+    for change in scenario.set:
+        if not change.startswith(("camera.", "eye.", "down.")):
+            override(table, change)
+    (drone,) = (node for node in table["nodes"] if node["name"] == "drone")
+    for sensors in ("cameras", "lidars", "trigger"):
+        del drone[sensors]
+    for seed in (1, 2, 3):
+        run = visnav.run(table, seed=seed, quiet=True)
+        assert run.summary["reason"] == "pilot: flight completed"
+        assert "Collision" not in run.summary["events"]
 
 
 def test_who_is_not_installed_is_named(small: Path, tmp_path: Path) -> None:
@@ -202,7 +242,11 @@ def test_flights_that_differ_are_refused(small: Path, tmp_path: Path) -> None:
     found = flights(suite, plan)
     assert {name: [*each] for name, each in found.items()} == {"slow": [1], "quick": [1]}
     assert len({digest for each in found.values() for digest in each.values()}) == 1
-    (Path(plan.jobs[1].out) / "summary.json").write_text(json.dumps({"digests": {"drone.x": "c"}}))
+    part: dict[str, Any] = {"digests": {"drone.x": "c"}, "error": "its worker died"}
+    (Path(plan.jobs[1].out) / "summary.json").write_text(json.dumps(part))
+    assert flights(suite, plan) == found
+    part["error"] = ""
+    (Path(plan.jobs[1].out) / "summary.json").write_text(json.dumps(part))
     with pytest.raises(ConfigError, match="bad seed=1: expected the flight of the others"):
         flights(suite, plan)
 
