@@ -179,13 +179,15 @@ HEIGHT = 240
 
 def draw(suite: Suite, cells: Mapping[str, Mapping[str, Cell]], path: Path) -> None:
     """Draw the error of each estimator in each scenario, with its range; crosses have failed."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     there = [e.name for e in suite.estimators if any(e.name in each for each in cells.values())]
     figure = Figure(figsize=(2.1 * len(suite.scenarios) + 2.4, 4.6), layout="constrained")
     axes: Any = figure.add_subplot()
+    colours = colormaps["tab20"]
     for index, name in enumerate(there):
-        colour = f"C{index % 10}"
+        colour = colours(index)
         for place, scenario in enumerate(suite.scenarios):
             cell = cells.get(scenario.name, {}).get(name)
             spread = cell.figures.get(RANKED) if cell else None
