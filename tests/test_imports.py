@@ -33,6 +33,7 @@ BRIDGES = {
     "foxglove",
     "mcap",
     "msgpack",
+    "pymavlink",
     "pyorbslam3",
     "rosbags",
     "svo_cpp",

@@ -1,0 +1,419 @@
+"""The door without a network: what each message does to the vehicle, and what is answered."""
+
+from __future__ import annotations
+
+import math
+import socket
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mav
+
+import events as ev
+from events import Odometry
+from nodes.mavlink.door import Door
+from nodes.mavlink.links import BURST
+from nodes.mavlink.settings import MavlinkConfig, address_of
+from runtime.logs import NodeLogger
+from tests.runtime.tools.samples_cli import ROOT, command_here
+
+SECOND = 1_000_000_000
+ORIGIN = (47.0, 8.0, 400.0)
+GROUND = (1.0, 2.0, -0.1)
+
+
+class Outside:
+    """A program at the other end of a door's link, and the vehicle behind it."""
+
+    def __init__(self, **changes: Any) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.setblocking(False)
+        link = f"udp://127.0.0.1:{self._socket.getsockname()[1]}"
+        self.now = SECOND
+        self.acts: list[Any] = []
+        self.seen: list[dict[str, Any]] = []
+        config = MavlinkConfig(endpoints=(link,), **changes)
+        self.door = Door(
+            config, ORIGIN, self._act, self._see, lambda: self.now, NodeLogger("mavlink")
+        )
+        self.door.open()
+        self.parser = mav.MAVLink(None, 245, 190)
+        if config.signing_key:
+            self.parser.signing.secret_key = bytes.fromhex(config.signing_key)
+            self.parser.signing.sign_outgoing = True
+            (peer,) = self.door._links._peers.values()
+            self.parser.signing.timestamp = peer.parser.signing.timestamp
+        self.at(GROUND)
+
+    def _act(self, kind: Any, **fields: Any) -> None:
+        self.acts.append(kind(stamp=self.now, source="mavlink", **fields))
+
+    def _see(self, **fields: Any) -> None:
+        self.seen.append(fields)
+
+    def at(self, position: Any) -> None:
+        """Put the vehicle somewhere, level."""
+        still = (0.0, 0.0, 0.0)
+        self.door.vehicle.note(
+            Odometry(
+                stamp=self.now, source="drone", position=position, orientation=(1, 0, 0, 0),
+                linear_velocity=still, angular_velocity=still,
+            )
+        )  # fmt: skip
+
+    def flies(self) -> None:
+        """Arm and put it into the air."""
+        self.say(arm(1))
+        self.at((1.0, 2.0, -2.0))
+        self.acts.clear()
+
+    def say(self, *messages: Any) -> list[Any]:
+        """Let the door hear messages; return what it answers at once."""
+        self.hear()
+        for message in messages:
+            data = message if isinstance(message, bytes) else message.pack(self.parser)
+            self._hand_in(data)
+        return self.hear()
+
+    def _hand_in(self, data: bytes) -> None:
+        ((end, peer),) = self.door._links._peers.items()
+        self._socket.sendto(data, end.getsockname())
+        self.door._links._hear_datagram(end, peer)
+
+    def passes(self, seconds: float, heartbeat: bool = True) -> list[Any]:
+        """Let time pass, as the node does; return what is sent."""
+        heard: list[Any] = []
+        for step in range(round(seconds * 50)):
+            if heartbeat and step % 50 == 0:
+                self._hand_in(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(self.parser))
+            self.now += SECOND // 50
+            self.door.update(self.now, self.now / SECOND)
+            heard += self.hear()
+        return heard
+
+    def hear(self) -> list[Any]:
+        found: list[Any] = []
+        while True:
+            try:
+                data = self._socket.recv(65535)
+            except BlockingIOError:
+                return found
+            found += self.parser.parse_buffer(data) or []
+
+    def close(self) -> None:
+        self.door.close()
+        self._socket.close()
+
+
+@pytest.fixture
+async def outside() -> Any:
+    made = Outside()
+    yield made
+    made.close()
+
+
+def command(number: int, *params: float) -> Any:
+    numbers = [*params, *[math.nan] * (7 - len(params))]
+    return mav.MAVLink_command_long_message(1, 1, number, 0, *numbers)
+
+
+def arm(number: int, force: float = 0) -> Any:
+    return command(mav.MAV_CMD_COMPONENT_ARM_DISARM, number, force)
+
+
+def mode(main: int, sub: int) -> Any:
+    return command(mav.MAV_CMD_DO_SET_MODE, 1, main, sub)
+
+
+def target(mask: int, x: float = 0, vx: float = 0, frame: int = 1) -> Any:
+    return mav.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, frame, mask, x, 0, -2, vx, 0, 0, 0, 0, 0, 0.5, 0.0
+    )
+
+
+def item(seq: int, number: int, z: float = 2.0, frame: int = 6, p1: float = 0) -> Any:
+    return mav.MAVLink_mission_item_int_message(
+        1, 1, seq, frame, number, 0, 1, p1, 0, 0, math.nan, 470000000, 80000000, z, 0
+    )
+
+
+def results(answers: list[Any]) -> list[int]:
+    return [each.result for each in answers if each.get_type() == "COMMAND_ACK"]
+
+
+async def test_it_is_seen_as_an_autopilot_that_can_fly(outside: Outside) -> None:
+    heard = {each.get_type(): each for each in outside.passes(2.0)}
+    assert (heard["HEARTBEAT"].get_srcSystem(), heard["HEARTBEAT"].get_srcComponent()) == (1, 1)
+    assert heard["SYS_STATUS"].onboard_control_sensors_health & mav.MAV_SYS_STATUS_PREARM_CHECK
+    assert heard["HOME_POSITION"].x == 1.0
+    assert heard["GLOBAL_POSITION_INT"].lat > 470000000
+    assert heard["LOCAL_POSITION_NED"].y == 2.0
+    assert "AUTOPILOT_VERSION" not in heard  # which comes when it is asked for
+    (ack,) = results(answers := outside.say(command(mav.MAV_CMD_REQUEST_MESSAGE, 148)))
+    assert ack == 0
+    assert any(each.get_type() == "AUTOPILOT_VERSION" for each in answers)
+
+
+async def test_rates_are_those_that_are_asked_for(outside: Outside) -> None:
+    outside.passes(1.0)
+    count = [each.get_type() for each in outside.passes(2.0)].count("ATTITUDE")
+    assert count == pytest.approx(40, abs=1)
+    assert results(outside.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 1e5))) == [0]
+    count = [each.get_type() for each in outside.passes(2.0)].count("ATTITUDE")
+    assert count == pytest.approx(20, abs=1)
+    assert results(outside.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 30, -1))) == [0]
+    assert "ATTITUDE" not in [each.get_type() for each in outside.passes(1.0)]
+    unknown = mav.MAV_RESULT_UNSUPPORTED
+    assert results(outside.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 9999, 1e5))) == [unknown]
+
+
+async def test_every_command_is_acknowledged(outside: Outside) -> None:
+    """What is not supported says so; take-off before arming is refused."""
+    assert results(outside.say(command(2500))) == [mav.MAV_RESULT_UNSUPPORTED]
+    take_off = command(mav.MAV_CMD_NAV_TAKEOFF)
+    assert results(outside.say(take_off)) == [mav.MAV_RESULT_TEMPORARILY_REJECTED]
+    assert results(outside.say(arm(1), take_off)) == [0, 0]
+    assert [type(act) for act in outside.acts] == [ev.Arm, ev.Takeoff]
+    assert outside.acts[1].altitude == 2.5
+    assert (
+        outside.say(mav.MAVLink_command_long_message(2, 1, 400, 0, *[0.0] * 7)) == []
+    )  # to another
+
+
+async def test_it_is_not_disarmed_in_the_air_but_by_force(outside: Outside) -> None:
+    outside.flies()
+    assert results(outside.say(arm(0))) == [mav.MAV_RESULT_DENIED]
+    assert outside.acts == []
+    assert results(outside.say(arm(0, 21196))) == [0]
+    assert isinstance(outside.acts[0], ev.Disarm)
+
+
+async def test_offboard_needs_setpoints_and_ends_without(outside: Outside) -> None:
+    outside.flies()
+    position = 0b101111111000  # its x, y, z and its heading count
+    assert results(outside.say(mode(6, 0))) == [mav.MAV_RESULT_TEMPORARILY_REJECTED]
+    assert results(outside.say(target(position, x=3.0), mode(6, 0))) == [0]
+    outside.say(target(position, x=3.0))
+    assert outside.acts[-1].position == (3.0, 0.0, -2.0)
+    assert outside.acts[-1].yaw == 0.5
+    outside.say(target(0b110111000111, vx=1.0, frame=mav.MAV_FRAME_BODY_NED))
+    assert outside.acts[-1].velocity == (1.0, 0.0, 0.0)
+    assert outside.acts[-1].frame_id == "heading"
+    outside.say(mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], 0.1, 0, 0, 0.5))
+    assert outside.acts[-1].angular_velocity == pytest.approx((0.1, 0.0, 0.0))
+    texts = [each.text for each in outside.passes(1.0) if each.get_type() == "STATUSTEXT"]
+    assert "offboard: no set-point for 0.5 s: holding" in texts
+    assert isinstance(outside.acts[-1], ev.Hover)
+    assert outside.door.vehicle.mode == "hold"
+
+
+async def test_a_place_is_approached_at_the_cruising_speed(outside: Outside) -> None:
+    outside.flies()
+    place = mav.MAVLink_command_int_message(
+        1, 1, mav.MAV_FRAME_GLOBAL_RELATIVE_ALT, mav.MAV_CMD_DO_REPOSITION, 0, 0,
+        1.0, 0, 0, math.nan, 470000000, 80000000, 4.0,
+    )  # fmt: skip
+    assert results(outside.say(place)) == [0]
+    outside.passes(1.02)
+    x, y, z = outside.acts[-1].position
+    assert math.dist((x, y, z), (1.0, 2.0, -2.0)) == pytest.approx(1.0, abs=0.05)  # 1 m/s
+    outside.passes(5.0)
+    assert outside.acts[-1].position == pytest.approx((0.0, 0.0, -4.1), abs=0.02)
+
+
+async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> None:
+    asked = outside.say(mav.MAVLink_mission_count_message(1, 1, 3, 0))
+    assert [each.get_type() for each in asked] == ["MISSION_REQUEST_INT"]
+    assert [each.get_type() for each in outside.passes(1.1)].count("MISSION_REQUEST_INT") == 1
+    outside.say(item(0, mav.MAV_CMD_NAV_WAYPOINT), item(1, mav.MAV_CMD_NAV_WAYPOINT, z=3.0))
+    answers = outside.say(item(2, mav.MAV_CMD_NAV_LAND))
+    assert [each.type for each in answers if each.get_type() == "MISSION_ACK"] == [0]
+    (count,) = outside.say(mav.MAVLink_mission_request_list_message(1, 1, 0))
+    assert count.count == 3
+    (second,) = outside.say(mav.MAVLink_mission_request_int_message(1, 1, 1, 0))
+    assert (second.x, second.z) == (470000000, 3.0)
+    outside.flies()
+    assert results(outside.say(command(mav.MAV_CMD_MISSION_START, 0, 0))) == [0]
+    reached = []
+    for _ in range(60):
+        heard = outside.passes(0.1)
+        reached += [each.seq for each in heard if each.get_type() == "MISSION_ITEM_REACHED"]
+        if isinstance(outside.acts[-1], ev.PositionSetpoint):
+            outside.at(outside.acts[-1].position)
+    assert reached == [0, 1, 2]
+    assert isinstance(outside.acts[-1], ev.Land)
+
+
+async def test_what_cannot_be_flown_is_refused_at_its_upload(outside: Outside) -> None:
+    outside.say(mav.MAVLink_mission_count_message(1, 1, 1, 0))
+    (ack,) = [
+        each.type
+        for each in outside.say(item(0, mav.MAV_CMD_NAV_SPLINE_WAYPOINT))
+        if each.get_type() == "MISSION_ACK"
+    ]
+    assert ack == mav.MAV_MISSION_UNSUPPORTED
+    fence = outside.say(mav.MAVLink_mission_count_message(1, 1, 4, mav.MAV_MISSION_TYPE_FENCE))
+    assert [each.type for each in fence if each.get_type() == "MISSION_ACK"] == [ack]
+    outside.say(mav.MAVLink_mission_count_message(1, 1, 2, 0))
+    late = [each.type for each in outside.passes(8.0) if each.get_type() == "MISSION_ACK"]
+    assert late == [mav.MAV_MISSION_OPERATION_CANCELLED]
+
+
+async def test_parameters_are_listed_read_and_set(outside: Outside) -> None:
+    found = outside.say(mav.MAVLink_param_request_list_message(1, 1))
+    assert {each.param_id for each in found} == {
+        "MIS_TAKEOFF_ALT",
+        "MPC_XY_CRUISE",
+        "RTL_RETURN_ALT",
+    }
+    real = mav.MAV_PARAM_TYPE_REAL32
+    (now,) = outside.say(mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", 4.0, real))
+    assert now.param_value == 4.0
+    kept = outside.say(mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", math.nan, real))
+    assert [each.param_value for each in kept if each.get_type() == "PARAM_VALUE"] == [4.0]
+    assert outside.say(mav.MAVLink_param_request_read_message(1, 1, b"CAL_GYRO0_ID", -1)) == []
+
+
+async def test_who_is_not_heard_any_more_is_missed(outside: Outside) -> None:
+    outside.flies()
+    outside.passes(5.0)
+    assert outside.acts == []
+    outside.passes(4.0, heartbeat=False)
+    assert [type(act) for act in outside.acts] == [ev.Hover]
+
+
+async def test_poses_from_outside_are_estimates_of_their_stamp() -> None:
+    outside = Outside(vision=True)
+    outside.now = 100 * SECOND
+    pose = (0.0, 0.0, 0.0, 0.0, 0.0, math.pi / 2)
+    covariance = [float(n) for n in range(1, 22)]
+    outside.say(
+        mav.MAVLink_vision_position_estimate_message(99_900_000, *pose, covariance, 2),
+        mav.MAVLink_vision_position_estimate_message(1, *pose, [math.nan] * 21, 0),
+        mav.MAVLink_vision_position_estimate_message(1, math.nan, *pose[1:], covariance, 0),
+    )
+    first, second = outside.seen
+    assert first["stamp"] == 99_900_000_000
+    assert first["frame_id"] == "odom_2"
+    assert first["orientation"] == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
+    assert first["covariance"][:8] == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 2.0, 7.0)
+    assert second["stamp"] == outside.now  # of another clock
+    assert second["covariance"] == ()
+    (sync,) = outside.say(mav.MAVLink_timesync_message(0, 77))
+    assert (sync.tc1, sync.ts1) == (outside.now, 77)
+    outside.close()
+
+
+async def test_only_the_signed_are_heard_if_there_is_a_key() -> None:
+    outside = Outside(signing_key="5a" * 32)
+    assert results(outside.say(arm(1))) == [0]
+    outside.parser.signing.sign_outgoing = False
+    outside.say(arm(0))
+    assert [type(act) for act in outside.acts] == [ev.Arm]
+    outside.close()
+
+
+async def test_a_flood_waits_and_our_own_name_is_not_heard(outside: Outside) -> None:
+    outside.passes(0.1)
+    outside.say(*[mav.MAVLink_ping_message(0, 1, 0, 0)] * (BURST + 1))
+    assert outside.door._links.counts["pauses in a flood"] >= 1
+    outside.passes(0.1)
+    outside.parser = mav.MAVLink(None, 1, 1)
+    assert outside.say(arm(1)) == []
+    assert outside.acts == []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("run.speed=2", "expected run.speed = 1.0 or less, for programs keep real time, found 2"),
+        ("mavlink.telemetry=odometri", 'telemetry: expected an estimator, found "odometri"'),
+        ("mavlink.vehicle=plane", "expected plane to fly, found none"),
+        ("mavlink.endpoints=['udp://there']", "endpoints: expected udp://HOST:PORT"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_said_before_the_flight(change: str, message: str) -> None:
+    done = command_here("check", "examples/mavsdk.toml", "--set", change, folder=ROOT)
+    assert done.returncode == 2
+    assert message in " ".join(done.stderr.split())
+
+
+def test_endpoints_are_udp_or_tcp() -> None:
+    assert address_of("tcp://127.0.0.1:5760") == ("tcp", "127.0.0.1", 5760)
+    for wrong in (
+        "127.0.0.1:14540",
+        "udp://:14540",
+        "udp://127.0.0.1",
+        "http://a:1",
+        "udp://a:99999",
+    ):
+        with pytest.raises(
+            ValueError, match="endpoints: expected udp://HOST:PORT or tcp://HOST:PORT"
+        ):
+            MavlinkConfig(endpoints=(wrong,))
+    with pytest.raises(ValueError, match="signing_key: expected 64 hexadecimal digits"):
+        MavlinkConfig(signing_key="secret")
+
+
+KINDS = [
+    mav.MAVLink_command_long_message, mav.MAVLink_command_int_message,
+    mav.MAVLink_set_position_target_local_ned_message,
+    mav.MAVLink_set_position_target_global_int_message, mav.MAVLink_mission_count_message,
+    mav.MAVLink_mission_item_int_message, mav.MAVLink_mission_item_message,
+    mav.MAVLink_mission_request_int_message, mav.MAVLink_param_request_read_message,
+    mav.MAVLink_set_mode_message, mav.MAVLink_vision_position_estimate_message,
+    mav.MAVLink_odometry_message, mav.MAVLink_set_attitude_target_message,
+]  # fmt: skip
+NUMBERS = {
+    "uint8_t": 0xFF, "uint16_t": 0xFFFF, "uint32_t": 0xFFFFFFFF, "uint64_t": 2**64 - 1,
+    "int8_t": 127, "int16_t": 32767, "int32_t": 2**31 - 1, "int64_t": 2**63 - 1,
+}  # fmt: skip
+
+
+@st.composite
+def hostile(draw: st.DrawFn) -> bytes:
+    """A valid message with any numbers, or bytes that are none."""
+    if draw(st.booleans()):
+        return draw(st.binary(max_size=300))
+    kind = draw(st.sampled_from(KINDS))
+    values: list[Any] = []
+    for name, what, size in zip(kind.fieldnames, kind.fieldtypes, _sizes(kind), strict=True):
+        most = NUMBERS.get(what)
+        one = st.floats(width=32) if most is None else st.integers(0, most)
+        if name.startswith("target"):
+            one = st.sampled_from([0, 1])
+        elif name == "command":
+            one = st.sampled_from([16, 20, 21, 22, 176, 178, 192, 300, 400, 511, 512, 9])
+        if what == "char":
+            values.append(draw(st.binary(max_size=16)))
+        elif size:
+            values.append(draw(st.lists(one, min_size=size, max_size=size)))
+        else:
+            values.append(draw(one))
+    data: bytes = kind(*values).pack(mav.MAVLink(None, 245, 190))
+    return data
+
+
+def _sizes(kind: Any) -> list[int]:
+    by_order = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+    return [by_order[name] for name in kind.fieldnames]
+
+
+@pytest.mark.slow
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(hostile(), min_size=1, max_size=8))
+async def test_no_message_breaks_the_door(data: list[bytes]) -> None:
+    """Whatever comes, every act is a valid event, and the door goes on."""
+    outside = Outside(vision=True)
+    try:
+        outside.flies()
+        outside.say(*data)
+        outside.passes(0.2)
+        assert results(outside.say(command(2500))) == [mav.MAV_RESULT_UNSUPPORTED]
+        outside.passes(1.0)
+        assert outside.door._links.counts["messages"] >= 1
+    finally:
+        outside.close()

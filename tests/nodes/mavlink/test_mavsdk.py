@@ -1,0 +1,171 @@
+"""MAVSDK's own client flies the example, and an estimator outside is judged as one inside."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import visnav
+from events import PoseEstimate
+from nodes.mavlink.settings import address_of
+from runtime import Node, NodeConfig, on
+from tests.runtime.tools.samples_cli import ROOT, start, summary
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+def free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
+        found.bind(("127.0.0.1", 0))
+        port: int = found.getsockname()[1]
+        return port
+
+
+def flown(out: Path, port: int, *script: str) -> tuple[str, dict[str, Any]]:
+    """Run a script beside the example's vehicle; return what it prints, and the run's summary."""
+    links = f'mavlink.endpoints=["udp://127.0.0.1:{port}"]'
+    words = ["run", "examples/mavsdk.toml", "--quiet", "--out", str(out), "--set", links]
+    with start(words, ROOT) as process:
+        done = subprocess.run(
+            [sys.executable, *script], cwd=ROOT, capture_output=True, text=True, timeout=200
+        )
+        process.terminate()
+        process.wait(60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, summary(out)
+
+
+def test_the_script_of_the_example_flies(tmp_path: Path) -> None:
+    port = free_udp_port()
+    script = "examples/mavsdk_flight.py", f"udpin://127.0.0.1:{port}"
+    printed, ended = flown(tmp_path, port, *script)
+    assert printed.splitlines()[-1] == "landed"
+    assert ended["outputs"]["drone.vehicle_events"] == 4  # armed, taken off, landed, disarmed
+    assert "mavlink" in ended["not_deterministic"]
+
+
+async def first(found: Any, ok: Callable[[Any], Any] = lambda _: True) -> Any:
+    async for each in found:
+        if ok(each):
+            return each
+    raise AssertionError("expected more telemetry, found its end")
+
+
+async def everything(address: str) -> None:
+    """Fly by MAVSDK's plugins: parameters, refusals, offboard, go to a place, a mission, return."""
+    from mavsdk_grpc import System
+    from mavsdk_grpc.action import ActionError
+    from mavsdk_grpc.mission import MissionItem, MissionPlan
+    from mavsdk_grpc.offboard import OffboardError, VelocityBodyYawspeed
+
+    drone: Any = System(port=free_udp_port())
+    await drone.connect(system_address=address)
+    await first(drone.telemetry.health(), lambda health: health.is_armable)
+    await drone.action.set_takeoff_altitude(1.5)
+    assert await drone.action.get_takeoff_altitude() == 1.5
+    assert len((await drone.param.get_all_params()).float_params) == 3
+    with pytest.raises(ActionError, match="DENIED"):
+        await drone.action.takeoff()  # before it is armed
+    await drone.action.arm()
+    await drone.action.takeoff()
+    await first(drone.telemetry.flight_mode(), lambda mode: str(mode) == "HOLD")
+    with pytest.raises(OffboardError):
+        await drone.offboard.start()
+    await drone.offboard.set_velocity_body(VelocityBodyYawspeed(0.5, 0.0, 0.0, 0.0))
+    await drone.offboard.start()
+    place = drone.telemetry.position_velocity_ned()
+    await first(place, lambda each: each.position.north_m > 0.5)
+    await drone.offboard.stop()
+    home = await first(drone.telemetry.home())
+    altitude, nan = home.absolute_altitude_m, float("nan")
+    north = home.latitude_deg + 1.0 / 111_300
+    await drone.action.goto_location(north, home.longitude_deg, altitude + 2.0, 0.0)
+    await first(drone.telemetry.position(), lambda each: abs(each.relative_altitude_m - 2) < 0.1)
+    none, nothing = MissionItem.CameraAction.NONE, MissionItem.VehicleAction.NONE
+    items = [
+        MissionItem(
+            home.latitude_deg + metres / 111_300, home.longitude_deg, 1.8, 1.5, True,
+            nan, nan, none, nan, nan, nan, nan, nan, nothing,
+        )
+        for metres in (0.5, 1.5)
+    ]  # fmt: skip
+    await drone.mission.set_return_to_launch_after_mission(True)
+    await drone.mission.upload_mission(MissionPlan(items))
+    assert len((await drone.mission.download_mission()).mission_items) == 2
+    await drone.mission.start_mission()
+    await first(drone.mission.mission_progress(), lambda each: each.current == each.total == 2)
+    await first(drone.telemetry.armed(), lambda armed: not armed)
+
+
+def test_all_plugins_fly(tmp_path: Path) -> None:
+    port = free_udp_port()
+    code = "import asyncio, sys; from tests.nodes.mavlink.test_mavsdk import everything; "
+    code += "asyncio.run(everything(sys.argv[1]))"
+    _, ended = flown(tmp_path, port, "-c", code, f"udpin://127.0.0.1:{port}")
+    assert ended["outputs"]["drone.vehicle_events"] == 4
+
+
+class CompanionConfig(NodeConfig):
+    """Settings: where its link ends."""
+
+    link: str
+
+
+class Companion(Node[CompanionConfig]):
+    """Sends an estimator's poses by MAVLink, as a program outside would."""
+
+    async def on_startup(self) -> None:
+        from pymavlink.dialects.v20 import common as mav
+
+        self._mav = mav.MAVLink(None, 1, 197)
+        self._socket = socket.create_connection(address_of(self.config.link)[1:])
+
+    @on(PoseEstimate)
+    def poses(self, event: PoseEstimate) -> None:
+        """Send one on."""
+        if event.source != "inside":
+            return
+        zeros, unknown = (0.0,) * 6, [float("nan")] + [0.0] * 20
+        message = self._mav.odometry_encode(
+            event.stamp // 1000, 1, 12, *event.position, [*event.orientation], *zeros,
+            unknown, unknown,
+        )  # fmt: skip
+        self._socket.sendall(message.pack(self._mav))
+
+    async def on_shutdown(self) -> None:
+        self._socket.close()
+
+
+def test_poses_by_mavlink_are_judged_as_those_inside(tmp_path: Path, monkeypatch: Any) -> None:
+    """Within what their stamps and numbers resolve: microseconds, and 32-bit floats."""
+    monkeypatch.chdir(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        link = f"tcp://127.0.0.1:{found.getsockname()[1]}"
+    pilot = {"start_delay": "0s", "waypoints": [[0.0, 0.0, -1.0], [2.0, 0.0, -1.0]]}
+    table = {
+        "run": {"name": "vision", "duration": "40s", "speed": 1.0},
+        "nodes": [
+            {"name": "drone", "type": "Multirotor", "world": "hall"},
+            {"name": "pilot", "type": "WaypointFollower"} | pilot,
+            {"name": "vision", "type": "Mavlink", "endpoints": [link], "vision": True},
+            {"name": "inside", "type": "SyntheticOdometry", "drift": 2.0, "noise": 0.01},
+            {"name": "companion", "type": Companion, "link": link},
+            {"name": "evaluation", "type": "Evaluation"},
+        ],
+    }
+    figures = visnav.run(table, quiet=True).figures
+    inside, outside = figures["inside"], figures["vision"]
+    assert outside["estimates"] == pytest.approx(inside["estimates"], abs=2)
+    assert outside["ate_rmse_m"] == pytest.approx(inside["ate_rmse_m"], rel=0.02)
+    assert inside["ate_rmse_m"] > 0.01
+
+
+if __name__ == "__main__":
+    asyncio.run(everything(sys.argv[1]))
