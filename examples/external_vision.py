@@ -12,11 +12,11 @@ from typing import Any
 from pymavlink import mavutil
 
 
-def main(address: str = "udpin:127.0.0.1:14540", silence: float = 10.0) -> None:
+def main(address: str = "udpin:127.0.0.1:14540", silence: str = "10") -> None:
     """Answer each of the vehicle's poses with ``ODOMETRY``, until it is silent for some seconds."""
     vehicle: Any = mavutil.mavlink_connection(address, source_system=1, source_component=197)
     answered = 0
-    while pose := vehicle.recv_match(type="ODOMETRY", blocking=True, timeout=silence):
+    while pose := vehicle.recv_match(type="ODOMETRY", blocking=True, timeout=float(silence)):
         vehicle.mav.odometry_send(
             pose.time_usec, pose.frame_id, pose.child_frame_id,
             1.01 * pose.x, 1.01 * pose.y, 1.01 * pose.z, pose.q,

@@ -102,7 +102,8 @@ class Flight:
         if mode == "mission" and not self._missions.items:
             self._tell("mission: expected one, found none: upload it first")
             return int(_LATER)
-        if mode in {"takeoff", "mission", "return"} and vehicle.home is None:
+        if mode in {"takeoff", "return"} and not vehicle.armed:
+            self._tell(f"{mode} denied: expected an armed vehicle, found it disarmed")
             return int(_LATER)
         self._goal, self._lands_there, self._wait_until = None, False, 0
         flies = vehicle.armed and vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
@@ -211,13 +212,10 @@ class Flight:
 
     def _take_off(self, numbers: Sequence[float], now: int) -> int:
         vehicle, altitude = self._vehicle, numbers[6]
-        if not vehicle.armed or vehicle.home is None:
-            self._tell("take-off denied: expected an armed vehicle, found it disarmed")
-            return int(_LATER)
-        if math.isfinite(altitude):  # above sea level
+        if math.isfinite(altitude) and vehicle.armed and vehicle.home:  # above sea level
             height = altitude - (vehicle.origin[2] - vehicle.home[2])
             if not 0.3 <= height <= FARTHEST:
-                self._tell(f"take-off denied: expected 0.3 m or more above home, found {height:g}")
+                self._tell(f"takeoff denied: expected 0.3 m or more above home, found {height:g}")
                 return int(_NO)
             self.set_mode("hold", now)
             vehicle.mode = "takeoff"

@@ -72,3 +72,21 @@ def key_of(text: str) -> bytes:
     if len(key) not in {0, 32}:
         raise ValueError("signing_key: expected 64 hexadecimal digits, or nothing")
     return key
+
+
+class Px4Config(NodeConfig):
+    """Settings of PX4 in the loop.
+
+    Attributes:
+        vehicle: Vehicle whose motors it drives; may be left out if there is only one.
+        host: Address to listen on.
+        port: Port to listen on, where PX4 looks for its simulator.
+        start: Real time in which PX4 must have connected.
+        answer: Real time in which it must have answered; simulated time waits for it.
+    """
+
+    vehicle: str = ""
+    host: str = "127.0.0.1"
+    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 4560
+    start: Duration = Duration(60.0)  # immutable
+    answer: Duration = Duration(10.0)

@@ -28,15 +28,18 @@ def free_udp_port() -> int:
         return port
 
 
-def flown(out: Path, port: int, *script: str) -> tuple[str, dict[str, Any]]:
-    """Run a script beside the example's vehicle; return what it prints, and the run's summary."""
-    links = f'mavlink.endpoints=["udp://127.0.0.1:{port}"]'
-    words = ["run", "examples/mavsdk.toml", "--quiet", "--out", str(out), "--set", links]
+def flown(
+    out: Path, port: int, *script: str, example: str = "mavsdk", node: str = "mavlink"
+) -> tuple[str, dict[str, Any]]:
+    """Run a script beside an example; return what it prints, and the run's summary."""
+    endpoints = f'{node}.endpoints=["udp://127.0.0.1:{port}"]'
+    words = ["run", f"examples/{example}.toml", "--quiet", "--out", str(out), "--set", endpoints]
     with start(words, ROOT) as process:
         done = subprocess.run(
-            [sys.executable, *script], cwd=ROOT, capture_output=True, text=True, timeout=200
+            [sys.executable, *script], cwd=ROOT, capture_output=True, text=True, timeout=100
         )
-        process.terminate()
+        if example == "mavsdk":  # the other one ends with its pilot
+            process.terminate()
         process.wait(60)
     assert done.returncode == 0, done.stderr
     return done.stdout, summary(out)
@@ -49,6 +52,17 @@ def test_the_script_of_the_example_flies(tmp_path: Path) -> None:
     assert printed.splitlines()[-1] == "landed"
     assert ended["outputs"]["drone.vehicle_events"] == 4  # armed, taken off, landed, disarmed
     assert "mavlink" in ended["not_deterministic"]
+
+
+def test_an_estimator_outside_is_judged(tmp_path: Path) -> None:
+    """By pymavlink's own connection: its poses are one percent too long, and hardly late."""
+    port = free_udp_port()
+    script = "examples/external_vision.py", f"udpin:127.0.0.1:{port}", "3"
+    printed, ended = flown(tmp_path, port, *script, example="external_vision", node="vision")
+    figures = ended["verdict"]["estimators"]["vision"]
+    assert printed == f"{figures['estimates']} poses\n"
+    assert figures["passed"]
+    assert figures["scale"] == pytest.approx(1 / 1.01, rel=1e-3)
 
 
 async def first(found: Any, ok: Callable[[Any], Any] = lambda _: True) -> Any:
@@ -165,6 +179,40 @@ def test_poses_by_mavlink_are_judged_as_those_inside(tmp_path: Path, monkeypatch
     assert outside["estimates"] == pytest.approx(inside["estimates"], abs=2)
     assert outside["ate_rmse_m"] == pytest.approx(inside["ate_rmse_m"], rel=0.02)
     assert inside["ate_rmse_m"] > 0.01
+
+
+def test_two_vehicles_are_two_systems(tmp_path: Path, monkeypatch: Any) -> None:
+    """Each on its own endpoint, and each where it stands."""
+    from pymavlink.dialects.v20 import common as mav
+
+    monkeypatch.chdir(tmp_path)
+    ends = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+    nodes: list[dict[str, Any]] = [{"name": "world", "type": "World", "world": "hall"}]
+    for number, end in enumerate(ends, 1):
+        end.bind(("127.0.0.1", 0))
+        end.setblocking(False)
+        link, name = f"udp://127.0.0.1:{end.getsockname()[1]}", f"drone_{number}"
+        nodes += [
+            {"name": name, "type": "Multirotor", "position": [number - 1.0, 0.0]},
+            {
+                "name": f"mavlink_{number}", "type": "Mavlink", "vehicle": name,
+                "system_id": number, "endpoints": [link],
+            },
+        ]  # fmt: skip
+    run = {"name": "two", "duration": "1s", "speed": 1.0}
+    visnav.run({"run": run, "nodes": nodes}, quiet=True)
+    for number, end in enumerate(ends, 1):
+        parser = mav.MAVLink(None)
+        heard: list[Any] = []
+        with end:
+            while True:
+                try:
+                    heard += parser.parse_buffer(end.recv(65535)) or []
+                except BlockingIOError:
+                    break
+        assert {each.get_srcSystem() for each in heard} == {number}
+        places = [each.x for each in heard if each.get_type() == "LOCAL_POSITION_NED"]
+        assert places[-1] == pytest.approx(number - 1.0, abs=0.01)
 
 
 if __name__ == "__main__":
