@@ -109,9 +109,9 @@ class Door:
             self._once("poses from outside come, and are not judged: vision is false")
             return
         if message.get_type() == "ODOMETRY":
-            frames = message.frame_id, message.child_frame_id
-            if frames[0] not in {mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD}:
-                self._once(f"ODOMETRY: expected frame_id LOCAL_NED or LOCAL_FRD, found {frames[0]}")
+            frame = message.frame_id
+            if frame not in {mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD}:
+                self._once(f"ODOMETRY: expected frame_id LOCAL_NED or LOCAL_FRD, found {frame}")
                 return
             stamp, covariance, q = message.time_usec, message.pose_covariance, message.q
             size = math.hypot(*q)

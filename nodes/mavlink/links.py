@@ -65,12 +65,12 @@ class Links:
         self._peers: dict[socket.socket, Peer] = {}
         self._unsent: dict[socket.socket, bytearray] = {}
         self._listeners: list[socket.socket] = []
-        self._left = BURST
+        self._now, self._left = 0.0, BURST
         self._muted: list[socket.socket] = []
         self.counts: Counter[str] = Counter()
 
-    def open(self, link: str) -> tuple[str, int]:
-        """Open a link; return the address of its own end.
+    def open(self, link: str) -> None:
+        """Open a link.
 
         Raises:
             OSError: It cannot be opened.
@@ -86,8 +86,6 @@ class Links:
             end.setblocking(False)
             self._listeners.append(end)
             self._loop.add_reader(end, self._accept, end)
-        found: tuple[str, int] = end.getsockname()[:2]
-        return found
 
     def send(self, message: Any) -> None:
         """Send a message to every peer."""
@@ -106,8 +104,6 @@ class Links:
             if peer := self._peers.get(end):
                 hear = self._hear_datagram if end.type == socket.SOCK_DGRAM else self._hear_stream
                 self._loop.add_reader(end, hear, end, peer)
-
-    _now = 0.0
 
     def close(self) -> None:
         """Close all sockets; log what was odd."""
