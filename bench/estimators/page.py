@@ -20,7 +20,7 @@ from runtime.errors import ConfigError
 from runtime.run.results import write
 from runtime.run.summarise import commit, environment
 from runtime.tools.sweep.plan import Plan
-from runtime.tools.sweep.tables import Row, Spread, in_order, numbers, summarise
+from runtime.tools.sweep.tables import Row, Spread, crashed, in_order, numbers, summarise
 
 COLUMNS = {
     "flight_ate_percent": "error, whole flight, %",
@@ -77,12 +77,15 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
 def cells(suite: Suite, plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Cell]]:
     """Return each estimator's results, by scenario and estimator.
 
-    A run equal to another to the bit adds nothing, and is left out.
+    A run equal to another to the bit adds nothing, and is left out. A run that crashed before it
+    came to its end counts for both: who crashes now and then has not passed.
     """
     different: dict[tuple[Any, ...], Row] = {}
     for job, row in in_order(plan, rows):
         place, name = (text for _, text in job.settings)
         different[place, name, job.seed, row.get("digests", {}).get(name, job.id)] = row
+        for index, error in enumerate(row.get("crashes", [])):
+            different[place, name, job.seed, (job.id, index)] = crashed(job, error)
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for key, row in different.items():
         groups.setdefault(key[:2], []).append(row)

@@ -34,6 +34,7 @@ class Row(TypedDict):
         repeat: Which of the runs with equal settings and seed it is.
         digest: Of all events; `None` if off, or if equal runs may differ in it.
         digests: Name of an estimator to the digest of all that it has sent.
+        crashes: Errors of the run's earlier tries; a run that has crashed is tried again.
         sim_seconds: Seconds of the run's clock.
         run_seconds: Real seconds from the first update to the end.
         wall_seconds: Real seconds of the whole process.
@@ -53,6 +54,7 @@ class Row(TypedDict):
     estimators: dict[str, dict[str, Any]]
     repeat: NotRequired[int]
     digests: NotRequired[dict[str, str]]
+    crashes: NotRequired[list[str]]
     flights: NotRequired[dict[str, dict[str, Any]]]
     workers: NotRequired[dict[str, dict[str, float | None]]]
 
@@ -68,18 +70,27 @@ def crashed(job: Job, error: str) -> Row:
 
 def decode_rows(text: bytes) -> dict[str, Row]:
     """Return the rows of a ``rows.jsonl`` by job; lines cut short are left out."""
-    rows = {}
+    rows: dict[str, Row] = {}
     for line in text.splitlines():
         with contextlib.suppress(msgspec.MsgspecError):
-            row = msgspec.json.decode(line, type=Row)
-            rows[row["id"]] = row
+            _enter(rows, msgspec.json.decode(line, type=Row))
     return rows
+
+
+def _enter(rows: dict[str, Row], row: Row) -> Row:
+    """Let a row take the place of its job's earlier one, whose crash it remembers."""
+    if (earlier := rows.get(row["id"])) is not None:
+        crashes = earlier.get("crashes", []) + [earlier["error"]] * bool(earlier["error"])
+        if crashes:
+            row["crashes"] = crashes
+    rows[row["id"]] = row
+    return row
 
 
 class Rows:
     """A file of rows, open for adding; a context manager.
 
-    Of several rows of one job the last one counts. A line that was cut short, by a full disk or a
+    Of several rows of one job the last one counts, and knows how the earlier ones crashed. A line that was cut short, by a full disk or a
     power cut, is as if it were not there.
 
     Raises:
@@ -117,9 +128,7 @@ class Rows:
         line = msgspec.json.encode(row)
         self._file.write(line + b"\n")
         self._file.flush()
-        row = msgspec.json.decode(line, type=Row)
-        self._rows[row["id"]] = row
-        return row
+        return _enter(self._rows, msgspec.json.decode(line, type=Row))
 
 
 class Spread(msgspec.Struct, frozen=True):

@@ -173,6 +173,17 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
     assert "**failed** 1 of 2" in line_of(page, "bad")
 
 
+@pytest.mark.slow
+def test_a_crash_that_a_later_try_mended_is_still_told(small: Path, tmp_path: Path) -> None:
+    def mended(row: Row) -> Row:
+        return row | {"crashes": ["its worker died"]} if row["seed"] == 2 else row
+
+    page = page_of(read_suite(small), tmp_path, mended)
+    assert "**failed** 1 of" in line_of(page, "bad")
+    assert "failed" not in line_of(page, "good")
+    assert page.count("- bad: its worker died\n") == 2
+
+
 def test_a_flaw_of_the_flight_is_told_and_is_not_the_estimators(
     small: Path, tmp_path: Path
 ) -> None:

@@ -83,9 +83,12 @@ def test_a_process_that_takes_its_pool_along_is_a_row(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.rate=5,4,6")
     with processes() as pool:
         rows = sweep(plan, pool, run=die)
-    assert [row["error"].partition(":")[0] for row in rows] == ["BrokenProcessPool"] * 3
+    errors = [row["error"] for row in rows]
+    assert [error.partition(":")[0] for error in errors] == ["BrokenProcessPool"] * 3
     with threads() as pool:
-        assert sweep(plan, pool, run=pretend) == [pretend(job) for job in plan.jobs]
+        again = sweep(plan, pool, run=pretend)
+    assert [row.pop("crashes") for row in again] == [[error] for error in errors]
+    assert again == [pretend(job) for job in plan.jobs]
 
 
 def test_what_failed_is_run_again_and_what_is_finished_is_not(tmp_path: Path) -> None:
@@ -103,6 +106,8 @@ def test_what_failed_is_run_again_and_what_is_finished_is_not(tmp_path: Path) ->
         diary = Diary()
         rows = sweep(plan, pool, run=run, watch=diary)
         assert [row["error"] for row in rows] == ["", "", ""]
+        crashes = [row.get("crashes") for row in rows]
+        assert crashes == [None, ["OSError: disk full"], ["out of order"]]
         assert diary.finished == 1
         more = plan_in(tmp_path, "judge.rate=4,1,2,3")
         assert len(sweep(more, pool, run=run)) == 4
