@@ -118,7 +118,7 @@ def end(rows: Sequence[Row], *, judged: bool = True) -> None:
         typer.Exit: With 2 if a run crashed, with 1 if a threshold was missed and runs are `judged`.
     """
     if again := sum("crashes" in row for row in rows):
-        typer.echo(f"{again} of {len(rows)} runs had crashed before, and were tried again", err=True)
+        typer.echo(f"{again} of {len(rows)} runs crashed before, and were tried again", err=True)
     if crashed := sum(bool(row["error"]) for row in rows):
         typer.echo(f"error: {crashed} of {len(rows)} runs crashed", err=True)
         raise typer.Exit(2)

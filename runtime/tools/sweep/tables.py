@@ -90,8 +90,8 @@ def _enter(rows: dict[str, Row], row: Row) -> Row:
 class Rows:
     """A file of rows, open for adding; a context manager.
 
-    Of several rows of one job the last one counts, and knows how the earlier ones crashed. A line that was cut short, by a full disk or a
-    power cut, is as if it were not there.
+    Of several rows of one job the last one counts, and knows how the earlier ones crashed. A line
+    that was cut short, by a full disk or a power cut, is as if it were not there.
 
     Raises:
         ConfigError: Another sweep has it open.
