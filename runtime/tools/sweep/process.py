@@ -230,7 +230,8 @@ def last_error(output: str) -> str:
     """Return the last error line of a run's output, or else the last line."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("error: ")]
-    return (errors or lines or [""])[-1].removeprefix("error: ")
+    error = (errors or lines or [""])[-1].removeprefix("error: ")
+    return error.removesuffix("; its last output:")  # which follows in lines of its own
 
 
 def _same_everywhere(error: str, job: Job) -> str:
