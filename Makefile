@@ -17,18 +17,18 @@ help:  ## List the targets.
 
 setup: $(READY)  ## Make a virtual environment with all that is needed (the others do it too).
 
-# MuJoCo renders through EGL; where its libraries are missing, install them if we may.
-$(CORE): pyproject.toml
+$(CORE): pyproject.toml setup.py $(wildcard sims/cameras/rasteriser/*)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "expected Python 3.11 or later, found $$($(PYTHON) --version): set PYTHON="; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet -e .
-	@sh tools/system_packages.sh gl $(BIN)/python
 	@touch $@
 
+# The tests compare with MuJoCo's renderer, through EGL; what it lacks is installed if we may.
 $(READY): $(CORE)
 	$(BIN)/python -m pip install --quiet -e '.[dev,docs]'
+	@sh tools/system_packages.sh gl $(BIN)/python
 	@touch $@
 
 demo: $(CORE)  ## Fly the standard tour, judge visual odometry on it, and report in runs/tour/latest.

@@ -269,8 +269,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         ended_by: A node's name, ``user``, or "" for its duration; see `RunEnd`.
         wall_seconds: Real seconds, from the first update to when the end was asked for.
         sim_seconds: The same time on the run's clock: all events were sent in it.
-        digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels depend
-            on the graphics driver, so digests compare on one machine.) `None` if off.
+        digest: Fingerprint of all events in order; equal for equal runs in lockstep. (They
+            compare on machines of one kind; see docs/explanation/determinism.md.) `None` if off.
         digests: Fingerprint of each output's events, of which that of the run is made.
         not_deterministic: Nodes because of which equal runs may have unequal digests.
         truth_readers: Nodes that received true poses, but those that fly, judge, record or show.

@@ -16,6 +16,7 @@ from runtime.host import Sibling
 from runtime.paths import NameOrPath
 from sims.cameras import CameraSpec
 from sims.cameras.rig import CameraOutputs, CameraRig
+from sims.cameras.stage import RendererName
 from sims.world import Inhabitant
 
 Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
@@ -35,7 +36,9 @@ class SimulatorConfig(NodeConfig):
             and east, and altitude, metres above the WGS 84 ellipsoid, which here is sea level too.
         cameras: The cameras that are carried.
         camera_processes: Number of processes that render.
-        render_threads: Threads of the software renderer in each of them.
+        render_threads: Threads of OpenGL's software renderer in each of them.
+        renderer: ``mujoco``: MuJoCo's, by OpenGL; its pixels depend on the driver. ``raster``: the
+            project's own, several times as quick, with the same bytes on every machine.
         setpoint_timeout: Age beyond which set-points are ignored, but of position or pose.
     """
 
@@ -44,6 +47,7 @@ class SimulatorConfig(NodeConfig):
     cameras: tuple[CameraSpec, ...] = ()
     camera_processes: Count = 2
     render_threads: Count = 1
+    renderer: RendererName = "raster"
     setpoint_timeout: Duration = Duration(0.5)  # immutable
 
 
@@ -82,7 +86,12 @@ class Simulator(Inhabitant, Node[C], ABC):
             self.images, self.depth_images, self.segmentation_images, self.camera_poses
         )
         self.rig = CameraRig(
-            self, self.cameras, outputs, config.camera_processes, config.render_threads
+            self,
+            self.cameras,
+            outputs,
+            config.camera_processes,
+            config.render_threads,
+            config.renderer,
         )
 
     def announce(self) -> Iterable[ev.Announcement]:

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Install system packages that are missing, if we may; otherwise say which.
-# Usage: system_packages.sh gl PYTHON     what MuJoCo renders with, without a screen
+# Usage: system_packages.sh gl PYTHON     what MuJoCo's renderer draws with, without a screen
 #        system_packages.sh display       what the tests of windows need
 #        system_packages.sh orbslam3 PYTHON  what ORB-SLAM3 is linked with
 #        system_packages.sh peers         what the benchmarks compare with
@@ -8,7 +8,7 @@ set -u
 
 has_what_it_takes() {
     case "$1" in
-    gl) "$2" -c 'from sims.cameras.stage import open_context; open_context(8, 8, 1).free()' ;;
+    gl) "$2" -c 'from sims.cameras.opengl import open_context; open_context(8, 8, 1).free()' ;;
     orbslam3) "$2" -c "import pyorbslam3" ;;
     display) command -v Xvfb && command -v xdotool ;;
     peers) command -v g++ && dpkg -s libroscpp-dev libnodeletlib-dev python3-rosmaster python3-rospy ;;
@@ -16,7 +16,7 @@ has_what_it_takes() {
 }
 
 case "$1" in
-gl) packages="libegl1 libgl1 libgl1-mesa-dri" without="MuJoCo cannot render" ;;
+gl) packages="libegl1 libgl1 libgl1-mesa-dri" without="renderer = mujoco and the tests of it do not draw" ;;
 display) packages="xvfb xdotool" without="tests of windows are skipped" ;;
 orbslam3)
     packages="libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6"

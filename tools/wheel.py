@@ -1,10 +1,11 @@
-"""Additions to the wheel: `config.toml` and the examples, for `visnav demo`."""
+"""Additions to the wheel: `config.toml` and the examples, for `visnav demo`, and its name."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
 
+from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).parents[1]
@@ -28,3 +29,11 @@ class BuildWithExamples(build_py):
             if file.suffix != ".pyc":
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, copy)
+
+
+class PlatformWheel(bdist_wheel):
+    """Wheel for a platform and every Python: the compiled rasteriser is called by ctypes."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        """Return the tags of Python, ABI and platform."""
+        return "py3", "none", super().get_tag()[2]

@@ -21,9 +21,11 @@ from sims.cameras.development import Development
 from sims.cameras.lens import undistorted
 from sims.cameras.response import generator, grey_of, moments
 from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain
-from sims.cameras.stage import Changing, Colours, Depths, Floats, Stage, gl_renderer, keep_memory
+from sims.cameras.stage import Changing, Floats, RendererName, keep_memory, open_stage
 from sims.cameras.view import (
     FINER_FOR_DEPTH,
+    Colours,
+    Depths,
     Drawn,
     View,
     image_speeds,
@@ -157,10 +159,12 @@ class CameraRenderer:
         cameras: Settings of the cameras; a stereo rig is two.
         threads: Threads of the software renderer, if this is the process's first GL context.
         dynamics: What moves in the world by itself, as `sims.worlds.Dynamics`.
+        renderer: What draws.
 
     Raises:
-        GraphicsError: There is no GL; the message names what to install.
-        ValueError: The bytes are no model, or the model lacks one of the cameras.
+        GraphicsError: What draws is missing; the message names what to install.
+        ValueError: The bytes are no model, the model lacks one of the cameras, or it holds
+            something that is not drawn.
     """
 
     def __init__(
@@ -171,6 +175,7 @@ class CameraRenderer:
         seed: int,
         threads: int = 1,
         dynamics: Changing | None = None,
+        renderer: RendererName = "raster",
     ) -> None:
         cameras = tuple(eye for spec in cameras for eye in eyes(spec))
         keep_memory()
@@ -188,8 +193,8 @@ class CameraRenderer:
             spec.name: undistorted(camera_info(spec)) for spec in cameras if spec.undistorted
         }
         self._views = {spec.name: View(camera_info(spec), is_plain(spec)) for spec in cameras}
-        width, height = np.max([(1, 1), *(v.largest() for v in self._views.values())], axis=0)
-        self._stage = Stage(model, int(width), int(height), threads, dynamics)
+        infos = tuple(view.info for view in self._views.values())
+        self._stage = open_stage(renderer, model, infos, threads, dynamics)
 
     def expose(self, shots: tuple[Shot, ...]) -> tuple[Frame, ...]:
         """Return the frames of some exposures. The same arguments give the same bits."""
@@ -209,12 +214,11 @@ class CameraRenderer:
         return tuple(frames)
 
     def graphics(self) -> str:
-        """Return the GL name of the renderer: a graphics card, or ``llvmpipe``."""
-        self._stage.enter()
-        return gl_renderer()
+        """Return the name of what draws: a graphics card, ``llvmpipe``, or ``raster``."""
+        return self._stage.name
 
     def close(self) -> None:
-        """Give the GL context back. Further calls do nothing."""
+        """Give back what the renderer holds. Further calls do nothing."""
         self._stage.close()
 
     def _capture(self, shot: Shot, spec: CameraSpec, number: int) -> Captured:
@@ -244,7 +248,7 @@ class CameraRenderer:
                 if not spec.readout and alone:
                     poses.append(stage.pose(number))
                 wanted = (coloured, alone and "depth" in kinds, alone and "segmentation" in kinds)
-                pieces.append(view.draw(stage, *wanted, rows if len(bands) > 1 else None))
+                pieces.append(stage.draw(view, *wanted, rows if len(bands) > 1 else None))
         whole = [stacked(pieces) for pieces in drawn]
         _, depth, numbers = whole[len(whole) // 2]
         return Captured(
@@ -307,7 +311,7 @@ class CameraRenderer:
         times = np.linspace(-0.5, 0.5, 2 * math.ceil(seconds / 0.004) + 1) * seconds
         poses = [pose_matrix(*self._pose(shot, number, moment)) for moment in times.tolist()]
         self._look(shot, spec, number, 0.0)
-        depth = small.draw(self._stage, False, True, False).depth
+        depth = self._stage.draw(small, False, True, False).depth
         assert depth is not None
         return image_speeds(camera_info(spec), small.info, depth, poses, seconds)
 

@@ -19,6 +19,7 @@ from sims.cameras.lens import undistorted
 from sims.cameras.renderer import CameraRenderer, Frame, Motion, Shot, delay_of, stamp_error
 from sims.cameras.response import ExposureControl
 from sims.cameras.spec import CameraSpec, announcement, eyes, optical_frame, optical_in_body
+from sims.cameras.stage import RendererName
 
 STEP = 1_000_000  # interval of the states recorded during an exposure, nanoseconds
 UNDISTORTED = "/undistorted"  # ends the source of a camera's images without distortion
@@ -77,12 +78,14 @@ class CameraRig:
         outputs: CameraOutputs,
         processes: int,
         threads: int,
+        renderer: RendererName,
     ) -> None:
         self._node = node
         self._specs = {spec.name: spec for spec in specs}
         self._outputs = outputs
         self._processes = processes
         self._threads = threads
+        self._draws: RendererName = renderer
         self._renderer: Worker[CameraRenderer] | None = None
         self._seed = 0
         self._last: dict[str, asyncio.Future[None]] = {}
@@ -110,6 +113,7 @@ class CameraRig:
             self._seed,
             self._threads,
             world.dynamics,
+            self._draws,
             processes=self._processes,
         )
         self._node.doing = ""

@@ -1,4 +1,4 @@
-"""Sensor images from drawings: whole images, or bands of a rolling shutter."""
+"""Drawings of a camera: what they are, and how many a moving camera needs."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from sims.cameras.lens import MARGIN, Face, Maps, faces, pixel_rays
-from sims.cameras.stage import RANGE, Colours, Depths, Stage
+from sims.cameras.lens import Maps, pixel_rays
 
+Colours = npt.NDArray[np.uint8]
+Depths = npt.NDArray[np.float32]
 Numbers = npt.NDArray[np.int32]
 
 CREASE = 1e-3  # least second difference of the inverse depth, as a share, between two surfaces
@@ -30,43 +31,11 @@ class Drawn(NamedTuple):
     numbers: Numbers | None  # int32 object numbers, shape (rows, width); -1 where nothing is
 
 
-class View:
-    """Images of a camera, assembled from drawings; `framed`: the model's has just this frame."""
+class View(msgspec.Struct, frozen=True):
+    """View of a camera; `framed`: the model's camera has just this frame."""
 
-    def __init__(self, info: CameraInfo, framed: bool = False) -> None:
-        self.info = info
-        self._framed = framed
-        self._faces = faces(info)
-
-    def largest(self) -> tuple[int, int]:
-        """Return width and height of a buffer for all drawings, pixels."""
-        width = max((face.width for face in self._faces), default=1)
-        return width, max((face.height for face in self._faces), default=1)
-
-    def draw(
-        self,
-        stage: Stage,
-        colour: bool,
-        depth: bool,
-        numbers: bool,
-        rows: tuple[int, int] | None = None,
-    ) -> Drawn:
-        """Draw the requested images of the camera."""
-        first, last = rows or (0, self.info.height)
-        size = last - first, self.info.width
-        if self._framed and rows is None:
-            return _drawn(stage, size, colour, depth, numbers)
-        if len(self._faces) == 1 and self._faces[0].columns is None:
-            _aim(stage, self._faces[0], 0, first, *size[::-1])
-            return _drawn(stage, size, colour, depth, numbers)
-        seen = Drawn(
-            np.zeros((*size, 3), np.uint8) if colour else None,
-            np.full(size, np.inf, np.float32) if depth else None,
-            np.full(size, -1, np.int32) if numbers else None,
-        )
-        for face in self._faces:
-            _add(seen, stage, face, first, last)
-        return seen
+    info: CameraInfo
+    framed: bool = False
 
 
 def stacked(pieces: list[Drawn]) -> Drawn:
@@ -103,45 +72,6 @@ def looked_up(drawn: Drawn, columns: Maps, rows: Maps) -> Drawn:
     return Drawn(colours, depth, numbers)
 
 
-def _add(seen: Drawn, stage: Stage, face: Face, first: int, last: int) -> None:
-    """Draw the part of a face needed for some rows of an image, into `seen`."""
-    assert face.columns is not None
-    assert face.rows is not None
-    assert face.mask is not None
-    mask = face.mask[first:last]
-    if not mask.any():
-        return
-    columns, rows = face.columns[first:last], face.rows[first:last]
-    left, right = _span(columns[mask], face.width)
-    top, bottom = _span(rows[mask], face.height)
-    _aim(stage, face, left, top, right - left, bottom - top)
-    wanted = (image is not None for image in seen)
-    drawn = _drawn(stage, (bottom - top, right - left), *wanted)
-    part = looked_up(drawn, columns - np.float32(left), rows - np.float32(top))
-    if part.depth is not None and face.steepness is not None:
-        part = part._replace(depth=part.depth * face.steepness[first:last])
-    for whole, piece in zip(seen, part, strict=True):
-        if whole is not None and piece is not None:
-            whole[mask] = piece[mask]
-
-
-def _span(places: Maps, length: int) -> tuple[int, int]:
-    first, last = math.floor(places.min()) - MARGIN + 1, math.ceil(places.max()) + MARGIN
-    return max(first, 0), min(last, length)
-
-
-def _aim(stage: Stage, face: Face, left: int, top: int, width: int, height: int) -> None:
-    """Have a stage draw a rectangle of a face's pixels."""
-    (across, down), x, y = face.pitch, face.left, face.top
-    edges = x + left * across, x + (left + width) * across
-    stage.aim(face.turn, *edges, y + top * down, y + (top + height) * down)
-
-
-def _drawn(stage: Stage, size: tuple[int, int], colour: bool, depth: bool, numbers: bool) -> Drawn:
-    colours, planar = stage.colour_and_depth(size, colour, depth)
-    return Drawn(colours, planar, stage.segmentation(size) if numbers else None)
-
-
 Floats = npt.NDArray[np.float64]
 
 OFF = 0.25  # largest shift of a row drawn at another row's time, pixels
@@ -150,6 +80,7 @@ FINER_FOR_DEPTH = 2.5
 """Times as many bands where depth is wanted: on a slanted floor a pixel is some centimetres."""
 
 MOST_BANDS = 128  # most bands per image; beyond 64 pixels of motion in a readout, rows exceed `OFF`
+FARTHEST = 500.0  # metres; stands for ``inf`` where a point is needed
 SAMPLES = 32  # longer side of the small image for motion measurement, pixels
 
 
@@ -197,7 +128,7 @@ def image_speeds(
     rays = pixel_rays(small).reshape(-1, 3)
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = depth.reshape(-1) / rays[:, 2]
-    points = rays * np.where(np.isfinite(scale), scale, RANGE)[:, None]
+    points = rays * np.where(np.isfinite(scale), scale, FARTHEST)[:, None]
     middle = poses[len(poses) // 2]
     points = points[np.isfinite(points).all(axis=1)] @ middle[:3, :3].T + middle[:3, 3]
     places = np.array([info.project((points - pose[:3, 3]) @ pose[:3, :3]) for pose in poses])

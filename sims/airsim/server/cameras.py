@@ -30,7 +30,7 @@ from sims.airsim.settings import DEFAULT_CAMERAS, default_mount
 from sims.airsim.wire import Pose
 from sims.cameras import GraphicsError
 from sims.cameras.spec import CameraSpec, Pixels, camera_info, eyes
-from sims.cameras.view import View
+from sims.cameras.stage import RendererName
 from sims.world import SharedWorld
 
 DrawnState = Callable[[], tuple[int, npt.NDArray[np.float64]]]
@@ -132,9 +132,7 @@ class Cameras:
                     log.info("%s: %s are one camera, %s", each.name, names, min(given))
         cameras = (camera for named in self._named.values() for camera in named.values())
         specs = [spec for camera in cameras for spec in camera.specs.values()]
-        width, height = np.max([(1, 1), *(View(camera_info(s)).largest() for s in specs)], axis=0)
-        # Width and height of a buffer in which each of their images can be drawn, pixels.
-        self.largest = int(width), int(height)
+        self.largest = tuple(camera_info(spec) for spec in specs)
 
     def find(self, vehicle: ServedVehicle, name: str, external: object = False) -> Camera:
         """Return a vehicle's camera by name, or raise `RpcError`."""
@@ -293,10 +291,12 @@ class Images:
         segmentation_ids: Callable[[], npt.NDArray[np.uint8]],
         processes: int,
         threads: int,
+        renderer: RendererName,
     ) -> None:
         self._node, self._world, self._cameras = node, world, cameras
         self._drawn_state, self._segmentation_ids = drawn_state, segmentation_ids
         self._processes, self._threads = processes, threads
+        self._draws: RendererName = renderer
         self._renderer: Worker[Renderer] | None = None
         self._starting = asyncio.Lock()
         self._idle = asyncio.Semaphore(processes)
@@ -314,6 +314,7 @@ class Images:
                     self._cameras.largest,
                     self._threads,
                     self._world.dynamics,
+                    self._draws,
                     processes=self._processes,
                     timeout=TIMEOUT,
                 )

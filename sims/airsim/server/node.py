@@ -44,6 +44,7 @@ from sims.airsim.server.vehicles import (
     ServedVehicle,
     Vehicles,
 )
+from sims.cameras.stage import RendererName
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
 from sims.simulator import Count, Simulator
@@ -78,6 +79,7 @@ class AirsimServerConfig(NodeConfig):
         cameras: Cameras for clients besides the vehicles' and AirSim's default ones.
         camera_processes: Number of processes that render what clients ask for.
         render_threads: Threads of the software renderer in each of them.
+        renderer: What draws, as of a simulator.
         lidar_frame: Frame of lidars' points, as AirSim's ``DataFrame``.
         recording: What `startRecording` records.
         sensor_names: Names of vehicles' sensors by those by which scripts call them.
@@ -98,6 +100,7 @@ class AirsimServerConfig(NodeConfig):
     cameras: tuple[ServedCamera, ...] = ()
     camera_processes: Count = 1
     render_threads: Count = 1
+    renderer: RendererName = "raster"
     lidar_frame: Literal["VehicleInertialFrame", "SensorLocalFrame"] = "VehicleInertialFrame"
     recording: RecordingConfig = RecordingConfig()
     sensor_names: dict[str, str] = msgspec.field(default_factory=dict)
@@ -131,7 +134,8 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         carriers = self.siblings(Simulator)
         objects = Objects(world, spare_objects(self.name, config.objects), now, log)
         cameras = Cameras(carriers, config.cameras, world.model, drawn_state, log)
-        ids, draw = objects.segmentation_ids, (config.camera_processes, config.render_threads)
+        ids = objects.segmentation_ids
+        draw = config.camera_processes, config.render_threads, config.renderer
         images = Images(self, world, cameras, drawn_state, ids, *draw)
         scenery = Scenery(world, vehicles, objects, now, log)
         rates = [

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -22,8 +22,8 @@ from events.geometry import pose_matrix
 from sims.airsim import wire
 from sims.cameras.renderer import model_from_bytes
 from sims.cameras.spec import CameraSpec, camera_info, is_plain, vertical_fov
-from sims.cameras.stage import Changing, Colours, Depths, Floats, Stage, keep_memory
-from sims.cameras.view import Drawn, View
+from sims.cameras.stage import Changing, Floats, RendererName, Stage, keep_memory, open_stage
+from sims.cameras.view import Colours, Depths, Drawn, View
 
 Form = Literal["float", "rgb", "bgr", "png"]
 Mount = tuple[Vector3, Quaternion]
@@ -183,22 +183,24 @@ class Renderer:
 
     Args:
         camera: Name of a camera of the model, which is moved to where it is needed.
-        size: Width and height of the largest drawing, pixels.
+        infos: The largest cameras.
         threads: Threads of the software renderer, if this is the process's first GL context.
+        renderer: What draws.
     """
 
     def __init__(
         self,
         model_bytes: bytes,
         camera: str,
-        size: tuple[int, int],
+        infos: tuple[CameraInfo, ...],
         threads: int = 1,
         dynamics: Changing | None = None,
+        renderer: RendererName = "raster",
     ) -> None:
         keep_memory()
         self._model: Any = model_from_bytes(model_bytes)
         self._camera = int(self._model.camera(camera).id)
-        self._make = partial(Stage, self._model, *size, threads, dynamics)
+        self._make = partial(open_stage, renderer, self._model, infos, threads, dynamics)
 
     def take(
         self, stamp: int, qpos: Floats, ids: npt.NDArray[np.uint8], wanted: Sequence[Wanted]
@@ -209,7 +211,7 @@ class Renderer:
             ids: Segmentation ID of each object number, and last of nothing, shape (ngeom + 1,).
 
         Raises:
-            GraphicsError: There is no GL; the message names what to install.
+            GraphicsError: What draws is missing; the message names what to install.
         """
         self._stage.enter()
         images: dict[int, npt.NDArray[np.uint8]] = {}
@@ -222,13 +224,13 @@ class Renderer:
         return [images[n] for n in range(len(wanted))]
 
     def close(self) -> None:
-        """Give the GL context back."""
+        """Give back what the renderer holds."""
         if "_stage" in self.__dict__:
             self._stage.close()
 
     @cached_property
     def _stage(self) -> Stage:
-        return self._make()  # by the first images: without GL, all else is served
+        return self._make()  # by the first images: without it, all else is served
 
     def _see(
         self, eye: Eye, stamp: int, qpos: Floats, ids: npt.NDArray[np.uint8], kinds: set[ImageType]
@@ -239,13 +241,8 @@ class Renderer:
         model.cam_quat[number] = flip_yz_rotation(multiply(turn, OPTICAL_TO_FRD))
         model.cam_fovy[number] = vertical_fov(eye.spec)
         self._stage.look(number, qpos, stamp * 1e-9, eye.spec.light)
-        view = _view(camera_info(eye.spec), is_plain(eye.spec))
-        drawn = view.draw(
-            self._stage, ImageType.SCENE in kinds, bool(kinds & OF_DEPTH), bool(kinds & OF_NUMBERS)
+        view = View(camera_info(eye.spec), is_plain(eye.spec))
+        drawn = self._stage.draw(
+            view, ImageType.SCENE in kinds, bool(kinds & OF_DEPTH), bool(kinds & OF_NUMBERS)
         )
         return Seen(drawn, view.info, ids, pose_matrix(*self._stage.pose(number))[:3, :3])
-
-
-@lru_cache(maxsize=64)
-def _view(info: CameraInfo, framed: bool) -> View:
-    return View(info, framed)

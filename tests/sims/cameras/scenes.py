@@ -9,6 +9,7 @@ import mujoco
 
 from sims.cameras import CameraRenderer, CameraSpec, Frame, add_free_camera, model_to_bytes
 from sims.cameras.renderer import Shot
+from sims.cameras.stage import RendererName
 from sims.worlds import load_world
 
 ALL = CameraSpec(
@@ -29,6 +30,17 @@ NOISY = CameraSpec(
     depth_noise=0.002,
 )
 CAMERAS = (ALL, WIDE, NOISY)
+
+
+draws: RendererName = "raster"
+"""What draws in tests; the fixture of this name gives each in turn."""
+
+
+def renderer_of(
+    packed: bytes, cameras: tuple[CameraSpec, ...], prefix: str, seed: int = 0
+) -> CameraRenderer:
+    """Return a renderer of cameras of a model."""
+    return CameraRenderer(packed, cameras, prefix, seed=seed, renderer=draws)
 
 
 class Scene(NamedTuple):

@@ -33,7 +33,7 @@ from sims.cameras import (
 )
 from sims.cameras.development import Development
 from sims.cameras.response import AutoExposure, ExposureControl, generator, moments
-from tests.sims.cameras.scenes import frames_of
+from tests.sims.cameras.scenes import frames_of, renderer_of
 
 EXPOSURE = 0.02
 PLAIN = CameraSpec(
@@ -65,7 +65,7 @@ QPOS = pose_to_qpos((0.0, 0.0, 0.0), AHEAD)
 
 
 @pytest.fixture(scope="module")
-def renderer() -> Iterator[CameraRenderer]:
+def renderer(draws: str) -> Iterator[CameraRenderer]:
     """A wall of grey boxes, 2 m ahead, under a lamp and the camera's own light."""
     world = mujoco.MjSpec()
     world.visual.headlight.ambient = [0.2, 0.2, 0.2]
@@ -83,7 +83,7 @@ def renderer() -> Iterator[CameraRenderer]:
             rgba=[grey, grey, grey, 1.0],
         )
     prefix = add_free_camera(world, "free", CAMERAS)
-    made = CameraRenderer(model_to_bytes(world.compile()), CAMERAS, prefix, seed=0)
+    made = renderer_of(model_to_bytes(world.compile()), CAMERAS, prefix, seed=0)
     yield made
     made.close()
 

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from events import CameraInfo
 from events.camera_info import DistortionModel
 from sims.cameras import (
-    CameraRenderer,
     CameraSpec,
     Frame,
     add_free_camera,
@@ -25,7 +24,9 @@ from sims.cameras import (
     pose_to_qpos,
 )
 from sims.cameras.lens import LARGEST, Lens, faces, pixel_rays, undistorted
-from tests.sims.cameras.scenes import frames_of
+from tests.sims.cameras.scenes import frames_of, renderer_of
+
+pytestmark = pytest.mark.usefixtures("draws")
 
 Array = npt.NDArray[np.float64]
 AHEAD = (1.0, 0.0, 0.0, 0.0)
@@ -62,7 +63,7 @@ def render(
     spec: CameraSpec, world: Any, position: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> Frame:
     prefix = add_free_camera(world, "free", (spec,))
-    renderer = CameraRenderer(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
+    renderer = renderer_of(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
     frame = frames_of(renderer, 0, pose_to_qpos(position, AHEAD), (spec.name,))[spec.name]
     renderer.close()
     return frame

@@ -31,7 +31,9 @@ from sims.cameras import (
 )
 from sims.cameras.response import MOST, defocused, mean, moments
 from sims.worlds import TOURS
-from tests.sims.cameras.scenes import ALL, CAMERAS, Scene, frames_of, scene
+from tests.sims.cameras.scenes import ALL, CAMERAS, Scene, frames_of, renderer_of, scene
+
+pytestmark = pytest.mark.usefixtures("draws")
 
 Array = npt.NDArray[np.float64]
 POSITION = (0.4, -0.3, -1.2)
@@ -107,7 +109,7 @@ def residuals(spec: CameraSpec, info: CameraInfo) -> Array:
             size=[radius, 0, 0],
         )
     prefix = add_free_camera(world, "body", (spec,))
-    renderer = CameraRenderer(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
+    renderer = renderer_of(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
     frame = frames_of(renderer, 0, pose_to_qpos(POSITION, ORIENTATION), (spec.name,))[spec.name]
     renderer.close()
     assert frame.segmentation is not None
@@ -193,9 +195,11 @@ SOLIDS = np.array([0, 0, 0, 1, 0, 0], np.uint8)
 
 
 @pytest.fixture(params=["hall", pytest.param("yard", marks=pytest.mark.slow)], scope="module")
-def world(request: pytest.FixtureRequest) -> Iterator[tuple[Scene, CameraRenderer, str]]:
+def world(
+    request: pytest.FixtureRequest, draws: str
+) -> Iterator[tuple[Scene, CameraRenderer, str]]:
     built = scene(request.param)
-    renderer = CameraRenderer(built.packed, CAMERAS, built.prefix, seed=0)
+    renderer = renderer_of(built.packed, CAMERAS, built.prefix, seed=0)
     yield built, renderer, request.param
     renderer.close()
 

@@ -22,17 +22,20 @@ from sims.cameras import (
     model_to_bytes,
     pose_to_qpos,
 )
-from sims.cameras import stage as graphics
-from tests.sims.cameras.scenes import CAMERAS, frames_of, scene
+from sims.cameras import opengl as graphics
+from sims.cameras.stage import RendererName
+from tests.sims.cameras.scenes import CAMERAS, frames_of, renderer_of, scene
+
+pytestmark = pytest.mark.usefixtures("draws")
 
 QPOS = pose_to_qpos((1.0, 0.4, -1.5), (0.9, 0.05, -0.1, 0.4))
 NAMES = ("all", "wide", "noisy")
 
 
 @pytest.fixture(scope="module")
-def renderer() -> Iterator[CameraRenderer]:
+def renderer(draws: str) -> Iterator[CameraRenderer]:
     built = scene("hall")
-    made = CameraRenderer(built.packed, CAMERAS, built.prefix, seed=3)
+    made = renderer_of(built.packed, CAMERAS, built.prefix, seed=3)
     yield made
     made.close()
 
@@ -48,9 +51,9 @@ def digest(frames: dict[str, Frame]) -> str:
     return total.hexdigest()
 
 
-def elsewhere(packed: bytes, prefix: str) -> str:
+def elsewhere(packed: bytes, prefix: str, draws: RendererName) -> str:
     """Render in this process and return the hash; runs in a spawned one."""
-    made = CameraRenderer(packed, CAMERAS, prefix, seed=3)
+    made = CameraRenderer(packed, CAMERAS, prefix, seed=3, renderer=draws)
     frames_of(made, 1, pose_to_qpos((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0)), ("noisy",))
     try:
         return digest(frames_of(made, 7, QPOS, NAMES))
@@ -67,11 +70,11 @@ def test_same_state_same_bits(renderer: CameraRenderer) -> None:
 
 
 @pytest.mark.slow
-def test_same_bits_in_other_processes(renderer: CameraRenderer) -> None:
+def test_same_bits_in_other_processes(renderer: CameraRenderer, draws: RendererName) -> None:
     """Two spawned processes draw, and add noise, exactly as this one does."""
     built = scene("hall")
     with multiprocessing.get_context("spawn").Pool(2) as pool:
-        jobs = [pool.apply_async(elsewhere, (built.packed, built.prefix)) for _ in range(2)]
+        jobs = [pool.apply_async(elsewhere, (built.packed, built.prefix, draws)) for _ in range(2)]
         found = {job.get(timeout=50) for job in jobs}
     assert found == {digest(frames_of(renderer, 7, QPOS, NAMES))}
 
@@ -123,7 +126,7 @@ def test_rows_run_down_and_columns_right() -> None:
         x, y, z = place
         world.worldbody.add_geom(type=ball, size=[0.4, 0, 0], pos=[x, -y, -z], rgba=colour)
     prefix = add_free_camera(world, "b", (spec,))
-    made = CameraRenderer(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
+    made = renderer_of(model_to_bytes(world.compile()), (spec,), prefix, seed=0)
     image = frames_of(made, 0, pose_to_qpos((0, 0, 0), (1, 0, 0, 0)), ("c",))["c"].rgb
     made.close()
     assert image is not None
@@ -141,9 +144,9 @@ def test_wrong_arguments_are_named(renderer: CameraRenderer) -> None:
     with pytest.raises(KeyError, match="nobody"):
         frames_of(renderer, 0, QPOS, ("nobody",))
     with pytest.raises(ValueError, match="camera free/other: expected one of the model's"):
-        CameraRenderer(built.packed, (CameraSpec(name="other"),), built.prefix, seed=0)
+        renderer_of(built.packed, (CameraSpec(name="other"),), built.prefix, seed=0)
     small = (CAMERAS[2],)
-    closed = CameraRenderer(built.packed, small, built.prefix, seed=0)
+    closed = renderer_of(built.packed, small, built.prefix, seed=0)
     closed.close()
     closed.close()
     with pytest.raises(RuntimeError, match="closed"):
@@ -156,7 +159,7 @@ def test_missing_libraries_are_named_with_their_packages(monkeypatch: pytest.Mon
     def broken(name: str) -> None:
         raise ImportError("libEGL.so.1: cannot open shared object file")
 
-    monkeypatch.setattr("sims.cameras.stage.importlib.import_module", broken)
+    monkeypatch.setattr("sims.cameras.opengl.importlib.import_module", broken)
     with pytest.raises(GraphicsError, match="apt-get install libegl1 libgl1"):
         graphics.open_context(8, 8, 1)
 

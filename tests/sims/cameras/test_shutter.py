@@ -29,7 +29,7 @@ from sims.cameras import (
 from sims.cameras.lens import Lens
 from sims.cameras.renderer import Motion, Shot
 from sims.cameras.view import MOST_BANDS, OFF, row_bands, row_time
-from tests.sims.cameras.scenes import frames_of
+from tests.sims.cameras.scenes import frames_of, renderer_of
 
 Array = npt.NDArray[np.float64]
 READOUT, EXPOSURE = 0.03, 0.006
@@ -84,7 +84,7 @@ def renderer() -> Any:
             rgba=[0.3 + 0.01 * k, 0.9 - 0.01 * k, 0.2 * (k % 5), 1.0],
         )
     prefix = add_free_camera(world, "free", CAMERAS)
-    made = CameraRenderer(model_to_bytes(world.compile()), CAMERAS, prefix, seed=0)
+    made = renderer_of(model_to_bytes(world.compile()), CAMERAS, prefix, seed=0)
     yield made
     made.close()
 

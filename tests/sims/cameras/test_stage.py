@@ -11,7 +11,9 @@ import pytest
 
 from events.frames import from_rpy
 from sims.cameras import add_free_camera, model_from_bytes, model_to_bytes, pose_to_qpos
-from sims.cameras.stage import Floats, Stage
+from sims.cameras.opengl import OpenGL
+from sims.cameras.spec import camera_info
+from sims.cameras.stage import Floats
 from sims.worlds import TOURS
 from tests.sims.cameras.scenes import WIDE, scene
 
@@ -43,10 +45,10 @@ def glass() -> bytes:
     return model_to_bytes(world.compile())
 
 
-def views(name: str) -> Iterator[tuple[Stage, int, Floats]]:
+def views(name: str) -> Iterator[tuple[OpenGL, int, Floats]]:
     """Return a stage, its camera, and states along the world's tour."""
     model = model_from_bytes(glass() if name == "glass" else scene(name).packed)
-    stage = Stage(model, SIZE[1], SIZE[0], 1)
+    stage = OpenGL(model, (camera_info(WIDE),), 1)
     stage.enter()
     camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "free/wide")
     for k, place in enumerate(TOURS.get(name, ((0.0, 0.0, -0.6), (-1.0, 1.0, -2.0)) * 4)):

@@ -1,8 +1,7 @@
-"""Cameras with the oldest settings give the images that they always gave, to the byte.
+"""Cameras give the images that they gave before, to the byte, on every machine.
 
-`unchanged.npz` holds them as they were drawn before there were lenses and rolling shutters (but
-defocus, which is in linear light since). Where
-a change of the drawing is wanted, ``python -m tests.sims.cameras.test_unchanged`` writes it anew.
+`unchanged.npz` holds them. Where a change of the drawing is wanted,
+``python -m tests.sims.cameras.test_unchanged`` writes it anew.
 """
 
 from __future__ import annotations

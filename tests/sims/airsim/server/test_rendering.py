@@ -31,6 +31,7 @@ from sims.airsim.server.rendering import (
 )
 from sims.cameras import CameraRenderer, CameraSpec, add_camera, model_to_bytes
 from sims.cameras.lens import Lens
+from sims.cameras.spec import camera_info
 from sims.cameras.view import Drawn
 from sims.vehicle import attach_vehicle
 from tests.sims.cameras.scenes import frames_of
@@ -93,7 +94,7 @@ def model() -> Any:
 
 @pytest.fixture(scope="module")
 def renderer(model: Any) -> Renderer:
-    return Renderer(model_to_bytes(model), "spare", (80, 72))
+    return Renderer(model_to_bytes(model), "spare", tuple(map(camera_info, (*CAMERAS, LENS))))
 
 
 def wanted(model: Any, spec: CameraSpec, *forms: tuple[int, Form]) -> list[Wanted]:

@@ -1,0 +1,26 @@
+"""The part of the build that pyproject.toml cannot describe: the compiled rasteriser."""
+
+import platform
+
+from setuptools import Extension, setup
+
+# The same bytes everywhere: no contraction, no reordering. It is called by ctypes, not imported.
+FLAGS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
+FLAGS += ["-fvisibility=hidden", "-Wno-psabi"]
+MACHINES = {"x86_64": {"v3": ["-march=x86-64-v3"], "v2": ["-march=x86-64-v2"]}}
+"""Names of instruction sets by machine, the quickest first; another machine has one for all."""
+
+setup(
+    ext_modules=[
+        Extension(
+            f"sims.cameras._raster_{name}",
+            ["sims/cameras/rasteriser/raster.cpp"],
+            depends=[
+                f"sims/cameras/rasteriser/{part}.hpp" for part in ("types", "texture", "lighting")
+            ],
+            extra_compile_args=[*FLAGS, *flags],
+            optional=True,  # MuJoCo's renderer needs none
+        )
+        for name, flags in MACHINES.get(platform.machine(), {"any": []}).items()
+    ]
+)

@@ -1,0 +1,284 @@
+"""Stage of the project's own rasteriser: the same bytes on every machine, in a few milliseconds.
+
+The drawing itself is in C++ (``sims/cameras/rasteriser``); here a model becomes the triangles,
+textures and lights that it takes. Every lens is drawn directly, without pinhole drawings between.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from typing_extensions import override
+
+from events import CameraInfo
+from events.camera_info import srgb_light
+from sims.cameras.lens import pixel_rays
+from sims.cameras.meshes import Mesh, mesh_of, shape_of
+from sims.cameras.stage import NEAR, RANGE, Changing, Floats, GraphicsError, Stage, object_numbers
+from sims.cameras.view import Drawn, View
+
+GEOM = np.dtype(
+    [
+        ("mesh", "i4"), ("texture", "i4"), ("number", "i4"), ("culled", "i4"), ("rgba", "f4", 4),
+        ("emission", "f4"), ("specular", "f4"), ("shininess", "f4"), ("repeat", "f4", 2),
+        ("offset", "f4"), ("cube", "f4", 3), ("unused", "f4"), ("position", "f8", 3),
+        ("turn", "f8", 9),
+    ]
+)  # fmt: skip
+LIGHT = np.dtype(
+    [
+        ("kind", "i4"), ("unused", "i4"), ("ambient", "f4", 3), ("diffuse", "f4", 3),
+        ("specular", "f4", 3), ("attenuation", "f4", 3), ("cutoff", "f4"), ("exponent", "f4"),
+        ("position", "f8", 3), ("direction", "f8", 3),
+    ]
+)  # fmt: skip
+VIEW = np.dtype(
+    [
+        ("position", "f8", 3), ("turn", "f8", 9), ("width", "i4"), ("height", "i4"),
+        ("first", "i4"), ("last", "i4"), ("sky", "i4"), ("fogged", "i4"), ("near", "f4"),
+        ("far", "f4"), ("fog", "f4", 3), ("fog_start", "f4"), ("fog_end", "f4"), ("unused", "f4"),
+    ]
+)  # fmt: skip
+"""Layouts of the structures of ``rasteriser/types.hpp``."""
+
+_Kind = mujoco.mjtGeom
+_GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing is said
+
+
+@functools.cache
+def libraries() -> dict[str, Any]:
+    """Return the compiled rasterisers that run here, by instruction set, the quickest first."""
+    found = {}
+    for name in ("v3", "v2", "any"):
+        for path in Path(__file__).parent.glob(f"_raster_{name}.*"):
+            library = ctypes.CDLL(str(path))
+            library.raster_new.restype = ctypes.c_void_p
+            if library.raster_runs():
+                found[name] = library
+    return found
+
+
+def _at(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if array is None else array.ctypes.data)
+
+
+class Raster(Stage):
+    """Stage of the rasteriser.
+
+    Args:
+        instructions: One of `libraries`; the quickest by default. All draw the same.
+
+    Raises:
+        GraphicsError: The rasteriser was not compiled with the package.
+        ValueError: The model has skins, flexes or geoms that are not drawn.
+    """
+
+    def __init__(
+        self, model: Any, dynamics: Changing | None = None, instructions: str = ""
+    ) -> None:
+        super().__init__(model, dynamics)
+        for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
+            if count:
+                raise ValueError(
+                    f'renderer = "raster": expected a world without {kind}, found {count}; '
+                    '"mujoco" draws them'
+                )
+        if not libraries():
+            raise GraphicsError(
+                'renderer = "raster": expected sims/cameras/_raster_*.so, found none: there was no '
+                "C++ compiler when the package was installed. Install one (Debian, Ubuntu: apt-get "
+                'install g++) and the package again, or say renderer = "mujoco"'
+            )
+        self._library = libraries()[instructions or next(iter(libraries()))]
+        self._world = ctypes.c_void_p(self._library.raster_new())
+        self._textures = [self._add_texture(number) for number in range(model.ntex)]
+        skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+        self._sky = self._textures[skies[0]] if skies.size else -1
+        self._drawn = np.flatnonzero(model.geom_group < 3)
+        self._geoms = np.zeros(len(self._drawn), GEOM)
+        meshes: dict[Any, int] = {}
+        for place, geom in enumerate(self._drawn.tolist()):
+            shape = shape_of(model, geom)
+            if shape not in meshes:
+                meshes[shape] = self._add_mesh(mesh_of(model, *shape))
+            self._geoms["mesh"][place] = meshes[shape]
+        kind, size = model.geom_type[self._drawn], model.geom_size[self._drawn]
+        own = np.append(model.mesh_texcoordadr, -1)[model.geom_dataid[self._drawn]] >= 0
+        self._own_places = (kind == _Kind.mjGEOM_MESH) & own
+        self._from_above = (kind == _Kind.mjGEOM_HFIELD) | ((kind == _Kind.mjGEOM_MESH) & ~own)
+        self._from_above |= (kind == _Kind.mjGEOM_PLANE) & (size[:, :2] == 0.0).any(axis=1)
+        self._geoms["offset"] = 0.5 * self._from_above
+        self._geoms["number"] = object_numbers(model)[self._drawn]
+        self._lenses: dict[CameraInfo, int] = {}
+
+    @property
+    @override
+    def closed(self) -> bool:
+        return self._world.value is None
+
+    @property
+    @override
+    def name(self) -> str:
+        return "raster"
+
+    @override
+    def enter(self) -> None:
+        pass  # it belongs to no thread
+
+    @override
+    def close(self) -> None:
+        if not self.closed:
+            self._library.raster_free(self._world)
+            self._world = ctypes.c_void_p(None)
+
+    @override
+    def draw(
+        self,
+        view: View,
+        colour: bool,
+        depth: bool,
+        numbers: bool,
+        rows: tuple[int, int] | None = None,
+    ) -> Drawn:
+        height, width = view.info.height, view.info.width
+        first, last = rows or (0, height)
+        shape = last - first, width
+        drawn = Drawn(
+            np.empty((*shape, 3), np.uint8) if colour else None,
+            np.empty(shape, np.float32) if depth else None,
+            np.empty(shape, np.int32) if numbers else None,
+        )
+        data, camera, model = self._data, self._camera.fixedcamid, self.model
+        eye = np.zeros(1, VIEW)
+        eye["position"] = data.cam_xpos[camera]
+        eye["turn"] = data.cam_xmat[camera] * np.tile(
+            [1, -1, -1], 3
+        )  # MuJoCo's camera looks along -z
+        eye["height"], eye["width"] = height, width
+        eye["first"], eye["last"], eye["sky"] = first, last, self._sky
+        eye["near"], eye["far"] = NEAR, RANGE
+        if (fog := self._fog()) is not None:
+            eye["fogged"], eye["fog"] = 1, model.vis.rgba.fog[:3]
+            eye["fog_start"], eye["fog_end"] = fog
+        geoms, lights = self._placed(), self._lights()
+        self._library.raster_draw(
+            self._world, self._lens(view.info), _at(eye), len(geoms), _at(geoms), len(lights),
+            _at(lights), *map(_at, drawn),
+        )  # fmt: skip
+        return drawn
+
+    @override
+    def _update(self) -> None:
+        """Let the lights shine; the headlight stands where the camera does."""
+        mujoco.mjv_updateCamera(self.model, self._data, self._camera, self._scene)
+        mujoco.mjv_makeLights(self.model, self._data, self._scene)
+
+    def _lights(self) -> npt.NDArray[Any]:
+        """Return the lights; MuJoCo's renderer, too, leaves out those without a direction."""
+        kinds = mujoco.mjtLightType
+        spot, point = int(kinds.mjLIGHT_SPOT), int(kinds.mjLIGHT_POINT)
+        lights = [of for of in self._scene.lights[: self._scene.nlight] if int(of.type) != point]
+        found = np.zeros(len(lights), LIGHT)
+        for to, of in zip(found, lights, strict=True):
+            to["kind"] = 2 if int(of.type) == spot else 0
+            to["ambient"], to["diffuse"], to["specular"] = of.ambient, of.diffuse, of.specular
+            to["attenuation"], to["exponent"] = of.attenuation, of.exponent
+            to["cutoff"] = np.cos(np.radians(of.cutoff))
+            to["position"], to["direction"] = of.pos, of.dir
+        return found
+
+    def _placed(self) -> npt.NDArray[Any]:
+        """Return the geoms where they are, with their materials as they are."""
+        model, data = self.model, self._data
+        drawn, geoms = self._drawn, self._geoms
+        geoms["position"], geoms["turn"] = data.geom_xpos[drawn], data.geom_xmat[drawn]
+        material = model.geom_matid[drawn]
+        rgba = model.geom_rgba[drawn].copy()
+        geoms["emission"], geoms["specular"], geoms["shininess"] = 0.0, 0.5, 0.5
+        geoms["texture"], geoms["repeat"] = -1, 1.0
+        if (has := np.flatnonzero(material >= 0)).size:
+            of = material[has]
+            own = (rgba[has] != _GREY).any(axis=1)[:, None]
+            rgba[has] = np.where(own, rgba[has], model.mat_rgba[of])
+            geoms["emission"][has] = model.mat_emission[of]
+            geoms["specular"][has] = model.mat_specular[of]
+            geoms["shininess"][has] = model.mat_shininess[of]
+            geoms["repeat"][has] = model.mat_texrepeat[of] * self._scale()[has]
+            textures = model.mat_texid[of, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
+            geoms["texture"][has] = np.append(self._textures, -1)[textures]
+            geoms["cube"] = self._cube()
+        geoms["rgba"] = rgba
+        geoms["culled"] = rgba[:, 3] >= 1.0
+        seen: npt.NDArray[Any] = geoms[rgba[:, 3] > 0.0]
+        return seen
+
+    def _scale(self) -> Floats:
+        """Return how often a texture is repeated on each geom for its size, shape (n, 2)."""
+        model, drawn = self.model, self._drawn
+        uniform = model.mat_texuniform[model.geom_matid[drawn]][:, None]
+        size = _sizes(model.geom_type[drawn], model.geom_size[drawn])[:, :2]
+        above = self._from_above[:, None]
+        scale = np.where(above, np.where(uniform, 1.0, 1.0 / size), np.where(uniform, size, 1.0))
+        return np.where(self._own_places[:, None], 1.0, scale)
+
+    def _cube(self) -> Floats:
+        """Return factors of the geoms' points to directions in a cube of textures, shape (n, 3)."""
+        model, drawn = self.model, self._drawn
+        uniform = model.mat_texuniform[model.geom_matid[drawn]][:, None]
+        kind, size = model.geom_type[drawn], _sizes(model.geom_type[drawn], model.geom_size[drawn])
+        in_metres = np.isin(kind, (_Kind.mjGEOM_MESH, _Kind.mjGEOM_HFIELD, _Kind.mjGEOM_PLANE))
+        return np.where(uniform, size, 1.0) / np.where(in_metres[:, None], 1.0, size)
+
+    def _add_texture(self, number: int) -> int:
+        model = self.model
+        width, height = int(model.tex_width[number]), int(model.tex_height[number])
+        channels, start = int(model.tex_nchannel[number]), int(model.tex_adr[number])
+        data = np.ascontiguousarray(model.tex_data[start : start + width * height * channels])
+        if model.tex_colorspace[number] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
+            data = np.rint(srgb_light() * 255.0).astype(np.uint8)[data]  # as OpenGL decodes it
+        cube = model.tex_type[number] != mujoco.mjtTexture.mjTEXTURE_2D
+        if cube and height == width:  # all of its faces
+            data, height = np.tile(data, 6), 6 * height
+        return int(
+            self._library.raster_texture(self._world, width, height, channels, _at(data), int(cube))
+        )
+
+    def _add_mesh(self, mesh: Mesh) -> int:
+        points, corners = mesh.points, mesh.corners
+        return int(
+            self._library.raster_mesh(
+                self._world, len(points), _at(points), _at(mesh.normals), _at(mesh.places),
+                len(corners), _at(corners),
+            )
+        )  # fmt: skip
+
+    def _lens(self, info: CameraInfo) -> int:
+        if info not in self._lenses:
+            if info.is_pinhole:
+                x = (np.arange(info.width) - info.cx) / info.fx
+                y = (np.arange(info.height) - info.cy) / info.fy
+                planes: Any = x, y, None
+            else:
+                planes = np.moveaxis(pixel_rays(info), -1, 0)
+            planes = [p if p is None else np.ascontiguousarray(p, np.float32) for p in planes]
+            self._lenses[info] = self._library.raster_lens(
+                self._world, info.width, info.height, *map(_at, planes)
+            )
+        return self._lenses[info]
+
+
+def _sizes(kind: npt.NDArray[Any], size: Floats) -> Floats:
+    """Return half lengths of geoms along x, y and z, shape (n, 3)."""
+    found = size.copy()
+    ball = kind == _Kind.mjGEOM_SPHERE
+    found[ball] = size[ball, :1]
+    upright = np.isin(kind, (_Kind.mjGEOM_CYLINDER, _Kind.mjGEOM_CAPSULE))
+    found[upright, 1:] = size[upright, :2]
+    found[found == 0.0] = 1.0  # a plane without end
+    return found

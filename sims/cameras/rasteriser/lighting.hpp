@@ -1,0 +1,85 @@
+// Light on the vertices of a mesh, by the equations of OpenGL 1.5, section 2.14.1.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+
+#include "types.hpp"
+
+namespace raster {
+
+// 2 to the power of x, for -126 < x < 127; relative error below 2e-7.
+inline float power_of_2(float x) {
+    int whole = static_cast<int>(x);
+    whole -= x < static_cast<float>(whole);
+    const float y = (x - whole) * 0.693147180559945f;  // Taylor's series about 0, ln 2 at most
+    const float share =
+        1.0f + y * (1.0f + y * (0.5f + y * (1.0f / 6 + y * (1.0f / 24 + y * (1.0f / 120 +
+        y * (1.0f / 720 + y * (1.0f / 5040)))))));
+    const std::int32_t bits = (whole + 127) << 23;
+    float scale;
+    std::memcpy(&scale, &bits, sizeof scale);
+    return share * scale;
+}
+
+// Logarithm to base 2 of x > 0; absolute error below 1e-4.
+inline float log_2(float x) {
+    std::int32_t bits;
+    std::memcpy(&bits, &x, sizeof bits);
+    const int exponent = (bits >> 23) - 127;
+    bits = (bits & 0x7fffff) | 0x3f800000;
+    float y;
+    std::memcpy(&y, &bits, sizeof y);
+    y -= 1.0f;  // a polynomial in y from 0 to 1, exact at both ends
+    return exponent + y * (1.44252727f + y * (-0.71791348f + y * (0.456540411f + y * (-0.275968957f + y * (0.120100259f + y * -0.025285506f)))));
+}
+
+inline double root(double x) { return std::sqrt(x); }  // IEEE 754 requires it to be exact
+
+inline Vec3 unit(Vec3 a) {
+    const double length = root(dot(a, a));
+    return length > 0 ? a * (1.0 / length) : a;
+}
+
+// Light of a point with a unit normal, both in the world; each part from 0 to 1.
+inline Vec3f lit(const Geom& geom, const std::vector<Light>& lights, Vec3 point, Vec3 normal,
+                 Vec3 eye) {
+    float sums[3];
+    for (int k = 0; k < 3; ++k) sums[k] = geom.emission * geom.rgba[k];
+    for (const Light& light : lights) {
+        Vec3 towards{-light.direction[0], -light.direction[1], -light.direction[2]};
+        double strength = 1;
+        if (light.kind != 0) {
+            const Vec3 apart =
+                Vec3{light.position[0], light.position[1], light.position[2]} - point;
+            const double distance = root(dot(apart, apart));
+            const Vec3 ray = unit(apart);
+            strength = 1.0 / (light.attenuation[0] + light.attenuation[1] * distance +
+                              light.attenuation[2] * distance * distance);
+            if (light.kind == 2) {
+                const double along = dot(ray, towards);
+                strength *= along < light.cutoff || along <= 0 ? 0.0
+                            : light.exponent == 0.0f
+                                ? 1.0
+                                : power_of_2(light.exponent * log_2(static_cast<float>(along)));
+            }
+            towards = ray;
+        }
+        const double facing = std::max(dot(normal, towards), 0.0);
+        double shine = 0;
+        if (facing > 0 && geom.specular > 0) {
+            const double half = dot(normal, unit(towards + unit(eye - point)));
+            if (half > 0)
+                shine = power_of_2(std::max(
+                    geom.shininess * 128.0f * log_2(static_cast<float>(half)), -100.0f));
+        }
+        for (int k = 0; k < 3; ++k)
+            sums[k] += static_cast<float>(
+                strength * (geom.rgba[k] * (light.ambient[k] + light.diffuse[k] * facing) +
+                            geom.specular * light.specular[k] * shine));
+    }
+    const auto within = [](float part) { return std::min(std::max(part, 0.0f), 1.0f); };
+    return {within(sums[0]), within(sums[1]), within(sums[2])};
+}
+
+}  // namespace raster

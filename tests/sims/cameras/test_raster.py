@@ -1,0 +1,286 @@
+"""The rasteriser draws what MuJoCo's renderer draws, and the same bytes everywhere."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import mujoco
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from events.frames import from_rpy
+from sims.cameras import CameraSpec, GraphicsError, add_free_camera, pose_to_qpos
+from sims.cameras.lens import Lens
+from sims.cameras.opengl import OpenGL
+from sims.cameras.raster import Raster, libraries
+from sims.cameras.spec import camera_info
+from sims.cameras.stage import Stage
+from sims.cameras.view import Drawn, View
+from sims.worlds import TOURS, WORLDS
+from tests.sims.cameras.scenes import fresh
+
+HASHES = Path(__file__).with_name("raster.json")
+"""Hash of all images of each world, on every machine. Where a change of the drawing is wanted,
+``python -m tests.sims.cameras.test_raster`` writes it anew."""
+
+PINHOLE = CameraSpec(name="pinhole", width=240, height=180, fov=85.0, position=(0.0, 0.0, 0.0))
+FISHEYE = CameraSpec(
+    name="fisheye",
+    width=200,
+    height=200,
+    fov=190.0,
+    position=(0.0, 0.0, 0.0),
+    lens=Lens(model="equidistant", coefficients=(0.01, 0.002, 0.0, 0.0)),
+)
+SPECS = (PINHOLE, FISHEYE)
+SLOW = pytest.mark.slow
+
+
+def compiled(world: Any) -> Any:
+    add_free_camera(world, "free", SPECS)
+    return world.compile()
+
+
+def drawn(stage: Stage, spec: CameraSpec, place: Any, turn: Any) -> Drawn:
+    camera = mujoco.mj_name2id(stage.model, mujoco.mjtObj.mjOBJ_CAMERA, f"free/{spec.name}")
+    qpos = np.zeros(stage.model.nq)
+    qpos[-7:] = pose_to_qpos(place, turn)
+    stage.enter()
+    stage.look(camera, qpos)
+    return stage.draw(View(camera_info(spec)), True, True, True)
+
+
+def places(name: str) -> Iterator[tuple[Any, Any]]:
+    """Places along a world's tour, tilted this way and that."""
+    for k, place in enumerate(TOURS[name]):
+        yield place, from_rpy(0.1, 0.2 * math.cos(k), 0.9 * k)
+
+
+def difference(one: Drawn, other: Drawn) -> tuple[float, float, float]:
+    """Share of equal numbers; mean grey levels and greatest share of depth away from edges."""
+    numbers, same = one.numbers, one.numbers == other.numbers
+    assert numbers is not None
+    assert one.colours is not None
+    assert other.colours is not None
+    assert one.depth is not None
+    assert other.depth is not None
+    edges = np.zeros(numbers.shape, np.uint8)
+    edges[:, 1:] |= numbers[:, 1:] != numbers[:, :-1]
+    edges[1:] |= numbers[1:] != numbers[:-1]
+    inside = np.asarray(same) & (cv2.dilate(edges, np.ones((5, 5))) == 0)
+    levels = np.abs(one.colours.astype(int) - other.colours)[inside]
+    seen = inside & np.isfinite(one.depth) & np.isfinite(other.depth)
+    apart = np.abs(one.depth[seen] - other.depth[seen]) / one.depth[seen]
+    share = float(np.quantile(apart, 0.999)) if apart.size else 0.0  # a crease is no edge here
+    return float(np.mean(same)), float(levels.mean()) if levels.size else 0.0, share
+
+
+WORLD = [name if name == "hall" else pytest.param(name, marks=SLOW) for name in WORLDS]
+
+
+@pytest.mark.parametrize("name", WORLD)
+@pytest.mark.timeout(300)
+def test_every_world_looks_as_mujoco_draws_it(name: str) -> None:
+    model = compiled(fresh(name))
+    raster, reference = Raster(model), OpenGL(model, tuple(map(camera_info, SPECS)), 1)
+    for place, turn in itertools.islice(places(name), None, None, 3):
+        numbers, levels, depth = difference(
+            drawn(reference, PINHOLE, place, turn), drawn(raster, PINHOLE, place, turn)
+        )
+        assert numbers > 0.995
+        assert levels < 3.0
+        assert depth < 1e-4
+        numbers, levels, depth = difference(
+            drawn(reference, FISHEYE, place, turn), drawn(raster, FISHEYE, place, turn)
+        )
+        assert numbers > 0.95  # drawn by way of a cube there, and at the pixel's own ray here
+        assert levels < 6.0
+        assert depth < 0.05
+    raster.close()
+    reference.close()
+
+
+SHAPES = {
+    "plane": '<geom type="plane" size="2 1.5 .1"/>',
+    "endless": '<geom type="plane" size="0 0 .1"/>',
+    "box": '<geom type="box" size="1 .5 .3"/>',
+    "mesh": '<geom type="mesh" mesh="block"/>',
+    "sphere": '<geom type="sphere" size=".5"/>',
+    "ellipsoid": '<geom type="ellipsoid" size=".8 .5 .4"/>',
+    "cylinder": '<geom type="cylinder" size=".5 .7"/>',
+    "capsule": '<geom type="capsule" size=".5 .7"/>',
+    "hfield": '<geom type="hfield" hfield="hill"/>',
+}
+SCENE = """
+<mujoco>
+  <visual><headlight ambient="{ambient}" diffuse=".3 .3 .3" specular="{shine}"/></visual>
+  <asset>
+    <mesh name="block" vertex="-1 -.5 -.3 1 -.5 -.3 -1 .5 -.3 1 .5 -.3 -1 -.5 .3 1 -.5 .3 -1 .5 .3
+      1 .5 .3"/>
+    <hfield name="hill" nrow="3" ncol="3" size="1 .7 .3 .1" elevation="0 0 0 0 1 0 0 0 0"/>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1=".3 .5 .7" rgb2=".1 .1 .2" width="64"
+      height="384"/>
+  </asset>
+  <worldbody>{body}</worldbody>
+</mujoco>
+"""
+LAMPS = """
+<light type="spot" pos="-2 -1 3" dir=".6 .3 -1" cutoff="40" exponent="8" attenuation="1 .1 .02"/>
+<light type="directional" dir="1 -.3 -1" diffuse=".4 .3 .2" specular=".5 .5 .5"/>
+"""
+AROUND = (
+    ((-2.2, 0.3, -0.2), (0.0, 0.0, 0.0)),
+    ((0.2, 2.2, -0.4), (0.0, 0.0, -0.5 * math.pi)),
+    ((-1.5, -1.2, -1.4), (0.0, -0.6, 0.7)),
+)
+
+
+def ramps(cube: bool) -> npt.NDArray[np.uint8]:
+    """Return a texture whose red says the column, whose green the row, and whose blue the side."""
+    at = np.arange(128) * 2
+    image = np.stack(np.broadcast_arrays(at[None, :], at[:, None], np.uint8(128)), -1)
+    if not cube:
+        return image.astype(np.uint8)
+    sides = [np.concatenate([image[..., :2], image[..., 2:] * 0 + 40 * k], -1) for k in range(6)]
+    return np.concatenate(sides).astype(np.uint8)
+
+
+def shaped(body: str, ambient: str = "1 1 1", shine: str = "0 0 0", **material: Any) -> Any:
+    """Return a model of some geoms, textured if `kind` says how."""
+    world = mujoco.MjSpec.from_string(SCENE.format(body=body, ambient=ambient, shine=shine))
+    if (kind := material.pop("kind", None)) is not None:
+        image = ramps(kind == mujoco.mjtTexture.mjTEXTURE_CUBE)
+        texture = world.add_texture(
+            name="ramps", type=kind, width=image.shape[1], height=len(image), nchannel=3
+        )
+        texture.data = image.tobytes()
+        added = world.add_material(name="ramps", specular=0.0, **material)
+        textures = list(added.textures)
+        textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ramps"
+        added.textures = textures
+        for geom in world.geoms:
+            geom.material = "ramps"
+    return compiled(world)
+
+
+def compare(model: Any, levels: float, numbers: float = 0.99) -> None:
+    raster, reference = Raster(model), OpenGL(model, (camera_info(PINHOLE),), 1)
+    for place, turn in AROUND:
+        found = difference(
+            drawn(reference, PINHOLE, place, from_rpy(*turn)),
+            drawn(raster, PINHOLE, place, from_rpy(*turn)),
+        )
+        assert found[0] >= numbers
+        assert found[1] <= levels
+        assert found[2] < 1e-3  # MuJoCo's depth buffer, close by
+    raster.close()
+    reference.close()
+
+
+@pytest.mark.parametrize("shape", ["box", *(pytest.param(n, marks=SLOW) for n in SHAPES)])
+def test_textures_lie_on_shapes_as_mujoco_lays_them(shape: str) -> None:
+    flat, cube = mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtTexture.mjTEXTURE_CUBE
+    for uniform in (False, True):
+        for repeat in ([1, 1], [3, 2]):
+            compare(
+                shaped(SHAPES[shape], kind=flat, texuniform=uniform, texrepeat=repeat), levels=2.0
+            )
+        if shape != "endless":  # a cube about a plane without end says nothing
+            compare(shaped(SHAPES[shape], kind=cube, texuniform=uniform), levels=3.0)
+
+
+# On a plane without end light is computed at vertices of other places.
+@pytest.mark.parametrize(
+    "shape", ["sphere", *(pytest.param(n, marks=SLOW) for n in SHAPES if n != "endless")]
+)
+def test_lights_shine_as_mujocos(shape: str) -> None:
+    """Spot, sun and headlight, with gloss."""
+    compare(shaped(LAMPS + SHAPES[shape], ambient=".2 .2 .2", shine=".4 .4 .4"), levels=2.0)
+
+
+def test_what_is_see_through_is_blended_and_has_no_depth() -> None:
+    """Both of its sides are seen; its number is the nearest."""
+    behind = '<geom type="box" size=".1 9 9" pos="5 0 1" rgba="1 0 0 1"/>'
+    balls = "".join(
+        f'<geom type="sphere" size=".4" pos="{0.3 * k} {y} 0.2" rgba="0 1 .2 .{k + 2}"/>'
+        for k, y in enumerate((-0.6, -0.2, 0.2, 0.6))
+    )
+    model = shaped(LAMPS + behind + balls)
+    compare(model, levels=1.0)
+    raster = Raster(model)
+    depth, numbers = drawn(raster, PINHOLE, (-3.0, 0.0, -0.2), (1.0, 0.0, 0.0, 0.0))[1:]
+    assert depth is not None
+    assert numbers is not None
+    assert {*np.unique(numbers).tolist()} == {0, 1, 2, 3, 4}
+    np.testing.assert_allclose(depth, 7.9, rtol=1e-6)
+    raster.close()
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
+def test_some_rows_are_those_of_the_whole_image(spec: CameraSpec) -> None:
+    raster = Raster(compiled(fresh("hall")))
+    place, turn = next(places("hall"))
+    whole = drawn(raster, spec, place, turn)
+    for first, last in ((0, 1), (7, 60), (spec.height - 17, spec.height)):
+        part = raster.draw(View(camera_info(spec)), True, True, True, (first, last))
+        for image, rows in zip(whole, part, strict=True):
+            assert image is not None
+            np.testing.assert_array_equal(image[first:last], rows)
+    raster.close()
+
+
+def test_each_image_is_the_same_alone() -> None:
+    raster = Raster(compiled(fresh("hall")))
+    whole = drawn(raster, PINHOLE, *next(places("hall")))
+    for wanted in itertools.product((False, True), repeat=3):
+        colour, depth, numbers = wanted
+        found = raster.draw(View(camera_info(PINHOLE)), colour, depth, numbers)
+        for alone, image, asked in zip(found, whole, wanted, strict=True):
+            assert (alone is not None) == asked
+            if alone is not None and image is not None:
+                np.testing.assert_array_equal(alone, image)
+    raster.close()
+
+
+def hash_of(name: str, instructions: str) -> str:
+    raster, total = Raster(compiled(fresh(name)), instructions=instructions), hashlib.sha256()
+    for place, turn in itertools.islice(places(name), 9):
+        for spec in SPECS:
+            for image in drawn(raster, spec, place, turn):
+                assert image is not None
+                total.update(image.tobytes())
+    raster.close()
+    return total.hexdigest()
+
+
+@pytest.mark.parametrize("name", WORLD)
+@pytest.mark.timeout(300)
+def test_the_bytes_are_those_of_every_machine(name: str) -> None:
+    """With each instruction set that this one has."""
+    saved = json.loads(HASHES.read_text(encoding="utf-8"))
+    assert {hash_of(name, each) for each in libraries()} == {saved[name]}
+
+
+def test_what_it_cannot_draw_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = mujoco.MjSpec.from_string(
+        '<mujoco><worldbody><flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" '
+        'radius=".01" dim="2"><edge equality="true"/></flexcomp></worldbody></mujoco>'
+    )
+    with pytest.raises(ValueError, match=r'without flex, found 1; "mujoco" draws them'):
+        Raster(compiled(world))
+    monkeypatch.setattr("sims.cameras.raster.libraries", dict)
+    with pytest.raises(GraphicsError, match=r'apt-get install g\+\+.* or say renderer = "mujoco"'):
+        Raster(compiled(mujoco.MjSpec()))
+
+
+if __name__ == "__main__":
+    text = json.dumps({name: hash_of(name, "") for name in WORLDS}, indent=2)
+    HASHES.write_text(text + "\n", encoding="utf-8")
