@@ -1,12 +1,14 @@
 """The part of the build that pyproject.toml cannot describe: the compiled rasteriser."""
 
 import platform
+from pathlib import Path
 
 from setuptools import Extension, setup
 
 # The same bytes everywhere: no contraction, no reordering. It is called by ctypes, not imported.
 FLAGS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
 FLAGS += ["-fvisibility=hidden", "-Wno-psabi"]
+FOLDER = Path("sims/cameras/rasteriser")
 MACHINES = {"x86_64": {"v3": ["-march=x86-64-v3"], "v2": ["-march=x86-64-v2"]}}
 """Names of instruction sets by machine, the quickest first; another machine has one for all."""
 
@@ -14,10 +16,8 @@ setup(
     ext_modules=[
         Extension(
             f"sims.cameras._raster_{name}",
-            ["sims/cameras/rasteriser/raster.cpp"],
-            depends=[
-                f"sims/cameras/rasteriser/{part}.hpp" for part in ("types", "texture", "lighting")
-            ],
+            [str(each) for each in FOLDER.glob("*.cpp")],
+            depends=[str(each) for each in FOLDER.glob("*.hpp")],
             extra_compile_args=[*FLAGS, *flags],
             optional=True,  # MuJoCo's renderer needs none
         )

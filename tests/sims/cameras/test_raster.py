@@ -77,6 +77,7 @@ def difference(one: Drawn, other: Drawn) -> tuple[float, float, float]:
     edges[1:] |= numbers[1:] != numbers[:-1]
     inside = np.asarray(same) & (cv2.dilate(edges, np.ones((5, 5))) == 0)
     levels = np.abs(one.colours.astype(int) - other.colours)[inside]
+    assert np.mean(np.isfinite(one.depth) == np.isfinite(other.depth)) > 0.98
     seen = inside & np.isfinite(one.depth) & np.isfinite(other.depth)
     apart = np.abs(one.depth[seen] - other.depth[seen]) / one.depth[seen]
     share = float(np.quantile(apart, 0.999)) if apart.size else 0.0  # a crease is no edge here
