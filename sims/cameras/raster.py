@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 from pathlib import Path
 from typing import Any
 
@@ -108,13 +109,7 @@ class Raster(Stage):
             if shape not in meshes:
                 meshes[shape] = self._add_mesh(mesh_of(model, *shape))
             self._geoms["mesh"][place] = meshes[shape]
-        kind, size = model.geom_type[self._drawn], model.geom_size[self._drawn]
-        own = np.append(model.mesh_texcoordadr, -1)[model.geom_dataid[self._drawn]] >= 0
-        self._own_places = (kind == _Kind.mjGEOM_MESH) & own
-        self._from_above = (kind == _Kind.mjGEOM_HFIELD) | ((kind == _Kind.mjGEOM_MESH) & ~own)
-        self._from_above |= (kind == _Kind.mjGEOM_PLANE) & (size[:, :2] == 0.0).any(axis=1)
-        self._geoms["offset"] = 0.5 * self._from_above
-        self._geoms["number"] = object_numbers(model)[self._drawn]
+        self._describe()
         self._lenses: dict[CameraInfo, int] = {}
 
     @property
@@ -189,34 +184,43 @@ class Raster(Stage):
             to["kind"] = 2 if int(of.type) == spot else 0
             to["ambient"], to["diffuse"], to["specular"] = of.ambient, of.diffuse, of.specular
             to["attenuation"], to["exponent"] = of.attenuation, of.exponent
-            to["cutoff"] = np.cos(np.radians(of.cutoff))
+            to["cutoff"] = math.cos(math.radians(of.cutoff))
             to["position"], to["direction"] = of.pos, of.dir
         return found
 
     def _placed(self) -> npt.NDArray[Any]:
-        """Return the geoms where they are, with their materials as they are."""
-        model, data = self.model, self._data
-        drawn, geoms = self._drawn, self._geoms
+        """Return the geoms where they are, in their colours of now."""
+        model, data, drawn, geoms = self.model, self._data, self._drawn, self._geoms
         geoms["position"], geoms["turn"] = data.geom_xpos[drawn], data.geom_xmat[drawn]
-        material = model.geom_matid[drawn]
-        rgba = model.geom_rgba[drawn].copy()
-        geoms["emission"], geoms["specular"], geoms["shininess"] = 0.0, 0.5, 0.5
-        geoms["texture"], geoms["repeat"] = -1, 1.0
-        if (has := np.flatnonzero(material >= 0)).size:
-            of = material[has]
-            own = (rgba[has] != _GREY).any(axis=1)[:, None]
-            rgba[has] = np.where(own, rgba[has], model.mat_rgba[of])
-            geoms["emission"][has] = model.mat_emission[of]
-            geoms["specular"][has] = model.mat_specular[of]
-            geoms["shininess"][has] = model.mat_shininess[of]
-            geoms["repeat"][has] = model.mat_texrepeat[of] * self._scale()[has]
-            textures = model.mat_texid[of, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
-            geoms["texture"][has] = np.append(self._textures, -1)[textures]
-            geoms["cube"] = self._cube()
-        geoms["rgba"] = rgba
-        geoms["culled"] = rgba[:, 3] >= 1.0
+        rgba = model.geom_rgba[drawn]
+        # A material's colour, unless the geom has one of its own.
+        plain = (model.geom_matid[drawn] >= 0) & (rgba == _GREY).all(axis=1)
+        rgba[plain] = model.mat_rgba[model.geom_matid[drawn[plain]]]
+        geoms["rgba"], geoms["culled"] = rgba, rgba[:, 3] >= 1.0
         seen: npt.NDArray[Any] = geoms[rgba[:, 3] > 0.0]
         return seen
+
+    def _describe(self) -> None:
+        """Fill in the geoms' fields that stay as they are."""
+        model, geoms = self.model, self._geoms
+        kind, size = model.geom_type[self._drawn], model.geom_size[self._drawn]
+        own = np.append(model.mesh_texcoordadr, -1)[model.geom_dataid[self._drawn]] >= 0
+        self._own_places = (kind == _Kind.mjGEOM_MESH) & own
+        self._from_above = (kind == _Kind.mjGEOM_HFIELD) | ((kind == _Kind.mjGEOM_MESH) & ~own)
+        self._from_above |= (kind == _Kind.mjGEOM_PLANE) & (size[:, :2] == 0.0).any(axis=1)
+        geoms["offset"] = 0.5 * self._from_above
+        geoms["number"] = object_numbers(model)[self._drawn]
+        geoms["specular"], geoms["shininess"] = 0.5, 0.5
+        geoms["texture"], geoms["repeat"] = -1, 1.0
+        has = np.flatnonzero(model.geom_matid[self._drawn] >= 0)
+        if has.size:
+            material = model.geom_matid[self._drawn[has]]
+            for field in ("emission", "specular", "shininess"):
+                geoms[field][has] = getattr(model, f"mat_{field}")[material]
+            textures = model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
+            geoms["texture"][has] = np.append(self._textures, -1)[textures]
+            geoms["repeat"][has] = model.mat_texrepeat[material] * self._scale()[has]
+            geoms["cube"] = self._cube()
 
     def _scale(self) -> Floats:
         """Return how often a texture is repeated on each geom for its size, shape (n, 2)."""
