@@ -15,13 +15,16 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from events import CameraInfo
 from events.base import Quaternion, Vector3
 from events.geometry import pose_matrix
 from sims.cameras.development import Development
 from sims.cameras.lens import undistorted
+from sims.cameras.opengl import OpenGL
+from sims.cameras.raster import Raster
 from sims.cameras.response import generator, grey_of, moments
 from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain
-from sims.cameras.stage import Changing, Floats, RendererName, keep_memory, open_stage
+from sims.cameras.stage import Changing, Floats, RendererName, Stage, keep_memory
 from sims.cameras.view import (
     FINER_FOR_DEPTH,
     Colours,
@@ -131,6 +134,28 @@ def model_to_bytes(model: Any) -> bytes:
 def model_from_bytes(data: bytes) -> Any:
     """Return the model of `model_to_bytes`; `ValueError` for other bytes or another MuJoCo's."""
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": data})
+
+
+def open_stage(
+    renderer: RendererName,
+    model: Any,
+    infos: tuple[CameraInfo, ...],
+    threads: int,
+    dynamics: Changing | None = None,
+) -> Stage:
+    """Return a stage of a renderer.
+
+    Args:
+        infos: The largest cameras.
+        threads: Threads of OpenGL's software renderer, if this is the process's first context.
+
+    Raises:
+        GraphicsError: What the renderer needs is missing; the message names what to install.
+        ValueError: The model holds what the renderer does not draw.
+    """
+    if renderer == "raster":
+        return Raster(model, dynamics)
+    return OpenGL(model, infos, threads, dynamics)
 
 
 Pose = tuple[Vector3, Quaternion]

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from events import CameraInfo
 from events.base import Quaternion, Vector3
 from events.frames import flip_yz, flip_yz_rotation
 from runtime.errors import MissingDependencyError
@@ -155,29 +154,3 @@ def object_numbers(model: Any) -> npt.NDArray[np.int32]:
             if solid >= 0:
                 numbers[geom] = solid
     return numbers
-
-
-def open_stage(
-    renderer: RendererName,
-    model: Any,
-    infos: tuple[CameraInfo, ...],
-    threads: int,
-    dynamics: Changing | None = None,
-) -> Stage:
-    """Return a stage.
-
-    Args:
-        infos: The largest cameras.
-        threads: Threads of OpenGL's software renderer, if this is the process's first context.
-
-    Raises:
-        GraphicsError: What the renderer needs is missing; the message names what to install.
-        ValueError: The model holds what the renderer does not draw.
-    """
-    if renderer == "raster":
-        from sims.cameras.raster import Raster
-
-        return Raster(model, dynamics)
-    from sims.cameras.opengl import OpenGL
-
-    return OpenGL(model, infos, threads, dynamics)

@@ -95,7 +95,8 @@ def test_colmap_finds_lens_and_places_from_images_alone(tmp_path: Path) -> None:
     (camera,) = found.cameras.values()
     fx, fy, cx, cy, *lens = camera.params
     info = Keeper.cameras[0].info
-    assert (fx, fy) == pytest.approx((info.fx, info.fy), rel=1e-3)
+    # Its threads race: from run to run a focal length is 0.05 to 0.2 % off.
+    assert (fx, fy) == pytest.approx((info.fx, info.fy), rel=4e-3)
     # COLMAP's pixels have their centres at halves; it leaves the principal point in the middle.
     assert (cx - 0.5, cy - 0.5) == pytest.approx((info.cx, info.cy), abs=0.5)
     assert lens == pytest.approx(info.distortion[:4], abs=3e-3)

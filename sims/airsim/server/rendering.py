@@ -20,9 +20,9 @@ from events.base import Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation, multiply
 from events.geometry import pose_matrix
 from sims.airsim import wire
-from sims.cameras.renderer import model_from_bytes
+from sims.cameras.renderer import model_from_bytes, open_stage
 from sims.cameras.spec import CameraSpec, camera_info, is_plain, vertical_fov
-from sims.cameras.stage import Changing, Floats, RendererName, Stage, keep_memory, open_stage
+from sims.cameras.stage import Changing, Floats, RendererName, Stage, keep_memory
 from sims.cameras.view import Colours, Depths, Drawn, View
 
 Form = Literal["float", "rgb", "bgr", "png"]

@@ -479,4 +479,4 @@ def test_without_gl_all_else_is_served(tiny_world: str, monkeypatch: pytest.Monk
                 images(call, request("eye", 0))
         assert call("ping") is True
 
-    with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
+    with_script(script, [drone(world=tiny_world)], cameras=CAMERAS, renderer="mujoco")
