@@ -9,7 +9,7 @@ from setuptools import Extension, setup
 FLAGS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
 FLAGS += ["-fvisibility=hidden", "-Wno-psabi"]
 FOLDER = Path("sims/cameras/rasteriser")
-MACHINES = {"x86_64": {"v3": ["-march=x86-64-v3"], "v2": ["-march=x86-64-v2"]}}
+MACHINES = {"x86_64": {"avx2": ["-mavx2"], "sse4": ["-msse4.1"]}}
 """Names of instruction sets by machine, the quickest first; another machine has one for all."""
 
 setup(

@@ -38,7 +38,7 @@ class SimulatorConfig(NodeConfig):
         camera_processes: Number of processes that render.
         render_threads: Threads of OpenGL's software renderer in each of them.
         renderer: ``mujoco``: MuJoCo's, by OpenGL; its pixels depend on the driver. ``raster``: the
-            project's own, several times as quick, with the same bytes on every machine.
+            project's own, about twice as quick, with the same bytes on every machine.
         setpoint_timeout: Age beyond which set-points are ignored, but of position or pose.
     """
 

@@ -22,14 +22,13 @@ from sims.cameras.lens import MARGIN, Face, Maps, faces
 from sims.cameras.stage import (
     FAR,
     NEAR,
-    RANGE,
     Changing,
     Floats,
     GraphicsError,
     Stage,
     object_numbers,
 )
-from sims.cameras.view import Colours, Depths, Drawn, View, looked_up
+from sims.cameras.view import RANGE, Colours, Depths, Drawn, View, looked_up
 
 INSTALL = "apt-get install libegl1 libgl1 libgl1-mesa-dri"
 
@@ -88,7 +87,7 @@ _PLAIN = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCO
 
 
 class OpenGL(Stage):
-    """Stage of MuJoCo's renderer.
+    """Stage of MuJoCo's renderer; the model is changed to be drawn quickly.
 
     Raises:
         GraphicsError: There is no GL; the message names what to install.

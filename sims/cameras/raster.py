@@ -21,8 +21,8 @@ from events import CameraInfo
 from events.camera_info import srgb_light
 from sims.cameras.lens import pixel_rays
 from sims.cameras.meshes import Mesh, mesh_of, shape_of
-from sims.cameras.stage import NEAR, RANGE, Changing, Floats, GraphicsError, Stage, object_numbers
-from sims.cameras.view import Drawn, View
+from sims.cameras.stage import NEAR, Changing, Floats, GraphicsError, Stage, object_numbers
+from sims.cameras.view import RANGE, Drawn, View
 
 GEOM = np.dtype(
     [
@@ -49,6 +49,7 @@ VIEW = np.dtype(
 """Layouts of the structures of ``rasteriser/types.hpp``."""
 
 _Kind = mujoco.mjtGeom
+_OPTICAL = np.tile([1.0, -1.0, -1.0], 3)  # MuJoCo's camera looks along -z, with y up
 _GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing is said
 
 
@@ -56,7 +57,7 @@ _GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing
 def libraries() -> dict[str, Any]:
     """Return the compiled rasterisers that run here, by instruction set, the quickest first."""
     found = {}
-    for name in ("v3", "v2", "any"):
+    for name in ("avx2", "sse4", "any"):
         for path in Path(__file__).parent.glob(f"_raster_{name}.*"):
             library = ctypes.CDLL(str(path))
             library.raster_new.restype = ctypes.c_void_p
@@ -93,8 +94,9 @@ class Raster(Stage):
         if not libraries():
             raise GraphicsError(
                 'renderer = "raster": expected sims/cameras/_raster_*.so, found none: there was no '
-                "C++ compiler when the package was installed. Install one (Debian, Ubuntu: apt-get "
-                'install g++) and the package again, or say renderer = "mujoco"'
+                "C++ compiler (GCC 11 or later) when the package was installed. Install one "
+                "(Debian, Ubuntu: apt-get install g++) and the package again, or say "
+                'renderer = "mujoco"'
             )
         self._library = libraries()[instructions or next(iter(libraries()))]
         self._world = ctypes.c_void_p(self._library.raster_new())
@@ -152,9 +154,7 @@ class Raster(Stage):
         data, camera, model = self._data, self._camera.fixedcamid, self.model
         eye = np.zeros(1, VIEW)
         eye["position"] = data.cam_xpos[camera]
-        eye["turn"] = data.cam_xmat[camera] * np.tile(
-            [1, -1, -1], 3
-        )  # MuJoCo's camera looks along -z
+        eye["turn"] = data.cam_xmat[camera] * _OPTICAL
         eye["height"], eye["width"] = height, width
         eye["first"], eye["last"], eye["sky"] = first, last, self._sky
         eye["near"], eye["far"] = NEAR, RANGE
@@ -185,7 +185,10 @@ class Raster(Stage):
             to["ambient"], to["diffuse"], to["specular"] = of.ambient, of.diffuse, of.specular
             to["attenuation"], to["exponent"] = of.attenuation, of.exponent
             to["cutoff"] = math.cos(math.radians(of.cutoff))
-            to["position"], to["direction"] = of.pos, of.dir
+            # Light from everywhere, as a headlight often is, has no place: it would move with the
+            # camera, and the light on all surfaces would be computed anew.
+            if to["kind"] or of.diffuse.any() or of.specular.any():
+                to["position"], to["direction"] = of.pos, of.dir
         return found
 
     def _placed(self) -> npt.NDArray[Any]:

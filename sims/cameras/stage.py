@@ -39,9 +39,6 @@ NEAR = 0.02
 FAR = 20_000.0
 """Clipping planes, metres."""
 
-RANGE = 500.0
-"""Depth beyond this (metres) is ``inf``."""
-
 LOOK = ".look"  # suffix of looks: geom `<name>.look` is the image of geom `<name>`, with its number
 
 
@@ -59,7 +56,7 @@ class Changing(Protocol):
 class Stage(ABC):
     """Stage for the geoms of groups 0 to 2 (MuJoCo's default) of a model.
 
-    Not thread-safe: stay in the thread that made it. The model is changed to be drawn quickly.
+    Not thread-safe: stay in the thread that made it.
     """
 
     def __init__(self, model: Any, dynamics: Changing | None = None) -> None:

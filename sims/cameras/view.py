@@ -18,6 +18,7 @@ Colours = npt.NDArray[np.uint8]
 Depths = npt.NDArray[np.float32]
 Numbers = npt.NDArray[np.int32]
 
+RANGE = 500.0  # metres; depth beyond it is ``inf``
 CREASE = 1e-3  # least second difference of the inverse depth, as a share, between two surfaces
 
 
@@ -80,7 +81,6 @@ FINER_FOR_DEPTH = 2.5
 """Times as many bands where depth is wanted: on a slanted floor a pixel is some centimetres."""
 
 MOST_BANDS = 128  # most bands per image; beyond 64 pixels of motion in a readout, rows exceed `OFF`
-FARTHEST = 500.0  # metres; stands for ``inf`` where a point is needed
 SAMPLES = 32  # longer side of the small image for motion measurement, pixels
 
 
@@ -128,7 +128,7 @@ def image_speeds(
     rays = pixel_rays(small).reshape(-1, 3)
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = depth.reshape(-1) / rays[:, 2]
-    points = rays * np.where(np.isfinite(scale), scale, FARTHEST)[:, None]
+    points = rays * np.where(np.isfinite(scale), scale, RANGE)[:, None]
     middle = poses[len(poses) // 2]
     points = points[np.isfinite(points).all(axis=1)] @ middle[:3, :3].T + middle[:3, 3]
     places = np.array([info.project((points - pose[:3, 3]) @ pose[:3, :3]) for pose in poses])

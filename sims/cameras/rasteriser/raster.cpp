@@ -20,8 +20,9 @@ extern "C" {
 // Whether this machine has the instructions that this was compiled for.
 int raster_runs() {
 #ifdef __AVX2__
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-           __builtin_cpu_supports("bmi2");
+    return __builtin_cpu_supports("avx2");
+#elif defined(__SSE4_1__)
+    return __builtin_cpu_supports("sse4.1");
 #else
     return 1;
 #endif

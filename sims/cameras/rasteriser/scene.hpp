@@ -50,9 +50,9 @@ struct Surface {  // what is interpolated on a triangle, each times the ray
 
 struct Placed {  // a geom of the frame
     Geom geom;
-    Vec3 shift;               // of its mesh's origin from the eye, in the optical frame
-    Matrix turn;              // from the mesh's axes to the optical frame
-    std::vector<Vec3> seen;   // its vertices in the optical frame
+    Vec3 shift;                    // of its mesh's origin from the eye, in the optical frame
+    Matrix turn;                   // from the mesh's axes to the optical frame
+    std::vector<Vec3> seen;        // its vertices in the optical frame
     const Vec3f* light = nullptr;  // of its vertices; if it is see-through, then from behind
 };
 
@@ -109,7 +109,6 @@ class Scene {
     const Lens* lens_ = nullptr;
     View view_{};
     std::vector<Light> lights_;
-    bool eye_matters_ = false;  // to the light on surfaces
     const std::uint8_t* end_ = nullptr;  // of the image
     std::vector<Placed> placed_;
     std::vector<Slot> slots_;

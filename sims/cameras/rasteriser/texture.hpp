@@ -13,6 +13,13 @@ using u32x4 = std::uint32_t __attribute__((vector_size(16)));
 using f4 = float __attribute__((vector_size(16)));
 using i4 = std::int32_t __attribute__((vector_size(16)));
 
+// Lanes of two vectors, by their numbers.
+#ifdef __clang__
+#define RASTER_SHUFFLE(type, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else  // GCC has the other one since version 12 only
+#define RASTER_SHUFFLE(type, a, b, ...) __builtin_shuffle(a, b, type{__VA_ARGS__})
+#endif
+
 struct Level {
     int width, height;
     std::vector<std::uint32_t> texels;  // red in the lowest byte
@@ -132,8 +139,8 @@ class Texture {
     // Bytes of two texels, widened.
     static u16x8 pair(std::uint32_t a, std::uint32_t b) {
         const u8x16 bytes = reinterpret_cast<u8x16>(u32x4{a, b, 0, 0});
-        return reinterpret_cast<u16x8>(__builtin_shufflevector(
-            bytes, u8x16{}, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23));
+        return reinterpret_cast<u16x8>(RASTER_SHUFFLE(
+            u8x16, bytes, u8x16{}, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23));
     }
 
     // Means of four texels each of two levels, times 256: the first one's in the lower lanes.
@@ -141,7 +148,7 @@ class Texture {
                           int k) {
         const auto weights = [](std::int32_t one, std::int32_t other) {
             const auto both = reinterpret_cast<u16x8>(i4{one, other, 0, 0});  // little-endian
-            return __builtin_shufflevector(both, both, 0, 0, 0, 0, 2, 2, 2, 2);
+            return RASTER_SHUFFLE(u16x8, both, both, 0, 0, 0, 0, 2, 2, 2, 2);
         };
         const u16x8 right = weights(a.right[k], b.right[k]), low = weights(a.low[k], b.low[k]);
         const u16x8 left = 256 - right, high = 256 - low;
@@ -156,8 +163,8 @@ class Texture {
 
     static f4 widened(u16x8 values, bool upper) {
         const u16x8 whole =
-            upper ? __builtin_shufflevector(values, u16x8{}, 4, 8, 5, 8, 6, 8, 7, 8)
-                  : __builtin_shufflevector(values, u16x8{}, 0, 8, 1, 8, 2, 8, 3, 8);
+            upper ? RASTER_SHUFFLE(u16x8, values, u16x8{}, 4, 8, 5, 8, 6, 8, 7, 8)
+                  : RASTER_SHUFFLE(u16x8, values, u16x8{}, 0, 8, 1, 8, 2, 8, 3, 8);
         return __builtin_convertvector(reinterpret_cast<i4>(whole), f4);
     }
 

@@ -33,7 +33,7 @@ void Scene::draw(const Lens& lens, const View& view, const Geom* geoms, int coun
         const Vec3 shift = placed_[index].shift;
         order.emplace_back(dot(shift, shift), index);
     }
-    std::sort(order.begin(), order.end());  // front to back; the opaque ones in any order alike
+    std::sort(order.begin(), order.end());  // front to back: of equal depths the first counts
     for (const auto& [_, index] : order) {
         Placed& placed = placed_[index];
         const Mesh& mesh = *meshes[placed.geom.mesh];
