@@ -36,7 +36,7 @@ class SimulatorConfig(NodeConfig):
             and east, and altitude, metres above the WGS 84 ellipsoid, which here is sea level too.
         cameras: The cameras that are carried.
         camera_processes: Number of processes that render.
-        render_threads: Threads of OpenGL's software renderer in each of them.
+        render_threads: Threads that draw in each of them; images do not depend on it.
         renderer: ``mujoco``: MuJoCo's, by OpenGL; its pixels depend on the driver. ``raster``: the
             project's own, about twice as quick, with the same bytes on every machine.
         setpoint_timeout: Age beyond which set-points are ignored, but of position or pose.

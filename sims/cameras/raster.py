@@ -28,10 +28,10 @@ GEOM = np.dtype(
     [
         ("mesh", "i4"), ("texture", "i4"), ("number", "i4"), ("culled", "i4"), ("rgba", "f4", 4),
         ("emission", "f4"), ("specular", "f4"), ("shininess", "f4"), ("repeat", "f4", 2),
-        ("offset", "f4"), ("cube", "f4", 3), ("unused", "f4"), ("position", "f8", 3),
-        ("turn", "f8", 9),
+        ("offset", "f4"), ("cube", "f4", 3), ("unused", "f4"),
     ]
 )  # fmt: skip
+POSE = np.dtype([("position", "f8", 3), ("turn", "f8", 9)])
 LIGHT = np.dtype(
     [
         ("kind", "i4"), ("unused", "i4"), ("ambient", "f4", 3), ("diffuse", "f4", 3),
@@ -41,9 +41,9 @@ LIGHT = np.dtype(
 )  # fmt: skip
 VIEW = np.dtype(
     [
-        ("position", "f8", 3), ("turn", "f8", 9), ("width", "i4"), ("height", "i4"),
-        ("first", "i4"), ("last", "i4"), ("sky", "i4"), ("fogged", "i4"), ("near", "f4"),
-        ("far", "f4"), ("fog", "f4", 3), ("fog_start", "f4"), ("fog_end", "f4"), ("unused", "f4"),
+        ("width", "i4"), ("height", "i4"), ("first", "i4"), ("last", "i4"), ("sky", "i4"),
+        ("fogged", "i4"), ("poses", "i4"), ("threads", "i4"), ("near", "f4"), ("far", "f4"),
+        ("fog", "f4", 3), ("fog_start", "f4"), ("fog_end", "f4"), ("unused", "f4"),
     ]
 )  # fmt: skip
 """Layouts of the structures of ``rasteriser/types.hpp``."""
@@ -74,6 +74,7 @@ class Raster(Stage):
     """Stage of the rasteriser.
 
     Args:
+        threads: Threads that draw; any number draws the same.
         instructions: One of `libraries`; the quickest by default. All draw the same.
 
     Raises:
@@ -82,9 +83,14 @@ class Raster(Stage):
     """
 
     def __init__(
-        self, model: Any, dynamics: Changing | None = None, instructions: str = ""
+        self,
+        model: Any,
+        dynamics: Changing | None = None,
+        threads: int = 1,
+        instructions: str = "",
     ) -> None:
         super().__init__(model, dynamics)
+        self._threads = threads
         for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
             if count:
                 raise ValueError(
@@ -152,19 +158,19 @@ class Raster(Stage):
             np.empty(shape, np.int32) if numbers else None,
         )
         data, camera, model = self._data, self._camera.fixedcamid, self.model
-        eye = np.zeros(1, VIEW)
+        eye, frame = np.zeros(1, POSE), np.zeros(1, VIEW)
         eye["position"] = data.cam_xpos[camera]
         eye["turn"] = data.cam_xmat[camera] * _OPTICAL
-        eye["height"], eye["width"] = height, width
-        eye["first"], eye["last"], eye["sky"] = first, last, self._sky
-        eye["near"], eye["far"] = NEAR, RANGE
+        frame["height"], frame["width"], frame["threads"] = height, width, self._threads
+        frame["first"], frame["last"], frame["sky"] = first, last, self._sky
+        frame["near"], frame["far"] = NEAR, RANGE
         if (fog := self._fog()) is not None:
-            eye["fogged"], eye["fog"] = 1, model.vis.rgba.fog[:3]
-            eye["fog_start"], eye["fog_end"] = fog
-        geoms, lights = self._placed(), self._lights()
+            frame["fogged"], frame["fog"] = 1, model.vis.rgba.fog[:3]
+            frame["fog_start"], frame["fog_end"] = fog
+        (geoms, poses), lights = self._placed(), self._lights()
         self._library.raster_draw(
-            self._world, self._lens(view.info), _at(eye), len(geoms), _at(geoms), len(lights),
-            _at(lights), *map(_at, drawn),
+            self._world, self._lens(view.info), _at(frame), _at(eye), len(geoms), _at(geoms),
+            _at(poses), len(lights), _at(lights), *map(_at, drawn),
         )  # fmt: skip
         return drawn
 
@@ -191,17 +197,18 @@ class Raster(Stage):
                 to["position"], to["direction"] = of.pos, of.dir
         return found
 
-    def _placed(self) -> npt.NDArray[Any]:
-        """Return the geoms where they are, in their colours of now."""
+    def _placed(self) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        """Return the geoms in their colours of now, and where they are."""
         model, data, drawn, geoms = self.model, self._data, self._drawn, self._geoms
-        geoms["position"], geoms["turn"] = data.geom_xpos[drawn], data.geom_xmat[drawn]
+        poses = np.empty(len(drawn), POSE)
+        poses["position"], poses["turn"] = data.geom_xpos[drawn], data.geom_xmat[drawn]
         rgba = model.geom_rgba[drawn]
         # A material's colour, unless the geom has one of its own.
         plain = (model.geom_matid[drawn] >= 0) & (rgba == _GREY).all(axis=1)
         rgba[plain] = model.mat_rgba[model.geom_matid[drawn[plain]]]
         geoms["rgba"], geoms["culled"] = rgba, rgba[:, 3] >= 1.0
-        seen: npt.NDArray[Any] = geoms[rgba[:, 3] > 0.0]
-        return seen
+        seen = rgba[:, 3] > 0.0
+        return geoms[seen], poses[seen]
 
     def _describe(self) -> None:
         """Fill in the geoms' fields that stay as they are."""

@@ -147,14 +147,14 @@ def open_stage(
 
     Args:
         infos: The largest cameras.
-        threads: Threads of OpenGL's software renderer, if this is the process's first context.
+        threads: Threads that draw; of OpenGL's software renderer only in the first context.
 
     Raises:
         GraphicsError: What the renderer needs is missing; the message names what to install.
         ValueError: The model holds what the renderer does not draw.
     """
     if renderer == "raster":
-        return Raster(model, dynamics)
+        return Raster(model, dynamics, threads)
     return OpenGL(model, infos, threads, dynamics)
 
 
@@ -182,7 +182,7 @@ class CameraRenderer:
     Args:
         model_bytes: From `model_to_bytes`; has a camera `<prefix><name>` for each spec.
         cameras: Settings of the cameras; a stereo rig is two.
-        threads: Threads of the software renderer, if this is the process's first GL context.
+        threads: Threads that draw.
         dynamics: What moves in the world by itself, as `sims.worlds.Dynamics`.
         renderer: What draws.
 

@@ -34,7 +34,8 @@ void raster_free(Scene* scene) { delete scene; }
 
 int raster_texture(Scene* scene, int width, int height, int channels, const std::uint8_t* data,
                    int cube) {
-    scene->textures.push_back(std::make_unique<Texture>(width, height, channels, data, cube));
+    scene->textures.push_back(std::make_unique<Texture>(
+        scene->texels, width, height, channels, data, cube));
     return static_cast<int>(scene->textures.size()) - 1;
 }
 
@@ -61,55 +62,16 @@ int raster_mesh(Scene* scene, int vertices, const float* points, const float* no
 // Rays of a pinhole (x of each column, y of each row, z null) or of each pixel (NaN: none).
 int raster_lens(Scene* scene, int width, int height, const float* x, const float* y,
                 const float* z) {
-    auto lens = std::make_unique<Lens>();
-    lens->pinhole = z == nullptr;
-    lens->width = width;
-    lens->height = height;
-    lens->stride = (width + lanes - 1) / lanes * lanes;
-    const float none = std::numeric_limits<float>::quiet_NaN();
-    if (lens->pinhole) {
-        lens->x.assign(lens->stride + lanes, none);
-        std::copy(x, x + width, lens->x.begin());
-        lens->y.assign(y, y + height);
-        lens->pitch[0] = width > 1 ? x[1] - x[0] : 1.0f;
-        lens->pitch[1] = height > 1 ? y[1] - y[0] : 1.0f;
-    } else {
-        for (auto [to, from] : {std::pair{&lens->x, x}, std::pair{&lens->y, y},
-                                std::pair{&lens->z, z}}) {
-            to->assign(std::size_t(lens->stride) * height + lanes, 0.0f);  // hits nothing
-            for (int row = 0; row < height; ++row)
-                for (int column = 0; column < width; ++column) {
-                    const float value = from[std::size_t(row) * width + column];
-                    if (value == value) (*to)[std::size_t(row) * lens->stride + column] = value;
-                }
-        }
-        lens->coarse.side = 64, lens->fine.side = 16;
-        for (Lens::Grid* grid : {&lens->coarse, &lens->fine}) {
-            grid->across = (width + grid->side - 1) / grid->side;
-            const int down = (height + grid->side - 1) / grid->side;
-            grid->boxes.assign(std::size_t(grid->across) * down, {{2, 2, 2}, {-2, -2, -2}});
-            for (int row = 0; row < height; ++row)
-                for (int column = 0; column < width; ++column) {
-                    const std::size_t at = std::size_t(row) * lens->stride + column;
-                    Lens::Box& box = grid->boxes[std::size_t(row / grid->side) * grid->across +
-                                                 column / grid->side];
-                    const float ray[3] = {lens->x[at], lens->y[at], lens->z[at]};
-                    if (ray[0] == 0 && ray[1] == 0 && ray[2] == 0) continue;
-                    for (int k = 0; k < 3; ++k) {
-                        box.low[k] = std::min(box.low[k], ray[k]);
-                        box.high[k] = std::max(box.high[k], ray[k]);
-                    }
-                }
-        }
-    }
-    scene->lenses.push_back(std::move(lens));
+    scene->lenses.push_back(std::make_unique<Lens>(width, height, x, y, z));
     return static_cast<int>(scene->lenses.size()) - 1;
 }
 
 // Images not wanted are null.
-void raster_draw(Scene* scene, int lens, const View* view, int geoms, const Geom* geom, int lights,
-                 const Light* light, std::uint8_t* rgb, float* depth, std::int32_t* numbers) {
-    scene->draw(*scene->lenses[lens], *view, geom, geoms, light, lights, rgb, depth, numbers);
+void raster_draw(Scene* scene, int lens, const View* view, const Pose* eye, int geoms,
+                 const Geom* geom, const Pose* poses, int lights, const Light* light,
+                 std::uint8_t* rgb, float* depth, std::int32_t* numbers) {
+    scene->draw(*scene->lenses[lens], *view, *eye, geom, poses, geoms, light, lights,
+                {rgb, depth, numbers});
 }
 
 #pragma GCC visibility pop

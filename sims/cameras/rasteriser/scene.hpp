@@ -1,6 +1,7 @@
 // What is drawn, and how far the drawing of a frame has come.
 #pragma once
 
+#include <functional>
 #include <memory>
 #include <vector>
 
@@ -16,19 +17,43 @@ struct Mesh {
     Vec3f middle, reach;                // of the box about it
 };
 
-struct Lens {  // rays of all pixels: of a pinhole x by column and y by row, else all by pixel
-    bool pinhole;
-    int width, height, stride;
-    float pitch[2];  // of a pinhole: a pixel's width and height at z = 1
+// Rays of all pixels: of a pinhole x by column and y by row, else all by pixel.
+struct Lens {
+    const bool pinhole;
+    const int width, height, stride;
+    double step[2];  // of a pinhole: a pixel's width and height at z = 1
     std::vector<float> x, y, z;
-    struct Box {
-        float low[3], high[3];
+
+    // Squares of pixels, and of each the four smaller ones in it, with boxes about their rays.
+    struct Square {
+        f4 low[3], high[3];     // low above high: no rays
+        std::int32_t parts[4];  // numbers of squares, below 0 for pixels
     };
-    struct Grid {  // boxes about the rays of each `side` x `side` pixels
-        int side, across;
-        std::vector<Box> boxes;
-    };
-    Grid coarse, fine;
+    static constexpr int smallest = 8, small = 64;  // sides, pixels
+    int largest = smallest;  // the root's side, twice that of its parts
+    std::vector<Square> squares;
+
+    Lens(int width, int height, const float* x, const float* y, const float* z);
+
+    Vec3f ray(int column, int row) const {
+        if (pinhole) return {x[column], y[row], 1.0f};
+        const std::size_t at = std::size_t(row) * stride + column;
+        return {x[at], y[at], z[at]};
+    }
+
+  private:
+    int cut(int column, int row, int side);
+};
+
+// The planes through the eye and the edges of a triangle, and how far it faces away.
+struct Corners {
+    Vec3 edges[3];
+    double away;
+
+    explicit Corners(const Vec3 (&points)[3])
+        : edges{cross(points[0], points[1]), cross(points[1], points[2]),
+                cross(points[2], points[0])},
+          away(dot(cross(points[1] - points[0], points[2] - points[0]), points[0])) {}
 };
 
 struct Triangle {
@@ -36,24 +61,42 @@ struct Triangle {
     float edges[3][3];  // positive inside
     std::int32_t geom, corner;
     int left, right, top, bottom;  // pixels that it may cover: to right - 1 and bottom - 1
+    Vec3f ahead;                   // towards the ball about it, and the least cosine of rays to it
+    float least;
+
+    void see(const Corners& corners) {
+        const double share = 1.0 / corners.away, side = corners.away > 0 ? 1.0 : -1.0;
+        put(depth, (corners.edges[0] + corners.edges[1] + corners.edges[2]) * share);
+        for (int k = 0; k < 3; ++k) put(edges[k], corners.edges[k] * side);
+    }
 };
 
 struct Surface {  // what is interpolated on a triangle, each times the ray
+    float depth[3];
     float u[3], v[3], w[3];  // w of a cube, in which they are a direction
     float light[3][3];
     bool flat;
-    float same[3];  // the light of a flat one
+    std::uint16_t same[3];  // the light of a flat one, in 65536ths
     const Texture* texture;
     float width, height;  // of its finest level, texels
     float opacity;
 };
 
 struct Placed {  // a geom of the frame
-    Geom geom;
+    const Geom* geom;
+    const Mesh* mesh;
     Vec3 shift;                    // of its mesh's origin from the eye, in the optical frame
     Matrix turn;                   // from the mesh's axes to the optical frame
+    int square, column, row, side;  // the smallest of the lens that it fits into, unless a pinhole
     std::vector<Vec3> seen;        // its vertices in the optical frame
     const Vec3f* light = nullptr;  // of its vertices; if it is see-through, then from behind
+};
+
+// Images to fill; those not wanted are null.
+struct Images {
+    std::uint8_t* rgb;
+    float* depth;
+    std::int32_t* numbers;
 };
 
 class Scene {
@@ -61,64 +104,39 @@ class Scene {
     std::vector<std::unique_ptr<Mesh>> meshes;
     std::vector<std::unique_ptr<Texture>> textures;
     std::vector<std::unique_ptr<Lens>> lenses;
+    std::vector<std::uint32_t> texels{0xffffff, 0xffffff};  // two white ones, and all textures'
 
-    void draw(const Lens& lens, const View& view, const Geom* geoms, int count,
-              const Light* lights, int light_count, std::uint8_t* rgb, float* depth,
-              std::int32_t* numbers);
+    void draw(const Lens& lens, const View& view, const Pose& eye, const Geom* geoms,
+              const Pose* poses, int count, const Light* lights, int light_count,
+              const Images& images);
 
   private:
+    friend class Band;
+
     struct Slot {  // light of a geom's vertices that holds until something moves
         Geom geom;
+        Pose pose;
         std::vector<Vec3f> light;
     };
 
-    void measure(float* depth) const;
-    void number(std::int32_t* numbers) const;
-    void place(const Geom& geom, int index);
-    void add(int geom, int corner, bool blended);
+    void place(const Geom& geom, const Pose& pose, Placed& placed) const;
+    static bool ball(Vec3 middle, double reach, Vec3f& ahead, float& least);
+    bool in_view(Placed& placed) const;
+    bool in_frame(const Placed& placed) const;
+    bool in_squares(Placed& placed) const;
+    void add(std::vector<Triangle>& to, int index) const;
     bool bounded(Triangle& triangle, const Vec3 (&points)[3]) const;
-    bool in_view(const Placed& placed, const Mesh& mesh) const;
-    void cover(const Triangle& triangle, std::int32_t number);
-    template <typename Found>
-    void over(const Triangle& triangle, Found found) const;
-    template <bool pinhole, typename Found>
-    void scan(const Triangle& triangle, Found found) const;
-    const Surface& surface(std::int32_t number);
-    void light(Placed& placed, int index);
-    void shade(std::uint8_t* rgb);
-    void shade_run(std::uint8_t* row, int y, int left, int right, std::int32_t number);
-    void shade_sky(std::uint8_t* row, int y, int left, int right);
-    void blend(std::uint8_t* rgb);
-    static bool owns(const Triangle& triangle, Vec3f ray);
-    void colours(const Surface& surface, const Triangle& triangle, int x, int y, f8 q, int count,
-                 f4* found) const;
-    int detail_of(const Surface& surface, const Triangle& triangle, int x, int y, float inverse,
-                  float u, float v) const;
-    int detail_around(const Surface& surface, const Triangle& triangle, int x, int y, float inverse,
-                      Vec3f at) const;
-    void steps(int x, int y, Vec3f& right, Vec3f& below) const;
-    Vec3f ray(int x, int y) const {
-        if (lens_->pinhole) return {lens_->x[x], lens_->y[y], 1.0f};
-        const std::size_t at = std::size_t(y) * lens_->stride + x;
-        return {lens_->x[at], lens_->y[at], lens_->z[at]};
-    }
-    static float times(const float (&plane)[3], Vec3f ray) {
-        return plane[0] * ray.x + (plane[1] * ray.y + plane[2] * ray.z);
-    }
+    void light(Placed& placed, const Pose& pose, Slot& slot) const;
+    void spread(int parts, const std::function<void(int)>& work) const;
 
     const Lens* lens_ = nullptr;
     View view_{};
+    Pose eye_{};
     std::vector<Light> lights_;
-    const std::uint8_t* end_ = nullptr;  // of the image
     std::vector<Placed> placed_;
     std::vector<Slot> slots_;
-    std::vector<Light> slots_lights_;
-    std::vector<Triangle> triangles_;
-    std::vector<Surface> surfaces_;
-    std::vector<std::int32_t> surface_of_;
-    std::vector<std::int32_t> blended_;
-    std::vector<float> nearest_;  // inverse depth of the nearest opaque surface; 0 for nothing
-    std::vector<float> front_;    // of the nearest of all
+    std::vector<std::vector<Triangle>> solid_, clear_;  // the frame's triangles, in parts
+    std::vector<float> nearest_;         // inverse depth of the nearest surface; 0 for nothing
     std::vector<std::int32_t> visible_;  // its triangle
 };
 

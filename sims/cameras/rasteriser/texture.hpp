@@ -7,191 +7,183 @@
 
 namespace raster {
 
-using u16x8 = std::uint16_t __attribute__((vector_size(16)));
-using u8x16 = std::uint8_t __attribute__((vector_size(16)));
-using u32x4 = std::uint32_t __attribute__((vector_size(16)));
-using f4 = float __attribute__((vector_size(16)));
-using i4 = std::int32_t __attribute__((vector_size(16)));
+// Where the colours of the pixels of a row come from: for each of two sizes of a texture the upper
+// left and the lower left of four texels, numbered in all texels of the scene, and the weights of
+// the right and of the lower ones; the weight of the second size; and the light. All weights are in
+// 65536ths, twice in each lane, but the light.
+struct Taps {
+    enum { upper, lower = 2, right = 4, low = 6, share = 8, red_blue, green, clear, kinds };
 
-// Lanes of two vectors, by their numbers.
-#ifdef __clang__
-#define RASTER_SHUFFLE(type, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-#else  // GCC has the other one since version 12 only
-#define RASTER_SHUFFLE(type, a, b, ...) __builtin_shuffle(a, b, type{__VA_ARGS__})
-#endif
+    explicit Taps(int width) : stride_(width + widest), values_(std::size_t(stride_) * kinds) {}
 
-struct Level {
-    int width, height;
-    std::vector<std::uint32_t> texels;  // red in the lowest byte
+    std::uint32_t* at(int kind, int x) { return values_.data() + kind * stride_ + x; }
+    void set(int kind, int x, iv value) { store(at(kind, x), value); }
+    iv get(int kind, int x) const { return load<iv>(values_.data() + kind * stride_ + x); }
+    wv weights(int kind, int x) const { return reinterpret_cast<wv>(get(kind, x)); }
+
+  private:
+    int stride_;
+    std::vector<std::uint32_t> values_;
 };
 
-// An image, or a cube of six square ones, one below the other.
+inline iv twice(iv value) { return (value & 65535) | value << 16; }
+
+// An image, which repeats, or a cube of six square ones.
 class Texture {
   public:
     const bool is_cube;
 
-    Texture(int width, int height, int channels, const std::uint8_t* data, bool cube)
+    // Adds its texels, red in their lowest bytes, to those of all.
+    Texture(std::vector<std::uint32_t>& all, int width, int height, int channels,
+            const std::uint8_t* data, bool cube)
         : is_cube(cube) {
-        Level base{width, height, std::vector<std::uint32_t>(std::size_t(width) * height)};
-        for (std::size_t k = 0; k < base.texels.size(); ++k) {
+        std::vector<std::uint32_t> texels(std::size_t(width) * height);
+        for (std::size_t k = 0; k < texels.size(); ++k) {
             const std::uint8_t* from = data + k * channels;
             const std::uint8_t red = from[0], green = channels > 2 ? from[1] : red;
             const std::uint8_t blue = channels > 2 ? from[2] : red;
-            base.texels[k] = red | green << 8 | blue << 16 | 0xff000000u;
+            texels[k] = red | green << 8 | blue << 16;
         }
-        levels_.push_back(std::move(base));
-        while (levels_.back().width > 1 || (!cube && levels_.back().height > 1))
-            levels_.push_back(halved(levels_.back(), cube));
+        const int sides = cube ? 6 : 1;
+        for (height /= sides;;) {
+            levels_.push_back({width, height, static_cast<std::int32_t>(all.size())});
+            border(all, texels, width, height);
+            if (width == 1 && height == 1) break;
+            const int across = std::max(width / 2, 1), down = std::max(height / 2, 1);
+            texels = halved(texels, width, height * sides, across, down * sides);
+            width = across, height = down;
+        }
     }
 
     int levels() const { return static_cast<int>(levels_.size()); }
-    const Level& level(int number) const { return levels_[number]; }
+    int width() const { return levels_[0].width; }
+    int height() const { return levels_[0].height; }
 
-    // Colours (red, green, blue, 0 to 65280) at some places (u, v), which repeat; `detail` is the
-    // mipmap's level in 256ths: between two levels both are read, and within each four texels.
-    void sample(f8 u, f8 v, int count, int detail, f4* found) const {
-        u -= floored(u), v -= floored(v);
-        const Level& fine = levels_[detail >> 8];
-        const Taps a = taps(fine, u, v);
-        const int part = detail & 255;
-        if (part == 0) {
-            for (int k = 0; k < count; ++k) found[k] = widened(weighted(fine, a, fine, a, k), false);
-            return;
-        }
-        const Level& coarse = levels_[(detail >> 8) + 1];
-        const Taps b = taps(coarse, u, v);
-        const float share = part * (1.0f / 256.0f);
-        for (int k = 0; k < count; ++k) {
-            const u16x8 both = weighted(fine, a, coarse, b, k);
-            const f4 finer = widened(both, false), coarser = widened(both, true);
-            found[k] = finer + (coarser - finer) * share;
-        }
+    // Pixels from x on lie at places (u, v), which repeat; `detail` is the mipmap's level in 256ths:
+    // between two levels both are read.
+    void place(Taps& taps, int x, fv u, fv v, int detail) const {
+        place(taps, x, within(u - floored(u)), within(v - floored(v)), iv{}, detail);
     }
 
-    // Colour (0 to 65280) of a cube in a direction.
-    f4 around(Vec3f ray, int detail) const {
-        const float x = ray.x < 0 ? -ray.x : ray.x, y = ray.y < 0 ? -ray.y : ray.y;
-        const float z = ray.z < 0 ? -ray.z : ray.z;
-        int face;
-        float s, t, most;
-        if (x >= y && x >= z) {
-            face = ray.x > 0 ? 0 : 1, most = x, s = ray.x > 0 ? -ray.z : ray.z, t = -ray.y;
-        } else if (y >= z) {
-            face = ray.y > 0 ? 2 : 3, most = y, s = ray.x, t = ray.y > 0 ? ray.z : -ray.z;
-        } else {
-            face = ray.z > 0 ? 4 : 5, most = z, s = ray.z > 0 ? ray.x : -ray.x, t = -ray.y;
-        }
-        const auto on = [&](int number) { return face_of(levels_[number], face, s / most, t / most); };
-        const int first = detail >> 8;
-        const f4 finer = on(first);
-        if ((detail & 255) == 0) return finer;
-        return finer + (on(first + 1) - finer) * ((detail & 255) * (1.0f / 256.0f));
+    // Pixels from x on lie in directions from the middle of a cube.
+    void around(Taps& taps, int at, fv x, fv y, fv z, int detail) const {
+        const fv ax = x < 0 ? -x : x, ay = y < 0 ? -y : y, az = z < 0 ? -z : z;
+        const iv on_x = (ax >= ay) & (ax >= az), on_y = ~on_x & (ay >= az);
+        const fv most = on_x ? ax : on_y ? ay : az;
+        const fv s = on_x ? (x > 0 ? -z : z) : on_y ? x : z > 0 ? x : -x;
+        const fv t = on_y ? (y > 0 ? z : -z) : -y;
+        const iv first = on_x ? iv{} : on_y ? iv{} + 2 : iv{} + 4;
+        const iv face = first + ((on_x ? x : on_y ? y : z) > 0 ? iv{} : iv{} + 1);
+        const fv share = 0.5f / most;
+        place(taps, at, within(s * share + 0.5f), within(t * share + 0.5f), face, detail);
     }
 
   private:
-    struct Taps {  // of some places: texels, upper left, upper right, lower left, lower right
-        std::int32_t at[4][lanes];
-        std::int32_t right[lanes], low[lanes];  // weights of the right and the lower ones, of 256
+    // One of its sizes: six sides, if it is a cube, one below the other, and about each a border of
+    // one texel, so that the four texels about a place are two pairs of neighbours.
+    struct Level {
+        int width, height;   // of a side
+        std::int32_t start;  // among all texels
+        int stride() const { return width + 2; }
     };
 
-    static f8 floored(f8 value) {
-        const f8 whole = __builtin_convertvector(__builtin_convertvector(value, i8), f8);
-        return value < whole ? whole - 1.0f : whole;
+    static fv within(fv at) { return (at >= 0) & (at <= 1) ? at : fv{}; }  // also if it is none
+
+    void place(Taps& taps, int x, fv u, fv v, iv face, int detail) const {
+        const int part = detail & 255, first = detail >> 8;
+        place(taps, x, u, v, face, 0, levels_[first]);
+        if (part) place(taps, x, u, v, face, 1, levels_[first + 1]);
+        taps.set(Taps::share, x, iv{} + (part << 8 | part << 24));
     }
 
-    // At places from 0 to 1.
-    static Taps taps(const Level& level, f8 u, f8 v) {
-        const f8 column = u * float(level.width) - 0.5f, row = v * float(level.height) - 0.5f;
-        const f8 whole_column = floored(column), whole_row = floored(row);
-        i8 left = __builtin_convertvector(whole_column, i8);
-        i8 top = __builtin_convertvector(whole_row, i8);
-        i8 right = left + 1, bottom = top + 1;
-        left = left < 0 ? left + level.width : left;  // -1 to width - 1
-        right = right >= level.width ? right - level.width : right;
-        top = top < 0 ? top + level.height : top;
-        bottom = bottom >= level.height ? bottom - level.height : bottom;
-        top *= level.width, bottom *= level.width;
-        Taps found;
-        store(found.at[0], top + left), store(found.at[1], top + right);
-        store(found.at[2], bottom + left), store(found.at[3], bottom + right);
-        store(found.right, __builtin_convertvector((column - whole_column) * 256.0f, i8));
-        store(found.low, __builtin_convertvector((row - whole_row) * 256.0f, i8));
-        return found;
+    void place(Taps& taps, int x, fv u, fv v, iv face, int size, const Level& level) const {
+        const iv column = as_whole(u * (level.width * 65536.0f)) + 32768;  // in 65536ths
+        const iv row = as_whole(v * (level.height * 65536.0f)) + 32768;
+        iv at = (row >> 16) * level.stride() + ((column >> 16) + level.start);
+        if (is_cube) at += face * (level.stride() * (level.height + 2));
+        taps.set(Taps::upper + size, x, at);
+        taps.set(Taps::lower + size, x, at + level.stride());
+        taps.set(Taps::right + size, x, twice(column));
+        taps.set(Taps::low + size, x, twice(row));
     }
 
-    // Colour of a cube's face at a place from -1 to 1.
-    static f4 face_of(const Level& level, int face, float s, float t) {
-        const int side = level.width;
-        const float column = (s + 1.0f) * (0.5f * side) - 0.5f, row = (t + 1.0f) * (0.5f * side) - 0.5f;
-        const f8 places = floored(f8{column, row});
-        const int left = static_cast<int>(places[0]), top = static_cast<int>(places[1]);
-        const auto within = [side](int at) { return std::min(std::max(at, 0), side - 1); };
-        const std::int32_t upper = (face * side + within(top)) * side;
-        const std::int32_t lower = (face * side + within(top + 1)) * side;
-        Taps a;
-        a.at[0][0] = upper + within(left), a.at[1][0] = upper + within(left + 1);
-        a.at[2][0] = lower + within(left), a.at[3][0] = lower + within(left + 1);
-        a.right[0] = static_cast<int>((column - places[0]) * 256.0f);
-        a.low[0] = static_cast<int>((row - places[1]) * 256.0f);
-        return widened(weighted(level, a, level, a, 0), false);
+    void border(std::vector<std::uint32_t>& all, const std::vector<std::uint32_t>& texels,
+                int width, int height) const {
+        all.reserve(all.size() + texels.size() + 12 * (width + height + 2));
+        for (auto side = texels.begin(); side != texels.end(); side += std::size_t(width) * height)
+            for (int y = -1; y <= height; ++y) {
+                const int beyond = is_cube ? std::min(std::max(y, 0), height - 1)
+                                           : (y + height) % height;
+                const auto row = side + std::size_t(beyond) * width;
+                all.push_back(row[is_cube ? 0 : width - 1]);
+                all.insert(all.end(), row, row + width);
+                all.push_back(row[is_cube ? width - 1 : 0]);
+            }
     }
 
-    // Bytes of two texels, widened.
-    static u16x8 pair(std::uint32_t a, std::uint32_t b) {
-        const u8x16 bytes = reinterpret_cast<u8x16>(u32x4{a, b, 0, 0});
-        return reinterpret_cast<u16x8>(RASTER_SHUFFLE(
-            u8x16, bytes, u8x16{}, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23));
-    }
-
-    // Means of four texels each of two levels, times 256: the first one's in the lower lanes.
-    static u16x8 weighted(const Level& fine, const Taps& a, const Level& coarse, const Taps& b,
-                          int k) {
-        const auto weights = [](std::int32_t one, std::int32_t other) {
-            const auto both = reinterpret_cast<u16x8>(i4{one, other, 0, 0});  // little-endian
-            return RASTER_SHUFFLE(u16x8, both, both, 0, 0, 0, 0, 2, 2, 2, 2);
-        };
-        const u16x8 right = weights(a.right[k], b.right[k]), low = weights(a.low[k], b.low[k]);
-        const u16x8 left = 256 - right, high = 256 - low;
-        const auto across = [&](int tap) __attribute__((always_inline)) {
-            const std::uint32_t* one = fine.texels.data();
-            const std::uint32_t* other = coarse.texels.data();
-            return (pair(one[a.at[tap][k]], other[b.at[tap][k]]) * left +
-                    pair(one[a.at[tap + 1][k]], other[b.at[tap + 1][k]]) * right + 128) >> 8;
-        };
-        return across(0) * high + across(2) * low;
-    }
-
-    static f4 widened(u16x8 values, bool upper) {
-        const u16x8 whole =
-            upper ? RASTER_SHUFFLE(u16x8, values, u16x8{}, 4, 8, 5, 8, 6, 8, 7, 8)
-                  : RASTER_SHUFFLE(u16x8, values, u16x8{}, 0, 8, 1, 8, 2, 8, 3, 8);
-        return __builtin_convertvector(reinterpret_cast<i4>(whole), f4);
-    }
-
-    // Half as wide and high, rounded down: each texel the mean of those that it covers.
-    static Level halved(const Level& from, bool cube) {
-        const int width = std::max(from.width / 2, 1);
-        Level to{width, cube ? 6 * width : std::max(from.height / 2, 1), {}};
-        to.texels.resize(std::size_t(to.width) * to.height);
-        for (int y = 0; y < to.height; ++y)
-            for (int x = 0; x < to.width; ++x)
-                to.texels[std::size_t(y) * to.width + x] = mean(from, to, x, y);
+    // Smaller, rounded down: each texel the mean of those that it covers.
+    static std::vector<std::uint32_t> halved(const std::vector<std::uint32_t>& from, int width,
+                                             int height, int across, int down) {
+        std::vector<std::uint32_t> to;
+        to.reserve(std::size_t(across) * down);
+        for (int y = 0; y < down; ++y)
+            for (int x = 0; x < across; ++x) {
+                const int top = y * height / down, bottom = (y + 1) * height / down;
+                const int left = x * width / across, right = (x + 1) * width / across;
+                std::uint32_t sums[3] = {0, 0, 0}, count = 0;
+                for (int row = top; row < bottom; ++row)
+                    for (int column = left; column < right; ++column, ++count)
+                        for (int k = 0; k < 3; ++k)
+                            sums[k] += from[std::size_t(row) * width + column] >> 8 * k & 255;
+                for (std::uint32_t& sum : sums) sum = (sum + count / 2) / count;
+                to.push_back(sums[0] | sums[1] << 8 | sums[2] << 16);
+            }
         return to;
-    }
-
-    static std::uint32_t mean(const Level& from, const Level& to, int x, int y) {
-        const int top = y * from.height / to.height, bottom = (y + 1) * from.height / to.height;
-        const int left = x * from.width / to.width, right = (x + 1) * from.width / to.width;
-        std::uint32_t sums[3] = {0, 0, 0}, count = 0;
-        for (int row = top; row < bottom; ++row)
-            for (int column = left; column < right; ++column, ++count)
-                for (int k = 0; k < 3; ++k)
-                    sums[k] += from.texels[std::size_t(row) * from.width + column] >> 8 * k & 255;
-        for (std::uint32_t& sum : sums) sum = (sum + count / 2) / count;
-        return sums[0] | sums[1] << 8 | sums[2] << 16 | 0xff000000u;
     }
 
     std::vector<Level> levels_;
 };
+
+// Colours of as many pixels as there are lanes, 0 to 65280 for 0 to 255.
+struct Colours {
+    wv red_blue, green;  // in each lane red below blue, and green below what counts for nothing
+};
+
+inline Colours between(Colours a, Colours b, wv share) {
+    return {between(a.red_blue, b.red_blue, share), between(a.green, b.green, share)};
+}
+
+inline Colours coloured(iv texels) {
+    const iv upper = iv{} + static_cast<std::int32_t>(0xff00ff00u);
+    return {reinterpret_cast<wv>((texels << 8) & upper), reinterpret_cast<wv>(texels & upper)};
+}
+
+struct Pair {
+    iv left, right;
+};
+
+// Texels at some places, and their neighbours to the right.
+inline Pair pair(const std::uint32_t* texels, const std::uint32_t* at) {
+    const auto two = [&](int k) { return load<std::uint64_t>(texels + at[k]); };
+#ifdef __AVX2__
+    const auto one = reinterpret_cast<iv>(qv{two(0), two(1), two(4), two(5)});
+    const auto other = reinterpret_cast<iv>(qv{two(2), two(3), two(6), two(7)});
+    return {RASTER_SHUFFLE(iv, one, other, 0, 2, 8, 10, 4, 6, 12, 14),
+            RASTER_SHUFFLE(iv, one, other, 1, 3, 9, 11, 5, 7, 13, 15)};
+#else
+    const auto one = reinterpret_cast<iv>(qv{two(0), two(1)});
+    const auto other = reinterpret_cast<iv>(qv{two(2), two(3)});
+    return {RASTER_SHUFFLE(iv, one, other, 0, 2, 4, 6), RASTER_SHUFFLE(iv, one, other, 1, 3, 5, 7)};
+#endif
+}
+
+inline Colours read(const std::uint32_t* texels, Taps& taps, int x, int size) {
+    const Pair above = pair(texels, taps.at(Taps::upper + size, x));
+    const Pair below = pair(texels, taps.at(Taps::lower + size, x));
+    const wv low = taps.weights(Taps::low + size, x);
+    return between(between(coloured(above.left), coloured(below.left), low),
+                   between(coloured(above.right), coloured(below.right), low),
+                   taps.weights(Taps::right + size, x));
+}
 
 }  // namespace raster

@@ -4,6 +4,10 @@
 // may round differently elsewhere: the same scene gives the same bytes on every machine.
 #pragma once
 
+#ifdef __SSE2__
+#include <immintrin.h>
+#endif
+
 #include <cstdint>
 #include <cstring>
 #include <memory>
@@ -11,22 +15,80 @@
 
 namespace raster {
 
-using f8 = float __attribute__((vector_size(32)));
-using i8 = std::int32_t __attribute__((vector_size(32)));
+#ifdef __AVX2__
 constexpr int lanes = 8;
+#else
+constexpr int lanes = 4;
+#endif
+constexpr int widest = 8;  // of all machines: buffers have room for it
+constexpr int width_of_vectors = 4 * lanes;
+using fv = float __attribute__((vector_size(width_of_vectors)));
+using iv = std::int32_t __attribute__((vector_size(width_of_vectors)));
+using wv = std::uint16_t __attribute__((vector_size(width_of_vectors)));  // two in each lane
+using f4 = float __attribute__((vector_size(16)));
+using i4 = std::int32_t __attribute__((vector_size(16)));
+using qv = std::uint64_t __attribute__((vector_size(width_of_vectors)));
 
-inline f8 load(const float* from) {
-    f8 found;
+// Lanes of two vectors, by their numbers.
+#ifdef __clang__
+#define RASTER_SHUFFLE(type, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else  // GCC has the other one since version 12 only
+#define RASTER_SHUFFLE(type, a, b, ...) __builtin_shuffle(a, b, type{__VA_ARGS__})
+#endif
+
+template <typename V, typename T>
+inline V load(const T* from) {
+    V found;
     std::memcpy(&found, from, sizeof found);
     return found;
 }
-inline void store(float* to, f8 value) { std::memcpy(to, &value, sizeof value); }
-inline i8 load(const std::int32_t* from) {
-    i8 found;
-    std::memcpy(&found, from, sizeof found);
+template <typename V, typename T>
+inline void store(T* to, V value) { std::memcpy(to, &value, sizeof value); }
+
+inline fv as_float(iv value) { return __builtin_convertvector(value, fv); }
+inline iv as_whole(fv value) { return __builtin_convertvector(value, iv); }  // towards 0
+inline bool any(iv mask) {  // whether a lane is not 0
+#if defined(__AVX2__)
+    const auto bits = reinterpret_cast<__m256i>(mask);
+    return !_mm256_testz_si256(bits, bits);
+#elif defined(__SSE4_1__)
+    const auto bits = reinterpret_cast<__m128i>(mask);
+    return !_mm_testz_si128(bits, bits);
+#else
+    std::int32_t found = 0;
+    for (int k = 0; k < lanes; ++k) found |= mask[k];
     return found;
+#endif
 }
-inline void store(std::int32_t* to, i8 value) { std::memcpy(to, &value, sizeof value); }
+inline int bits(i4 mask) {  // one for each lane
+#ifdef __SSE2__
+    return _mm_movemask_ps(reinterpret_cast<__m128>(mask));
+#else
+    return (mask[0] & 1) | (mask[1] & 2) | (mask[2] & 4) | (mask[3] & 8);
+#endif
+}
+inline fv floored(fv value) {
+    const fv whole = as_float(as_whole(value));
+    return value < whole ? whole - 1.0f : whole;
+}
+
+// The upper halves of the products.
+inline wv high(wv a, wv b) {
+#if defined(__AVX2__)
+    return reinterpret_cast<wv>(_mm256_mulhi_epu16(reinterpret_cast<__m256i>(a),
+                                                   reinterpret_cast<__m256i>(b)));
+#elif defined(__SSE2__)
+    return reinterpret_cast<wv>(_mm_mulhi_epu16(reinterpret_cast<__m128i>(a),
+                                                reinterpret_cast<__m128i>(b)));
+#else
+    using wide = std::uint32_t __attribute__((vector_size(2 * width_of_vectors)));
+    return __builtin_convertvector(
+        (__builtin_convertvector(a, wide) * __builtin_convertvector(b, wide)) >> 16, wv);
+#endif
+}
+
+// Between two colours, as far from the first as `share` says in 65536ths.
+inline wv between(wv a, wv b, wv share) { return high(a, 65535 - share) + high(b, share); }
 
 template <typename T>
 struct Vec {
@@ -49,6 +111,10 @@ inline Vec<T> cross(Vec<T> a, Vec<T> b) {
 }
 inline Vec3f narrow(Vec3 a) {
     return {static_cast<float>(a.x), static_cast<float>(a.y), static_cast<float>(a.z)};
+}
+inline void put(float (&to)[3], Vec3 from) {
+    const Vec3f found = narrow(from);
+    to[0] = found.x, to[1] = found.y, to[2] = found.z;
 }
 
 struct Matrix {  // 3 x 3, row by row
@@ -73,8 +139,11 @@ struct Geom {
     float emission, specular, shininess;
     float repeat[2], offset;  // of the places in the texture
     float cube[3], unused;    // times a point of the mesh: its direction in a cube of textures
+};
+
+struct Pose {
     double position[3];  // in the world, metres
-    Matrix turn;         // from the mesh's axes to the world's
+    Matrix turn;         // from its axes to the world's: of an eye, from the optical frame's
 };
 
 struct Light {
@@ -85,10 +154,9 @@ struct Light {
 };
 
 struct View {
-    double position[3];  // of the eye in the world, metres
-    Matrix turn;         // from the optical frame (x right, y down, z ahead) to the world
     std::int32_t width, height, first, last;  // rows to draw: first to last - 1
     std::int32_t sky, fogged;                 // number of the sky's texture, or -1
+    std::int32_t poses, threads;              // how many poses of everything there are (`Moving`)
     float near, far;                          // nothing nearer is drawn; depth beyond is inf
     float fog[3], fog_start, fog_end, unused;
 };

@@ -251,8 +251,9 @@ def test_each_image_is_the_same_alone() -> None:
     raster.close()
 
 
-def hash_of(name: str, instructions: str) -> str:
-    raster, total = Raster(compiled(fresh(name)), instructions=instructions), hashlib.sha256()
+def hash_of(name: str, instructions: str, threads: int = 1) -> str:
+    model, total = compiled(fresh(name)), hashlib.sha256()
+    raster = Raster(model, threads=threads, instructions=instructions)
     for place, turn in itertools.islice(places(name), 9):
         for spec in SPECS:
             for image in drawn(raster, spec, place, turn):
@@ -265,9 +266,10 @@ def hash_of(name: str, instructions: str) -> str:
 @pytest.mark.parametrize("name", WORLD)
 @pytest.mark.timeout(300)
 def test_the_bytes_are_those_of_every_machine(name: str) -> None:
-    """With each instruction set that this one has."""
+    """With each instruction set that this one has, and by any number of threads."""
     saved = json.loads(HASHES.read_text(encoding="utf-8"))
-    assert {hash_of(name, each) for each in libraries()} == {saved[name]}
+    found = {hash_of(name, each) for each in libraries()} | {hash_of(name, "", k) for k in (2, 5)}
+    assert found == {saved[name]}
 
 
 def test_what_it_cannot_draw_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,243 @@
+// Which triangle each pixel of a band sees.
+#include "band.hpp"
+
+#include <algorithm>
+#include <limits>
+
+namespace raster {
+
+constexpr int parts_from = 24;  // bit of a triangle's number; those before count within its part
+constexpr std::int32_t clear_part = 1 << 30;
+
+Band::Band(Scene& scene, int first, int last, const Images& images)
+    : scene_(scene), lens_(*scene.lens_), view_(scene.view_), first_(first), last_(last),
+      images_(images), end_(images.rgb ? row(last) : nullptr), nearest_(scene.nearest_.data()),
+      visible_(scene.visible_.data()), taps_(lens_.stride),
+      farthest_(lens_.pinhole ? 0 : leaf(0, last + Lens::smallest)) {}
+
+const Triangle& Band::triangle(std::int32_t number) const {
+    const auto& parts = number & clear_part ? scene_.clear_ : scene_.solid_;
+    return parts[(number & ~clear_part) >> parts_from][number & ((1 << parts_from) - 1)];
+}
+
+std::int32_t& Band::surface_of(std::int32_t number) {
+    const std::size_t solid = scene_.solid_.size(), clear = scene_.clear_.size();
+    if (surface_of_.empty()) surface_of_.resize(solid + clear);
+    const bool is_clear = number & clear_part;
+    const std::size_t part = (number & ~clear_part) >> parts_from;
+    std::vector<std::int32_t>& known = surface_of_[part + (is_clear ? solid : 0)];
+    if (known.empty()) known.assign((is_clear ? scene_.clear_ : scene_.solid_)[part].size(), -1);
+    return known[number & ((1 << parts_from) - 1)];
+}
+
+void Band::draw() {
+    std::fill(nearest_ + at(first_), nearest_ + at(last_), 0.0f);
+    std::fill(visible_ + at(first_), visible_ + at(last_), -1);
+    std::int32_t part = 0;
+    for (const std::vector<Triangle>& triangles : scene_.solid_) {
+        std::int32_t number = part++ << parts_from;
+        for (const Triangle& triangle : triangles) cover(triangle, number++);
+    }
+    if (images_.rgb) shade();
+    blend();
+    if (images_.depth) measure();
+    if (images_.numbers) number();
+}
+
+// Call found(y, x, inside, inverse depth) for pixels side by side, some of them in a triangle.
+template <typename Found>
+inline void Band::over(const Triangle& triangle, Found found) {
+    if (triangle.top >= last_ || triangle.bottom <= first_) return;
+    if (lens_.pinhole) return scan_frame(triangle, found);
+    const Placed& placed = scene_.placed_[triangle.geom];
+    over_square(triangle, placed.square, placed.column, placed.row, placed.side, found);
+}
+
+template <typename Found>
+inline void Band::scan_frame(const Triangle& triangle, Found found) {
+    const float(&e)[3][3] = triangle.edges;
+    const float(&d)[3] = triangle.depth;
+    const fv nearest = fv{} + 1.0f / view_.near;
+    const int left = triangle.left & ~(lanes - 1);
+    const bool wide = triangle.right - left > 4 * lanes;
+    const float start = lens_.x[0], steps = static_cast<float>(1.0 / lens_.step[0]);
+    float slope[3];  // of the columns in which the edges are, by row
+    for (int k = 0; k < 3; ++k) slope[k] = e[k][0] != 0 ? -1.0f / e[k][0] : 0;
+    const int last = std::min(triangle.bottom, last_);
+    for (int y = std::max(triangle.top, first_); y < last; ++y) {
+        const float down = lens_.y[y];
+        float in[3];
+        for (int k = 0; k < 3; ++k) in[k] = e[k][1] * down + e[k][2];
+        const float depth = d[1] * down + d[2];
+        int from = left, to = triangle.right;
+        if (wide) {  // the columns between the edges, and a few more for rounding
+            float low = lens_.x[triangle.left], high = lens_.x[triangle.right - 1];
+            for (int k = 0; k < 3; ++k) {
+                if (e[k][0] > 0) low = std::max(low, in[k] * slope[k]);
+                if (e[k][0] < 0) high = std::min(high, in[k] * slope[k]);
+            }
+            const float begin = (low - start) * steps - 3, end = (high - start) * steps + 4;
+            if (!(begin < end)) continue;
+            if (begin > from) from = static_cast<int>(begin) & ~(lanes - 1);
+            if (end < to) to = static_cast<int>(end);
+        }
+        for (int x = from; x < to; x += lanes) {
+            const fv rays = load<fv>(&lens_.x[x]), q = rays * d[0] + depth;
+            const iv inside = (rays * e[0][0] + in[0] >= 0.0f) & (rays * e[1][0] + in[1] >= 0.0f) &
+                              (rays * e[2][0] + in[2] >= 0.0f) & (q > 0.0f) & (q <= nearest);
+            found(y, x, inside, q);
+        }
+    }
+}
+
+static f4 most(const Lens::Square& rays, Vec3f along) {
+    return (along.x > 0 ? rays.high : rays.low)[0] * along.x +
+           ((along.y > 0 ? rays.high : rays.low)[1] * along.y +
+            (along.z > 0 ? rays.high : rays.low)[2] * along.z);
+}
+
+// In the parts of a square of rays that the triangle does not miss: those of large squares must come
+// near the ball about it, and those of small ones not be all beyond an edge, behind, or hidden.
+template <typename Found>
+void Band::over_square(const Triangle& triangle, int square, int column, int row, int side,
+                       Found found) {
+    const Lens::Square& rays = lens_.squares[square];
+    i4 met = (rays.low[2] <= rays.high[2]) & (most(rays, triangle.ahead) >= triangle.least);
+    f4 nearest{};
+    if (side <= Lens::small) {
+        for (const auto& edge : triangle.edges) met &= most(rays, {edge[0], edge[1], edge[2]}) >= 0.0f;
+        nearest = most(rays, {triangle.depth[0], triangle.depth[1], triangle.depth[2]});
+        met &= nearest >= 0.0f;
+    }
+    side /= 2;
+    for (int left_over = bits(met); left_over; left_over &= left_over - 1) {
+        const int part = __builtin_ctz(left_over);
+        const int left = column + part % 2 * side, top = row + part / 2 * side;
+        if (top >= last_ || top + side <= first_) continue;
+        if (rays.parts[part] >= 0)
+            over_square(triangle, rays.parts[part], left, top, side, found);
+        else if (!(nearest[part] * 1.00001f <= farthest_[leaf(left, top)]))
+            over_leaf(triangle, left, top, found);
+    }
+}
+
+// In the smallest square of a lens.
+template <typename Found>
+inline void Band::over_leaf(const Triangle& triangle, int left, int top, Found found) {
+    const int from = std::max(top, first_), to = std::min(top + Lens::smallest, last_);
+    const int right = std::min(left + Lens::smallest, lens_.stride);
+    if (!scan_pixels(triangle, left, right, from, to, found)) return;
+    fv least = load<fv>(nearest_ + at(from) + left);
+    for (int y = from; y < to; ++y)
+        for (int x = left; x < right; x += lanes) {
+            const fv here = load<fv>(nearest_ + at(y) + x);
+            least = here < least ? here : least;
+        }
+    float all = least[0];
+    for (int k = 1; k < lanes; ++k) all = std::min(all, least[k]);
+    farthest_[leaf(left, top)] = all;
+}
+
+// In some pixels; false if the triangle is in none of them.
+template <typename Found>
+inline bool Band::scan_pixels(const Triangle& triangle, int left, int right, int top, int bottom,
+                              Found found) const {
+    const float(&e)[3][3] = triangle.edges;
+    const fv nearest = fv{} + 1.0f / view_.near;
+    bool touched = false;
+    for (int y = top; y < bottom; ++y)
+        for (int x = left; x < right; x += lanes) {
+            const std::size_t here = std::size_t(y) * lens_.stride + x;
+            const fv rx = load<fv>(&lens_.x[here]), ry = load<fv>(&lens_.y[here]);
+            const fv rz = load<fv>(&lens_.z[here]);
+            const auto times = [&](const float(&p)[3]) { return rx * p[0] + (ry * p[1] + rz * p[2]); };
+            const fv q = times(triangle.depth);
+            const iv inside = (times(e[0]) >= 0.0f) & (times(e[1]) >= 0.0f) &
+                              (times(e[2]) >= 0.0f) & (q > 0.0f) & (q <= nearest);
+            if (!any(inside)) continue;
+            found(y, x, inside, q);
+            touched = true;
+        }
+    return touched;
+}
+
+void Band::cover(const Triangle& triangle, std::int32_t number) {
+    const iv mine = iv{} + number;
+    over(triangle, [&](int y, int x, iv inside, fv q) __attribute__((always_inline)) {
+        const std::size_t here = at(y) + x;
+        const fv before = load<fv>(nearest_ + here);
+        const iv wins = inside & (q > before);
+        store(nearest_ + here, wins ? q : before);
+        store(visible_ + here, wins ? mine : load<iv>(visible_ + here));
+    });
+}
+
+// Whether a pixel on an edge is the triangle's, and not that of the one beyond.
+static bool owns(const Triangle& triangle, Vec3f ray) {
+    for (const auto& edge : triangle.edges)
+        if (edge[0] * ray.x + (edge[1] * ray.y + edge[2] * ray.z) == 0.0f &&
+            !(edge[0] > 0 || (edge[0] == 0 && edge[1] > 0)))
+            return false;
+    return true;
+}
+
+// Draw what is see-through over what is behind it, from the back to the front. It has a number, but
+// no depth.
+void Band::blend() {
+    std::vector<float> front;  // inverse depth of the nearest of all
+    for (std::size_t part = scene_.clear_.size(); part-- > 0;) {
+        std::int32_t number = clear_part | static_cast<std::int32_t>(part) << parts_from;
+        for (const Triangle& triangle : scene_.clear_[part]) {
+            if (front.empty()) front.assign(nearest_ + at(first_), nearest_ + at(last_) + widest);
+            over(triangle, [&](int y, int x, iv inside, fv q) {
+                const std::size_t here = at(y) + x;
+                const iv wins = inside & (q > load<fv>(nearest_ + here));
+                for (int k = 0; k < lanes && x + k < lens_.width; ++k) {
+                    if (!wins[k] || !owns(triangle, lens_.ray(x + k, y))) continue;
+                    float& most = front[here - at(first_) + k];
+                    if (q[k] > most) most = q[k], visible_[here + k] = number;
+                    if (images_.rgb) mix(x + k, y, q[k], number);
+                }
+            });
+            ++number;
+        }
+    }
+}
+
+// Depth along the optical axis, metres; inf beyond the view's end.
+void Band::measure() const {
+    const float none = std::numeric_limits<float>::infinity(), far = view_.far;
+    for (int y = first_; y < last_; ++y) {
+        const float* from = nearest_ + at(y);
+        float* to = images_.depth + std::size_t(y - view_.first) * lens_.width;
+        if (lens_.pinhole) {
+            for (int x = 0; x < lens_.width; ++x) {
+                const float depth = 1.0f / from[x];
+                to[x] = depth > far ? none : depth;
+            }
+        } else {
+            const float* ahead = &lens_.z[std::size_t(y) * lens_.stride];
+            for (int x = 0; x < lens_.width; ++x) {
+                const float depth = 1.0f / from[x] * ahead[x];
+                to[x] = ahead[x] > 0.0f && depth <= far ? depth : none;
+            }
+        }
+    }
+}
+
+// Number of each pixel's geom; -1 for none.
+void Band::number() const {
+    for (int y = first_; y < last_; ++y) {
+        const std::int32_t* seen = visible_ + at(y);
+        std::int32_t* to = images_.numbers + std::size_t(y - view_.first) * lens_.width;
+        for (int left = 0, right; left < lens_.width; left = right) {
+            const std::int32_t number = seen[left];
+            for (right = left + 1; right < lens_.width && seen[right] == number;) ++right;
+            const std::int32_t found =
+                number < 0 ? -1 : scene_.placed_[triangle(number).geom].geom->number;
+            std::fill(to + left, to + right, found);
+        }
+    }
+}
+
+}  // namespace raster

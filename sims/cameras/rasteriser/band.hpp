@@ -1,0 +1,70 @@
+// Some rows of a frame, drawn by one thread: which triangle each pixel sees, and its colour.
+#pragma once
+
+#include "scene.hpp"
+
+namespace raster {
+
+class Band {
+  public:
+    Band(Scene& scene, int first, int last, const Images& images);
+    void draw();
+
+  private:
+    static constexpr int run = 16;  // pixels side by side with one level of a mipmap
+
+    const Triangle& triangle(std::int32_t number) const;
+    std::int32_t& surface_of(std::int32_t number);
+    const Surface& surface(std::int32_t number);
+    template <typename Found>
+    void over(const Triangle& triangle, Found found);
+    template <typename Found>
+    void over_square(const Triangle& triangle, int square, int column, int row, int side,
+                     Found found);
+    template <typename Found>
+    void scan_frame(const Triangle& triangle, Found found);
+    template <typename Found>
+    void over_leaf(const Triangle& triangle, int left, int top, Found found);
+    template <typename Found>
+    bool scan_pixels(const Triangle& triangle, int left, int right, int top, int bottom,
+                     Found found) const;
+    void cover(const Triangle& triangle, std::int32_t number);
+    void shade();
+    void place(int y, int left, int right, std::int32_t number);
+    void place_sky(int y, int left, int right);
+    void plain(int x);
+    template <bool pinhole>
+    void place(const Surface& surface, int x, int y, const float* nearest, int count);
+    template <bool pinhole>
+    int detail(const Surface& surface, int x, int y, float inverse) const;
+    Colours colours(int x);
+    void mix(int x, int y, float nearest, std::int32_t number);
+    void write(std::uint8_t* to, Colours colours, int count) const;
+    void blend();
+    void measure() const;
+    void number() const;
+
+    std::size_t at(int y) const { return std::size_t(y - view_.first) * lens_.stride; }
+    std::size_t leaf(int x, int y) const {
+        return std::size_t(y / Lens::smallest - first_ / Lens::smallest) *
+                   (lens_.stride / Lens::smallest) + x / Lens::smallest;
+    }
+    std::uint8_t* row(int y) const {
+        return images_.rgb + std::size_t(y - view_.first) * lens_.width * 3;
+    }
+
+    const Scene& scene_;
+    const Lens& lens_;
+    const View& view_;
+    const int first_, last_;  // rows: first to last - 1
+    const Images images_;
+    std::uint8_t* const end_;  // of its rows of colours
+    float* const nearest_;     // of the frame
+    std::int32_t* const visible_;
+    Taps taps_;
+    std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
+    std::vector<Surface> surfaces_;
+    std::vector<std::vector<std::int32_t>> surface_of_;  // by part and triangle; -1: none yet
+};
+
+}  // namespace raster
