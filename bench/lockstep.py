@@ -31,7 +31,9 @@ from runtime.channels.digest import Digest
 from runtime.config.reading import parse
 from runtime.run.execute import execute
 from runtime.workers.shared_memory import SharedPipe, anonymous_file
-from sims.cameras.response import generator, noisy_depth, noisy_image
+from sims.cameras import CameraSpec
+from sims.cameras.development import Development
+from sims.cameras.response import generator
 from sims.sensors import ImuNoise, ImuParameters
 from sims.vehicle import STANDING_HEIGHT, Autopilot, Physics, attach_vehicle
 from sims.worlds import load_world
@@ -200,9 +202,11 @@ def _noise() -> float:
     colours, depth = _images()
     random = generator(1, "camera", 0)
 
+    camera = Development(CameraSpec(name="camera", noise=NOISE, depth_noise=DEPTH_NOISE))
+
     def add() -> None:
-        noisy_image(colours, NOISE, random)
-        noisy_depth(depth, DEPTH_NOISE, random)
+        camera.develop([colours], random)
+        camera.measure(depth, (), random)
 
     return _cost(add)
 

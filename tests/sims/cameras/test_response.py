@@ -5,18 +5,34 @@ Automatic exposure in a run: what each image says of it, and that no worker has 
 
 from __future__ import annotations
 
+import ctypes
+import hashlib
+import itertools
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from events import CameraAnnouncement, Image
 from events.camera_info import srgb_light
 from runtime.testing import NodeResult, run_node
-from sims.cameras import response as noise
-from sims.cameras.response import generator, noisy_depth, noisy_image
+from sims.cameras import CameraSpec
+from sims.cameras.development import (
+    Development,
+    Passes,
+    _at,
+    _quantiles,
+    noise_key,
+    random_words,
+)
+from sims.cameras.raster import libraries
+from sims.cameras.response import generator
+from sims.cameras.spec import DepthSensor
 from sims.computer_vision import FreeCamera
 
 GREY = np.full((400, 400, 3), 128, np.uint8)
@@ -27,13 +43,31 @@ ENOUGH = 5.0 / 400
 Array = npt.NDArray[np.float64]
 
 
+def noisy_image(image: npt.NDArray[np.uint8], sigma: float, random: np.random.Generator) -> Array:
+    spec = CameraSpec(name="c", noise=sigma)
+    return Development(spec).develop([image], random).astype(np.float64)
+
+
+def noisy_depth(
+    depth: npt.NDArray[np.float32], coefficient: float, random: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    spec = CameraSpec(name="c", depth_noise=coefficient)
+    return Development(spec).measure(depth, (), random)
+
+
 def image_noise(sigma: float, stamp: int = 7, camera: str = "c", seed: int = 1) -> Array:
-    random = generator(seed, camera, stamp)
-    return noisy_image(GREY, sigma, random).astype(np.float64) - 128.0
+    return noisy_image(GREY, sigma, generator(seed, camera, stamp)) - 128.0
 
 
 def depth_noise(coefficient: float, stamp: int = 7) -> Array:
     return noisy_depth(DEPTH, coefficient, generator(1, "c", stamp)).astype(np.float64) - 2.0
+
+
+def shot_noise() -> Array:
+    """Of a linear image sensor, 32 electrons a grey level."""
+    spec = CameraSpec(name="c", response="linear", full_well=8160.0, gain=2.0)
+    found = Development(spec).develop([GREY], generator(1, "c", 7), gain=2.0)
+    return found.astype(np.float64)
 
 
 def correlation(a: Array, b: Array) -> float:
@@ -64,7 +98,11 @@ def test_depth_noise_grows_with_the_square_of_depth() -> None:
     assert far.std() == pytest.approx(0.05, rel=0.01)
 
 
-@pytest.mark.parametrize("found", [image_noise(10.0), depth_noise(0.002)], ids=["image", "depth"])
+@pytest.mark.parametrize(
+    "found",
+    [image_noise(10.0), shot_noise(), depth_noise(0.002)],
+    ids=["image", "shot", "depth"],
+)
 def test_noise_is_white(found: Array) -> None:
     """No pixel says anything of its neighbours, and no channel of the others."""
     for shift in range(1, 5):
@@ -73,6 +111,14 @@ def test_noise_is_white(found: Array) -> None:
     if found.ndim == 3:
         assert abs(correlation(found[..., 0], found[..., 1])) < ENOUGH
         assert abs(correlation(found[..., 0], found[..., 2])) < ENOUGH
+        assert abs(correlation(found[..., 1], found[..., 2])) < ENOUGH
+    flat = found.ravel()  # random numbers are made in blocks of 8, groups of 64 and chunks of 512
+    for shift in (5, 6, 8, 16, 32, 48, 64, 128, 512, 1200):
+        assert abs(correlation(flat[:-shift], flat[shift:])) < ENOUGH
+        size = np.square(flat - flat.mean())
+        assert abs(correlation(size[:-shift], size[shift:])) < ENOUGH
+    spectrum = np.abs(np.fft.rfft(flat - flat.mean())) ** 2 / (flat.size * flat.var())
+    assert spectrum.max() < 25.0  # exponential with mean 1: one of 240,000 beyond it in 3e5 images
 
 
 def test_each_exposure_has_its_own_noise() -> None:
@@ -84,7 +130,7 @@ def test_each_exposure_has_its_own_noise() -> None:
         shifted = correlation(first[:200], other[200:])
         assert abs(shifted) < 2 * ENOUGH
     random = generator(1, "c", 7)
-    seen = noisy_image(GREY, 10.0, random).astype(np.float64)
+    seen = noisy_image(GREY, 10.0, random)
     measured = noisy_depth(DEPTH, 0.002, random).astype(np.float64)
     assert abs(correlation(seen[..., 0], measured)) < ENOUGH
 
@@ -117,20 +163,112 @@ def test_what_was_not_hit_stays_so() -> None:
 
 
 def test_no_noise_costs_nothing() -> None:
+    """Neither an image's copy nor a random number."""
     random = generator(1, "c", 7)
-    assert noisy_image(GREY, 0.0, random) is GREY
-    assert noisy_depth(DEPTH, 0.0, random) is DEPTH
+    state = str(random.bit_generator.state)
+    ideal = Development(CameraSpec(name="c"))
+    assert ideal.develop([GREY], random) is GREY
+    assert ideal.measure(DEPTH, (), random) is DEPTH
+    assert str(random.bit_generator.state) == state
 
 
-def test_both_ways_of_looking_up_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    """OpenCV from version 5 on, and numpy, give the same bits."""
-    first = image_noise(3.0), depth_noise(0.002)
-    monkeypatch.setattr(noise, "_TABLES_OF_16_BITS", not noise._TABLES_OF_16_BITS)
-    np.testing.assert_array_equal(image_noise(3.0), first[0])
-    np.testing.assert_array_equal(depth_noise(0.002), first[1])
+@pytest.mark.parametrize(
+    ("rounds", "expected"),
+    [
+        (7, "5f6fb709 0d893f64 4f121f81 4f730a48"),
+        (10, "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
+    ],
+)
+def test_random_numbers_are_those_of_philox(rounds: int, expected: str) -> None:
+    """Known answers of Random123 (``kat_vectors``), for counter and key 0."""
+    words = random_words(np.zeros(4, np.uint32), 0, 64, rounds).view(np.uint32)
+    assert " ".join(f"{word:08x}" for word in words[::8]) == expected
 
 
-pytestmark = pytest.mark.slow
+def test_every_word_of_the_key_makes_other_random_numbers() -> None:
+    """So does the stream; and a longer image's numbers begin with those of a shorter one."""
+    key = np.array([5, 6, 7, 8], np.uint32)
+    words = random_words(key, 1, 64 * 100)
+    assert len(np.unique(words.view(np.uint64))) == 16 * 100
+    np.testing.assert_array_equal(random_words(key, 1, 1000), words[:1000])
+    for other in range(4):
+        changed = key.copy()
+        changed[other] += 1
+        assert (random_words(changed, 1, 6400) == words).mean() < 0.001
+    assert (random_words(key, 0, 6400) == words).mean() < 0.001
+
+
+SPOILT: dict[str, Any] = {
+    "noise": 2.0, "full_well": 5000.0, "vignette": (-0.3, 0.05), "response": "gamma",
+}  # fmt: skip
+FORMS: list[tuple[dict[str, Any], str]] = [
+    ({"noise": 3.0}, "5caad579aa8355f2"),
+    ({"depth_noise": 0.002}, "6411c8ab13fcb971"),
+    (SPOILT | {"blur": 0.8}, "9f668e8f45e5bc16"),
+    ({"depth_sensor": DepthSensor()}, "a79e054aaf61570b"),
+    ({"depth_sensor": DepthSensor(model="stereo", disparity_step=0.0)}, "4f01ad9ef69e802a"),
+]
+
+
+@pytest.mark.parametrize(("settings", "expected"), FORMS)
+def test_bytes_are_the_same_with_all_instructions(settings: dict[str, Any], expected: str) -> None:
+    """In C++ and in numpy, on every machine, of odd sizes; and OpenCV's have no say in it."""
+    spec = CameraSpec(name="c", width=161, height=123, **settings)
+    scene = np.random.default_rng(3)
+    images = [scene.integers(0, 256, (123, 81, 3), np.uint8) for _ in range(3)]
+    images = [image.repeat(2, axis=1)[:, :161] for image in images]
+    depth = scene.uniform(0.5, 6.0, (5, 7)).astype(np.float32)
+    depth = depth.repeat(25, axis=0)[:123].repeat(23, axis=1)
+    depth[:9] = np.inf
+    hashes = set()
+    for instructions, optimized in itertools.product((*libraries(), "numpy"), (True, False)):
+        cv2.setUseOptimized(optimized)
+        try:
+            development = Development(spec, instructions)
+            random = generator(1, "c", 7)
+            found = (
+                development.develop(images, random),
+                development.develop(images[:1], random),
+                development.develop([image[..., 1] for image in images], random),
+                development.measure(depth, images, random),
+            )
+        finally:
+            cv2.setUseOptimized(True)
+        hashes.add(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest()[:16])
+    assert hashes == {expected}
+
+
+def test_cameras_have_noise_where_nothing_was_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with MuJoCo's renderer on a machine without a compiler; and it is the same."""
+    compiled = image_noise(3.0)
+    monkeypatch.setattr("sims.cameras.development.libraries", dict)
+    np.testing.assert_array_equal(image_noise(3.0), compiled)
+
+
+@given(st.lists(st.integers(0, 4000), max_size=5), st.booleans(), st.sampled_from([*libraries()]))
+def test_parts_of_an_image_are_those_of_the_whole(
+    cuts: list[int], wide: bool, instructions: str
+) -> None:
+    """However its samples are split: parts may be left to rows or threads of their own."""
+    spec = CameraSpec(name="c", width=50, height=80, **SPOILT)
+    light = np.random.default_rng(1).integers(0, 256, (80, 50), np.uint8)
+    image = light.astype(np.uint16) * 257 if wide else light
+    stages = Development(spec)._make_stages(wide, 2, 1.0, 1.0)
+    key = noise_key(generator(1, "c", 7))
+    whole = Passes(instructions).develop(image, stages, key)
+    depth = (1.0 + light).astype(np.float32)
+    deep = Passes(instructions).add_noise(depth, 0.002, key, square=True)
+    pieces, far = np.zeros_like(whole), np.zeros_like(deep)
+    table = _quantiles() * np.float32(0.002)
+    library = libraries()[instructions]
+    places = sorted({0, 4000, *cuts})
+    for first, last in reversed(list(itertools.pairwise(places))):
+        part = _at(key), ctypes.c_int64(first), ctypes.c_int64(last)
+        library.develop_image(*part, int(wide), _at(image), *map(_at, stages), _at(pieces))
+        library.develop_depth(*part, 1, *map(_at, (depth, table, far)))
+    np.testing.assert_array_equal(pieces, whole)
+    np.testing.assert_array_equal(far, deep)
+
 
 WORLD = """<mujoco><visual>
 <headlight ambient="{0} {0} {0}" diffuse="0 0 0" specular="0 0 0"/></visual>
@@ -166,6 +304,7 @@ def shutters(result: NodeResult) -> list[tuple[float, float]]:
     return [(image.exposure_time, image.gain) for image in result.of(Image)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ambient", "gained"), [(1.6, False), (0.16, True)])
 def test_images_of_a_bright_and_of_a_dark_world_come_right(
     tmp_path: Path, ambient: float, gained: bool
@@ -186,6 +325,7 @@ def test_images_of_a_bright_and_of_a_dark_world_come_right(
     assert announced.reference_exposure == 4e-3
 
 
+@pytest.mark.slow
 def test_who_renders_makes_no_difference(tmp_path: Path) -> None:
     """With late images, lost ones and three processes: the same exposures and the same bytes."""
     camera: dict[str, Any] = {"latency": "70ms", "jitter": "20ms", "loss": 0.2}
@@ -195,6 +335,7 @@ def test_who_renders_makes_no_difference(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.data, other.data)
 
 
+@pytest.mark.slow
 def test_an_image_has_no_effect_before_it_is_delivered(tmp_path: Path) -> None:
     """With a latency of three periods, the first four are exposed alike."""
     found = shutters(run(tmp_path, 1.6, latency="110ms"))
@@ -203,6 +344,7 @@ def test_an_image_has_no_effect_before_it_is_delivered(tmp_path: Path) -> None:
     assert found[4] != found[0]
 
 
+@pytest.mark.slow
 def test_an_image_of_a_fixed_camera_says_how_it_was_exposed(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"auto_exposure": None, "exposure": "2ms", "gain": 2.0}
     result = run(tmp_path, 0.9, **settings)
