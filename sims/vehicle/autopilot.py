@@ -30,7 +30,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from math import sqrt
-from typing import Any
+from typing import Any, get_args
 
 import mujoco
 import numpy as np
@@ -38,7 +38,7 @@ import numpy as np
 import events as ev
 from events import Vector3
 from events.frames import flip_yz, yaw_of
-from sims.vehicle.control import Controller, Motors, fault
+from sims.vehicle.control import Controller, Motors, Setpoint, fault
 from sims.vehicle.model import STANDING_HEIGHT, VehicleParameters, mover_of, name_of
 from sims.vehicle.physics import State
 from sims.vehicle.position import Gains, Limits
@@ -76,11 +76,23 @@ def teleport_fault(event: ev.Teleport) -> str | None:
     return None
 
 
-_NO_SETPOINTS = {
+_ON_GROUND = (Phase.DISARMED, Phase.ARMED)
+_BUSY = {
     Phase.DISARMED: "disarmed",
     Phase.TAKING_OFF: "taking off",
     Phase.LANDING: "landing",
 }
+_REFUSALS: dict[type[ev.Event], dict[Phase, str]] = {
+    ev.Arm: dict.fromkeys(set(Phase) - {Phase.DISARMED}, "already armed"),
+    ev.Disarm: {Phase.DISARMED: "already disarmed"},
+    ev.Takeoff: dict.fromkeys(set(Phase) - {*_ON_GROUND}, "already in the air"),
+    ev.Land: dict.fromkeys(_ON_GROUND, "not in the air") | {Phase.LANDING: "already landing"},
+    ev.Hover: dict.fromkeys(_ON_GROUND, "not in the air"),
+    ev.Teleport: {},
+    ev.Reset: {},
+    **dict.fromkeys(get_args(Setpoint), _BUSY),
+}
+"""Orders that a vehicle knows, and why it refuses them in some phases."""
 
 
 class Autopilot:
@@ -165,68 +177,35 @@ class Autopilot:
 
     def _refusal(self, event: ev.Event) -> str | None:
         """Return the reason to refuse a command now, or None."""
-        phase = self.phase
-        grounded = phase in (Phase.DISARMED, Phase.ARMED)
-        reason = None
-        match event:
-            case (
-                ev.PositionSetpoint()
-                | ev.VelocitySetpoint()
-                | ev.AttitudeSetpoint()
-                | ev.BodyRateSetpoint()
-                | ev.MotorSetpoint()
-            ):
-                reason = _NO_SETPOINTS.get(phase) or fault(event)
-            case ev.Arm():
-                reason = "already armed" if phase is not Phase.DISARMED else None
-            case ev.Disarm():
-                reason = "already disarmed" if phase is Phase.DISARMED else None
-            case ev.Takeoff():
-                if not grounded:
-                    reason = "already in the air"
-                elif not event.altitude > 0.0:
-                    reason = f"Takeoff.altitude: expected a number > 0, found {event.altitude}"
-            case ev.Land():
-                if grounded:
-                    reason = "not in the air"
-                elif phase is Phase.LANDING:
-                    reason = "already landing"
-            case ev.Hover():
-                reason = "not in the air" if grounded else None
-            case ev.Teleport():
-                reason = teleport_fault(event)
-            case ev.Reset():
-                reason = None
-            case _:
-                reason = f"{type(event).__name__} is no command of a vehicle"
-        return reason
+        if type(event) not in _REFUSALS:
+            return f"{type(event).__name__} is no command of a vehicle"
+        if reason := _REFUSALS[type(event)].get(self.phase):
+            return reason
+        if isinstance(event, Setpoint):
+            return fault(event)
+        if isinstance(event, ev.Takeoff) and not event.altitude > 0.0:
+            return f"Takeoff.altitude: expected a number > 0, found {event.altitude}"
+        return teleport_fault(event) if isinstance(event, ev.Teleport) else None
 
     def _accept(self, event: ev.Event) -> None:
         match event:
             case ev.Arm():
                 self._arm()
-                return
-            case ev.Disarm():
-                self._disarm()
-                return
-            case ev.Reset():
+            case ev.Disarm() | ev.Reset():
                 if self.phase is not Phase.DISARMED:
                     self._disarm()
-                return
             case ev.Teleport():
                 self._controller.reset()
-                if self.phase in (Phase.DISARMED, Phase.ARMED):
-                    return
-                self.phase = Phase.FLYING
+                if self.phase not in _ON_GROUND:
+                    self.phase, self._order = Phase.FLYING, event
             case ev.Takeoff():
                 if self.phase is Phase.DISARMED:
                     self._arm()
-                self.phase = Phase.TAKING_OFF
+                self.phase, self._order = Phase.TAKING_OFF, event
             case ev.Land():
-                self.phase = Phase.LANDING
+                self.phase, self._order = Phase.LANDING, event
             case _:
-                self.phase = Phase.FLYING
-        self._order = event
+                self.phase, self._order = Phase.FLYING, event
 
     def _arm(self) -> None:
         self.phase = Phase.ARMED
@@ -240,17 +219,11 @@ class Autopilot:
 
     def _begin(self, order: ev.Event, state: State) -> None:
         self._expires_ns = None
-        match order:
-            case ev.PositionSetpoint():
-                self._controller.follow(order, state)
-            case (
-                ev.VelocitySetpoint()
-                | ev.AttitudeSetpoint()
-                | ev.BodyRateSetpoint()
-                | ev.MotorSetpoint()
-            ):
-                self._controller.follow(order, state)
+        if isinstance(order, Setpoint):
+            self._controller.follow(order, state)
+            if not isinstance(order, ev.PositionSetpoint):
                 self._expires_ns = order.stamp + self._timeout_ns
+        match order:
             case ev.Takeoff():
                 self._yaw = yaw_of(state.orientation)
                 self._to_climb = order.altitude

@@ -5,14 +5,24 @@ The outer ones are in `position`; whether the vehicle may fly is `autopilot`'s b
 
 from __future__ import annotations
 
-from math import atan2, pi, sqrt
+from math import atan2, sqrt
+
+import numpy as np
 
 import events as ev
 from events import Quaternion, Vector3
-from events.frames import normalize, yaw_of
+from events.frames import inverse, multiply, normalize, yaw_of
 from sims.vehicle.model import Mixer, VehicleParameters
 from sims.vehicle.physics import State
-from sims.vehicle.position import Gains, Limits, PositionController
+from sims.vehicle.position import (
+    Derivative,
+    Gains,
+    Limits,
+    PositionController,
+    clip,
+    shortened,
+    wrapped,
+)
 
 
 class AttitudeController:
@@ -23,51 +33,26 @@ class AttitudeController:
     IEEE TCST 2018), so that a large yaw error does not bend the path.
     """
 
-    __slots__ = ("_tilt", "_tilt_rate", "_yaw", "_yaw_rate")
-
     def __init__(self, gains: Gains, limits: Limits) -> None:
-        self._tilt = gains.tilt
-        self._yaw = gains.yaw
-        self._tilt_rate = limits.tilt_rate
-        self._yaw_rate = limits.yaw_rate
+        self._gains = gains
+        self._limits = limits
 
     def update(self, orientation: Quaternion, target: Quaternion, yaw_rate: float) -> Vector3:
         """Return the body rates (rad/s, FRD) to a target, a yaw rate about down fed forward."""
-        w, x, y, z = orientation
-        tw, tx, ty, tz = target
-        # error = orientation⁻¹ ⊗ target: the turn still to make, seen from the body
-        ew = w * tw + x * tx + y * ty + z * tz
-        ex = w * tx - x * tw - y * tz + z * ty
-        ey = w * ty + x * tz - y * tw - z * tx
-        ez = w * tz - x * ty + y * tx - z * tw
+        ew, ex, ey, ez = multiply(inverse(orientation), target)  # the turn, seen from the body
         # error = swing ⊗ twist, the twist about z; the swing is never more than half a turn
         twist = sqrt(ew * ew + ez * ez)
         if twist > 1e-6:
             sx = (ew * ex - ey * ez) / twist
             sy = (ew * ey + ex * ez) / twist
-            turn = 2.0 * atan2(ez, ew)
-            if turn > pi:
-                turn -= 2.0 * pi
-            elif turn < -pi:
-                turn += 2.0 * pi
+            turn = wrapped(2.0 * atan2(ez, ew))
         else:  # upside down: any way round is as short, and yaw says nothing
             sx, sy, turn = ex, ey, 0.0
-        gain = 2.0 * self._tilt
-        rx = gain * sx
-        ry = gain * sy
-        limit = self._tilt_rate
-        square = rx * rx + ry * ry
-        if square > limit * limit:
-            scale = limit / sqrt(square)
-            rx *= scale
-            ry *= scale
-        rz = self._yaw * turn
-        limit = self._yaw_rate
-        if rz > limit:
-            rz = limit
-        elif rz < -limit:
-            rz = -limit
+        gain = 2.0 * self._gains.tilt
+        rx, ry = shortened(gain * sx, gain * sy, self._limits.tilt_rate)
+        rz = clip(self._gains.yaw * turn, self._limits.yaw_rate)
         if yaw_rate:  # about the world's z, whose coordinates in the body are the last row of R
+            w, x, y, z = orientation
             rx += yaw_rate * 2.0 * (x * z - w * y)
             ry += yaw_rate * 2.0 * (y * z + w * x)
             rz += yaw_rate * (1.0 - 2.0 * (x * x + y * y))
@@ -77,66 +62,34 @@ class AttitudeController:
 class BodyRateController:
     """PID on body rates, with the derivative of the measurement and the gyroscopic torque."""
 
-    __slots__ = (
-        "_cutoff", "_dx", "_dy", "_ix", "_iy", "_iz", "_jx", "_jy", "_jz", "_kd", "_ki", "_kiz",
-        "_kp", "_kpz", "_started", "_wx", "_wy",
-    )  # fmt: skip
-
     _INTEGRAL = 10.0  # limit of an integrator, rad/s²
 
     def __init__(self, parameters: VehicleParameters, gains: Gains) -> None:
-        self._jx, self._jy, self._jz = parameters.inertia
-        self._kp = gains.rate_xy_p
-        self._ki = gains.rate_xy_i
-        self._kd = gains.rate_xy_d
-        self._kpz = gains.rate_z_p
-        self._kiz = gains.rate_z_i
-        self._cutoff = 2.0 * pi * gains.derivative_cutoff
+        self._inertia = parameters.inertia
+        level = gains.rate_xy_p, gains.rate_xy_i, gains.rate_xy_d
+        self._gains = (level, level, (gains.rate_z_p, gains.rate_z_i, 0.0))
+        self._derivative = Derivative(gains.derivative_cutoff)
         self.reset()
 
     def reset(self) -> None:
         """Forget integrals and the last measurement."""
-        self._ix = self._iy = self._iz = 0.0
-        self._dx = self._dy = 0.0
-        self._wx = self._wy = 0.0
-        self._started = False
+        self._integrals = [0.0, 0.0, 0.0]
+        self._derivative.reset()
 
     def update(self, rates: Vector3, target: Vector3, dt: float) -> Vector3:
         """Return the torque (N m, FRD) to bring `rates` to `target` (both rad/s, FRD)."""
-        wx, wy, wz = rates
-        tx, ty, tz = target
-        if self._started:
-            share = self._cutoff * dt
-            share /= 1.0 + share
-            dx = self._dx
-            dx += share * ((wx - self._wx) / dt - dx)
-            dy = self._dy
-            dy += share * ((wy - self._wy) / dt - dy)
-            self._dx = dx
-            self._dy = dy
-        else:
-            dx = dy = 0.0
-            self._started = True
-        self._wx = wx
-        self._wy = wy
-        ex = tx - wx
-        ey = ty - wy
-        ez = tz - wz
-        bound = self._INTEGRAL
-        gain = self._ki * dt
-        self._ix = ix = min(bound, max(-bound, self._ix + gain * ex))
-        self._iy = iy = min(bound, max(-bound, self._iy + gain * ey))
-        self._iz = iz = min(bound, max(-bound, self._iz + self._kiz * dt * ez))
-        jx = self._jx
-        jy = self._jy
-        jz = self._jz
-        kp = self._kp
-        kd = self._kd
+        slopes = self._derivative.update(rates, dt)
+        wanted = []
+        for axis, (p, i, d) in enumerate(self._gains):
+            error = target[axis] - rates[axis]
+            self._integrals[axis] = clip(self._integrals[axis] + i * dt * error, self._INTEGRAL)
+            wanted.append(p * error + self._integrals[axis] - d * slopes[axis])
+        (ax, ay, az), (wx, wy, wz), (jx, jy, jz) = wanted, rates, self._inertia
         # J α + ω × J ω, Euler's equations
         return (
-            jx * (kp * ex + ix - kd * dx) + (jz - jy) * wy * wz,
-            jy * (kp * ey + iy - kd * dy) + (jx - jz) * wz * wx,
-            jz * (self._kpz * ez + iz) + (jy - jx) * wx * wy,
+            jx * ax + (jz - jy) * wy * wz,
+            jy * ay + (jx - jz) * wz * wx,
+            jz * az + (jy - jx) * wx * wy,
         )
 
 
@@ -208,12 +161,12 @@ class Controller:
                 tilt, yaw = self._limits.tilt_rate, self._limits.yaw_rate
                 x, y, z = setpoint.angular_velocity
                 self._target = None
-                self._target_rates = (_clip(x, tilt), _clip(y, tilt), _clip(z, yaw))
+                self._target_rates = (clip(x, tilt), clip(y, tilt), clip(z, yaw))
                 self._take_thrust(setpoint.thrust)
             case ev.MotorSetpoint():
-                a, b, c, d = setpoint.motor1, setpoint.motor2, setpoint.motor3, setpoint.motor4
                 self._take_thrust(0.0)
-                self._motors = (_share(a), _share(b), _share(c), _share(d))
+                a, b, c, d = (_share(getattr(setpoint, name)) for name in _NUMBERS[type(setpoint)])
+                self._motors = (a, b, c, d)
 
     def hold(self, position: Vector3, velocity: Vector3, yaw: float) -> None:
         """Fly to a position (m, NED) with a velocity (m/s, NED), for the autopilot's manoeuvres."""
@@ -266,10 +219,6 @@ def _share(value: float) -> float:
     return min(1.0, max(0.0, value))
 
 
-def _clip(value: float, limit: float) -> float:
-    return min(limit, max(-limit, value))
-
-
 Setpoint = (
     ev.PositionSetpoint
     | ev.VelocitySetpoint
@@ -281,26 +230,23 @@ Setpoint = (
 
 MOST = 1e6  # in SI units; squares of much greater numbers would overflow in the control loops
 
+_NUMBERS: dict[type[Setpoint], tuple[str, ...]] = {
+    ev.PositionSetpoint: ("position", "velocity", "acceleration", "yaw", "yaw_rate"),
+    ev.VelocitySetpoint: ("velocity", "yaw_rate"),
+    ev.AttitudeSetpoint: ("thrust",),
+    ev.BodyRateSetpoint: ("angular_velocity", "thrust"),
+    ev.MotorSetpoint: ("motor1", "motor2", "motor3", "motor4"),
+}
+"""Fields of set-points that must be numbers up to `MOST`."""
+
 
 def fault(setpoint: Setpoint) -> str | None:
     """Return the error in a set-point, or None."""
-    match setpoint:
-        case ev.PositionSetpoint():
-            numbers = [*setpoint.position, *setpoint.velocity, *setpoint.acceleration]
-            numbers += [setpoint.yaw, setpoint.yaw_rate]
-        case ev.VelocitySetpoint():
-            if setpoint.frame_id not in ("map", "heading"):
-                return (
-                    "VelocitySetpoint.frame_id: expected 'map' or 'heading', "
-                    f"found {setpoint.frame_id!r}"
-                )
-            numbers = [*setpoint.velocity, setpoint.yaw_rate]
-        case ev.AttitudeSetpoint():
-            numbers = [setpoint.thrust]
-        case ev.BodyRateSetpoint():
-            numbers = [*setpoint.angular_velocity, setpoint.thrust]
-        case ev.MotorSetpoint():
-            numbers = [setpoint.motor1, setpoint.motor2, setpoint.motor3, setpoint.motor4]
-    if not all(-MOST <= number <= MOST for number in numbers):
+    if isinstance(setpoint, ev.VelocitySetpoint) and setpoint.frame_id not in ("map", "heading"):
+        return (
+            f"VelocitySetpoint.frame_id: expected 'map' or 'heading', found {setpoint.frame_id!r}"
+        )
+    numbers = np.hstack([getattr(setpoint, name) for name in _NUMBERS[type(setpoint)]])
+    if not (np.abs(numbers) <= MOST).all():
         return f"{type(setpoint).__name__}: expected numbers up to {MOST:g}, found {setpoint}"
     return None

@@ -175,47 +175,19 @@ class Mixer:
         self, thrust: float, roll: float, pitch: float, yaw: float
     ) -> tuple[float, float, float, float]:
         """Return the motor commands, 0 to 1 each, closest to the requested wrench."""
-        a, b, c, d = self._roll
-        e, f, g, h = self._pitch
-        m0 = a * roll + e * pitch
-        m1 = b * roll + f * pitch
-        m2 = c * roll + g * pitch
-        m3 = d * roll + h * pitch
-        low = min(m0, m1, m2, m3)
-        high = max(m0, m1, m2, m3)
-        if high - low > 1.0:
-            scale = 1.0 / (high - low)
-            m0 *= scale
-            m1 *= scale
-            m2 *= scale
-            m3 *= scale
-            low *= scale
-            high *= scale
-        base = thrust * self._thrust
-        if base > 1.0 - high:
-            base = 1.0 - high
-        if base < -low:
-            base = -low
-        m0 += base
-        m1 += base
-        m2 += base
-        m3 += base
-        a, b, c, d = self._yaw
-        a *= yaw
-        b *= yaw
-        c *= yaw
-        d *= yaw
-        n0 = m0 + a
-        n1 = m1 + b
-        n2 = m2 + c
-        n3 = m3 + d
-        if min(n0, n1, n2, n3) < 0.0 or max(n0, n1, n2, n3) > 1.0:
-            share = min(_room(m0, a), _room(m1, b), _room(m2, c), _room(m3, d))
-            n0 = min(1.0, max(0.0, m0 + share * a))
-            n1 = min(1.0, max(0.0, m1 + share * b))
-            n2 = min(1.0, max(0.0, m2 + share * c))
-            n3 = min(1.0, max(0.0, m3 + share * d))
-        return n0, n1, n2, n3
+        motors = [r * roll + p * pitch for r, p in zip(self._roll, self._pitch, strict=True)]
+        span = max(motors) - min(motors)
+        if span > 1.0:
+            scale = 1.0 / span
+            motors = [motor * scale for motor in motors]
+        base = max(-min(motors), min(1.0 - max(motors), thrust * self._thrust))
+        turns = [effect * yaw for effect in self._yaw]
+        pairs = [(motor + base, turn) for motor, turn in zip(motors, turns, strict=True)]
+        a, b, c, d = (motor + turn for motor, turn in pairs)
+        if min(a, b, c, d) < 0.0 or max(a, b, c, d) > 1.0:
+            share = min(_room(motor, turn) for motor, turn in pairs)
+            a, b, c, d = (min(1.0, max(0.0, motor + share * turn)) for motor, turn in pairs)
+        return a, b, c, d
 
 
 def _room(motor: float, change: float) -> float:

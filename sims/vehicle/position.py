@@ -104,6 +104,53 @@ _LARGE = 0.5 * 0.5
 """Square of the velocity error (m/s) that halves the learning rate: a manoeuvre is no wind."""
 
 
+def clip(value: float, limit: float) -> float:
+    """Return a number within a limit either way."""
+    return min(limit, max(-limit, value))
+
+
+def shortened(x: float, y: float, longest: float) -> tuple[float, float]:
+    """Return a vector of the same direction, no longer than a limit."""
+    square = x * x + y * y
+    if square <= longest * longest:
+        return x, y
+    scale = longest / sqrt(square)
+    return x * scale, y * scale
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle of up to a turn and a half as one of up to half a turn, radians."""
+    if angle > pi:
+        return angle - 2.0 * pi
+    return angle + 2.0 * pi if angle < -pi else angle
+
+
+class Derivative:
+    """Derivative of a measured vector, through a low-pass filter; zero until the second."""
+
+    def __init__(self, cutoff: float) -> None:
+        self._cutoff = 2.0 * pi * cutoff  # given in Hz
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the measurements."""
+        self._before: Vector3 | None = None
+        self._value: Vector3 = (0.0, 0.0, 0.0)
+
+    def update(self, measured: Vector3, dt: float) -> Vector3:
+        """Return the derivative at a measurement, `dt` seconds after the last one."""
+        if self._before is not None:
+            share = self._cutoff * dt
+            share /= 1.0 + share
+            x, y, z = (
+                value + share * ((now - before) / dt - value)
+                for value, now, before in zip(self._value, measured, self._before, strict=True)
+            )
+            self._value = (x, y, z)
+        self._before = measured
+        return self._value
+
+
 class PositionController:
     """Controller of position or velocity, with a single target at a time.
 
@@ -111,13 +158,6 @@ class PositionController:
     control for quadrotors*, ICRA 2011, with the yaw of the ZYX angles as heading even when tilted,
     as in PX4.
     """
-
-    __slots__ = (
-        "_ax", "_ay", "_az", "_braking", "_cutoff", "_dx", "_dy", "_dz", "_gains", "_gravity",
-        "_heading_frame", "_hold_xy", "_hold_z", "_ix", "_iy", "_iz", "_lift_max", "_lift_min",
-        "_limits", "_lvx", "_lvy", "_lvz", "_mass", "_px", "_py", "_pz", "_specific_max",
-        "_started", "_tan_tilt", "_thrust_max", "_vx", "_vy", "_vz", "_yaw_rate", "yaw",
-    )  # fmt: skip
 
     def __init__(self, parameters: VehicleParameters, gains: Gains, limits: Limits) -> None:
         self._gains = gains
@@ -129,10 +169,8 @@ class PositionController:
         self._lift_min = limits.min_thrust * self._specific_max
         self._lift_max = limits.max_thrust * self._specific_max
         self._tan_tilt = tan(limits.tilt)
-        self._cutoff = 2.0 * pi * gains.derivative_cutoff
-        self._px = self._py = self._pz = 0.0
-        self._vx = self._vy = self._vz = 0.0
-        self._ax = self._ay = self._az = 0.0
+        self._derivative = Derivative(gains.derivative_cutoff)
+        self._place = self._velocity = self._acceleration = (0.0, 0.0, 0.0)
         self.yaw = self._yaw_rate = 0.0
         self._hold_xy = self._hold_z = self._braking = self._heading_frame = False
         self.reset()
@@ -140,9 +178,7 @@ class PositionController:
     def reset(self) -> None:
         """Forget integrals and the last measurement; the target stays."""
         self._ix = self._iy = self._iz = 0.0
-        self._dx = self._dy = self._dz = 0.0
-        self._lvx = self._lvy = self._lvz = 0.0
-        self._started = False
+        self._derivative.reset()
 
     def to_position(
         self,
@@ -153,11 +189,8 @@ class PositionController:
         yaw_rate: float = 0.0,
     ) -> None:
         """Fly to a position (m, NED), with a velocity, acceleration and yaw expected there."""
-        self._px, self._py, self._pz = position
-        self._vx, self._vy, self._vz = velocity
-        self._ax, self._ay, self._az = acceleration
-        self.yaw = yaw
-        self._yaw_rate = yaw_rate
+        self._place, self._velocity, self._acceleration = position, velocity, acceleration
+        self.yaw, self._yaw_rate = yaw, yaw_rate
         self._hold_xy = self._hold_z = True
         self._braking = self._heading_frame = False
 
@@ -165,11 +198,8 @@ class PositionController:
         self, velocity: Vector3, yaw: float, yaw_rate: float = 0.0, heading_frame: bool = False
     ) -> None:
         """Move at a velocity (m/s NED, or right of the heading), from `yaw` on at `yaw_rate`."""
-        self._vx, self._vy, self._vz = velocity
-        self._ax = self._ay = self._az = 0.0
-        self.yaw = yaw
-        limit = self._limits.yaw_rate
-        self._yaw_rate = min(limit, max(-limit, yaw_rate))
+        self._velocity, self._acceleration = velocity, (0.0, 0.0, 0.0)
+        self.yaw, self._yaw_rate = yaw, clip(yaw_rate, self._limits.yaw_rate)
         self._hold_xy = self._hold_z = self._braking = False
         self._heading_frame = heading_frame
 
@@ -182,87 +212,25 @@ class PositionController:
         """Return the attitude (FRD → NED), the thrust (N) and the yaw rate (rad/s) to fly now."""
         gains = self._gains
         limits = self._limits
-        x, y, z = state.position
-        vx, vy, vz = state.velocity
-        yaw = self.yaw
         if self._braking:
-            self._take_hold(x, y, z, vx, vy, vz)
+            self._take_hold(state)
         if not self._hold_xy and self._yaw_rate:
-            yaw += self._yaw_rate * dt
-            if yaw > pi:
-                yaw -= 2.0 * pi
-            elif yaw < -pi:
-                yaw += 2.0 * pi
-            self.yaw = yaw
+            self.yaw = wrapped(self.yaw + self._yaw_rate * dt)
+        tx, ty, tz = self._wanted_velocity(state)
 
-        # Position to velocity. Far away the speed follows the parabola that ends in the place at
-        # the approach's deceleration; near it is proportional (the "square root controller").
-        tx = self._vx
-        ty = self._vy
-        if self._hold_xy:
-            ex = self._px - x
-            ey = self._py - y
-            gain = gains.position_xy
-            distance = sqrt(ex * ex + ey * ey)
-            near = limits.approach / (gain * gain)
-            if distance > near:
-                gain = sqrt(2.0 * limits.approach * (distance - 0.5 * near)) / distance
-            tx += gain * ex
-            ty += gain * ey
-        elif self._heading_frame:
-            heading = yaw_of(state.orientation)
-            c = cos(heading)
-            s = sin(heading)
-            tx, ty = c * tx - s * ty, s * tx + c * ty
-        square = tx * tx + ty * ty
-        if square > limits.speed * limits.speed:
-            scale = limits.speed / sqrt(square)
-            tx *= scale
-            ty *= scale
-        tz = self._vz
-        if self._hold_z:
-            ez = self._pz - z
-            gain = gains.position_z
-            distance = abs(ez)
-            near = limits.approach / (gain * gain)
-            if distance > near:
-                gain = sqrt(2.0 * limits.approach * (distance - 0.5 * near)) / distance
-            tz += gain * ez
-        if tz > limits.descent:
-            tz = limits.descent
-        elif tz < -limits.climb:
-            tz = -limits.climb
-
-        # Velocity to acceleration; derivatives of what is measured, so that steps do not kick.
-        dx = self._dx
-        dy = self._dy
-        dz = self._dz
-        if self._started:
-            share = self._cutoff * dt
-            share /= 1.0 + share
-            self._dx = dx = dx + share * ((vx - self._lvx) / dt - dx)
-            self._dy = dy = dy + share * ((vy - self._lvy) / dt - dy)
-            self._dz = dz = dz + share * ((vz - self._lvz) / dt - dz)
-        else:
-            self._started = True
-        self._lvx = vx
-        self._lvy = vy
-        self._lvz = vz
-        ex = tx - vx
-        ey = ty - vy
-        ez = tz - vz
-        kp = gains.velocity_xy_p
-        kd = gains.velocity_xy_d
-        # The derivative opposes acceleration that nobody asked for, not the feed-forward's.
-        ax = self._ax + kp * ex + self._ix - kd * (dx - self._ax)
-        ay = self._ay + kp * ey + self._iy - kd * (dy - self._ay)
-        az = (
-            self._az + gains.velocity_z_p * ez + self._iz - gains.velocity_z_d * (dz - self._az)
-        )  # fmt: skip
+        # Velocity to acceleration; derivatives of what is measured, so that steps do not kick. The
+        # derivative opposes acceleration that nobody asked for, not the feed-forward's.
+        vx, vy, vz = state.velocity
+        dx, dy, dz = self._derivative.update(state.velocity, dt)
+        ax, ay, az = self._acceleration
+        ex, ey, ez = tx - vx, ty - vy, tz - vz
+        kp, kd = gains.velocity_xy_p, gains.velocity_xy_d
+        ax = ax + kp * ex + self._ix - kd * (dx - ax)
+        ay = ay + kp * ey + self._iy - kd * (dy - ay)
+        az = az + gains.velocity_z_p * ez + self._iz - gains.velocity_z_d * (dz - az)
 
         # Acceleration to thrust: the vertical first, then what tilt and motors leave. Integrators
         # stand still while what they would add is cut off anyway.
-        bound = limits.integral
         lift = self._gravity - az
         if lift > self._lift_max:
             lift = self._lift_max
@@ -274,25 +242,19 @@ class PositionController:
             wind = True
         if wind:
             gain = gains.velocity_z_i * dt / (1.0 + ez * ez / _LARGE)
-            self._iz = min(bound, max(-bound, self._iz + gain * ez))
+            self._iz = clip(self._iz + gain * ez, limits.integral)
         reach = min(self._tan_tilt * lift, sqrt(self._specific_max**2 - lift * lift))
-        square = ax * ax + ay * ay
-        wind = True
-        if square > reach * reach:
-            scale = reach / sqrt(square)
-            wind = ax * ex + ay * ey < 0.0
-            ax *= scale
-            ay *= scale
-        if wind:
+        cut = ax * ax + ay * ay > reach * reach
+        if not cut or ax * ex + ay * ey < 0.0:
             gain = gains.velocity_xy_i * dt / (1.0 + (ex * ex + ey * ey) / _LARGE)
-            self._ix = min(bound, max(-bound, self._ix + gain * ex))
-            self._iy = min(bound, max(-bound, self._iy + gain * ey))
+            self._ix = clip(self._ix + gain * ex, limits.integral)
+            self._iy = clip(self._iy + gain * ey, limits.integral)
+        ax, ay = shortened(ax, ay, reach)
 
         # Thrust vector and yaw to attitude: z of the body is -f/|f|, here in the heading's frame.
-        c = cos(yaw)
-        s = sin(yaw)
+        c, s = cos(self.yaw), sin(self.yaw)
         norm = sqrt(ax * ax + ay * ay + lift * lift)
-        target = from_rpy(asin((c * ay - s * ax) / norm), atan2(-(c * ax + s * ay), lift), yaw)
+        roll, pitch = asin((c * ay - s * ax) / norm), atan2(-(c * ax + s * ay), lift)
         # Only the part of it along the body's present z axis is thrust in the right direction.
         qw, qx, qy, qz = state.orientation
         thrust = self._mass * (
@@ -300,14 +262,48 @@ class PositionController:
             - ax * 2.0 * (qx * qz + qw * qy)
             - ay * 2.0 * (qy * qz - qw * qx)
         )
+        target = from_rpy(roll, pitch, self.yaw)
         return target, min(self._thrust_max, max(0.0, thrust)), self._yaw_rate
 
-    def _take_hold(self, x: float, y: float, z: float, vx: float, vy: float, vz: float) -> None:
+    def _wanted_velocity(self, state: State) -> Vector3:
+        gains, limits = self._gains, self._limits
+        x, y, z = state.position
+        px, py, pz = self._place
+        vx, vy, vz = self._velocity
+        if self._hold_xy:
+            ex, ey = px - x, py - y
+            gain = self._approach(gains.position_xy, sqrt(ex * ex + ey * ey))
+            vx += gain * ex
+            vy += gain * ey
+        elif self._heading_frame:
+            heading = yaw_of(state.orientation)
+            c, s = cos(heading), sin(heading)
+            vx, vy = c * vx - s * vy, s * vx + c * vy
+        vx, vy = shortened(vx, vy, limits.speed)
+        if self._hold_z:
+            ez = pz - z
+            vz += self._approach(gains.position_z, abs(ez)) * ez
+        return vx, vy, max(-limits.climb, min(limits.descent, vz))
+
+    def _approach(self, gain: float, distance: float) -> float:
+        """Return the velocity per position error at a distance (the "square root controller").
+
+        Far away the speed follows the parabola that ends in the place at the approach's
+        deceleration; near it is proportional.
+        """
+        deceleration = self._limits.approach
+        near = deceleration / (gain * gain)
+        if distance > near:
+            return sqrt(2.0 * deceleration * (distance - 0.5 * near)) / distance
+        return gain
+
+    def _take_hold(self, state: State) -> None:
+        (x, y, z), (vx, vy, vz) = state.position, state.velocity
+        stops = self._velocity[2] == 0.0
         if not self._hold_xy and vx * vx + vy * vy < _STILL * _STILL:
-            self._px = x
-            self._py = y
+            self._place = (x, y, self._place[2])
             self._hold_xy = True
-        if not self._hold_z and self._vz == 0.0 and abs(vz) < _STILL:
-            self._pz = z
+        if not self._hold_z and stops and abs(vz) < _STILL:
+            self._place = (*self._place[:2], z)
             self._hold_z = True
-        self._braking = not (self._hold_xy and (self._hold_z or self._vz != 0.0))
+        self._braking = not (self._hold_xy and (self._hold_z or not stops))
