@@ -19,6 +19,7 @@ import mujoco
 from events import Quaternion, Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_yaw
 from runtime.units import Duration
+from sims.worlds.builder import add_material
 from sims.worlds.dynamics import Dynamics, Motion, Path, Scene, interpolated, path_through
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -191,10 +192,7 @@ class _Shape:
             width=64,
             height=64,
         )
-        material = self._world.add_material(name=name, specular=0.15, shininess=0.2)
-        textures = list(material.textures)
-        textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-        material.textures = textures
+        add_material(self._world, name, specular=0.15, shininess=0.2)
 
     def part(self, given: ET.Element) -> None:
         self._geom(

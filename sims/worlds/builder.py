@@ -7,6 +7,7 @@ geoms: `<name>` is the solid (a primitive, group 3, not drawn), `<name>.look` th
 
 from __future__ import annotations
 
+import functools
 import math
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,7 @@ from events.base import Vector3
 from events.frames import from_rpy
 from sims.worlds import shapes
 from sims.worlds.decals import tile
+from sims.worlds.materials import Canvas, sky
 from sims.worlds.shapes import FACES, STEP, Surface, Window
 from sims.worlds.textures import Draw, own_generator, texture
 
@@ -51,6 +53,14 @@ def sides(
     yield "wall_west", (u, v + y), -90.0, 2.0 * x
 
 
+def add_material(world: mujoco.MjSpec, name: str, **look: Any) -> None:
+    """Add a material to a world, with the texture of the same name."""
+    material = world.add_material(name=name, **look)
+    textures = list(material.textures)
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    material.textures = textures
+
+
 class Builder:
     """Builder of a world: materials, surfaces, lights and solids.
 
@@ -71,33 +81,46 @@ class Builder:
         self.spec.visual.quality.shadowsize = 0
         self.spec.visual.quality.offsamples = 0
 
-    def _texture(self, name: str, draw: Draw, kind: Any) -> tuple[int, int]:
+    def _texture(
+        self, name: str, draw: Draw, shape: tuple[int, int], density: float, kind: Any
+    ) -> tuple[int, int]:
         random = own_generator(self._world, self._seed, name, self.random)
         if self._bare:
             image = np.zeros((6, 1, 3), np.uint8)  # as a skybox has it, which is six squares
         else:
-            image = texture(self._world, self._seed, name, draw, random)
+            canvas = Canvas(shape, random, density)
+            image = texture(self._world, self._seed, name, draw, canvas)
         height, width = image.shape[:2]
         added = self.spec.add_texture(name=name, type=kind, width=width, height=height, nchannel=3)
         added.data = image.tobytes()
         return width, height
 
     def material(
-        self, name: str, draw: Draw, density: float, module: float = 0.0, glow: float = 0.0
+        self,
+        name: str,
+        draw: Draw,
+        shape: tuple[int, int],
+        density: float,
+        *,
+        module: float = 0.0,
+        glow: float = 0.0,
+        **options: Any,
     ) -> Material:
-        """Add a material drawn at `density` pixels per metre, emitting light `glow`, 0 to 1."""
-        width, height = self._texture(name, draw, mujoco.mjtTexture.mjTEXTURE_2D)
-        material = self.spec.add_material(
-            name=name, specular=0.05, shininess=0.1, reflectance=0.0, emission=glow
-        )
-        textures = list(material.textures)
-        textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-        material.textures = textures
+        """Add a material, drawn on a canvas of a shape (pixels) and density (pixels per metre).
+
+        Args:
+            glow: Light that it emits, 0 to 1.
+            options: Further arguments of `draw`.
+        """
+        drawn, kind = functools.partial(draw, **options), mujoco.mjtTexture.mjTEXTURE_2D
+        width, height = self._texture(name, drawn, shape, density, kind)
+        add_material(self.spec, name, specular=0.05, shininess=0.1, reflectance=0.0, emission=glow)
         return Material(name, width / density, height / density, module)
 
-    def sky(self, draw: Draw) -> None:
+    def sky(self, night: bool = False) -> None:
         """Add a sky: the six faces of a cube, stacked in OpenGL's order."""
-        self._texture("sky", draw, mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+        drawn = functools.partial(sky, night=night)
+        self._texture("sky", drawn, (384, 384), 1.0, mujoco.mjtTexture.mjTEXTURE_SKYBOX)
 
     def cut(self, material: Material, width: float, height: float) -> Window:
         """Return a piece of a material, metres, from a random place, or the whole."""

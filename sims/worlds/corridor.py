@@ -13,7 +13,7 @@ import numpy as np
 
 from sims.worlds import materials
 from sims.worlds.builder import WHOLE, Builder, Material, sides
-from sims.worlds.materials import Colour, Image, shade, smooth, specks
+from sims.worlds.materials import Canvas, Colour, Image, shade, smooth
 
 MODULE = 2.6  # metres from door to door, and the width of the corridor
 
@@ -27,9 +27,11 @@ def corridor(seed: int = 0, bare: bool = False) -> Any:
     """Return the corridor as a `mujoco.MjSpec`; the seed changes grain and speckles only."""
     b = Builder("corridor", seed, bare)
     b.spec.visual.headlight.ambient = [0.74, 0.74, 0.72]
-    wall = b.material("wall", _wall, DENSITY)
-    trim = b.material("trim", lambda r: materials.paint((64, 64), r, (0.60, 0.63, 0.62)), 64.0)
-    red = b.material("red", lambda r: materials.paint((64, 64), r, (0.72, 0.13, 0.10)), 64.0)
+    wall = b.material("wall", _wall, (_pixels(HEIGHT), _pixels(MODULE)), DENSITY)
+    trim, red = (
+        b.material(name, materials.paint, (64, 64), 64.0, colour=colour)
+        for name, colour in (("trim", (0.60, 0.63, 0.62)), ("red", (0.72, 0.13, 0.10)))
+    )
     half_x, half_y = NORTH * MODULE / 2.0, WEST * MODULE / 2.0
     middle = half_y - MODULE / 2.0
     _pilasters(b, trim, half_x, half_y, middle)
@@ -40,13 +42,14 @@ def corridor(seed: int = 0, bare: bool = False) -> Any:
     long, short = (0.0, 0.0, NORTH - 2.0, 1.0), (0.0, 0.0, WEST - 2.0, 1.0)
     b.box("block", wall, inner, (0.0, middle, 0.0), hidden=("top", "bottom"),
           windows={"front": short, "back": short, "left": long, "right": long})  # fmt: skip
+    square = (_pixels(MODULE),) * 2
     half, window = (half_x, half_y), (0.0, 0.0, float(WEST), float(NORTH))
     for name, place, facing, width in sides(half, (0.0, middle)):
         b.wall(name, wall, (width, HEIGHT), (*place, 0.0), facing,
                window=(0.0, 0.0, float(round(width / MODULE)), 1.0))  # fmt: skip
-    b.floor("floor", b.material("floor", _floor, DENSITY), half, middle=(0.0, middle),
+    b.floor("floor", b.material("floor", _floor, square, DENSITY), half, middle=(0.0, middle),
             window=window)  # fmt: skip
-    b.ceiling("ceiling", b.material("ceiling", _ceiling, DENSITY, glow=0.25), half, HEIGHT,
+    b.ceiling("ceiling", b.material("ceiling", _ceiling, square, DENSITY, glow=0.25), half, HEIGHT,
               middle=(0.0, middle), window=window)  # fmt: skip
     for name, way in (("fill", 1.0), ("glow", -1.0)):  # as bright on each side of the block
         b.light(name, (0.0, 0.0, 2.0), (0.17, 0.17, 0.17), towards=(0.5 * way, 0.3 * way, -0.4),
@@ -74,12 +77,12 @@ def _pixels(metres: float) -> int:
     return round(metres * DENSITY)
 
 
-def _wall(random: np.random.Generator) -> Image:
+def _wall(on: Canvas) -> Image:
     """Return a wall module: a door with its frame, a notice, a handrail, a skirting."""
-    shape = (_pixels(HEIGHT), _pixels(MODULE))
+    shape = on.shape
     height = HEIGHT - np.arange(shape[0], dtype=np.float32)[:, None] / DENSITY
-    wall = materials.paint(shape, random, (0.86, 0.85, 0.79))
-    lower = materials.paint(shape, random, (0.52, 0.64, 0.61))
+    wall = materials.paint(on, (0.86, 0.85, 0.79))
+    lower = materials.paint(on, (0.52, 0.64, 0.61))
     rail = smooth(0.0, 0.01, 0.05 - np.abs(height - 0.95))
     wall = np.where(height[..., None] < 0.92, lower, wall)
     wall = shade(wall, np.broadcast_to(-0.45 * rail, shape))
@@ -90,7 +93,7 @@ def _wall(random: np.random.Generator) -> Image:
             slice(_pixels(left), _pixels(right)),
         )
         part = wall[rows, columns]
-        part[:] = materials.paint((part.shape[0], part.shape[1]), random, colour)
+        part[:] = materials.paint(on._replace(shape=part.shape[:2]), colour)
 
     fill(0.0, MODULE, 0.0, 0.10, (0.26, 0.28, 0.29))
     fill(0.78, 1.82, 0.0, 2.14, (0.36, 0.38, 0.40))
@@ -110,25 +113,24 @@ def _wall(random: np.random.Generator) -> Image:
     return shade(wall, fall.astype(np.float32))
 
 
-def _square(random: np.random.Generator, colour: tuple[float, float, float]) -> tuple[Image, Image]:
+def _square(on: Canvas, colour: Colour) -> tuple[Image, Image]:
     """Return a module of plain surface, and each pixel's nearness to the lamp, 0..1."""
-    shape = (_pixels(MODULE), _pixels(MODULE))
-    place = (np.arange(shape[0], dtype=np.float32) + 0.5) / DENSITY - MODULE / 2.0
+    place = (np.arange(on.shape[0], dtype=np.float32) + 0.5) / DENSITY - MODULE / 2.0
     near = np.exp(-(place[:, None] ** 2 + place[None, :] ** 2) / 0.9)
-    return materials.paint(shape, random, colour), near.astype(np.float32)
+    return materials.paint(on, colour), near.astype(np.float32)
 
 
-def _floor(random: np.random.Generator) -> Image:
-    floor, near = _square(random, (0.55, 0.56, 0.53))
-    spots = specks(floor.shape[:2], random, count=900, radius=(1.0, 2.0))
+def _floor(on: Canvas) -> Image:
+    floor, near = _square(on, (0.55, 0.56, 0.53))
+    spots = on.specks(count=900, radius=(1.0, 2.0))
     floor = shade(floor, 0.12 * spots + 0.30 * near - 0.10)
     floor[:2] *= 0.8
     floor[:, :2] *= 0.8
     return floor
 
 
-def _ceiling(random: np.random.Generator) -> Image:
-    ceiling, near = _square(random, (0.74, 0.74, 0.72))
+def _ceiling(on: Canvas) -> Image:
+    ceiling, near = _square(on, (0.74, 0.74, 0.72))
     ceiling = shade(ceiling, 0.15 * near - 0.05)
     size = _pixels(MODULE)
     for line in np.linspace(0.0, size, 5)[:-1].astype(int).tolist():

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sims.worlds import materials
-from sims.worlds.materials import Colour, Image, fractal, mix, planks, shade, share, smooth, specks
+from sims.worlds.materials import Canvas, Colour, Image, mix, planks, shade, share, smooth
 
 WORDS = (
     "DEPTH", "PARALLAX", "HORIZON", "LOOP", "FLOW", "EPIPOLE", "INERTIA", "KEYFRAME", "ORBIT",
@@ -43,11 +43,11 @@ def letters(image: Image, text: str, where: Box, colour: Colour, worn: Image | N
     image[:] = mix(image, colour, mask)
 
 
-def poster(shape: tuple[int, int], random: np.random.Generator, number: int) -> Image:
+def poster(on: Canvas, number: int) -> Image:
     """Return a printed poster: composition, inks and word by `number`."""
-    height, width = shape
+    height, width = on.shape
     paper, ink, second = INKS[number % len(INKS)]
-    sheet = share(_composition(shape, random, number))
+    sheet = share(_composition(on, number))
     margin = width // 12
     word = WORDS[number % len(WORDS)]
     letters(
@@ -55,24 +55,25 @@ def poster(shape: tuple[int, int], random: np.random.Generator, number: int) -> 
     )
     for line in range(3):
         y = int(height * (0.90 + 0.025 * line))
-        end = int(width * random.uniform(0.5, 0.9))
+        end = int(width * on.random.uniform(0.5, 0.9))
         cv2.line(sheet, (margin, y), (end, y), ink, 1)
-    sheet = shade(sheet, 0.05 * fractal(shape, random, coarse=width / 2))
-    sheet = shade(sheet, 0.18 * specks(shape, random, count=40, radius=(1.0, 4.0)))
+    sheet = shade(sheet, 0.05 * on.fractal(coarse=width / 2))
+    sheet = shade(sheet, 0.18 * on.specks(count=40, radius=(1.0, 4.0)))
     sheet = mix(sheet, paper, 0.06)
     cv2.rectangle(sheet, (0, 0), (width - 1, height - 1), (0.15, 0.13, 0.12), 4)
     return sheet
 
 
-def _composition(
-    shape: tuple[int, int], random: np.random.Generator, number: int
-) -> npt.NDArray[np.uint8]:
-    height, width = shape
+def _composition(on: Canvas, number: int) -> npt.NDArray[np.uint8]:
+    height, width = on.shape
     paper, ink, second = (
         tuple(round(255 * part) for part in colour) for colour in INKS[number % len(INKS)]
     )
     sheet = np.full((height, width, 3), paper, np.uint8)
-    centre = (int(width * random.uniform(0.35, 0.65)), int(height * random.uniform(0.3, 0.45)))
+    centre = (
+        int(width * on.random.uniform(0.35, 0.65)),
+        int(height * on.random.uniform(0.3, 0.45)),
+    )
     kind = number % 4
     if kind == 0:
         for index, radius in enumerate(np.linspace(0.42, 0.06, 6) * width):
@@ -81,22 +82,32 @@ def _composition(
     elif kind == 1:
         for index in range(9):
             x = int(width * index / 9)
-            y = int(height * random.uniform(0.15, 0.62))
+            y = int(height * on.random.uniform(0.15, 0.62))
             colour = (ink, second)[index % 2]
             cv2.rectangle(sheet, (x, y), (x + width // 11, int(height * 0.7)), colour, -1)
         cv2.circle(sheet, (int(width * 0.75), int(height * 0.18)), width // 9, ink, -1, cv2.LINE_AA)
     elif kind == 2:
         for index in range(14):
-            points = random.uniform((0.05, 0.05), (0.95, 0.68), (3, 2)) * (width, height)
+            points = on.random.uniform((0.05, 0.05), (0.95, 0.68), (3, 2)) * (width, height)
             colour = (ink, second, paper)[index % 3]
             cv2.fillPoly(sheet, [points.astype(np.int32)], colour, cv2.LINE_AA)
     else:
         for row in range(7):
             for column in range(6):
                 at = (int(width * (column + 0.6) / 6.2), int(height * (row + 0.7) / 10.5))
-                radius = int(width * random.uniform(0.02, 0.075))
+                radius = int(width * on.random.uniform(0.02, 0.075))
                 cv2.circle(sheet, at, radius, (ink, second)[(row + column) % 2], -1, cv2.LINE_AA)
     return sheet
+
+
+def posters(on: Canvas) -> Image:
+    """Return twelve posters of the canvas's shape, in rows of four."""
+    return sheets([poster(on, number) for number in range(12)], 4)
+
+
+def crate_faces(on: Canvas) -> Image:
+    """Return nine crates' sides of the canvas's shape, in rows of three."""
+    return sheets([crate_face(on, number) for number in range(9)], 3)
 
 
 def sheets(images: list[Image], columns: int) -> Image:
@@ -105,20 +116,21 @@ def sheets(images: list[Image], columns: int) -> Image:
     return np.concatenate(rows, 0)
 
 
-def crate_face(size: int, random: np.random.Generator, number: int) -> Image:
+def crate_face(on: Canvas, number: int) -> Image:
     """Return a side of a wooden crate: boards, a frame, a brace, a stencilled mark."""
-    shape = (size, size)
+    size, random = on.shape[0], on.random
+    wood = on._replace(density=size * 0.9)
     tint = random.uniform(0.85, 1.12, 3)
     tone = tuple(
         tuple(float(c) for c in np.asarray(colour) * tint)
         for colour in ((0.66, 0.50, 0.31), (0.58, 0.42, 0.26), (0.72, 0.56, 0.37))
     )
-    face = planks(shape, random, size * 0.9, palette=tone, width=0.19)  # type: ignore[arg-type]
+    face = planks(wood, palette=tone, width=0.19)  # type: ignore[arg-type]
     if number % 2:
         face = np.ascontiguousarray(face.transpose(1, 0, 2))
-    frame = planks(shape, random, size * 0.9, palette=tone, width=0.5)  # type: ignore[arg-type]
+    frame = planks(wood, palette=tone, width=0.5)  # type: ignore[arg-type]
     edge = int(size * 0.11)
-    boards = np.zeros(shape, np.uint8)
+    boards = np.zeros(on.shape, np.uint8)
     if number % 3 != 2:
         band = int(size * 0.10)
         cv2.line(boards, (edge, size - edge), (size - edge, edge), 255, band, cv2.LINE_AA)
@@ -131,7 +143,7 @@ def crate_face(size: int, random: np.random.Generator, number: int) -> Image:
     for x in (edge // 2, size - edge // 2):
         for y in np.linspace(edge // 2, size - edge // 2, 5):
             cv2.circle(face, (x, int(y)), max(1, size // 110), (0.15, 0.13, 0.12), -1)
-    worn = smooth(-1.6, -0.2, fractal(shape, random, coarse=size / 6))
+    worn = smooth(-1.6, -0.2, on.fractal(coarse=size / 6))
     ink = ((0.10, 0.10, 0.10), (0.55, 0.12, 0.10), (0.12, 0.20, 0.36))[number % 3]
     text = f"{'ABCDEFGH'[number % 8]}-{random.integers(100, 999)}"
     inset = int(size * 0.2)
@@ -140,9 +152,9 @@ def crate_face(size: int, random: np.random.Generator, number: int) -> Image:
     return face
 
 
-def window_pane(shape: tuple[int, int], random: np.random.Generator, lit: bool) -> Image:
+def window_pane(on: Canvas, lit: bool) -> Image:
     """Return a framed window; its panes reflect the sky, or are lit from within."""
-    height, width = shape
+    height, width = on.shape
     fall = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
     top, bottom = (
         ((0.98, 0.86, 0.58), (0.80, 0.62, 0.36))
@@ -152,9 +164,9 @@ def window_pane(shape: tuple[int, int], random: np.random.Generator, lit: bool) 
     glass = np.asarray(top, np.float32) * (1 - fall) + np.asarray(bottom, np.float32) * fall
     glass = np.ascontiguousarray(np.broadcast_to(glass, (height, width, 3)))
     columns, rows = max(2, width // 26), max(2, height // 30)
-    panes = random.uniform(0.68, 1.12, (rows, columns)).astype(np.float32)
+    panes = on.random.uniform(0.68, 1.12, (rows, columns)).astype(np.float32)
     glass *= cv2.resize(panes, (width, height), interpolation=cv2.INTER_NEAREST)[..., None]
-    streak = fractal(shape, random, coarse=width / 3, stretch=(2.0, 1.0))
+    streak = on.fractal(coarse=width / 3, stretch=(2.0, 1.0))
     glass = shade(glass, 0.10 * streak)
     bar = (0.22, 0.23, 0.24)
     for column in range(columns + 1):
@@ -220,11 +232,12 @@ def house(
     """Return a house front `width` metres wide at `density` pixels per metre."""
     height = height_of(storeys)
     shape = (int(height * density), int(width * density))
-    bare = materials.brick(shape, random, density, BRICKS[number % 3], (0.17, 0.42))
+    on = Canvas(shape, random, density)
+    bare = materials.brick(on, BRICKS[number % 3], (0.17, 0.42))
     front = bare
     if number % 2:
         paint = PAINTS[int(random.integers(len(PAINTS)))]
-        front = materials.plaster(shape, random, density, paint, bare)
+        front = materials.plaster(on, paint, bare)
         front = shade(front, 0.4 * (bare.mean(2) - float(bare.mean())))
     spacing = float(random.uniform(1.9, 2.4))
     columns = max(2, int((width - 0.8) / spacing))
@@ -238,7 +251,7 @@ def house(
             if storey == 0 and column == door:
                 _door(front, left, int((height - 2.3) * density), density, random)
                 continue
-            pane = window_pane(size, random, lit=bool(random.uniform() < 0.18))
+            pane = window_pane(Canvas(size, random), lit=bool(random.uniform() < 0.18))
             if random.uniform() < 0.35:
                 blind = int(size[0] * random.uniform(0.2, 0.6))
                 pane[2:blind, 2:-2] = np.asarray(PAINTS[int(random.integers(6))], np.float32) * 0.9
@@ -257,7 +270,7 @@ def house(
     for x in (4, shape[1] - 8):
         cv2.line(front, (x, 8), (x, shape[0]), (0.30, 0.31, 0.32), 3)
     rise = np.arange(shape[0], 0, -1, dtype=np.float32)[:, None] / density
-    damp = fractal(shape, random, coarse=2.0 * density, fine=4, stretch=(3.0, 1.0))
+    damp = on.fractal(coarse=2.0 * density, fine=4, stretch=(3.0, 1.0))
     front = mix(front, (0.26, 0.24, 0.22), smooth(0.9, 2.2, damp) * 0.45)
     foot = np.broadcast_to(-0.4 * np.exp(-rise / 0.5), shape)
     return shade(front, foot.astype(np.float32))
@@ -265,8 +278,9 @@ def house(
 
 def _door(front: Image, left: int, top: int, density: float, random: np.random.Generator) -> None:
     shape = (front.shape[0] - top, int(1.1 * density))
-    leaf = np.full((*shape, 3), PAINTS[int(random.integers(6))], np.float32) * 0.55
-    leaf = shade(leaf, 0.12 * fractal(shape, random, coarse=20))
+    on = Canvas(shape, random)
+    leaf = on.flat(PAINTS[int(random.integers(6))]) * 0.55
+    leaf = shade(leaf, 0.12 * on.fractal(coarse=20))
     for row in range(3):
         low, high = int(shape[0] * (0.08 + 0.3 * row)), int(shape[0] * (0.30 + 0.3 * row))
         for start, end in ((0.12, 0.46), (0.54, 0.88)):

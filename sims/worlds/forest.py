@@ -17,7 +17,7 @@ import numpy.typing as npt
 from sims.worlds import materials
 from sims.worlds.builder import TOURS, Builder, Material, Vector
 from sims.worlds.dynamics import Dynamics, Motion, Scene
-from sims.worlds.materials import Image, fractal, mix, shade, share, smooth, specks
+from sims.worlds.materials import Canvas, Image, mix, shade, share, smooth
 from sims.worlds.shapes import Surface, cylinder
 
 HALF = 20.0
@@ -49,19 +49,20 @@ def forest(seed: int = 0, bare: bool = False) -> Scene:
     """Return the wood and its dynamics; bark, ground and leaves depend on the seed."""
     b = Builder("forest", seed, bare)
     b.spec.visual.headlight.ambient = [0.50, 0.55, 0.48]
-    bark = b.material("bark", lambda r: materials.bark((768, 192), r, 96.0, 0.05), 96.0)
-    green = b.material("leaves", lambda r: materials.leaves((512, 512), r, 96.0), 96.0)
+    bark = b.material("bark", materials.bark, (768, 192), 96.0, width=0.05)
+    green = b.material("leaves", materials.leaves, (512, 512), 96.0)
     sways = [b.moving(f"sway_{number}") for number in range(len(SWING))]
     _leaves(b, green, _stems(b, bark), sways)
-    back = b.material("thicket", _thicket, 24.0)
+    back = b.material("thicket", _thicket, (576, 480), 24.0)
     size = (2.0 * HALF * math.tan(math.pi / 24) + 0.05, 24.0)
     for number in range(24):
         angle = math.radians(15.0 * number)
         place = (-HALF * math.cos(angle), -HALF * math.sin(angle), 0.0)
         b.wall(f"thicket_{number}", back, size, place, 15.0 * number, window=b.cut(back, *size))
-    b.floor("ground", b.material("ground", _ground, DENSITY), (HALF, HALF), step=2.5)
+    ground = b.material("ground", _ground, (int(2 * HALF * DENSITY),) * 2, DENSITY)
+    b.floor("ground", ground, (HALF, HALF), step=2.5)
     _shadows(b, sways[2 * GROUPS :])
-    b.sky(materials.sky)
+    b.sky()
     b.light("sun", (0.0, 0.0, 20.0), (0.66, 0.62, 0.46), towards=SUN, sun=True)
     b.light("sky_light", (0.0, 0.0, 20.0), (0.12, 0.15, 0.17), towards=(-0.5, 0.5, -0.3), sun=True)
     b.spec.stat.center = [0.0, 0.0, 2.0]
@@ -157,28 +158,27 @@ def _shadows(b: Builder, sways: list[Any]) -> None:
         b.hang(f"shadow_{number}", "shadow", Material("shadow", 1.0, 1.0), body, (x, y, 0.015))
 
 
-def _ground(random: np.random.Generator) -> Image:
-    shape = (int(2 * HALF * DENSITY),) * 2
-    ground = materials.grass(shape, random, DENSITY)
-    where = fractal(shape, random, coarse=4.0 * DENSITY)
+def _ground(on: Canvas) -> Image:
+    ground = materials.grass(on)
+    where = on.fractal(coarse=4.0 * DENSITY)
     ground = mix(ground, (0.33, 0.25, 0.17), smooth(-0.4, 0.5, where) * 0.85)
-    fallen = specks(shape, random, count=30000, radius=(1.5, 4.0))
+    fallen = on.specks(count=30000, radius=(1.5, 4.0))
     ground = mix(ground, (0.58, 0.40, 0.18), np.maximum(fallen, 0.0) * 0.8)
     ground = shade(ground, -0.5 * np.maximum(-fallen, 0.0))
-    sun = smooth(0.2, 0.7, fractal(shape, random, coarse=1.6 * DENSITY, gain=0.5))
+    sun = smooth(0.2, 0.7, on.fractal(coarse=1.6 * DENSITY, gain=0.5))
     return shade(ground, 0.55 * sun - 0.25)
 
 
-def _thicket(random: np.random.Generator) -> Image:
+def _thicket(on: Canvas) -> Image:
     """Return 20 x 24 m of dense wood in the distance: stems, leaves, light in gaps."""
-    shape = (576, 480)
+    shape, random = on.shape, on.random
     height = np.broadcast_to(np.linspace(1.0, 0.0, shape[0], dtype=np.float32)[:, None], shape)
-    wood = materials.leaves(shape, random, 40.0)
+    wood = materials.leaves(on._replace(density=40.0))
     stems = np.zeros(shape, np.uint8)
     for x in random.integers(0, shape[1], 44).tolist():
         lean = int(random.integers(-14, 15))
         cv2.line(stems, (x, 0), (x + lean, shape[0]), 255, int(random.integers(2, 9)), cv2.LINE_AA)
     wood = mix(wood, (0.28, 0.24, 0.19), share(stems) * smooth(1.0, 0.2, height))
-    gaps = fractal(shape, random, coarse=48, fine=3, gain=0.9)
+    gaps = on.fractal(coarse=48, fine=3, gain=0.9)
     wood = mix(wood, (0.78, 0.85, 0.80), smooth(1.5, 2.0, gaps + 1.6 * height - 0.6))
     return shade(wood, 0.9 * height - 0.45)

@@ -6,7 +6,6 @@ floor. Shadows are painted on the floor, not drawn: they cost nothing per frame.
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import cv2
@@ -14,7 +13,7 @@ import numpy as np
 
 from sims.worlds import decals, materials
 from sims.worlds.builder import Builder, Material, sides
-from sims.worlds.materials import Image, cells, fractal, mix, shade, share, smooth, specks
+from sims.worlds.materials import Canvas, Image, mix, shade, share, smooth
 
 NORTH, WEST, HEIGHT = 8.0, 6.0, 5.0
 DENSITY = 96.0  # pixels per metre of floor and walls
@@ -34,32 +33,32 @@ BARRELS = (
 )  # fmt: skip
 
 
-def _wall(random: np.random.Generator, width: float) -> Image:
+def _wall(on: Canvas) -> Image:
     """Return brick, painted from 1.1 m up where paint still holds, windows under the ceiling."""
-    shape = (int(HEIGHT * DENSITY), int(width * DENSITY))
-    bare = materials.brick(shape, random, DENSITY)
+    shape, random, width = on.shape, on.random, on.shape[1] / DENSITY
+    bare = materials.brick(on)
     colours = ((0.74, 0.73, 0.66), (0.62, 0.68, 0.66), (0.78, 0.70, 0.56), (0.68, 0.70, 0.74))
     colour = colours[int(random.integers(len(colours)))]
-    painted = materials.plaster(shape, random, DENSITY, colour, bare)
+    painted = materials.plaster(on, colour, bare)
     # Bricks show through paint.
     relief = bare.mean(2) - float(bare.mean())
     painted = shade(painted, 0.35 * relief)
     level = np.arange(shape[0], dtype=np.float32)[:, None] / DENSITY
-    ragged = 0.03 * fractal(shape, random, coarse=40)
+    ragged = 0.03 * on.fractal(coarse=40)
     wall = mix(bare, painted, smooth(-0.03, 0.03, (HEIGHT - 1.15) - level + ragged))
     band = smooth(-0.02, 0.02, 0.07 - np.abs(level - (HEIGHT - 1.2)) + 0.3 * ragged)
-    wall = mix(wall, (0.22, 0.34, 0.38), band * smooth(-1.4, 0.0, fractal(shape, random)) * 0.9)
+    wall = mix(wall, (0.22, 0.34, 0.38), band * smooth(-1.4, 0.0, on.fractal()) * 0.9)
     step = 2.0
     for left in np.arange(0.45, width - 1.4, step):
         if random.uniform() < 0.72:
             size = (int(0.95 * DENSITY), int(1.25 * DENSITY))
-            pane = decals.window_pane(size, random, lit=random.uniform() < 0.25)
+            pane = decals.window_pane(on._replace(shape=size), lit=random.uniform() < 0.25)
             decals.paste(wall, pane, int(left * DENSITY), int(0.5 * DENSITY), border=7)
         else:
             number = f"{random.integers(1, 99):02d}"
             box = (int(left * DENSITY), 50, int((left + 1.25) * DENSITY), 140)
             decals.letters(wall, number, box, (0.20, 0.24, 0.28),
-                           smooth(-1.2, 0.2, fractal(shape, random, coarse=24)))  # fmt: skip
+                           smooth(-1.2, 0.2, on.fractal(coarse=24)))  # fmt: skip
     # Dirt gathers in the corners and at the foot.
     across = np.arange(shape[1], dtype=np.float32)[None, :] / DENSITY
     corner = np.exp(-np.minimum(across, width - across) / 0.5)
@@ -69,17 +68,17 @@ def _wall(random: np.random.Generator, width: float) -> Image:
     )
 
 
-def _floor(random: np.random.Generator) -> Image:
+def _floor(on: Canvas) -> Image:
     """Return slabs and cast concrete, with course lines and the objects' shadows."""
-    shape = (int(2 * NORTH * DENSITY), int(2 * WEST * DENSITY))
+    shape = on.shape
     slabs = materials.tiles(
-        shape, random, DENSITY, ((0.58, 0.56, 0.52), (0.50, 0.49, 0.47), (0.64, 0.60, 0.53)),
+        on, ((0.58, 0.56, 0.52), (0.50, 0.49, 0.47), (0.64, 0.60, 0.53)),
         size=(0.8, 0.8),
     )  # fmt: skip
-    cast = materials.concrete(shape, random, DENSITY, (0.55, 0.54, 0.52))
-    where = fractal(shape, random, coarse=4.0 * DENSITY, fine=8, gain=0.55)
+    cast = materials.concrete(on, (0.55, 0.54, 0.52))
+    where = on.fractal(coarse=4.0 * DENSITY, fine=8, gain=0.55)
     floor = mix(slabs, cast, smooth(0.25, 0.32, where))
-    worn = smooth(-1.5, 0.3, fractal(shape, random, coarse=50))
+    worn = smooth(-1.5, 0.3, on.fractal(coarse=50))
     line = np.zeros(shape, np.uint8)
     inset = int(1.0 * DENSITY)
     cv2.rectangle(line, (inset, inset), (shape[1] - inset, shape[0] - inset), 255, 9)
@@ -99,6 +98,10 @@ def _floor(random: np.random.Generator) -> Image:
         column, row = _pixel(x, y)
         decals.stripes(floor, (column - 45, row - 45, column + 45, row + 45), worn)
     return decals.contact_shadow(floor, _footprints(shape), 22.0, 0.75)
+
+
+def _pixels(density: float) -> tuple[int, int]:
+    return int(2 * NORTH * density), int(2 * WEST * density)
 
 
 def _pixel(x: float, y: float) -> tuple[int, int]:
@@ -122,36 +125,34 @@ def _footprints(shape: tuple[int, int]) -> Image:
     return mask
 
 
-def _ceiling(random: np.random.Generator) -> Image:
+def _ceiling(on: Canvas) -> Image:
     """Return painted boards between the beams, with skylights and water stains."""
-    density = CEILING_DENSITY
-    shape = (int(2 * NORTH * density), int(2 * WEST * density))
+    density = on.density
     boards = materials.planks(
-        shape, random, density, width=0.30,
+        on, width=0.30,
         palette=((0.60, 0.58, 0.53), (0.52, 0.50, 0.46), (0.68, 0.64, 0.57), (0.45, 0.43, 0.41)),
     )  # fmt: skip
-    boards = shade(boards, 0.30 * specks(shape, random, count=5000, radius=(1.2, 5.0)))
-    stain = fractal(shape, random, coarse=2.5 * density, fine=6)
+    boards = shade(boards, 0.30 * on.specks(count=5000, radius=(1.2, 5.0)))
+    stain = on.fractal(coarse=2.5 * density, fine=6)
     boards = mix(boards, (0.34, 0.27, 0.20), smooth(0.8, 1.9, stain) * 0.6)
     for x in (-3.6, 0.0, 3.6):
         for y in (-4.3, 0.6, 4.5):
-            pane = decals.window_pane((int(1.7 * density), int(1.2 * density)), random, lit=False)
+            size = (int(1.7 * density), int(1.2 * density))
+            pane = decals.window_pane(on._replace(shape=size), lit=False)
             row, column = int((NORTH + x - 0.85) * density), int((WEST - y - 0.6) * density)
             decals.paste(boards, pane, column, row, border=5)
     return boards
 
 
-def _columns(random: np.random.Generator) -> Image:
+def _columns(on: Canvas) -> Image:
     """Return sixteen pillar faces side by side: concrete, a number, stripes at the foot."""
-    width = int(0.45 * DENSITY)
+    foot, width = on.shape
     faces = []
     for number in range(16):
-        shape = (int(HEIGHT * DENSITY), width)
-        face = materials.concrete(shape, random, DENSITY, (0.63, 0.62, 0.58))
-        layout = cells(shape, random, high=1.25 * DENSITY, wide=10.0 * DENSITY)
+        face = materials.concrete(on, (0.63, 0.62, 0.58))
+        layout = on.cells(high=1.25 * DENSITY, wide=10.0 * DENSITY)
         face = mix(face, (0.25, 0.24, 0.22), 1.0 - smooth(0.5, 2.0, layout.edge))
-        worn = smooth(-1.6, 0.2, fractal(shape, random, coarse=20))
-        foot = shape[0]
+        worn = smooth(-1.6, 0.2, on.fractal(coarse=20))
         decals.stripes(face, (0, foot - 105, width, foot - 8), worn)
         decals.letters(
             face,
@@ -164,22 +165,14 @@ def _columns(random: np.random.Generator) -> Image:
     return np.concatenate(faces, 1)
 
 
-def _crate_faces(random: np.random.Generator) -> Image:
-    return decals.sheets([decals.crate_face(256, random, n) for n in range(9)], 3)
-
-
-def _posters(random: np.random.Generator) -> Image:
-    return decals.sheets([decals.poster((288, 216), random, n) for n in range(12)], 4)
-
-
-def _steel(random: np.random.Generator) -> Image:
+def _steel(on: Canvas) -> Image:
     """Return blue barrels' sides above, red ones' in the middle, bare sheet below."""
     parts = []
     for rows, colour in ((154, (0.20, 0.36, 0.52)), (154, (0.62, 0.24, 0.18)),
                          (76, (0.58, 0.59, 0.60))):  # fmt: skip
-        shape = (rows, 512)
-        sheet = materials.metal(shape, random, 128.0, colour, pitch=0.32)
-        rims = cells(shape, random, high=rows / 3.0, wide=5000.0)
+        part = on._replace(shape=(rows, on.shape[1]))
+        sheet = materials.metal(part, colour, pitch=0.32)
+        rims = part.cells(high=rows / 3.0, wide=5000.0)
         sheet = shade(sheet, 0.35 * smooth(1.0, 3.0, rims.edge) - 0.35)
         parts.append(sheet)
     return np.concatenate(parts, 0)
@@ -189,13 +182,13 @@ def hall(seed: int = 0, bare: bool = False) -> Any:
     """Return the hall as a `mujoco.MjSpec`; every seed has its own bricks, posters and crates."""
     b = Builder("hall", seed, bare)
     b.spec.visual.headlight.ambient = [0.62, 0.62, 0.64]
-    crates = b.material("crates", _crate_faces, 256.0)
-    posters = b.material("posters", _posters, 128.0, glow=0.15)
-    red = b.material("brick", lambda r: materials.brick((512, 1024), r, DENSITY), DENSITY, 0.12)
-    wood = b.material("wood", lambda r: materials.planks((512, 768), r, 128.0), 128.0)
-    timber = b.material("timber", _upright, 128.0)
-    column = b.material("column", _columns, 96.0)
-    steel = b.material("steel", _steel, 128.0)
+    crates = b.material("crates", decals.crate_faces, (256, 256), 256.0)
+    posters = b.material("posters", decals.posters, (288, 216), 128.0, glow=0.15)
+    red = b.material("brick", materials.brick, (512, 1024), DENSITY, module=0.12)
+    wood = b.material("wood", materials.planks, (512, 768), 128.0)
+    timber = b.material("timber", materials.upright, (384, 384), 128.0, width=0.14)
+    column = b.material("column", _columns, (int(HEIGHT * DENSITY), int(0.45 * DENSITY)), DENSITY)
+    steel = b.material("steel", _steel, (384, 512), 128.0)
     _things(b, crates, steel)
     _structure(b, red, wood, timber, column)
     _partition(b, wood, posters)
@@ -206,11 +199,6 @@ def hall(seed: int = 0, bare: bool = False) -> Any:
     b.spec.stat.center = [0.0, 0.0, 2.0]
     b.spec.stat.extent = 10.0
     return b.spec
-
-
-def _upright(random: np.random.Generator) -> Image:
-    boards = materials.planks((384, 384), random, 128.0, width=0.14)
-    return np.ascontiguousarray(boards.transpose(1, 0, 2))
 
 
 def _things(b: Builder, crates: Material, steel: Material) -> None:
@@ -277,9 +265,9 @@ def _shell(b: Builder, posters: Material) -> None:
             b.panel(f"{name}_poster_{count}", posters, decals.tile(count % 12, 4, 3),
                     (0.75 * height, height), where, facing)  # fmt: skip
             count += 1
-        brick = b.material(name, functools.partial(_wall, width=width), DENSITY)
+        brick = b.material(name, _wall, (int(HEIGHT * DENSITY), int(width * DENSITY)), DENSITY)
         b.wall(name, brick, (width, HEIGHT), (*place, 0.0), facing)
-    floor = b.material("floor", _floor, DENSITY)
+    floor = b.material("floor", _floor, _pixels(DENSITY), DENSITY)
     b.floor("floor", floor, (NORTH, WEST))
 
 
@@ -293,7 +281,7 @@ def _roof(b: Builder, wood: Material, steel: Material) -> None:
             b.box(f"duct_{number}_{piece}", steel, (4.0, 0.4, 0.34), (x, y, HEIGHT - 0.85),
                   windows=dict.fromkeys(("left", "right", "top", "bottom"), bare),
                   hidden=("front", "back"))  # fmt: skip
-    ceiling = b.material("ceiling", _ceiling, CEILING_DENSITY)
+    ceiling = b.material("ceiling", _ceiling, _pixels(CEILING_DENSITY), CEILING_DENSITY)
     b.ceiling("ceiling", ceiling, (NORTH, WEST), HEIGHT)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from sims.worlds import materials
 from sims.worlds.builder import Builder, Material, sides
-from sims.worlds.materials import Colour, Image
+from sims.worlds.materials import Canvas, Colour, Image
 
 NORTH, WEST, HEIGHT = 8.0, 6.0, 2.9
 DESKS = (  # x, y, turn
@@ -29,7 +29,7 @@ def office(seed: int = 0, bare: bool = False) -> Any:
     b.spec.visual.headlight.ambient = [0.80, 0.80, 0.80]
 
     def paint(name: str, colour: Colour, glow: float = 0.0) -> Material:
-        return b.material(name, lambda r: materials.paint((128, 128), r, colour), 32.0, glow=glow)
+        return b.material(name, materials.paint, (128, 128), 32.0, glow=glow, colour=colour)
 
     white, dark = paint("white", (0.90, 0.90, 0.88)), paint("dark", (0.13, 0.14, 0.16))
     grey, blue = paint("grey", (0.60, 0.62, 0.64)), paint("blue", (0.20, 0.29, 0.42))
@@ -81,10 +81,10 @@ def _shell(b: Builder, white: Material, window: Material, frame: Material) -> No
         b.panel(f"pane_{number}", window, (0.0, 0.0, 0.4, 0.4), (1.7, 1.6), (x, -5.98, 1.75), 90.0)
     grain = 0.03  # the carpet's pile
     pile = b.material(
-        "carpet", lambda r: materials.paint((128, 128), r, (0.42, 0.44, 0.47), grain), 64.0
+        "carpet", materials.paint, (128, 128), 64.0, colour=(0.42, 0.44, 0.47), grain=grain
     )
     b.floor("floor", pile, (NORTH, WEST), window=(0.0, 0.0, 8.0, 6.0))
-    tiles = b.material("tiles", _tiles, 64.0, glow=0.3)
+    tiles = b.material("tiles", _tiles, (205, 192), 64.0, glow=0.3)
     b.ceiling("ceiling", tiles, (NORTH, WEST), HEIGHT, window=(0.0, 0.0, 4.0, 5.0))
 
 
@@ -100,8 +100,8 @@ def _glazing(b: Builder, frame: Material) -> None:
     b.box("table", frame, (1.6, 0.9, 0.74), (x, y, 0.0))
 
 
-def _tiles(random: np.random.Generator) -> Image:
-    tiles = materials.paint((205, 192), random, (0.76, 0.76, 0.76))
+def _tiles(on: Canvas) -> Image:
+    tiles = materials.paint(on, (0.76, 0.76, 0.76))
     for k in range(5):
         tiles[k * 41] *= 0.88
         tiles[:, min(k * 48, 191)] *= 0.88

@@ -24,10 +24,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sims.worlds.materials import Image, to_bytes
+from sims.worlds.materials import Canvas, Image, to_bytes
 
-Draw = Callable[[np.random.Generator], Image]
-"""Returns an image, shape (h, w, 3), given a source of random numbers."""
+Draw = Callable[..., Image]
+"""Returns an image, shape (h, w, 3), on a `Canvas`, and with further arguments if it has some."""
 
 _LOG = logging.getLogger("visnav.worlds")
 _HERE = Path(__file__).parent
@@ -53,15 +53,13 @@ def own_generator(
     return own
 
 
-def texture(
-    world: str, seed: int, name: str, draw: Draw, random: np.random.Generator
-) -> npt.NDArray[np.uint8]:
+def texture(world: str, seed: int, name: str, draw: Draw, canvas: Canvas) -> npt.NDArray[np.uint8]:
     """Return a texture (h, w, 3), RGB, from a readable cache or drawn."""
     file = f"{world}-{seed}-{name}"
     with contextlib.suppress(OSError, RuntimeError, ValueError):
         return _read(folder() / file)
     _say_once(world)
-    drawn = to_bytes(draw(random))
+    drawn = to_bytes(draw(canvas))
     try:
         _write(folder() / file, drawn)
     except (OSError, RuntimeError) as error:

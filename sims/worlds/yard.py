@@ -7,7 +7,6 @@ the ground, not drawn: they cost nothing per frame.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -18,7 +17,7 @@ import numpy.typing as npt
 
 from sims.worlds import decals, materials
 from sims.worlds.builder import WHOLE, Builder, Material
-from sims.worlds.materials import Image, fractal, mix, shade, share, smooth
+from sims.worlds.materials import Canvas, Image, mix, shade, share, smooth
 
 HALF = 17.6
 DENSITY = 60.0
@@ -43,15 +42,15 @@ POSTS = ((12.5, -5.0), (-1.5, 10.9), (-8.9, 3.4), (0.6, -9.9))
 Points = npt.NDArray[np.float64]
 
 
-def _ground(random: np.random.Generator, sun: tuple[float, float, float] | None) -> Image:
+def _ground(on: Canvas, sun: tuple[float, float, float] | None) -> Image:
     """Return the ground, north up and west left, with shadows if light goes along a `sun`."""
-    shape = (int(2 * HALF * DENSITY),) * 2
-    ground = materials.asphalt(shape, random, DENSITY)
+    shape, random = on.shape, on.random
+    ground = materials.asphalt(on)
     slabs = materials.tiles(
-        shape, random, DENSITY, ((0.62, 0.59, 0.53), (0.55, 0.53, 0.49), (0.68, 0.63, 0.55)),
+        on, ((0.62, 0.59, 0.53), (0.55, 0.53, 0.49), (0.68, 0.63, 0.55)),
         size=(0.6, 0.9), stagger=0.5,
     )  # fmt: skip
-    wobble = fractal(shape, random, coarse=2.0 * DENSITY, fine=6, gain=0.6)
+    wobble = on.fractal(coarse=2.0 * DENSITY, fine=6, gain=0.6)
     x, y = _coordinates(shape[0])
     # A paved round in the middle, a paved strip along the houses and the walls.
     paved = np.maximum(
@@ -66,8 +65,8 @@ def _ground(random: np.random.Generator, sun: tuple[float, float, float] | None)
         near = 1.5 * radius - np.hypot(x - tree_x, y - tree_y)
         field = np.maximum(field, near.astype(np.float32))
     green = smooth(-0.05, 0.25, field + 0.35 * wobble)
-    ground = mix(ground, materials.grass(shape, random, DENSITY), green * (1.0 - 0.97 * kerb))
-    _paint(ground, random)
+    ground = mix(ground, materials.grass(on), green * (1.0 - 0.97 * kerb))
+    _paint(ground, on)
     ground = _manholes(ground, random)
     if sun is None:
         return ground
@@ -89,11 +88,10 @@ def _coordinates(size: int) -> tuple[Image, Image]:
     return np.broadcast_to(line[:, None], (size, size)), np.broadcast_to(line, (size, size))
 
 
-def _paint(ground: Image, random: np.random.Generator) -> None:
+def _paint(ground: Image, on: Canvas) -> None:
     """Parking bays in the south, a ball court's lines in the north, numbers."""
-    size = ground.shape[0]
-    worn = smooth(-1.2, 0.6, fractal((size, size), random, coarse=40))
-    lines = np.zeros((size, size), np.uint8)
+    worn = smooth(-1.2, 0.6, on.fractal(coarse=40))
+    lines = np.zeros(on.shape, np.uint8)
     for y in np.arange(-10.5, 1.0, 2.7):
         ends = _pixels(np.array([[-13.2, y], [-9.4, y]]))
         cv2.line(lines, tuple(ends[0].tolist()), tuple(ends[1].tolist()), 255, 6, cv2.LINE_AA)
@@ -188,23 +186,24 @@ def yard(seed: int = 0, bare: bool = False, night: bool = False) -> Any:
     """Return the yard as a `mujoco.MjSpec`; every seed has its own houses, ground and trees."""
     b = Builder("yard", seed, bare, "night" if night else "")
     b.spec.visual.headlight.ambient = [0.07, 0.08, 0.12] if night else [0.56, 0.59, 0.66]
-    red = b.material("brick", lambda r: materials.brick((384, 768), r, 80.0), 80.0, 0.12)
-    ashlar = b.material("ashlar", _stone, 96.0, 0.22)
-    cast = b.material("concrete", lambda r: materials.concrete((512, 512), r, 96.0), 96.0)
-    wood = b.material("wood", lambda r: materials.planks((256, 512), r, 96.0), 96.0)
-    crates = b.material("crates", _crate_faces, 192.0)
-    steel = b.material("steel", _containers, 80.0)
+    red = b.material("brick", materials.brick, (384, 768), 80.0, module=0.12)
+    ashlar = b.material("ashlar", materials.brick, (512, 768), 96.0, module=0.22,
+                        palette=materials.GREY_STONE, block=(0.22, 0.46))  # fmt: skip
+    cast = b.material("concrete", materials.concrete, (512, 512), 96.0)
+    wood = b.material("wood", materials.planks, (256, 512), 96.0)
+    crates = b.material("crates", decals.crate_faces, (192, 192), 192.0)
+    steel = b.material("steel", _containers, (208, 688), 80.0)
     _containers_and_crates(b, steel, crates)
     _masonry(b, red, ashlar, cast)
     _furniture(b, wood, cast)
     _trees(b)
     _walls(b, red)
     _houses(b)
-    sun = None if night else SUN
-    ground = b.material("ground", lambda r: _ground(r, sun), DENSITY)
+    shape = (int(2 * HALF * DENSITY),) * 2
+    ground = b.material("ground", _ground, shape, DENSITY, sun=None if night else SUN)
     step = 0.8 if night else 2.2
     b.floor("ground", ground, (HALF, HALF), step=step)
-    b.sky(functools.partial(materials.sky, night=night))
+    b.sky(night)
     (_lamps if night else _daylight)(b)
     b.spec.stat.center = [0.0, 0.0, 2.0]
     b.spec.stat.extent = 20.0
@@ -225,9 +224,8 @@ def _daylight(b: Builder) -> None:
 
 def _lamps(b: Builder) -> None:
     """Light the lamps on the posts, a few windows, and a faint moon."""
-    shine = b.material("shine", lambda r: materials.paint((64, 64), r, (1.0, 0.93, 0.74)), 64.0,
-                       glow=1.0)  # fmt: skip
-    lit = b.material("lit", lambda r: decals.window_pane((102, 67), r, True), 64.0, glow=0.9)
+    shine = b.material("shine", materials.paint, (64, 64), 64.0, glow=1.0, colour=(1.0, 0.93, 0.74))
+    lit = b.material("lit", decals.window_pane, (102, 67), 64.0, glow=0.9, lit=True)
     for number, (x, y) in enumerate(POSTS):
         b.cylinder(f"lamp_{number}", shine, 0.24, 0.2, (x, y, 4.52), top=WHOLE, side=WHOLE)
         b.light(f"lamp_{number}", (x, y, 4.0), (1.9, 1.5, 0.95), fall_off=0.05,
@@ -292,8 +290,8 @@ def _furniture(b: Builder, wood: Material, cast: Material) -> None:
 
 
 def _trees(b: Builder) -> None:
-    bark = b.material("bark", lambda r: materials.bark((384, 192), r, 96.0, 0.07), 96.0)
-    green = b.material("leaves", lambda r: materials.leaves((512, 768), r, 72.0), 72.0)
+    bark = b.material("bark", materials.bark, (384, 192), 96.0, width=0.07)
+    green = b.material("leaves", materials.leaves, (512, 768), 72.0)
     for number, (x, y, height, radius) in enumerate(TREES):
         b.cylinder(f"tree_{number}/trunk", bark, 0.17, height, (x, y, 0.0))
         flat = 0.85 * radius
@@ -303,14 +301,6 @@ def _trees(b: Builder) -> None:
         top = height + 1.6 * flat
         b.crown(f"tree_{number}/top", green, (small, small, 0.8 * small),
                 (x + float(off[0]), y + float(off[1]), top))  # fmt: skip
-
-
-def _stone(random: np.random.Generator) -> Image:
-    return materials.brick((512, 768), random, 96.0, materials.GREY_STONE, (0.22, 0.46))
-
-
-def _crate_faces(random: np.random.Generator) -> Image:
-    return decals.sheets([decals.crate_face(192, random, n) for n in range(9)], 3)
 
 
 def _walls(b: Builder, red: Material) -> None:
@@ -324,8 +314,8 @@ def _houses(b: Builder) -> None:
     for side, (line, turn, row) in SIDES.items():
         heights = [int(decals.height_of(storeys) * HOUSE_DENSITY) for _, storeys in row]
         tall = max(heights)
-        draw = functools.partial(_fronts, row=row, side=side)
-        material = b.material(f"houses_{side}", draw, HOUSE_DENSITY)
+        material = b.material(f"houses_{side}", _fronts, (tall, 0), HOUSE_DENSITY, row=row,
+                              side=side)  # fmt: skip
         angle = np.radians(turn)
         total = sum(width for width, _ in row)
         left = 0.0
@@ -347,9 +337,9 @@ def _houses(b: Builder) -> None:
             left += width
 
 
-def _fronts(random: np.random.Generator, row: Sequence[tuple[float, int]], side: str) -> Image:
+def _fronts(on: Canvas, row: Sequence[tuple[float, int]], side: str) -> Image:
     fronts = [
-        decals.house(width, storeys, random, HOUSE_DENSITY, number + len(side))
+        decals.house(width, storeys, on.random, on.density, number + len(side))
         for number, (width, storeys) in enumerate(row)
     ]
     tall = max(len(front) for front in fronts)
@@ -357,20 +347,19 @@ def _fronts(random: np.random.Generator, row: Sequence[tuple[float, int]], side:
     return np.concatenate(padded, 1)
 
 
-def _containers(random: np.random.Generator) -> Image:
+def _containers(on: Canvas) -> Image:
     """Return long side and end of four named containers, stacked downwards."""
     rows = []
     paints = ((0.20, 0.36, 0.50), (0.66, 0.30, 0.18), (0.30, 0.44, 0.34), (0.74, 0.58, 0.24))
     for number, paint in enumerate(paints):
-        shape = (208, 688)
-        sheet = materials.metal(shape, random, 80.0, paint, pitch=0.28)
-        worn = smooth(-1.5, 0.1, fractal(shape, random, coarse=30))
+        sheet = materials.metal(on, paint, pitch=0.28)
+        worn = smooth(-1.5, 0.1, on.fractal(coarse=30))
         word = decals.WORDS[(3 * number + 2) % 12]
         decals.letters(sheet, word, (50, 50, 360, 120), (0.88, 0.86, 0.80), worn)
-        code = f"VNRU {random.integers(100000, 999999)}"
+        code = f"VNRU {on.random.integers(100000, 999999)}"
         decals.letters(sheet, code, (330, 140, 470, 180), (0.88, 0.86, 0.80), worn)
         decals.letters(sheet, f"{number + 1}", (510, 40, 670, 150), (0.88, 0.86, 0.80), worn)
-        frame = np.zeros(shape, np.float32)
+        frame = np.zeros(on.shape, np.float32)
         frame[:9] = frame[-12:] = 1.0
         for x in (0, 476, 486, 680):
             frame[:, x : x + 8] = 1.0

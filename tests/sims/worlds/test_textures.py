@@ -12,7 +12,7 @@ import pytest
 
 from sims.worlds import WORLDS, load_world, textures
 from sims.worlds.builder import Builder
-from sims.worlds.materials import Image
+from sims.worlds.materials import Canvas, Image
 
 SAVED: dict[str, dict[str, str]] = json.loads(
     Path(__file__).with_name("textures.json").read_text(encoding="utf-8")
@@ -62,13 +62,13 @@ class Drawings:
     def __init__(self) -> None:
         self.count = 0
 
-    def draw(self, random: np.random.Generator) -> Image:
+    def draw(self, on: Canvas) -> Image:
         self.count += 1
-        return random.uniform(size=(5, 7, 3)).astype(np.float32)
+        return on.random.uniform(size=(*on.shape, 3)).astype(np.float32)
 
     def world(self, seed: int = 0, name: str = "mine", bare: bool = False) -> bytes:
         model = Builder(name, seed, bare)
-        model.material("stone", self.draw, 1.0)
+        model.material("stone", self.draw, (5, 7), 1.0)
         return bytes(model.spec.texture("stone").data)
 
 
