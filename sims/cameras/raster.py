@@ -91,6 +91,7 @@ class Raster(Stage):
     ) -> None:
         super().__init__(model, dynamics)
         self._threads = threads
+        self._kept: list[tuple[npt.NDArray[Any], npt.NDArray[Any]]] = []  # poses of eye and geoms
         for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
             if count:
                 raise ValueError(
@@ -157,19 +158,20 @@ class Raster(Stage):
             np.empty(shape, np.float32) if depth else None,
             np.empty(shape, np.int32) if numbers else None,
         )
-        data, camera, model = self._data, self._camera.fixedcamid, self.model
-        eye, frame = np.zeros(1, POSE), np.zeros(1, VIEW)
-        eye["position"] = data.cam_xpos[camera]
-        eye["turn"] = data.cam_xmat[camera] * _OPTICAL
+        if not self._kept:
+            self.keep()
+        eyes, poses = (np.concatenate(each) for each in zip(*self._kept, strict=True))
+        frame = np.zeros(1, VIEW)
         frame["height"], frame["width"], frame["threads"] = height, width, self._threads
         frame["first"], frame["last"], frame["sky"] = first, last, self._sky
-        frame["near"], frame["far"] = NEAR, RANGE
+        frame["near"], frame["far"], frame["poses"] = NEAR, RANGE, len(self._kept)
         if (fog := self._fog()) is not None:
-            frame["fogged"], frame["fog"] = 1, model.vis.rgba.fog[:3]
+            frame["fogged"], frame["fog"] = 1, self.model.vis.rgba.fog[:3]
             frame["fog_start"], frame["fog_end"] = fog
-        (geoms, poses), lights = self._placed(), self._lights()
+        geoms, lights = self._coloured(), self._lights()
+        self._kept = []
         self._library.raster_draw(
-            self._world, self._lens(view.info), _at(frame), _at(eye), len(geoms), _at(geoms),
+            self._world, self._lens(view.info), _at(frame), _at(eyes), len(geoms), _at(geoms),
             _at(poses), len(lights), _at(lights), *map(_at, drawn),
         )  # fmt: skip
         return drawn
@@ -197,18 +199,25 @@ class Raster(Stage):
                 to["position"], to["direction"] = of.pos, of.dir
         return found
 
-    def _placed(self) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-        """Return the geoms in their colours of now, and where they are."""
-        model, data, drawn, geoms = self.model, self._data, self._drawn, self._geoms
-        poses = np.empty(len(drawn), POSE)
-        poses["position"], poses["turn"] = data.geom_xpos[drawn], data.geom_xmat[drawn]
+    @override
+    @override
+    def keep(self) -> None:
+        data, camera, eye = self._data, self._camera.fixedcamid, np.empty(1, POSE)
+        eye["position"] = data.cam_xpos[camera]
+        eye["turn"] = data.cam_xmat[camera] * _OPTICAL
+        poses = np.empty(len(self._drawn), POSE)
+        poses["position"], poses["turn"] = data.geom_xpos[self._drawn], data.geom_xmat[self._drawn]
+        self._kept.append((eye, poses))
+
+    def _coloured(self) -> npt.NDArray[Any]:
+        """Return the geoms in their colours of now."""
+        model, drawn, geoms = self.model, self._drawn, self._geoms
         rgba = model.geom_rgba[drawn]
         # A material's colour, unless the geom has one of its own.
         plain = (model.geom_matid[drawn] >= 0) & (rgba == _GREY).all(axis=1)
         rgba[plain] = model.mat_rgba[model.geom_matid[drawn[plain]]]
         geoms["rgba"], geoms["culled"] = rgba, rgba[:, 3] >= 1.0
-        seen = rgba[:, 3] > 0.0
-        return geoms[seen], poses[seen]
+        return geoms
 
     def _describe(self) -> None:
         """Fill in the geoms' fields that stay as they are."""

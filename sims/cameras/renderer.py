@@ -160,6 +160,8 @@ def open_stage(
 
 Pose = tuple[Vector3, Quaternion]
 
+KEPT = 0.002  # most seconds between the states through which rows are drawn
+
 
 class Captured(NamedTuple):
     """Light on a camera's sensor in an exposure, before the sensor's errors."""
@@ -220,6 +222,7 @@ class CameraRenderer:
         self._views = {spec.name: View(camera_info(spec), is_plain(spec)) for spec in cameras}
         infos = tuple(view.info for view in self._views.values())
         self._stage = open_stage(renderer, model, infos, threads, dynamics)
+        self._rows_move = renderer == "raster"
 
     def expose(self, shots: tuple[Shot, ...]) -> tuple[Frame, ...]:
         """Return the frames of some exposures. The same arguments give the same bits."""
@@ -247,7 +250,10 @@ class CameraRenderer:
         self._stage.close()
 
     def _capture(self, shot: Shot, spec: CameraSpec, number: int) -> Captured:
-        """Draw light on the sensor, in bands: colours at each moment, all else in the middle."""
+        """Draw light on the sensor: colours at each moment, all else in the middle.
+
+        A rolling shutter's rows are drawn each at its own time, or in bands where the stage cannot.
+        """
         kinds, stage, view = set(spec.images), self._stage, self._views[spec.name]
         coloured = not kinds.isdisjoint({"rgb", "grey"})
         exposure = shot.exposure if coloured and shot.moves() else 0.0
@@ -255,10 +261,11 @@ class CameraRenderer:
         readout = float(spec.readout) if shot.moves() else 0.0
         bands: list[tuple[int, int]] = [(0, spec.height)]
         times = [0.0]
-        if exposure + readout > 0.0:
+        if exposure > 0.0 or (readout > 0.0 and not self._rows_move):
             speeds = self._speeds(shot, spec, number, exposure + readout)
-            finer = FINER_FOR_DEPTH if "depth" in kinds else 1.0
-            bands = row_bands(spec.height, float(speeds.max()) * readout * finer)
+            if not self._rows_move:
+                finer = FINER_FOR_DEPTH if "depth" in kinds else 1.0
+                bands = row_bands(spec.height, float(speeds.max()) * readout * finer)
             times = moments(exposure, float(np.quantile(speeds, 0.9)) * exposure)
         poses = [
             self._pose(shot, number, moment)
@@ -268,6 +275,10 @@ class CameraRenderer:
         for rows in bands:
             middle = row_time(readout, (rows[0] + rows[1] - 1) / 2.0, spec.height)
             for pieces, moment in zip(drawn, times, strict=True):
+                if self._rows_move and readout:
+                    for late in np.linspace(-0.5, 0.5, math.ceil(readout / KEPT) + 1) * readout:
+                        self._look(shot, spec, number, float(late) + moment)
+                        stage.keep()
                 self._look(shot, spec, number, middle + moment)
                 alone = moment == 0.0
                 if not spec.readout and alone:

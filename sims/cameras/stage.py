@@ -85,6 +85,14 @@ class Stage(ABC):
     def close(self) -> None:
         """Give back what it holds. Further calls do nothing."""
 
+    def keep(self) -> None:
+        """Keep the state last looked at for the next drawing, if the stage draws row by row.
+
+        Of kept states the first is that of the first row and the last that of the last row, with
+        the others between at equal steps. The drawing's light is that of the state last looked at.
+        """
+        raise NotImplementedError
+
     @abstractmethod
     def draw(
         self,

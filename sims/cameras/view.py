@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from typing import NamedTuple
@@ -112,6 +113,9 @@ def small_camera(info: CameraInfo) -> CameraInfo:
     )
 
 
+_rays = functools.lru_cache(maxsize=64)(lambda small: pixel_rays(small).reshape(-1, 3))
+
+
 def image_speeds(
     info: CameraInfo,
     small: CameraInfo,
@@ -125,7 +129,7 @@ def image_speeds(
         depth: Planar depth as the small camera sees it at the middle pose, shape (h, w).
         poses: The optical frame in ``map``, (4, 4), at an odd number of times at equal intervals.
     """
-    rays = pixel_rays(small).reshape(-1, 3)
+    rays = _rays(small)
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = depth.reshape(-1) / rays[:, 2]
     points = rays * np.where(np.isfinite(scale), scale, RANGE)[:, None]

@@ -20,6 +20,24 @@ const Triangle& Band::triangle(std::int32_t number) const {
     return parts[(number & ~clear_part) >> parts_from][number & ((1 << parts_from) - 1)];
 }
 
+const Moving& Band::moving(std::int32_t number) const {
+    const auto& parts = number & clear_part ? scene_.clear_moving_ : scene_.solid_moving_;
+    return parts[(number & ~clear_part) >> parts_from][number & ((1 << parts_from) - 1)];
+}
+
+Corners Band::between_poses(std::int32_t number, int y) const {
+    const Moving& moving = this->moving(number);
+    return {moving.from, moving.to, (y - scene_.start_) / scene_.step_};
+}
+
+// A triangle as a row sees it; false if it does not.
+bool Band::seen(Triangle& triangle, std::int32_t number, int y) const {
+    const Corners corners = between_poses(number, y);
+    if (corners.away >= 0 && scene_.placed_[triangle.geom].geom->culled) return false;
+    triangle.see(corners);
+    return true;
+}
+
 std::int32_t& Band::surface_of(std::int32_t number) {
     const std::size_t solid = scene_.solid_.size(), clear = scene_.clear_.size();
     if (surface_of_.empty()) surface_of_.resize(solid + clear);
@@ -46,15 +64,23 @@ void Band::draw() {
 
 // Call found(y, x, inside, inverse depth) for pixels side by side, some of them in a triangle.
 template <typename Found>
-inline void Band::over(const Triangle& triangle, Found found) {
+inline void Band::over(const Triangle& triangle, std::int32_t number, Found found) {
     if (triangle.top >= last_ || triangle.bottom <= first_) return;
-    if (lens_.pinhole) return scan_frame(triangle, found);
     const Placed& placed = scene_.placed_[triangle.geom];
-    over_square(triangle, placed.square, placed.column, placed.row, placed.side, found);
+    if (!lens_.pinhole) {
+        Triangle later = triangle;
+        if (view_.poses > 1) later.see(moving(number).to);
+        return over_square(triangle, later, number, placed.square, placed.column, placed.row,
+                           placed.side, found);
+    }
+    if (view_.poses == 1) return scan_frame(triangle, triangle.top, triangle.bottom, found);
+    Triangle row = triangle;
+    for (int y = std::max(triangle.top, first_); y < std::min(triangle.bottom, last_); ++y)
+        if (seen(row, number, y)) scan_frame(row, y, y + 1, found);
 }
 
 template <typename Found>
-inline void Band::scan_frame(const Triangle& triangle, Found found) {
+inline void Band::scan_frame(const Triangle& triangle, int top, int bottom, Found found) {
     const float(&e)[3][3] = triangle.edges;
     const float(&d)[3] = triangle.depth;
     const fv nearest = fv{} + 1.0f / view_.near;
@@ -63,8 +89,8 @@ inline void Band::scan_frame(const Triangle& triangle, Found found) {
     const float start = lens_.x[0], steps = static_cast<float>(1.0 / lens_.step[0]);
     float slope[3];  // of the columns in which the edges are, by row
     for (int k = 0; k < 3; ++k) slope[k] = e[k][0] != 0 ? -1.0f / e[k][0] : 0;
-    const int last = std::min(triangle.bottom, last_);
-    for (int y = std::max(triangle.top, first_); y < last; ++y) {
+    bottom = std::min(bottom, last_);
+    for (int y = std::max(top, first_); y < bottom; ++y) {
         const float down = lens_.y[y];
         float in[3];
         for (int k = 0; k < 3; ++k) in[k] = e[k][1] * down + e[k][2];
@@ -90,23 +116,24 @@ inline void Band::scan_frame(const Triangle& triangle, Found found) {
     }
 }
 
-static f4 most(const Lens::Square& rays, Vec3f along) {
-    return (along.x > 0 ? rays.high : rays.low)[0] * along.x +
-           ((along.y > 0 ? rays.high : rays.low)[1] * along.y +
-            (along.z > 0 ? rays.high : rays.low)[2] * along.z);
-}
-
-// In the parts of a square of rays that the triangle does not miss: those of large squares must come
-// near the ball about it, and those of small ones not be all beyond an edge, behind, or hidden.
+// In the parts of a square of rays that the triangle does not miss, neither now nor later: those of
+// large squares must come near the ball about it, and those of small ones not be all beyond an edge,
+// behind, or hidden.
 template <typename Found>
-void Band::over_square(const Triangle& triangle, int square, int column, int row, int side,
-                       Found found) {
+void Band::over_square(const Triangle& triangle, const Triangle& later, std::int32_t number,
+                       int square, int column, int row, int side, Found found) {
     const Lens::Square& rays = lens_.squares[square];
     i4 met = (rays.low[2] <= rays.high[2]) & (most(rays, triangle.ahead) >= triangle.least);
     f4 nearest{};
     if (side <= Lens::small) {
-        for (const auto& edge : triangle.edges) met &= most(rays, {edge[0], edge[1], edge[2]}) >= 0.0f;
-        nearest = most(rays, {triangle.depth[0], triangle.depth[1], triangle.depth[2]});
+        const auto reach = [&](const float(&now)[3], const float(&then)[3]) {
+            const f4 one = most(rays, {now[0], now[1], now[2]});
+            if (view_.poses == 1) return one;
+            const f4 other = most(rays, {then[0], then[1], then[2]});
+            return one < other ? other : one;
+        };
+        for (int k = 0; k < 3; ++k) met &= reach(triangle.edges[k], later.edges[k]) >= 0.0f;
+        nearest = reach(triangle.depth, later.depth);
         met &= nearest >= 0.0f;
     }
     side /= 2;
@@ -115,18 +142,27 @@ void Band::over_square(const Triangle& triangle, int square, int column, int row
         const int left = column + part % 2 * side, top = row + part / 2 * side;
         if (top >= last_ || top + side <= first_) continue;
         if (rays.parts[part] >= 0)
-            over_square(triangle, rays.parts[part], left, top, side, found);
+            over_square(triangle, later, number, rays.parts[part], left, top, side, found);
         else if (!(nearest[part] * 1.00001f <= farthest_[leaf(left, top)]))
-            over_leaf(triangle, left, top, found);
+            over_leaf(triangle, number, left, top, found);
     }
 }
 
 // In the smallest square of a lens.
 template <typename Found>
-inline void Band::over_leaf(const Triangle& triangle, int left, int top, Found found) {
+inline void Band::over_leaf(const Triangle& triangle, std::int32_t number, int left, int top,
+                            Found found) {
     const int from = std::max(top, first_), to = std::min(top + Lens::smallest, last_);
     const int right = std::min(left + Lens::smallest, lens_.stride);
-    if (!scan_pixels(triangle, left, right, from, to, found)) return;
+    bool touched = false;
+    if (view_.poses == 1) {
+        touched = scan_pixels(triangle, left, right, from, to, found);
+    } else {
+        Triangle row = triangle;
+        for (int y = from; y < to; ++y)
+            if (seen(row, number, y)) touched |= scan_pixels(row, left, right, y, y + 1, found);
+    }
+    if (!touched) return;
     fv least = load<fv>(nearest_ + at(from) + left);
     for (int y = from; y < to; ++y)
         for (int x = left; x < right; x += lanes) {
@@ -163,7 +199,7 @@ inline bool Band::scan_pixels(const Triangle& triangle, int left, int right, int
 
 void Band::cover(const Triangle& triangle, std::int32_t number) {
     const iv mine = iv{} + number;
-    over(triangle, [&](int y, int x, iv inside, fv q) __attribute__((always_inline)) {
+    over(triangle, number, [&](int y, int x, iv inside, fv q) __attribute__((always_inline)) {
         const std::size_t here = at(y) + x;
         const fv before = load<fv>(nearest_ + here);
         const iv wins = inside & (q > before);
@@ -181,6 +217,12 @@ static bool owns(const Triangle& triangle, Vec3f ray) {
     return true;
 }
 
+bool Band::owned(const Triangle& triangle, std::int32_t number, int x, int y) const {
+    if (view_.poses == 1) return owns(triangle, lens_.ray(x, y));
+    Triangle row = triangle;
+    return seen(row, number, y) && owns(row, lens_.ray(x, y));
+}
+
 // Draw what is see-through over what is behind it, from the back to the front. It has a number, but
 // no depth.
 void Band::blend() {
@@ -189,11 +231,11 @@ void Band::blend() {
         std::int32_t number = clear_part | static_cast<std::int32_t>(part) << parts_from;
         for (const Triangle& triangle : scene_.clear_[part]) {
             if (front.empty()) front.assign(nearest_ + at(first_), nearest_ + at(last_) + widest);
-            over(triangle, [&](int y, int x, iv inside, fv q) {
+            over(triangle, number, [&](int y, int x, iv inside, fv q) {
                 const std::size_t here = at(y) + x;
                 const iv wins = inside & (q > load<fv>(nearest_ + here));
                 for (int k = 0; k < lanes && x + k < lens_.width; ++k) {
-                    if (!wins[k] || !owns(triangle, lens_.ray(x + k, y))) continue;
+                    if (!wins[k] || !owned(triangle, number, x + k, y)) continue;
                     float& most = front[here - at(first_) + k];
                     if (q[k] > most) most = q[k], visible_[here + k] = number;
                     if (images_.rgb) mix(x + k, y, q[k], number);

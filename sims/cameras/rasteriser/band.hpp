@@ -15,16 +15,20 @@ class Band {
 
     const Triangle& triangle(std::int32_t number) const;
     std::int32_t& surface_of(std::int32_t number);
-    const Surface& surface(std::int32_t number);
+    const Surface& surface(std::int32_t number, int y);
+    const Moving& moving(std::int32_t number) const;
+    Corners between_poses(std::int32_t number, int y) const;
+    bool seen(Triangle& triangle, std::int32_t number, int y) const;
+    bool owned(const Triangle& triangle, std::int32_t number, int x, int y) const;
     template <typename Found>
-    void over(const Triangle& triangle, Found found);
+    void over(const Triangle& triangle, std::int32_t number, Found found);
     template <typename Found>
-    void over_square(const Triangle& triangle, int square, int column, int row, int side,
-                     Found found);
+    void over_square(const Triangle& triangle, const Triangle& later, std::int32_t number,
+                     int square, int column, int row, int side, Found found);
     template <typename Found>
-    void scan_frame(const Triangle& triangle, Found found);
+    void scan_frame(const Triangle& triangle, int top, int bottom, Found found);
     template <typename Found>
-    void over_leaf(const Triangle& triangle, int left, int top, Found found);
+    void over_leaf(const Triangle& triangle, std::int32_t number, int left, int top, Found found);
     template <typename Found>
     bool scan_pixels(const Triangle& triangle, int left, int right, int top, int bottom,
                      Found found) const;

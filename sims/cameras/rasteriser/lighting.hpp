@@ -2,7 +2,6 @@
 #pragma once
 
 #include <algorithm>
-#include <cmath>
 
 #include "types.hpp"
 
@@ -33,8 +32,6 @@ inline float log_2(float x) {
     y -= 1.0f;  // a polynomial in y from 0 to 1, exact at both ends
     return exponent + y * (1.44252727f + y * (-0.71791348f + y * (0.456540411f + y * (-0.275968957f + y * (0.120100259f + y * -0.025285506f)))));
 }
-
-inline double root(double x) { return std::sqrt(x); }  // IEEE 754 requires it to be exact
 
 inline Vec3 unit(Vec3 a) {
     const double length = root(dot(a, a));

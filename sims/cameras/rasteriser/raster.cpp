@@ -66,11 +66,11 @@ int raster_lens(Scene* scene, int width, int height, const float* x, const float
     return static_cast<int>(scene->lenses.size()) - 1;
 }
 
-// Images not wanted are null.
-void raster_draw(Scene* scene, int lens, const View* view, const Pose* eye, int geoms,
+// Images not wanted are null; eyes and poses as `Scene::draw` takes them.
+void raster_draw(Scene* scene, int lens, const View* view, const Pose* eyes, int geoms,
                  const Geom* geom, const Pose* poses, int lights, const Light* light,
                  std::uint8_t* rgb, float* depth, std::int32_t* numbers) {
-    scene->draw(*scene->lenses[lens], *view, *eye, geom, poses, geoms, light, lights,
+    scene->draw(*scene->lenses[lens], *view, eyes, geom, poses, geoms, light, lights,
                 {rgb, depth, numbers});
 }
 

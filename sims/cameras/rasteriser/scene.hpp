@@ -54,7 +54,21 @@ struct Corners {
         : edges{cross(points[0], points[1]), cross(points[1], points[2]),
                 cross(points[2], points[0])},
           away(dot(cross(points[1] - points[0], points[2] - points[0]), points[0])) {}
+
+    // Between two poses: all of these are linear in the eye's place.
+    Corners(const Corners& from, const Corners& to, double share)
+        : away(from.away + (to.away - from.away) * share) {
+        for (int k = 0; k < 3; ++k)
+            edges[k] = from.edges[k] + (to.edges[k] - from.edges[k]) * share;
+    }
 };
+
+// The most that a plane may say of the rays in each part of a square.
+inline f4 most(const Lens::Square& rays, Vec3f plane) {
+    return (plane.x > 0 ? rays.high : rays.low)[0] * plane.x +
+           ((plane.y > 0 ? rays.high : rays.low)[1] * plane.y +
+            (plane.z > 0 ? rays.high : rays.low)[2] * plane.z);
+}
 
 struct Triangle {
     float depth[3];     // inverse depth, times the ray
@@ -69,6 +83,10 @@ struct Triangle {
         put(depth, (corners.edges[0] + corners.edges[1] + corners.edges[2]) * share);
         for (int k = 0; k < 3; ++k) put(edges[k], corners.edges[k] * side);
     }
+};
+
+struct Moving {  // a triangle that is seen from one pose in its first row, and another in its last
+    Corners from, to;
 };
 
 struct Surface {  // what is interpolated on a triangle, each times the ray
@@ -89,7 +107,6 @@ struct Placed {  // a geom of the frame
     Matrix turn;                   // from the mesh's axes to the optical frame
     int square, column, row, side;  // the smallest of the lens that it fits into, unless a pinhole
     std::vector<Vec3> seen;        // its vertices in the optical frame
-    const Vec3f* light = nullptr;  // of its vertices; if it is see-through, then from behind
 };
 
 // Images to fill; those not wanted are null.
@@ -106,36 +123,47 @@ class Scene {
     std::vector<std::unique_ptr<Lens>> lenses;
     std::vector<std::uint32_t> texels{0xffffff, 0xffffff};  // two white ones, and all textures'
 
-    void draw(const Lens& lens, const View& view, const Pose& eye, const Geom* geoms,
+    // Eyes and poses are `view.poses` times those of one pose: the first are of the uppermost row of
+    // the image, the last of the lowest one, and the others between at equal steps.
+    void draw(const Lens& lens, const View& view, const Pose* eyes, const Geom* geoms,
               const Pose* poses, int count, const Light* lights, int light_count,
               const Images& images);
 
   private:
     friend class Band;
 
-    struct Slot {  // light of a geom's vertices that holds until something moves
+    struct Slot {  // light on a geom's vertices; if it is see-through, then from behind
         Geom geom;
         Pose pose;
+        int frame;
         std::vector<Vec3f> light;
     };
+    using Triangles = std::vector<std::vector<Triangle>>;
+    using Movings = std::vector<std::vector<Moving>>;
 
-    void place(const Geom& geom, const Pose& pose, Placed& placed) const;
+    void draw_rows(int first, int last, const Geom* geoms, const Pose* poses, int count,
+                   const Images& images);
+    void place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) const;
+    static void see(Placed& placed);
+    int beyond(const Placed& placed) const;
     static bool ball(Vec3 middle, double reach, Vec3f& ahead, float& least);
-    bool in_view(Placed& placed) const;
-    bool in_frame(const Placed& placed) const;
-    bool in_squares(Placed& placed) const;
-    void add(std::vector<Triangle>& to, int index) const;
-    bool bounded(Triangle& triangle, const Vec3 (&points)[3]) const;
-    void light(Placed& placed, const Pose& pose, Slot& slot) const;
+    bool in_squares(Placed& placed, const Placed& later) const;
+    void add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) const;
+    bool bounded(Triangle& triangle, const Vec3* points, int count) const;
+    void light(const Geom& geom, const Pose& pose, Slot& slot) const;
     void spread(int parts, const std::function<void(int)>& work) const;
 
     const Lens* lens_ = nullptr;
     View view_{};
-    Pose eye_{};
+    int frame_ = 0;
+    int first_ = 0, last_ = 0;  // rows that are being drawn: first to last - 1
+    double start_ = 0, step_ = 0;  // row of the first pose, and how many there are to the next one
+    Pose eye_{}, next_eye_{}, middle_eye_{};
     std::vector<Light> lights_;
-    std::vector<Placed> placed_;
+    std::vector<Placed> placed_, later_;  // for the first pose, and the next one
     std::vector<Slot> slots_;
-    std::vector<std::vector<Triangle>> solid_, clear_;  // the frame's triangles, in parts
+    Triangles solid_, clear_;  // of these rows, in parts
+    Movings solid_moving_, clear_moving_;
     std::vector<float> nearest_;         // inverse depth of the nearest surface; 0 for nothing
     std::vector<std::int32_t> visible_;  // its triangle
 };

@@ -7,48 +7,57 @@
 namespace raster {
 
 // Light on a geom's vertices; that of before, if nothing has moved.
-void Scene::light(Placed& placed, const Pose& pose, Slot& slot) const {
-    const Mesh& mesh = *placed.mesh;
-    const Geom& geom = *placed.geom;
+void Scene::light(const Geom& geom, const Pose& pose, Slot& slot) const {
+    if (slot.frame == frame_ && !slot.light.empty()) return;
+    slot.frame = frame_;
+    const Mesh& mesh = *meshes[geom.mesh];
     bool shines = false;
     for (const Light& each : lights_)
         shines |= geom.specular > 0 && (each.specular[0] + each.specular[1] + each.specular[2]) > 0;
     const std::size_t sides = geom.culled ? 1 : 2;
-    if (shines || slot.light.size() != sides * mesh.points.size() ||
-        std::memcmp(&slot.geom, &geom, sizeof geom) || std::memcmp(&slot.pose, &pose, sizeof pose)) {
-        const Vec3 eye{eye_.position[0], eye_.position[1], eye_.position[2]};
-        const Vec3 origin{pose.position[0], pose.position[1], pose.position[2]};
-        slot.light.clear();
-        for (std::size_t side = 0; side < sides; ++side)
-            for (std::size_t k = 0; k < mesh.points.size(); ++k) {
-                const Vec3f p = mesh.points[k], n = mesh.normals[k];
-                const Vec3 normal = unit(pose.turn * Vec3{n.x, n.y, n.z}) * (side ? -1.0 : 1.0);
-                const Vec3 point = pose.turn * Vec3{p.x, p.y, p.z} + origin;
-                slot.light.push_back(lit(geom, lights_, point, normal, eye));
-            }
-        slot.geom = geom, slot.pose = pose;
-    }
-    placed.light = slot.light.data();
+    if (!shines && slot.light.size() == sides * mesh.points.size() &&
+        !std::memcmp(&slot.geom, &geom, sizeof geom) &&
+        !std::memcmp(&slot.pose, &pose, sizeof pose))
+        return;
+    const Vec3 eye{middle_eye_.position[0], middle_eye_.position[1], middle_eye_.position[2]};
+    const Vec3 origin{pose.position[0], pose.position[1], pose.position[2]};
+    slot.light.clear();
+    for (std::size_t side = 0; side < sides; ++side)
+        for (std::size_t k = 0; k < mesh.points.size(); ++k) {
+            const Vec3f p = mesh.points[k], n = mesh.normals[k];
+            const Vec3 normal = unit(pose.turn * Vec3{n.x, n.y, n.z}) * (side ? -1.0 : 1.0);
+            const Vec3 point = pose.turn * Vec3{p.x, p.y, p.z} + origin;
+            slot.light.push_back(lit(geom, lights_, point, normal, eye));
+        }
+    slot.geom = geom, slot.pose = pose;
 }
 
-// Planes of all that is interpolated on a triangle, computed when its first pixel is shaded.
-const Surface& Band::surface(std::int32_t number) {
-    std::int32_t& known = surface_of(number);
-    if (known >= 0) return surfaces_[known];
-    known = static_cast<std::int32_t>(surfaces_.size());
+// Planes of all that is interpolated on a triangle, computed when its first pixel is shaded; while
+// it moves, those of a row.
+const Surface& Band::surface(std::int32_t number, int y) {
+    const bool rolling = view_.poses > 1;
+    if (!rolling) {
+        std::int32_t& known = surface_of(number);
+        if (known >= 0) return surfaces_[known];
+        known = static_cast<std::int32_t>(surfaces_.size());
+    } else {
+        surfaces_.clear();
+    }
     const Triangle& triangle = this->triangle(number);
     const Placed& placed = scene_.placed_[triangle.geom];
     const Geom& geom = *placed.geom;
     const Mesh& mesh = *placed.mesh;
     const std::int32_t* corners = mesh.corners.data() + triangle.corner;
-    const Corners seen({placed.seen[corners[0]], placed.seen[corners[1]], placed.seen[corners[2]]});
+    const Corners seen =
+        rolling ? between_poses(number, y)
+                : Corners({placed.seen[corners[0]], placed.seen[corners[1]], placed.seen[corners[2]]});
     const double share = 1.0 / seen.away;
     const Vec3 weights[3] = {seen.edges[1] * share, seen.edges[2] * share, seen.edges[0] * share};
     const auto plane = [&](float (&to)[3], float a, float b, float c) {
         put(to, weights[0] * double(a) + weights[1] * double(b) + weights[2] * double(c));
     };
     Surface made{};
-    std::memcpy(made.depth, triangle.depth, sizeof made.depth);
+    put(made.depth, weights[0] + weights[1] + weights[2]);
     made.opacity = geom.rgba[3];
     if (geom.texture >= 0) {
         made.texture = scene_.textures[geom.texture].get();
@@ -70,7 +79,8 @@ const Surface& Band::surface(std::int32_t number) {
             plane(made.v, place(0, 1), place(1, 1), place(2, 1));
         }
     }
-    const Vec3f* light = placed.light + (share > 0 && !geom.culled ? mesh.points.size() : 0);
+    const Vec3f* light = scene_.slots_[triangle.geom].light.data() +
+                         (share > 0 && !geom.culled ? mesh.points.size() : 0);
     const Vec3f l[3] = {light[corners[0]], light[corners[1]], light[corners[2]]};
     made.flat = !std::memcmp(&l[0], &l[1], sizeof l[0]) && !std::memcmp(&l[0], &l[2], sizeof l[0]);
     if (made.flat) {
@@ -218,7 +228,7 @@ void Band::shade() {
 }
 
 void Band::place(int y, int left, int right, std::int32_t number) {
-    const Surface& surface = this->surface(number);
+    const Surface& surface = this->surface(number, y);
     for (; left < right; left += run) {
         const int count = std::min(right - left, run);
         const float* nearest = nearest_ + at(y) + left;
@@ -228,11 +238,14 @@ void Band::place(int y, int left, int right, std::int32_t number) {
 }
 
 void Band::place_sky(int y, int left, int right) {
+    const double share = (y - scene_.start_) / scene_.step_;
     for (; left < right; left += lanes) {
         float rays[3][lanes] = {};
         for (int k = 0; k < lanes && left + k < right; ++k) {
             const Vec3f ray = lens_.ray(left + k, y);
-            const Vec3 world = scene_.eye_.turn * Vec3{ray.x, ray.y, ray.z};
+            const Vec3 along{ray.x, ray.y, ray.z};
+            const Vec3 from = scene_.eye_.turn * along, to = scene_.next_eye_.turn * along;
+            const Vec3 world = from + (to - from) * share;
             rays[0][k] = static_cast<float>(world.x);
             rays[1][k] = static_cast<float>(world.z);
             rays[2][k] = static_cast<float>(-world.y);
@@ -253,7 +266,7 @@ void Band::place_sky(int y, int left, int right) {
 
 // Blend a see-through triangle's colour into a pixel.
 void Band::mix(int x, int y, float nearest, std::int32_t number) {
-    const Surface& surface = this->surface(number);
+    const Surface& surface = this->surface(number, y);
     float inverse[widest];
     std::fill_n(inverse, widest, nearest);
     if (lens_.pinhole) place<true>(surface, x, y, inverse, 1);

@@ -8,6 +8,7 @@
 #include <immintrin.h>
 #endif
 
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <memory>
@@ -116,6 +117,8 @@ inline void put(float (&to)[3], Vec3 from) {
     const Vec3f found = narrow(from);
     to[0] = found.x, to[1] = found.y, to[2] = found.z;
 }
+
+inline double root(double x) { return std::sqrt(x); }  // IEEE 754 requires it to be exact
 
 struct Matrix {  // 3 x 3, row by row
     double m[9];

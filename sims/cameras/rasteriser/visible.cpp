@@ -20,69 +20,90 @@ void Scene::spread(int parts, const std::function<void(int)>& work) const {
     for (std::thread& other : others) other.join();
 }
 
-void Scene::draw(const Lens& lens, const View& view, const Pose& eye, const Geom* geoms,
+void Scene::draw(const Lens& lens, const View& view, const Pose* eyes, const Geom* geoms,
                  const Pose* poses, int count, const Light* lights, int light_count,
                  const Images& images) {
     lens_ = &lens;
     view_ = view;
-    eye_ = eye;
+    ++frame_;
     if (lights_.size() != std::size_t(light_count) ||
         (light_count && std::memcmp(lights_.data(), lights, sizeof(Light) * light_count))) {
         slots_.clear();
         lights_.assign(lights, lights + light_count);
     }
-    slots_.resize(count);
-    placed_.resize(count);
+    slots_.resize(count), placed_.resize(count), later_.resize(count);
+    nearest_.resize(std::size_t(view.last - view.first) * lens.stride + widest);
+    visible_.resize(std::size_t(view.last - view.first) * lens.stride + widest);
+    const int steps = view.poses - 1, middle = view.poses / 2;
+    middle_eye_ = eyes[middle];
+    if (images.rgb)  // the light of the middle is that of all rows
+        for (int k = 0; k < count; ++k) slots_[k].pose = poses[std::size_t(middle) * count + k];
+    for (int k = 0; k < std::max(steps, 1); ++k) {
+        step_ = steps ? (view.height - 1.0) / steps : 1.0, start_ = k * step_;
+        eye_ = eyes[k], next_eye_ = eyes[std::min(k + 1, steps)];
+        const int first = std::max(static_cast<int>(std::ceil(start_)), view.first);
+        const int end = k + 1 >= steps ? view.height : static_cast<int>(std::ceil(start_ + step_));
+        const int last = std::min(end, view.last);
+        if (first < last)
+            draw_rows(first, last, geoms, poses + std::size_t(k) * count, count, images);
+    }
+}
+
+void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses, int count,
+                      const Images& images) {
+    first_ = first, last_ = last;
+    const bool rolling = view_.poses > 1;
     std::vector<std::pair<double, int>> order;
     for (int index = 0; index < count; ++index) {
         Placed& placed = placed_[index];
-        place(geoms[index], poses[index], placed);
-        if (in_view(placed)) order.emplace_back(dot(placed.shift, placed.shift), index);
+        if (!(geoms[index].rgba[3] > 0.0f)) continue;
+        place(geoms[index], poses[index], eye_, placed);
+        if (rolling) place(geoms[index], poses[count + index], next_eye_, later_[index]);
+        if (lens_->pinhole) {
+            if (beyond(placed) & (rolling ? beyond(later_[index]) : ~0)) continue;
+        } else if (!in_squares(placed, rolling ? later_[index] : placed)) {
+            continue;
+        }
+        order.emplace_back(dot(placed.shift, placed.shift), index);
     }
     std::sort(order.begin(), order.end());  // front to back: of equal depths the first counts
-    const int pieces = view.threads == 1 ? 1 : view.threads * 4;  // so that none waits long
+    const int pieces = view_.threads == 1 || rolling ? 1 : view_.threads * 4;  // none waits long
     solid_.resize(pieces), clear_.resize(pieces);
+    solid_moving_.resize(pieces), clear_moving_.resize(pieces);
     spread(pieces, [&](int part) {
         solid_[part].clear(), clear_[part].clear();
-        const std::size_t first = order.size() * part / pieces;
-        const std::size_t last = order.size() * (part + 1) / pieces;
-        for (std::size_t k = first; k < last; ++k) {
+        solid_moving_[part].clear(), clear_moving_[part].clear();
+        const std::size_t begin = order.size() * part / pieces;
+        const std::size_t end = order.size() * (part + 1) / pieces;
+        for (std::size_t k = begin; k < end; ++k) {
             const int index = order[k].second;
-            Placed& placed = placed_[index];
-            placed.seen.resize(placed.mesh->points.size());
-            for (std::size_t at = 0; at < placed.seen.size(); ++at) {
-                const Vec3f p = placed.mesh->points[at];
-                placed.seen[at] = placed.turn * Vec3{p.x, p.y, p.z} + placed.shift;
-            }
-            if (images.rgb) light(placed, poses[index], slots_[index]);
-            if (geoms[index].rgba[3] >= 1.0f) add(solid_[part], index);
+            see(placed_[index]);
+            if (rolling) see(later_[index]);
+            if (images.rgb) light(geoms[index], slots_[index].pose, slots_[index]);
+            if (geoms[index].rgba[3] >= 1.0f) add(index, solid_[part], solid_moving_[part]);
         }
-        for (std::size_t k = last; k-- > first;)  // from back to front
-            if (geoms[order[k].second].rgba[3] < 1.0f) add(clear_[part], order[k].second);
+        for (std::size_t k = end; k-- > begin;)  // from back to front
+            if (geoms[order[k].second].rgba[3] < 1.0f)
+                add(order[k].second, clear_[part], clear_moving_[part]);
     });
-    const int rows = view.last - view.first;
-    nearest_.resize(std::size_t(rows) * lens.stride + widest);
-    visible_.resize(std::size_t(rows) * lens.stride + widest);
-    const int bands = std::min(pieces, rows);
+    const int rows = last - first, bands = std::min(pieces, rows);
     spread(bands, [&](int band) {
         const auto edge = [&](int number) {  // between the smallest squares of a lens
-            if (number == 0 || number == bands) return number ? view.last : view.first;
-            const int row = view.first + rows * number / bands;
-            return std::max(row / Lens::smallest * Lens::smallest, view.first);
+            if (number == 0 || number == bands) return number ? last : first;
+            return std::max((first + rows * number / bands) / Lens::smallest * Lens::smallest, first);
         };
         if (edge(band) < edge(band + 1)) Band(*this, edge(band), edge(band + 1), images).draw();
     });
 }
 
-void Scene::place(const Geom& geom, const Pose& pose, Placed& placed) const {
+void Scene::place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) const {
     placed.geom = &geom;
     placed.mesh = meshes[geom.mesh].get();
-    placed.light = nullptr;
-    placed.shift = eye_.turn.back({pose.position[0] - eye_.position[0],
-                                   pose.position[1] - eye_.position[1],
-                                   pose.position[2] - eye_.position[2]});
+    placed.shift = eye.turn.back({pose.position[0] - eye.position[0],
+                                  pose.position[1] - eye.position[1],
+                                  pose.position[2] - eye.position[2]});
     for (int column = 0; column < 3; ++column) {
-        const Vec3 axis = eye_.turn.back(
+        const Vec3 axis = eye.turn.back(
             {pose.turn.m[column], pose.turn.m[3 + column], pose.turn.m[6 + column]});
         placed.turn.m[column] = axis.x;
         placed.turn.m[3 + column] = axis.y;
@@ -90,25 +111,30 @@ void Scene::place(const Geom& geom, const Pose& pose, Placed& placed) const {
     }
 }
 
-bool Scene::in_view(Placed& placed) const {
-    return lens_->pinhole ? in_frame(placed) : in_squares(placed);
+void Scene::see(Placed& placed) {
+    placed.seen.resize(placed.mesh->points.size());
+    for (std::size_t at = 0; at < placed.seen.size(); ++at) {
+        const Vec3f p = placed.mesh->points[at];
+        placed.seen[at] = placed.turn * Vec3{p.x, p.y, p.z} + placed.shift;
+    }
 }
 
-// Whether the box about a geom may be in view: not beyond an edge of a pinhole's image.
-bool Scene::in_frame(const Placed& placed) const {
+// Edges of a pinhole's image that the box about a geom is beyond, a bit each.
+int Scene::beyond(const Placed& placed) const {
     const Mesh& mesh = *placed.mesh;
     const float left = lens_->x[0], right = lens_->x[lens_->width - 1];
-    const float top = lens_->y[view_.first], bottom = lens_->y[view_.last - 1];
+    const float top = lens_->y[first_], bottom = lens_->y[last_ - 1];
     const Vec3 middle =
         placed.turn * Vec3{mesh.middle.x, mesh.middle.y, mesh.middle.z} + placed.shift;
     const Vec3 inward[5] = {{1, 0, -left}, {-1, 0, right}, {0, 1, -top}, {0, -1, bottom}, {0, 0, 1}};
-    for (const Vec3& normal : inward) {
-        const Vec3 along = placed.turn.back(normal);
+    int found = 0;
+    for (int k = 0; k < 5; ++k) {
+        const Vec3 along = placed.turn.back(inward[k]);
         const double reach = std::abs(along.x) * mesh.reach.x + std::abs(along.y) * mesh.reach.y +
                              std::abs(along.z) * mesh.reach.z;
-        if (dot(normal, middle) + reach * 1.001 < 0) return false;
+        if (dot(inward[k], middle) + reach * 1.001 < 0) found |= 1 << k;
     }
-    return true;
+    return found;
 }
 
 // Direction of a ball from the eye and least cosine of rays that meet it, if the eye is outside.
@@ -118,61 +144,76 @@ bool Scene::ball(Vec3 middle, double reach, Vec3f& ahead, float& least) {
         ahead = {}, least = -1;  // met by all
         return false;
     }
-    ahead = narrow(middle * (1.0 / std::sqrt(away)));
-    least = static_cast<float>(std::sqrt(1.0 - share)) - 1e-5f;
+    ahead = narrow(middle * (1.0 / root(away)));
+    least = static_cast<float>(root(1.0 - share)) - 1e-5f;
     return true;
 }
 
-// Whether the ball about a geom may be in view, and the smallest square of rays about it.
-bool Scene::in_squares(Placed& placed) const {
-    const Vec3 half{placed.mesh->reach.x, placed.mesh->reach.y, placed.mesh->reach.z};
-    const Vec3 middle = placed.turn * Vec3{placed.mesh->middle.x, placed.mesh->middle.y,
-                                           placed.mesh->middle.z} + placed.shift;
+// Whether the ball about a geom, on its way, may be in view, and the smallest square of rays about it.
+bool Scene::in_squares(Placed& placed, const Placed& later) const {
+    const Mesh& mesh = *placed.mesh;
+    const Vec3 half{mesh.reach.x, mesh.reach.y, mesh.reach.z};
+    const Vec3 centre{mesh.middle.x, mesh.middle.y, mesh.middle.z};
+    const Vec3 from = placed.turn * centre + placed.shift, to = later.turn * centre + later.shift;
+    const double way = 0.5 * root(dot(to - from, to - from)), reach = root(dot(half, half)) + way;
     placed.square = 0, placed.column = placed.row = 0, placed.side = lens_->largest;
     Vec3f ahead;
     float least;
-    if (!ball(middle, dot(half, half), ahead, least)) return true;
+    if (!ball((from + to) * 0.5, reach * reach, ahead, least)) return true;
     for (;;) {
         const Lens::Square& square = lens_->squares[placed.square];
-        const f4 most = (ahead.x > 0 ? square.high : square.low)[0] * ahead.x +
-                        ((ahead.y > 0 ? square.high : square.low)[1] * ahead.y +
-                         (ahead.z > 0 ? square.high : square.low)[2] * ahead.z);
-        const i4 met = (most >= least) & (square.low[2] <= square.high[2]);
-        const int found = bits(met);
+        const int side = placed.side / 2;
+        int found = bits((most(square, ahead) >= least) & (square.low[2] <= square.high[2]));
+        if (placed.row >= last_ || placed.row + side <= first_) found &= ~3;
+        if (placed.row + side >= last_ || placed.row + 2 * side <= first_) found &= ~12;
         if (!found) return false;
         const int part = __builtin_ctz(found);
         if (found & (found - 1) || square.parts[part] < 0) return true;
-        placed.square = square.parts[part], placed.side /= 2;
-        placed.column += part % 2 * placed.side, placed.row += part / 2 * placed.side;
+        placed.square = square.parts[part], placed.side = side;
+        placed.column += part % 2 * side, placed.row += part / 2 * side;
     }
 }
 
 // Add a geom's triangles to the frame, unless they are out of view.
-void Scene::add(std::vector<Triangle>& to, int index) const {
+void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) const {
     const Placed& placed = placed_[index];
+    const bool rolling = view_.poses > 1, culled = placed.geom->culled;
     const std::vector<std::int32_t>& corners = placed.mesh->corners;
     for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
-        const Vec3 points[3] = {placed.seen[corners[corner]], placed.seen[corners[corner + 1]],
-                                placed.seen[corners[corner + 2]]};
-        const double away = dot(cross(points[1] - points[0], points[2] - points[0]), points[0]);
-        if (away == 0 || (away > 0 && placed.geom->culled)) continue;
+        Vec3 points[6];  // now, and for the next pose
+        for (int k = 0; k < 3; ++k) points[k] = placed.seen[corners[corner + k]];
+        const Vec3(&now)[3] = *reinterpret_cast<Vec3(*)[3]>(points);
         Triangle triangle;
-        if (!bounded(triangle, points)) continue;
         triangle.geom = index;
         triangle.corner = static_cast<int>(corner);
-        triangle.see(Corners(points));
+        if (!rolling) {
+            const double away = dot(cross(now[1] - now[0], now[2] - now[0]), now[0]);
+            if (away == 0 || (away > 0 && culled)) continue;
+            if (!bounded(triangle, points, 3)) continue;
+            triangle.see(Corners(now));
+            to.push_back(triangle);
+            continue;
+        }
+        for (int k = 0; k < 3; ++k) points[3 + k] = later_[index].seen[corners[corner + k]];
+        if (!bounded(triangle, points, 6)) continue;
+        const Corners from(now), next(*reinterpret_cast<Vec3(*)[3]>(points + 3));
+        if (culled && from.away >= 0 && next.away >= 0) continue;
+        triangle.see(from);
         to.push_back(triangle);
+        moving.push_back({from, next});
     }
 }
 
-// Find the pixels about a triangle's image; false if there are none.
-bool Scene::bounded(Triangle& triangle, const Vec3 (&points)[3]) const {
+// Find the pixels about triangles' image; false if there are none.
+bool Scene::bounded(Triangle& triangle, const Vec3* points, int count) const {
     triangle.left = 0, triangle.right = lens_->width;
-    triangle.top = view_.first, triangle.bottom = view_.last;
+    triangle.top = first_, triangle.bottom = last_;
     if (!lens_->pinhole) {
-        const Vec3 middle = (points[0] + points[1] + points[2]) * (1.0 / 3);
+        Vec3 middle{};
         double reach = 0;
-        for (const Vec3& point : points) reach = std::max(reach, dot(point - middle, point - middle));
+        for (int k = 0; k < count; ++k) middle = middle + points[k] * (1.0 / count);
+        for (int k = 0; k < count; ++k)
+            reach = std::max(reach, dot(points[k] - middle, points[k] - middle));
         ball(middle, reach, triangle.ahead, triangle.least);
         return true;
     }
@@ -183,8 +224,8 @@ bool Scene::bounded(Triangle& triangle, const Vec3 (&points)[3]) const {
         low[0] = std::min(low[0], x), high[0] = std::max(high[0], x);
         low[1] = std::min(low[1], y), high[1] = std::max(high[1], y);
     };
-    for (int k = 0; k < 3; ++k) {
-        const Vec3 from = points[k], to = points[(k + 1) % 3];
+    for (int k = 0; k < count; ++k) {
+        const Vec3 from = points[k], to = points[k % 3 == 2 ? k - 2 : k + 1];
         if (from.z >= near) see(from);
         if ((from.z >= near) != (to.z >= near)) {
             Vec3 at = from + (to - from) * ((near - from.z) / (to.z - from.z));
@@ -192,9 +233,11 @@ bool Scene::bounded(Triangle& triangle, const Vec3 (&points)[3]) const {
             see(at);
         }
     }
-    // Columns are at equal steps of x, rows of y; a pixel more on each side for rounding.
-    const auto span = [](double low, double high, double start, double step, int& first, int& last) {
-        const double from = (low - start) / step - 1.0, to = (high - start) / step + 2.0;
+    // Columns are at equal steps of x, rows of y; a pixel more on each side for rounding, and one
+    // for a way between two poses that is not quite straight.
+    const double more = count > 3 ? 2.0 : 1.0;
+    const auto span = [=](double low, double high, double start, double step, int& first, int& last) {
+        const double from = (low - start) / step - more, to = (high - start) / step + more + 1.0;
         if (!(to > first) || !(from < last)) return false;
         first = from > first ? static_cast<int>(from) : first;
         last = to < last ? static_cast<int>(to) : last;

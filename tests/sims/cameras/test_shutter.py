@@ -111,10 +111,13 @@ def each_row(height: int, _: float) -> list[tuple[int, int]]:
     "name",
     ["plain", *(pytest.param(n, marks=pytest.mark.slow) for n in ("barrel", "fisheye", "open"))],
 )
-def test_bands_look_like_one_drawing_for_each_row(
+def test_rows_and_bands_look_like_one_drawing_for_each_row(
     renderer: CameraRenderer, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """But for edges that lie a quarter of a pixel elsewhere; and not like a global shutter."""
+    """But for edges: of bands they lie a quarter of a pixel elsewhere. Not like a global shutter."""
+    (by_row,) = renderer.expose((moving(name),))
+    rolls = renderer._rows_move
+    monkeypatch.setattr(renderer, "_rows_move", False)
     (found,) = renderer.expose((moving(name),))
     monkeypatch.setattr("sims.cameras.renderer.row_bands", each_row)
     (expected,) = renderer.expose((moving(name),))
@@ -128,6 +131,10 @@ def test_bands_look_like_one_drawing_for_each_row(
         return float(colours), float(np.mean(np.not_equal(one.segmentation, other.segmentation)))  # type: ignore[arg-type]
 
     near, far = unlike(found, expected), unlike(at_once, expected)
+    nearest = unlike(by_row, expected)
+    if rolls:
+        assert nearest[1] < 0.0015
+        assert nearest[0] < 0.04 * far[0]  # light is that of the middle
     assert near[1] < 0.015
     assert near[0] < 0.2 * far[0]
     assert near[1] < 0.2 * far[1]
