@@ -114,7 +114,7 @@ def each_row(height: int, _: float) -> list[tuple[int, int]]:
 def test_rows_and_bands_look_like_one_drawing_for_each_row(
     renderer: CameraRenderer, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """But for edges: of bands they lie a quarter of a pixel elsewhere. Not like a global shutter."""
+    """Bands but for edges, a quarter of a pixel elsewhere; and not like a global shutter."""
     (by_row,) = renderer.expose((moving(name),))
     rolls = renderer._rows_move
     monkeypatch.setattr(renderer, "_rows_move", False)
