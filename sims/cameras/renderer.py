@@ -237,8 +237,9 @@ class CameraRenderer:
             spec, number = self._cameras[shot.camera]
             due = time.monotonic() + spec.render_time
             frames.append(self._develop(shot, spec, self._capture(shot, spec, number)))
-            # In real time, and not on the run's clock: it stands for a slow renderer.
-            time.sleep(max(due - time.monotonic(), 0.0))
+            if spec.render_time:
+                # In real time, and not on the run's clock: it stands for a slow renderer.
+                time.sleep(max(due - time.monotonic(), 0.0))
         return tuple(frames)
 
     def graphics(self) -> str:
