@@ -13,7 +13,7 @@ import numpy.typing as npt
 from events import ImuAnnouncement, Quaternion, Vector3
 from events.frames import cross, inverse, multiply, rotate, rotate_inverse, slerp
 from sims.presets import IMUS
-from sims.sensors.sensor import Mount, NonNegative
+from sims.sensors.sensor import Mount, Mounted, NonNegative, Place
 
 _BLOCK = 512  # samples per draw: a numpy call costs as much as a few hundred random numbers
 
@@ -114,9 +114,6 @@ class ImuNoise:
     deviation density/√dt for the noise and random_walk·√dt for each step of the bias (J. Crassidis,
     *Sigma-point Kalman filtering for integrated GPS and inertial navigation*, 2006; Kalibr's "IMU
     noise model").
-
-    Raises:
-        ValueError: The rate is not positive, or a parameter is negative.
     """
 
     def __init__(
@@ -126,11 +123,6 @@ class ImuNoise:
         generator: np.random.Generator,
         bias: Floats | None = None,  # bias at the start: rad/s, then m/s², shape (6,)
     ) -> None:
-        if not rate > 0.0:
-            raise ValueError(f"rate: expected a number > 0, found {rate}")
-        for field in NOISES:
-            if not (value := getattr(parameters, field)) >= 0.0:
-                raise ValueError(f"{field}: expected a number >= 0, found {value}")
         p = parameters
         densities = p.gyroscope_noise_density, p.accelerometer_noise_density
         walks = p.gyroscope_random_walk, p.accelerometer_random_walk
@@ -160,7 +152,7 @@ class ImuNoise:
         self._next = 0
 
 
-class ImuModel:
+class ImuModel(Mounted[ImuParameters]):
     """Model of an IMU with all its errors: measurements from true motion.
 
     Args:
@@ -168,18 +160,22 @@ class ImuModel:
         constants: Source of what is drawn once: bias at the start, scale, misalignment, phases.
     """
 
+    announced = ImuAnnouncement
+
     def __init__(
         self,
         parameters: ImuParameters,
         rate: float,
         noise: np.random.Generator,
         constants: np.random.Generator,
+        place: Place,
     ) -> None:
         if parameters.ideal:
             silent: dict[str, Any] = dict.fromkeys(NOISES, 0.0)
             kept = {name: getattr(parameters, name) for name in _NO_ERRORS}
             parameters = ImuParameters(**silent, **kept)
-        self.parameters = p = parameters
+        super().__init__(parameters, place)
+        p = parameters
         self._rate = rate
         drawn = constants.standard_normal((2, 10))
         self.matrices = [
@@ -212,38 +208,33 @@ class ImuModel:
             rates, force = self._shake(rates, force, thrusts)
         if not self._linear:
             gyroscope, accelerometer = self.matrices
-            turned = gyroscope @ rates + self.parameters.g_sensitivity * np.asarray(force)
+            turned = gyroscope @ rates + self.spec.g_sensitivity * np.asarray(force)
             rates, force = _vector(turned), _vector(accelerometer @ force)
         rates, force = self._noise.add(rates, force)
         return _limited(rates, *self._limits[0]), _limited(force, *self._limits[1])
 
-    def announcement(self, source: str, body: str, stamp: int = 0) -> ImuAnnouncement:
-        """Return the announcement of the IMU."""
-        p = self.parameters
-        fields = ImuAnnouncement.__struct_fields__
-        same = {name: getattr(p, name) for name in fields if hasattr(p, name)}
+    def also_announced(self) -> dict[str, Any]:
+        """Return rate, vibration, drawn scale, and the body's frame if the IMU has none."""
+        p = self.spec
         gyroscope, accelerometer = (tuple(matrix.ravel().tolist()) for matrix in self.matrices)
-        special = {
+        return {
             "rate": self._rate,
             "gyroscope_matrix": gyroscope,
             "accelerometer_matrix": accelerometer,
             "vibration": p.vibration.amplitude,
             "averaged": p.sampling == "mean",
-            "orientation": p.rotation,
-            "parent_frame_id": body,
-            "frame_id": source if p.mounted else body,
+            "frame_id": self.source if p.mounted else self.place.parent_frame_id,
         }
-        return ImuAnnouncement(**{**same, **special}, stamp=stamp, source=source)
 
     def _shake(self, rates: Vector3, force: Vector3, thrusts: Any) -> tuple[Vector3, Vector3]:
-        vibration = self.parameters.vibration
+        vibration = self.spec.vibration
         share = np.clip(np.asarray(thrusts, dtype=np.float64), 0.0, None)
         speeds = vibration.rotor_speed * np.sqrt(share)
         self._phases = (self._phases + 2.0 * math.pi * speeds / self._rate) % (2.0 * math.pi)
         total = np.zeros(3)
         for index, strength in enumerate(vibration.harmonics, start=1):
             weight = strength * share
-            if self.parameters.sampling == "mean":
+            if self.spec.sampling == "mean":
                 weight = weight * np.sinc(index * speeds / self._rate)
             cosine, sine = (
                 weight @ np.cos(index * self._phases),

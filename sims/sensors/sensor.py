@@ -1,4 +1,4 @@
-"""Common base of all sensors but cameras and IMU: settings, place, source, truth."""
+"""Common base of all sensors but cameras: settings, place, source, truth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from events import Event, Quaternion, SensorAnnouncement, Vector3
+from events import Announcement, Event, Quaternion, Vector3
 from events.frames import from_rpy
 from runtime.units import Duration, Latency
 
@@ -71,13 +71,13 @@ class Place(NamedTuple):
     """Latitude and longitude (degrees) and altitude (metres) of the origin of ``map``."""
 
 
-S = TypeVar("S", bound=SensorSpec)
+S = TypeVar("S", bound=Mount)
 
 
 class Mounted(Generic[S]):
     """A sensor on a body."""
 
-    announced: ClassVar[type[SensorAnnouncement]]
+    announced: ClassVar[type[Announcement]]
     """Announcement type; its fields named like settings take the settings' values."""
 
     def __init__(self, spec: S, place: Place) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import mujoco
 
-from events import Announcement, Event, Imu, ImuAnnouncement, TransformStamped
+from events import Announcement, Event, Imu, TransformStamped
 from events.frames import flip_yz, flip_yz_rotation
 from runtime import Node, Tick
 from sims.cameras.rig import DrawnWorld
@@ -24,7 +24,7 @@ from sims.sensors.earth import (
 from sims.sensors.imu import ImuModel, ImuParameters, Motion, mean_between, motion_at
 from sims.sensors.lidar import Lidar, LidarRig, LidarSpec
 from sims.sensors.rays import RangeFinder, RangeFinderSpec, Rays
-from sims.sensors.sensor import Mount, Mounted, Place, Sensor, Truth, generator_of
+from sims.sensors.sensor import Mounted, Place, Sensor, Truth, generator_of
 from sims.simulator import SimulatorConfig
 from sims.vehicle import Physics, State
 from sims.world import Rate
@@ -77,34 +77,30 @@ def mount_imu(world: mujoco.MjSpec, vehicle: str, parameters: ImuParameters) -> 
         site.pos, site.quat = flip_yz(parameters.position), flip_yz_rotation(parameters.rotation)
 
 
-class VehicleImu:
+class VehicleImu(ImuModel):
     """IMU of a vehicle: its model, fed from the physics."""
 
     def __init__(
-        self, node: Node[Any], config: SensorsConfig, physics: Physics, frame_id: str
+        self, node: Node[Any], config: SensorsConfig, physics: Physics, place: Place
     ) -> None:
         constants = generator_of(node.rng, "imu")
-        self._model = ImuModel(config.imu, config.imu_rate, node.rng, constants)
+        super().__init__(config.imu, config.imu_rate, node.rng, constants, place)
         self._physics = physics
-        self.source = f"{node.name}/imu"
-        self._body = frame_id
         self._before: tuple[int, Motion] | None = None
         self._frame_id = self.announcement().frame_id
 
     def sample(self, stamp: int, state: State) -> Imu:
         """Return the measurement of the present, in a state of the same stamp."""
-        parameters, physics = self._model.parameters, self._physics
+        physics = self._physics
         rates, force = physics.imu(stamp)
-        if parameters.sampling == "mean":
-            motion = motion_at(
-                parameters, state.orientation, state.velocity, state.angular_velocity
-            )
+        if self.spec.sampling == "mean":
+            motion = motion_at(self.spec, state.orientation, state.velocity, state.angular_velocity)
             if self._before is not None and stamp > self._before[0]:
                 seconds = (stamp - self._before[0]) / 1e9
                 gravity = physics.parameters.gravity
                 rates, force = mean_between(self._before[1], motion, seconds, gravity)
             self._before = stamp, motion
-        rates, force = self._model.measure(rates, force, physics.thrusts)
+        rates, force = self.measure(rates, force, physics.thrusts)
         return Imu(
             stamp=stamp,
             source=self.source,
@@ -112,15 +108,6 @@ class VehicleImu:
             angular_velocity=rates,
             linear_acceleration=force,
         )
-
-    @property
-    def mounted(self) -> bool:
-        """Whether the IMU has a frame of its own."""
-        return self._model.parameters.mounted
-
-    def announcement(self) -> ImuAnnouncement:
-        """Return the announcement of the IMU."""
-        return self._model.announcement(self.source, self._body)
 
     def forget(self) -> None:
         """Forget the last motion, after a jump of the vehicle."""
@@ -151,12 +138,13 @@ class SensorSuite:
         self._physics = physics
         self._advance = advance
         self._world = world
-        self._config = config
         self._frame_id = frame_id
         self._random = node.rng.bit_generator.state
 
         def place(name: str) -> Place:
             return Place(f"{node.name}/{name}", frame_id, config.origin)
+
+        self._make_imu = functools.partial(VehicleImu, node, config, physics, place("imu"))
 
         def making(
             model: Callable[..., Sensor[Any]], spec: Any, name: str, *rest: Any
@@ -191,29 +179,26 @@ class SensorSuite:
         self._begin()
 
     def _begin(self) -> None:
-        self.imu = VehicleImu(self._node, self._config, self._physics, self._frame_id)
+        self.imu = self._make_imu()
         """The IMU, whose samples the vehicle's node takes and sends itself."""
         self.sensors = [make() for make in self._making]
 
     def announcements(self) -> Iterable[Announcement]:
         """Return the announcements of the sensors."""
-        yield self.imu.announcement()
-        for sensor in self.mounted:
+        for sensor in (self.imu, *self.mounted):
             yield sensor.announcement()
 
     def transforms(self) -> Iterable[TransformStamped]:
         """Return the pose of each sensor's frame in the body's, constant for the run."""
-        mounts: list[tuple[str, Mount]] = [(sensor.source, sensor.spec) for sensor in self.mounted]
-        if self.imu.mounted:
-            mounts.insert(0, (self.imu.source, self._config.imu))
-        for source, mount in mounts:
+        own = (self.imu,) if self.imu.spec.mounted else ()
+        for sensor in (*own, *self.mounted):
             yield TransformStamped(
                 stamp=self._node.clock.now(),
-                source=source,
+                source=sensor.source,
                 frame_id=self._frame_id,
-                child_frame_id=source,
-                translation=mount.position,
-                rotation=mount.rotation,
+                child_frame_id=sensor.source,
+                translation=sensor.spec.position,
+                rotation=sensor.spec.rotation,
                 static=True,
             )
 
