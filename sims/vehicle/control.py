@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from math import atan2, sqrt
 
+import msgspec
 import numpy as np
 
 import events as ev
@@ -118,101 +119,78 @@ class Controller:
         self.mixer = Mixer(parameters)
         self._limits = limits
         self._max_thrust = parameters.max_thrust
-        self._in_position = True
-        self._in_velocity = False
-        self._target: Quaternion | None = None
-        self._target_rates: Vector3 = (0.0, 0.0, 0.0)
-        self._thrust = 0.0
-        self._motors: Motors | None = None
+        self._order: Setpoint | None = None  # None: `position`, by itself
 
     def reset(self) -> None:
         """Forget the integrals and last measurements of a flight."""
         self.position.reset()
         self.rates.reset()
-        self._in_velocity = False
+        if isinstance(self._order, ev.VelocitySetpoint):
+            self._order = None
 
     def follow(self, setpoint: Setpoint, state: State) -> None:
         """Follow a set-point (of velocity: heading of `state`); `ValueError` for a `fault`."""
         reason = fault(setpoint)
         if reason is not None:
             raise ValueError(reason)
-        match setpoint:
-            case ev.PositionSetpoint():
-                self._take_over()
-                self.position.to_position(
-                    setpoint.position,
-                    setpoint.velocity,
-                    setpoint.acceleration,
-                    setpoint.yaw,
-                    setpoint.yaw_rate,
-                )
-            case ev.VelocitySetpoint():
-                # Renewed set-points turn on from where the last one has turned to.
-                yaw = self.position.yaw if self._in_velocity else yaw_of(state.orientation)
-                self._take_over()
-                self._in_velocity = True
-                self.position.to_velocity(
-                    setpoint.velocity, yaw, setpoint.yaw_rate, setpoint.frame_id == "heading"
-                )
-            case ev.AttitudeSetpoint():
-                self._target = normalize(setpoint.orientation)
-                self._take_thrust(setpoint.thrust)
-            case ev.BodyRateSetpoint():
-                tilt, yaw = self._limits.tilt_rate, self._limits.yaw_rate
-                x, y, z = setpoint.angular_velocity
-                self._target = None
-                self._target_rates = (clip(x, tilt), clip(y, tilt), clip(z, yaw))
-                self._take_thrust(setpoint.thrust)
-            case ev.MotorSetpoint():
-                self._take_thrust(0.0)
-                a, b, c, d = (_share(getattr(setpoint, name)) for name in _NUMBERS[type(setpoint)])
-                self._motors = (a, b, c, d)
+        before = self._order
+        if isinstance(setpoint, ev.AttitudeSetpoint):
+            turn = normalize(setpoint.orientation)
+            setpoint = msgspec.structs.replace(setpoint, orientation=turn)
+        self._switch(setpoint)
+        if isinstance(setpoint, ev.PositionSetpoint):
+            self.position.to_position(
+                setpoint.position,
+                setpoint.velocity,
+                setpoint.acceleration,
+                setpoint.yaw,
+                setpoint.yaw_rate,
+            )
+        elif isinstance(setpoint, ev.VelocitySetpoint):
+            # Renewed set-points turn on from where the last one has turned to.
+            turning = isinstance(before, ev.VelocitySetpoint)
+            yaw = self.position.yaw if turning else yaw_of(state.orientation)
+            self.position.to_velocity(
+                setpoint.velocity, yaw, setpoint.yaw_rate, setpoint.frame_id == "heading"
+            )
 
     def hold(self, position: Vector3, velocity: Vector3, yaw: float) -> None:
         """Fly to a position (m, NED) with a velocity (m/s, NED), for the autopilot's manoeuvres."""
-        self._take_over()
+        self._switch(None)
         self.position.to_position(position, velocity, yaw=yaw)
 
     def brake(self, state: State, vertical_velocity: float = 0.0) -> None:
         """Stop and hold the place, or only climb or sink (m/s, NED); keep the heading."""
-        self._take_over()
+        self._switch(None)
         self.position.brake(yaw_of(state.orientation), vertical_velocity)
 
     def update(self, state: State, dt: float) -> Motors:
         """Return the motor commands for now."""
-        if self._motors is not None:
-            return self._motors
-        if self._in_position:
-            target, thrust, yaw_rate = self.position.update(state, dt)
-            rates = self.attitude.update(state.orientation, target, yaw_rate)
-        else:
-            thrust = self._thrust
-            rates = (
-                self._target_rates
-                if self._target is None
-                else self.attitude.update(state.orientation, self._target, 0.0)
-            )
-        roll, pitch, yaw = self.rates.update(state.angular_velocity, rates, dt)
-        return self.mixer.mix(thrust, roll, pitch, yaw)
+        match order := self._order:
+            case ev.MotorSetpoint():
+                a, b, c, d = (_share(getattr(order, name)) for name in _NUMBERS[type(order)])
+                return a, b, c, d
+            case ev.AttitudeSetpoint():
+                thrust = _share(order.thrust) * self._max_thrust
+                rates = self.attitude.update(state.orientation, order.orientation, 0.0)
+            case ev.BodyRateSetpoint():
+                thrust = _share(order.thrust) * self._max_thrust
+                x, y, z = order.angular_velocity
+                tilt, yaw = self._limits.tilt_rate, self._limits.yaw_rate
+                rates = clip(x, tilt), clip(y, tilt), clip(z, yaw)
+            case _:
+                target, thrust, yaw_rate = self.position.update(state, dt)
+                rates = self.attitude.update(state.orientation, target, yaw_rate)
+        torque = self.rates.update(state.angular_velocity, rates, dt)
+        return self.mixer.mix(thrust, *torque)
 
-    def _take_over(self) -> None:
-        """Switch to position or velocity flight, with a reset of stale loop states."""
-        if not self._in_position:
-            self.position.reset()
-        self._leave_motors()
-        self._in_position = True
-        self._in_velocity = False
-
-    def _leave_motors(self) -> None:
-        """Hand the motors back to the loops, with a reset of stale loop states."""
-        if self._motors is not None:
-            self._motors = None
+    def _switch(self, order: Setpoint | None) -> None:
+        """Take an order; states of loops that have stood still are stale."""
+        if isinstance(self._order, ev.MotorSetpoint):
             self.rates.reset()
-
-    def _take_thrust(self, thrust: float) -> None:
-        self._leave_motors()
-        self._thrust = _share(thrust) * self._max_thrust
-        self._in_position = self._in_velocity = False
+        if isinstance(self._order, _Direct) and not isinstance(order, _Direct):
+            self.position.reset()
+        self._order = order
 
 
 def _share(value: float) -> float:
@@ -227,6 +205,8 @@ Setpoint = (
     | ev.MotorSetpoint
 )
 """Set-points accepted by the cascade."""
+
+_Direct = ev.AttitudeSetpoint | ev.BodyRateSetpoint | ev.MotorSetpoint  # past the outer loops
 
 MOST = 1e6  # in SI units; squares of much greater numbers would overflow in the control loops
 
