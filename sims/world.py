@@ -115,14 +115,14 @@ class SharedWorld:
         """Keep the states of the last `seconds` for `past_state`, if any are wanted."""
         if seconds and self.simulation is not None:
             # In real time, they may be asked for later.
-            self.simulation.history.keep(seconds + 1.0)
+            self.simulation.keep(seconds + 1.0)
 
     def past_state(self, stamp_ns: int) -> Floats:
         """Return the generalised positions at a time not in the future, shape (nq,)."""
         if self.simulation is None:
             return self.state_at(stamp_ns)[1]
         self.simulation.advance_to(stamp_ns)
-        return self.simulation.history.at(stamp_ns)[0].copy()
+        return self.simulation.past(stamp_ns)[0].copy()
 
     def set_wind(self, velocity: Vector3) -> None:
         """Set the mean wind for vehicles, m/s NED, from the next millisecond on; gusts stay."""

@@ -392,7 +392,8 @@ class LidarRig:
         self._scanner = await self._node.worker(
             Scanner, model, world.dynamics, specs, self._node.name, seed
         )
-        self._physics.history.keep(max(1.0 / spec.rate for spec in specs) + LATE + 2e-3)
+        simulation = self._physics.simulation
+        simulation.keep(max(1.0 / spec.rate for spec in specs) + LATE + 2e-3)
         for lidar in self._lidars:
             self._node.every(lidar.spec.rate, functools.partial(self._turn, lidar), lidar.spec.name)
 
@@ -411,7 +412,8 @@ class LidarRig:
             self._skipped.add(lidar.source)
             return
         stamps = range(start, end, TIMESTEP_NS)
-        states = np.stack([self._physics.history.at(stamp)[0] for stamp in (*stamps, end)])
+        past = self._physics.simulation.past
+        states = np.stack([past(stamp)[0] for stamp in (*stamps, end)])
         self._in_flight[lidar.source] += 1
         self._node.start(self._deliver(lidar, start, end, states))
 

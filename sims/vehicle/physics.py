@@ -72,7 +72,6 @@ class Physics:
         self.simulation = world if isinstance(world, Simulation) else Simulation(world)
         self.model = model
         self.data: Any = self.simulation.data
-        self.history = self.simulation.history
         self._body = model.body(f"{name}/base_link").id
         joint = model.joint(f"{name}/free")
         pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
@@ -119,7 +118,7 @@ class Physics:
         return self.state_in(qpos, qvel), qpos, qvel
 
     def state_in(self, qpos: Floats, qvel: Floats) -> State:
-        """Return the vehicle's state in a world state, such as from `history`."""
+        """Return the vehicle's state in a world state, such as from `Simulation.past`."""
         return _state(qpos[self._of_pose], qvel[self._of_twist])
 
     def imu(self, stamp_ns: int = 0) -> tuple[Vector3, Vector3]:

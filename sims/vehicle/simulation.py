@@ -16,68 +16,6 @@ from sims.vehicle.model import TIMESTEP_NS
 Floats = npt.NDArray[np.float64]
 
 
-class History:
-    """States of a simulation's last milliseconds, for as long as somebody has asked for."""
-
-    def __init__(self, simulation: Simulation) -> None:
-        self._simulation = simulation
-        self._states: deque[tuple[Floats, Floats]] = deque(maxlen=0)
-
-    @property
-    def kept(self) -> bool:
-        """Whether anybody has asked for a past."""
-        return bool(self._states.maxlen)
-
-    def keep(self, seconds: float) -> None:
-        """Keep at least the states of the last `seconds` from now on."""
-        steps = math.ceil(seconds * 1e9 / TIMESTEP_NS) + 1
-        if steps > (self._states.maxlen or 0):
-            self._states = deque(self._states, maxlen=steps)
-
-    def add(self) -> None:
-        """Store the present state, before the next step."""
-        data = self._simulation.data
-        self._states.append((data.qpos.copy(), data.qvel.copy()))
-
-    def clear(self) -> None:
-        """Forget all states."""
-        self._states.clear()
-
-    def at(self, stamp_ns: int) -> tuple[Floats, Floats]:
-        """Return the world's state at a stored time, or up to a step ahead.
-
-        On a whole millisecond positions are those of that step, between two as the step carried
-        them (semi-implicit Euler); velocities are as of `Simulation.state_at`. Time begins with 0.
-
-        Returns:
-            Generalised positions, shape (nq,), and velocities, shape (nv,); not to be written to.
-
-        Raises:
-            ValueError: The time is not kept any more, or is too far ahead.
-        """
-        now = self._simulation.time_ns
-        stamp_ns = max(stamp_ns, 0)
-        if stamp_ns >= now:
-            return self._simulation.state_at(stamp_ns)
-        steps = now // TIMESTEP_NS
-        step, rest = divmod(stamp_ns, TIMESTEP_NS)
-        oldest = steps - len(self._states)
-        if step < oldest:
-            raise ValueError(
-                f"history: expected a time from {oldest * TIMESTEP_NS} ns on, which is what "
-                f"`keep` asked for, found {stamp_ns} ns"
-            )
-        qpos, qvel = self._states[step - oldest]
-        if step + 1 < steps:
-            _, later = self._states[step + 1 - oldest]
-        else:
-            later = self._simulation.data.qvel
-        if rest:
-            qpos = qpos.copy()
-            mujoco.mj_integratePos(self._simulation.model, qpos, later, rest * 1e-9)
-        return qpos, qvel + (later - qvel) * (0.5 + rest / TIMESTEP_NS)
-
-
 class PhysicsDivergedError(Exception):
     """State no longer finite: the world's model or a written state is at fault."""
 
@@ -113,7 +51,7 @@ class Simulation:
             )
         self.model = model
         self.data: Any = mujoco.MjData(model)
-        self.history = History(self)
+        self._past: deque[tuple[Floats, Floats]] = deque(maxlen=0)  # of each millisecond
         self.diverged = False
         self.influences = tuple(influences)
         self._steps = 0
@@ -130,10 +68,10 @@ class Simulation:
         steps = stamp_ns // TIMESTEP_NS - self._steps
         if steps <= 0:
             return
-        if self.history.kept or self.influences:
+        if self._past.maxlen or self.influences:
             for _ in range(steps):
-                if self.history.kept:
-                    self.history.add()
+                if self._past.maxlen:
+                    self._past.append((self.data.qpos.copy(), self.data.qvel.copy()))
                 self._step(1)
                 self._apply()
         else:
@@ -171,6 +109,42 @@ class Simulation:
             mujoco.mj_integratePos(self.model, qpos, next_qvel, ahead * 1e-9)
         return qpos, qvel + self.data.qacc * ((ahead + TIMESTEP_NS / 2) * 1e-9)
 
+    def keep(self, seconds: float) -> None:
+        """Keep at least the states of the last `seconds` from now on, for `past`."""
+        steps = math.ceil(seconds * 1e9 / TIMESTEP_NS) + 1
+        if steps > (self._past.maxlen or 0):
+            self._past = deque(self._past, maxlen=steps)
+
+    def past(self, stamp_ns: int) -> tuple[Floats, Floats]:
+        """Return the world's state at a kept time, or up to a step ahead.
+
+        On a whole millisecond positions are those of that step, between two as the step carried
+        them (semi-implicit Euler); velocities are as of `state_at`. Time begins with 0.
+
+        Returns:
+            Generalised positions, shape (nq,), and velocities, shape (nv,); not to be written to.
+
+        Raises:
+            ValueError: The time is not kept any more, or is too far ahead.
+        """
+        stamp_ns = max(stamp_ns, 0)
+        if stamp_ns >= self.time_ns:
+            return self.state_at(stamp_ns)
+        step, rest = divmod(stamp_ns, TIMESTEP_NS)
+        oldest = self._steps - len(self._past)
+        if step < oldest:
+            raise ValueError(
+                f"history: expected a time from {oldest * TIMESTEP_NS} ns on, which is what "
+                f"`keep` asked for, found {stamp_ns} ns"
+            )
+        qpos, qvel = self._past[step - oldest]
+        newest = step + 1 == self._steps
+        later = self.data.qvel if newest else self._past[step + 1 - oldest][1]
+        if rest:
+            qpos = qpos.copy()
+            mujoco.mj_integratePos(self.model, qpos, later, rest * 1e-9)
+        return qpos, qvel + (later - qvel) * (0.5 + rest / TIMESTEP_NS)
+
     def refresh(self) -> None:
         """Have sensors, contacts and accelerations be those of the present instant."""
         if not self._fresh:
@@ -196,7 +170,7 @@ class Simulation:
         mujoco.mj_resetData(self.model, self.data)
         self._steps = 0
         self._fresh = False
-        self.history.clear()
+        self._past.clear()
         self._apply()
 
     def _apply(self) -> None:

@@ -195,7 +195,7 @@ def _poses(physics: Any, sensor: Any, scan: Any) -> tuple[Any, Rotation]:
     """Return the sensor's pose at each millisecond of a scan: metres in ``map``, shape (n, 3)."""
     places, turns = [], []
     for stamp in range(scan.stamp, scan.end + 2 * TIMESTEP_NS, TIMESTEP_NS):
-        state = physics.state_in(*physics.simulation.history.at(min(stamp, physics.time_ns)))
+        state = physics.state_in(*physics.simulation.past(min(stamp, physics.time_ns)))
         places.append(np.add(state.position, rotate(state.orientation, sensor.position)))
         turns.append(multiply(state.orientation, sensor.orientation))
     return np.array(places), Rotation.from_quat(turns, scalar_first=True)
