@@ -136,6 +136,7 @@ class Passes:
             normal = (across * u + down * v - inverse) ** 2 + across**2 + down**2
             return np.asarray(inverse**2 / (normal * (1.0 + u**2 + v**2)))
         height, width = inverse.shape
+        inverse = np.ascontiguousarray(inverse)
         found = np.empty_like(inverse)
         self._library.develop_slant(
             width, height, *map(_at, (inverse, u, v)), ctypes.c_float(per_u),
@@ -191,6 +192,7 @@ def _quantiles() -> Depths:
     return np.asarray(values / values.std(), dtype=np.float32)
 
 
+@functools.lru_cache(maxsize=16)
 def _steps(sigma: float, limit: int) -> Table | None:
     """Return 65536 equally likely whole numbers of a deviation, none beyond a limit."""
     if sigma <= 0.0:
@@ -315,6 +317,7 @@ class Development:
         )
         # With automatic exposure the same few exposure times and gains come again and again.
         self._stages = functools.lru_cache(maxsize=8)(self._make_stages)
+        self._shares = functools.cache(self._make_shares)
 
     def develop(
         self,
@@ -366,20 +369,23 @@ class Development:
         if not (any(spec.vignette) or spec.full_well):
             ideal = not wide and self._srgb and factor == 1.0
             return Stages(None if ideal else self._grey_levels(light), steps=steps)
-        shares = None
-        if any(spec.vignette):
-            roots = np.sqrt(vignette_map(camera_info(spec), spec.vignette))
-            shares = np.rint(roots * _LINEAR).astype(np.uint16).ravel()
-            shares = shares.repeat(3) if ndim == 3 else shares
         sigma = 0.5 / math.sqrt(spec.full_well / gain) if spec.full_well else 0.0
         root = np.arange(65536) / _ROOT
         return Stages(
             np.minimum(np.rint(np.sqrt(light) * _ROOT), 65535).astype(np.int32),
-            shares,
+            self._shares(ndim),
             _steps(sigma * _ROOT, 65535),
             self._grey_levels(np.maximum(root * root - sigma * sigma, 0.0)),
             steps,
         )
+
+    def _make_shares(self, ndim: int) -> Codes | None:
+        """Return the vignette at each sample of an image of 2 or 3 dimensions."""
+        if not any(self._spec.vignette):
+            return None
+        roots = np.sqrt(vignette_map(camera_info(self._spec), self._spec.vignette))
+        shares = np.rint(roots * _LINEAR).astype(np.uint16).ravel()
+        return shares.repeat(3) if ndim == 3 else shares
 
     def _grey_levels(self, light: npt.NDArray[np.float64]) -> Table:
         levels = np.rint(np.interp(light, self._light, np.arange(256.0)))

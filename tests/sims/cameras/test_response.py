@@ -135,6 +135,23 @@ def test_each_exposure_has_its_own_noise() -> None:
     assert abs(correlation(seen[..., 0], measured)) < ENOUGH
 
 
+def test_a_pixel_says_nothing_of_the_next_exposures() -> None:
+    """Of many small images, whose stamps, cameras or seeds follow one another."""
+    small = Development(CameraSpec(name="c", width=8, height=8, noise=10.0))
+    grey = np.full((8, 8, 3), 128, np.uint8)
+    for step in ((0, 0, 1), (0, 0, 33_333_333), (0, 1, 0), (1, 0, 0)):
+        found = np.array(
+            [
+                small.develop([grey], generator(k * step[0], f"c{k * step[1]}", k * step[2]))
+                for k in range(800)
+            ],
+            np.float64,
+        )
+        for lag in (1, 2, 7):
+            assert abs(correlation(found[:-lag], found[lag:])) < 5.0 / found[lag:].size ** 0.5
+        assert found.mean() == pytest.approx(128.0, abs=5 * 10.0 / found.size**0.5)
+
+
 def test_the_same_exposure_has_the_same_noise() -> None:
     np.testing.assert_array_equal(image_noise(10.0), image_noise(10.0))
     np.testing.assert_array_equal(depth_noise(0.002), depth_noise(0.002))
