@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Odometry, PoseSetpoint, PositionSetpoint, Quaternion, Vector3, VelocitySetpoint
-from events.frames import from_rpy, from_yaw, multiply, normalize, rotate, rotate_inverse, yaw_of
+from events import PoseSetpoint, PositionSetpoint, Quaternion, Vector3, VelocitySetpoint
+from events.frames import from_rpy, from_yaw, multiply, normalize, rotate, yaw_of
 from runtime import Tick, every, on
 from runtime.paths import InputPath
 from sims.cameras import CameraSpec, add_free_camera, check_cameras, pose_to_qpos, qvel_between
-from sims.simulator import Addressee, Simulator, SimulatorConfig
+from sims.simulator import Simulator, SimulatorConfig
 from sims.vehicle import State
 from sims.world import Rate, join_world
 from sims.worlds import Dynamics, Scene
@@ -78,7 +78,6 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         self._rows = (
             await self.offload(read_tum, Path(config.trajectory)) if (config.trajectory) else None
         )
-        self._addressee = Addressee(self.name, self.siblings(Simulator), self.sources)
         self._world = await join_world(self)
         joint = self._world.model.joint(self.name)
         pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
@@ -119,18 +118,7 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         self._stamp = tick.stamp
         course = self._course(tick.stamp)
         qvel = _velocity_on(course, tick.stamp)
-        vx, vy, vz, wx, wy, wz = qvel.tolist()  # FLU, as MuJoCo has it: half a turn from FRD
-        self.odometry.send(
-            Odometry(
-                stamp=tick.stamp,
-                source=self.name,
-                child_frame_id=self.name,
-                position=self._position,
-                orientation=self._orientation,
-                linear_velocity=rotate_inverse(self._orientation, (vx, -vy, -vz)),
-                angular_velocity=(wx, -wy, -wz),
-            )
-        )
+        self._send_state(tick.stamp, _state(self._position, self._orientation, qvel))
         _, state, velocities = self._world.state_at(tick.stamp)
         state[self._of_pose] = pose_to_qpos(self._position, self._orientation)
         velocities[self._of_twist] = qvel
@@ -146,8 +134,7 @@ class FreeCamera(Simulator[FreeCameraConfig]):
     def state_at(self, stamp: int) -> State:
         """Return pose and velocity at a time (ns) not before the last update."""
         course = self._course(stamp)
-        vx, vy, vz, wx, wy, wz = _velocity_on(course, stamp).tolist()
-        return State(*course(stamp), (vx, -vy, -vz), (wx, -wy, -wz))
+        return _state(*course(stamp), _velocity_on(course, stamp))
 
     def _course(self, stamp: int) -> Course:
         """Return the camera's path near `stamp`, as poses of times (ns)."""
@@ -176,6 +163,11 @@ class FreeCamera(Simulator[FreeCameraConfig]):
             return False
         self._position, self._orientation = pose_at(self._rows, stamp / 1e9)
         return True
+
+
+def _state(place: Vector3, turn: Quaternion, qvel: npt.NDArray[np.float64]) -> State:
+    vx, vy, vz, wx, wy, wz = qvel.tolist()  # FLU, as MuJoCo has it: half a turn from FRD
+    return State(place, turn, (vx, -vy, -vz), (wx, -wy, -wz))
 
 
 def _velocity_on(course: Course, stamp: int) -> npt.NDArray[np.float64]:

@@ -9,11 +9,10 @@ from typing import Any, Literal
 
 import events as ev
 from events import Vector3
-from events.frames import rotate_inverse
 from runtime import Output, Tick, every, on
 from sims.cameras import CameraSpec, add_camera, check_cameras
 from sims.sensors import SensorsConfig, SensorSuite, mount_imu
-from sims.simulator import Addressee, Simulator
+from sims.simulator import Simulator
 from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,
@@ -100,7 +99,6 @@ class Multirotor(Simulator[MultirotorConfig]):
             setpoint_timeout=config.setpoint_timeout,
         )
         self._suite = SensorSuite(self, config, FRAME, self._physics, self._advance, self._world)
-        self._addressee = Addressee(self.name, self.siblings(Simulator), self.sources)
         self._pilots: list[ev.PilotAnnouncement] = []
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
@@ -277,19 +275,9 @@ class Multirotor(Simulator[MultirotorConfig]):
         return max(tick.stamp, self._physics.time_ns)
 
     def _send_odometry(self, stamp: int, state: State) -> None:
-        if stamp <= self._odometry_stamp:
-            return
-        self._odometry_stamp = stamp
-        self.odometry.send(
-            ev.Odometry(
-                stamp=stamp,
-                source=self.name,
-                position=state.position,
-                orientation=state.orientation,
-                linear_velocity=rotate_inverse(state.orientation, state.velocity),
-                angular_velocity=state.angular_velocity,
-            )
-        )
+        if stamp > self._odometry_stamp:
+            self._odometry_stamp = stamp
+            self._send_state(stamp, state)
 
     def _send_collisions(self) -> None:
         contacts = [c for c in self._physics.contacts() if not _stands_on(c)]

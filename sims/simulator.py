@@ -10,6 +10,7 @@ import msgspec
 from typing_extensions import TypeVar
 
 import events as ev
+from events.frames import rotate_inverse
 from runtime import Duration, Node, NodeConfig, Output
 from runtime.errors import suggest
 from runtime.host import Sibling
@@ -17,6 +18,7 @@ from runtime.paths import NameOrPath
 from sims.cameras import CameraSpec
 from sims.cameras.rig import CameraOutputs, CameraRig
 from sims.cameras.stage import RendererName
+from sims.vehicle import State
 from sims.world import Inhabitant
 
 Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
@@ -80,8 +82,9 @@ class Simulator(Inhabitant, Node[C], ABC):
         return self.config.cameras
 
     async def on_startup(self) -> None:
-        """Prepare the cameras."""
+        """Prepare the cameras and the routing of orders."""
         config = self.config
+        self._addressee = Addressee(self.name, self.siblings(Simulator), self.sources)
         outputs = CameraOutputs(
             self.images, self.depth_images, self.segmentation_images, self.camera_poses
         )
@@ -97,6 +100,19 @@ class Simulator(Inhabitant, Node[C], ABC):
     def announce(self) -> Iterable[ev.Announcement]:
         """Announce the cameras."""
         return self.rig.announcements(self.frame_id)
+
+    def _send_state(self, stamp: int, state: State) -> None:
+        self.odometry.send(
+            ev.Odometry(
+                stamp=stamp,
+                source=self.name,
+                child_frame_id=self.frame_id,
+                position=state.position,
+                orientation=state.orientation,
+                linear_velocity=rotate_inverse(state.orientation, state.velocity),
+                angular_velocity=state.angular_velocity,
+            )
+        )
 
     def on_change(self, before: Any) -> None:  # noqa: ARG002
         """Deliver images as the changed settings say."""
