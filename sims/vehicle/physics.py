@@ -102,11 +102,7 @@ class Physics:
 
     def set_motors(self, m0: float, m1: float, m2: float, m3: float) -> None:
         """Set the motor commands, each 0 to 1 of its full thrust; clamped beyond."""
-        motors = self._motors
-        motors[0] = m0
-        motors[1] = m1
-        motors[2] = m2
-        motors[3] = m3
+        self._motors[:] = m0, m1, m2, m3
 
     def state(self) -> State:
         """Return the vehicle's pose and velocity."""
@@ -203,13 +199,10 @@ class Physics:
         for index, (pair, distance) in enumerate(
             zip(contact.geom.tolist(), contact.dist.tolist(), strict=True)
         ):
+            sides = [side for side in (0, 1) if body_of[pair[side]] == self._body]
             # MuJoCo also lists pairs within the margin that do not touch yet.
-            if distance > 0.0:
-                continue
-            for side in (0, 1):
-                if body_of[pair[side]] == self._body:
-                    own.append((index, side))
-                    break
+            if sides and distance <= 0.0:
+                own.append((index, sides[0]))
         return own
 
     def _contact(self, index: int, own: int) -> Contact:
