@@ -149,25 +149,15 @@ def arch(
     turn = np.linspace(np.pi, 0.0, angles + 1)
     rims = {radius: np.stack([np.cos(turn), np.sin(turn)], 1) * radius for radius in (inner, outer)}
     around = turn[::-1] * (inner + outer) / 2.0 * per_metre[0]
-    parts = []
-    for x, sign in ((-depth / 2.0, 1), (depth / 2.0, -1)):
-        # The front looks to -x, and there the left is +y.
-        points = np.zeros((2, angles + 1, 3))
-        points[..., 0] = x
-        for row, radius in enumerate((outer, inner)):
-            points[row, :, 1] = -sign * rims[radius][:, 0]
-            points[row, :, 2] = rims[radius][:, 1]
-        texture = np.zeros((2, angles + 1, 2))
-        texture[..., 0] = around
-        texture[1, :, 1] = (outer - inner) * per_metre[1]
-        parts.append(grid(points, texture))
-    for radius, flip in ((outer, False), (inner, True)):
-        points = np.zeros((2, angles + 1, 3))
-        points[0, :, 0], points[1, :, 0] = depth / 2.0, -depth / 2.0
-        points[..., 1] = -rims[radius][:, 0]
-        points[..., 2] = rims[radius][:, 1]
-        texture = np.zeros((2, angles + 1, 2))
-        texture[..., 0] = around
-        texture[1, :, 1] = depth * per_metre[1]
-        parts.append(grid(points[::-1] if flip else points, texture))
+    half, parts = depth / 2.0, []
+    # The front looks to -x, and there the left is +y; then the back, the outside, the inside.
+    for upper, lower, sign, height in (
+        ((-half, outer), (-half, inner), 1.0, outer - inner),
+        ((half, outer), (half, inner), -1.0, outer - inner),
+        ((half, outer), (-half, outer), 1.0, depth),
+        ((-half, inner), (half, inner), 1.0, depth),
+    ):
+        y, z = (np.stack([rims[radius][:, k] for _, radius in (upper, lower)]) for k in (0, 1))
+        points = _stacked(np.array([[upper[0]], [lower[0]]]), -sign * y, z)
+        parts.append(grid(points, _stacked(around, np.array([[0.0], [height * per_metre[1]]]))))
     return join(parts)
