@@ -126,6 +126,19 @@ class Texture {
                                              int height, int across, int down) {
         std::vector<std::uint32_t> to;
         to.reserve(std::size_t(across) * down);
+        if (width == 2 * across && height == 2 * down) {  // quicker, and the same
+            for (int y = 0; y < down; ++y)
+                for (int x = 0; x < across; ++x) {
+                    const std::uint32_t* above = &from[std::size_t(2 * y) * width + 2 * x];
+                    const std::uint32_t texels[4] = {above[0], above[1], above[width],
+                                                     above[width + 1]};
+                    std::uint32_t red_blue = 0x20002, green = 0x200;
+                    for (const std::uint32_t texel : texels)
+                        red_blue += texel & 0xff00ff, green += texel & 0xff00;
+                    to.push_back((red_blue >> 2 & 0xff00ff) | (green >> 2 & 0xff00));
+                }
+            return to;
+        }
         for (int y = 0; y < down; ++y)
             for (int x = 0; x < across; ++x) {
                 const int top = y * height / down, bottom = (y + 1) * height / down;
