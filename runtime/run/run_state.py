@@ -98,6 +98,7 @@ class ParameterServer:
         self._state = state
         self._fault = fault
         self._sender = Sender("run.parameters", ParameterChanged)
+        self._early: list[ParameterChanged] = []  # of changes before the first update
 
     def connect(self, listeners: Iterable[Listener], taps: Iterable[Tap], fault: Fault) -> None:
         """Connect all capable listeners to changes, also those of the changed node."""
@@ -131,5 +132,15 @@ class ParameterServer:
         for key, value in values.items():
             log.info("%s.%s is now %s", name, key, value)
             now = self._state.clock.now()
-            self._sender.send(ParameterChanged(stamp=now, source=name, key=key, value=value))
+            changed = ParameterChanged(stamp=now, source=name, key=key, value=value)
+            if self._state.running:
+                self._sender.send(changed)
+            else:
+                self._early.append(changed)
         return values
+
+    def begin(self) -> None:
+        """Send the events of changes made while the nodes were starting."""
+        early, self._early = self._early, []
+        for changed in early:
+            self._sender.send(changed)

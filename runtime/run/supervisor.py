@@ -290,6 +290,7 @@ class Supervisor:
             if spec.name in state.runners:
                 state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
                 self._host.run_node(state.runners[spec.name])
+        self.parameters.begin()
         self.others.nodes_run()
 
     async def _start_nodes(self) -> list[Announcement]:

@@ -147,6 +147,21 @@ def test_a_node_that_has_not_started_cannot_change() -> None:
     look([spec(First, "first"), spec(Pilot, "pilot")], duration=0.1)
 
 
+def test_a_change_before_the_first_update_is_told_as_the_run_begins() -> None:
+    class Last(Node):
+        async def on_startup(self) -> None:
+            host: Any = self._host
+            host.parameters.set("pilot.gain=3")
+
+    looked = look(
+        [spec(Pilot, "pilot"), spec(Last, "last"), spec(Listener, "listener")], duration=0.3
+    )
+    assert [e.value for e in looked.sent if isinstance(e, ParameterChanged)] == ["3.0"]
+    listener = looked.supervisor.state.all_nodes[2]
+    assert isinstance(listener, Listener)
+    assert listener.heard == ["pilot.gain=3.0"]
+
+
 def test_a_node_that_does_not_run_cannot_change() -> None:
     async def body(supervisor: Supervisor) -> None:
         await supervisor.state.clock.sleep(0.2)
