@@ -183,15 +183,21 @@ class Raster(Stage):
         mujoco.mjv_makeLights(self.model, self._data, self._scene)
 
     def _lights(self) -> npt.NDArray[Any]:
-        """Return the lights; MuJoCo's renderer, too, leaves out those without a direction."""
+        """Return the lights; those of an image without a place in the scene are left out."""
         kinds = mujoco.mjtLightType
-        spot, point = int(kinds.mjLIGHT_SPOT), int(kinds.mjLIGHT_POINT)
-        lights = [of for of in self._scene.lights[: self._scene.nlight] if int(of.type) != point]
+        known = {
+            int(kinds.mjLIGHT_SPOT): 2,
+            int(kinds.mjLIGHT_POINT): 1,
+            int(kinds.mjLIGHT_DIRECTIONAL): 0,
+        }
+        lights = [of for of in self._scene.lights[: self._scene.nlight] if int(of.type) in known]
         found = np.zeros(len(lights), LIGHT)
         for to, of in zip(found, lights, strict=True):
-            to["kind"] = 2 if int(of.type) == spot else 0
+            to["kind"] = known[int(of.type)]
             to["ambient"], to["diffuse"], to["specular"] = of.ambient, of.diffuse, of.specular
-            to["attenuation"], to["exponent"] = of.attenuation, of.exponent
+            # MuJoCo gives the scene's point lights none.
+            fall = self.model.light_attenuation[of.id] if to["kind"] == 1 else of.attenuation
+            to["attenuation"], to["exponent"] = fall, of.exponent
             to["cutoff"] = math.cos(math.radians(of.cutoff))
             # Light from everywhere, as a headlight often is, has no place: it would move with the
             # camera, and the light on all surfaces would be computed anew.

@@ -286,7 +286,4 @@ def _roof(b: Builder, wood: Material, steel: Material) -> None:
 
 
 def _lights(b: Builder) -> None:
-    b.light("lamp_north", (4.8, -1.5, 4.2), (0.95, 0.80, 0.58), fall_off=0.06)
-    b.light("lamp_south", (-5.0, 2.0, 4.2), (0.60, 0.74, 0.95), fall_off=0.06)
-    b.light("lamp_east", (-1.0, -4.0, 3.6), (0.85, 0.72, 0.55), fall_off=0.10)
     b.light("daylight", (0.0, 0.0, 5.0), (0.42, 0.43, 0.46), towards=(0.35, -0.6, -0.7), sun=True)

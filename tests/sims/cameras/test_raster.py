@@ -207,6 +207,31 @@ def test_lights_shine_as_mujocos(shape: str) -> None:
     compare(shaped(LAMPS + SHAPES[shape], ambient=".2 .2 .2", shine=".4 .4 .4"), levels=2.0)
 
 
+def test_a_point_light_shines_to_all_sides_and_falls_off() -> None:
+    """As OpenGL's equations have it; MuJoCo's renderer leaves such lights dark."""
+    lamp = (
+        '<light type="point" pos="0 0 2" diffuse=".9 .6 .3" specular="0 0 0" attenuation="1 0 .5"/>'
+    )
+    floor = '<geom type="plane" size="4 4 .1" rgba="1 1 1 1"/>'
+    scene = SCENE.replace(".3 .3 .3", "0 0 0").format(
+        body=lamp + floor, ambient="0 0 0", shine="0 0 0"
+    )
+    world = mujoco.MjSpec.from_string(scene)
+    world.visual.quality.numquads = 64  # light is computed at the corners of cells
+    raster = Raster(compiled(world))
+    turn = from_rpy(0.0, -0.5 * math.pi, 0.0)  # looking down
+    image, depth, _ = drawn(raster, PINHOLE, (0.0, 0.0, -3.0), turn)
+    assert image is not None
+    assert depth is not None
+    info = camera_info(PINHOLE)
+    for row, column in ((90, 120), (30, 60), (150, 200)):
+        place = (np.array([column, row]) - (info.cx, info.cy)) / (info.fx, info.fy) * 3.0
+        distance = math.hypot(2.0, *place)
+        expected = np.array([0.9, 0.6, 0.3]) * (2.0 / distance) / (1.0 + 0.5 * distance**2)
+        np.testing.assert_allclose(image[row, column], 255.0 * expected, atol=1.5)
+    raster.close()
+
+
 def test_what_is_see_through_is_blended_and_has_no_depth() -> None:
     """Both of its sides are seen; its number is the nearest."""
     behind = '<geom type="box" size=".1 9 9" pos="5 0 1" rgba="1 0 0 1"/>'

@@ -314,7 +314,7 @@ def test_leaves_and_shadows_move_as_a_pure_function_of_time() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_they_cost_at_most_half_as_much_again_as_the_others() -> None:
+def test_they_cost_at_most_twice_as_much_as_the_others() -> None:
     """Processor time of colour and depth at 512 x 512, outdoors against the yard, else the hall."""
     built = {name: scene(name) for name in ("hall", "yard", *HARD)}
     renderers = {
@@ -336,7 +336,7 @@ def test_they_cost_at_most_half_as_much_again_as_the_others() -> None:
     print({name: f"{1e3 * seconds:.1f} ms" for name, seconds in medians.items()})
     for name in HARD:
         usual = "yard" if name in ("night", "forest") else "hall"
-        assert medians[name] < 1.5 * medians[usual], name
+        assert medians[name] < 2.0 * medians[usual], name
     for renderer in renderers.values():
         renderer.close()
 
