@@ -119,6 +119,22 @@ def lockstep(
 
 
 @app.command()
+def frame(
+    json: Json = None,
+    places: Annotated[int, typer.Option(min=1, help="Views of each world.")] = 5,
+    repeats: Annotated[int, typer.Option(min=1, help="Starts of each run.")] = 5,
+) -> None:
+    """Measure a drawn frame by world and lens, and the time from a start to the first image."""
+    from bench.frame import measure, measure_first_image
+
+    _show(
+        json,
+        frame=lambda say: measure(places=places, progress=say),
+        first_image=lambda _: measure_first_image(repeats=repeats),
+    )
+
+
+@app.command()
 def bridge(
     json: Json = None,
     samples: Annotated[

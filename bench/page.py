@@ -11,11 +11,12 @@ import jinja2
 import msgspec
 from matplotlib.figure import Figure
 
-from bench import airsim, bridge, flood, lateness, lockstep, outside, stall, throughput
+from bench import airsim, bridge, flood, frame, lateness, lockstep, outside, stall, throughput
 from bench.airsim import AirsimRow
 from bench.bridge import BridgeRow, RosImageRow
 from bench.driver import Outcome, Row, measure_all
 from bench.flood import FloodRow
+from bench.frame import FirstImageRow, FrameRow
 from bench.lateness import RecordingRow
 from bench.lockstep import LockstepRow, PartRow
 from bench.outside import HeldRow, LinkRow
@@ -39,6 +40,8 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
     idle: IdleRow
     lockstep: list[LockstepRow]
     parts: list[PartRow] = []
+    frame: list[FrameRow] = []
+    first_image: list[FirstImageRow] = []
     bridge: list[BridgeRow] = []
     link: list[LinkRow] = []
     held: list[HeldRow] = []
@@ -103,6 +106,8 @@ def measure(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> 
 def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> dict[str, Any]:
     """Run the benchmarks between processes and beside the loop, by field of `Results`."""
     return {
+        "frame": frame.measure(places=1 if quick else 5, progress=progress),
+        "first_image": frame.measure_first_image(repeats=1 if quick else 5),
         "bridge": bridge.measure(200 if quick else 2000, progress),
         "link": outside.measure_link(100 if quick else 1000),
         "held": outside.measure_held(

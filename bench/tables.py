@@ -106,6 +106,17 @@ TABLES = {
         "case: case | simulated seconds a second: speed .1f | "
         "the runtime's own share of the time: share .0%",
     ),
+    "frame": _table(
+        "A drawn frame on one core: 512×512 colour, depth and object numbers, by the project's "
+        "rasteriser and by MuJoCo's renderer (OpenGL in software)",
+        "world: world | camera: camera | ms: raster_ms .1f | MuJoCo's: mujoco_ms ?.1f | "
+        "ratio: ratio ?.1f",
+        texts=2,
+    ),
+    "first_image": _table(
+        "From the start of the command `run` to the first image",
+        "world: world | seconds: seconds .2f",
+    ),
     "parts": _table(
         "Processor time of a frame (all processes; RGB-D with noise, odometry, evaluation)",
         "part: part | ms: ms .1f | share: share .0%",

@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtri
 
 from events import CameraInfo
 from events.camera_info import response_light, srgb_light, vignette_map
@@ -188,6 +187,8 @@ def _at(array: Any) -> ctypes.c_void_p:
 @functools.cache
 def _quantiles() -> Depths:
     """Return 65536 numbers as likely as each other, of mean 0 and standard deviation 1."""
+    from scipy.special import ndtri  # a tenth of a second, which only cameras with noise need
+
     values = ndtri((np.arange(65536) + 0.5) / 65536)
     return np.asarray(values / values.std(), dtype=np.float32)
 

@@ -16,7 +16,6 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import msgspec
 import mujoco
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from events import Vector3
 from events.frames import flip_yz
@@ -123,6 +122,8 @@ def path_through(
         times: When it is to be at each, seconds, rising.
         yaw: Heading until it first moves, radians.
     """
+    from scipy.interpolate import CubicSpline  # a tenth of a second, which only moving bodies need
+
     spline = CubicSpline(times, places, bc_type="periodic" if loop else "clamped")
     at = np.arange(times[0], times[-1] + 2 * _YAW_STEP, _YAW_STEP)
     velocity = spline(np.minimum(at, times[-1]), 1)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import lockstep, outside, stall, throughput
+from bench import frame, lockstep, outside, stall, throughput
 
 
 @pytest.mark.slow
@@ -102,3 +102,17 @@ def test_an_odometry_outside_and_one_in_a_worker_fly_the_same() -> None:
     (row,) = outside.measure_held(seconds=2.0, repeats=1)
     assert row.equal
     assert row.ratio == pytest.approx(row.outside_speed / row.worker_speed)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_frames_are_drawn_by_both_renderers_and_the_first_image_comes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(frame, "WORLDS", ("hall",))
+    rows = frame.measure(places=1)
+    assert [row.camera for row in rows] == list(frame.CAMERAS)
+    for row in rows:
+        assert row.mujoco_ms is not None
+        assert row.ratio == pytest.approx(row.mujoco_ms / row.raster_ms)
+    assert [row.world for row in frame.measure_first_image(repeats=1)] == ["hall", "yard"]
