@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from runtime.channels.answers import Answers, Outcome, Wrong
-from runtime.channels.digest import combined, combined_of
+from runtime.channels.digest import combined
 from runtime.workers.costs import Costs
 
 
@@ -272,8 +272,6 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         digest: Fingerprint of all events in order; equal for equal runs in lockstep. (They
             compare on machines of one kind; see docs/explanation/determinism.md.) `None` if off.
         digests: Fingerprint of each output's events, of which that of the run is made.
-        inputs: Outputs with sensors' data and true poses, of nodes that hear no such data.
-        inputs_digest: Fingerprint of these: of what estimators were given. `None` if off, or none.
         not_deterministic: Nodes because of which equal runs may have unequal digests.
         truth_readers: Nodes that received true poses, but those that fly, judge, record or show.
         environment: Machine and versions; the command line, and the commit of the current folder.
@@ -310,8 +308,6 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     workers: dict[str, WorkerSummary] = {}
     outside: dict[str, OutsideSummary] = {}
     twice: TwiceSummary | None = None
-    inputs: list[str] = []
-    inputs_digest: str | None = None
 
 
 def verdict_of(
@@ -349,8 +345,6 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
         events.update(part.events)
         stalls.update(part.stalls)
 
-    inputs = sorted({name for part in parts for name in part.inputs})
-
     def of_all(field: str) -> dict[str, Any]:
         return {key: value for part in parts for key, value in getattr(part, field).items()}
 
@@ -361,8 +355,6 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
         wall_seconds=max(part.wall_seconds for part in parts),
         digest=combined(digests) if all(part.digest for part in parts) else None,
         digests=dict(sorted(digests.items())),
-        inputs=inputs,
-        inputs_digest=combined_of(digests, inputs) if all(part.digest for part in parts) else None,
         not_deterministic=sorted({node for part in parts for node in part.not_deterministic}),
         verdict=verdict_of(
             {k: f for v in verdicts for k, f in v.estimators.items()},

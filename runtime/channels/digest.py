@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -78,12 +78,6 @@ def fingerprint(data: Any) -> int:
 def combined(outputs: Mapping[str, str]) -> str:
     """Return the fingerprint of a run, made of those of its outputs."""
     return xxhash.xxh3_128_hexdigest(msgspec.msgpack.encode(sorted(outputs.items())))
-
-
-def combined_of(outputs: Mapping[str, str], names: Iterable[str]) -> str | None:
-    """Return the fingerprint of some outputs; `None` if nothing was sent, or nothing hashed."""
-    found = {name: outputs[name] for name in names if name in outputs}
-    return combined(found) if found else None
 
 
 class _Output:

@@ -14,9 +14,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from events import Category
 from runtime.channels.answers import Answers
-from runtime.channels.digest import Digest, combined_of
+from runtime.channels.digest import Digest
 from runtime.node import matchers, senders, streams
 from runtime.run.run_state import RunState
 from runtime.summary import (
@@ -88,28 +87,6 @@ def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
     return by_type, by_output
 
 
-_MEASURED = {Category.SENSOR, Category.GEOMETRY}
-
-
-def input_outputs(state: RunState) -> list[str]:
-    """Return the outputs with the inputs of estimators: sensors' data and true poses.
-
-    They are those of nodes that hear no such data themselves: an image that an estimator sends on
-    is its result.
-    """
-    found = set()
-    for node in state.all_nodes:
-        declared = node.declared
-        heard = [each.event for each in declared.inputs.values()]
-        heard += [f.event for b in declared.bundles.values() for f in b.fields.values()]
-        heard += [event for each in declared.handlers.values() for event in each.events]
-        if not any(event.category in _MEASURED for event in heard):
-            found |= {
-                s.name for s in senders(node).values() for e in s.sent() if e.category in _MEASURED
-            }
-    return sorted(found)
-
-
 def count_drops(state: RunState) -> dict[str, StreamSummary]:
     """Return each input's bound, peak and drops."""
     found: dict[str, StreamSummary] = {}
@@ -153,8 +130,6 @@ def summarise(
     by_type, by_output = count_events(state)
     by_input = count_drops(state)
     ended = state.stopped or time.monotonic()
-    digests = digest.outputs() if digest else {}
-    inputs = input_outputs(state)
     return Summary(
         name=state.config.run.name,
         clock=state.clock.kind,
@@ -165,9 +140,7 @@ def summarise(
         sim_seconds=(state.clock.now() if state.stopped_at is None else state.stopped_at) / SECOND,
         wall_seconds=round(ended - (state.first_update or ended), 6),
         digest=digest.hexdigest() if digest else None,
-        digests=digests,
-        inputs=inputs,
-        inputs_digest=combined_of(digests, inputs),
+        digests=digest.outputs() if digest else {},
         not_deterministic=_not_deterministic(state),
         verdict=verdict_of(state.conclusions | _losses(state.outside), state.flights),
         events=dict(sorted(by_type.items())),

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 import pytest
 
-from events import Image
-from runtime import Duration, Input, Node, Output
+from runtime import Duration, Input, Node
 from runtime.config.model import Config, RunConfig
 from runtime.run.execute import execute
 from runtime.run.summarise import command_line, commit
@@ -87,36 +85,6 @@ def test_the_digest_is_of_what_was_said(tmp_path: Path) -> None:
     one, two = run(tmp_path, Speaker), run(tmp_path, Speaker)
     assert one.digest == two.digest
     assert one.digest != run(tmp_path, Speaker, Painter).digest
-
-
-class Restorer(Node):
-    """Sends images on, with a change: results, and no inputs."""
-
-    images = Input(Image)
-    restored = Output(Image)
-    shift = 1
-
-    async def run(self) -> None:
-        async for image in self.images:
-            data = image.data + np.uint8(self.shift)
-            self.restored.send(msgspec.structs.replace(image, source=self.name, data=data))
-
-
-class OtherRestorer(Restorer):
-    shift = 2
-
-
-def test_the_inputs_have_a_digest_of_their_own(tmp_path: Path) -> None:
-    """An estimator's results change nothing in it, and a changed image does."""
-    first = run(tmp_path, Painter, Restorer)
-    assert first.inputs == ["painter.images"]
-    found = dict(zip(("painter", "restorer"), (Painter, OtherRestorer), strict=True))
-    specs = tuple(spec(node, name) for name, node in found.items())
-    settings = RunConfig(duration=Duration(1.0), clock="lockstep", seed=3)
-    other = execute(Config(run=settings, nodes=specs), tmp_path)
-    assert other.digest != first.digest
-    assert other.inputs_digest == first.inputs_digest is not None
-    assert run(tmp_path, Speaker).inputs_digest is None
 
 
 def test_a_result_for_tests_counts_drops_too() -> None:
