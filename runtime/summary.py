@@ -272,6 +272,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         digest: Fingerprint of all events in order; equal for equal runs in lockstep. (They
             compare on machines of one kind; see docs/explanation/determinism.md.) `None` if off.
         digests: Fingerprint of each output's events, of which that of the run is made.
+        inputs_digest: Fingerprint of what estimators are fed: sensors, true poses, and their
+            announcements (`runtime.run.summarise.inputs`). `None` if digests are off.
+        inputs: Fingerprint of each output and announcement that counts to the inputs.
         not_deterministic: Nodes because of which equal runs may have unequal digests.
         truth_readers: Nodes that received true poses, but those that fly, judge, record or show.
         environment: Machine and versions; the command line, and the commit of the current folder.
@@ -291,6 +294,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     wall_seconds: float
     digest: str | None
     digests: dict[str, str]
+    inputs_digest: str | None = None
+    inputs: dict[str, str] = {}
     not_deterministic: list[str]
     verdict: Verdict | None
     events: dict[str, int]
@@ -337,7 +342,6 @@ def overall(
 def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
     """Merge the summaries of a run's processes; common entries are taken once."""
     first = parts[0]
-    digests = {name: each for part in parts for name, each in part.digests.items()}
     verdicts = [part.verdict for part in parts if part.verdict is not None]
     stalls: Counter[str] = Counter()
     events: Counter[str] = Counter()
@@ -348,13 +352,17 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
     def of_all(field: str) -> dict[str, Any]:
         return {key: value for part in parts for key, value in getattr(part, field).items()}
 
+    digests, inputs = of_all("digests"), of_all("inputs")
+    fingerprinted = all(part.digest for part in parts)
     return msgspec.structs.replace(
         first,
         error=next((part.error for part in parts if part.error), None),
         sim_seconds=max(part.sim_seconds for part in parts),
         wall_seconds=max(part.wall_seconds for part in parts),
-        digest=combined(digests) if all(part.digest for part in parts) else None,
+        digest=combined(digests) if fingerprinted else None,
         digests=dict(sorted(digests.items())),
+        inputs_digest=combined(inputs) if fingerprinted else None,
+        inputs=dict(sorted(inputs.items())),
         not_deterministic=sorted({node for part in parts for node in part.not_deterministic}),
         verdict=verdict_of(
             {k: f for v in verdicts for k, f in v.estimators.items()},

@@ -101,8 +101,8 @@ class Sender(Generic[T]):
 
     __slots__ = (
         "_candidates", "_deliver", "_expected", "_fault", "_known", "_listeners", "_outside",
-        "_routes", "_sent", "_source", "_sources", "_taps", "_thread", "_to_streams", "_voices",
-        "_waiting", "event", "name", "send",
+        "_routes", "_sent", "_source", "_taps", "_thread", "_to_streams", "_voices",
+        "_waiting", "event", "name", "send", "sources",
     )  # fmt: skip
 
     def __init__(self, name: str, event: type[T], outside: Collection[Any] = ()) -> None:
@@ -112,7 +112,8 @@ class Sender(Generic[T]):
         self._thread = 0
         self._expected: type[T] | None = None
         self._source = ""  # of the event that was checked last
-        self._sources: set[str] = set()  # of all that were
+        self.sources: set[str] = set()
+        """Sources of all events sent so far."""
         self._voices: Voices | None = None
         self._sent = 0
         self.send: Callable[[T], bool] = self._refuse
@@ -193,10 +194,10 @@ class Sender(Generic[T]):
                 f"{threading.current_thread().name!r}: return the event from the function and send "
                 f"it after the await, or use loop.call_soon_threadsafe({self.name}.send, event)"
             )
-        if event.source not in self._sources:
+        if event.source not in self.sources:
             if self._voices is not None:
                 self._voices.check(self.name, event)
-            self._sources.add(event.source)
+            self.sources.add(event.source)
         self._source = self._to_streams.source = event.source
         if not self._outside:
             self._expected = self._to_streams.expected = self.event
@@ -230,7 +231,7 @@ class Sender(Generic[T]):
         return False
 
     def _send_tapped(self, event: T) -> bool:
-        if event.__class__ is not self._expected or event.source not in self._sources:
+        if event.__class__ is not self._expected or event.source not in self.sources:
             self._check(event)
         for tap in self._taps:
             tap(self, event)

@@ -11,11 +11,19 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from events import (
+    Announcement,
+    Category,
+    EstimatorAnnouncement,
+    PathAnnouncement,
+    PilotAnnouncement,
+)
 from runtime.channels.answers import Answers
-from runtime.channels.digest import Digest
+from runtime.channels.digest import Digest, combined, fingerprint
 from runtime.node import matchers, senders, streams
 from runtime.run.run_state import RunState
 from runtime.summary import (
@@ -119,6 +127,37 @@ def tick_summaries(state: RunState) -> dict[str, TickSummary]:
     }
 
 
+_INPUTS = Category.SENSOR | Category.GEOMETRY
+_OF_OTHERS = (EstimatorAnnouncement, PathAnnouncement, PilotAnnouncement)
+
+
+def inputs(state: RunState, outputs: Mapping[str, str]) -> dict[str, str]:
+    """Return the fingerprints of what estimators are fed, by output and by announcement.
+
+    An output counts if it has sent a sensor's event, a true pose or the wind (`_INPUTS`) in an
+    announced name, or below one, but not in that of an estimator or a pilot: so what an estimator
+    republishes does not. It counts as a whole, such as that of a replay, with all that was
+    recorded. Announcements of such names count, too: calibration, noise.
+
+    Args:
+        outputs: Fingerprint of each output's events, by its name.
+    """
+    others = [each for each in state.announcements if isinstance(each, _OF_OTHERS)]
+    given = [each for each in state.announcements if not _named(each.source, others)]
+    found = {f"{each.source} {type(each).__name__}": f"{fingerprint(each):016x}" for each in given}
+    for node in state.all_nodes:
+        for sender in senders(node).values():
+            if any(event.category in _INPUTS for event in sender.sent()) and any(
+                _named(source, given) and not _named(source, others) for source in sender.sources
+            ):
+                found[sender.name] = outputs[sender.name]
+    return dict(sorted(found.items()))
+
+
+def _named(source: str, announcements: Iterable[Announcement]) -> bool:
+    return any(f"{source}/".startswith(f"{each.source}/") for each in announcements)
+
+
 def summarise(
     state: RunState,
     *,
@@ -130,6 +169,8 @@ def summarise(
     by_type, by_output = count_events(state)
     by_input = count_drops(state)
     ended = state.stopped or time.monotonic()
+    digests = digest.outputs() if digest else {}
+    fed = inputs(state, digests) if digest and state.running else {}
     return Summary(
         name=state.config.run.name,
         clock=state.clock.kind,
@@ -139,8 +180,10 @@ def summarise(
         error=None if state.error is None else str(state.error),
         sim_seconds=(state.clock.now() if state.stopped_at is None else state.stopped_at) / SECOND,
         wall_seconds=round(ended - (state.first_update or ended), 6),
-        digest=digest.hexdigest() if digest else None,
-        digests=digest.outputs() if digest else {},
+        digest=combined(digests) if digest else None,
+        digests=digests,
+        inputs_digest=combined(fed) if digest else None,
+        inputs=fed,
         not_deterministic=_not_deterministic(state),
         verdict=verdict_of(state.conclusions | _losses(state.outside), state.flights),
         events=dict(sorted(by_type.items())),

@@ -39,6 +39,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     sim_seconds: float | None = None
     wall_seconds: float | None = None
     digest: str | None = None
+    inputs_digest: str | None = None
     not_deterministic: list[str] = []
     verdict: Verdict | None = None
     outputs: dict[str, int] = {}
@@ -181,6 +182,7 @@ def facts(run: Run) -> list[tuple[str, str]]:
         "ended by": f.reason,
         "error": f.error,
         "digest": f.clock and _digest(f),
+        "digest of the inputs": f.inputs_digest,
         "run twice": f.twice and (f.twice.first or "it repeats"),
     }
     rows += [(name, str(value)) for name, value in known.items() if value is not None]

@@ -98,6 +98,7 @@ def print_tables(summary: Summary) -> None:
     if summary.digest and summary.not_deterministic:
         digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
     console.print(f"digest {digest}", highlight=False)
+    console.print(f"digest of the inputs {summary.inputs_digest or 'off'}", highlight=False)
 
 
 def print_lines(summary: Summary, folder: Path) -> None:

@@ -37,6 +37,7 @@ def test_in_lockstep_the_digest_is_that_of_one_process(onlys: tuple[str, ...]) -
     for summary in apart(config, *onlys):
         assert summary.digests == alone.digests
         assert summary.digest == alone.digest
+        assert summary.inputs_digest == alone.inputs_digest
         assert summary.outputs == alone.outputs
         assert summary.sim_seconds == alone.sim_seconds
         assert {*summary.streams} == {*alone.streams}

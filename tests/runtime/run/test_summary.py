@@ -5,18 +5,31 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
+from msgspec.structs import replace
 
-from runtime import Duration, Input, Node
+from events import (
+    Announcement,
+    EstimatorAnnouncement,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PoseEstimate,
+)
+from runtime import Duration, Input, Node, NodeConfig, Output, every, on
 from runtime.config.model import Config, RunConfig
 from runtime.run.execute import execute
 from runtime.run.summarise import command_line, commit
-from runtime.summary import Summary
+from runtime.summary import Summary, merged
 from runtime.testing import run_nodes, spec
+from runtime.time.schedule import Tick
 from runtime.tools.cli.brief import run_tables
 from tests.runtime.samples import Diarist, Failing, Painter, Ping, Reader, Speaker
 
@@ -85,6 +98,123 @@ def test_the_digest_is_of_what_was_said(tmp_path: Path) -> None:
     one, two = run(tmp_path, Speaker), run(tmp_path, Speaker)
     assert one.digest == two.digest
     assert one.digest != run(tmp_path, Speaker, Painter).digest
+
+
+class RigConfig(NodeConfig, frozen=True):
+    """Settings of the rig of the inputs."""
+
+    noise: float = 0.0
+    announced_noise: float = 0.0
+
+
+class Rig(Node[RigConfig]):
+    """A vehicle with an IMU and a camera."""
+
+    imu = Output(Imu)
+    images = Output(Image)
+    odometry = Output(Odometry)
+
+    def announce(self) -> Iterator[Announcement]:
+        noise = self.config.announced_noise
+        yield ImuAnnouncement(
+            stamp=0,
+            source="rig/imu",
+            rate=10.0,
+            frame_id="imu",
+            gyroscope_noise_density=noise,
+            gyroscope_random_walk=0.0,
+            accelerometer_noise_density=0.0,
+            accelerometer_random_walk=0.0,
+        )
+        yield Announcement(stamp=0, source="rig")
+
+    @every(hz=10)
+    def measure(self, tick: Tick) -> None:
+        zero = (0.0, 0.0, 0.0)
+        self.imu.send(
+            Imu(
+                stamp=tick.stamp,
+                source="rig/imu",
+                frame_id="imu",
+                angular_velocity=zero,
+                linear_acceleration=zero,
+            )
+        )
+        self.odometry.send(
+            Odometry(
+                stamp=tick.stamp,
+                source="rig",
+                position=zero,
+                orientation=(1.0, 0.0, 0.0, 0.0),
+                linear_velocity=zero,
+                angular_velocity=zero,
+            )
+        )
+        grey = np.uint8(abs(self.rng.normal()) * self.config.noise % 256)
+        self.images.send(
+            Image(stamp=tick.stamp, source="rig", frame_id="lens", data=np.full((2, 2), grey))
+        )
+
+
+class TrackerConfig(NodeConfig, frozen=True):
+    """Settings of the estimator of the inputs."""
+
+    gain: float = 1.0
+
+
+class Tracker(Node[TrackerConfig]):
+    """An estimator, which sends its images on in its own name."""
+
+    estimates = Output(PoseEstimate)
+    views = Output(Image)
+
+    def announce(self) -> Iterator[Announcement]:
+        method = f"gain {self.config.gain}"
+        yield EstimatorAnnouncement(stamp=0, source=self.name, method=method)
+        yield Announcement(stamp=0, source=f"{self.name}/view")
+
+    @on(Image, source="rig")
+    def track(self, image: Image) -> None:
+        seen = image.data + np.uint8(self.config.gain)
+        self.views.send(replace(image, source=f"{self.name}/view", data=seen))
+
+
+def rigged(gain: float = 1.0, digest: bool | None = None, **rig: float) -> Summary:
+    nodes = (spec(Rig, "rig", rig), spec(Tracker, "tracker", {"gain": gain}))
+    settings = RunConfig(duration=Duration(0.5), clock="lockstep", digest=digest)
+    return execute(Config(run=settings, nodes=nodes))
+
+
+def test_the_inputs_are_what_estimators_are_fed_and_not_what_they_answer() -> None:
+    found = rigged()
+    assert set(found.inputs) == {
+        *("rig Announcement", "rig/imu ImuAnnouncement"),
+        *("rig.images", "rig.imu", "rig.odometry"),
+    }
+    other = rigged(gain=2.0)
+    assert found.digests["tracker.views"] != other.digests["tracker.views"]
+    assert (found.inputs_digest, found.inputs) == (other.inputs_digest, other.inputs)
+    assert found.digest != other.digest
+
+
+@pytest.mark.parametrize("rig", [{"noise": 50.0}, {"announced_noise": 0.1}], ids=str)
+def test_a_changed_sensor_changes_the_digest_of_the_inputs(rig: dict[str, Any]) -> None:
+    assert rigged(**rig).inputs_digest != rigged().inputs_digest
+
+
+def test_without_a_digest_the_inputs_have_none() -> None:
+    found = rigged(digest=False)
+    assert (found.digest, found.inputs_digest, found.inputs) == (None, None, {})
+
+
+def test_joined_runs_have_the_inputs_of_one() -> None:
+    found = rigged()
+    announced = {name: each for name, each in found.inputs.items() if "." not in name}
+    there = {name: each for name, each in found.inputs.items() if name == "rig.imu"}
+    here = {name: each for name, each in found.inputs.items() if name not in there}
+    parts = [replace(found, inputs=here), replace(found, inputs=announced | there)]
+    assert merged(parts, []).inputs_digest == found.inputs_digest
+    assert merged([found, replace(found, digest=None)], []).inputs_digest is None
 
 
 def test_a_result_for_tests_counts_drops_too() -> None:
