@@ -7,7 +7,7 @@ Read the core in this order:
 - Delivery of events: `channels.sender`, `streams` and `links`, as `run.graph` has connected them;
   its speed: `channels.tasks`, `run.event_loop`.
 - Time: `time.schedule`, `clock`, `lockstep`, `stepping`, `time_limits`.
-- A run: `run.node_runner`, `node_host`, `run_state`, `supervisor`, `execute`; `watchdogs` and
+- A run: `run.node_runner`, `run_state`, `supervisor`, `execute`; `watchdogs` and
   `code_location` find the node that blocks the loop or holds up the run, `instruments` are for
   observers.
 - Results: `channels.digest`, `summary` (made by `run.summarise`), `run.results`, `logs`.

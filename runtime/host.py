@@ -6,7 +6,7 @@ import concurrent.futures
 import functools
 from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import msgspec
 from typing_extensions import TypeVar
@@ -62,44 +62,58 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
     truth_readers: frozenset[str] = frozenset()
 
 
-class Host(Protocol):
+class Host:
     """Services of a run for its nodes, called by the methods of `Node` with themselves.
+
+    Each run of nodes (a run, a check of its file, a test) has its own; here is what all have.
+    Without a run there is nothing to end, and no summary: what nodes ask of these is left undone.
 
     Attributes:
         siblings: All nodes of the run, in file order.
+        out: Folder for files of nodes, or `None`; `out_of_programs` of those that start programs.
         shared: Objects shared by nodes of this process, by name.
         run_end: How the run ended; `None` before.
     """
 
-    seed: int
-    clock: Clock
-    out: Path | None
-    out_of_programs: Path | None
-    checking: bool
-    siblings: tuple[Sibling, ...]
-    shared: dict[str, Any]
-    stepping: Stepping
+    checking = False
+    run_end: RunEnd | None = None
 
-    def start(self, node: Any, coro: Coroutine[Any, Any, None]) -> None:
-        """Run a coroutine as part of a node."""
+    def __init__(
+        self,
+        clock: Clock,
+        seed: int = 0,
+        siblings: tuple[Sibling, ...] = (),
+        over: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.clock = clock
+        self.seed = seed
+        self.siblings = siblings
+        self.out: Path | None = None
+        self.out_of_programs: Path | None = None
+        self.shared: dict[str, Any] = {}
+        self.stepping = Stepping(clock, over)
+
+    def start(self, node: Any, coro: Coroutine[Any, Any, None]) -> Any:
+        """Run a coroutine as part of a node, and return its task."""
+        raise NotImplementedError
 
     def every(self, node: Any, hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
-        """Call a function of a node at a rate."""
+        """Call a function of a node at a rate, from the first update on."""
+        raise NotImplementedError
 
     async def worker(
         self, node: Any, factory: Callable[..., W], args: tuple[Any, ...], **options: Any
     ) -> Worker[W]:
-        """Make a worker, ended with the node."""
+        """Start a worker, and end the worker with the node."""
+        raise NotImplementedError
 
-    def hold(self, node: Any, name: str, config: HoldConfig, latency: float) -> Hold[Any]:
-        """Make the hold of an outside system, ended with the node."""
+    def hold(self, node: Any, name: str, config: HoldConfig, latency: float) -> Hold[Any]:  # noqa: ARG002
+        """Make the hold of an outside system, and end the hold with the node."""
+        return Hold(name, self.clock, config, latency)
 
     def offload(self, node: Any, call: functools.partial[Any]) -> concurrent.futures.Future[Any]:
         """Run a function of a node in a thread."""
-
-    @property
-    def run_end(self) -> RunEnd | None:
-        """How the run ended; `None` before."""
+        raise NotImplementedError
 
     def stop(self, node: Any, reason: str) -> None:
         """End the run in order, for a reason of a node's."""

@@ -205,7 +205,7 @@ class _Run:
             results.write_summary(out, summary)
         except VisnavError as error:
             self.failed(error)
-        for call in self.supervisor.state.after_run:
+        for call in self.supervisor.state.afterwards:
             owner = getattr(call, "__self__", None)
             name = owner.name if isinstance(owner, Node) else getattr(call, "__module__", "runtime")
             try:

@@ -1,42 +1,54 @@
-"""State of a run in progress, and changes of its nodes' settings.
+"""State of a run in progress, its services for nodes, and changes of its nodes' settings.
 
-The supervisor writes the state, observers read it. Which settings may change is decided in
-`runtime.config.parameters`.
+The supervisor writes the state, observers read it, nodes ask for tasks, ticks, workers and threads.
+Which settings may change is decided in `runtime.config.parameters`.
 """
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
+import functools
+import inspect
 import logging
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Container, Coroutine, Iterable, Mapping
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from typing_extensions import TypeVar, override
 
 from events import Announcement, ParameterChanged
 from runtime.channels.answers import Answers
+from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.links import Link
 from runtime.channels.sender import Listener, Sender, Tap
+from runtime.channels.streams import Stream
 from runtime.channels.tasks import Fault
 from runtime.config.model import Config
 from runtime.config.parameters import change
 from runtime.errors import ConfigError
-from runtime.host import RunEnd
+from runtime.host import Host, Sibling
 from runtime.node import Node
-from runtime.run.node_runner import NodeRunner
+from runtime.run.instruments import Instruments
+from runtime.run.node_runner import Create, NodeRunner
 from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND, Ticker
+from runtime.time.schedule import SECOND, Tick, Ticker
 from runtime.workers.costs import Costs
+from runtime.workers.worker import Worker
+
+W = TypeVar("W")
+
+log = logging.getLogger("visnav.runtime")
 
 SHUTDOWN_SHARE = 0.05
 """Share of a run's length (clock's or real time, if longer) in `shutdown_limit`."""
 
 
-@dataclass
-class RunState:
-    """State of a run in this process.
+class RunState(Host):
+    """State of a run in this process, and its services for nodes.
 
     Attributes:
         runners: The nodes that run in this process, by name, in file order.
@@ -49,33 +61,56 @@ class RunState:
         all_nodes: All nodes there have been, those restarted or dropped included.
         links: All links of the nodes that there are, by ``node.port``.
         environment: What nodes found of the machine on which figures depend.
+        afterwards: Functions to call once the summary is written.
     """
 
-    config: Config
-    clock: Clock
-    runners: dict[str, NodeRunner]
-    several_processes: bool = False
-    running: bool = False
-    first_update: float | None = None
-    stop_requested: str = ""
-    stopped: float | None = None
-    stopped_at: int | None = None
-    reason: str = ""
-    end: RunEnd | None = None
-    error: Exception | None = None
-    interruption: Exception | None = None
-    announcements: list[Announcement] = field(default_factory=list)
-    truth_readers: set[str] = field(default_factory=set)
-    all_nodes: list[Node[Any]] = field(default_factory=list)
-    tickers: dict[str, Ticker] = field(default_factory=dict)
-    links: dict[str, Link] = field(default_factory=dict)
-    conclusions: dict[str, dict[str, Any]] = field(default_factory=dict)
-    flights: dict[str, dict[str, Any]] = field(default_factory=dict)
-    environment: dict[str, str] = field(default_factory=dict)
-    costs: dict[str, Costs] = field(default_factory=dict)
-    outside: dict[str, Answers] = field(default_factory=dict)
-    before_first_update: Callable[[], None] = lambda: None
-    after_run: list[Callable[[Path], Any]] = field(default_factory=list)
+    def __init__(
+        self,
+        config: Config,
+        clock: Clock,
+        runners: dict[str, NodeRunner],
+        instruments: Instruments,
+        create: Create,
+        stop: Callable[[str, str], None],
+        fault: Callable[[str, BaseException], None],
+    ) -> None:
+        super().__init__(
+            clock, config.run.seed, siblings(config, runners), over=lambda: bool(self.reason)
+        )
+        self.config = config
+        self.runners = runners
+        self.instruments = instruments
+        self.running = False
+        self.first_update: float | None = None
+        self.stop_requested = ""
+        self.stopped: float | None = None
+        self.stopped_at: int | None = None
+        self.reason = ""
+        self.error: Exception | None = None
+        self.interruption: Exception | None = None
+        self.announcements: list[Announcement] = []
+        self.truth_readers: set[str] = set()
+        self.all_nodes: list[Node[Any]] = []
+        self.tickers: dict[str, Ticker] = {}
+        self.links: dict[str, Link] = {}
+        self.conclusions: dict[str, dict[str, Any]] = {}
+        self.flights: dict[str, dict[str, Any]] = {}
+        self.environment: dict[str, str] = {}
+        self.costs: dict[str, Costs] = {}
+        self.outside: dict[str, Answers] = {}
+        self.before_first_update: Callable[[], None] = lambda: None
+        self.afterwards: list[Callable[[Path], Any]] = []
+        self._create = create
+        self._stop = stop
+        self._fault = fault
+        self._executor = concurrent.futures.ThreadPoolExecutor(
+            max_workers=8, thread_name_prefix="offload"
+        )
+
+    @property
+    def several_processes(self) -> bool:
+        """Whether other nodes of the file run in other processes."""
+        return len(self.runners) < len(self.config.nodes)
 
     def note_error(self, error: Exception) -> None:
         """Record an error; the first becomes the error of the run."""
@@ -87,8 +122,167 @@ class RunState:
         length = max(real, self.clock.now() / SECOND)
         return self.config.run.shutdown_limit + SHUTDOWN_SHARE * length
 
+    def close(self) -> None:
+        """Start no more threads, and wait for none."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
 
-log = logging.getLogger("visnav.runtime")
+    def run_node(self, runner: NodeRunner) -> None:
+        """Begin a node's ticks and its `run`: the first update."""
+        node = runner.node
+        assert node is not None
+        runner.running_since = self.clock.now()
+        for ticker in runner.tickers:
+            self._add(ticker)
+        for method, ticks in node.declared.ticks.items():
+            hz = getattr(node.config, ticks.hz) if isinstance(ticks.hz, str) else ticks.hz
+            self.every(node, hz, getattr(node, method), method)
+        if type(node).run is not Node.run:
+            self.start(node, node.run()).add_done_callback(lambda _: self._has_run(node))
+
+    # What nodes ask for.
+
+    @override
+    def stop(self, node: Node[Any], reason: str) -> None:
+        self._stop(node.name, reason)
+
+    @override
+    def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        runner = self.runners[node.name]
+        guarded = self._guard(node, coro)
+        guarded.__qualname__ = getattr(coro, "__qualname__", guarded.__qualname__)  # type: ignore[attr-defined]
+        task = self._create(guarded, node.name)
+        runner.tasks[task] = None
+        self.instruments.on_task(node.name, task)
+        task.add_done_callback(lambda _: runner.tasks.pop(task, None))
+        if inspect.iscoroutine(coro):  # which is not begun if the task is cancelled before
+            task.add_done_callback(lambda _: coro.close())
+        return task
+
+    @override
+    def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
+        runner, tickers = self.runners[node.name], self.tickers
+        full_name = _ticker_name(runner, name)
+        if inspect.iscoroutinefunction(call):
+            call = self._in_background(node, call, full_name)
+        fault = functools.partial(self._fault, node.name)
+        ticker = Ticker(full_name, hz, call, fault, before=tickers.get(full_name))
+        tickers[full_name] = ticker
+        runner.tickers.append(ticker)
+        self.instruments.on_ticker(ticker)
+        if self.running and runner.started:
+            self._add(ticker)
+        return ticker
+
+    @override
+    async def worker(
+        self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
+    ) -> Worker[W]:
+        loop = asyncio.get_running_loop()
+
+        def died(error: Exception) -> None:
+            loop.call_soon_threadsafe(self._fault, node.name, error)
+
+        name = f"{node.name}.{getattr(factory, '__name__', 'worker')}"
+        worker: Worker[W] = Worker(
+            name,
+            self.clock,
+            factory,
+            *args,
+            printed=lambda line: node.log.debug("%s printed: %s", name, line),
+            died=died,
+            costs=self.costs.setdefault(name, Costs()),
+            **options,
+        )
+        self.runners[node.name].workers.append(worker)  # which ends it, ready or not
+        await worker.ready()
+        self.instruments.on_worker(worker)
+        return worker
+
+    @override
+    def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:
+        known = self.outside.get(name)
+        answers = self.outside.setdefault(name, Answers())
+        hold: Hold[Any] = Hold(
+            name,
+            self.clock,
+            config,
+            latency,
+            answers=answers,
+            log=node.log.warning,
+            wall=self.stepping.real_seconds,
+        )
+        self.runners[node.name].holds.append(hold)
+        if known is None:
+            self.after_run(lambda folder: answers.write(folder, name))
+        return hold
+
+    @override
+    def offload(
+        self, node: Node[Any], call: functools.partial[Any]
+    ) -> concurrent.futures.Future[Any]:
+        return self._executor.submit(self.instruments.offloaded(node.name, call))
+
+    @override
+    def note_environment(self, name: str, value: str) -> None:
+        self.environment[name] = value
+
+    @override
+    def conclude(
+        self, subject: str, figures: Mapping[str, Any], passed: bool | None, flight: bool
+    ) -> None:
+        found = self.flights if flight else self.conclusions
+        found[subject] = {"passed": passed, **figures}
+
+    @override
+    def after_run(self, call: Callable[[Path], Any]) -> None:
+        self.afterwards.append(call)
+
+    # How it is done.
+
+    async def _guard(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
+        runner = self.runners[node.name]
+        me = asyncio.current_task()
+        try:
+            await coro
+        except BaseException as error:
+            ours = runner.shutting_down or runner.node is not node
+            if ours and isinstance(error, asyncio.CancelledError):
+                raise
+            if asyncio._get_running_loop() is None or asyncio.current_task() is not me:
+                raise  # a GeneratorExit: it is thrown away
+            if runner.node is node:
+                self._fault(node.name, error)
+
+    def _has_run(self, node: Node[Any]) -> None:
+        runner = self.runners[node.name]
+        ports = [*node.declared.inputs, *node.declared.bundles]
+        over = self.stopped is not None or runner.shutting_down or runner.restarting
+        if ports and not over:
+            unread = ", ".join(ports)
+            log.warning("%s: run() has returned: nobody reads %s any more", node.name, unread)
+
+    def _add(self, ticker: Ticker) -> None:
+        ticker.begin(self.clock.now())
+        self.clock.schedule.add(ticker.due, ticker)
+
+    def _in_background(
+        self, node: Node[Any], call: Callable[[Tick], Any], name: str
+    ) -> Callable[[Tick], None]:
+        """Return a function to hand ticks to a coroutine; ticks are skipped while busy."""
+        ticks: Stream[Tick] = Stream(name, bound=1, overflow="drop_oldest")
+
+        async def serve() -> None:
+            async for tick in ticks:
+                await call(tick)
+
+        def hand_over(tick: Tick) -> None:
+            if ticks.waiter is None:
+                self.tickers[ticks.name].missed += 1
+            else:
+                ticks.offer(tick)
+
+        self.start(node, serve())
+        return hand_over
 
 
 class ParameterServer:
@@ -144,3 +338,17 @@ class ParameterServer:
         early, self._early = self._early, []
         for changed in early:
             self._sender.send(changed)
+
+
+def siblings(config: Config, here: Container[str]) -> tuple[Sibling, ...]:
+    """Return all nodes of a file as siblings; `here` holds the nodes of this process."""
+    return tuple(
+        Sibling(spec.name, spec.node, spec.config, spec.inputs, spec.name in here)
+        for spec in config.nodes
+    )
+
+
+def _ticker_name(runner: NodeRunner, name: str) -> str:
+    full = f"{runner.spec.name}.{name}"
+    taken = {ticker.name for ticker in runner.tickers if not ticker.stopped}
+    return next(n for n in chain([full], (f"{full}_{i}" for i in count(2))) if n not in taken)

@@ -176,7 +176,7 @@ def summarise(
         clock=state.clock.kind,
         seed=state.config.run.seed,
         reason=state.reason,
-        ended_by=state.end.by if state.end is not None else "",
+        ended_by=state.run_end.by if state.run_end is not None else "",
         error=None if state.error is None else str(state.error),
         sim_seconds=(state.clock.now() if state.stopped_at is None else state.stopped_at) / SECOND,
         wall_seconds=round(ended - (state.first_update or ended), 6),

@@ -35,7 +35,6 @@ from runtime.peers.others import Others
 from runtime.run import graph
 from runtime.run.event_loop import RunTask
 from runtime.run.instruments import Instruments
-from runtime.run.node_host import NodeHost
 from runtime.run.node_runner import Announced, NodeRunner, Phase, log_error, start_up, wrap
 from runtime.run.run_state import ParameterServer, RunState
 from runtime.time.clock import Clock
@@ -77,25 +76,23 @@ class Supervisor:
         for spec in here:
             node = stand_ins.get(spec.name, spec.node)
             runners[spec.name] = NodeRunner(msgspec.structs.replace(spec, node=node), self._own)
-        several = len(runners) < len(config.nodes)
-        self.state = RunState(config, clock, runners, several_processes=several)
         self.instruments = Instruments(runners, self._reconnect)
-        self.parameters = ParameterServer(self.state, self.fault)
-        self._host = NodeHost(
-            self.state,
-            out,
-            out_of_programs or out,
+        self.state = RunState(
+            config,
+            clock,
+            runners,
             self.instruments,
-            self.parameters,
             self._own,
             lambda node, reason: self.stop(reason, by=node),
             self.fault,
         )
-        self.stepping = self._host.stepping
+        self.state.out, self.state.out_of_programs = out, out_of_programs or out
+        self.parameters = ParameterServer(self.state, self.fault)
+        self.stepping = self.state.stepping
         self._taps = tuple(taps)
         self._voices = Voices([spec.name for spec in config.nodes], scripted)
         self.others = Others(clock)
-        if several:
+        if self.state.several_processes:
             from runtime.peers.peers import Peers
 
             self.others = Peers(config, only, clock, self)
@@ -114,7 +111,7 @@ class Supervisor:
         finally:  # there are none left but those that would not end, unless this was cancelled
             for task in self._tasks:
                 task.cancel()
-            self._host.close()
+            self.state.close()
 
     def _own(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(coro, name=name)
@@ -150,7 +147,7 @@ class Supervisor:
         state.reason = reason
         state.error = error
         state.stopped, state.stopped_at = time.monotonic(), state.clock.now()
-        state.end = RunEnd(
+        state.run_end = RunEnd(
             stamp=state.stopped_at,
             reason=reason,
             by=by,
@@ -289,7 +286,7 @@ class Supervisor:
         for index, spec in enumerate(state.config.nodes):
             if spec.name in state.runners:
                 state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
-                self._host.run_node(state.runners[spec.name])
+                self.state.run_node(state.runners[spec.name])
         self.parameters.begin()
         self.others.nodes_run()
 
@@ -333,7 +330,7 @@ class Supervisor:
     async def _start_node(self, runner: NodeRunner) -> None:
         state = self.state
         try:
-            await runner.start_up(self._host, state.config.run.startup_limit)
+            await runner.start_up(self.state, state.config.run.startup_limit)
         finally:
             if runner.node is not None and runner.node not in state.all_nodes:
                 state.all_nodes.append(runner.node)
@@ -365,7 +362,7 @@ class Supervisor:
                 continue
             runner.restarting = False
             self.connect()
-            self._host.run_node(runner)
+            self.state.run_node(runner)
             return
 
     # Ending.

@@ -24,28 +24,26 @@ import functools
 import logging
 import posixpath
 from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Sequence
-from pathlib import Path
 from types import CodeType
 from typing import Any, NoReturn
 
 import msgspec
 
 from events import Announcement, EstimatorAnnouncement, Shutdown, WindowClosed
-from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.sender import Listener, Voices
 from runtime.config.model import Config, NodeSpec
 from runtime.config.plugins import offers
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
+from runtime.host import Host
 from runtime.node import Node
 from runtime.paths import written
 from runtime.run import event_loop
 from runtime.run.execute import make_clock, make_loop
 from runtime.run.graph import circles, edges_of, input_types, unconnected
-from runtime.run.node_host import siblings
 from runtime.run.node_runner import Announced, NodeRunner, Phase, start_up
+from runtime.run.run_state import siblings
 from runtime.time.clock import Clock
 from runtime.time.schedule import Tick, Ticker
-from runtime.time.stepping import Stepping
 
 RUN_FILES = ("config.toml", "log.txt", "summary.json")
 """Files written by the run itself into its folder."""
@@ -165,18 +163,12 @@ class _Absent:
         return 0
 
 
-class _DryHost:
+class _DryHost(Host):
     checking = True
-    out: Path | None = None
-    out_of_programs: Path | None = None
-    run_end = None
 
     def __init__(self, config: Config, clock: Clock) -> None:
-        self.seed = config.run.seed
-        self.clock = clock
-        self.siblings = siblings(config, {spec.name for spec in config.nodes})
-        self.shared: dict[str, Any] = {}
-        self.stepping = Stepping(clock)
+        here = {spec.name for spec in config.nodes}
+        super().__init__(clock, config.run.seed, siblings(config, here))
         self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
         )
@@ -196,14 +188,6 @@ class _DryHost:
 
     async def worker(self, *_: Any, **__: Any) -> Any:
         return _Absent()
-
-    def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:  # noqa: ARG002
-        return Hold(name, self.clock, config, latency)
-
-    def stop(self, *_: Any) -> None:
-        pass
-
-    note_environment = conclude = after_run = stop
 
 
 @contextlib.contextmanager

@@ -107,7 +107,7 @@ class _Recorder(Instrument):
         for name, ticker in state.tickers.items():
             node, _, what = name.partition(".")
             nodes[node].tickers[what] = ticker.hz, self._ticks.get(name, {})
-        if state.conclusions or state.flights or state.outside or state.after_run:
+        if state.conclusions or state.flights or state.outside or state.afterwards:
             self._unfit = "a node of the flight concludes, writes or asks something"
         elif len(state.all_nodes) > len(state.runners):
             self._unfit = "a node of the flight was restarted"
@@ -179,7 +179,7 @@ class _Recorder(Instrument):
 
     def _hook(self) -> None:
         loop = asyncio.get_running_loop()
-        host: Any = self._supervisor._host
+        host: Any = self._supervisor.state
         assert isinstance(loop, LockstepLoop)
         schedule: Any = loop.schedule
         stop, add, hold, call_at = host.stop, schedule.add, loop.hold, loop.call_at

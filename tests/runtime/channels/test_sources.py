@@ -113,8 +113,8 @@ def test_it_is_noticed_with_and_without_a_digest_after_events_that_were_right(
 ) -> None:
     cheat = spec(Speaker, "cheat", {"sources": ["cheat", "cheat", "drone"], "kind": kind})
     found = supervise([spec(Speaker, "drone"), cheat], clock=clock, duration=0.2)
-    assert found.supervisor.state.end is not None
-    assert found.supervisor.state.end.by == "cheat"
+    assert found.supervisor.state.run_end is not None
+    assert found.supervisor.state.run_end.by == "cheat"
     assert "'drone', which is drone's" in str(found.error)
 
 

@@ -139,7 +139,7 @@ def test_an_instrument_does_not_let_nodes_send_before_the_first_update() -> None
         async def on_startup(self) -> None:
             host: Any = self._host
             host.instruments.attach(Eye())
-            early = senders(host.state.runners["drone"].node)["images"]
+            early = senders(host.runners["drone"].node)["images"]
             with pytest.raises(ChannelClosedError):
                 early.send(None)
             refused.append(early.name)
