@@ -5,8 +5,6 @@ Bridges build publishers from these, estimators their calibration, reports their
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from events.base import Category, Event, Quaternion, Vector3, check, check_pose
 from events.camera_info import CameraInfo
 from events.estimates import TrackedFeatures
@@ -15,14 +13,12 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 """The matrix of a sensor without errors of scale and alignment, row by row."""
 
 
-class Announcement(Event):
+class Announcement(Event, category=Category.ANNOUNCEMENT):
     """Base of all announcements; `source` is the announced name.
 
     The announcing node may send in this name, and in those below it. This class itself says no
     more; with the source ``*``, it is for all names that no other node announces.
     """
-
-    category: ClassVar[Category] = Category.ANNOUNCEMENT
 
     def __post_init__(self) -> None:
         check(self)

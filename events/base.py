@@ -41,9 +41,16 @@ class EventMeta(msgspec.StructMeta):
     """Makes every subclass of `Event` frozen and keyword-only without its having to say so."""
 
     def __new__(
-        cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **options: Any
+        cls,
+        name: str,
+        bases: tuple[type, ...],
+        namespace: dict[str, Any],
+        category: Category | None = None,
+        **options: Any,
     ) -> EventMeta:
         """Create the class; msgspec inherits neither option to subclasses in the way we need."""
+        if category is not None:
+            namespace["category"] = category
         options = {"frozen": True, "kw_only": True, "gc": False} | options
         return super().__new__(cls, name, bases, namespace, **options)
 
@@ -52,7 +59,8 @@ class EventMeta(msgspec.StructMeta):
 class Event(msgspec.Struct, metaclass=EventMeta, frozen=True, kw_only=True):
     """Typed data sent by a node to all its listeners.
 
-    Subclass it to add fields; every subclass is frozen and takes keyword arguments only.
+    Subclass it to add fields; every subclass is frozen and takes keyword arguments only. It has the
+    category of its base, or its own: ``class Fog(Event, category=Category.SENSOR)``.
 
     Attributes:
         stamp: Time of the described state, nanoseconds on the run's clock (the exposure of an
@@ -66,19 +74,17 @@ class Event(msgspec.Struct, metaclass=EventMeta, frozen=True, kw_only=True):
     source: str
 
 
-class Shutdown(Event):
+class Shutdown(Event, category=Category.LIFECYCLE):
     """Asks the run to end in order, as Ctrl-C would.
 
     Attributes:
         reason: Why, for the log and the summary.
     """
 
-    category: ClassVar[Category] = Category.LIFECYCLE
-
     reason: str = ""
 
 
-class ParameterChanged(Event):
+class ParameterChanged(Event, category=Category.LIFECYCLE):
     """A setting of a node has changed during the run.
 
     Its source is the node, its stamp the moment from which on the new value holds.
@@ -87,8 +93,6 @@ class ParameterChanged(Event):
         key: The setting, as it stands in the file: ``gain``, ``cameras.front.loss``.
         value: The new value, as TOML.
     """
-
-    category: ClassVar[Category] = Category.LIFECYCLE
 
     key: str
     value: str

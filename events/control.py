@@ -6,19 +6,15 @@ The newest set-point wins, whatever its kind. World frame NED, body frame FRD, S
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from events.base import Category, Event, Quaternion, Vector3, check, check_pose
 
 
-class Command(Event):
+class Command(Event, category=Category.CONTROL):
     """Base of the commands, each sent once.
 
     Attributes:
         vehicle: Name of the vehicle; empty for the only one.
     """
-
-    category: ClassVar[Category] = Category.CONTROL
 
     vehicle: str = ""
 
@@ -26,14 +22,12 @@ class Command(Event):
         check(self)
 
 
-class Setpoint(Event):
+class Setpoint(Event, category=Category.CONTROL):
     """Base of the set-points, sent repeatedly; only the newest counts.
 
     Attributes:
         vehicle: Name of the vehicle; empty for the only one.
     """
-
-    category: ClassVar[Category] = Category.CONTROL
 
     vehicle: str = ""
 
@@ -199,7 +193,7 @@ class MotorSetpoint(Setpoint):
         check(self, (self.motor1, self.motor2, self.motor3), (self.motor4, 0.0, 0.0))
 
 
-class PlannedPose(Event):
+class PlannedPose(Event, category=Category.CONTROL):
     """Where a pilot means the vehicle to be at `stamp`; for the record, not an order.
 
     Attributes:
@@ -208,8 +202,6 @@ class PlannedPose(Event):
         position: Metres in the parent frame.
         yaw: Heading in radians, clockwise from north seen from above.
     """
-
-    category: ClassVar[Category] = Category.CONTROL
 
     vehicle: str = ""
     frame_id: str = "map"
@@ -220,10 +212,8 @@ class PlannedPose(Event):
         check(self, self.position, (self.yaw, 0.0, 0.0))
 
 
-class VehicleEvent(Event):
+class VehicleEvent(Event, category=Category.VEHICLE):
     """Base of all events of a vehicle."""
-
-    category: ClassVar[Category] = Category.VEHICLE
 
     def __post_init__(self) -> None:
         check(self)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 import numpy.typing as npt
 
@@ -21,7 +19,7 @@ from events.base import (
 from events.sensors import publish
 
 
-class PoseEstimate(Event):
+class PoseEstimate(Event, category=Category.ESTIMATE):
     """Estimated pose of a body, at the time of the data used by the estimator.
 
     `stamp` is that of the image (or other measurement), not of the moment of sending: latency is
@@ -42,8 +40,6 @@ class PoseEstimate(Event):
             frame as in ROS's ``PoseWithCovariance``: 36 numbers, row by row; empty if unknown.
     """
 
-    category: ClassVar[Category] = Category.ESTIMATE
-
     frame_id: str = "odom"
     child_frame_id: str = "base_link"
     position: Vector3
@@ -59,7 +55,7 @@ class PoseEstimate(Event):
         check_covariance(self, "covariance", 6)
 
 
-class TrajectoryEstimate(Event, eq=False):
+class TrajectoryEstimate(Event, category=Category.ESTIMATE, eq=False):
     """Whole trajectory as now seen by an estimator, after loop closures and corrections.
 
     The last one of a run is judged beside the poses as they were sent (`PoseEstimate`). Frames and
@@ -72,8 +68,6 @@ class TrajectoryEstimate(Event, eq=False):
         positions: float64 metres in the parent frame, shape (n, 3).
         orientations: float64 unit quaternions (w, x, y, z), shape (n, 4).
     """
-
-    category: ClassVar[Category] = Category.ESTIMATE
 
     frame_id: str = "odom"
     child_frame_id: str = "base_link"
@@ -103,10 +97,8 @@ class TrajectoryEstimate(Event, eq=False):
             raise ValueError(f"{name}.stamps: expected them to rise strictly, found others")
 
 
-class TrackingEvent(Event):
+class TrackingEvent(Event, category=Category.ESTIMATE):
     """Base of the events of an estimator's tracking."""
-
-    category: ClassVar[Category] = Category.ESTIMATE
 
     def __post_init__(self) -> None:
         check(self)
@@ -126,7 +118,7 @@ class TrackingRegained(TrackingEvent):
     """An estimator knows its pose again, from this stamp on."""
 
 
-class TrackedFeatures(Event, eq=False):
+class TrackedFeatures(Event, category=Category.ESTIMATE, eq=False):
     """Features tracked by an estimator in an image; `stamp` is the image's.
 
     Attributes:
@@ -134,8 +126,6 @@ class TrackedFeatures(Event, eq=False):
         points: float32 pixels, shape (n, 2): column, row (pixel centres are whole numbers).
         inliers: bool, shape (n,): those that agree with the estimated pose.
     """
-
-    category: ClassVar[Category] = Category.ESTIMATE
 
     frame_id: str
     points: npt.NDArray[np.float32]
@@ -152,7 +142,7 @@ class TrackedFeatures(Event, eq=False):
             )
 
 
-class Score(Event):
+class Score(Event, category=Category.SCORE):
     """Value of a metric for a single estimate.
 
     Attributes:
@@ -161,8 +151,6 @@ class Score(Event):
         value: In `unit`.
         unit: ``m``, ``rad``, ``%``, ``s``, …
     """
-
-    category: ClassVar[Category] = Category.SCORE
 
     subject: str
     metric: str
@@ -173,7 +161,7 @@ class Score(Event):
         check(self)
 
 
-class PointCloud(Event, eq=False):
+class PointCloud(Event, category=Category.MAP, eq=False):
     """Points with colours, as ROS's ``sensor_msgs/PointCloud2`` would carry them.
 
     Attributes:
@@ -181,8 +169,6 @@ class PointCloud(Event, eq=False):
         points: float32 metres, shape (n, 3).
         colors: uint8 red, green, blue, shape (n, 3); shape (0, 3) if there are none.
     """
-
-    category: ClassVar[Category] = Category.MAP
 
     frame_id: str = "map"
     points: npt.NDArray[np.float32]

@@ -15,7 +15,7 @@ such as a ROS bridge.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ from events.frames import inverse as inverse_rotation
 from events.frames import multiply, rotate
 
 
-class PoseStamped(Event):
+class PoseStamped(Event, category=Category.GEOMETRY):
     """Where something is, as ROS's ``geometry_msgs/PoseStamped``.
 
     Attributes:
@@ -33,8 +33,6 @@ class PoseStamped(Event):
         position: Metres in the parent frame.
         orientation: Rotation from ``source``'s frame to the parent frame.
     """
-
-    category: ClassVar[Category] = Category.GEOMETRY
 
     frame_id: str = "map"
     position: Vector3
@@ -44,7 +42,7 @@ class PoseStamped(Event):
         check_pose(self, self.position, self.orientation)
 
 
-class TransformStamped(Event):
+class TransformStamped(Event, category=Category.GEOMETRY):
     """A child frame's pose in its parent, as ROS's ``geometry_msgs/TransformStamped``.
 
     Attributes:
@@ -54,8 +52,6 @@ class TransformStamped(Event):
         rotation: Rotation from the child to the parent frame.
         static: True if it holds for the whole run; then it is sent once.
     """
-
-    category: ClassVar[Category] = Category.GEOMETRY
 
     frame_id: str
     child_frame_id: str
@@ -67,7 +63,7 @@ class TransformStamped(Event):
         check_pose(self, self.translation, self.rotation)
 
 
-class Odometry(Event):
+class Odometry(Event, category=Category.GEOMETRY):
     """Pose and twist of a body, as ROS's ``nav_msgs/Odometry``: the twist is in the body frame.
 
     A simulator sends its ground truth this way.
@@ -81,8 +77,6 @@ class Odometry(Event):
         angular_velocity: Radians per second in the **body** frame.
     """
 
-    category: ClassVar[Category] = Category.GEOMETRY
-
     frame_id: str = "map"
     child_frame_id: str = "base_link"
     position: Vector3
@@ -95,14 +89,12 @@ class Odometry(Event):
         check(self, self.linear_velocity, self.angular_velocity)
 
 
-class Wind(Event):
+class Wind(Event, category=Category.GEOMETRY):
     """True velocity of the air at a vehicle's position, for the record.
 
     Attributes:
         velocity: Metres per second in ``map``: (1, 0, 0) blows towards the north.
     """
-
-    category: ClassVar[Category] = Category.GEOMETRY
 
     velocity: Vector3
 

@@ -6,7 +6,7 @@ and an image passes from node to node by reference.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,7 @@ def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> N
     array.setflags(write=False)
 
 
-class Image(Event, eq=False):
+class Image(Event, category=Category.SENSOR, eq=False):
     """A colour or grey image, as ROS's ``sensor_msgs/Image``.
 
     Attributes:
@@ -40,8 +40,6 @@ class Image(Event, eq=False):
         gain: Factor of the amplifier; 1 if unknown.
         data: uint8, shape (height, width, 3) for ``rgb8``, (height, width) for ``mono8``.
     """
-
-    category: ClassVar[Category] = Category.SENSOR
 
     frame_id: str
     encoding: str = "rgb8"
@@ -54,7 +52,7 @@ class Image(Event, eq=False):
         publish("Image", "data", self.data, np.uint8, {2, 3})
 
 
-class DepthImage(Event, eq=False):
+class DepthImage(Event, category=Category.SENSOR, eq=False):
     """Planar depth (along the optical z axis, not along the ray), REP 118's ``32FC1``.
 
     Attributes:
@@ -62,8 +60,6 @@ class DepthImage(Event, eq=False):
         data: float32 metres, shape (height, width); ``inf`` where nothing was hit, or the sensor
             found no depth.
     """
-
-    category: ClassVar[Category] = Category.SENSOR
 
     frame_id: str
     data: npt.NDArray[np.float32]
@@ -73,15 +69,13 @@ class DepthImage(Event, eq=False):
         publish("DepthImage", "data", self.data, np.float32, {2})
 
 
-class SegmentationImage(Event, eq=False):
+class SegmentationImage(Event, category=Category.SENSOR, eq=False):
     """Object number of each pixel.
 
     Attributes:
         frame_id: Optical frame.
         data: int32 object numbers, shape (height, width); -1 where nothing was hit.
     """
-
-    category: ClassVar[Category] = Category.SENSOR
 
     frame_id: str
     data: npt.NDArray[np.int32]
@@ -91,7 +85,7 @@ class SegmentationImage(Event, eq=False):
         publish("SegmentationImage", "data", self.data, np.int32, {2})
 
 
-class Imu(Event):
+class Imu(Event, category=Category.SENSOR):
     """Inertial measurement, as ROS's ``sensor_msgs/Imu`` without the orientation.
 
     Attributes:
@@ -101,8 +95,6 @@ class Imu(Event):
             (at rest, in FRD: about (0, 0, -9.81)).
     """
 
-    category: ClassVar[Category] = Category.SENSOR
-
     frame_id: str = "base_link"
     angular_velocity: Vector3
     linear_acceleration: Vector3
@@ -111,15 +103,13 @@ class Imu(Event):
         check(self, self.angular_velocity, self.linear_acceleration)
 
 
-class FluidPressure(Event):
+class FluidPressure(Event, category=Category.SENSOR):
     """Barometer, as ROS's ``sensor_msgs/FluidPressure``.
 
     Attributes:
         fluid_pressure: Pascal.
         variance: Pascal squared; 0 if unknown.
     """
-
-    category: ClassVar[Category] = Category.SENSOR
 
     fluid_pressure: float
     variance: float = 0.0
@@ -128,15 +118,13 @@ class FluidPressure(Event):
         check(self, (self.fluid_pressure, self.variance, 0.0))
 
 
-class MagneticField(Event):
+class MagneticField(Event, category=Category.SENSOR):
     """Magnetometer, as ROS's ``sensor_msgs/MagneticField``.
 
     Attributes:
         frame_id: Frame of the measurement.
         magnetic_field: Tesla in that frame.
     """
-
-    category: ClassVar[Category] = Category.SENSOR
 
     frame_id: str = "base_link"
     magnetic_field: Vector3
@@ -145,7 +133,7 @@ class MagneticField(Event):
         check(self, self.magnetic_field)
 
 
-class NavSatFix(Event):
+class NavSatFix(Event, category=Category.SENSOR):
     """Satellite position, as ROS's ``sensor_msgs/NavSatFix``.
 
     Attributes:
@@ -156,8 +144,6 @@ class NavSatFix(Event):
         velocity: Metres per second in ``map``, as receivers measure it by Doppler shift.
         status: As ROS's ``sensor_msgs/NavSatStatus``: 0 is a fix, -1 none yet.
     """
-
-    category: ClassVar[Category] = Category.SENSOR
 
     latitude: float
     longitude: float
@@ -171,7 +157,7 @@ class NavSatFix(Event):
         check_covariance(self, "position_covariance", 3)
 
 
-class Range(Event):
+class Range(Event, category=Category.SENSOR):
     """Distance sensor, as ROS's ``sensor_msgs/Range``.
 
     Attributes:
@@ -181,8 +167,6 @@ class Range(Event):
         min_range: Metres.
         max_range: Metres.
     """
-
-    category: ClassVar[Category] = Category.SENSOR
 
     frame_id: str = "base_link"
     range: float
@@ -194,7 +178,7 @@ class Range(Event):
         check(self)
 
 
-class LidarScan(Event, eq=False):
+class LidarScan(Event, category=Category.SENSOR, eq=False):
     """A single turn of a lidar, like the ``sensor_msgs/PointCloud2`` of a ROS lidar driver.
 
     `stamp` is the time of the first ray. Each point is in the sensor's frame at the time of its own
@@ -208,8 +192,6 @@ class LidarScan(Event, eq=False):
         times: float32 seconds after `stamp`, shape (n,), not falling.
         rings: uint16 number of the ray's channel, 0 the uppermost, shape (n,).
     """
-
-    category: ClassVar[Category] = Category.SENSOR
 
     frame_id: str
     points: npt.NDArray[np.float32]

@@ -3,50 +3,41 @@
 from __future__ import annotations
 
 import string
-from typing import ClassVar
 
 from events.base import Category, Event
 
 
-class KeyPressed(Event):
+class KeyPressed(Event, category=Category.INPUT):
     """A key went down. Held keys are not repeated.
 
     Attributes:
         key: Name in lower case: ``w``, ``7``, ``space``, ``left``, ``page_up``, ``left_shift``.
     """
 
-    category: ClassVar[Category] = Category.INPUT
-
     key: str
 
 
-class KeyReleased(Event):
+class KeyReleased(Event, category=Category.INPUT):
     """A key came up.
 
     Attributes:
         key: Name, as in `KeyPressed`.
     """
 
-    category: ClassVar[Category] = Category.INPUT
-
     key: str
 
 
-class WindowClosed(Event):
+class WindowClosed(Event, category=Category.WINDOW):
     """The user closed a window; the run ends in order."""
 
-    category: ClassVar[Category] = Category.WINDOW
 
-
-class WindowResized(Event):
+class WindowResized(Event, category=Category.WINDOW):
     """A window has a new size.
 
     Attributes:
         width: Pixels.
         height: Pixels.
     """
-
-    category: ClassVar[Category] = Category.WINDOW
 
     width: int
     height: int

@@ -193,18 +193,25 @@ class OutsideSummary(msgspec.Struct, frozen=True):
 
     def row(self) -> list[str]:
         """Return the cells of a table row, under `OUTSIDE_COLUMNS`."""
+        found = (getattr(self, field) for field in _OUTSIDE.values())
+        figures = ("–" if each is None else each for each in found)
         return [
-            *(f"{self.sent}", "–" if self.received is None else f"{self.received}"),
-            *(str(each) for each in (self.answered, self.empty, self.initialising, self.skipped)),
-            *(str(each) for each in (self.lost, self.open, self.says_lost, self.late)),
-            *(str(each) for each in (self.repeated, self.contradicting, self.unknown)),
-            *(
-                "–" if each is None else f"{each:.3g}"
-                for each in (self.initialisation_s, self.latency_ms, self.wall_p50_ms)
-            ),
+            *(f"{each:.3g}" if isinstance(each, float) else str(each) for each in figures),
             "yes" if self.reproducible else f"no: {'; '.join(self.why_not)}",
             {True: "yes", False: "no", None: "unknown until run --twice"}[self.repeats],
         ]
+
+
+_OUTSIDE = {
+    "sent": "sent", "received": "received", "answered": "answered", "empty": "empty",
+    "initialising": "initialising", "skipped": "skipped", "no answer": "lost", "open": "open",
+    "says lost": "says_lost", "late": "late", "repeated": "repeated",
+    "contradicting": "contradicting", "of no frame": "unknown",
+    "initialised s": "initialisation_s", "latency ms": "latency_ms", "real p50 ms": "wall_p50_ms",
+}  # fmt: skip
+"""Columns of figures, with the field of each."""
+
+OUTSIDE_COLUMNS = (*_OUTSIDE, "inputs repeat", "answers repeat")
 
 
 class TwiceSummary(msgspec.Struct, frozen=True):
@@ -218,13 +225,6 @@ class TwiceSummary(msgspec.Struct, frozen=True):
     repeats: bool
     first: str = ""
     outputs: list[str] = []
-
-
-OUTSIDE_COLUMNS = (
-    *("sent", "received", "answered", "empty", "initialising", "skipped"),
-    *("no answer", "open", "says lost", "late", "repeated", "contradicting", "of no frame"),
-    *("initialised s", "latency ms", "real p50 ms", "inputs repeat", "answers repeat"),
-)
 
 
 class Verdict(msgspec.Struct, frozen=True):

@@ -18,7 +18,6 @@ from runtime.channels.tasks import Fault
 from runtime.config.model import NodeSpec
 from runtime.node import Node, senders
 
-Sources = Mapping[str, Mapping[str, str]]  # source of each narrowed port, by node and port
 Links = Mapping[str, Mapping[str, Link]]  # link before each port, by node and port
 
 Wrap = Callable[[str, Deliver], Deliver]
@@ -32,13 +31,13 @@ def unwrapped(_: str, deliver: Deliver) -> Deliver:
 
 def listeners(
     node: Node[Any],
-    sources: Mapping[str, str],
     links: Mapping[str, Link],
     fault: Fault | None = None,
     wrap: Wrap = unwrapped,
 ) -> list[Listener]:
     """Return a node's inputs, fields of bundles and handlers, in order."""
     found = []
+    sources = node.sources
 
     def add(
         port: str, deliver: Deliver, events: Any, source: str | None, stream: Any = None
@@ -71,7 +70,6 @@ def listeners(
 
 def connect(
     nodes: Sequence[Node[Any]],
-    sources: Sources,
     links: Links | None = None,
     taps: Iterable[Tap] = (),
     fault: Fault | None = None,
@@ -93,9 +91,7 @@ def connect(
     connected = [
         listener
         for node in nodes
-        for listener in listeners(
-            node, sources.get(node.name, {}), (links or {}).get(node.name, {}), fault, wrap
-        )
+        for listener in listeners(node, (links or {}).get(node.name, {}), fault, wrap)
     ]
     connected += last
     for node in nodes:

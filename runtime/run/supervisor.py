@@ -224,7 +224,6 @@ class Supervisor:
         taps = (*self._taps, *self.instruments.taps)
         listeners = graph.connect(
             nodes,
-            sources={node.name: node.sources for node in nodes},
             links={runner.spec.name: runner.links for runner in runners},
             taps=taps,
             fault=self._listener_failed,

@@ -40,7 +40,9 @@ class Crowd(Node):
 
 def connected(*nodes: Node[Any], sources: Mapping[str, Mapping[str, str]] | None = None) -> None:
     log.clear()
-    connect(nodes, sources or {})
+    for node in nodes:
+        node.sources = dict((sources or {}).get(node.name, {}))
+    connect(nodes)
 
 
 def test_a_node_does_not_hear_itself() -> None:
@@ -92,7 +94,7 @@ def test_the_last_listeners_come_after_all_nodes() -> None:
     singer, speaker = make(Singer, "singer"), make(Speaker, "s")
     log.clear()
     last = Listener("run", lambda _: log.append("last"), (Event,))
-    connect([singer, speaker], {}, last=[last])
+    connect([singer, speaker], last=[last])
     singer.anything.send(said("x"))
     assert log == ["s x", "last"]
 
@@ -100,7 +102,7 @@ def test_the_last_listeners_come_after_all_nodes() -> None:
 def test_a_node_left_out_hears_nothing_more() -> None:
     singer, speaker = make(Singer, "singer"), make(Speaker, "s")
     connected(singer, speaker)
-    connect([singer], {})
+    connect([singer])
     singer.anything.send(said())
     assert log == []
 
