@@ -22,7 +22,18 @@ from events.announcements import (
     VehicleAnnouncement,
     WindAnnouncement,
 )
-from events.base import Category, Event, ParameterChanged, Quaternion, Shutdown, Vector3
+from events.base import (
+    Category,
+    Event,
+    KeyPressed,
+    KeyReleased,
+    ParameterChanged,
+    Quaternion,
+    Shutdown,
+    Vector3,
+    WindowClosed,
+    WindowResized,
+)
 from events.camera_info import CameraInfo
 from events.control import (
     Arm,
@@ -70,7 +81,6 @@ from events.sensors import (
     Range,
     SegmentationImage,
 )
-from events.window import KeyPressed, KeyReleased, WindowClosed, WindowResized
 
 __all__ = [
     "Announcement", "Arm", "Armed", "AttitudeSetpoint", "BarometerAnnouncement", "BodyAnnouncement",

@@ -23,7 +23,7 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from events.window import KEYS
+from events.base import KEYS
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from runtime.config.parameters import Changeable
 from runtime.errors import suggest

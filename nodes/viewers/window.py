@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Image, KeyPressed, KeyReleased, WindowClosed, WindowResized
-from events.window import KEYS, LABELS
+from events.base import KEYS, LABELS
 from runtime import Input, Node, NodeConfig, Output, Tick, Worker, every
 from runtime.errors import MissingDependencyError
 

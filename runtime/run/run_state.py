@@ -12,7 +12,7 @@ import functools
 import inspect
 import logging
 import time
-from collections.abc import Callable, Container, Coroutine, Iterable, Mapping
+from collections.abc import Callable, Container, Coroutine, Mapping
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,8 @@ from events import Announcement, ParameterChanged
 from runtime.channels.answers import Answers
 from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.links import Link
-from runtime.channels.sender import Listener, Sender, Tap
+from runtime.channels.sender import Sender
 from runtime.channels.streams import Stream
-from runtime.channels.tasks import Fault
 from runtime.config.model import Config
 from runtime.config.parameters import change
 from runtime.errors import ConfigError
@@ -62,6 +61,7 @@ class RunState(Host):
         links: All links of the nodes that there are, by ``node.port``.
         environment: What nodes found of the machine on which figures depend.
         afterwards: Functions to call once the summary is written.
+        changes: Output for changes of settings; its listeners include the changed node.
     """
 
     def __init__(
@@ -100,6 +100,8 @@ class RunState(Host):
         self.outside: dict[str, Answers] = {}
         self.before_first_update: Callable[[], None] = lambda: None
         self.afterwards: list[Callable[[Path], Any]] = []
+        self.changes = Sender("run.parameters", ParameterChanged)
+        self._early: list[ParameterChanged] = []  # of changes before the first update
         self._create = create
         self._stop = stop
         self._fault = fault
@@ -138,6 +140,47 @@ class RunState(Host):
             self.every(node, hz, getattr(node, method), method)
         if type(node).run is not Node.run:
             self.start(node, node.run()).add_done_callback(lambda _: self._has_run(node))
+
+    def set_parameter(self, text: str) -> dict[str, str]:
+        """Change a setting (``node.key=value``) between two steps; return new values by key.
+
+        Raises:
+            ConfigError: It cannot be: the message says why, and all is as it was.
+        """
+        runners = self.runners
+        name, config, values = change(
+            {n: (runner.node or runner.spec).config for n, runner in runners.items()}, text
+        )
+        if not values:
+            return {}
+        runner = runners[name]
+        if runner.node is None or not runner.started:
+            raise ConfigError(f"{text}: expected a node that runs, and {name} does not just now")
+        before = runner.node.config
+        runner.node.config = config
+        try:
+            runner.node.on_change(before)
+        except ValueError as error:
+            runner.node.config = before
+            raise ConfigError(f"{text}: {name} refuses: {error}") from None
+        except BaseException as error:
+            self._fault(name, error)
+        runner.spec = msgspec.structs.replace(runner.spec, config=config)  # for when it restarts
+        for key, value in values.items():
+            log.info("%s.%s is now %s", name, key, value)
+            now = self.clock.now()
+            changed = ParameterChanged(stamp=now, source=name, key=key, value=value)
+            if self.running:
+                self.changes.send(changed)
+            else:
+                self._early.append(changed)
+        return values
+
+    def tell_early_changes(self) -> None:
+        """Send the events of changes made while the nodes were starting."""
+        early, self._early = self._early, []
+        for changed in early:
+            self.changes.send(changed)
 
     # What nodes ask for.
 
@@ -283,61 +326,6 @@ class RunState(Host):
 
         self.start(node, serve())
         return hand_over
-
-
-class ParameterServer:
-    """Changes settings of a run's nodes, and sends an event for each."""
-
-    def __init__(self, state: RunState, fault: Callable[[str, BaseException], None]) -> None:
-        self._state = state
-        self._fault = fault
-        self._sender = Sender("run.parameters", ParameterChanged)
-        self._early: list[ParameterChanged] = []  # of changes before the first update
-
-    def connect(self, listeners: Iterable[Listener], taps: Iterable[Tap], fault: Fault) -> None:
-        """Connect all capable listeners to changes, also those of the changed node."""
-        self._sender.connect(listeners, taps, fault)
-
-    def set(self, text: str) -> dict[str, str]:
-        """Change a setting (``node.key=value``) between two steps; return new values by key.
-
-        Raises:
-            ConfigError: It cannot be: the message says why, and all is as it was.
-        """
-        runners = self._state.runners
-        name, config, values = change(
-            {n: (runner.node or runner.spec).config for n, runner in runners.items()}, text
-        )
-        if not values:
-            return {}
-        runner = runners[name]
-        if runner.node is None or not runner.started:
-            raise ConfigError(f"{text}: expected a node that runs, and {name} does not just now")
-        before = runner.node.config
-        runner.node.config = config
-        try:
-            runner.node.on_change(before)
-        except ValueError as error:
-            runner.node.config = before
-            raise ConfigError(f"{text}: {name} refuses: {error}") from None
-        except BaseException as error:
-            self._fault(name, error)
-        runner.spec = msgspec.structs.replace(runner.spec, config=config)  # for when it restarts
-        for key, value in values.items():
-            log.info("%s.%s is now %s", name, key, value)
-            now = self._state.clock.now()
-            changed = ParameterChanged(stamp=now, source=name, key=key, value=value)
-            if self._state.running:
-                self._sender.send(changed)
-            else:
-                self._early.append(changed)
-        return values
-
-    def begin(self) -> None:
-        """Send the events of changes made while the nodes were starting."""
-        early, self._early = self._early, []
-        for changed in early:
-            self._sender.send(changed)
 
 
 def siblings(config: Config, here: Container[str]) -> tuple[Sibling, ...]:

@@ -36,7 +36,7 @@ from runtime.run import graph
 from runtime.run.event_loop import RunTask
 from runtime.run.instruments import Instruments
 from runtime.run.node_runner import Announced, NodeRunner, Phase, log_error, start_up, wrap
-from runtime.run.run_state import ParameterServer, RunState
+from runtime.run.run_state import RunState
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND, Once
 
@@ -87,7 +87,6 @@ class Supervisor:
             self.fault,
         )
         self.state.out, self.state.out_of_programs = out, out_of_programs or out
-        self.parameters = ParameterServer(self.state, self.fault)
         self.stepping = self.state.stepping
         self._taps = tuple(taps)
         self._voices = Voices([spec.name for spec in config.nodes], scripted)
@@ -234,7 +233,7 @@ class Supervisor:
         )
         self.state.truth_readers |= graph.truth_readers(nodes, listeners, self.state.announcements)
         self.others.connect(listeners, self._listener_failed)
-        self.parameters.connect(listeners, taps, self._listener_failed)
+        self.state.changes.connect(listeners, taps, self._listener_failed)
 
     def _reconnect(self) -> None:
         if self.state.running:  # before, nodes must not be able to send
@@ -286,7 +285,7 @@ class Supervisor:
             if spec.name in state.runners:
                 state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
                 self.state.run_node(state.runners[spec.name])
-        self.parameters.begin()
+        state.tell_early_changes()
         self.others.nodes_run()
 
     async def _start_nodes(self) -> list[Announcement]:

@@ -62,7 +62,7 @@ class Tuner(Node):
             await self.clock.sleep(0.1)
             gains = ", ".join(f"{name} = {number}.5" for name in Gains.__struct_fields__)
             with contextlib.suppress(Exception):  # while the talker is away
-                host.parameters.set(f"talker.gains = {{ {gains} }}")
+                host.set_parameter(f"talker.gains = {{ {gains} }}")
 
 
 class Crowd(Node):

@@ -252,6 +252,6 @@ class Phased(Node[PhasedConfig]):
 
     def outlast_signal(self) -> None:
         host: Any = self._host
-        while not host.state.stop_requested:
+        while not host.stop_requested:
             time.sleep(0.01)
         time.sleep(0.3)  # real: a thread knows no other time

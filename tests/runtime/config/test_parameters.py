@@ -98,9 +98,9 @@ def test_what_can_change_is_listed_with_its_values() -> None:
 def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> None:
     async def body(supervisor: Supervisor) -> None:
         await until_sent(supervisor, "pilot", 1)
-        assert supervisor.parameters.set("pilot.gain=3") == {"gain": "3.0"}
+        assert supervisor.state.set_parameter("pilot.gain=3") == {"gain": "3.0"}
         with pytest.raises(ConfigError, match="pilot refuses: expected a gain that brings no"):
-            supervisor.parameters.set("pilot.gain=13")
+            supervisor.state.set_parameter("pilot.gain=13")
         if clock == "real":
             await until_sent(supervisor, "pilot", 1)
             supervisor.stop("seen enough")
@@ -127,7 +127,7 @@ def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> Non
 def test_a_node_that_restarts_keeps_what_was_changed() -> None:
     async def body(supervisor: Supervisor) -> None:
         await supervisor.state.clock.sleep(0.2)
-        supervisor.parameters.set("pilot.gain=3")
+        supervisor.state.set_parameter("pilot.gain=3")
         supervisor.restart("pilot", anyway=True)
 
     looked = look([spec(Pilot, "pilot")], body)
@@ -142,7 +142,7 @@ def test_a_node_that_has_not_started_cannot_change() -> None:
         async def on_startup(self) -> None:
             host: Any = self._host
             with pytest.raises(ConfigError, match="pilot does not just now"):
-                host.parameters.set("pilot.gain=3")
+                host.set_parameter("pilot.gain=3")
 
     look([spec(First, "first"), spec(Pilot, "pilot")], duration=0.1)
 
@@ -151,7 +151,7 @@ def test_a_change_before_the_first_update_is_told_as_the_run_begins() -> None:
     class Last(Node):
         async def on_startup(self) -> None:
             host: Any = self._host
-            host.parameters.set("pilot.gain=3")
+            host.change("pilot.gain=3")
 
     looked = look(
         [spec(Pilot, "pilot"), spec(Last, "last"), spec(Listener, "listener")], duration=0.3
@@ -168,6 +168,6 @@ def test_a_node_that_does_not_run_cannot_change() -> None:
         supervisor.restart("pilot", anyway=True)
         await supervisor.state.clock.sleep(0.2)
         with pytest.raises(ConfigError, match="expected a node that runs"):
-            supervisor.parameters.set("pilot.gain=3")
+            supervisor.state.set_parameter("pilot.gain=3")
 
     look([spec(Pilot, "pilot")], body)

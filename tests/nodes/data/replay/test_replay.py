@@ -180,7 +180,7 @@ class Setting(Pausing):
 
     def set(self, text: str) -> None:
         host: Any = self._host
-        host.parameters.set(f"{self.drone.name}.{text}")
+        host.set_parameter(f"{self.drone.name}.{text}")
 
 
 class Going(Setting):
@@ -212,7 +212,7 @@ class Overshooting(Seeking):
 
 def _replay_of(witness: Node[Any]) -> Replay:
     host: Any = witness._host
-    return next(node for node in host.state.all_nodes if isinstance(node, Replay))
+    return next(node for node in host.all_nodes if isinstance(node, Replay))
 
 
 def test_a_pause_makes_all_that_follows_later(path: Path) -> None:

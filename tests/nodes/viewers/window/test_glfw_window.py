@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from events.window import KEYS
+from events.base import KEYS
 from nodes.viewers.window import letterbox
 
 
