@@ -5,6 +5,7 @@ A change is ``--set drone.cameras.front.rate=10``.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import re
 import tomllib
@@ -77,9 +78,14 @@ def _fields_at(type_: Any, path: str) -> list[str]:
 def _type_at(type_: Any, path: str) -> Any:
     for name in re.findall(r"\.([\w-]+)", path):
         struct = struct_in(type_)
-        fields = () if struct is None else msgspec.structs.fields(struct)
-        type_ = next((f.type for f in fields if f.encode_name == name), None)
+        type_ = None if struct is None else types_of(struct).get(name)
     return type_
+
+
+@functools.cache  # reading annotations takes some tenths of a millisecond
+def types_of(struct: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return the types of a struct's fields by their keys in the file."""
+    return {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
 
 
 def struct_in(type_: Any) -> type[msgspec.Struct] | None:

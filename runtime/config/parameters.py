@@ -12,14 +12,13 @@ values that the file accepts, and nothing else. This module computes the new set
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar, get_origin
 
 import msgspec
 import tomli_w
 
-from runtime.config.messages import override, struct_in
+from runtime.config.messages import override, struct_in, types_of
 from runtime.config.model import without_none
 from runtime.config.reading import convert
 from runtime.errors import ConfigError
@@ -81,13 +80,12 @@ def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
 def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
     """Return the keys of the changeable settings; ``cameras.*.loss`` is every camera's."""
     found = []
-    for field in _fields(type_):
-        key = f"{before}{field.encode_name}"
-        inner = struct_in(field.type)
-        if is_marked(field.type):
+    for name, field in types_of(type_).items():
+        key, inner = f"{before}{name}", struct_in(field)
+        if is_marked(field):
             found.append(key)
         elif inner is not None:
-            found += changeable(inner, f"{key}." if inner is field.type else f"{key}.*.")
+            found += changeable(inner, f"{key}." if inner is field else f"{key}.*.")
     return found
 
 
@@ -143,18 +141,13 @@ def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
     for name in path:
         if struct is None:
             return False
-        field = next((f for f in _fields(struct) if f.encode_name == name), None)
+        field = types_of(struct).get(name)
         if field is None:  # the name of an entry of a list
             continue
-        if is_marked(field.type):
+        if is_marked(field):
             return True
-        struct = struct_in(field.type)
+        struct = struct_in(field)
     return False
-
-
-@functools.cache  # reading annotations takes some tenths of a millisecond
-def _fields(type_: type[msgspec.Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
-    return msgspec.structs.fields(type_)
 
 
 def is_marked(type_: Any) -> bool:
@@ -168,18 +161,17 @@ def settings(config: NodeConfig) -> dict[str, str]:
     found: dict[str, str] = {}
 
     def walk(type_: Any, value: Any, before: str) -> None:
-        for field in _fields(type_):
-            key, inner = f"{before}{field.encode_name}", value.get(field.encode_name)
-            struct = struct_in(field.type)
+        for name, field in types_of(type_).items():
+            key, inner, struct = f"{before}{name}", value.get(name), struct_in(field)
             if inner is None:
                 continue
-            if is_marked(field.type):
+            if is_marked(field):
                 found[key] = toml(inner)
             elif isinstance(inner, dict) and struct is not None:
                 walk(struct, inner, f"{key}.")
             elif names := _names(inner):
-                for name, entry in zip(names, inner, strict=True):
-                    walk(struct, entry, f"{key}.{name}.")
+                for entry_name, entry in zip(names, inner, strict=True):
+                    walk(struct, entry, f"{key}.{entry_name}.")
 
     if changeable(type(config)):
         walk(type(config), _table(config), "")

@@ -23,7 +23,7 @@ from typing import Any, get_origin
 
 import msgspec
 
-from runtime.config.messages import show, struct_in
+from runtime.config.messages import show, struct_in, types_of
 from runtime.errors import ConfigError, expect_known
 
 Presets = Mapping[str, Mapping[str, Any]]
@@ -59,7 +59,7 @@ def expanded(value: Any, type_: Any, where: str, at: str = "") -> Any:
         return value
     if isinstance(value.get("preset"), str) and extra:
         value = _put_in(value, extra, f"{where}: {f'{at}.preset'[1:]}")
-    types = _types(table)
+    types = types_of(table)
     return {k: expanded(v, types.get(k), where, f"{at}.{k}") for k, v in value.items()}
 
 
@@ -90,10 +90,5 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 @functools.cache
 def _extra(table: type[msgspec.Struct]) -> Mapping[str, Any]:
     """Return what the type of a settings class's field ``preset`` holds; nothing without one."""
-    marks = getattr(_types(table).get("preset"), "__metadata__", ())
+    marks = getattr(types_of(table).get("preset"), "__metadata__", ())
     return next((mark.extra for mark in marks if presets_in(mark.extra)), {})
-
-
-@functools.cache  # reading annotations takes some tenths of a millisecond
-def _types(table: type[msgspec.Struct]) -> dict[str, Any]:
-    return {field.encode_name: field.type for field in msgspec.structs.fields(table)}
