@@ -121,3 +121,18 @@ def test_importing_events_imports_nothing_heavy() -> None:
         "zenoh",
     }
     assert heavy & set(done.stdout.split()) == set()
+
+
+def test_an_event_has_the_category_of_its_class_line_or_of_its_base() -> None:
+    class Fog(Event, category=Category.SENSOR):
+        """Seen through."""
+
+    class Mist(Fog):
+        """Thinner."""
+
+    class Plain(Event):
+        """Of a user."""
+
+    found = [cls.category for cls in (Fog, Mist, Plain)]
+    assert found == [Category.SENSOR, Category.SENSOR, Category.USER]
+    assert Fog(stamp=1, source="a") == Fog(stamp=1, source="a")
