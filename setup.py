@@ -6,7 +6,14 @@ from pathlib import Path
 from setuptools import Extension, setup
 
 # The same bytes everywhere: no contraction, no reordering. It is called by ctypes, not imported.
-FLAGS = ["-std=c++17", "-O3", "-pthread", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
+FLAGS = [
+    "-std=c++17",
+    "-O3",
+    "-pthread",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+]
 FLAGS += ["-fvisibility=hidden", "-Wno-psabi"]
 FOLDER = Path("sims/cameras/rasteriser")
 MACHINES = {"x86_64": {"avx2": ["-mavx2"], "sse4": ["-msse4.1"]}}

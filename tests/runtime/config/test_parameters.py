@@ -151,7 +151,7 @@ def test_a_change_before_the_first_update_is_told_as_the_run_begins() -> None:
     class Last(Node):
         async def on_startup(self) -> None:
             host: Any = self._host
-            host.change("pilot.gain=3")
+            host.set_parameter("pilot.gain=3")
 
     looked = look(
         [spec(Pilot, "pilot"), spec(Last, "last"), spec(Listener, "listener")], duration=0.3
