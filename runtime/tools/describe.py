@@ -18,7 +18,7 @@ from msgspec import inspect as types
 
 from runtime.config.model import OnError
 from runtime.config.parameters import is_marked
-from runtime.config.presets import by_name_alone, presets_in
+from runtime.config.reading import by_name_alone, presets_in
 from runtime.node import Node
 from runtime.run.graph import input_types
 from runtime.units import Duration, Latency, plain

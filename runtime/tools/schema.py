@@ -18,7 +18,7 @@ from msgspec import inspect as types
 from runtime.channels.links import LinkConfig
 from runtime.config.model import NetworkConfig, OnError, RunConfig
 from runtime.config.parameters import is_marked
-from runtime.config.presets import by_name_alone, presets_in
+from runtime.config.reading import by_name_alone, presets_in
 from runtime.node import Node
 from runtime.tools.describe import TYPE_DOC, attribute_docs, summary
 from runtime.units import Duration, plain
