@@ -216,7 +216,7 @@ def test_a_heavy_scene_takes_real_time(
     heavy = rgb(take(renderer, "heavy"))
     assert 0.0 < slept[0] < 0.25
     np.testing.assert_array_equal(heavy, rgb(take(renderer, "plain")))
-    assert slept[1:] == [0.0]
+    assert len(slept) == 1
 
 
 def test_a_velocity_of_the_wrong_length_is_named(renderer: CameraRenderer) -> None:
