@@ -7,8 +7,11 @@ import shlex
 from pathlib import Path
 from subprocess import CompletedProcess
 
+import mujoco
+import numpy as np
 import pytest
 
+from sims.cameras.raster import libraries
 from tests.runtime.tools.samples_cli import command, command_here, summary
 
 ROOT = Path(__file__).parents[1]
@@ -36,6 +39,19 @@ A_RUN = "runs/tour"
 
 MISSED = 1
 """The exit code of a run that missed a threshold, as one must that has not left the ground."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+def test_the_demo_has_the_inputs_of_the_readme(tmp_path: Path) -> None:
+    """A change of what is drawn or measured changes it: then it is written anew."""
+    here = f"MuJoCo {mujoco.__version__} and NumPy {np.__version__}"
+    if "avx2" not in libraries() or here not in README:
+        pytest.skip("the README's digest is that of other instructions or versions")
+    options = ["--set", "report.figures=[]", "--quiet", "--out", str(tmp_path)]
+    assert command("run", "config.toml", *options, folder=ROOT, limit=200).returncode == 0
+    found = summary(tmp_path)["inputs_digest"]
+    assert re.findall(r"`([0-9a-f]{32})`", README) == [found]
 
 
 def test_there_are_commands_to_check() -> None:
