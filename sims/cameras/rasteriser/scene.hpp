@@ -105,8 +105,8 @@ struct Placed {  // a geom of the frame
     const Mesh* mesh;
     Vec3 shift;                    // of its mesh's origin from the eye, in the optical frame
     Matrix turn;                   // from the mesh's axes to the optical frame
-    int square, column, row, side;  // the smallest of the lens that it fits into, unless a pinhole
     std::vector<Vec3> seen;        // its vertices in the optical frame
+    int square, column, row, side;  // the smallest of the lens's squares about it, if it has any
 };
 
 // Images to fill; those not wanted are null.

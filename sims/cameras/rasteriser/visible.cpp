@@ -67,7 +67,8 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
         order.emplace_back(dot(placed.shift, placed.shift), index);
     }
     std::sort(order.begin(), order.end());  // front to back: of equal depths the first counts
-    const int pieces = view_.threads == 1 || rolling ? 1 : view_.threads * 4;  // none waits long
+    // So many that no thread waits long for another, and that triangles' numbers have room for.
+    const int pieces = view_.threads == 1 || rolling ? 1 : std::min(view_.threads * 4, 60);
     solid_.resize(pieces), clear_.resize(pieces);
     solid_moving_.resize(pieces), clear_moving_.resize(pieces);
     spread(pieces, [&](int part) {
