@@ -40,6 +40,7 @@ test: $(READY)  ## Run the quick tests.
 
 test-slow: $(READY)  ## Run the slow tests; what fails is repeated once, alone.
 	@sh tools/system_packages.sh display
+	@sh tools/system_packages.sh arm
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow || { \
 		echo "Repeated once, alone, is what failed above:"; \
 		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m slow; }

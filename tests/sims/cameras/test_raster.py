@@ -293,7 +293,9 @@ def hash_of(name: str, instructions: str, threads: int = 1) -> str:
 def test_the_bytes_are_those_of_every_machine(name: str) -> None:
     """With each instruction set that this one has, and by any number of threads."""
     saved = json.loads(HASHES.read_text(encoding="utf-8"))
-    found = {hash_of(name, each) for each in libraries()} | {hash_of(name, "", k) for k in (2, 5, 99)}
+    found = {hash_of(name, each) for each in libraries()} | {
+        hash_of(name, "", k) for k in (2, 5, 99)
+    }
     assert found == {saved[name]}
 
 

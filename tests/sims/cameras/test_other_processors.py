@@ -1,0 +1,111 @@
+"""Other processors draw the same bytes, in an emulator."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sims.cameras.raster import GEOM, LIGHT, POSE, VIEW, Raster, libraries
+from tests.sims.cameras.scenes import fresh
+from tests.sims.cameras.test_raster import SPECS, compiled, drawn, places
+
+HERE = Path(__file__).parent
+SOURCES = HERE.parents[2] / "sims" / "cameras" / "rasteriser"
+COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
+FLAGS = ["-std=c++17", "-O2", "-static", "-pthread", "-ffp-contract=off", "-fno-math-errno"]
+
+
+class Recorder:
+    """A rasteriser's library that also writes down all calls, for ``replay.cpp``."""
+
+    def __init__(self, library: Any) -> None:
+        self._library = library
+        self.calls = bytearray()
+
+    def _note(self, *values: Any) -> None:
+        """Add whole numbers, or addresses with how many bytes are there."""
+        for value in values:
+            if isinstance(value, tuple):
+                address, count = value
+                count = count if address.value else 0
+                self.calls += struct.pack("i", count)
+                self.calls += ctypes.string_at(address, count) if count else b""
+            else:
+                self.calls += struct.pack("i", value)
+
+    def raster_new(self) -> Any:
+        return self._library.raster_new()
+
+    def raster_free(self, world: Any) -> None:
+        self._library.raster_free(world)
+
+    def raster_texture(
+        self, world: Any, width: int, height: int, channels: int, data: Any, cube: int
+    ) -> int:
+        self._note(0, width, height, channels, cube, (data, width * height * channels))
+        return int(self._library.raster_texture(world, width, height, channels, data, cube))
+
+    def raster_mesh(
+        self,
+        world: Any,
+        vertices: int,
+        points: Any,
+        normals: Any,
+        at: Any,
+        count: int,
+        corners: Any,
+    ) -> int:
+        arrays = (points, 12 * vertices), (normals, 12 * vertices), (at, 8 * vertices)
+        self._note(1, vertices, count, *arrays, (corners, 12 * count))
+        return int(self._library.raster_mesh(world, vertices, points, normals, at, count, corners))
+
+    def raster_lens(self, world: Any, width: int, height: int, x: Any, y: Any, z: Any) -> int:
+        pixels = width * height if z.value else 0
+        arrays = (x, 4 * (pixels or width)), (y, 4 * (pixels or height)), (z, 4 * pixels)
+        self._note(2, width, height, *arrays)
+        return int(self._library.raster_lens(world, width, height, x, y, z))
+
+    def raster_draw(self, world: Any, lens: int, view: Any, eyes: Any, *rest: Any) -> None:
+        geoms, geom, poses, lights, light, *_ = rest
+        frame = np.frombuffer(ctypes.string_at(view, VIEW.itemsize), VIEW)[0]
+        count = int(frame["poses"])
+        self._note(3, lens, geoms, lights, int(frame["width"] * (frame["last"] - frame["first"])))
+        self._note((view, VIEW.itemsize), (eyes, count * POSE.itemsize))
+        self._note((geom, geoms * GEOM.itemsize), (poses, count * geoms * POSE.itemsize))
+        self._note((light, lights * LIGHT.itemsize))
+        self._library.raster_draw(world, lens, view, eyes, *rest)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("world", ["hall", "forest"])
+def test_a_64_bit_arm_draws_the_same(
+    world: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pinhole and a fisheye, colour, depth and numbers, in a static program under qemu."""
+    if shutil.which(COMPILER) is None or shutil.which(EMULATOR) is None:
+        pytest.skip("needs apt-get install g++-aarch64-linux-gnu qemu-user")
+    program = tmp_path / "replay"
+    sources = [HERE / "replay.cpp", *SOURCES.glob("*.cpp")]
+    subprocess.run([COMPILER, *FLAGS, *map(str, sources), "-o", str(program)], check=True)
+    recorder = Recorder(next(iter(libraries().values())))
+    monkeypatch.setattr("sims.cameras.raster.libraries", lambda: {"recorder": recorder})
+    raster, expected = Raster(compiled(fresh(world))), b""
+    for place, turn in list(places(world))[:2]:
+        for spec in SPECS:
+            for image in drawn(raster, spec, place, turn):
+                assert image is not None
+                expected += image.tobytes()
+    raster.close()
+    done = subprocess.run(
+        [EMULATOR, str(program)], input=bytes(recorder.calls), capture_output=True, check=True
+    )
+    assert len(done.stdout) == len(expected)
+    assert done.stdout == expected
