@@ -18,14 +18,6 @@ import numpy.typing as npt
 
 from events import Collision, Odometry, PlannedPose, PositionSetpoint, Vector3
 from events.frames import from_yaw
-from nodes.judging.evaluation.coverage import (
-    Interval,
-    Stamps,
-    answered,
-    choose_frames,
-    cover,
-    seconds,
-)
 from nodes.judging.evaluation.metrics import (
     Alignment,
     Floats,
@@ -43,7 +35,15 @@ from nodes.judging.evaluation.metrics import (
     segment_errors,
     transform,
 )
-from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.record import (
+    EstimatorRecord,
+    Interval,
+    Stamps,
+    answered,
+    choose_frames,
+    cover,
+    seconds,
+)
 from nodes.trajectory import PoseRows, RecentPoses, Trajectory, associate
 from runtime.time.schedule import SECOND
 
@@ -61,7 +61,7 @@ def held_errors(
         frames: Stamps of the flight's images (ns), strictly rising, within the truth's time.
         poses: Stamps of poses, strictly rising, shape (n,), n ≥ 0.
         errors: Their distances to the truth after alignment, metres, shape (n,).
-        lost: Intervals without a pose; see `nodes.judging.evaluation.coverage.cover`.
+        lost: Intervals without a pose; see `nodes.judging.evaluation.record.cover`.
     """
     path = _path_at(truth, frames)
     if not len(poses) or not len(frames):

@@ -11,9 +11,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.judging.evaluation.coverage import Interval, cover, seconds
 from nodes.judging.evaluation.judging import Errors, judge
-from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.record import EstimatorRecord, Interval, cover, seconds
 from nodes.judging.evaluation.results import read_errors
 from nodes.judging.report.style import COLORS
 from nodes.judging.report.tables import Estimator, Facts, Run, Verdict

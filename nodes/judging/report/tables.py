@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.judging.evaluation.coverage import Interval
 from nodes.judging.evaluation.judging import Errors
+from nodes.judging.evaluation.record import Interval
 from nodes.judging.report.style import number
 from nodes.trajectory import Trajectory
 from runtime import summary

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from nodes.judging.evaluation.coverage import Interval
+from nodes.judging.evaluation.record import Interval
 from nodes.judging.report.folder import Floats, broken
 from nodes.judging.report.style import (
     DPI,

@@ -9,9 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from events import PoseEstimate
-from nodes.judging.evaluation.coverage import Interval, answered, choose_frames, cover, seconds
 from nodes.judging.evaluation.judging import judge
-from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.record import (
+    EstimatorRecord,
+    Interval,
+    answered,
+    choose_frames,
+    cover,
+    seconds,
+)
 from tests.nodes.judging.report.folders import walk
 
 MS = 1_000_000

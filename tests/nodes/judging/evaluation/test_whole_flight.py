@@ -11,9 +11,8 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 
-from nodes.judging.evaluation.coverage import cover
 from nodes.judging.evaluation.judging import held_errors, interpolated_errors, judge
-from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.record import EstimatorRecord, cover
 from nodes.trajectory import Trajectory
 from tests.nodes.judging.evaluation.flights import (
     MS,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.judging.evaluation.coverage import Interval
+from nodes.judging.evaluation.record import Interval
 from nodes.judging.evaluation.verdict import Thresholds
 from nodes.judging.report.clouds import Shown, View, paint
 from nodes.judging.report.curves import draw_latency
