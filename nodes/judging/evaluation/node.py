@@ -178,7 +178,7 @@ class Evaluation(Node[EvaluationConfig]):
     def check(self) -> Iterable[str]:
         """Say if there is no such vehicle as the file names, or nobody to judge."""
         config = self.config
-        asked = any(each.given for each in (config.thresholds, *config.own_thresholds().values()))
+        asked = any(each.given() for each in (config.thresholds, *config.own_thresholds().values()))
         if asked and not (self._records or self.senders_of(PoseEstimate, TrajectoryEstimate)):
             yield "thresholds: expected an estimator to judge, found none"
         senders = self.senders_of(PoseEstimate, TrajectoryEstimate)

@@ -8,32 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from runtime.figures import FIGURES
+from runtime.figures import FIGURES, Figure
 from runtime.host import RunEnd
 from runtime.summary import overall
 from runtime.time.schedule import SECOND
 
 
 class _Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    @property
-    def given(self) -> bool:
-        """Whether any threshold of an estimator differs from its default."""
-        return self._given(of_flight=False)
-
-    @property
-    def flight_given(self) -> bool:
-        """Whether any threshold of a flight differs from its default."""
-        return self._given(of_flight=True)
-
-    def _given(self, *, of_flight: bool) -> bool:
-        asked = (each for each in _ASKED if each.of_flight == of_flight)
-        return any(getattr(self, each.name) != each.default for each in asked)
+    def given(self, *, of_flight: bool = False) -> bool:
+        """Return whether any threshold of an estimator, or else of a flight, is not its default."""
+        return any(getattr(self, each.name) != each.default for each in _asked(of_flight))
 
     def missed(self, figures: Mapping[str, Any], *, of_flight: bool = False) -> list[str]:
         """Return a sentence for each missed threshold of an estimator, or else of the flight."""
-        asked = (each for each in _ASKED if each.of_flight == of_flight)
+        asked = _asked(of_flight)
         found = (each.missed(getattr(self, each.name), figures.get(each.name)) for each in asked)
         return [*filter(None, found)]
+
+
+def _asked(of_flight: bool) -> list[Figure]:
+    return [each for each in _ASKED if each.of_flight == of_flight]
 
 
 _ASKED = [each for each in FIGURES.values() if each.limit]
@@ -115,7 +109,7 @@ def conclude(
         if of_run.get("reads_truth") == "undeclared":
             failed.append(UNDECLARED)
         failed += faults
-        passed = not failed if failed or asked.given else None
+        passed = not failed if failed or asked.given() else None
         if stopped:
             passed, failed = None, []
             of_run["why"] = stopped
@@ -123,7 +117,9 @@ def conclude(
     flown = {}
     for vehicle, figures in flights.items():
         failed = [] if stopped else thresholds.missed(figures, of_flight=True)
-        passed = not failed if failed or (thresholds.flight_given and not stopped) else None
+        passed = (
+            not failed if failed or (thresholds.given(of_flight=True) and not stopped) else None
+        )
         flown[vehicle] = {"passed": passed, **figures, "failed": failed}
     verdict = {
         "passed": overall(estimators.values(), flown.values()),
@@ -133,7 +129,7 @@ def conclude(
     }
     if own:
         verdict["own_thresholds"] = msgspec.to_builtins(own)
-    if not found and thresholds.given:
+    if not found and thresholds.given():
         why = "expected an estimator to judge, found none that announced itself or sent a pose"
         verdict |= {"passed": None if stopped else False, "failed": [stopped or why, *faults]}
     return verdict
