@@ -16,8 +16,7 @@ import typer
 from events import CameraAnnouncement, Image, ImuAnnouncement, Odometry
 from events.frames import from_rpy
 from nodes.calibration import proofs
-from nodes.calibration.allan import Curve, needed, noise
-from nodes.calibration.proofs import Figure, Points
+from nodes.calibration.proofs import Curve, Figure, Points, needed, noise
 from nodes.calibration.room import CENTRE, Motion, _Collector, mjcf
 from nodes.data.dataset.recording import choose
 from nodes.judging.report import style

@@ -15,7 +15,7 @@ from events import CameraAnnouncement, CameraInfo
 from events.camera_info import DistortionModel
 from events.frames import OPTICAL_TO_FRD, from_rpy, multiply
 from nodes.calibration import proofs
-from nodes.calibration.allan import noise, trials, variances
+from nodes.calibration.proofs import noise, trials, variances
 from nodes.calibration.room import HIGH, LOW, Motion, _Collector, hits, mjcf, spheres
 from nodes.data.dataset.recording import Rig
 from tests.nodes.calibration.samples import ANGLE, IMU, camera, flown, true_motion, twist

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from events import Announcement, CameraAnnouncement, ImuAnnouncement
-from nodes.calibration.allan import Curve
 from nodes.calibration.command import Result, prove, subjects, write_page
-from nodes.calibration.proofs import Figure, Points
+from nodes.calibration.proofs import Curve, Figure, Points
 from runtime.config.reading import load, parse
 from runtime.errors import ConfigError
 from sims.computer_vision import FreeCamera
