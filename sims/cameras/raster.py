@@ -91,6 +91,7 @@ class Raster(Stage):
     ) -> None:
         super().__init__(model, dynamics)
         self._threads = threads
+        self._colours = b""  # those that the geoms have
         self._kept: list[tuple[npt.NDArray[Any], npt.NDArray[Any]]] = []  # poses of eye and geoms
         for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
             if count:
@@ -159,7 +160,7 @@ class Raster(Stage):
             np.empty(shape, np.int32) if numbers else None,
         )
         if not self._kept:
-            self.keep()
+            self._kept.append(self._seen(self._camera.fixedcamid))
         eyes, poses = (np.concatenate(each) for each in zip(*self._kept, strict=True))
         frame = np.zeros(1, VIEW)
         frame["height"], frame["width"], frame["threads"] = height, width, self._threads
@@ -207,17 +208,26 @@ class Raster(Stage):
 
     @override
     @override
-    def keep(self) -> None:
-        data, camera, eye = self._data, self._camera.fixedcamid, np.empty(1, POSE)
-        eye["position"] = data.cam_xpos[camera]
-        eye["turn"] = data.cam_xmat[camera] * _OPTICAL
-        poses = np.empty(len(self._drawn), POSE)
+    def keep(self, camera_id: int, qpos: Floats, seconds: float) -> None:
+        self._place(qpos, seconds)
+        mujoco.mj_camlight(self.model, self._data)
+        self._kept.append(self._seen(camera_id))
+
+    def _seen(self, camera_id: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        """Return the poses of the eye and of all geoms."""
+        data, eye, poses = self._data, np.empty(1, POSE), np.empty(len(self._drawn), POSE)
+        eye["position"] = data.cam_xpos[camera_id]
+        eye["turn"] = data.cam_xmat[camera_id] * _OPTICAL
         poses["position"], poses["turn"] = data.geom_xpos[self._drawn], data.geom_xmat[self._drawn]
-        self._kept.append((eye, poses))
+        return eye, poses
 
     def _coloured(self) -> npt.NDArray[Any]:
         """Return the geoms in their colours of now."""
         model, drawn, geoms = self.model, self._drawn, self._geoms
+        colours = model.geom_rgba.tobytes() + model.mat_rgba.tobytes()
+        if colours == self._colours:
+            return geoms
+        self._colours = colours
         rgba = model.geom_rgba[drawn]
         # A material's colour, unless the geom has one of its own.
         plain = (model.geom_matid[drawn] >= 0) & (rgba == _GREY).all(axis=1)

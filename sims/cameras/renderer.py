@@ -278,8 +278,9 @@ class CameraRenderer:
             for pieces, moment in zip(drawn, times, strict=True):
                 if self._rows_move and readout:
                     for late in np.linspace(-0.5, 0.5, math.ceil(readout / KEPT) + 1) * readout:
-                        self._look(shot, spec, number, float(late) + moment)
-                        stage.keep()
+                        since = float(late) + moment
+                        state = shot.state(self._model, since)
+                        stage.keep(number, state, shot.stamp * 1e-9 + since)
                 self._look(shot, spec, number, middle + moment)
                 alone = moment == 0.0
                 if not spec.readout and alone:

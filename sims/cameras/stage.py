@@ -85,8 +85,8 @@ class Stage(ABC):
     def close(self) -> None:
         """Give back what it holds. Further calls do nothing."""
 
-    def keep(self) -> None:
-        """Keep the state last looked at for the next drawing, if the stage draws row by row.
+    def keep(self, camera_id: int, qpos: Floats, seconds: float) -> None:
+        """Keep a camera's view of a state and time for the next drawing, if rows are drawn singly.
 
         Of kept states the first is that of the first row and the last that of the last row, with
         the others between at equal steps. The drawing's light is that of the state last looked at.
@@ -107,10 +107,7 @@ class Stage(ABC):
     def look(self, camera_id: int, qpos: Floats, seconds: float = 0.0, light: float = 1.0) -> None:
         """Set up the scene of a camera for a state and time; `light` is a factor on all lights."""
         model, data = self.model, self._data
-        data.qpos[:] = qpos
-        if self._dynamics is not None:
-            self._dynamics.apply(model, data, seconds)
-        mujoco.mj_kinematics(model, data)
+        self._place(qpos, seconds)
         mujoco.mj_comPos(model, data)  # lights that track something ask for it
         mujoco.mj_camlight(model, data)
         self._camera.fixedcamid = camera_id
@@ -119,6 +116,13 @@ class Stage(ABC):
             for source in self._scene.lights[: self._scene.nlight]:
                 for part in (source.ambient, source.diffuse, source.specular):
                     part *= light
+
+    def _place(self, qpos: Floats, seconds: float) -> None:
+        """Set all bodies to a state and time."""
+        self._data.qpos[:] = qpos
+        if self._dynamics is not None:
+            self._dynamics.apply(self.model, self._data, seconds)
+        mujoco.mj_kinematics(self.model, self._data)
 
     @abstractmethod
     def _update(self) -> None:
