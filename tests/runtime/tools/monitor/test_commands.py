@@ -119,10 +119,12 @@ def test_the_screen_and_the_run_share_a_terminal(tmp_path: Path, sockets: Path) 
     silent[3] &= ~termios.ECHO  # else keys that come too late stand amid the table
     termios.tcsetattr(inside, termios.TCSANOW, silent)
     shown = b""
+    # Workers of tests have a size in their environment, which would count before the terminal's.
+    environment = {k: v for k, v in os.environ.items() if k not in {"COLUMNS", "LINES"}}
     with subprocess.Popen(
         [sys.executable, "-m", "runtime", "run", str(path), "--top"],
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=environment | {"PYTHONPATH": str(ROOT)},
         stdin=inside,
         stdout=inside,
         stderr=inside,
