@@ -1,13 +1,15 @@
-"""Common parts of data sets in folders: world with z up, image files, rows to merge."""
+"""Common parts of data sets in folders: image files, calibrations, truth, rows to merge."""
 
 from __future__ import annotations
 
 import bisect
 import heapq
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import cv2
 import msgspec
@@ -28,16 +30,10 @@ from events import (
 )
 from events.frames import OPTICAL_TO_FRD
 from events.geometry import pose_matrix
-from nodes.data.replay.reader import Reader, ReplayError, Timed, Wants
+from nodes.data.replay.reader import Reader, ReplayConfig, ReplayError, Timed, Wants
 
-R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
-
-
-def while_seen(truth: list[R], first: int, last: int) -> list[R]:
-    """Return the truth's ordered rows (stamp (ns) first) in the sensors' time, and one beside."""
-    begin = bisect.bisect_right(truth, first, key=lambda row: row[0]) - 1
-    end = bisect.bisect_left(truth, last, key=lambda row: row[0]) + 1
-    return truth[max(begin, 0) : end]
+Files = list[tuple[int, Path]]  # images of a camera, by stamp (ns)
+T = TypeVar("T")
 
 
 def vehicle_at(pose: Odometry) -> VehicleAnnouncement:
@@ -102,13 +98,43 @@ class Rows(NamedTuple):
 
 
 class FolderReader(Reader):
-    """Reader of a data set in a folder, with its stamps as times; sensors are below `vehicle`."""
+    """Reader of a data set in a folder, with its stamps as times; sensors are below `vehicle`.
 
-    def __init__(self, folder: Path, vehicle: str) -> None:
+    Args:
+        folder: As of `find`.
+        vehicle: Source of the truth.
+
+    Raises:
+        ReplayError: A file is not as published.
+    """
+
+    layout: ClassVar[str]  # name and marks of the layout, for an error
+
+    def __init__(self, folder: Path, config: ReplayConfig, vehicle: str) -> None:
         super().__init__()
-        self._folder, self._vehicle = folder, vehicle
+        self._folder, self._config, self._vehicle = folder, config, vehicle
         self._origin = 0  # stamp in the data set (ns) of the run's time 0
+        self._images: dict[str, Files] = {}  # by source, as are the depth images
+        self._depths: dict[str, tuple[Files, float]] = {}  # with their steps per metre
+        self._truth: list[Any] = []  # tuples: the stamp (ns), then the arguments of `_odometry`
         self._announcements: list[Announcement] = []
+        try:
+            self._read()
+        except ValueError as error:
+            raise ReplayError(str(error)) from None
+
+    @classmethod
+    @abstractmethod
+    def find(cls, path: Path) -> Path | None:
+        """Return the folder to read, `path` or one in it; `None` if the layout is another."""
+
+    @abstractmethod
+    def _read(self) -> None:
+        """Read indices, truth and calibrations, then call `_begin`; may raise `ValueError`."""
+
+    @abstractmethod
+    def _odometry(self, *row: Any) -> Odometry:
+        """Return the true odometry of a row of the truth."""
 
     def announcements(self) -> Sequence[Announcement]:
         """Return the announcements of the vehicle, at its first pose, and its sensors."""
@@ -127,9 +153,37 @@ class FolderReader(Reader):
         merged = heapq.merge(*wanted, key=lambda event: event.stamp)
         return (Timed(event.stamp, event) for event in merged)
 
-    @abstractmethod
     def _rows(self) -> Iterator[Rows]:
         """Yield the rows of the truth and of each sensor."""
+        yield Rows(Odometry, self._vehicle, self._truth, self._odometry)
+        for source, (files, factor) in self._depths.items():
+            yield Rows(DepthImage, source, files, partial(self._depth_image, source, factor))
+        for source, files in self._images.items():
+            yield Rows(Image, source, files, partial(self._image, source))
+
+    def _begin(self, others: Sequence[int] = (), noted: Path | None = None) -> None:
+        """Choose time 0, cut the truth to the sensors' time, and announce the vehicle.
+
+        Args:
+            others: Stamps of sensors besides cameras, ns.
+            noted: File in which our own data sets note the epoch.
+        """
+        firsts = [files[0][0] for files in self._images.values() if files]
+        lasts = [files[-1][0] for files in self._images.values() if files]
+        if not firsts and not others:
+            raise ReplayError(f"{self._folder}: expected the data of cameras or an IMU, found none")
+        first, last = min([*firsts, *others]), max([*lasts, *others])
+        # One pose beside the sensors' time is kept at either end.
+        begin = bisect.bisect_right(self._truth, first, key=lambda row: row[0]) - 1
+        end = bisect.bisect_left(self._truth, last, key=lambda row: row[0]) + 1
+        self._truth = self._truth[max(begin, 0) : end]
+        self._origin = min([first, *(row[0] for row in self._truth[:1])])
+        if noted is not None:
+            self._origin = min([self._origin, *noted_epoch(noted)])
+        if self._truth:
+            seen = min(firsts, default=self._truth[0][0])
+            row = next((row for row in self._truth if row[0] >= seen), self._truth[0])
+            self._announcements.insert(0, vehicle_at(self._odometry(*row)))
 
     def _pose(
         self,
@@ -149,29 +203,47 @@ class FolderReader(Reader):
         )
 
     def _image(self, source: str, stamp: int, path: Path) -> Image:
-        return read_image(path, stamp - self._origin, source, f"{source}_optical")
+        pixels = read_image(path)
+        return Image(
+            stamp=stamp - self._origin,
+            source=source,
+            frame_id=f"{source}_optical",
+            encoding="rgb8" if pixels.ndim == 3 else "mono8",
+            data=pixels,
+        )
 
     def _depth_image(self, source: str, factor: float, stamp: int, path: Path) -> DepthImage:
-        return read_depth(path, stamp - self._origin, source, f"{source}_optical", factor)
+        metres, frame_id = read_depth(path, factor), f"{source}_optical"
+        return DepthImage(stamp=stamp - self._origin, source=source, frame_id=frame_id, data=metres)
 
 
-def read_image(path: Path, stamp: int, source: str, frame_id: str) -> Image:
-    """Read a colour or grey image; a `ReplayError` if it is none."""
+def noted_epoch(path: Path) -> list[int]:
+    """Return the noted epoch (ns) of our own data sets, or nothing; may raise `ReplayError`."""
+    text = read_sensor(path).texts.get("epoch_ns") if path.is_file() else None
+    if text is not None and not (text.isdecimal() and len(text) <= 19):
+        raise ReplayError(f"{path}: epoch_ns: expected whole nanoseconds, found {text!r:.80}")
+    return [] if text is None else [int(text)]
+
+
+def first_image(path: Path) -> tuple[str, int, int]:
+    """Return the kind of a camera's images, ``rgb`` or ``grey``, their width and their height."""
+    pixels = read_image(path)
+    return "rgb" if pixels.ndim == 3 else "grey", pixels.shape[1], pixels.shape[0]
+
+
+def read_image(path: Path) -> npt.NDArray[np.uint8]:
+    """Read a colour (RGB) or grey image; a `ReplayError` if it is none."""
     pixels = _pixels(path)
     if pixels.dtype == np.uint16:
         raise ReplayError(f"{path}: expected an image of 8 bits, found one of 16")
     if pixels.ndim == 3:
         code = cv2.COLOR_BGRA2RGB if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
         pixels = cv2.cvtColor(pixels, code)
-    encoding = "rgb8" if pixels.ndim == 3 else "mono8"
-    return Image(stamp=stamp, source=source, frame_id=frame_id, encoding=encoding, data=pixels)
+    return pixels
 
 
-def read_depth(path: Path, stamp: int, source: str, frame_id: str, factor: float) -> DepthImage:
-    """Read a depth image of 16 bits.
-
-    Args:
-        factor: Steps per metre; a step of 0 is none, and becomes ``inf``.
+def read_depth(path: Path, factor: float) -> npt.NDArray[np.float32]:
+    """Read a depth image of 16 bits in metres, at `factor` steps per metre; step 0 becomes ``inf``.
 
     Raises:
         ReplayError: It is none.
@@ -183,7 +255,7 @@ def read_depth(path: Path, stamp: int, source: str, frame_id: str, factor: float
         )
     metres = steps.astype(np.float32) / np.float32(factor)
     metres[steps == 0] = np.inf
-    return DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=metres)
+    return metres
 
 
 def _pixels(path: Path) -> npt.NDArray[Any]:
@@ -195,3 +267,54 @@ def _pixels(path: Path) -> npt.NDArray[Any]:
     if pixels is None:
         raise ReplayError(f"{path}: expected an image, found something else")
     return pixels
+
+
+class Sensor(msgspec.Struct, frozen=True):
+    """A sensor.yaml: its lines by key, and all lists of numbers as such."""
+
+    path: Path
+    texts: dict[str, str]
+    lists: dict[str, list[float]]
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """Return a number; a `ReplayError` if there is none."""
+        try:
+            return float(self.texts[key])
+        except (KeyError, ValueError):
+            if default is not None:
+                return default
+            found = self.texts.get(key, "nothing")
+            raise ReplayError(f"{self.path}: {key}: expected a number, found {found}") from None
+
+    def list(self, key: str, *lengths: int) -> list[float]:
+        """Return a list of numbers; a `ReplayError` if there is none of such a length."""
+        found = self.lists.get(key, [])
+        if len(found) not in lengths:
+            counts = " or ".join(map(str, lengths))
+            raise ReplayError(f"{self.path}: {key}: expected {counts} numbers, found {found}")
+        return found
+
+    def converted(self, values: dict[str, Any], kind: type[T]) -> T:
+        """Return values as a struct; a `ReplayError` if they do not fit."""
+        try:
+            return msgspec.convert(values, kind)
+        except msgspec.ValidationError as error:
+            raise ReplayError(f"{self.path}: {error}") from None
+
+
+def read_sensor(path: Path) -> Sensor:
+    """Read a sensor.yaml of ``key: value`` lines with bracketed lists; may raise `ReplayError`."""
+    try:
+        text = re.sub(r"#.*", "", path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ReplayError(f"{path}: expected a sensor's description, found: {error}") from None
+    lists = {}
+    for key, content in re.findall(r"(\w+):\s*\[([^\]]*)\]", text):
+        try:
+            lists[key] = [float(value) for value in content.split(",") if value.strip()]
+        except ValueError:
+            raise ReplayError(f"{path}: {key}: expected numbers, found {content!r:.80}") from None
+    texts = {
+        key: value.strip() for key, value in re.findall(r"^\s*(\w+):[ \t]*([^\[\n]+)$", text, re.M)
+    }
+    return Sensor(path, texts, lists)

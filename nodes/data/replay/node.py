@@ -116,34 +116,17 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
     vehicle = config.vehicle or name
     if (path / "recording.mcap").is_file() and not config.topics:  # a run's folder
         path /= "recording.mcap"
-    if path.is_dir():
-        if (path / "metadata.yaml").is_file():
-            from nodes.data.replay.rosbag import RosBag
+    # Readers are imported when needed: scipy and rosbags take tenths of a second.
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        from nodes.data.replay.datasets import open_folder
 
-            return RosBag(path, config.topics, vehicle)
-        for folder in (path, path / "mav0"):
-            if (folder / "cam0").is_dir() or (folder / "imu0").is_dir():
-                from nodes.data.replay.euroc import Euroc
-
-                return Euroc(folder, vehicle)
-        if (path / "rgb.txt").is_file():
-            from nodes.data.replay.tum_rgbd import TumRgbd
-
-            return TumRgbd(path, vehicle, config.camera, config.depth_factor)
-        if (path / "times.txt").is_file() and (path / "calib.txt").is_file():
-            from nodes.data.replay.kitti import Kitti
-
-            return Kitti(path, vehicle)
-        raise ReplayError(
-            f"{path}: expected a ROS 2 bag (metadata.yaml), or a data set of EuRoC's (mav0), TUM's "
-            "(rgb.txt) or KITTI's (times.txt and calib.txt), found a folder with none of these"
-        )
-    if not path.is_file():
+        return open_folder(path, config, vehicle)
+    if not path.is_dir() and not path.is_file():
         raise ReplayError(
             f"{path}: expected a recording or the folder of a data set, found nothing there; "
             "docs/how-to/datasets.md says where to download those of EuRoC, TUM and KITTI"
         )
-    if path.suffix not in {".db3", ".bag"} and is_ours(path):
+    if path.is_file() and path.suffix not in {".db3", ".bag"} and is_ours(path):
         return Recorded(path)
     from nodes.data.replay.rosbag import RosBag
 

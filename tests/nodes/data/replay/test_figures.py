@@ -28,7 +28,7 @@ from events.geometry import pose_matrix
 from nodes.data.dataset.euroc import Euroc
 from nodes.data.dataset.recording import choose, in_grey
 from nodes.data.dataset.tum import TumRgbd
-from nodes.data.replay.euroc import read_sensor
+from nodes.data.replay.folders import read_sensor
 from nodes.data.replay.node import open_reader
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError
 from nodes.trajectory.table import epoch_of

@@ -1,0 +1,351 @@
+"""Data sets in folders, as published: EuRoC MAV, TUM RGB-D, KITTI odometry.
+
+The first two also as `nodes.data.dataset` writes them. Their worlds, z up, are turned to NED by
+half a turn about x. Times count from the first stamp, or from the epoch that ``body.yaml`` or
+``camera.yaml`` notes (``epoch_ns``).
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from events import (
+    CameraAnnouncement,
+    CameraInfo,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PoseStamped,
+    Quaternion,
+    Vector3,
+)
+from events.base import UNIT_TOLERANCE
+from events.frames import (
+    OPTICAL_TO_FRD,
+    flip_yz,
+    inverse,
+    multiply,
+    rotate_inverse,
+    rotation_to_ned,
+)
+from events.geometry import pose_matrix, pose_tuples
+from nodes.data.replay.folders import (
+    Files,
+    FolderReader,
+    Rows,
+    as_pair,
+    camera_at,
+    first_image,
+    read_sensor,
+)
+from nodes.data.replay.reader import Pinhole, ReplayConfig, ReplayError
+from nodes.trajectory.formats import euroc_rows, read_kitti, read_tum
+from nodes.trajectory.table import Row, read_rows
+
+_MODELS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
+"""Kalibr's names of distortion models, and ours."""
+
+
+class Euroc(FolderReader):
+    """Reader of a data set's cameras, first IMU and ground truth; the folder has cam0 in it (mav0).
+
+    M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The body keeps the data
+    set's axes: in EuRoC's own those of the IMU, not FRD. The second of two cameras side by side is
+    announced as the right one of a stereo rig.
+    """
+
+    layout = "EuRoC's (mav0)"
+
+    @classmethod
+    def find(cls, path: Path) -> Path | None:
+        """Return the folder of cameras and IMU."""
+        folders = (path, path / "mav0")
+        found = (f for f in folders if (f / "cam0").is_dir() or (f / "imu0").is_dir())
+        return next(found, None)
+
+    def _read(self) -> None:
+        folder = self._folder
+        cameras = [self._camera(camera) for camera in sorted(folder.glob("cam[0-9]*"))]
+        if len(cameras) == 2:
+            cameras[1] = as_pair(*cameras)
+        self._announcements += cameras
+        self._imu_source, self._imu_frame = f"{self._vehicle}/imu0", "base_link"
+        self._imu = self._measurements(folder / "imu0" / "data.csv")
+        if self._imu:
+            self._announcements.append(self._imu_announcement())
+        truth = folder / "state_groundtruth_estimate0" / "data.csv"
+        rows = euroc_rows(truth, tolerance=UNIT_TOLERANCE) if truth.is_file() else ()
+        self._truth = sorted((stamp, values) for _, stamp, values in rows)
+        self._begin([row[0] for row in self._imu], folder / "body.yaml")
+
+    def _rows(self) -> Iterator[Rows]:
+        yield Rows(Imu, self._imu_source, self._imu, self._measurement)
+        yield from super()._rows()
+
+    def _measurement(self, stamp: int, values: list[float]) -> Imu:
+        return Imu(
+            stamp=stamp - self._origin,
+            source=self._imu_source,
+            frame_id=self._imu_frame,
+            angular_velocity=(values[0], values[1], values[2]),
+            linear_acceleration=(values[3], values[4], values[5]),
+        )
+
+    def _odometry(self, stamp: int, values: list[float]) -> Odometry:
+        """Return the true odometry; the data set has no angular velocity, so 0."""
+        x, y, z, qw, qx, qy, qz, u, v, w = values[:10]
+        turn = qw, qx, qy, qz
+        velocity = rotate_inverse(turn, (u, v, w))
+        return self._pose(stamp, flip_yz((x, y, z)), rotation_to_ned(turn), velocity)
+
+    def _camera(self, folder: Path) -> CameraAnnouncement:
+        sensor = read_sensor(folder / "sensor.yaml")
+        source = f"{self._vehicle}/{folder.name}"
+        width, height = sensor.list("resolution", 2)
+        fx, fy, cx, cy = sensor.list("intrinsics", 4)
+        lens = sensor.list("distortion_coefficients", 4, 5)
+        named = sensor.texts.get("distortion_model", "")
+        model = _MODELS.get(named, "" if any(lens) else "plumb_bob")
+        if not model:
+            raise ReplayError(
+                f"{sensor.path}: distortion_model: expected one of {', '.join(_MODELS)}, "
+                f"found {named!r}"
+            )
+        if model == "plumb_bob":
+            lens = [*lens, 0.0][:5]  # of four, k3 is none
+        position, orientation = pose_tuples(np.reshape(sensor.list("data", 16), (4, 4)))
+        self._images[source] = files = self._index(folder)
+        images = [first_image(files[0][1])[0] if files else "grey"]
+        depth = self._folder / folder.name.replace("cam", "depth")
+        if depth.is_dir():
+            factor = read_sensor(depth / "sensor.yaml").number("depth_factor")
+            self._depths[source] = self._index(depth), factor
+            images.append("depth")
+        info = sensor.converted(
+            {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+            | {"distortion_model": model, "distortion": lens},
+            CameraInfo,
+        )
+        rate = sensor.number("rate_hz")
+        return camera_at(source, tuple(images), info, rate, position, orientation)
+
+    def _imu_announcement(self) -> ImuAnnouncement:
+        sensor = read_sensor(self._folder / "imu0" / "sensor.yaml")
+        given = sensor.list("data", 16) if "data" in sensor.lists else np.eye(4)
+        position, orientation = pose_tuples(np.reshape(given, (4, 4)))
+        if (position, orientation) != ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)):
+            self._imu_frame = self._imu_source
+        return ImuAnnouncement(
+            stamp=0,
+            source=self._imu_source,
+            rate=sensor.number("rate_hz"),
+            frame_id=self._imu_frame,
+            position=position,
+            orientation=orientation,
+            gyroscope_noise_density=sensor.number("gyroscope_noise_density", 0.0),
+            gyroscope_random_walk=sensor.number("gyroscope_random_walk", 0.0),
+            accelerometer_noise_density=sensor.number("accelerometer_noise_density", 0.0),
+            accelerometer_random_walk=sensor.number("accelerometer_random_walk", 0.0),
+        )
+
+    def _index(self, folder: Path) -> Files:
+        rows = read_rows(folder / "data.csv", ",", (2,), "timestamp, filename")
+        return sorted((row.nanoseconds(), folder / "data" / row.fields[1]) for row in rows)
+
+    def _measurements(self, path: Path) -> list[tuple[int, list[float]]]:
+        if not path.is_file():
+            return []
+        rows = read_rows(path, ",", (7,), "timestamp, w x 3, a x 3")
+        return sorted((row.nanoseconds(), row.numbers(1, 7)) for row in rows)
+
+
+FARTHEST = 20_000_000  # nanoseconds between a depth image and its colour image
+
+
+class TumRgbd(FolderReader):
+    """Reader of colour, depth and true poses; the camera looks ahead from the body's origin.
+
+    J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and
+    cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. A depth image gets the stamp of the
+    nearest colour image, within 20 ms as in their associate.py.
+    """
+
+    layout = "TUM's (rgb.txt)"
+
+    @classmethod
+    def find(cls, path: Path) -> Path | None:
+        """Return the folder of rgb.txt."""
+        return path if (path / "rgb.txt").is_file() else None
+
+    def _read(self) -> None:
+        folder, camera = self._folder, self._config.camera
+        self._source = f"{self._vehicle}/camera"
+        self._images[self._source] = rgb = self._index("rgb.txt")
+        depth = self._index("depth.txt") if (folder / "depth.txt").is_file() else []
+        self._truth = self._poses()
+        depth = self._paired(depth, [stamp for stamp, _ in rgb])
+        factor = self._config.depth_factor
+        span = rgb[-1][0] - rgb[0][0]
+        rate = (len(rgb) - 1) * 1e9 / span if span else 30.0
+        calibration = folder / "camera.yaml"
+        if calibration.is_file():
+            sensor = read_sensor(calibration)
+            factor = sensor.number("depth_factor", factor)
+            rate = sensor.number("rate_hz", rate)
+            if camera is None:
+                model = sensor.texts.get("distortion_model", "plumb_bob")
+                lens = {"distortion_model": model, "distortion": sensor.lists.get("distortion")}
+                middle = {name: sensor.number(name) for name in ("fx", "fy", "cx", "cy")}
+                camera = sensor.converted({**middle, **lens}, Pinhole)
+        if camera is None:
+            raise ReplayError(
+                f"{folder}: expected a camera.yaml or the setting camera, found neither: write "
+                "camera = { fx = …, fy = …, cx = …, cy = … } (pixels); the benchmark's page has "
+                "those of its sequences (freiburg1: 517.3, 516.5, 318.6, 255.3)"
+            )
+        self._depths[self._source] = depth, factor
+        kind, *size = first_image(rgb[0][1])
+        kinds = (kind, "depth") if depth else (kind,)
+        self._announcements.append(camera_at(self._source, kinds, camera.info(*size), rate))
+        self._begin(noted=calibration)
+
+    def _rows(self) -> Iterator[Rows]:
+        truth, *images = super()._rows()
+        yield truth
+        yield Rows(PoseStamped, self._source, self._truth, self._camera_pose)
+        yield from images
+
+    def _odometry(self, stamp: int, position: Vector3, optical: Quaternion) -> Odometry:
+        return self._pose(stamp, position, multiply(optical, inverse(OPTICAL_TO_FRD)))
+
+    def _camera_pose(self, stamp: int, position: Vector3, optical: Quaternion) -> PoseStamped:
+        return PoseStamped(
+            stamp=stamp - self._origin, source=self._source, position=position, orientation=optical
+        )
+
+    def _paired(self, depth: Files, stamps: list[int]) -> Files:
+        """Give each depth image the stamp of its colour image; those without are left out."""
+        taken: dict[int, tuple[int, Path]] = {}
+        for stamp, path in depth:
+            at = bisect.bisect_left(stamps, stamp)
+            near = min(stamps[max(at - 1, 0) : at + 1], key=lambda each: abs(each - stamp))
+            distance = abs(near - stamp)
+            if distance <= FARTHEST and (near not in taken or distance < taken[near][0]):
+                taken[near] = distance, path
+        if left_out := len(depth) - len(taken):
+            self.trouble.append(f"{left_out} depth images have no colour image near them")
+        return sorted((stamp, path) for stamp, (_, path) in taken.items())
+
+    def _index(self, name: str) -> Files:
+        rows = read_rows(self._folder / name, None, (2,), "timestamp filename")
+        return sorted((row.seconds(), self._folder / row.fields[1]) for row in rows)
+
+    def _poses(self) -> list[tuple[int, Vector3, Quaternion]]:
+        path = self._folder / "groundtruth.txt"
+        if not path.is_file():
+            return []
+        truth = read_tum(path, in_order=False)
+        return [
+            (stamp, flip_yz(place), rotation_to_ned(turn)) for stamp, place, turn in truth.poses()
+        ]
+
+
+_AXES = pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
+
+
+class Kitti(FolderReader):
+    """Reader of rectified cameras in a row on a car, and of its true poses if they are there.
+
+    A. Geiger, P. Lenz and R. Urtasun, "Are we ready for autonomous driving? The KITTI vision
+    benchmark suite", CVPR 2012, and cvlibs.net/datasets/kitti/eval_odometry.php::
+
+        sequences/00/image_0/000000.png …    left grey camera; 1: right one; 2, 3: in colour
+        sequences/00/calib.txt               P0 to P3: projection of the left grey camera's points
+        sequences/00/times.txt               seconds
+        poses/00.txt                         true poses of the left grey camera, of the first 11
+
+    The body is the left grey camera with a vehicle's axes (FRD), and begins in the world's origin.
+    """
+
+    layout = "KITTI's (times.txt and calib.txt)"
+
+    @classmethod
+    def find(cls, path: Path) -> Path | None:
+        """Return the folder of times.txt and calib.txt."""
+        return path if all((path / f"{n}.txt").is_file() for n in ("times", "calib")) else None
+
+    def _read(self) -> None:
+        folder = self._folder
+        self._stamps = [
+            row.seconds() for row in read_rows(folder / "times.txt", None, (1,), "seconds")
+        ]
+        self._truth = self._poses()
+        rows = read_rows(folder / "calib.txt", None, (13,), "name: 12 numbers")
+        projections = {row.fields[0].rstrip(":"): row for row in rows}
+        seconds = (self._stamps[-1] - self._stamps[0]) / 1e9
+        rate = (len(self._stamps) - 1) / seconds if seconds > 0 else 10.0
+        cameras: dict[str, CameraAnnouncement] = {}
+        for images in sorted(folder.glob("image_[0-3]")):
+            source, number = f"{self._vehicle}/{images.name}", images.name[-1]
+            paths = sorted(images.glob("*.png"))
+            self._count(images, "images", len(paths))
+            self._images[source] = list(zip(self._stamps, paths, strict=True))
+            if (row := projections.get(f"P{number}")) is None:
+                raise ReplayError(f"{folder / 'calib.txt'}: expected P{number}, found none")
+            cameras[number] = _camera(source, row, paths[0], rate)
+            if (left := cameras.get({"1": "0", "3": "2"}.get(number, ""))) is not None:
+                cameras[number] = as_pair(left, cameras[number])
+        if not cameras:
+            raise ReplayError(f"{folder}: expected images in image_0 to image_3, found none")
+        self._announcements += cameras.values()
+        self._begin()
+
+    def _odometry(self, stamp: int, position: Vector3, orientation: Quaternion) -> Odometry:
+        return self._pose(stamp, position, orientation)
+
+    def _poses(self) -> list[tuple[int, Vector3, Quaternion]]:
+        path = self._folder.parent.parent / "poses" / f"{self._folder.name}.txt"
+        if not path.is_file():
+            self.complain(f"expected true poses in {path}, found none")
+            return []
+        poses = read_kitti(path)
+        self._count(path, "poses", len(poses))
+        bodies = _AXES @ poses @ np.linalg.inv(_AXES)
+        return [(s, *pose_tuples(body)) for s, body in zip(self._stamps, bodies, strict=True)]
+
+    def _count(self, where: Path, what: str, found: int) -> None:
+        if found != len(self._stamps):
+            raise ReplayError(
+                f"{where}: expected {len(self._stamps)} {what}, as many as times.txt has stamps, "
+                f"found {found}"
+            )
+
+
+def _camera(source: str, row: Row, image: Path, rate: float) -> CameraAnnouncement:
+    """Return a camera by its projection K [I | t] of points in the left grey camera."""
+    projection = np.reshape(row.numbers(1, 13), (3, 4))
+    kind, width, height = first_image(image)
+    (fx, _, cx), (_, fy, cy) = projection[:2, :3].tolist()
+    info = CameraInfo(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+    moved = np.eye(4)
+    moved[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    return camera_at(source, (kind,), info, rate, *pose_tuples(_AXES @ moved))
+
+
+_READERS: tuple[type[FolderReader], ...] = (Euroc, TumRgbd, Kitti)
+
+
+def open_folder(path: Path, config: ReplayConfig, vehicle: str) -> FolderReader:
+    """Return the reader of a data set's folder; a `ReplayError` if its layout is unknown."""
+    for reader in _READERS:
+        if (folder := reader.find(path)) is not None:
+            return reader(folder, config, vehicle)
+    *others, last = (reader.layout for reader in _READERS)
+    raise ReplayError(
+        f"{path}: expected a ROS 2 bag (metadata.yaml), or a data set of {', '.join(others)} or "
+        f"{last}, found a folder with none of these"
+    )
