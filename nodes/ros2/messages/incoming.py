@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf, isfinite
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from events import (
     CameraAnnouncement,
@@ -47,6 +46,8 @@ from events.frames import (
 from nodes.ros2.messages.images import decode_compressed, depth_pixels, image_pixels
 from nodes.ros2.messages.typestore import Stamps
 
+E = TypeVar("E", bound=Event)
+
 
 class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
     """Input of a reader besides the message."""
@@ -64,6 +65,10 @@ class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
     def frame(self, header: Any, default: str) -> str:
         """Return the frame for an event: `frame_id`, the header's, or else `default`."""
         return self.frame_id or header.frame_id or default
+
+    def event(self, kind: type[E], header: Any, **fields: Any) -> E:
+        """Return an event of `source` at a header's time."""
+        return kind(stamp=self.stamp(header), source=self.source, **fields)
 
 
 Reader = Callable[[Any, MessageContext], Event | None]
@@ -98,9 +103,9 @@ def odometry(message: Any, context: MessageContext) -> Event:
     frame_id, child = context.frame(message.header, "odom"), message.child_frame_id or "base_link"
     position, orientation = _pose(message.pose.pose, frame_id, child)
     twist, axes = message.twist.twist, axes_of(child)
-    return Odometry(
-        stamp=context.stamp(message.header),
-        source=context.source,
+    return context.event(
+        Odometry,
+        message.header,
         frame_id=frame_id,
         child_frame_id=child,
         position=position,
@@ -124,34 +129,24 @@ def stamped_velocity(message: Any, context: MessageContext) -> Event:
 def position(message: Any, context: MessageContext) -> Event:
     """Read a PoseStamped as a place to be at, with its heading."""
     place, orientation = _pose_in_map(message, context)
-    return PositionSetpoint(
-        stamp=context.stamp(message.header),
-        source=context.source,
-        vehicle=context.vehicle,
-        position=place,
-        yaw=yaw_of(orientation),
-    )
+    target = {"vehicle": context.vehicle, "position": place, "yaw": yaw_of(orientation)}
+    return context.event(PositionSetpoint, message.header, **target)
 
 
 def pose(message: Any, context: MessageContext) -> Event:
     """Read a PoseStamped as a place to be at in an attitude."""
     place, orientation = _pose_in_map(message, context)
-    return PoseSetpoint(
-        stamp=context.stamp(message.header),
-        source=context.source,
-        vehicle=context.vehicle,
-        position=place,
-        orientation=orientation,
-    )
+    target = {"vehicle": context.vehicle, "position": place, "orientation": orientation}
+    return context.event(PoseSetpoint, message.header, **target)
 
 
 def imu(message: Any, context: MessageContext) -> Event:
     """Read an Imu, without its orientation."""
     frame_id = context.frame(message.header, "base_link")
     axes = axes_of(frame_id)
-    return Imu(
-        stamp=context.stamp(message.header),
-        source=context.source,
+    return context.event(
+        Imu,
+        message.header,
         frame_id=frame_id,
         angular_velocity=convert_vector(axes, _vector(message.angular_velocity)),
         linear_acceleration=convert_vector(axes, _vector(message.linear_acceleration)),
@@ -163,9 +158,9 @@ def distance(message: Any, context: MessageContext) -> Event:
     least, most, found = (
         float(value) for value in (message.min_range, message.max_range, message.range)
     )
-    return Range(
-        stamp=context.stamp(message.header),
-        source=context.source,
+    return context.event(
+        Range,
+        message.header,
         frame_id=context.frame(message.header, "base_link"),
         range=found if least <= found <= most else inf,
         field_of_view=float(message.field_of_view),
@@ -176,23 +171,15 @@ def distance(message: Any, context: MessageContext) -> Event:
 
 def pressure(message: Any, context: MessageContext) -> Event:
     """Read a FluidPressure."""
-    return FluidPressure(
-        stamp=context.stamp(message.header),
-        source=context.source,
-        fluid_pressure=float(message.fluid_pressure),
-        variance=float(message.variance),
-    )
+    found, variance = float(message.fluid_pressure), float(message.variance)
+    return context.event(FluidPressure, message.header, fluid_pressure=found, variance=variance)
 
 
 def magnetic_field(message: Any, context: MessageContext) -> Event:
     """Read a MagneticField, without its covariance."""
     frame_id = context.frame(message.header, "base_link")
-    return MagneticField(
-        stamp=context.stamp(message.header),
-        source=context.source,
-        frame_id=frame_id,
-        magnetic_field=convert_vector(axes_of(frame_id), _vector(message.magnetic_field)),
-    )
+    field = convert_vector(axes_of(frame_id), _vector(message.magnetic_field))
+    return context.event(MagneticField, message.header, frame_id=frame_id, magnetic_field=field)
 
 
 def fix(message: Any, context: MessageContext) -> Event:
@@ -201,9 +188,9 @@ def fix(message: Any, context: MessageContext) -> Event:
         raise ValueError("status: expected a fix, found none")
     known = message.position_covariance_type != message.COVARIANCE_TYPE_UNKNOWN
     covariance = convert_covariance("world", message.position_covariance) if known else np.empty(0)
-    return NavSatFix(
-        stamp=context.stamp(message.header),
-        source=context.source,
+    return context.event(
+        NavSatFix,
+        message.header,
         latitude=float(message.latitude),
         longitude=float(message.longitude),
         altitude=float(message.altitude),
@@ -212,23 +199,19 @@ def fix(message: Any, context: MessageContext) -> Event:
 
 
 def image(message: Any, context: MessageContext) -> Event:
-    """Read an Image as a colour or grey image."""
-    return _image(message, context, image_pixels(message))
-
-
-def compressed_image(message: Any, context: MessageContext) -> Event:
-    """Read a CompressedImage as a colour or grey image."""
-    return _image(message, context, decode_compressed(message))
+    """Read an Image or a CompressedImage as a colour or grey image."""
+    raw = hasattr(message, "encoding")
+    pixels = image_pixels(message) if raw else decode_compressed(message)
+    encoding, frame_id = "rgb8" if pixels.ndim == 3 else "mono8", context.frame(message.header, "")
+    return context.event(Image, message.header, frame_id=frame_id, encoding=encoding, data=pixels)
 
 
 def depth(message: Any, context: MessageContext) -> Event:
-    """Read an Image as depth."""
-    return _depth(message, context, depth_pixels(message))
-
-
-def compressed_depth(message: Any, context: MessageContext) -> Event:
-    """Read a CompressedImage as depth."""
-    return _depth(message, context, decode_compressed(message))
+    """Read an Image or a CompressedImage as depth."""
+    raw = hasattr(message, "encoding")
+    metres = depth_pixels(message) if raw else decode_compressed(message)
+    frame_id = context.frame(message.header, "")
+    return context.event(DepthImage, message.header, frame_id=frame_id, data=metres)
 
 
 def true_odometry(message: Any, context: MessageContext) -> Event:
@@ -241,9 +224,9 @@ def true_pose(message: Any, context: MessageContext) -> Event:
     """Read a PoseStamped as the true pose of a body, like `true_odometry`."""
     frame_id = context.frame_id or "map"
     place, orientation = _pose(message.pose, frame_id, "base_link")
-    return Odometry(
-        stamp=context.stamp(message.header),
-        source=context.source,
+    return context.event(
+        Odometry,
+        message.header,
         frame_id=frame_id,
         position=place,
         orientation=orientation,
@@ -340,33 +323,14 @@ def _estimate(
     frame_id = context.frame(header, "odom")
     place, orientation = _pose(pose, frame_id, child)
     given = convert_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
-    return PoseEstimate(
-        stamp=context.stamp(header),
-        source=context.source,
+    return context.event(
+        PoseEstimate,
+        header,
         frame_id=frame_id,
         child_frame_id=child,
         position=place,
         orientation=orientation,
         covariance=tuple(given),
-    )
-
-
-def _image(message: Any, context: MessageContext, pixels: npt.NDArray[Any]) -> Event:
-    return Image(
-        stamp=context.stamp(message.header),
-        source=context.source,
-        frame_id=context.frame(message.header, ""),
-        encoding="rgb8" if pixels.ndim == 3 else "mono8",
-        data=pixels,
-    )
-
-
-def _depth(message: Any, context: MessageContext, metres: npt.NDArray[Any]) -> Event:
-    return DepthImage(
-        stamp=context.stamp(message.header),
-        source=context.source,
-        frame_id=context.frame(message.header, ""),
-        data=metres,
     )
 
 
