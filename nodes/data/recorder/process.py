@@ -31,8 +31,7 @@ from nodes.data.mcap.mcap_file import McapWriter
 from nodes.data.mcap.native import HOLDERS
 from nodes.data.recorder import pipe
 from nodes.data.recorder.pipe import McapRecorderConfig, Reply, WriteRequest
-from nodes.ros2.messages.mappings import LARGE, SMALL
-from nodes.ros2.messages.publishing import Publishing
+from nodes.ros2.messages.mappings import LARGE, SMALL, Publishing
 from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, Topic, ros_name
 from nodes.ros2.messages.typestore import Stamps, TypeStore
 from runtime.errors import MissingDependencyError, WireError

@@ -35,8 +35,7 @@ from nodes.ros2.bridge.keys import Complaints, NodeName
 from nodes.ros2.bridge.services import Services
 from nodes.ros2.bridge.session import Publisher, Session, SessionError
 from nodes.ros2.bridge.settings import Ros2BridgeConfig, event_type
-from nodes.ros2.messages.mappings import LARGE, SMALL
-from nodes.ros2.messages.publishing import Publishing
+from nodes.ros2.messages.mappings import LARGE, SMALL, Publishing
 from nodes.ros2.messages.typestore import Stamps, TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
 from runtime.channels.ports import Handles

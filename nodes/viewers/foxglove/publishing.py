@@ -34,7 +34,7 @@ from events.frames import convert_vector
 from events.geometry import Pose
 from nodes.ros2.messages import mappings
 from nodes.ros2.messages.mappings import PUBLISHED
-from nodes.ros2.messages.publishing import Publishing as RosPublishing
+from nodes.ros2.messages.mappings import Publishing as RosPublishing
 from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, Topic, ros_name
 from nodes.ros2.messages.typestore import Stamps, TypeStore
 from nodes.trajectory import RecentPoses
