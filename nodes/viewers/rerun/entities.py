@@ -24,7 +24,6 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
-import msgspec
 import numpy as np
 
 from events import CameraAnnouncement, Event
@@ -64,16 +63,15 @@ class EntityLog:
 
     def __init__(self, rr: Any, stream: Any) -> None:
         self.rr, self.stream = rr, stream
+        self.now = 0, 0  # time of the next entries: an event's number, and its stamp (ns)
         stream.set_log_time_enabled(False)  # one's own time lines: ``run`` and ``event``
         stream.set_log_tick_enabled(False)
 
-    def at(self, number: int, stamp: int) -> None:
-        """Set the time of the next entries: the event's number, and its stamp (ns)."""
+    def put(self, entity: str, *what: Any) -> None:
+        """Log components of an entity at the time `now`."""
+        number, stamp = self.now
         self.stream.set_time("event", sequence=number)
         self.stream.set_time("run", duration=np.timedelta64(stamp, "ns"))
-
-    def put(self, entity: str, *what: Any) -> None:
-        """Log components of an entity at the set time."""
         self.stream.log(entity, *what)
 
     def static(self, entity: str, *what: Any) -> None:
@@ -101,31 +99,27 @@ _SHOWN = 2  # cameras whose images have a place of their own; those of more shar
 _ABREAST = 4  # plots with a place of their own, at most
 
 
-class Contents(msgspec.Struct):
-    """Contents of the layout."""
-
-    trails: list[str] = []  # entities shown with their whole past
-    # By entity: its images (``rgb``, ``grey``, ``depth``, ``segmentation``).
-    cameras: dict[str, list[str]] = {}
-    plots: dict[str, str] = {}  # by title: the entities plotted
-    eye: Eye | None = None  # viewpoint; None leaves it to the viewer
-
-
-def layout(rrb: Any, contents: Contents) -> Any:
+def layout(
+    rrb: Any,
+    trails: list[str],  # entities shown with their whole past
+    cameras: dict[str, list[str]],  # kinds of images (``rgb``, ``grey``, …), by camera's entity
+    plots: dict[str, str],  # entities plotted, by title
+    eye: Eye | None,  # viewpoint; None leaves it to the viewer
+) -> Any:
     """Return the blueprint."""
-    above = [_world(rrb, contents)]
-    if views := _images(rrb, contents):
+    above = [_world(rrb, trails, cameras, eye)]
+    if views := _images(rrb, cameras):
         above.append(rrb.Vertical(*views))
     rows = [rrb.Horizontal(*above, column_shares=[2.4, 1.0][: len(above)])]
     legend = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
-    plots = [
+    curves = [
         rrb.TimeSeriesView(name=title, origin="/", contents=what, plot_legend=legend)
-        for title, what in contents.plots.items()
+        for title, what in plots.items()
     ]
-    if len(plots) > _ABREAST:  # the rest share the last place
-        plots[_ABREAST - 1 :] = [rrb.Tabs(*plots[_ABREAST - 1 :])]
-    if plots:
-        rows.append(rrb.Horizontal(*plots))
+    if len(curves) > _ABREAST:  # the rest share the last place
+        curves[_ABREAST - 1 :] = [rrb.Tabs(*curves[_ABREAST - 1 :])]
+    if curves:
+        rows.append(rrb.Horizontal(*curves))
     return rrb.Blueprint(
         rrb.Vertical(*rows, row_shares=[2.6, 1.0][: len(rows)]),
         rrb.BlueprintPanel(state="collapsed"),
@@ -135,23 +129,23 @@ def layout(rrb: Any, contents: Contents) -> Any:
     )
 
 
-def _world(rrb: Any, contents: Contents) -> Any:
+def _world(rrb: Any, trails: list[str], cameras: dict[str, list[str]], eye: Eye | None) -> Any:
     so_far = rrb.VisibleTimeRanges(
         timeline="run",
         start=rrb.TimeRangeBoundary.infinite(),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    eye = None
-    if contents.eye is not None:
-        position, target = contents.eye
-        eye = rrb.EyeControls3D(
+    controls = None
+    if eye is not None:
+        position, target = eye
+        controls = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=(0, 0, -1)
         )
     # Depth images in the world would be clouds of their own, and features would float. But a
     # camera that has nothing else is shown by its depth.
     hidden = [
         f"- /{camera}/{kind}/**"
-        for camera, there in contents.cameras.items()
+        for camera, there in cameras.items()
         for kind in ("depth", "segmentation", "rgb/features", "grey/features")
         if kind != "depth" or there != ["depth"]
     ]
@@ -159,24 +153,24 @@ def _world(rrb: Any, contents: Contents) -> Any:
         name="world: true path green, planned path grey, estimates as in the plots",
         origin=f"/{WORLD}",
         contents=["+ $origin/**", *hidden],
-        overrides={trail: [so_far] for trail in contents.trails},
-        eye_controls=eye,
+        overrides={trail: [so_far] for trail in trails},
+        eye_controls=controls,
         background=_DARK,
         line_grid=rrb.LineGrid3D(visible=True, spacing=1.0),
     )
 
 
-def _images(rrb: Any, contents: Contents) -> list[Any]:
-    cameras = [_camera(rrb, entity, kinds) for entity, kinds in contents.cameras.items() if kinds]
-    if len(cameras) > _SHOWN:
-        return [rrb.Tabs(*(rrb.Vertical(*views, name=name) for name, views in cameras))]
-    return [view for _, views in cameras for view in views]
-
-
-def _camera(rrb: Any, entity: str, kinds: list[str]) -> tuple[str, list[Any]]:
-    name = entity.removeprefix(f"{WORLD}/")
-    views = [rrb.Spatial2DView(name=f"{name} {k}", origin=f"/{entity}/{k}") for k in kinds]
-    return name, views
+def _images(rrb: Any, cameras: dict[str, list[str]]) -> list[Any]:
+    shown = {
+        (name := entity.removeprefix(f"{WORLD}/")): [
+            rrb.Spatial2DView(name=f"{name} {kind}", origin=f"/{entity}/{kind}") for kind in kinds
+        ]
+        for entity, kinds in cameras.items()
+        if kinds
+    }
+    if len(shown) > _SHOWN:
+        return [rrb.Tabs(*(rrb.Vertical(*views, name=name) for name, views in shown.items()))]
+    return [view for views in shown.values() for view in views]
 
 
 _DARK = (22, 25, 31)  # background of the world in every theme, matched to the colours of paths

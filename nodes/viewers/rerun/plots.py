@@ -66,9 +66,15 @@ class Plots:
         self._to = log
         self._colours = colours
         self._known: set[str] = set()
+        self.plotted: set[str] = set()  # parts of the tree with curves
+
+    def titles(self) -> dict[str, str]:
+        """Return the plots with something to show: the entities of each, by title."""
+        return {t: what for t, what in PLOTS.items() if what.split("/")[1] in self.plotted}
 
     def measurements(self, kind: type[Event], source: str, events: Sequence[Numbered[Any]]) -> None:
         """Put the measurements of a sensor."""
+        self.plotted.add(GROUPS[kind])
         for field in fields_of(kind):
             entity = entities.path(GROUPS[kind], field, source)
             rows = np.array([numbers(event, field) for _, event in events])
@@ -82,8 +88,9 @@ class Plots:
             columns = self._to.rr.GeoPoints.columns(positions=places)
             self._to.columns(entities.path("gps", source), events, columns)
 
-    def scores(self, events: Sequence[Numbered[Score]]) -> None:
+    def scores(self, _: str, events: Sequence[Numbered[Score]]) -> None:
         """Put scores, of any subject and metric."""
+        self.plotted.add("scores")
         apart: dict[tuple[str, str, str], list[Numbered[Score]]] = {}
         for number, event in events:
             key = event.subject, event.metric, event.unit

@@ -9,6 +9,7 @@ There are two time lines: ``run``, an event's stamp, and ``event``, the order in
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,8 @@ from events import (
     VehicleEvent,
     Wind,
 )
-from nodes.viewers.rerun.entities import Contents, EntityLog, Eye, Numbered, layout
-from nodes.viewers.rerun.plots import GROUPS, PLOTS, Plots
+from nodes.viewers.rerun.entities import EntityLog, Eye, Numbered, layout
+from nodes.viewers.rerun.plots import GROUPS, Plots
 from nodes.viewers.rerun.sdk import RerunConfig, Viewer, load
 from nodes.viewers.rerun.world import World
 
@@ -82,18 +83,28 @@ class Recorder:
         self._stream.send_recording_name(name)
         self._entities = EntityLog(library, self._stream)
         self._world = World(self._entities, config)
-        self._plots = Plots(self._entities, self._world.colours)
+        world, self._plots = self._world, Plots(self._entities, self._world.colours)
         self._puts: dict[type[Event], Callable[[Any], None]] = {
-            Image: self._world.image,
-            DepthImage: self._world.depth,
-            SegmentationImage: self._world.segmentation,
-            TrackedFeatures: self._world.features,
-            LidarScan: self._world.scan,
-            PointCloud: self._world.cloud,
+            Image: world.image,
+            DepthImage: world.depth,
+            SegmentationImage: world.segmentation,
+            TrackedFeatures: world.features,
+            LidarScan: world.scan,
+            PointCloud: world.cloud,
+            PoseStamped: world.pose,
+            PlannedPose: world.plan,
+            PositionSetpoint: world.plan,
             TrackingEvent: self._plots.logged,
             VehicleEvent: self._plots.logged,
         }
-        self._plotted: set[str] = set()
+        # Put in columns, by source, before those above; the truth first: estimates are held
+        # against it.
+        self._columns: dict[type[Event], Callable[[str, Any], None]] = {
+            Odometry: world.odometry,
+            PoseEstimate: world.estimates,
+            **{kind: functools.partial(self._plots.measurements, kind) for kind in GROUPS},
+            Score: self._plots.scores,
+        }
         self._shown: tuple[int, ...] = ()
         self._closed = False
         self._behind = False
@@ -113,7 +124,7 @@ class Recorder:
                     self._world.vehicle(each.source)
                 case EstimatorAnnouncement():
                     self._world.estimator(each.source)
-                    self._plotted.add("scores")
+                    self._plots.plotted.add("scores")
                 case ImuAnnouncement() | SensorAnnouncement():
                     self._world.sensor(each)
                 case BodyAnnouncement():
@@ -141,16 +152,20 @@ class Recorder:
                 self._world.vehicles.tracked(event)  # before the estimates are placed
         together: dict[tuple[type[Event], str], list[Any]] = {}
         for number, event in batch:
-            kind = next((kind for kind in _IN_COLUMNS if isinstance(event, kind)), None)
+            kind = next((kind for kind in self._columns if isinstance(event, kind)), None)
             if kind is not None:
                 together.setdefault((kind, event.source), []).append((number, event))
-        for kind in _IN_COLUMNS:  # the truth first: estimates are held against it
+        for kind, put_columns in self._columns.items():
             for (found, source), events in together.items():
                 if found is kind:
-                    self._put_columns(kind, source, events)
+                    put_columns(source, events)
+                    if kind is Wind:
+                        self._world.wind(source, events)
         for number, event in batch:
-            self._entities.at(number, event.stamp)
-            self._put(number, event)
+            self._entities.now = number, event.stamp
+            put = next((put for kind, put in self._puts.items() if isinstance(event, kind)), None)
+            if put is not None:
+                put(event)
         self._show()
 
     def left_out(self) -> int:
@@ -187,44 +202,18 @@ class Recorder:
             self._behind = False
         return not self._behind
 
-    def _put_columns(self, kind: type[Event], source: str, events: list[Any]) -> None:
-        if kind is Odometry:
-            self._world.odometry(source, events)
-        elif kind is PoseEstimate:
-            self._world.estimates(source, events)
-        elif kind is Score:
-            self._plots.scores(events)
-            self._plotted.add("scores")
-        else:
-            self._plots.measurements(kind, source, events)
-            self._plotted.add(GROUPS[kind])
-            if kind is Wind:
-                self._world.wind(source, events)
-
-    def _put(self, number: int, event: Event) -> None:
-        if isinstance(event, PoseStamped):
-            self._world.pose(number, event)
-        elif isinstance(event, PlannedPose | PositionSetpoint):
-            self._world.plan(number, event)
-        else:
-            for kind, put in self._puts.items():
-                if isinstance(event, kind):
-                    put(event)
-                    return
-
     def _show(self, eye: Eye | None = None) -> None:
         images = self._world.images
         found = (
             len(self._world.trails),
-            len(self._plotted),
+            len(self._plots.plotted),
             *(len(kinds) for kinds in images.values()),
         )
         if found == self._shown and eye is None:
             return
         self._shown = found
-        plots = {t: what for t, what in PLOTS.items() if what.split("/")[1] in self._plotted}
-        contents = Contents(trails=self._world.trails, cameras=images, plots=plots, eye=eye)
-        self._stream.send_blueprint(layout(self._rrb, contents))
+        plots = self._plots.titles()
+        self._stream.send_blueprint(layout(self._rrb, self._world.trails, images, plots, eye))
 
     def _eye(self) -> Eye | None:
         """Return an eye above the whole flight, from the south-west."""
@@ -234,6 +223,3 @@ class Recorder:
         centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 5.0)
         x, y, z = centre.tolist()
         return (x - 0.8 * size, y - 0.45 * size, z - size), (x, y, z)
-
-
-_IN_COLUMNS: tuple[type[Event], ...] = (Odometry, PoseEstimate, *GROUPS, Score)

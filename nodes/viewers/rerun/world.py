@@ -52,6 +52,8 @@ CENTIMETRES = 100.0  # steps of a depth image per metre; finer ones would be noi
 _WIND_PERIOD = 100_000_000  # nanoseconds between two arrows of a vehicle's wind
 _THICK, _THIN = 0.02, 0.01  # metres: radii of paths
 
+Planned = PlannedPose | PositionSetpoint
+
 
 class World:
     """Writer of the entities with a place in the world."""
@@ -155,7 +157,8 @@ class World:
         truth = self._truth[source]
         for number, event in events:
             truth.add(event.stamp, event.position, event.orientation)
-            self._extend(entities.world("truth", source), number, event.stamp, event.position)
+            self._to.now = number, event.stamp
+            self._extend(entities.world("truth", source), event)
         positions = np.array([event.position for _, event in events])
         self.bounds[0] = np.minimum(self.bounds[0], positions.min(axis=0))
         self.bounds[1] = np.maximum(self.bounds[1], positions.max(axis=0))
@@ -175,15 +178,16 @@ class World:
                     self._to.static(frame_entity, self._transform(*frame))
             self._to.static(f"{frame_entity}/body", self._rr.TransformAxes3D(0.3))
         for number, event in events:
-            self._extend(f"{frame_entity}/path", number, event.stamp, event.position)
+            self._to.now = number, event.stamp
+            self._extend(f"{frame_entity}/path", event)
         self._poses(f"{frame_entity}/body", events)
 
-    def plan(self, number: int, event: PlannedPose | PositionSetpoint) -> None:
+    def plan(self, event: Planned) -> None:
         """Put where a vehicle is meant to be."""
         if self._plan.select(event):
             entity = entities.path(entities.PLAN, event.vehicle)
             self._path(entity, PLAN, _THIN)
-            self._extend(entity, number, event.stamp, event.position)
+            self._extend(entity, event)
 
     def wind(self, source: str, events: Sequence[Numbered[Wind]]) -> None:
         """Put the wind as an arrow at its vehicle, some times a second: a metre for each m/s."""
@@ -192,19 +196,18 @@ class World:
             there = self._truth[vehicle].at(event.stamp) if vehicle in self._truth else None
             if there is not None and event.stamp >= self._wind_due.get(vehicle, 0):
                 self._wind_due[vehicle] = event.stamp + _WIND_PERIOD
-                self._to.at(number, event.stamp)
+                self._to.now = number, event.stamp
                 arrow = self._rr.Arrows3D(
                     origins=[there[0]], vectors=[event.velocity], colors=[WIND], radii=[_THICK]
                 )
                 self._to.put(entities.world("wind", vehicle), arrow)
 
-    def pose(self, number: int, event: PoseStamped) -> None:
+    def pose(self, event: PoseStamped) -> None:
         """Put the pose of a free camera or self-moving body, or of a camera, for depth images."""
         if event.source in self._moving:
             entity = entities.world(event.source)
             self._to.put(entity, self._transform(event.position, event.orientation))
-            path = entities.world("paths", event.source)
-            self._extend(path, number, event.stamp, event.position)
+            self._extend(entities.world("paths", event.source), event)
             return
         camera = self._cameras.get(event.source)
         if camera is not None and camera.parent_frame_id == "map":
@@ -272,7 +275,8 @@ class World:
         """Put the remaining points of the paths."""
         for entity, (path, _, _) in self._paths.items():
             if (rest := path.rest()) is not None:
-                self._strip(entity, *self._latest[entity], rest)
+                self._to.now = self._latest[entity]
+                self._strip(entity, rest)
 
     def _place(self, event: Image | DepthImage | SegmentationImage, kind: str) -> str:
         """Return an image's entity: below its camera, or by itself if the camera is unannounced."""
@@ -325,12 +329,11 @@ class World:
             self._paths[entity] = PathPieces(), colour, radius
             self.trails.append(entity)
 
-    def _extend(self, entity: str, number: int, stamp: int, position: Vector3) -> None:
-        self._latest[entity] = number, stamp
-        if (piece := self._paths[entity][0].add(stamp, position)) is not None:
-            self._strip(entity, number, stamp, piece)
+    def _extend(self, entity: str, event: Odometry | PoseEstimate | PoseStamped | Planned) -> None:
+        self._latest[entity] = self._to.now
+        if (piece := self._paths[entity][0].add(event.stamp, event.position)) is not None:
+            self._strip(entity, piece)
 
-    def _strip(self, entity: str, number: int, stamp: int, piece: list[Vector3]) -> None:
+    def _strip(self, entity: str, piece: list[Vector3]) -> None:
         _, colour, radius = self._paths[entity]
-        self._to.at(number, stamp)
         self._to.put(entity, self._rr.LineStrips3D([piece], colors=[colour], radii=[radius]))
