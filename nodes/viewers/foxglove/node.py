@@ -1,18 +1,363 @@
-"""Foxglove server as a node: its events, and their way to the server."""
+"""Foxglove server as a node, and its messages, in ROS's axes: ROS's as CDR, Foxglove's own.
+
+Images and point clouds are put from threads beside the loop, one of each kind at a time; the rest
+takes microseconds and is put at once.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
-from typing import Any
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
-from events import Announcement, DepthImage, Event, Image, LidarScan, PointCloud, TrackedFeatures
-from nodes.viewers.common import ImageSelection
-from nodes.viewers.foxglove.publishing import SMALL, Publishing
+import msgspec
+
+from events import (
+    Announcement,
+    BodyAnnouncement,
+    CameraAnnouncement,
+    DepthImage,
+    Event,
+    Image,
+    LidarScan,
+    Odometry,
+    PlannedPose,
+    PointCloud,
+    PoseEstimate,
+    PositionSetpoint,
+    TrackedFeatures,
+    TrackingEvent,
+    TrackingLost,
+    TransformStamped,
+    Vector3,
+    VehicleAnnouncement,
+    VehicleEvent,
+)
+from events.frames import convert_vector
+from events.geometry import Pose
+from nodes.ros2.messages import mappings
+from nodes.ros2.messages.mappings import PUBLISHED
+from nodes.ros2.messages.mappings import Publishing as RosPublishing
+from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, Topic, ros_name
+from nodes.ros2.messages.typestore import Stamps, TypeStore
+from nodes.trajectory import RecentPoses
+from nodes.viewers.common import (
+    INLIER,
+    OUTLIER,
+    PLAN,
+    VEHICLE,
+    Box,
+    Colour,
+    ImageSelection,
+    PlanSelection,
+    Trail,
+    describe,
+    estimate_colour,
+    estimate_frame,
+    moving_body,
+    truth_colour,
+)
 from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 from runtime import Node, Stream, Tick, every, on
 from runtime.errors import MissingDependencyError, VisnavError
+from runtime.time.schedule import SECOND
+
+
+class Messages:
+    """Maker of messages of ``foxglove.messages``."""
+
+    def __init__(self, types: Any) -> None:
+        self._m = types
+
+    def features(self, event: TrackedFeatures) -> Any:
+        """Return an ImageAnnotations: inliers in green, the rest in red."""
+        groups = [
+            self._m.PointsAnnotation(
+                timestamp=self._time(event.stamp),
+                type=self._m.PointsAnnotationType.Points,
+                points=[self._m.Point2(x=x, y=y) for x, y in event.points[chosen].tolist()],
+                outline_color=self._colour(colour),
+                fill_color=self._colour(colour),
+                thickness=4.0,
+            )
+            for chosen, colour in ((event.inliers, INLIER), (~event.inliers, OUTLIER))
+        ]
+        return self._m.ImageAnnotations(points=groups)
+
+    def log(self, event: Event) -> Any:
+        """Return a Log."""
+        levels = self._m.LogLevel
+        return self._m.Log(
+            timestamp=self._time(event.stamp),
+            level=levels.Warning if isinstance(event, TrackingLost) else levels.Info,
+            message=describe(event),
+            name=event.source,
+        )
+
+    def scene(self, *entities: Any) -> Any:
+        """Return a SceneUpdate of entities from `line` and `body`."""
+        return self._m.SceneUpdate(entities=list(entities))
+
+    def line(self, trail: Trail, name: str, piece: list[Vector3]) -> Any:
+        """Return a piece of a path as a SceneEntity."""
+        strip = self._m.LinePrimitive(
+            type=self._m.LinePrimitiveLineType.LineStrip,
+            thickness=trail.thickness,
+            points=[self._m.Point3(x=x, y=y, z=z) for x, y, z in piece],
+            color=self._colour(trail.colour),
+        )
+        return self._m.SceneEntity(frame_id=trail.frame_id, id=name, lines=[strip])
+
+    def body(self, name: str, frame_id: str, boxes: Sequence[Box] = VEHICLE) -> Any:
+        """Return a body as a SceneEntity fixed to its frame; by default a vehicle's."""
+        vector = self._m.Vector3
+        cubes = []
+        for centre, (length, width, height), colour in boxes:
+            x, y, z = convert_vector("body", centre)
+            cubes.append(
+                self._m.CubePrimitive(
+                    pose=self._m.Pose(
+                        position=vector(x=x, y=y, z=z), orientation=self._m.Quaternion(w=1.0)
+                    ),
+                    size=vector(x=length, y=width, z=height),
+                    color=self._colour(colour),
+                )
+            )
+        return self._m.SceneEntity(frame_id=frame_id, id=name, frame_locked=True, cubes=cubes)
+
+    def _colour(self, colour: Colour) -> Any:
+        r, g, b = colour
+        return self._m.Color(r=r / 255, g=g / 255, b=b / 255, a=1.0)
+
+    def _time(self, stamp: int) -> Any:
+        return self._m.Timestamp(sec=stamp // SECOND, nsec=stamp % SECOND)
+
+
+E = TypeVar("E", bound=Event)
+
+
+class RosTopics:
+    """The topics of ROS's messages."""
+
+    def __init__(self, server: Server, store: TypeStore) -> None:
+        self.server = server
+        self._definitions = {row.type: store.definition(row.type) for row in PUBLISHED}
+        self._stamps = threading.local()  # of what each thread puts
+
+    def publisher(self, topic: Topic) -> RosTopic:
+        """Declare a topic."""
+        self.server.declare_ros(topic.name, topic.type, self._definitions[topic.type])
+        return RosTopic(self, topic)
+
+    def stamped(self, put: Callable[[E], None]) -> Callable[[E], None]:
+        """Return `put`, whose messages then have the time of their event."""
+
+        def put_stamped(event: E) -> None:
+            self._stamps.stamp = event.stamp
+            put(event)
+
+        return put_stamped
+
+    @property
+    def stamp(self) -> int:
+        """Return the stamp of the event whose messages this thread puts (ns)."""
+        return getattr(self._stamps, "stamp", 0)
+
+
+class RosTopic:
+    """A topic of ROS messages; late viewers get the newest of a transient-local topic or a map."""
+
+    def __init__(self, topics: RosTopics, topic: Topic) -> None:
+        self.topic, self._topics = topic, topics
+        cloud = topic.type == "sensor_msgs/msg/PointCloud2"
+        self._kept = topic.qos.transient_local or (cloud and topic.qos.reliable)
+
+    @property
+    def wanted(self) -> bool:
+        """Tell whether the topic has a viewer, or keeps messages for later viewers."""
+        return self._kept or self._topics.server.wanted(self.topic.name)
+
+    def put(self, message: bytearray) -> None:
+        """Send a message to the topic's viewers."""
+        data, server, stamp = bytes(message), self._topics.server, self._topics.stamp
+        if self._kept:
+            server.latch(self.topic.name, lambda: data, stamp)
+        else:
+            server.log(self.topic.name, data, stamp)
+
+
+SMALL: tuple[type[Event], ...] = (
+    *(kind for kind in mappings.SMALL if kind is not TrackedFeatures),
+    *(PlannedPose, PositionSetpoint, TrackingEvent, VehicleEvent),
+)  # events whose messages are made at once
+
+_LEFT_OUT = {"clock", "paths", "camera_poses", "body_poses", "segmentation_images"}
+"""Groups of ROS topics left out: shown in another way, or not at all by Foxglove."""
+
+
+class Publishing:
+    """Converter of events to messages. Takes tenths of a second to create: not on the loop."""
+
+    def __init__(self, server: Server, config: FoxgloveConfig) -> None:
+        self._server = server
+        self._make = Messages(server.types)
+        left_out = _LEFT_OUT | ({"depth_images"} if not config.depth else set())
+        if not config.image_rate:
+            left_out |= {"images", "depth_images"}
+        published = PublishingConfig(
+            publish=tuple(group for group in ALL_GROUPS if group not in left_out),
+            raw_images=not config.jpeg_quality,
+            compressed_images="jpeg" if config.jpeg_quality else "",
+            jpeg_quality=config.jpeg_quality,
+            raw_depth="millimetres",
+        )
+        store = TypeStore()
+        topics = RosTopics(server, store)
+        self._ros: RosPublishing[RosTopic]
+        self._ros = RosPublishing(topics, store, published, Stamps().out)
+        self._ros.warm_up()
+        self._put = topics.stamped(self._ros.put)
+        self._names = self._ros.names
+        self._frames: dict[str, str] = {}  # sources of images, by optical frame
+        self._estimators: dict[str, str] = {}  # parent frames, by source
+        self._renamed: dict[str, str] = {}  # the same by what the estimators call them
+        self._truths: dict[str, RecentPoses] = {}  # by vehicle
+        self._trails: dict[str, Trail] = {}
+        self._bodies: dict[str, Callable[[], Any]] = {}
+        """Makers of the bodies' entities, by source: frame names depend on the other vehicles."""
+        self._plan = PlanSelection()
+        server.declare("/scene", "SceneUpdate")
+        server.declare("/log", "Log")
+
+    def announced(self, announcement: Announcement) -> None:
+        """Declare the topics of an announcement."""
+        source = announcement.source
+        self._ros.announced(announcement)
+        match announcement:
+            case VehicleAnnouncement():
+                self._vehicle(source, "base_link")
+            case CameraAnnouncement():
+                self._frames.setdefault(announcement.frame_id, source)
+            case BodyAnnouncement(kind=kind):
+                self._bodies[source] = lambda: self._make.body(
+                    source, ros_name(source), [moving_body(kind)]
+                )
+
+    def begin(self) -> None:
+        """Put the messages for the whole run."""
+        self._ros.begin()
+        self._server.latch("/scene", self._whole_scene, 0)
+
+    def features(self, event: TrackedFeatures) -> None:
+        """Put an estimator's tracked features of an image; beside the loop."""
+        if (camera := self._frames.get(event.frame_id)) is not None:
+            topic = f"/{ros_name(camera)}/features/{ros_name(event.source)}"
+            self._server.declare(topic, "ImageAnnotations")
+            if self._server.wanted(topic):
+                self._server.log(topic, self._make.features(event), event.stamp)
+
+    def put(self, event: Event) -> None:
+        """Put an event's messages: of images and clouds beside the loop, of others on the loop."""
+        match event:
+            case PointCloud():  # in the frame of an estimator if it is that
+                frame = self._renamed.get(event.frame_id, event.frame_id)
+                self._put(msgspec.structs.replace(event, frame_id=frame))
+            case Odometry():
+                self._odometry(event)
+            case PoseEstimate():
+                self._estimate(event)
+            case PlannedPose() | PositionSetpoint():
+                if self._plan.select(event):
+                    name = f"plan/{event.vehicle}" if event.vehicle else "plan"
+                    self._extend(name, "map", PLAN, event)
+            case TrackingEvent() | VehicleEvent():
+                self._server.log("/log", self._make.log(event), event.stamp)
+            case _:
+                self._put(event)
+
+    def _odometry(self, event: Odometry) -> None:
+        source = event.source
+        self._vehicle(source, event.child_frame_id)
+        self._put(event)
+        self._truths[source].add(event.stamp, event.position, event.orientation)
+        colour = truth_colour(list(self._truths).index(source))
+        self._extend(f"truth/{source}", event.frame_id, colour, event)
+
+    def _estimate(self, event: PoseEstimate) -> None:
+        """Put an estimate, laid on the truth unless in ``map``, and ``<estimator>/<body>``."""
+        source, body = event.source, f"{event.source}/{event.child_frame_id}"
+        parent = self._estimators.get(source)
+        if parent is None:
+            parent = self._estimators[source] = self._parent_of(event)
+            self._names.own.add(body)
+        self._put(msgspec.structs.replace(event, frame_id=parent))
+        self._place(event, parent, body, (event.position, event.orientation))
+        colour = estimate_colour(list(self._estimators).index(source))
+        self._extend(f"estimate/{source}", parent, colour, event)
+
+    def _vehicle(self, source: str, frame_id: str) -> None:
+        if source not in self._truths:
+            self._truths[source] = RecentPoses()
+            self._bodies[source] = lambda: self._make.body(
+                source, self._names.name(frame_id, source)
+            )
+
+    def _parent_of(self, event: PoseEstimate) -> str:
+        """Return an estimator's parent frame; its own frame is first aligned with the truth."""
+        if event.frame_id == "map":
+            return "map"
+        frame_id = f"{event.source}/{event.frame_id}"
+        self._names.own.add(frame_id)
+        self._renamed.setdefault(event.frame_id, frame_id)
+        truth = self._truths.get(self._names.vehicles.of(event.source))
+        if (pose := estimate_frame(event, truth)) is not None:
+            self._place(event, "map", frame_id, pose, static=True)
+        return frame_id
+
+    def _place(
+        self, event: Event, parent: str, child: str, pose: Pose, *, static: bool = False
+    ) -> None:
+        self._put(
+            TransformStamped(
+                stamp=event.stamp,
+                source=event.source,
+                frame_id=parent,
+                child_frame_id=child,
+                translation=pose[0],
+                rotation=pose[1],
+                static=static,
+            )
+        )
+
+    def _extend(
+        self,
+        name: str,
+        frame_id: str,
+        colour: Colour,
+        event: Odometry | PoseEstimate | PlannedPose | PositionSetpoint,
+    ) -> None:
+        trail = self._trails.get(name)
+        if trail is None:
+            thickness = 0.04 if name.startswith("truth") else 0.02
+            frame = self._names.name(frame_id, event.source)
+            trail = self._trails[name] = Trail(name, frame, colour, thickness)
+        position = convert_vector(self._names.axes(frame_id), event.position)
+        piece = trail.add(event.stamp, position)
+        if piece is not None and self._server.wanted("/scene"):
+            line = self._make.line(trail, *piece)
+            self._server.log("/scene", self._make.scene(line), event.stamp)
+
+    def _whole_scene(self) -> Any:
+        bodies = [make() for make in list(self._bodies.values())]
+        lines = [
+            self._make.line(trail, name, piece)
+            for trail in list(self._trails.values())
+            for name, piece in trail.pieces()
+        ]
+        return self._make.scene(*bodies, *lines)
+
 
 _QUEUED = (Image, DepthImage, PointCloud, LidarScan, TrackedFeatures)
 """Events whose messages take long to make."""

@@ -24,7 +24,7 @@ from events import (
 )
 from nodes.ros2.messages import images
 from nodes.ros2.messages.images import LIDAR_POINT, POINT
-from nodes.viewers.foxglove.publishing import Publishing
+from nodes.viewers.foxglove.node import Publishing
 from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 from tests.nodes.ros2.messages.samples import store
 from tests.nodes.viewers.common.samples import (

@@ -17,7 +17,7 @@ import pytest
 
 from events import Event
 from nodes.viewers.rerun import RerunView, sdk
-from nodes.viewers.rerun.recorder import Recorder
+from nodes.viewers.rerun.node import Recorder
 from nodes.viewers.rerun.sdk import RerunConfig
 from runtime.errors import ConfigError, MissingDependencyError, VisnavError
 from runtime.testing import run_node
@@ -136,7 +136,7 @@ def test_a_viewer_that_goes_away_is_survived() -> None:
 @pytest.mark.slow
 def test_a_viewer_that_stands_still_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """What it does not take is left out and counted; once it goes on, so does the view."""
-    monkeypatch.setattr("nodes.viewers.rerun.recorder._TIMEOUT", 0.3)
+    monkeypatch.setattr("nodes.viewers.rerun.node._TIMEOUT", 0.3)
     config = RerunConfig(mode="serve", port=free_port(), web_port=free_port(), jpeg_quality=0)
     noise = np.random.default_rng(0).integers(0, 255, (1000, 1000, 3), np.uint8)
     recorder = Recorder(config, "test", None)

@@ -20,7 +20,7 @@ from events import (
     TrackingLost,
     Wind,
 )
-from nodes.viewers.rerun.recorder import Recorder
+from nodes.viewers.rerun.node import Recorder
 from nodes.viewers.rerun.sdk import RerunConfig
 from tests.nodes.viewers.common.samples import (
     CAMERA,
