@@ -34,9 +34,8 @@ from events import (
 from events.frames import Axes, convert_covariance, convert_points, convert_rotation, convert_vector
 from nodes.ros2.messages import images
 from nodes.ros2.messages.images import COMPRESSED, LIDAR_POINT, POINT, ImageWriter
-from nodes.ros2.messages.paths import Paths
 from nodes.ros2.messages.topics import FrameNames, PublishingConfig
-from nodes.ros2.messages.transforms import Transform, Transforms
+from nodes.ros2.messages.transforms import Paths, Transform, Transforms
 from nodes.ros2.messages.typestore import Time, TypeStore
 
 _ZEROS_9, _ZEROS_36 = np.zeros(9), np.zeros(36)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nodes.ros2.messages.paths import PathMessage
+from nodes.ros2.messages.transforms import PathMessage
 from tests.nodes.ros2.messages import samples
 
 TYPE = "nav_msgs/msg/Path"
