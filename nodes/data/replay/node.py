@@ -45,8 +45,7 @@ class ReadAhead:
     def take(self) -> Batch | None:
         """Wait for the next batch or an error (not on a loop); return `None` at the end."""
         with self._change:
-            while not self._batches and not self._ended:
-                self._change.wait()
+            self._change.wait_for(lambda: self._batches or self._ended)
             if self._batches:
                 batch, size = self._batches.popleft()
                 self._waiting -= size
@@ -69,10 +68,8 @@ class ReadAhead:
         except BaseException as error:
             self._error = error
         finally:
-            close = getattr(self._events, "close", None)
-            with contextlib.suppress(Exception):
-                if close is not None:
-                    close()
+            with contextlib.suppress(Exception):  # no generator, or one that cannot be closed
+                self._events.close()  # type: ignore[attr-defined]
             with self._change:
                 self._ended = True
                 self._change.notify_all()

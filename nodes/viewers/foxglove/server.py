@@ -246,7 +246,7 @@ class Server:
         self._latched: dict[str, tuple[Make, int]] = {}
         self._lock = threading.Lock()
         inner = hidden_host()
-        listener: Any = _Listener(self._subscribed)
+        listener: Any = self  # of the library's `ServerListener`, as far as used
         try:
             self._server = foxglove.start_server(
                 name=name,
@@ -309,20 +309,12 @@ class Server:
         stopping.join(_CLOSING)
         self._gate.close()
 
-    def _subscribed(self, topic: str) -> None:
-        with self._lock:
-            make, stamp = self._latched.get(topic, (None, 0))
-        if make is not None:
-            self.log(topic, make(), stamp)
-
-
-class _Listener:
-    def __init__(self, subscribed: Callable[[str], None]) -> None:
-        self._subscribed = subscribed
-
     def on_subscribe(self, _: Any, channel: Any) -> None:
-        """Send the topic's newest message to a new viewer."""
-        self._subscribed(channel.topic)
+        """Send the topic's newest message to a new viewer; the library calls it."""
+        with self._lock:
+            make, stamp = self._latched.get(channel.topic, (None, 0))
+        if make is not None:
+            self.log(channel.topic, make(), stamp)
 
     def on_unsubscribe(self, _: Any, channel: Any) -> None:
         """Do nothing: the library counts."""
