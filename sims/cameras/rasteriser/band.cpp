@@ -57,6 +57,10 @@ void Band::draw() {
         for (const Triangle& triangle : triangles) cover(triangle, number++);
     }
     if (images_.rgb) shade();
+}
+
+void Band::finish() {
+    smooth_outlines();
     blend();
     if (images_.depth) measure();
     if (images_.numbers) number();
@@ -270,15 +274,12 @@ void Band::measure() const {
 // Number of each pixel's geom; -1 for none.
 void Band::number() const {
     for (int y = first_; y < last_; ++y) {
-        const std::int32_t* seen = visible_ + at(y);
         std::int32_t* to = images_.numbers + std::size_t(y - view_.first) * lens_.width;
-        for (int left = 0, right; left < lens_.width; left = right) {
-            const std::int32_t number = seen[left];
-            for (right = left + 1; right < lens_.width && seen[right] == number;) ++right;
+        runs(y, [&](int left, int right, std::int32_t number) {
             const std::int32_t found =
                 number < 0 ? -1 : scene_.placed_[triangle(number).geom].geom->number;
             std::fill(to + left, to + right, found);
-        }
+        });
     }
 }
 

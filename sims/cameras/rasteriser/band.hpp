@@ -8,9 +8,17 @@ namespace raster {
 class Band {
   public:
     Band(Scene& scene, int first, int last, const Images& images);
-    void draw();
+    void draw();           // all but what needs the rows of other bands
+    void find_outlines();  // when all bands are drawn
+    void finish();         // when all have found theirs
 
   private:
+    struct Outline {  // a pixel that an outline crosses
+        std::uint8_t* pixel;
+        std::uint8_t colour[3];  // of its neighbour, and how much that covers of it, in 256ths
+        int share;
+    };
+
     static constexpr int run = 16;  // pixels side by side with one level of a mipmap
 
     const Triangle& triangle(std::int32_t number) const;
@@ -32,6 +40,8 @@ class Band {
     template <typename Found>
     bool scan_pixels(const Triangle& triangle, int left, int right, int top, int bottom,
                      Found found) const;
+    template <typename Found>
+    void runs(int y, Found found) const;
     void cover(const Triangle& triangle, std::int32_t number);
     void shade();
     void place(int y, int left, int right, std::int32_t number);
@@ -44,6 +54,8 @@ class Band {
     Colours colours(int x);
     void mix(int x, int y, float nearest, std::int32_t number);
     void write(std::uint8_t* to, Colours colours, int count) const;
+    void smooth(int x, int y, bool below);
+    void smooth_outlines() const;
     void blend();
     void measure() const;
     void number() const;
@@ -66,9 +78,27 @@ class Band {
     float* const nearest_;     // of the frame
     std::int32_t* const visible_;
     Taps taps_;
+    std::vector<Outline> outlines_;
     std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
     std::vector<Surface> surfaces_;
     std::vector<std::vector<std::int32_t>> surface_of_;  // by part and triangle; -1: none yet
 };
+
+// Call found(left, right, number) for pixels side by side that see one triangle, or none (-1).
+template <typename Found>
+inline void Band::runs(int y, Found found) const {
+    const std::int32_t* seen = visible_ + at(y);
+    int left = 0;
+    for (int x = 0; x < lens_.width; x += lanes) {
+        int ends = bits(load<iv>(seen + x) != load<iv>(seen + x + 1));
+        if (const int rest = lens_.width - 1 - x; rest < lanes)
+            ends = (ends & ((1 << rest) - 1)) | 1 << rest;
+        for (; ends; ends &= ends - 1) {
+            const int right = x + __builtin_ctz(ends) + 1;
+            found(left, right, seen[left]);
+            left = right;
+        }
+    }
+}
 
 }  // namespace raster

@@ -55,6 +55,7 @@ int raster_mesh(Scene* scene, int vertices, const float* points, const float* no
     }
     mesh->middle = (low + high) * 0.5f;
     mesh->reach = (high - low) * 0.5f;
+    mesh->find_parts();
     scene->meshes.push_back(std::move(mesh));
     return static_cast<int>(scene->meshes.size()) - 1;
 }

@@ -14,6 +14,10 @@ struct Mesh {
     std::vector<Vec3f> points, normals;
     std::vector<float> places;          // in a texture, u and v of each vertex
     std::vector<std::int32_t> corners;  // three of each triangle, counterclockwise from outside
+    std::vector<std::int32_t> parts;    // of each triangle: number of the surface without a crease
+    int part_count = 0;
+
+    void find_parts();
     Vec3f middle, reach;                // of the box about it
 };
 
@@ -73,7 +77,7 @@ inline f4 most(const Lens::Square& rays, Vec3f plane) {
 struct Triangle {
     float depth[3];     // inverse depth, times the ray
     float edges[3][3];  // positive inside
-    std::int32_t geom, corner;
+    std::int32_t geom, corner, part;  // its parts count on from geom to geom
     int left, right, top, bottom;  // pixels that it may cover: to right - 1 and bottom - 1
     Vec3f ahead;                   // towards the ball about it, and the least cosine of rays to it
     float least;
@@ -105,6 +109,7 @@ struct Placed {  // a geom of the frame
     const Mesh* mesh;
     Vec3 shift;                    // of its mesh's origin from the eye, in the optical frame
     Matrix turn;                   // from the mesh's axes to the optical frame
+    std::int32_t parts;            // how many those before it have
     std::vector<Vec3> seen;        // its vertices in the optical frame
     int square, column, row, side;  // the smallest of the lens's squares about it, if it has any
 };

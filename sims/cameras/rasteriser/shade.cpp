@@ -215,13 +215,10 @@ void Band::write(std::uint8_t* to, Colours colours, int count) const {
 
 void Band::shade() {
     for (int y = first_; y < last_; ++y) {
-        const std::int32_t* seen = visible_ + at(y);
-        for (int left = 0, right; left < lens_.width; left = right) {
-            const std::int32_t number = seen[left];
-            for (right = left + 1; right < lens_.width && seen[right] == number;) ++right;
+        runs(y, [&](int left, int right, std::int32_t number) {
             if (number < 0) place_sky(y, left, right);
             else place(y, left, right, number);
-        }
+        });
         for (int x = 0; x < lens_.width; x += lanes)
             write(row(y) + 3 * x, colours(x), std::min(lens_.width - x, lanes));
     }

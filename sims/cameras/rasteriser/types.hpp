@@ -68,6 +68,9 @@ inline int bits(i4 mask) {  // one for each lane
     return (mask[0] & 1) | (mask[1] & 2) | (mask[2] & 4) | (mask[3] & 8);
 #endif
 }
+#ifdef __AVX2__
+inline int bits(iv mask) { return _mm256_movemask_ps(reinterpret_cast<__m256>(mask)); }
+#endif
 inline fv floored(fv value) {
     const fv whole = as_float(as_whole(value));
     return value < whole ? whole - 1.0f : whole;

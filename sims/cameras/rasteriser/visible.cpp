@@ -54,10 +54,12 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
     first_ = first, last_ = last;
     const bool rolling = view_.poses > 1;
     std::vector<std::pair<double, int>> order;
+    std::int32_t parts = 0;
     for (int index = 0; index < count; ++index) {
         Placed& placed = placed_[index];
         if (!(geoms[index].rgba[3] > 0.0f)) continue;
         place(geoms[index], poses[index], eye_, placed);
+        placed.parts = parts, parts += placed.mesh->part_count;
         if (rolling) place(geoms[index], poses[count + index], next_eye_, later_[index]);
         if (lens_->pinhole) {
             if (beyond(placed) & (rolling ? beyond(later_[index]) : ~0)) continue;
@@ -88,13 +90,21 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
                 add(order[k].second, clear_[part], clear_moving_[part]);
     });
     const int rows = last - first, bands = std::min(pieces, rows);
+    std::vector<std::unique_ptr<Band>> drawn(bands);
     spread(bands, [&](int band) {
         const auto edge = [&](int number) {  // between the smallest squares of a lens
             if (number == 0 || number == bands) return number ? last : first;
             return std::max((first + rows * number / bands) / Lens::smallest * Lens::smallest, first);
         };
-        if (edge(band) < edge(band + 1)) Band(*this, edge(band), edge(band + 1), images).draw();
+        if (edge(band) >= edge(band + 1)) return;
+        drawn[band] = std::make_unique<Band>(*this, edge(band), edge(band + 1), images);
+        drawn[band]->draw();
     });
+    const auto each = [&](auto step) {
+        spread(bands, [&](int band) { if (drawn[band]) step(*drawn[band]); });
+    };
+    if (images.rgb) each([](Band& band) { band.find_outlines(); });
+    each([](Band& band) { band.finish(); });
 }
 
 void Scene::place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) const {
@@ -187,6 +197,7 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         Triangle triangle;
         triangle.geom = index;
         triangle.corner = static_cast<int>(corner);
+        triangle.part = placed.parts + placed.mesh->parts[corner / 3];
         if (!rolling) {
             const double away = dot(cross(now[1] - now[0], now[2] - now[0]), now[0]);
             if (away == 0 || (away > 0 && culled)) continue;
