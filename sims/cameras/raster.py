@@ -152,7 +152,8 @@ class Raster(Stage):
         rows: tuple[int, int] | None = None,
     ) -> Drawn:
         height, width = view.info.height, view.info.width
-        first, last = rows or (0, height)
+        begin, end = rows or (0, height)
+        first, last = max(begin - 1, 0), min(end + 1, height)  # outlines take from their neighbours
         shape = last - first, width
         drawn = Drawn(
             np.empty((*shape, 3), np.uint8) if colour else None,
@@ -175,7 +176,8 @@ class Raster(Stage):
             self._world, self._lens(view.info), _at(frame), _at(eyes), len(geoms), _at(geoms),
             _at(poses), len(lights), _at(lights), *map(_at, drawn),
         )  # fmt: skip
-        return drawn
+        wanted = slice(begin - first, end - first)
+        return Drawn(*(image if image is None else image[wanted] for image in drawn))
 
     @override
     def _update(self) -> None:

@@ -74,8 +74,18 @@ inline void Band::over(const Triangle& triangle, std::int32_t number, Found foun
     if (!lens_.pinhole) {
         Triangle later = triangle;
         if (view_.poses > 1) later.see(moving(number).to);
-        return over_square(triangle, later, number, placed.square, placed.column, placed.row,
-                           placed.side, found);
+        // The squares about the pixels where it may be, if these are less than the geom's.
+        int side = 2 * Lens::smallest;
+        while (side < std::max(triangle.right - triangle.left, triangle.bottom - triangle.top))
+            side *= 2;
+        if (side >= placed.side)
+            return over_square(triangle, later, number, placed.square, placed.column, placed.row,
+                               placed.side, found);
+        for (int row = triangle.top / side * side; row < triangle.bottom; row += side)
+            for (int column = triangle.left / side * side; column < triangle.right; column += side)
+                if (const int square = lens_.square(side, column, row); square >= 0)
+                    over_square(triangle, later, number, square, column, row, side, found);
+        return;
     }
     if (view_.poses == 1) return scan_frame(triangle, triangle.top, triangle.bottom, found);
     Triangle row = triangle;
@@ -144,6 +154,8 @@ void Band::over_square(const Triangle& triangle, const Triangle& later, std::int
     for (int left_over = bits(met); left_over; left_over &= left_over - 1) {
         const int part = __builtin_ctz(left_over);
         const int left = column + part % 2 * side, top = row + part / 2 * side;
+        if (top >= triangle.bottom || top + side <= triangle.top) continue;
+        if (left >= triangle.right || left + side <= triangle.left) continue;
         if (top >= last_ || top + side <= first_) continue;
         if (rays.parts[part] >= 0)
             over_square(triangle, later, number, rays.parts[part], left, top, side, found);
@@ -156,7 +168,8 @@ void Band::over_square(const Triangle& triangle, const Triangle& later, std::int
 template <typename Found>
 inline void Band::over_leaf(const Triangle& triangle, std::int32_t number, int left, int top,
                             Found found) {
-    const int from = std::max(top, first_), to = std::min(top + Lens::smallest, last_);
+    const int from = std::max({top, first_, triangle.top});
+    const int to = std::min({top + Lens::smallest, last_, triangle.bottom});
     const int right = std::min(left + Lens::smallest, lens_.stride);
     bool touched = false;
     if (view_.poses == 1) {
@@ -167,8 +180,8 @@ inline void Band::over_leaf(const Triangle& triangle, std::int32_t number, int l
             if (seen(row, number, y)) touched |= scan_pixels(row, left, right, y, y + 1, found);
     }
     if (!touched) return;
-    fv least = load<fv>(nearest_ + at(from) + left);
-    for (int y = from; y < to; ++y)
+    fv least = fv{} + 1e30f;
+    for (int y = std::max(top, first_); y < std::min(top + Lens::smallest, last_); ++y)
         for (int x = left; x < right; x += lanes) {
             const fv here = load<fv>(nearest_ + at(y) + x);
             least = here < least ? here : least;

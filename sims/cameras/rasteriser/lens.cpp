@@ -26,13 +26,18 @@ Lens::Lens(int width, int height, const float* x, const float* y, const float* z
             }
     }
     while (largest < std::max({width, height, 2 * smallest})) largest *= 2;
+    for (int side = 2 * smallest; side <= largest; side *= 2)
+        by_level_.emplace_back(std::size_t(largest / side) * (largest / side), -1);
     cut(0, 0, largest);
+    find_spots();
 }
 
 // Add a square of pixels and those in it; returns its number.
 int Lens::cut(int column, int row, int side) {
     const int number = static_cast<int>(squares.size());
     squares.emplace_back();
+    by_level_[__builtin_ctz(side / (2 * smallest))]
+             [std::size_t(row / side) * (largest / side) + column / side] = number;
     side /= 2;
     for (int part = 0; part < 4; ++part) {
         const int left = column + part % 2 * side, top = row + part / 2 * side;
@@ -55,6 +60,60 @@ int Lens::cut(int column, int row, int side) {
         }
     }
     return number;
+}
+
+// Number of a direction's part of an octahedron that is unfolded to a square.
+std::size_t Lens::spot(Vec3f a) {
+    const float share = 1.0f / (std::abs(a.x) + std::abs(a.y) + std::abs(a.z));
+    float x = a.x * share, y = a.y * share;
+    if (a.z < 0) {
+        const float folded = (1 - std::abs(y)) * (x < 0 ? -1 : 1);
+        y = (1 - std::abs(x)) * (y < 0 ? -1 : 1), x = folded;
+    }
+    constexpr float half = spots_across / 2 - 0.01f;
+    return static_cast<std::size_t>((y + 1) * half) * spots_across +
+           static_cast<std::size_t>((x + 1) * half);
+}
+
+void Lens::find_spots() {
+    spots_.assign(std::size_t(spots_across) * spots_across, {-1, -1});
+    const auto at = [&](int column, int row) {
+        const Vec3f found = ray(column, row);
+        return Vec3{found.x, found.y, found.z};
+    };
+    double least = 1, most = 0;  // squares of the turns from pixel to pixel, and of their changes
+    for (int row = 1; row < height - 1; ++row)
+        for (int column = 1; column < width - 1; ++column) {
+            const Vec3 here = at(column, row), left = at(column - 1, row);
+            const Vec3 right = at(column + 1, row), above = at(column, row - 1);
+            const Vec3 below = at(column, row + 1);
+            bool known = true;
+            for (const Vec3 each : {here, left, right, above, below}) known &= dot(each, each) > 0;
+            if (!known) continue;
+            spots_[spot(ray(column, row))] = {static_cast<std::int16_t>(column),
+                                              static_cast<std::int16_t>(row)};
+            const Vec3 across = right - here, down = below - here;
+            const double a = dot(across, across), b = dot(across, down), c = dot(down, down);
+            least = std::min(least, 0.5 * (a + c) - root(0.25 * (a - c) * (a - c) + b * b));
+            for (const Vec3 change : {right - here * 2.0 + left, below - here * 2.0 + above})
+                most = std::max(most, dot(change, change));
+        }
+    const double scale = 1 / root(std::max(least, 1e-12));  // the most pixels of a radian
+    bend = static_cast<float>(scale * scale * scale * root(most));
+}
+
+// From a pixel near it by Newton's method, one step.
+Lens::Pixel Lens::pixel(Vec3 towards) const {
+    const Vec3f ahead = narrow(towards * (1.0 / root(dot(towards, towards))));
+    if (!(ahead.x == ahead.x)) return {-1, -1};
+    const Spot near = spots_[spot(ahead)];
+    if (near.column < 0) return {-1, -1};
+    const Vec3f here = ray(near.column, near.row), way = ahead - here;
+    const Vec3f across = ray(near.column + 1, near.row) - here;
+    const Vec3f down = ray(near.column, near.row + 1) - here;
+    const float a = dot(across, across), b = dot(across, down), c = dot(down, down);
+    const float u = dot(way, across), v = dot(way, down), share = 1.0f / (a * c - b * b);
+    return {near.column + (c * u - b * v) * share, near.row + (a * v - b * u) * share};
 }
 
 }  // namespace raster

@@ -37,6 +37,20 @@ struct Lens {
     int largest = smallest;  // the root's side, twice that of its parts
     std::vector<Square> squares;
 
+    // Number of the square of such a side about a pixel; -1 for none.
+    std::int32_t square(int side, int column, int row) const {
+        const int level = __builtin_ctz(side / (2 * smallest));
+        return by_level_[level][std::size_t(row / side) * (largest / side) + column / side];
+    }
+
+    // Where the ray in a direction is, pixels, within half a pixel; column -1 if that is not known.
+    struct Pixel {
+        float column, row;
+    };
+    Pixel pixel(Vec3 towards) const;
+
+    float bend = 0;  // how far an edge may bulge, pixels, by the square of its triangle's sine
+
     Lens(int width, int height, const float* x, const float* y, const float* z);
 
     Vec3f ray(int column, int row) const {
@@ -46,7 +60,17 @@ struct Lens {
     }
 
   private:
+    struct Spot {  // a pixel with a ray in about some direction; column -1 for none
+        std::int16_t column, row;
+    };
+    static constexpr int spots_across = 256;
+
     int cut(int column, int row, int side);
+    void find_spots();
+    static std::size_t spot(Vec3f direction);
+
+    std::vector<std::vector<std::int32_t>> by_level_;  // squares of 16 pixels, 32 and so on
+    std::vector<Spot> spots_;
 };
 
 // The planes through the eye and the edges of a triangle, and how far it faces away.
@@ -111,6 +135,7 @@ struct Placed {  // a geom of the frame
     Matrix turn;                   // from the mesh's axes to the optical frame
     std::int32_t parts;            // how many those before it have
     std::vector<Vec3> seen;        // its vertices in the optical frame
+    std::vector<Lens::Pixel> pixels;  // and, by a lens, in the image
     int square, column, row, side;  // the smallest of the lens's squares about it, if it has any
 };
 
@@ -149,12 +174,13 @@ class Scene {
     void draw_rows(int first, int last, const Geom* geoms, const Pose* poses, int count,
                    const Images& images);
     void place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) const;
-    static void see(Placed& placed);
+    void see(Placed& placed) const;
     int beyond(const Placed& placed) const;
-    static bool ball(Vec3 middle, double reach, Vec3f& ahead, float& least);
+    static double ball(Vec3 middle, double reach, Vec3f& ahead, float& least);
     bool in_squares(Placed& placed, const Placed& later) const;
     void add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) const;
-    bool bounded(Triangle& triangle, const Vec3* points, int count) const;
+    bool bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels,
+                 int count) const;
     void light(const Geom& geom, const Pose& pose, Slot& slot) const;
     void spread(int parts, const std::function<void(int)>& work) const;
 
@@ -169,6 +195,8 @@ class Scene {
     std::vector<Slot> slots_;
     Triangles solid_, clear_;  // of these rows, in parts
     Movings solid_moving_, clear_moving_;
+    std::vector<Triangle> before_;  // solid ones of the rows before these, while all moves
+    std::vector<Moving> before_moving_;
     std::vector<float> nearest_;         // inverse depth of the nearest surface; 0 for nothing
     std::vector<std::int32_t> visible_;  // its triangle
 };

@@ -131,8 +131,8 @@ inline int Band::detail(const Surface& surface, int x, int y, float inverse) con
                         step([&](const float(&plane)[3]) { return times(plane, below); }));
     }
     if (!(most > 1.0f)) return 0;  // also where a ray's neighbour is none
-    return std::min(static_cast<int>(128.0f * log_2(std::min(most, 1e30f))),
-                    (surface.texture->levels() - 1) << 8);
+    const int level = static_cast<int>(128.0f * log_2(std::min(most, 1e30f))) - sharper;
+    return std::min(std::max(level, 0), (surface.texture->levels() - 1) << 8);
 }
 
 // Find out where the colours of `count` pixels of a triangle in a row come from, from x on.

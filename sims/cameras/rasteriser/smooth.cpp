@@ -68,20 +68,26 @@ void Mesh::find_parts() {
     }
 }
 
+// The triangle that a row's pixel sees, while all moves as the row sees it; null for none.
+const Triangle* Band::seen_by(std::int32_t number, int y, Triangle& row) const {
+    if (number < 0) return nullptr;
+    if (view_.poses == 1) return &triangle(number);
+    if (y >= scene_.first_) return seen(row = triangle(number), number, y) ? &row : nullptr;
+    // A row of the rows before these. What was see-through there counts as nothing.
+    if (std::size_t(number) >= scene_.before_.size()) return nullptr;
+    const Moving& moving = scene_.before_moving_[number];
+    row = scene_.before_[number];
+    row.see({moving.from, moving.to, (y - scene_.start_) / scene_.step_ + 1});
+    return &row;
+}
+
 // Blend two neighbours that see different parts: a pixel and the one right of it, or below it.
 void Band::smooth(int x, int y, bool below) {
     const int other_x = x + !below, other_y = y + below;
     const std::size_t here = at(y) + x, there = at(other_y) + other_x;
     Triangle rows[2];  // while all moves
-    const auto seen_by = [&](std::int32_t number, Triangle& row) -> const Triangle* {
-        if (number < 0) return nullptr;
-        const Triangle& triangle = this->triangle(number);
-        if (view_.poses == 1) return &triangle;
-        row = triangle;
-        return seen(row, number, y) ? &row : nullptr;
-    };
-    const Triangle* first = seen_by(visible_[here], rows[0]);
-    const Triangle* second = seen_by(visible_[there], rows[1]);
+    const Triangle* first = seen_by(visible_[here], y, rows[0]);
+    const Triangle* second = seen_by(visible_[there], other_y, rows[1]);
     const bool turned = !first || (second && nearest_[there] > nearest_[here]);
     if (turned) std::swap(first, second);  // the first is the nearer one
     if (!first) return;
@@ -117,7 +123,7 @@ void Band::smooth(int x, int y, bool below) {
     const bool upon_near = parts < 128;  // the far one covers a part of the nearer one's pixel
     const bool to_other = upon_near == turned;
     const int to_x = to_other ? other_x : x, to_y = to_other ? other_y : y;
-    if (to_y < first_ || to_y >= last_) return;
+    if (to_y >= last_ || (to_y < first_ && first_ > scene_.first_)) return;  // another band's
     const std::uint8_t* colour = to_other ? row(y) + 3 * x : row(other_y) + 3 * other_x;
     outlines_.push_back({row(to_y) + 3 * to_x, {colour[0], colour[1], colour[2]},
                          std::abs(parts - 128)});
@@ -128,13 +134,16 @@ void Band::find_outlines() {
     outlines_.clear();
     std::vector<std::int32_t> rows[2];  // parts that each pixel of a row, and of that above, sees
     for (auto& row : rows) row.resize(lens_.stride + lanes);
-    const int top = std::max(first_ - 1, scene_.first_), end = std::min(last_ + 1, scene_.last_);
+    const int top = std::max(first_ - 1, view_.first), end = std::min(last_ + 1, scene_.last_);
     for (int y = top; y < end; ++y) {
         std::int32_t* parts = rows[y & 1].data();
         const std::int32_t* above = rows[~y & 1].data();
         const bool mine = y >= first_ && y < last_;
         runs(y, [&](int left, int right, std::int32_t number) {
-            const std::int32_t part = number < 0 ? -1 : triangle(number).part;
+            Triangle row;
+            const Triangle* triangle = y < scene_.first_ ? seen_by(number, y, row) :
+                                       number < 0 ? nullptr : &this->triangle(number);
+            const std::int32_t part = triangle ? triangle->part : -1;
             std::fill(parts + left, parts + right, part);
             if (mine && left && part != parts[left - 1]) smooth(left - 1, y, false);
         });

@@ -71,6 +71,10 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
     std::sort(order.begin(), order.end());  // front to back: of equal depths the first counts
     // So many that no thread waits long for another, and that triangles' numbers have room for.
     const int pieces = view_.threads == 1 || rolling ? 1 : std::min(view_.threads * 4, 60);
+    if (rolling && !solid_.empty()) {
+        std::swap(before_, solid_[0]), std::swap(before_moving_, solid_moving_[0]);
+        if (first == view_.first) before_.clear();
+    }
     solid_.resize(pieces), clear_.resize(pieces);
     solid_moving_.resize(pieces), clear_moving_.resize(pieces);
     spread(pieces, [&](int part) {
@@ -122,12 +126,15 @@ void Scene::place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& p
     }
 }
 
-void Scene::see(Placed& placed) {
+void Scene::see(Placed& placed) const {
     placed.seen.resize(placed.mesh->points.size());
     for (std::size_t at = 0; at < placed.seen.size(); ++at) {
         const Vec3f p = placed.mesh->points[at];
         placed.seen[at] = placed.turn * Vec3{p.x, p.y, p.z} + placed.shift;
     }
+    if (lens_->pinhole) return;
+    placed.pixels.clear();
+    for (const Vec3& point : placed.seen) placed.pixels.push_back(lens_->pixel(point));
 }
 
 // Edges of a pinhole's image that the box about a geom is beyond, a bit each.
@@ -148,16 +155,17 @@ int Scene::beyond(const Placed& placed) const {
     return found;
 }
 
-// Direction of a ball from the eye and least cosine of rays that meet it, if the eye is outside.
-bool Scene::ball(Vec3 middle, double reach, Vec3f& ahead, float& least) {
-    const double away = dot(middle, middle), share = reach / away * 1.01;  // of squares
+// Direction of a ball from the eye and least cosine of rays that meet it. Returns the sine's square
+// of the angle between them, or 1 if the eye is inside.
+double Scene::ball(Vec3 middle, double reach, Vec3f& ahead, float& least) {
+    const double away = dot(middle, middle), share = reach / away * 1.01;
     if (!(share < 1.0)) {
         ahead = {}, least = -1;  // met by all
-        return false;
+        return 1.0;
     }
     ahead = narrow(middle * (1.0 / root(away)));
     least = static_cast<float>(root(1.0 - share)) - 1e-5f;
-    return true;
+    return share;
 }
 
 // Whether the ball about a geom, on its way, may be in view, and the smallest square of rays about it.
@@ -170,7 +178,7 @@ bool Scene::in_squares(Placed& placed, const Placed& later) const {
     placed.square = 0, placed.column = placed.row = 0, placed.side = lens_->largest;
     Vec3f ahead;
     float least;
-    if (!ball((from + to) * 0.5, reach * reach, ahead, least)) return true;
+    if (ball((from + to) * 0.5, reach * reach, ahead, least) >= 1.0) return true;
     for (;;) {
         const Lens::Square& square = lens_->squares[placed.square];
         const int side = placed.side / 2;
@@ -192,7 +200,14 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
     const std::vector<std::int32_t>& corners = placed.mesh->corners;
     for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
         Vec3 points[6];  // now, and for the next pose
-        for (int k = 0; k < 3; ++k) points[k] = placed.seen[corners[corner + k]];
+        Lens::Pixel pixels[6] = {};
+        const auto put = [&](const Placed& of, int first) {
+            for (int k = 0; k < 3; ++k) {
+                points[first + k] = of.seen[corners[corner + k]];
+                if (!lens_->pinhole) pixels[first + k] = of.pixels[corners[corner + k]];
+            }
+        };
+        put(placed, 0);
         const Vec3(&now)[3] = *reinterpret_cast<Vec3(*)[3]>(points);
         Triangle triangle;
         triangle.geom = index;
@@ -201,13 +216,13 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         if (!rolling) {
             const double away = dot(cross(now[1] - now[0], now[2] - now[0]), now[0]);
             if (away == 0 || (away > 0 && culled)) continue;
-            if (!bounded(triangle, points, 3)) continue;
+            if (!bounded(triangle, points, pixels, 3)) continue;
             triangle.see(Corners(now));
             to.push_back(triangle);
             continue;
         }
-        for (int k = 0; k < 3; ++k) points[3 + k] = later_[index].seen[corners[corner + k]];
-        if (!bounded(triangle, points, 6)) continue;
+        put(later_[index], 3);
+        if (!bounded(triangle, points, pixels, 6)) continue;
         const Corners from(now), next(*reinterpret_cast<Vec3(*)[3]>(points + 3));
         if (culled && from.away >= 0 && next.away >= 0) continue;
         triangle.see(from);
@@ -217,7 +232,8 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
 }
 
 // Find the pixels about triangles' image; false if there are none.
-bool Scene::bounded(Triangle& triangle, const Vec3* points, int count) const {
+bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels,
+                    int count) const {
     triangle.left = 0, triangle.right = lens_->width;
     triangle.top = first_, triangle.bottom = last_;
     if (!lens_->pinhole) {
@@ -226,8 +242,22 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, int count) const {
         for (int k = 0; k < count; ++k) middle = middle + points[k] * (1.0 / count);
         for (int k = 0; k < count; ++k)
             reach = std::max(reach, dot(points[k] - middle, points[k] - middle));
-        ball(middle, reach, triangle.ahead, triangle.least);
-        return true;
+        // What is small is in the box about its corners and the bulges of its edges.
+        const double share = ball(middle, reach, triangle.ahead, triangle.least);
+        if (!(share < 0.03)) return true;
+        float low[2] = {1e9f, 1e9f}, high[2] = {-1e9f, -1e9f};
+        for (int k = 0; k < count; ++k) {
+            const auto [column, row] = pixels[k];
+            if (!(column >= 0)) return true;
+            low[0] = std::min(low[0], column), high[0] = std::max(high[0], column);
+            low[1] = std::min(low[1], row), high[1] = std::max(high[1], row);
+        }
+        const double more = 1.5 + lens_->bend * share;
+        triangle.left = std::max(triangle.left, static_cast<int>(low[0] - more));
+        triangle.right = std::min(triangle.right, static_cast<int>(high[0] + more) + 1);
+        triangle.top = std::max(triangle.top, static_cast<int>(low[1] - more));
+        triangle.bottom = std::min(triangle.bottom, static_cast<int>(high[1] + more) + 1);
+        return triangle.left < triangle.right && triangle.top < triangle.bottom;
     }
     double low[2] = {1e30, 1e30}, high[2] = {-1e30, -1e30};
     const double near = view_.near;

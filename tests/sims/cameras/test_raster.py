@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import mujoco
 import numpy as np
 import numpy.typing as npt
@@ -247,6 +248,63 @@ def test_what_is_see_through_is_blended_and_has_no_depth() -> None:
     assert numbers is not None
     assert {*np.unique(numbers).tolist()} == {0, 1, 2, 3, 4}
     np.testing.assert_allclose(depth, 7.9, rtol=1e-6)
+    raster.close()
+
+
+PLATE = """
+<mujoco>
+  <visual><headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/></visual>
+  <worldbody><geom type="box" size=".01 .4 .3" pos="3 0 0" rgba="1 1 1 1"/></worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
+@pytest.mark.parametrize("roll", [0.0, 0.2, 0.7])
+def test_a_plate_gives_the_light_of_its_area(spec: CameraSpec, roll: float) -> None:
+    """Wherever between the pixels its outline runs."""
+    raster = Raster(compiled(mujoco.MjSpec.from_string(PLATE)))
+    light = []
+    for shift in np.arange(8) * 0.003:  # a pixel is 0.018 at its distance, or 0.05
+        image = drawn(raster, spec, (0.0, shift, 1.7 * shift), from_rpy(roll, 0.0, 0.0))[0]
+        assert image is not None
+        light.append(float(((image[..., 0] / 255.0) ** 2).sum()))
+    assert np.ptp(light) < (0.008 if spec is PINHOLE else 0.03) * np.mean(light)
+    if spec is PINHOLE:
+        pixels = 0.8 * 0.6 * (camera_info(spec).fx / 2.99) ** 2
+        np.testing.assert_allclose(light, pixels, rtol=0.005)
+    raster.close()
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
+def test_outlines_and_textures_are_near_the_mean_of_many_samples(spec: CameraSpec) -> None:
+    info, samples = camera_info(spec), 4
+    finer = msgspec.structs.replace(
+        info,
+        width=info.width * samples,
+        height=info.height * samples,
+        fx=info.fx * samples,
+        fy=info.fy * samples,
+        cx=(info.cx + 0.5) * samples - 0.5,
+        cy=(info.cy + 0.5) * samples - 0.5,
+    )
+    raster = Raster(compiled(fresh("hall")))
+    at_edges, elsewhere = [], []
+    for place, turn in itertools.islice(places("hall"), None, None, 3):
+        image, _, numbers = drawn(raster, spec, place, turn)
+        many = raster.draw(View(finer), True, False, False).colours
+        assert image is not None
+        assert many is not None
+        assert numbers is not None
+        squares = many.reshape(info.height, samples, info.width, samples, 3).astype(float) ** 2
+        apart = np.abs(image - np.sqrt(squares.mean(axis=(1, 3)))).mean(axis=-1)
+        edges = np.zeros(numbers.shape, bool)
+        edges[:, 1:] |= numbers[:, 1:] != numbers[:, :-1]
+        edges[1:] |= numbers[1:] != numbers[:-1]
+        at_edges.append(apart[edges].mean())
+        elsewhere.append(apart[~edges].mean())
+    assert np.mean(elsewhere) < 3.5
+    assert np.mean(at_edges) < 7.0
     raster.close()
 
 
