@@ -133,7 +133,7 @@ def test_known_points_fall_on_their_pixels(spec: CameraSpec) -> None:
         )
     frame = render(spec, world)
     assert frame.rgb is not None
-    light = frame.rgb[..., 0] / 255.0
+    light = (frame.rgb[..., 0] / 255.0) ** 2  # as outlines are blended
     rows, columns = np.mgrid[0 : info.height, 0 : info.width]
     errors = []
     for centre, radius in zip(centres, radii, strict=True):
