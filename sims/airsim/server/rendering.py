@@ -96,8 +96,11 @@ def packed(kind: ImageType, seen: Seen, form: Form) -> npt.NDArray[np.uint8]:
     colours = as_colours(kind, seen)
     if form == "png":
         opaque = cv2.cvtColor(colours, cv2.COLOR_RGB2BGRA)  # OpenCV's own order
-        return cv2.imencode(".png", opaque, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
-    return (colours if form == "rgb" else cv2.cvtColor(colours, cv2.COLOR_RGB2BGR)).ravel()
+        png = cv2.imencode(".png", opaque, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        return np.asarray(png, np.uint8).ravel()
+    if form == "bgr":
+        colours = np.asarray(cv2.cvtColor(colours, cv2.COLOR_RGB2BGR), np.uint8)
+    return colours.ravel()
 
 
 def as_numbers(kind: ImageType, seen: Seen) -> Depths:
@@ -124,7 +127,8 @@ def as_colours(kind: ImageType, seen: Seen) -> Colours:
     if kind in OF_NUMBERS and numbers is not None:
         shades = np.pad(_SHADES[kind][seen.ids], ((0, 0), (0, 1)))  # a word each: that is quicker
         shown = np.take(shades.view(np.uint32), numbers, mode="wrap")  # that of nothing is -1
-        return cv2.cvtColor(shown.view(np.uint8).reshape(*shown.shape, 4), cv2.COLOR_RGBA2RGB)
+        pixels = shown.view(np.uint8).reshape(*shown.shape, 4)
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGBA2RGB), np.uint8)
     if kind is ImageType.SURFACE_NORMALS and depth is not None:
         turned = surface_normals(depth, seen.info) @ seen.turn.T.astype(np.float32)
         levels = np.rint((turned + np.float32(1.0)) * np.float32(127.5))
