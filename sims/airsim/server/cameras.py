@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from msgspec.structs import asdict, astuple
+from msgspec.structs import astuple
 
 from events.base import Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_rpy, multiply, normalize, rotate
@@ -42,8 +42,6 @@ MOST = 64  # images of one call, and calls that wait for their images at a time
 ABANDONED = 8  # calls of clients that have left with more of which the renderer is full
 TIMEOUT = 600.0  # real seconds after which the renderer hangs; the longest call takes some 30
 LONGEST = 100_000_000  # bytes of all images of one call: Cosys-AirSim's client takes no more
-
-_RESPONSES = {"airsim": wire.ImageResponse, "cosys": wire.CosysImageResponse}
 
 
 class Capture(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -276,7 +274,7 @@ class _Exposure(NamedTuple):
     qpos: npt.NDArray[np.float64]
     ids: npt.NDArray[np.uint8]
     wanted: list[Wanted]
-    known: list[wire.ImageResponse]
+    responses: list[wire.ImageResponse]  # without images
 
 
 class Images:
@@ -326,7 +324,7 @@ class Images:
         requests: list[wire.ImageRequest],
         vehicle: ServedVehicle,
         external: bool = False,
-    ) -> Awaitable[list[wire.ImageResponse]]:
+    ) -> Awaitable[msgspec.Raw]:
         """Return images of a single instant: a common stamp, and true camera poses."""
         return self.take(requests, vehicle, caller.flavour, external=external)
 
@@ -350,7 +348,10 @@ class Images:
         exposure = self._expose(requests, vehicle, caller.flavour)
 
         async def png() -> bytes:
-            return b"".join([each.image_data_uint8 for each in await self._develop(exposure)])
+            images = msgspec.msgpack.decode(
+                await self._develop(exposure), type=list[wire.ImageResponse]
+            )
+            return b"".join([each.image_data_uint8 for each in images])
 
         return png()
 
@@ -361,8 +362,12 @@ class Images:
         flavour: Flavour = "airsim",  # whose structures, and order of colours, are wanted
         *,
         external: bool = False,  # whether cameras that no vehicle carries are meant: there are none
-    ) -> Awaitable[list[wire.ImageResponse]]:
-        """Take images of the state at the call, awaitable, or raise `RpcError`; time goes on."""
+    ) -> Awaitable[msgspec.Raw]:
+        """Take images of the state at the call, or raise `RpcError`; time goes on.
+
+        Returns:
+            Awaitable of the structures, encoded.
+        """
         return self._develop(self._expose(requests, vehicle, flavour, external))
 
     def _expose(
@@ -376,6 +381,7 @@ class Images:
             raise RpcError(f"expected at most {MOST} images of one call, found {len(requests)}")
         stamp, qpos = self._drawn_state()
         exposure = _Exposure(stamp, qpos, self._segmentation_ids(), [], [])
+        poses: dict[str, Pose] = {}
         length = 0
         for each in requests:
             camera = self._cameras.find(vehicle, each.camera_name, external)
@@ -385,24 +391,32 @@ class Images:
             form: Form = "png" if each.compress else "rgb" if flavour == "cosys" else "bgr"
             form = "float" if each.pixels_as_float else form
             exposure.wanted.append(Wanted(eye, ImageType(each.image_type), form))
-            pose = self._cameras.pose(vehicle, eye, qpos)
+            if each.camera_name not in poses:
+                poses[each.camera_name] = self._cameras.pose(vehicle, eye, qpos)
+            pose = poses[each.camera_name]
             width, height = eye.spec.width, eye.spec.height
             length += width * height * (5 if form == "float" else 3)
-            known = asdict(each) | {
+            known: dict[str, Any] = {
+                "camera_name": each.camera_name,
+                "image_type": each.image_type,
+                "pixels_as_float": each.pixels_as_float,
+                "compress": each.compress,
                 "camera_position": pose.position,
                 "camera_orientation": pose.orientation,
                 "time_stamp": stamp,
                 "width": width,
                 "height": height,
             }
-            if flavour == "airsim":
-                del known["annotation_name"]
-            exposure.known.append(_RESPONSES[flavour](**known))
+            exposure.responses.append(
+                wire.ImageResponse(**known)
+                if flavour == "airsim"
+                else wire.CosysImageResponse(**known, annotation_name=each.annotation_name)
+            )
         if length > LONGEST:
             raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")
         return exposure
 
-    async def _develop(self, exposure: _Exposure) -> list[wire.ImageResponse]:
+    async def _develop(self, exposure: _Exposure) -> msgspec.Raw:
         abandoned = 0 if self._renderer is None else self._renderer.outstanding()
         if self._waiting >= MOST or abandoned > ABANDONED + self._processes:
             raise RpcError(f"expected at most {MOST} calls that wait for images")
@@ -411,17 +425,13 @@ class Images:
             await self.start()
             assert self._renderer is not None
             async with self._idle:
-                images = await self._renderer.call_untimed(Renderer.take, *exposure[:4])
+                encoded = msgspec.msgpack.encode(exposure.responses)
+                images = await self._renderer.call_untimed(Renderer.answer, *exposure[:4], encoded)
         except GraphicsError as error:
             raise RpcError(str(error)) from None
         finally:
             self._waiting -= 1
-        return [
-            msgspec.structs.replace(each, image_data_float=msgspec.Raw(image.data))
-            if each.pixels_as_float
-            else msgspec.structs.replace(each, image_data_uint8=image.tobytes())
-            for each, image in zip(exposure.known, images, strict=True)
-        ]
+        return msgspec.Raw(images.data)
 
 
 def _not_drawn(image_type: int) -> str:

@@ -15,6 +15,8 @@ from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+import msgspec
+
 from runtime.logs import NodeLogger
 from sims.airsim import wire
 from sims.airsim.server.methods import EXPECTED_ERRORS, Flavour, RpcError, Table, thrown
@@ -27,6 +29,7 @@ MOST_WARNINGS = 500  # different refusals that are logged as warnings; others ar
 SILENT, IDLE = 5.0, 300.0
 # Bytes that are read in one turn of the loop: some requests, or a part of a long one.
 SMALL, LARGE = 256, 2048
+CHUNK = 1 << 17  # bytes of an answer that are sent in one turn of the loop: some 30 µs
 
 
 class Incidents:
@@ -196,6 +199,10 @@ class Connection:
     def _answer(self, request: wire.Request, error: str | None, result: Any) -> None:
         if request.id is None or self._is_closed:
             return
+        if isinstance(result, msgspec.Raw):  # images, sent from where they are
+            head = wire.reply(request.id, error, msgspec.Raw())
+            self._write(memoryview(head), memoryview(result))
+            return
         try:
             data = wire.reply(request.id, error, result)
         except Exception as unencodable:
@@ -203,14 +210,14 @@ class Connection:
         else:
             self._write(memoryview(data))
 
-    def _write(self, data: memoryview) -> None:
+    def _write(self, *data: memoryview) -> None:
         """Send; while anything is unsent, the client's requests are not read."""
-        if self._unsent:
-            self._unsent.append(data)
-            if sum(map(len, self._unsent)) > LONGEST_QUEUE + len(data):
+        before = sum(map(len, self._unsent))
+        self._unsent.extend(data)
+        if before:
+            if before > LONGEST_QUEUE:
                 self.close(f"more than {LONGEST_QUEUE} bytes of replies are not read")
             return
-        self._unsent.append(data)
         self._flush()
         if self._unsent:
             self._loop.remove_reader(self._socket)
@@ -223,17 +230,26 @@ class Connection:
             self._loop.add_reader(self._socket, self._read)
 
     def _flush(self) -> None:
+        """Send a chunk of what is unsent; the rest is for further turns of the loop."""
+        chunk: list[memoryview] = []
+        room = CHUNK
+        for each in self._unsent:
+            chunk.append(each[:room])
+            room -= len(chunk[-1])
+            if not room:
+                break
         try:
-            while self._unsent:
-                rest = self._unsent[0][self._socket.send(self._unsent[0]) :]
-                if rest:
-                    self._unsent[0] = rest
-                    return
-                self._unsent.popleft()
+            sent = self._socket.sendmsg(chunk)
         except (BlockingIOError, InterruptedError):
-            pass
+            return
         except OSError:
             self.close()
+            return
+        while sent >= len(self._unsent[0]):
+            sent -= len(self._unsent.popleft())
+            if not self._unsent:
+                return
+        self._unsent[0] = self._unsent[0][sent:]
 
 
 def _thrown(request: wire.Request, text: str) -> str:

@@ -439,7 +439,7 @@ class Recording:
             if each.vehicle in {"", name}
         ]
 
-        async def take(taken: Awaitable[list[ImageResponse]]) -> list[ImageResponse]:
+        async def take(taken: Awaitable[msgspec.Raw]) -> msgspec.Raw:
             return await taken
 
         if requests:
@@ -459,7 +459,8 @@ def _make_folder(base: Path) -> Path:
     return folder
 
 
-def _write(folder: Path, vehicle: str, pose: Pose, images: list[ImageResponse]) -> None:
+def _write(folder: Path, vehicle: str, pose: Pose, encoded: msgspec.Raw) -> None:
+    images = msgspec.msgpack.decode(encoded, type=list[ImageResponse])
     names = []
     for image in images:
         suffix = "pfm" if image.pixels_as_float else "png" if image.compress else "ppm"
@@ -481,7 +482,7 @@ def _file(image: ImageResponse, suffix: str) -> bytes:
     """Return an image as file content; a PFM has rows from top to bottom, as AirSim's."""
     size = f"{image.width} {image.height}\n"
     if suffix == "pfm":
-        numbers = np.array(msgspec.msgpack.decode(image.image_data_float), "<f4")
+        numbers = np.array(image.image_data_float, "<f4")
         return f"Pf\n{size}-1\n".encode() + numbers.tobytes()
     header = f"P6\n{size}255\n".encode() if suffix == "ppm" else b""
     return header + image.image_data_uint8

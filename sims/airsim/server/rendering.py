@@ -12,6 +12,7 @@ from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -76,7 +77,11 @@ def palette() -> Colours:
     return colours
 
 
-_PALETTE = palette()
+_SHADES = {
+    ImageType.SEGMENTATION: palette(),
+    ImageType.INFRARED: np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1),
+}
+"""Colour of each segmentation ID, RGB, shape (256, 3), by type of image."""
 
 
 def packed(kind: ImageType, seen: Seen, form: Form) -> npt.NDArray[np.uint8]:
@@ -91,8 +96,11 @@ def packed(kind: ImageType, seen: Seen, form: Form) -> npt.NDArray[np.uint8]:
     colours = as_colours(kind, seen)
     if form == "png":
         opaque = cv2.cvtColor(colours, cv2.COLOR_RGB2BGRA)  # OpenCV's own order
-        return cv2.imencode(".png", opaque, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
-    return np.ascontiguousarray(colours if form == "rgb" else colours[..., ::-1]).ravel()
+        png = cv2.imencode(".png", opaque, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        return np.asarray(png, np.uint8).ravel()
+    if form == "bgr":
+        colours = np.asarray(cv2.cvtColor(colours, cv2.COLOR_RGB2BGR), np.uint8)
+    return colours.ravel()
 
 
 def as_numbers(kind: ImageType, seen: Seen) -> Depths:
@@ -117,15 +125,15 @@ def as_colours(kind: ImageType, seen: Seen) -> Colours:
     if kind is ImageType.SCENE and colours is not None:
         return colours
     if kind in OF_NUMBERS and numbers is not None:
-        grey = seen.ids[numbers]  # the number of nothing is -1
-        if kind is ImageType.SEGMENTATION:
-            return np.asarray(_PALETTE[grey])
-    elif kind is ImageType.SURFACE_NORMALS and depth is not None:
+        shades = np.pad(_SHADES[kind][seen.ids], ((0, 0), (0, 1)))  # a word each: that is quicker
+        shown = np.take(shades.view(np.uint32), numbers, mode="wrap")  # that of nothing is -1
+        pixels = shown.view(np.uint8).reshape(*shown.shape, 4)
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGBA2RGB), np.uint8)
+    if kind is ImageType.SURFACE_NORMALS and depth is not None:
         turned = surface_normals(depth, seen.info) @ seen.turn.T.astype(np.float32)
         levels = np.rint((turned + np.float32(1.0)) * np.float32(127.5))
         return np.where(np.isfinite(depth)[..., None], levels, 0.0).astype(np.uint8)
-    else:
-        grey = np.rint(np.minimum(as_numbers(kind, seen), 1.0) * 255.0).astype(np.uint8)
+    grey = np.rint(np.minimum(as_numbers(kind, seen), 1.0) * 255.0).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)
 
 
@@ -222,6 +230,27 @@ class Renderer:
             seen = self._see(eye, stamp, qpos, ids, {wanted[n].kind for n in numbers})
             images |= {n: packed(wanted[n].kind, seen, wanted[n].form) for n in numbers}
         return [images[n] for n in range(len(wanted))]
+
+    def answer(
+        self,
+        stamp: int,
+        qpos: Floats,
+        ids: npt.NDArray[np.uint8],
+        wanted: Sequence[Wanted],
+        responses: bytes,
+    ) -> npt.NDArray[np.uint8]:
+        """Return the msgpack of responses with images: of those in `responses`, without them.
+
+        All work on pixels is done here: it would hold up the run's loop.
+        """
+        found = msgspec.msgpack.decode(responses)
+        images = self.take(stamp, qpos, ids, wanted)
+        for response, each, image in zip(found, wanted, images, strict=True):
+            if each.form == "float":
+                response["image_data_float"] = msgspec.Raw(image.data)
+            else:
+                response["image_data_uint8"] = image.data
+        return np.frombuffer(msgspec.msgpack.encode(found), np.uint8)
 
     def close(self) -> None:
         """Give back what the renderer holds."""
