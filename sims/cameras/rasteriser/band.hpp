@@ -5,6 +5,26 @@
 
 namespace raster {
 
+// What a triangle's planes say of a ray: three edges, positive inside, and the inverse depth.
+struct Planes {
+    f4 x, y, z;
+
+    explicit Planes(const Triangle& of)
+        : x{of.edges[0][0], of.edges[1][0], of.edges[2][0], of.depth[0]},
+          y{of.edges[0][1], of.edges[1][1], of.edges[2][1], of.depth[1]},
+          z{of.edges[0][2], of.edges[1][2], of.edges[2][2], of.depth[2]} {}
+
+    explicit Planes(const Corners& of) {  // seen from the front
+        for (int k = 0; k < 3; ++k) {
+            const Vec3f edge = narrow(of.edges[k] * -1.0);
+            x[k] = edge.x, y[k] = edge.y, z[k] = edge.z;
+        }
+    }
+
+    f4 operator()(Vec3f ray) const { return x * ray.x + (y * ray.y + z * ray.z); }
+    Vec3f operator[](int k) const { return {x[k], y[k], z[k]}; }
+};
+
 class Band {
   public:
     Band(Scene& scene, int first, int last, const Images& images);
@@ -13,12 +33,17 @@ class Band {
     void finish();         // when all have found theirs
 
   private:
+    struct End {
+        float share;  // 0 to 1 of the way, or 2 if it does not end there
+        Vec3f plane;  // through the edge where it does
+    };
     struct Outline {  // a pixel that an outline crosses
         std::uint8_t* pixel;
         std::uint8_t colour[3];  // of its neighbour, and how much that covers of it, in 256ths
         int share;
     };
 
+    static constexpr int most_triangles = 64;  // of a pixel that are walked over
     static constexpr int run = 16;  // pixels side by side with one level of a mipmap
     // A mipmap's level whose texels are as large as a pixel blurs more than the pixel; so many 256ths
     // below it come nearest to the mean of 16 samples, also in how many corners are found.
@@ -58,6 +83,7 @@ class Band {
     Colours colours(int x);
     void mix(int x, int y, float nearest, std::int32_t number);
     void write(std::uint8_t* to, Colours colours, int count) const;
+    End end(const Triangle& triangle, const Planes& planes, Vec3f from, Vec3f to, int y) const;
     void smooth(int x, int y, bool below);
     void smooth_outlines() const;
     void blend();

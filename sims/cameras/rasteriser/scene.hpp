@@ -16,6 +16,8 @@ struct Mesh {
     std::vector<std::int32_t> corners;  // three of each triangle, counterclockwise from outside
     std::vector<std::int32_t> parts;    // of each triangle: number of the surface without a crease
     int part_count = 0;
+    std::vector<std::int32_t> beyond;   // of each edge: first corner of the triangle on the other
+                                        // side that belongs to the same part, or -1
 
     void find_parts();
     Vec3f middle, reach;                // of the box about it

@@ -7,43 +7,14 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
+#include <tuple>
 
 #include "band.hpp"
 
 namespace raster {
 
-namespace {
-
-// What a triangle's planes say of a ray: three edges, positive inside, and the inverse depth.
-struct Planes {
-    f4 x, y, z;
-
-    explicit Planes(const Triangle& of)
-        : x{of.edges[0][0], of.edges[1][0], of.edges[2][0], of.depth[0]},
-          y{of.edges[0][1], of.edges[1][1], of.edges[2][1], of.depth[1]},
-          z{of.edges[0][2], of.edges[1][2], of.edges[2][2], of.depth[2]} {}
-
-    f4 operator()(Vec3f ray) const { return x * ray.x + (y * ray.y + z * ray.z); }
-    Vec3f operator[](int k) const { return {x[k], y[k], z[k]}; }
-};
-
-// Where between two rays, 0 to 1, a triangle ends that the first of them meets, and by which edge.
-struct End {
-    float share = 2;  // the second meets it, too
-    int edge = 0;
-
-    End(f4 inside, f4 outside) {
-        inside = inside > 0.0f ? inside : f4{};
-        const f4 shares = inside / (inside - outside);
-        const i4 ends = outside < 0.0f;
-        for (int k = 0; k < 3; ++k)
-            if (ends[k] && shares[k] < share) share = shares[k], edge = k;
-    }
-};
-
-}  // namespace
-
-// Join triangles that share a vertex: there the normal is the same, which a crease parts.
+// Join triangles that share a vertex: there the normal is the same, which a crease parts. And find
+// those on the other side of each edge.
 void Mesh::find_parts() {
     std::vector<std::int32_t> root(points.size()), same(points.size());
     std::iota(root.begin(), root.end(), 0), std::iota(same.begin(), same.end(), 0);
@@ -56,10 +27,31 @@ void Mesh::find_parts() {
         return at;
     };
     std::sort(same.begin(), same.end(), less);  // vertices that only the places in a texture part
-    for (std::size_t k = 1; k < same.size(); ++k)
-        if (!less(same[k - 1], same[k])) root[find(same[k])] = find(same[k - 1]);
+    std::vector<std::int32_t> first(points.size());  // of the vertices that are the same
+    for (std::size_t k = 0; k < same.size(); ++k) {
+        const bool equal = k && !less(same[k - 1], same[k]);
+        first[same[k]] = equal ? first[same[k - 1]] : same[k];
+        root[find(same[k])] = find(first[same[k]]);
+    }
     for (std::size_t k = 0; k < corners.size(); ++k)
         root[find(corners[k])] = find(corners[k / 3 * 3]);
+    struct Side {
+        std::int32_t low, high, side;  // ends, and its number among all triangles' sides
+    };
+    std::vector<Side> sides;
+    for (std::size_t k = 0; k < corners.size(); ++k) {
+        const std::int32_t from = first[corners[k]], to = first[corners[k % 3 == 2 ? k - 2 : k + 1]];
+        sides.push_back({std::min(from, to), std::max(from, to), static_cast<std::int32_t>(k)});
+    }
+    std::sort(sides.begin(), sides.end(), [](const Side& a, const Side& b) {
+        return std::tie(a.low, a.high, a.side) < std::tie(b.low, b.high, b.side);
+    });
+    beyond.assign(corners.size(), -1);
+    for (std::size_t k = 1; k < sides.size(); ++k) {
+        const Side &one = sides[k - 1], &other = sides[k];
+        if (one.low != other.low || one.high != other.high) continue;
+        beyond[one.side] = other.side / 3 * 3, beyond[other.side] = one.side / 3 * 3;
+    }
     std::vector<std::int32_t> number(points.size(), -1);
     for (std::size_t k = 0; k < corners.size(); k += 3) {
         std::int32_t& part = number[find(corners[k])];
@@ -81,6 +73,41 @@ const Triangle* Band::seen_by(std::int32_t number, int y, Triangle& row) const {
     return &row;
 }
 
+// Where between two rays a surface without a crease ends, of which the first ray meets a triangle.
+Band::End Band::end(const Triangle& triangle, const Planes& planes, Vec3f from, Vec3f to,
+                    int y) const {
+    const Placed& placed = scene_.placed_[triangle.geom];
+    const Mesh& mesh = *placed.mesh;
+    const auto point = [&](std::int32_t corner) {
+        const Vec3 now = placed.seen[corner];
+        if (view_.poses == 1) return now;
+        const Vec3 later = scene_.later_[triangle.geom].seen[corner];
+        return now + (later - now) * ((y - scene_.start_) / scene_.step_);
+    };
+    std::int32_t corner = triangle.corner;
+    Planes at = planes;
+    End found{2, {}};
+    for (int count = 0; count < most_triangles; ++count) {  // across the edges between two of them
+        const f4 here = at(from), there = at(to);
+        float share = 2;
+        int edge = 0;
+        for (int k = 0; k < 3; ++k) {
+            if (!(there[k] < 0 && there[k] < here[k])) continue;
+            const float leaves = here[k] > 0 ? here[k] / (here[k] - there[k]) : 0;
+            if (leaves < share) share = leaves, edge = k;
+        }
+        if (share > 1) return {2, {}};
+        found = {count ? std::max(share, found.share) : share, at[edge]};
+        corner = mesh.beyond[corner + edge];
+        if (corner < 0) return found;
+        const std::int32_t* corners = mesh.corners.data() + corner;
+        const Corners next({point(corners[0]), point(corners[1]), point(corners[2])});
+        if (!(next.away < 0)) return found;
+        at = Planes(next);
+    }
+    return found;
+}
+
 // Blend two neighbours that see different parts: a pixel and the one right of it, or below it.
 void Band::smooth(int x, int y, bool below) {
     const int other_x = x + !below, other_y = y + below;
@@ -95,15 +122,14 @@ void Band::smooth(int x, int y, bool below) {
     const Vec3f far_ray = turned ? lens_.ray(x, y) : lens_.ray(other_x, other_y);
     const Planes nearer(*first);
     const f4 mine = nearer(near_ray), beyond = nearer(far_ray);
-    const End end(mine, beyond);
-    Vec3f plane = nearer[end.edge];
-    float share = end.share;  // of the way between the middles that is the nearer one's
+    // Of the way between the middles that is the nearer one's, and what ends it.
+    auto [share, plane] = end(*first, nearer, near_ray, far_ray, y);
     if (share > 1) {
         if (!second) return;
         const Planes farther(*second);
         const f4 theirs = farther(far_ray), behind = farther(near_ray);
-        const End start(theirs, behind);
-        share = 1 - start.share, plane = farther[start.edge];
+        const End start = end(*second, farther, far_ray, near_ray, y);
+        share = 1 - start.share, plane = start.plane;
         if (start.share > 1) {  // they meet
             const float inside = mine[3] - behind[3], outside = beyond[3] - theirs[3];
             if (!(inside >= 0 && outside < 0)) return;

@@ -114,8 +114,12 @@ def balls(info: CameraInfo) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("spec", CAMERAS, ids=lambda spec: spec.name)
-def test_known_points_fall_on_their_pixels(spec: CameraSpec) -> None:
-    """Balls at known places are seen where OpenCV projects their outlines."""
+def test_known_points_fall_on_their_pixels(spec: CameraSpec, draws: RendererName) -> None:
+    """Balls at known places are seen where OpenCV projects their outlines.
+
+    MuJoCo's outlines have steps; those of the rasteriser are smooth.
+    """
+    limit = 0.04 if draws == "raster" else 0.1  # pixels
     info = camera_info(spec)
     centres, radii = balls(info)
     world = mujoco.MjSpec()
@@ -147,7 +151,7 @@ def test_known_points_fall_on_their_pixels(spec: CameraSpec) -> None:
         errors.append(seen - centroid(expected))
     assert len(errors) >= 6
     length = np.linalg.norm(errors, axis=1)
-    assert length.max() < 0.1
+    assert length.max() < limit
     assert np.abs(np.mean(errors, axis=0)).max() < 0.03
 
 
