@@ -13,8 +13,9 @@ import contextlib
 import logging
 import secrets
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -25,7 +26,11 @@ from runtime.paths import file_names
 from runtime.peers.authentication import NONCE, ForgedError, Sealing, hello_seal
 from runtime.peers.member import Member
 from runtime.peers.messages import Hello, decode, encode
+from runtime.peers.outbox import Outbox
 from runtime.peers.zenoh_session import OnMessage, Session
+
+if TYPE_CHECKING:
+    from runtime.peers.membership import Membership
 
 log = logging.getLogger("visnav.runtime")
 
@@ -47,24 +52,6 @@ class Contact:
         self.doubt = b""
 
 
-class Meeting(Protocol):
-    """Listener to session events, on the loop; also describes this process."""
-
-    hello: Hello
-
-    def soon(self, call: Callable[..., Any], *args: Any) -> None:
-        """Have something called on the loop."""
-
-    def joined(self, member: Member) -> None:
-        """Handle the start of a session with a process."""
-
-    def left(self, member: Member, why: str = ...) -> None:
-        """Handle the end of a session."""
-
-    def unsent(self, member: Member, error: VisnavError) -> None:
-        """Handle a failure to send."""
-
-
 class Handshakes:
     """All visible processes, and our sessions with them.
 
@@ -74,7 +61,7 @@ class Handshakes:
         refused: Number of messages left out, since no process of the run wrote them.
     """
 
-    def __init__(self, key: bytes, session: Session, membership: Meeting) -> None:
+    def __init__(self, key: bytes, session: Session, membership: Membership) -> None:
         self.id = session.id
         self.refused = 0
         self._key = key
@@ -150,13 +137,7 @@ class Handshakes:
                 before is None or hello.session != before.sealing.tag
             ):
                 sealing = Sealing(self._key, (self.id, contact.nonce), (sender, hello.nonce))
-                contact.member = member = Member(
-                    sender,
-                    hello,
-                    sealing,
-                    lambda message, payload: self._session.put(sender, message, payload),
-                    lambda error: self._membership.unsent(member, error),
-                )
+                contact.member = member = self._member(sender, hello, sealing)
                 contact.nonce, contact.doubt = secrets.token_bytes(NONCE), b""
                 # Before anything that the loop seals for the session.
                 soon(self._greet_one, sender, sealing.nonce, sealing.seen, sealing.tag)
@@ -172,6 +153,13 @@ class Handshakes:
                 soon(self._greet_one, sender, mine.nonce, mine.seen, mine.tag)
             else:
                 contact.doubt = hello.nonce
+
+    def _member(self, sender: str, hello: Hello, sealing: Sealing) -> Member:
+        def put(message: bytes, payload: bytes) -> None:
+            self._session.put(sender, sealing.seal(message, payload), payload)
+
+        failed = partial(self._membership.soon, self._membership.unsent, ", ".join(hello.nodes))
+        return Member(sender, hello, sealing, Outbox(sender, put, failed))
 
     def refuse(self, sender: str, error: VisnavError) -> None:
         """Log a process whose messages are refused: once each, for so many."""
@@ -261,29 +249,7 @@ def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:
         )
 
 
-def missing(present: Iterable[Hello], nodes: Sequence[str]) -> list[str]:
-    """Return the nodes of no present process, in file order."""
-    found = {node for hello in present for node in hello.nodes}
-    return [node for node in nodes if node not in found]
-
-
-def missing_message(absent: Sequence[str], seconds: float, meet: str) -> str:
-    """Return the message for a process waiting in vain."""
-    only = ",".join(absent)
-    return (
-        f"expected all nodes to be there within {seconds:g} s (network.wait), found none of "
-        f"{', '.join(absent)} that knows our secret (network.secret) at {meet}: "
-        f"start them with --only {only}"
-    )
-
-
-def name_of(nodes: Iterable[str]) -> str:
-    """Return the name of a process: those of its nodes."""
-    return ", ".join(nodes)
-
-
-def _in_order(found: Iterable[str], nodes: Sequence[str]) -> str:
-    found = set(found)
+def _in_order(found: set[str], nodes: Sequence[str]) -> str:
     return ", ".join(node for node in nodes if node in found)
 
 

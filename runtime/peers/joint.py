@@ -38,8 +38,6 @@ import msgspec
 
 from events import Announcement
 from runtime.errors import PeerError, WireError
-from runtime.peers.clock_sync import compare
-from runtime.peers.handshake import name_of
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
 from runtime.peers.messages import (
@@ -80,7 +78,7 @@ class JointStart:
         )
         membership = self._membership
         await self._until(
-            lambda: self._whole() and all(m.announced is not None for m in membership.present()),
+            lambda: self._whole() and all(m.announced for m in membership.present()),
             whom=lambda m: m.announced is None,
         )
         everything = dict(own)
@@ -104,7 +102,7 @@ class JointStart:
             await self._until(self._whole, whom=lambda _: False)
             reference = self._reference()
             if reference is not None and not lockstep:
-                await compare(reference, membership.waiting.until)
+                await reference.compare_clocks(membership.waiting.until)
             self.say(Ready())
             if await self._decided(reference):
                 break
@@ -112,7 +110,7 @@ class JointStart:
             origin = time.monotonic_ns() + LEAD
         else:
             assert reference.begin is not None
-            best = reference.exchanges.best()
+            best = reference.best()
             origin = reference.begin.origin - (best.offset if best else 0)
             if lockstep:
                 loop = asyncio.get_running_loop()
@@ -170,7 +168,7 @@ class JointStart:
         if self._heard.setdefault(member.nodes, message) != message:
             self._membership.misfit(
                 PeerError(
-                    f"expected {name_of(member.nodes)}, which came back, to announce what it had "
+                    f"expected {member.name}, which came back, to announce what it had "
                     f"announced before, found something else ({member.place})"
                 )
             )
@@ -181,10 +179,8 @@ class JointStart:
     async def _until(
         self, condition: Callable[[], bool], *, whom: Callable[[Member], bool]
     ) -> None:
-        await self._membership.waiting.until(condition, whom=whom, limit=self._limit())
-
-    def _limit(self) -> float:
-        return self._startup_limit * (self._membership.largest() + 1)
+        limit = self._startup_limit * (self._membership.largest() + 1)
+        await self._membership.waiting.until(condition, whom=whom, limit=limit)
 
     def _reference(self) -> Member | None:
         present = self._membership.present()
@@ -282,7 +278,7 @@ class JointShutdown:
                     despite=True,
                 )
         except TimeoutError:
-            silent = [name_of(m.nodes) for m in membership.present() if m.final_summary is None]
+            silent = [m.name for m in membership.present() if m.final_summary is None]
             log.warning("no summary of %s", "; ".join(silent))
         parts = {membership.me: mine}
         processes = {membership.me: ProcessSummary(list(membership.here), membership.hello.place)}
@@ -309,7 +305,7 @@ class JointShutdown:
     def _give_up(self) -> None:
         membership = self._membership
         if silent := [m for m in membership.present() if not m.has_our_summary]:
-            names = "; ".join(name_of(m.nodes) for m in silent)
+            names = "; ".join(m.name for m in silent)
             log.error("%s: expected a word within %g s; the run ends without it", names, SILENCE)
             if membership.ended is not None:
                 membership.broadcast(membership.ended)

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Protocol
 
 import msgspec
 
@@ -14,14 +13,11 @@ from events import Announcement, Event
 from runtime.channels.sender import Listener
 from runtime.channels.tasks import Fault
 from runtime.config.model import Config
-from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
-from runtime.peers import messages
-from runtime.peers.clock_sync import ClockFollower
-from runtime.peers.handshake import name_of
+from runtime.errors import ChannelFullError, PeerError, WireError
+from runtime.peers import Others, messages
 from runtime.peers.joint import JointShutdown, JointStart
-from runtime.peers.member import Member
+from runtime.peers.member import ClockFollower, Member
 from runtime.peers.membership import Membership
-from runtime.peers.others import Others
 from runtime.peers.remote_events import RemoteEvents, subscriptions
 from runtime.peers.time_token import TimeTokenHolder
 from runtime.summary import Summary
@@ -31,30 +27,26 @@ from runtime.time.lockstep import LockstepClock, LockstepLoop
 log = logging.getLogger("visnav.runtime")
 
 
-class Run(Protocol):
-    """Operations on the run here, as requested by other processes."""
-
-    def stop(
-        self,
-        reason: str,
-        error: Exception | None = None,
-        *,
-        by: str = "user",
-        from_peer: bool = False,
-    ) -> None:
-        """End the run; `from_peer` if reported by another process."""
-
-    def connect(self) -> None:
-        """Freeze the listeners of each output anew."""
-
-
 class Peers(Others):
-    """All other processes of a run."""
+    """All other processes of a run.
 
-    def __init__(self, config: Config, only: Iterable[str], clock: Clock, run: Run) -> None:
+    Args:
+        stop: Ends the run here: given a reason, an error or `None`, `by` whom, and `from_peer`.
+        reconnect: Freezes the listeners of each output anew.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        only: Iterable[str],
+        clock: Clock,
+        stop: Callable[..., None],
+        reconnect: Callable[[], None],
+    ) -> None:
         self._config = config
         self._clock = clock
-        self._run = run
+        self._stop = stop
+        self._reconnect = reconnect
         self._membership = Membership(config, only, self)
         self._start = JointStart(self._membership, clock, float(config.run.startup_limit))
         self.shutdown = JointShutdown(self._membership, self._gather)
@@ -63,12 +55,8 @@ class Peers(Others):
         self._token: TimeTokenHolder | None = None
         self._early: list[tuple[Member, messages.OfTheRun, Event | None]] = []
         self._begun = self._ends = False
-        self._awaited: set[int] = set()  # in lockstep, time stands until they are back
-        self._returning, self._new = set[int](), set[int]()  # not yet ready; not yet gathered
-        self._apart: set[int] = set()
         self._ended_here: list[str] = []
         self._follower: ClockFollower | None = None
-        self._followed = -1
 
     # Before the run.
 
@@ -93,14 +81,13 @@ class Peers(Others):
         """Send the announcements of the nodes here; return those of all, in file order."""
         return await self._start.announce(own)
 
-    async def begin(self, connect: Callable[[], None]) -> None:
+    async def begin(self) -> None:
         """Agree with the others on the first update, and wait until then."""
-        connect()
+        self._reconnect()
         self._follow(await self._start.begin())
 
     def _follow(self, member: Member | None) -> None:
         if member is not None and isinstance(self._clock, RealClock):
-            self._followed = member.number
             self._follower = ClockFollower(self._clock, member)
 
     def start_clock(self) -> None:
@@ -115,9 +102,10 @@ class Peers(Others):
             self._loop.move(0, (len(self._membership.nodes) << 33, self._membership.me << 32))
             self._gather()
         self._receive_early()
-        absent = self._membership.waiting.absent
-        while absent:
-            self.lost(absent.pop(min(absent)))
+        for seat in self._membership.seats.values():
+            absent, seat.absent = seat.absent, None
+            if absent is not None:
+                self.lost(absent)
 
     def _receive_early(self) -> None:
         early, self._early = self._early, []
@@ -148,14 +136,15 @@ class Peers(Others):
         text = None if error is None else str(error)
         stop = messages.Stop(reason, text, apart=not self._begun, by=by)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
-        self._membership.waiting.absent.clear()
+        for seat in self._membership.seats.values():
+            seat.absent = None
         if not self._begun:  # also its senders: they need not wait for our turn
             self._membership.broadcast(stop)
             early, self._early = self._early, []
             for member, message, _ in early:
                 if isinstance(message, messages.NodeEnded):
                     self._do(member.number, message, None)
-        elif self._awaited:
+        elif self._time_stands():
             self._membership.broadcast(stop)
             self._gather(at_once=True)
         elif not from_peer:
@@ -209,8 +198,8 @@ class Peers(Others):
             case messages.Ready():
                 member.ready = True
                 member.running = member.running or message.begun
-                if member.number in self._returning:
-                    self._returning.discard(member.number)
+                if member.returning:
+                    member.returning = False
                     self._take_back(member, begun=message.begun)
             case messages.Subscriptions():
                 if self._remote is None:  # the processes here have no numbers yet
@@ -218,11 +207,11 @@ class Peers(Others):
                     return
                 self._remote.wants(member.number, message.wanted)
                 if self._begun:
-                    self._run.connect()
+                    self._reconnect()
             case messages.Stop() if not self._begun or message.serial < 0:
                 if message.apart:
                     self._go_on_without(member)
-                elif self._awaited:  # it is no use to wait for a return
+                elif self._time_stands():  # it is no use to wait for a return
                     self._gather(at_once=True)
                 self._do(member.number, message, None)
             case messages.NodeEnded() if message.node not in member.nodes:
@@ -245,9 +234,8 @@ class Peers(Others):
         """Deal with the loss of a process as its nodes' `on_error` says."""
         lost = set(member.nodes) - self.shutdown.ended_nodes
         self.shutdown.ended_nodes |= lost
-        gone = PeerError(f"{name_of(member.nodes)}: {member.over} ({member.place})")
-        if member.number in self._returning and not self._ends:
-            self._returning.discard(member.number)
+        gone = PeerError(f"{member.name}: {member.over} ({member.place})")
+        if member.returning and not self._ends:
             log.error("%s: waiting for its return again", gone)
             self._membership.settle(lost=member.nodes)
             return
@@ -269,34 +257,28 @@ class Peers(Others):
         if "stop" in rules:
             log.error("%s", gone, extra={"reported": True})
             self._gather()
-            self._run.stop(f"{name_of(member.nodes)} lost", gone, by=min(lost))
+            self._stop(f"{member.name} lost", gone, by=min(lost))
         elif "restart" in rules:
             log.error("%s: waiting for its return", gone)
             self._membership.settle(lost=member.nodes)
             if self._token is not None:
-                self._awaited.add(member.number)
+                self._membership.seats[member.number].awaited = True
                 self._token.suspend()
         else:
             log.error("%s: left out from here on", gone)
             self._membership.settle(left_out=lost)
             self._gather()
-        self._run.connect()
+        self._reconnect()
 
     def joined(self, member: Member) -> None:
         """Handle a process joining or returning after the numbering of processes."""
         self._start.say_again(member)
-        if self._begun:  # until it is ready, the run goes on without it
-            self._returning.add(member.number)
+        member.returning = self._begun  # until it is ready, the run goes on without it
 
     def now(self, ago: int = 0) -> int:
         """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
         speed = self._clock.speed if isinstance(self._clock, RealClock) else 0
         return self._clock.now() - round(ago * speed)
-
-    def unsent(self, member: Member, error: VisnavError) -> None:
-        """Log a failure to send; the loss of a process is noticed elsewhere."""
-        if not self._ends:
-            log.warning("to %s: %s", name_of(member.nodes), error)
 
     def _do(self, number: int, message: messages.Ordered, event: Event | None) -> None:
         try:
@@ -305,9 +287,9 @@ class Peers(Others):
                     self._remote.arrive(number, message.output, event)
                 case messages.Stop():
                     member = self._membership.numbered(number)
-                    where = name_of(member.nodes) if member else "?"
+                    where = member.name if member else "?"
                     failed = PeerError(f"at {where}: {message.error}") if message.error else None
-                    self._run.stop(message.reason, failed, by=message.by, from_peer=True)
+                    self._stop(message.reason, failed, by=message.by, from_peer=True)
                 case messages.NodeEnded():
                     self.shutdown.ended_nodes.add(message.node)
         except WireError as error:
@@ -317,40 +299,48 @@ class Peers(Others):
     def _take_back(self, member: Member, *, begun: bool) -> None:
         """Readmit a process: a new instance, or (if `begun`) the same, reconnected."""
         what = "found again" if begun else "back"
-        log.warning("%s: %s, at %s", name_of(member.nodes), what, member.place)
+        log.warning("%s: %s, at %s", member.name, what, member.place)
         if not begun:
             now = self._clock.now()
             real = now / self._clock.speed if isinstance(self._clock, RealClock) else 0
             member.outbox.send(messages.FirstUpdate(time.monotonic_ns() - round(real), now))
-        elif member.number == self._followed:
+        elif self._follower and self._follower.member.number == member.number:
             self._follow(member)
         self.shutdown.ended_nodes -= {*member.nodes}
-        self._apart.discard(member.number)
-        self._awaited.discard(member.number)
-        self._gather(member.number)
-        self._run.connect()
+        seat = self._membership.seats[member.number]
+        seat.apart = seat.awaited = False
+        seat.new = True
+        self._gather()
+        self._reconnect()
 
-    def _gather(self, *new: int, at_once: bool = False) -> None:
+    def _time_stands(self) -> bool:
+        return any(seat.awaited for seat in self._membership.seats.values())
+
+    def _gather(self, *, at_once: bool = False) -> None:
         """In lockstep, share turns among the processes present, unless one is awaited."""
         if self._token is None or self._loop is None or not self._begun:
             return
-        self._new.update(new)
+        membership, seats = self._membership, self._membership.seats.values()
         if at_once:
-            self._awaited.clear()
-        if self._awaited:
+            for seat in seats:
+                seat.awaited = False
+        if self._time_stands():
             return
-        present = [m for m in self._membership.present() if m.number not in self._apart]
+        present = [seat.member for seat in seats if seat.member and not seat.apart]
         self._loop.gate = self._token if present else None
         if present:
-            numbers = [self._membership.me, *(m.number for m in present)]
             self._token.gather(
-                numbers, [self._membership.id, *(m.id for m in present)], [*self._new]
+                [membership.me, *(member.number for member in present)],
+                [membership.id, *(member.id for member in present)],
+                [number for number, seat in membership.seats.items() if seat.new],
             )
-        self._new.clear()
+        for seat in seats:
+            seat.new = False
 
     def _go_on_without(self, member: Member) -> None:
         """Exclude a process from the turns: not begun yet, or given up."""
-        self._apart.add(member.number)
+        if seat := self._membership.seats.get(member.number):
+            seat.apart = True
         for node in self._ended_here:  # what was to be sent at our turn is lost
             member.outbox.send(messages.NodeEnded(node))
         self._gather()
@@ -358,11 +348,11 @@ class Peers(Others):
     # Sending.
 
     def _broadcast_in_order(self, message: messages.Ordered) -> None:
-        for member in self._membership.present():
-            if self._token is not None and self._begun and member.number not in self._apart:
-                self._token.post(member.number, message)
-            else:
-                member.outbox.send(message)
+        for number, seat in self._membership.seats.items():
+            if self._token is not None and self._begun and seat.member and not seat.apart:
+                self._token.post(number, message)
+            elif seat.member:
+                seat.member.outbox.send(message)
 
     def _leave(self, process: int, output: str, event: Event, skip: bool) -> None:
         if self._token is not None:

@@ -9,9 +9,8 @@ import pytest
 
 from events import Image
 from runtime.errors import VisnavError
-from runtime.peers.member import Outbox
 from runtime.peers.messages import EventMessage, Message, Ready, decode
-from runtime.peers.shared_memory import Outgoing
+from runtime.peers.outbox import Outbox, Outgoing
 from tests.runtime.peers.test_shared_memory import sample_image
 
 LARGE = 1000

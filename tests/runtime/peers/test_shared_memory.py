@@ -13,10 +13,9 @@ import pytest
 
 from events import Image
 from runtime.errors import WireError
-from runtime.peers import shared_memory
-from runtime.peers.member import SMALL, Outbox
+from runtime.peers import outbox
 from runtime.peers.messages import EventMessage, MemoryMapped, decode
-from runtime.peers.shared_memory import Incoming, Outgoing
+from runtime.peers.outbox import SMALL, Incoming, Outbox, Outgoing
 from runtime.wire import Packed, pack, unpack
 from runtime.workers.shared_memory import anonymous_file
 from tests.runtime.peers.samples import apart, settings
@@ -57,19 +56,19 @@ def test_a_frame_stays_until_its_last_array_is_gone_and_then_its_place_is_used_a
     assert isinstance(got, Image)
     part = got.data[5]
     del got
-    assert incoming.unread == 0
+    assert not incoming.freed
     others = {put(outgoing, sample_image(n)) for n in range(2, 5)}
     assert place not in others
     assert (part == 1).all()
     del part
-    assert incoming.unread == 1
-    outgoing.freed(incoming.freed())
-    assert incoming.unread == 0
+    assert len(incoming.freed) == 1
+    outgoing.freed.extend(incoming.take_freed())
+    assert not incoming.freed
     assert put(outgoing, sample_image(9)) == place
 
 
 def test_there_is_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_memory, "LIMIT", 100_000)
+    monkeypatch.setattr(outbox, "LIMIT", 100_000)
     outgoing, _ = both()
     packed = pack(sample_image())
     assert [outgoing.put(packed) is None for _ in range(4)] == [False, False, True, True]
@@ -172,7 +171,7 @@ def test_images_pass_through_it_if_the_file_says_so(
         return put(outgoing, packed)
 
     monkeypatch.setattr(Outgoing, "put", noted)
-    monkeypatch.setattr("runtime.peers.member.SMALL", 4096)  # less than an image of the sample
+    monkeypatch.setattr("runtime.peers.outbox.SMALL", 4096)  # less than an image of the sample
     config = settings(*THREE, shared=shared)
     one, other = apart(config, "asker", "one,other")
     assert one.outputs == other.outputs
