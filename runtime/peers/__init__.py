@@ -8,9 +8,8 @@
     handshake        how two processes that see each other come to a session, and whether they fit
     membership       who is there, who comes and who goes, and waiting for them
     time_token       lockstep: one process at a time goes on, the one with the next thing due
-    remote_events    outputs here with listeners there, and the other way round
     joint            the start and the end, in order, without anybody left behind
-    peers            all of it together, for the supervisor
+    peers            all of it together, for the supervisor, and the events that cross over
 
 An event that crosses is received once its sender's process has nothing more to do at that instant.
 A handler that returns True ends the delivery in its own process only.

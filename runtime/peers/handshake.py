@@ -14,6 +14,7 @@ import logging
 import secrets
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,7 @@ GREET_EVERY = 0.2  # seconds between two greetings of a process without an answe
 STRANGERS = 256  # most processes greeted without a session; further processes are not seen
 
 
+@dataclass(eq=False)
 class Contact:
     """A visible process, known or not.
 
@@ -46,10 +48,9 @@ class Contact:
         doubt: Nonce of a greeting of another session than ours, until it is replied to.
     """
 
-    def __init__(self) -> None:
-        self.nonce = secrets.token_bytes(NONCE)
-        self.member: Member | None = None
-        self.doubt = b""
+    nonce: bytes = field(default_factory=lambda: secrets.token_bytes(NONCE))
+    member: Member | None = None
+    doubt: bytes = b""
 
 
 class Handshakes:
@@ -62,7 +63,6 @@ class Handshakes:
     """
 
     def __init__(self, key: bytes, session: Session, membership: Membership) -> None:
-        self.id = session.id
         self.refused = 0
         self._key = key
         self._session = session
@@ -118,7 +118,7 @@ class Handshakes:
             ForgedError: The greeting is none of the run's.
             PeerError: The greeting is of another version.
         """
-        seal = hello_seal(self._key, sender, self.id)
+        seal = hello_seal(self._key, sender, self._session.id)
         try:
             hello = decode(seal.take_off(0, sealed))
         except ForgedError:
@@ -136,7 +136,9 @@ class Handshakes:
             if hello.seen == contact.nonce and (
                 before is None or hello.session != before.sealing.tag
             ):
-                sealing = Sealing(self._key, (self.id, contact.nonce), (sender, hello.nonce))
+                sealing = Sealing(
+                    self._key, (self._session.id, contact.nonce), (sender, hello.nonce)
+                )
                 contact.member = member = self._member(sender, hello, sealing)
                 contact.nonce, contact.doubt = secrets.token_bytes(NONCE), b""
                 # Before anything that the loop seals for the session.
@@ -201,7 +203,7 @@ class Handshakes:
 
     def _greet_one(self, other: str, nonce: bytes, seen: bytes = b"", tag: bytes = b"") -> None:
         hello = msgspec.structs.replace(self._membership.hello, nonce=nonce, seen=seen, session=tag)
-        seal = hello_seal(self._key, self.id, other)
+        seal = hello_seal(self._key, self._session.id, other)
         with contextlib.suppress(PeerError):  # the session is closed
             self._session.put(other, seal.put_on(0, encode(hello)), b"")
 

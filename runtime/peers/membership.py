@@ -73,7 +73,9 @@ class Membership:
         peers: Notified, on the loop, of messages and losses.
 
     Attributes:
+        nodes: All of the run, in file order.
         here: Those that run in this process, in order.
+        id: Of this process's session.
         me: Number of this process. They are numbered by their first nodes, once all have met.
         count: Number of processes; 0 before.
         seats: Those of the others, by number and in that order.
@@ -85,6 +87,7 @@ class Membership:
         chosen = set(only)
         self.nodes = [spec.name for spec in config.nodes]
         self.here = tuple(name for name in self.nodes if name in chosen)
+        self.id = ""
         self.me = self.count = 0
         self.seats: dict[int, Seat] = {}
         self._before = 0
@@ -138,6 +141,7 @@ class Membership:
 
     async def _appear(self, secret: bytes) -> None:
         session = await asyncio.to_thread(Session, self._run, self._network, secret)
+        self.id = session.id
         self._handshakes = Handshakes(derive(secret, "run", self._run), session, self)
         await asyncio.to_thread(self._handshakes.begin, self._receive)
 
@@ -162,10 +166,6 @@ class Membership:
         self._before = max((max(h.lost.count(self.here[0]), 1) for h in running), default=0)
         return True
 
-    def largest(self) -> int:
-        """Return how many nodes the process with the most has."""
-        return max(map(len, [self.here, *(seat.nodes for seat in self.seats.values())]))
-
     def owners(self) -> dict[str, int]:
         """Return the number of each node's process."""
         there = {node: number for number, seat in self.seats.items() for node in seat.nodes}
@@ -183,21 +183,10 @@ class Membership:
         """Return the process of a number, if present."""
         return self.seats[number].member if number in self.seats else None
 
-    @property
-    def id(self) -> str:
-        """Id of this process among the others."""
-        assert self._handshakes is not None
-        return self._handshakes.id
-
     def broadcast(self, message: messages.Message) -> None:
         """Send a message to all other processes present."""
         for member in self.present():
             member.outbox.send(message)
-
-    def forget(self, member: Member) -> None:
-        """Go on as if a process were gone."""
-        member.unfit = True
-        self.seats[member.number].member = None
 
     def settle(self, *, lost: Iterable[str] = (), left_out: Iterable[str] = ()) -> None:
         """State in hellos from now on: the run goes on, with these nodes lost or left out."""

@@ -1,4 +1,4 @@
-"""The other processes of a run, as its supervisor sees them."""
+"""The other processes of a run, as its supervisor sees them, and the events that cross over."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import msgspec
 
 from events import Announcement, Event
-from runtime.channels.sender import Listener
+from runtime.channels.sender import Listener, Sender
 from runtime.channels.tasks import Fault
-from runtime.config.model import Config
+from runtime.config.model import Config, NodeSpec
 from runtime.errors import ChannelFullError, PeerError, WireError
 from runtime.peers import Others, messages
 from runtime.peers.joint import JointShutdown, JointStart
 from runtime.peers.member import ClockFollower, Member
 from runtime.peers.membership import Membership
-from runtime.peers.remote_events import RemoteEvents, subscriptions
 from runtime.peers.time_token import TimeTokenHolder
 from runtime.summary import Summary
 from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.wire import event_type, kind_of
 
 log = logging.getLogger("visnav.runtime")
 
@@ -140,10 +141,7 @@ class Peers(Others):
             seat.absent = None
         if not self._begun:  # also its senders: they need not wait for our turn
             self._membership.broadcast(stop)
-            early, self._early = self._early, []
-            for member, message, _ in early:
-                if isinstance(message, messages.NodeEnded):
-                    self._do(member.number, message, None)
+            self._receive_early()
         elif self._time_stands():
             self._membership.broadcast(stop)
             self._gather(at_once=True)
@@ -190,8 +188,10 @@ class Peers(Others):
                 self._do(member.number, message, event)
             case messages.Announcements():
                 self._start.hear(member, message)
-            case messages.FinalSummary() | messages.SummaryReceived() | messages.StillWorking():
-                self.shutdown.receive(member, message)
+            case messages.FinalSummary():
+                self.shutdown.hear(member, message)
+            case messages.SummaryReceived():
+                member.has_our_summary = True
             case messages.FirstUpdate():
                 member.begin = message
                 member.running = True
@@ -218,6 +218,8 @@ class Peers(Others):
                 raise WireError(f"expected one of its nodes, found {message.node!r}")
             case messages.NodeEnded() if message.serial < 0 or (self._ends and not self._begun):
                 self._do(member.number, message, None)
+            case messages.StillWorking():
+                pass
             case _ if not self._begun:
                 if not self._ends:
                     self._early.append((member, message, event))
@@ -366,3 +368,114 @@ class Peers(Others):
     def _send_to(self, number: int, message: messages.Message, event: Event | None) -> None:
         if member := self._membership.numbered(number):
             member.outbox.send(message, event)
+
+
+Leave = Callable[[int, str, Event, bool], None]
+"""Sends an event: process number, output, event, and whether a newer event may replace this."""
+
+
+class RemoteEvents:
+    """Outputs here with listeners in other processes, and outputs there with listeners here."""
+
+    def __init__(
+        self, specs: Iterable[NodeSpec], owners: dict[str, int], me: int, leave: Leave
+    ) -> None:
+        self._leave = leave
+        self._wanted: dict[int, list[_Wanted]] = {}
+        self._arrivals: dict[str, tuple[int, Sender[Any]]] = {}
+        for spec in specs:
+            if owners[spec.name] != me:
+                for port, output in spec.node.declared.outputs.items():
+                    name = f"{spec.name}.{port}"
+                    self._arrivals[name] = (owners[spec.name], Sender(name, output.event))
+
+    def wants(self, process: int, wanted: tuple[messages.Subscription, ...]) -> None:
+        """Record the subscriptions of a process, empty if gone; `WireError` for unknown events."""
+        self._wanted[process] = [
+            _Wanted(tuple(map(event_type, each.kinds)), each.source, each.latest) for each in wanted
+        ]
+
+    def listeners(self, output: str) -> list[Listener]:
+        """Return the listeners in other processes; before those here, to reach them in any case."""
+        return [
+            RemoteListener(process, output, wanted, self._leave)
+            for process, wanted in sorted(self._wanted.items())
+        ]
+
+    def connect(self, listeners: Iterable[Listener], fault: Fault) -> None:
+        """Connect the listeners here to outputs elsewhere."""
+        listeners = list(listeners)
+        for _, sender in self._arrivals.values():
+            sender.connect(listeners, fault=fault)
+
+    def arrive(self, process: int, output: str, event: Event) -> None:
+        """Deliver an event of another process; `WireError` if it has no such output."""
+        owner, sender = self._arrivals.get(output, (None, None))
+        if sender is None or owner != process:
+            raise WireError(f"expected an output of process {process}, found {output!r}")
+        if not isinstance(event, sender.event):
+            raise WireError(
+                f"{output}: expected {sender.event.__name__}, found {type(event).__name__}"
+            )
+        sender.send(event)
+
+
+class _Wanted(Listener):
+    """In the place of an input or handler there."""
+
+    __slots__ = ("latest",)
+
+    def __init__(self, events: tuple[type[Event], ...], source: str | None, latest: bool) -> None:
+        super().__init__("", bool, events, source)
+        self.latest = latest
+
+
+class RemoteListener(Listener):
+    """All inputs and handlers of another process, as a single listener of an output."""
+
+    __slots__ = ("_leave", "_may_skip", "_output", "_process", "_wanted", "name")
+
+    def __init__(self, process: int, output: str, wanted: Iterable[_Wanted], leave: Leave) -> None:
+        super().__init__("", self.offer, ())
+        self.name = output  # whose fault it is if it cannot leave
+        self._process = process
+        self._output = output
+        self._leave = leave
+        self._wanted = wanted
+        self._may_skip: dict[tuple[type[Event], str], bool] = {}
+
+    def may_receive(self, event: type[Event]) -> bool:
+        """Return whether anything there can receive from an output of this type."""
+        return any(each.may_receive(event) for each in self._wanted)
+
+    def receives_all(self, event: type[Event]) -> bool:
+        """Return whether any listener there receives all events of an output of this type."""
+        return any(each.receives_all(event) for each in self._wanted)
+
+    def receives(self, event: type[Event], source: str) -> bool:
+        """Return whether anything there receives events of this very type from this source."""
+        return any(each.receives(event, source) for each in self._wanted)
+
+    def offer(self, event: Event) -> None:
+        """Send an event there."""
+        key = (type(event), event.source)
+        skip = self._may_skip.get(key)
+        if skip is None:
+            skip = all(each.latest for each in self._wanted if each.receives(*key))
+            self._may_skip[key] = skip
+        self._leave(self._process, self._output, event, skip)
+
+
+def subscriptions(listeners: Iterable[Listener]) -> tuple[messages.Subscription, ...]:
+    """Return the subscriptions of these listeners, for other processes."""
+    found = {
+        messages.Subscription(
+            kinds=tuple(kind_of(event) for event in listener.events),
+            source=listener.source,
+            latest=listener.stream is not None
+            and listener.stream.bound == 1
+            and listener.stream.overflow == "drop_oldest",
+        ): None
+        for listener in listeners
+    }
+    return tuple(found)

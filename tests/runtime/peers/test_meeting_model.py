@@ -237,7 +237,7 @@ def test_who_was_told_that_the_run_begins_waits_for_nobody_who_is_gone(
     told: bool, over: str, begins: bool
 ) -> None:
     """It may have stood still while the others began, and ended; the loss is one of the run."""
-    membership: Any = SimpleNamespace(present=list, largest=lambda: 1, waiting=Waiting({}, 1.0))
+    membership: Any = SimpleNamespace(present=list, here=(), seats={}, waiting=Waiting({}, 1.0))
     reference: Any = SimpleNamespace(over=over, begin=FirstUpdate(0, 0) if told else None)
     start = JointStart(membership, Still(), 1.0)  # type: ignore[arg-type]
     assert asyncio.run(start._decided(reference)) is begins
