@@ -155,7 +155,10 @@ class Membership:
             return True
         if self._missing():
             return False
-        others = {member.nodes: member for member in self._fitting()}
+        fitting = self._fitting()
+        others = {member.nodes: member for member in fitting}
+        for member in fitting:  # one is back before it was missed
+            member.unfit = others[member.nodes] is not member
         everybody = sorted([self.here, *others], key=lambda nodes: self.nodes.index(nodes[0]))
         self.me, self.count = everybody.index(self.here), len(everybody)
         for number, nodes in enumerate(everybody):
@@ -165,11 +168,6 @@ class Membership:
         running = [m.hello for m in others.values() if m.hello.running]
         self._before = max((max(h.lost.count(self.here[0]), 1) for h in running), default=0)
         return True
-
-    def owners(self) -> dict[str, int]:
-        """Return the number of each node's process."""
-        there = {node: number for number, seat in self.seats.items() for node in seat.nodes}
-        return there | dict.fromkeys(self.here, self.me)
 
     def present(self) -> list[Member]:
         """Return the other processes present, in the order of their numbers."""
@@ -300,12 +298,12 @@ class Membership:
             member.outgoing = Outgoing()
             member.outbox.send(member.outgoing.offer())
         if self.count:
-            number = self.owners()[member.nodes[0]]
-            seat = self.seats.get(number)
-            if seat is None or seat.nodes != member.nodes:
+            number = next((n for n, s in self.seats.items() if s.nodes == member.nodes), -1)
+            if number < 0:
                 text = "left alone: %s, at %s: no process of this run had these nodes"
                 log.warning(text, member.name, member.place)
                 return
+            seat = self.seats[number]
             if seat.member is not None:  # the one before has gone, but we do not know yet
                 member.held = member.held or []
                 return

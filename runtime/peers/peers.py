@@ -51,11 +51,11 @@ class Peers(Others):
         self._membership = Membership(config, only, self)
         self._start = JointStart(self._membership, clock, float(config.run.startup_limit))
         self.shutdown = JointShutdown(self._membership, self._gather)
-        self._remote: RemoteEvents | None = None
+        self._remote = RemoteEvents(config.nodes, self._membership, self._leave)
         self._loop: LockstepLoop | None = None
         self._token: TimeTokenHolder | None = None
         self._early: list[tuple[Member, messages.OfTheRun, Event | None]] = []
-        self._begun = self._ends = False
+        self._met = self._begun = self._ends = False
         self._ended_here: list[str] = []
         self._follower: ClockFollower | None = None
 
@@ -65,9 +65,7 @@ class Peers(Others):
         """Wait until all nodes of the file are there."""
         membership = self._membership
         before = await membership.meet()
-        self._remote = RemoteEvents(
-            self._config.nodes, membership.owners(), membership.me, self._leave
-        )
+        self._met = True
         if isinstance(self._clock, LockstepClock):
             loop = asyncio.get_running_loop()
             assert isinstance(loop, LockstepLoop)
@@ -117,12 +115,10 @@ class Peers(Others):
 
     def listeners(self, output: str) -> list[Listener]:
         """Return an output's listeners in other processes."""
-        return self._remote.listeners(output) if self._remote else []
+        return self._remote.listeners(output)
 
     def connect(self, listeners: list[Listener], fault: Fault) -> None:
         """Connect the listeners here to outputs elsewhere, and notify the others."""
-        if self._remote is None:
-            return
         self._remote.connect(listeners, fault)
         self._start.say(
             messages.Subscriptions(subscriptions(each for each in listeners if each.node != "run"))
@@ -202,7 +198,7 @@ class Peers(Others):
                     member.returning = False
                     self._take_back(member, begun=message.begun)
             case messages.Subscriptions():
-                if self._remote is None:  # the processes here have no numbers yet
+                if not self._met:  # the processes have no numbers yet
                     self._early.append((member, message, event))
                     return
                 self._remote.wants(member.number, message.wanted)
@@ -253,8 +249,7 @@ class Peers(Others):
             return
         if self._follower is not None and self._follower.member is member:
             self._follower.go_on_alone()
-        if self._remote is not None:
-            self._remote.wants(member.number, ())
+        self._remote.wants(member.number, ())
         rules = {spec.on_error for spec in self._config.nodes if spec.name in lost}
         if "stop" in rules:
             log.error("%s", gone, extra={"reported": True})
@@ -285,8 +280,9 @@ class Peers(Others):
     def _do(self, number: int, message: messages.Ordered, event: Event | None) -> None:
         try:
             match message:
-                case messages.EventMessage() if self._remote is not None and event is not None:
-                    self._remote.arrive(number, message.output, event)
+                case messages.EventMessage():
+                    if event is not None:  # else it was invalid
+                        self._remote.arrive(number, message.output, event)
                 case messages.Stop():
                     member = self._membership.numbered(number)
                     where = member.name if member else "?"
@@ -377,17 +373,16 @@ Leave = Callable[[int, str, Event, bool], None]
 class RemoteEvents:
     """Outputs here with listeners in other processes, and outputs there with listeners here."""
 
-    def __init__(
-        self, specs: Iterable[NodeSpec], owners: dict[str, int], me: int, leave: Leave
-    ) -> None:
+    def __init__(self, specs: Iterable[NodeSpec], membership: Membership, leave: Leave) -> None:
+        self._membership = membership
         self._leave = leave
         self._wanted: dict[int, list[_Wanted]] = {}
-        self._arrivals: dict[str, tuple[int, Sender[Any]]] = {}
-        for spec in specs:
-            if owners[spec.name] != me:
-                for port, output in spec.node.declared.outputs.items():
-                    name = f"{spec.name}.{port}"
-                    self._arrivals[name] = (owners[spec.name], Sender(name, output.event))
+        self._arrivals: dict[str, Sender[Any]] = {
+            (name := f"{spec.name}.{port}"): Sender(name, output.event)
+            for spec in specs
+            if spec.name not in membership.here
+            for port, output in spec.node.declared.outputs.items()
+        }
 
     def wants(self, process: int, wanted: tuple[messages.Subscription, ...]) -> None:
         """Record the subscriptions of a process, empty if gone; `WireError` for unknown events."""
@@ -405,13 +400,13 @@ class RemoteEvents:
     def connect(self, listeners: Iterable[Listener], fault: Fault) -> None:
         """Connect the listeners here to outputs elsewhere."""
         listeners = list(listeners)
-        for _, sender in self._arrivals.values():
+        for sender in self._arrivals.values():
             sender.connect(listeners, fault=fault)
 
     def arrive(self, process: int, output: str, event: Event) -> None:
         """Deliver an event of another process; `WireError` if it has no such output."""
-        owner, sender = self._arrivals.get(output, (None, None))
-        if sender is None or owner != process:
+        sender, node = self._arrivals.get(output), output.partition(".")[0]
+        if sender is None or node not in self._membership.seats[process].nodes:
             raise WireError(f"expected an output of process {process}, found {output!r}")
         if not isinstance(event, sender.event):
             raise WireError(

@@ -230,6 +230,22 @@ def test_all_begin_whatever_happens(
     asyncio.run(main())
 
 
+def test_who_is_back_before_it_was_missed_is_counted_once() -> None:
+    """Before all were there, the process that it was is not waited for, nor heard."""
+
+    async def main() -> None:
+        wire = Wire()
+        for _ in range(4):
+            await wire.do("drain", "asker", "one")
+            await wire.do("drain", "one", "asker")
+        wire.machines["one"].task.cancel()
+        wire.machines["one"] = Machine(wire, "one", "back")
+        await wire.settle()
+        check(wire)
+
+    asyncio.run(main())
+
+
 @pytest.mark.parametrize(
     ("told", "over", "begins"), [(True, "gone", True), (False, "gone", False), (True, "", True)]
 )
