@@ -362,7 +362,7 @@ class Waiting:
     def __init__(self, seats: Mapping[int, Seat], startup_limit: float) -> None:
         self._seats = seats.values()
         self._startup_limit = startup_limit
-        self._futures: set[asyncio.Future[None]] = set()
+        self._changed = asyncio.Event()
         self._broken: VisnavError | None = None
 
     async def until(
@@ -392,27 +392,21 @@ class Waiting:
                 raise self._broken
             if condition():
                 return
-            future = asyncio.get_running_loop().create_future()
-            self._futures.add(future)
+            hold = contextlib.nullcontext() if despite else _time_stands()
+            left = min(NAMED_EVERY, max(self._time_left(begin, limit), 0.0))
+            patience = contextlib.nullcontext() if whom is None else real_time_limit(left)
             try:
-                with contextlib.nullcontext() if despite else _time_stands():
-                    if whom is None:
-                        await future
-                    else:
-                        left = self._time_left(begin, limit)
-                        async with real_time_limit(min(NAMED_EVERY, max(left, 0.0))):
-                            await future
+                with hold:
+                    async with patience:
+                        await self._changed.wait()
             except TimeoutError:
                 assert whom is not None
                 self._name(whom, limit, late=self._time_left(begin, limit) <= 0)
-            finally:
-                self._futures.discard(future)
 
     def notify(self) -> None:
         """Have all waits check their conditions again."""
-        for future in list(self._futures):
-            if not future.done():
-                future.set_result(None)
+        self._changed.set()  # which wakes those that wait now
+        self._changed.clear()
 
     def fail(self, error: VisnavError) -> None:
         """Let all waits fail."""

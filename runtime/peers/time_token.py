@@ -130,17 +130,18 @@ class TimeTokenHolder:
         event: Event | None,
     ) -> None:
         """Take in a message of another process; raise `WireError` if it counts other processes."""
+        count = len(self._keys)
         match message:
             case TimeToken():
-                if not message.fits(len(self._keys)):
-                    raise WireError(f"expected a turn of {len(self._keys)} processes")
+                if {len(message.keys), len(message.sent), *map(len, message.sent)} != {count}:
+                    raise WireError(f"expected a turn of {count} processes")
                 if message.epoch >= self._oldest:
                     self._next = message
             case TokenRequest():
                 self._calls.add(other)  # of all of us, since only one has the turn
             case StateReport():
-                if len(message.sent) != len(self._keys):
-                    raise WireError(f"expected a standing of {len(self._keys)} processes")
+                if len(message.sent) != count:
+                    raise WireError(f"expected a standing of {count} processes")
                 self._reports[other] = message
                 self._resume()
             case _:
