@@ -55,7 +55,7 @@ class Peers(Others):
         self._loop: LockstepLoop | None = None
         self._token: TimeTokenHolder | None = None
         self._early: list[tuple[Member, messages.OfTheRun, Event | None]] = []
-        self._met = self._begun = self._ends = False
+        self._met = self._begun = False
         self._ended_here: list[str] = []
         self._follower: ClockFollower | None = None
 
@@ -129,7 +129,6 @@ class Peers(Others):
 
         They may receive it from us first.
         """
-        self._ends = True
         text = None if error is None else str(error)
         stop = messages.Stop(reason, text, apart=not self._begun, by=by)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
@@ -160,12 +159,6 @@ class Peers(Others):
     async def leave(self, summary: Summary) -> Summary:
         """Exchange summaries and leave; return the summary of all processes."""
         whole = await self.shutdown.exchange_summaries(summary)
-        await self.close()
-        return whole
-
-    async def close(self) -> None:
-        """Send the waiting messages, and leave."""
-        self._ends = True
         self.shutdown.close()
         if self._follower is not None:
             self._follower.stop()
@@ -173,12 +166,14 @@ class Peers(Others):
         if self._loop is not None:
             self._loop.gate = None
         await self._membership.close()
+        return whole
 
     # What the membership notifies of.
 
     def receive(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
         """Take in a message of another process, or raise `WireError`."""
         self.shutdown.received_at = time.monotonic()
+        ends = self._membership.ended is not None
         match message:
             case messages.EventMessage() if self._begun and self._token is None:  # most of all
                 self._do(member.number, message, event)
@@ -212,20 +207,18 @@ class Peers(Others):
                 self._do(member.number, message, None)
             case messages.NodeEnded() if message.node not in member.nodes:
                 raise WireError(f"expected one of its nodes, found {message.node!r}")
-            case messages.NodeEnded() if message.serial < 0 or (self._ends and not self._begun):
+            case messages.NodeEnded() if message.serial < 0 or (ends and not self._begun):
                 self._do(member.number, message, None)
             case messages.StillWorking():
                 pass
             case _ if not self._begun:
-                if not self._ends:
+                if not ends:
                     self._early.append((member, message, event))
             case _ if self._token is not None:
                 self._token.take(member.number, message, event)
             case messages.EventMessage() | messages.Stop() | messages.NodeEnded():
                 self._do(member.number, message, event)
-            case messages.TimeToken() | messages.TokenRequest() | messages.StateReport() if (
-                not self._ends
-            ):
+            case _ if not ends:
                 raise WireError("expected the run to be in lockstep there, too")
 
     def lost(self, member: Member) -> None:
@@ -233,19 +226,18 @@ class Peers(Others):
         lost = set(member.nodes) - self.shutdown.ended_nodes
         self.shutdown.ended_nodes |= lost
         gone = PeerError(f"{member.name}: {member.over} ({member.place})")
-        if member.returning and not self._ends:
+        ended = self._membership.ended
+        if member.returning and ended is None:
             log.error("%s: waiting for its return again", gone)
             self._membership.settle(lost=member.nodes)
             return
-        if self._ends or not lost:
+        if ended is not None or not lost:
             if lost:
                 log.warning("%s: the run ends without it", gone)
-                if self._begun and self._token is not None and self._membership.ended is not None:
-                    # Others may wait for its return, and not for their turn.
-                    self._membership.broadcast(
-                        msgspec.structs.replace(self._membership.ended, apart=False)
-                    )
-            self._gather(at_once=self._ends)
+            if lost and ended is not None and self._begun and self._token is not None:
+                # Others may wait for its return, and not for their turn.
+                self._membership.broadcast(msgspec.structs.replace(ended, apart=False))
+            self._gather(at_once=ended is not None)
             return
         if self._follower is not None and self._follower.member is member:
             self._follower.go_on_alone()
