@@ -11,7 +11,7 @@ import numpy as np
 
 from runtime.channels.answers import Answers, Outcome, Wrong
 from runtime.channels.digest import combined
-from runtime.workers.costs import Costs
+from runtime.workers.process import Costs
 
 
 class Stall(msgspec.Struct, frozen=True):

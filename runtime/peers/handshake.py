@@ -13,8 +13,10 @@ import contextlib
 import logging
 import secrets
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -25,7 +27,11 @@ from runtime.paths import file_names
 from runtime.peers.authentication import NONCE, ForgedError, Sealing, hello_seal
 from runtime.peers.member import Member
 from runtime.peers.messages import Hello, decode, encode
+from runtime.peers.outbox import Outbox
 from runtime.peers.zenoh_session import OnMessage, Session
+
+if TYPE_CHECKING:
+    from runtime.peers.membership import Membership
 
 log = logging.getLogger("visnav.runtime")
 
@@ -33,6 +39,7 @@ GREET_EVERY = 0.2  # seconds between two greetings of a process without an answe
 STRANGERS = 256  # most processes greeted without a session; further processes are not seen
 
 
+@dataclass(eq=False)
 class Contact:
     """A visible process, known or not.
 
@@ -41,28 +48,9 @@ class Contact:
         doubt: Nonce of a greeting of another session than ours, until it is replied to.
     """
 
-    def __init__(self) -> None:
-        self.nonce = secrets.token_bytes(NONCE)
-        self.member: Member | None = None
-        self.doubt = b""
-
-
-class Meeting(Protocol):
-    """Listener to session events, on the loop; also describes this process."""
-
-    hello: Hello
-
-    def soon(self, call: Callable[..., Any], *args: Any) -> None:
-        """Have something called on the loop."""
-
-    def joined(self, member: Member) -> None:
-        """Handle the start of a session with a process."""
-
-    def left(self, member: Member, why: str = ...) -> None:
-        """Handle the end of a session."""
-
-    def unsent(self, member: Member, error: VisnavError) -> None:
-        """Handle a failure to send."""
+    nonce: bytes = field(default_factory=lambda: secrets.token_bytes(NONCE))
+    member: Member | None = None
+    doubt: bytes = b""
 
 
 class Handshakes:
@@ -74,8 +62,7 @@ class Handshakes:
         refused: Number of messages left out, since no process of the run wrote them.
     """
 
-    def __init__(self, key: bytes, session: Session, membership: Meeting) -> None:
-        self.id = session.id
+    def __init__(self, key: bytes, session: Session, membership: Membership) -> None:
         self.refused = 0
         self._key = key
         self._session = session
@@ -131,7 +118,7 @@ class Handshakes:
             ForgedError: The greeting is none of the run's.
             PeerError: The greeting is of another version.
         """
-        seal = hello_seal(self._key, sender, self.id)
+        seal = hello_seal(self._key, sender, self._session.id)
         try:
             hello = decode(seal.take_off(0, sealed))
         except ForgedError:
@@ -149,14 +136,10 @@ class Handshakes:
             if hello.seen == contact.nonce and (
                 before is None or hello.session != before.sealing.tag
             ):
-                sealing = Sealing(self._key, (self.id, contact.nonce), (sender, hello.nonce))
-                contact.member = member = Member(
-                    sender,
-                    hello,
-                    sealing,
-                    lambda message, payload: self._session.put(sender, message, payload),
-                    lambda error: self._membership.unsent(member, error),
+                sealing = Sealing(
+                    self._key, (self._session.id, contact.nonce), (sender, hello.nonce)
                 )
+                contact.member = member = self._member(sender, hello, sealing)
                 contact.nonce, contact.doubt = secrets.token_bytes(NONCE), b""
                 # Before anything that the loop seals for the session.
                 soon(self._greet_one, sender, sealing.nonce, sealing.seen, sealing.tag)
@@ -172,6 +155,13 @@ class Handshakes:
                 soon(self._greet_one, sender, mine.nonce, mine.seen, mine.tag)
             else:
                 contact.doubt = hello.nonce
+
+    def _member(self, sender: str, hello: Hello, sealing: Sealing) -> Member:
+        def put(message: bytes, payload: bytes) -> None:
+            self._session.put(sender, sealing.seal(message, payload), payload)
+
+        failed = partial(self._membership.soon, self._membership.unsent, ", ".join(hello.nodes))
+        return Member(sender, hello, sealing, Outbox(sender, put, failed))
 
     def refuse(self, sender: str, error: VisnavError) -> None:
         """Log a process whose messages are refused: once each, for so many."""
@@ -213,7 +203,7 @@ class Handshakes:
 
     def _greet_one(self, other: str, nonce: bytes, seen: bytes = b"", tag: bytes = b"") -> None:
         hello = msgspec.structs.replace(self._membership.hello, nonce=nonce, seen=seen, session=tag)
-        seal = hello_seal(self._key, self.id, other)
+        seal = hello_seal(self._key, self._session.id, other)
         with contextlib.suppress(PeerError):  # the session is closed
             self._session.put(other, seal.put_on(0, encode(hello)), b"")
 
@@ -261,29 +251,7 @@ def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:
         )
 
 
-def missing(present: Iterable[Hello], nodes: Sequence[str]) -> list[str]:
-    """Return the nodes of no present process, in file order."""
-    found = {node for hello in present for node in hello.nodes}
-    return [node for node in nodes if node not in found]
-
-
-def missing_message(absent: Sequence[str], seconds: float, meet: str) -> str:
-    """Return the message for a process waiting in vain."""
-    only = ",".join(absent)
-    return (
-        f"expected all nodes to be there within {seconds:g} s (network.wait), found none of "
-        f"{', '.join(absent)} that knows our secret (network.secret) at {meet}: "
-        f"start them with --only {only}"
-    )
-
-
-def name_of(nodes: Iterable[str]) -> str:
-    """Return the name of a process: those of its nodes."""
-    return ", ".join(nodes)
-
-
-def _in_order(found: Iterable[str], nodes: Sequence[str]) -> str:
-    found = set(found)
+def _in_order(found: set[str], nodes: Sequence[str]) -> str:
     return ", ".join(node for node in nodes if node in found)
 
 

@@ -38,8 +38,6 @@ import msgspec
 
 from events import Announcement
 from runtime.errors import PeerError, WireError
-from runtime.peers.clock_sync import compare
-from runtime.peers.handshake import name_of
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
 from runtime.peers.messages import (
@@ -57,8 +55,17 @@ from runtime.time.lockstep import LockstepClock, LockstepLoop
 from runtime.time.time_limits import call_after, real_time_limit
 from runtime.wire import pack, unpack
 
+log = logging.getLogger("visnav.runtime")
+
 LEAD = 50_000_000
 """Nanoseconds from the starting message to the first update, for the message to reach all."""
+
+BUSY_EVERY = 2.0  # seconds between two `StillWorking` messages while a node here ends
+SILENCE = 8.0  # seconds without a message until the run ends without the silent processes
+PARTING = 5.0  # seconds for the processes to exchange their summaries
+
+_PARTS = msgspec.json.Decoder(Summary)
+"""Made once: msgspec crashes if two threads learn a type at the same time."""
 
 
 class JointStart:
@@ -80,18 +87,17 @@ class JointStart:
         )
         membership = self._membership
         await self._until(
-            lambda: self._whole() and all(m.announced is not None for m in membership.present()),
+            lambda: self._whole() and all(m.announced for m in membership.present()),
             whom=lambda m: m.announced is None,
         )
         everything = dict(own)
         for member in membership.present():
-            if member.announced is not None:
-                for name, frames in member.announced.by_node.items():
-                    try:
-                        everything[name] = [_announcement(frame) for frame in frames]
-                    except WireError as error:
-                        raise PeerError(f"{name}, at {member.place}: {error}") from None
-        return [a for name in self._membership.nodes for a in everything.get(name, ())]
+            for name, frames in member.announced.by_node.items() if member.announced else ():
+                try:
+                    everything[name] = [_announcement(frame) for frame in frames]
+                except WireError as error:
+                    raise PeerError(f"{name}, at {member.place}: {error}") from None
+        return [a for name in membership.nodes for a in everything.get(name, ())]
 
     async def begin(self) -> Member | None:
         """Agree with the others on the first update, wait for it, and return whose clock counts.
@@ -104,7 +110,7 @@ class JointStart:
             await self._until(self._whole, whom=lambda _: False)
             reference = self._reference()
             if reference is not None and not lockstep:
-                await compare(reference, membership.waiting.until)
+                await reference.compare_clocks(membership.waiting.until)
             self.say(Ready())
             if await self._decided(reference):
                 break
@@ -112,7 +118,7 @@ class JointStart:
             origin = time.monotonic_ns() + LEAD
         else:
             assert reference.begin is not None
-            best = reference.exchanges.best()
+            best = reference.best()
             origin = reference.begin.origin - (best.offset if best else 0)
             if lockstep:
                 loop = asyncio.get_running_loop()
@@ -170,7 +176,7 @@ class JointStart:
         if self._heard.setdefault(member.nodes, message) != message:
             self._membership.misfit(
                 PeerError(
-                    f"expected {name_of(member.nodes)}, which came back, to announce what it had "
+                    f"expected {member.name}, which came back, to announce what it had "
                     f"announced before, found something else ({member.place})"
                 )
             )
@@ -181,10 +187,10 @@ class JointStart:
     async def _until(
         self, condition: Callable[[], bool], *, whom: Callable[[Member], bool]
     ) -> None:
-        await self._membership.waiting.until(condition, whom=whom, limit=self._limit())
-
-    def _limit(self) -> float:
-        return self._startup_limit * (self._membership.largest() + 1)
+        membership = self._membership
+        largest = max(map(len, [membership.here, *(s.nodes for s in membership.seats.values())]))
+        limit = self._startup_limit * (largest + 1)
+        await membership.waiting.until(condition, whom=whom, limit=limit)
 
     def _reference(self) -> Member | None:
         present = self._membership.present()
@@ -198,16 +204,6 @@ def _announcement(frame: bytes) -> Announcement:
     if not isinstance(event, Announcement):
         raise WireError(f"expected an announcement, found {type(event).__name__}")
     return event
-
-
-log = logging.getLogger("visnav.runtime")
-
-_PARTS = msgspec.json.Decoder(Summary)
-"""Made once: msgspec crashes if two threads learn a type at the same time."""
-
-BUSY_EVERY = 2.0  # seconds between two `StillWorking` messages while a node here ends
-SILENCE = 8.0  # seconds without a message until the run ends without the silent processes
-PARTING = 5.0  # seconds for the processes to exchange their summaries
 
 
 class JointShutdown:
@@ -233,7 +229,7 @@ class JointShutdown:
     def begin(self) -> None:
         """Look from now on, in real time, whether the end goes on."""
         self.received_at = time.monotonic()
-        self._watch()
+        self._timer = call_after(BUSY_EVERY, asyncio.get_running_loop(), self._look)
 
     def close(self) -> None:
         """Look no more."""
@@ -243,25 +239,19 @@ class JointShutdown:
 
     async def wait_to_end(self, node: str) -> None:
         """Wait until all nodes after `node` have ended, in any process; "" precedes all."""
-        nodes = self._membership.nodes
-        after = set(nodes[nodes.index(node) + 1 if node else 0 :])
-        await self._membership.waiting.until(
-            lambda: (
-                not any(after & {*m.nodes} - self.ended_nodes for m in self._membership.present())
-            ),
-            despite=True,
-            whom=lambda m: bool(after & {*m.nodes} - self.ended_nodes),
+        membership = self._membership
+        after = membership.nodes[membership.nodes.index(node) + 1 if node else 0 :]
+
+        def awaited(member: Member) -> bool:
+            return not {*after}.isdisjoint({*member.nodes} - self.ended_nodes)
+
+        await membership.waiting.until(
+            lambda: not any(map(awaited, membership.present())), despite=True, whom=awaited
         )
         self.at_work = bool(node)
 
-    def receive(
-        self, member: Member, message: FinalSummary | SummaryReceived | StillWorking
-    ) -> None:
-        """Handle a part of another's summary, or its receipt of ours; or raise `WireError`."""
-        if isinstance(message, SummaryReceived):
-            member.has_our_summary = True
-        if not isinstance(message, FinalSummary):
-            return
+    def hear(self, member: Member, message: FinalSummary) -> None:
+        """Record a process's part of the summary, and confirm it; or raise `WireError`."""
         try:
             member.final_summary = _PARTS.decode(message.part)
         except (msgspec.DecodeError, RecursionError) as error:
@@ -282,7 +272,7 @@ class JointShutdown:
                     despite=True,
                 )
         except TimeoutError:
-            silent = [name_of(m.nodes) for m in membership.present() if m.final_summary is None]
+            silent = [m.name for m in membership.present() if m.final_summary is None]
             log.warning("no summary of %s", "; ".join(silent))
         parts = {membership.me: mine}
         processes = {membership.me: ProcessSummary(list(membership.here), membership.hello.place)}
@@ -294,26 +284,20 @@ class JointShutdown:
             [part for _, part in sorted(parts.items())], [p for _, p in sorted(processes.items())]
         )
 
-    def _watch(self) -> None:
-        self._timer = call_after(BUSY_EVERY, asyncio.get_running_loop(), self._look)
-
     def _look(self) -> None:
         if self._timer is None:
             return
-        if self.at_work:
-            self._membership.broadcast(StillWorking())
-        elif time.monotonic() - self.received_at > SILENCE:
-            self._give_up()
-        self._watch()
-
-    def _give_up(self) -> None:
         membership = self._membership
-        if silent := [m for m in membership.present() if not m.has_our_summary]:
-            names = "; ".join(name_of(m.nodes) for m in silent)
+        silent = [m for m in membership.present() if not m.has_our_summary]
+        if self.at_work:
+            membership.broadcast(StillWorking())
+        elif time.monotonic() - self.received_at > SILENCE and silent:
+            names = "; ".join(m.name for m in silent)
             log.error("%s: expected a word within %g s; the run ends without it", names, SILENCE)
             if membership.ended is not None:
                 membership.broadcast(membership.ended)
             for member in silent:
-                membership.forget(member)
+                member.unfit, membership.seats[member.number].member = True, None
             self._on_timeout()
             membership.waiting.notify()
+        self._timer = call_after(BUSY_EVERY, asyncio.get_running_loop(), self._look)

@@ -191,12 +191,6 @@ class TimeToken(Message, frozen=True):
     unread: tuple[Count, ...]
     sent: tuple[tuple[Count, ...], ...]
 
-    def fits(self, count: int) -> bool:
-        """Tell whether the token is for so many processes."""
-        return len(self.keys) == len(self.sent) == count and all(
-            len(row) == count for row in self.sent
-        )
-
 
 class Ack(Message, frozen=True):
     """So many bytes have arrived, and these places in your memory are read no more."""

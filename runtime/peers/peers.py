@@ -1,4 +1,4 @@
-"""The other processes of a run, as its supervisor sees them."""
+"""The other processes of a run, as its supervisor sees them, and the events that cross over."""
 
 from __future__ import annotations
 
@@ -6,69 +6,58 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Protocol
+from typing import Any
 
 import msgspec
 
 from events import Announcement, Event
-from runtime.channels.sender import Listener
+from runtime.channels.sender import Listener, Sender
 from runtime.channels.tasks import Fault
-from runtime.config.model import Config
-from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
-from runtime.peers import messages
-from runtime.peers.clock_sync import ClockFollower
-from runtime.peers.handshake import name_of
+from runtime.config.model import Config, NodeSpec
+from runtime.errors import ChannelFullError, PeerError, WireError
+from runtime.peers import Others, messages
 from runtime.peers.joint import JointShutdown, JointStart
-from runtime.peers.member import Member
+from runtime.peers.member import ClockFollower, Member
 from runtime.peers.membership import Membership
-from runtime.peers.others import Others
-from runtime.peers.remote_events import RemoteEvents, subscriptions
 from runtime.peers.time_token import TimeTokenHolder
 from runtime.summary import Summary
 from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.wire import event_type, kind_of
 
 log = logging.getLogger("visnav.runtime")
 
 
-class Run(Protocol):
-    """Operations on the run here, as requested by other processes."""
-
-    def stop(
-        self,
-        reason: str,
-        error: Exception | None = None,
-        *,
-        by: str = "user",
-        from_peer: bool = False,
-    ) -> None:
-        """End the run; `from_peer` if reported by another process."""
-
-    def connect(self) -> None:
-        """Freeze the listeners of each output anew."""
-
-
 class Peers(Others):
-    """All other processes of a run."""
+    """All other processes of a run.
 
-    def __init__(self, config: Config, only: Iterable[str], clock: Clock, run: Run) -> None:
+    Args:
+        stop: Ends the run here: given a reason, an error or `None`, `by` whom, and `from_peer`.
+        reconnect: Freezes the listeners of each output anew.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        only: Iterable[str],
+        clock: Clock,
+        stop: Callable[..., None],
+        reconnect: Callable[[], None],
+    ) -> None:
         self._config = config
         self._clock = clock
-        self._run = run
+        self._stop = stop
+        self._reconnect = reconnect
         self._membership = Membership(config, only, self)
         self._start = JointStart(self._membership, clock, float(config.run.startup_limit))
         self.shutdown = JointShutdown(self._membership, self._gather)
-        self._remote: RemoteEvents | None = None
+        self._remote = RemoteEvents(config.nodes, self._membership, self._leave)
         self._loop: LockstepLoop | None = None
         self._token: TimeTokenHolder | None = None
         self._early: list[tuple[Member, messages.OfTheRun, Event | None]] = []
-        self._begun = self._ends = False
-        self._awaited: set[int] = set()  # in lockstep, time stands until they are back
-        self._returning, self._new = set[int](), set[int]()  # not yet ready; not yet gathered
-        self._apart: set[int] = set()
+        self._met = self._begun = False
         self._ended_here: list[str] = []
         self._follower: ClockFollower | None = None
-        self._followed = -1
 
     # Before the run.
 
@@ -76,9 +65,7 @@ class Peers(Others):
         """Wait until all nodes of the file are there."""
         membership = self._membership
         before = await membership.meet()
-        self._remote = RemoteEvents(
-            self._config.nodes, membership.owners(), membership.me, self._leave
-        )
+        self._met = True
         if isinstance(self._clock, LockstepClock):
             loop = asyncio.get_running_loop()
             assert isinstance(loop, LockstepLoop)
@@ -93,14 +80,13 @@ class Peers(Others):
         """Send the announcements of the nodes here; return those of all, in file order."""
         return await self._start.announce(own)
 
-    async def begin(self, connect: Callable[[], None]) -> None:
+    async def begin(self) -> None:
         """Agree with the others on the first update, and wait until then."""
-        connect()
+        self._reconnect()
         self._follow(await self._start.begin())
 
     def _follow(self, member: Member | None) -> None:
         if member is not None and isinstance(self._clock, RealClock):
-            self._followed = member.number
             self._follower = ClockFollower(self._clock, member)
 
     def start_clock(self) -> None:
@@ -115,9 +101,10 @@ class Peers(Others):
             self._loop.move(0, (len(self._membership.nodes) << 33, self._membership.me << 32))
             self._gather()
         self._receive_early()
-        absent = self._membership.waiting.absent
-        while absent:
-            self.lost(absent.pop(min(absent)))
+        for seat in self._membership.seats.values():
+            absent, seat.absent = seat.absent, None
+            if absent is not None:
+                self.lost(absent)
 
     def _receive_early(self) -> None:
         early, self._early = self._early, []
@@ -128,12 +115,10 @@ class Peers(Others):
 
     def listeners(self, output: str) -> list[Listener]:
         """Return an output's listeners in other processes."""
-        return self._remote.listeners(output) if self._remote else []
+        return self._remote.listeners(output)
 
     def connect(self, listeners: list[Listener], fault: Fault) -> None:
         """Connect the listeners here to outputs elsewhere, and notify the others."""
-        if self._remote is None:
-            return
         self._remote.connect(listeners, fault)
         self._start.say(
             messages.Subscriptions(subscriptions(each for each in listeners if each.node != "run"))
@@ -144,18 +129,15 @@ class Peers(Others):
 
         They may receive it from us first.
         """
-        self._ends = True
         text = None if error is None else str(error)
         stop = messages.Stop(reason, text, apart=not self._begun, by=by)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
-        self._membership.waiting.absent.clear()
+        for seat in self._membership.seats.values():
+            seat.absent = None
         if not self._begun:  # also its senders: they need not wait for our turn
             self._membership.broadcast(stop)
-            early, self._early = self._early, []
-            for member, message, _ in early:
-                if isinstance(message, messages.NodeEnded):
-                    self._do(member.number, message, None)
-        elif self._awaited:
+            self._receive_early()
+        elif self._time_stands():
             self._membership.broadcast(stop)
             self._gather(at_once=True)
         elif not from_peer:
@@ -177,12 +159,6 @@ class Peers(Others):
     async def leave(self, summary: Summary) -> Summary:
         """Exchange summaries and leave; return the summary of all processes."""
         whole = await self.shutdown.exchange_summaries(summary)
-        await self.close()
-        return whole
-
-    async def close(self) -> None:
-        """Send the waiting messages, and leave."""
-        self._ends = True
         self.shutdown.close()
         if self._follower is not None:
             self._follower.stop()
@@ -190,124 +166,120 @@ class Peers(Others):
         if self._loop is not None:
             self._loop.gate = None
         await self._membership.close()
+        return whole
 
     # What the membership notifies of.
 
     def receive(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
         """Take in a message of another process, or raise `WireError`."""
         self.shutdown.received_at = time.monotonic()
+        ends = self._membership.ended is not None
         match message:
             case messages.EventMessage() if self._begun and self._token is None:  # most of all
                 self._do(member.number, message, event)
             case messages.Announcements():
                 self._start.hear(member, message)
-            case messages.FinalSummary() | messages.SummaryReceived() | messages.StillWorking():
-                self.shutdown.receive(member, message)
+            case messages.FinalSummary():
+                self.shutdown.hear(member, message)
+            case messages.SummaryReceived():
+                member.has_our_summary = True
             case messages.FirstUpdate():
                 member.begin = message
                 member.running = True
             case messages.Ready():
                 member.ready = True
                 member.running = member.running or message.begun
-                if member.number in self._returning:
-                    self._returning.discard(member.number)
+                if member.returning:
+                    member.returning = False
                     self._take_back(member, begun=message.begun)
             case messages.Subscriptions():
-                if self._remote is None:  # the processes here have no numbers yet
+                if not self._met:  # the processes have no numbers yet
                     self._early.append((member, message, event))
                     return
                 self._remote.wants(member.number, message.wanted)
                 if self._begun:
-                    self._run.connect()
+                    self._reconnect()
             case messages.Stop() if not self._begun or message.serial < 0:
                 if message.apart:
                     self._go_on_without(member)
-                elif self._awaited:  # it is no use to wait for a return
+                elif self._time_stands():  # it is no use to wait for a return
                     self._gather(at_once=True)
                 self._do(member.number, message, None)
             case messages.NodeEnded() if message.node not in member.nodes:
                 raise WireError(f"expected one of its nodes, found {message.node!r}")
-            case messages.NodeEnded() if message.serial < 0 or (self._ends and not self._begun):
+            case messages.NodeEnded() if message.serial < 0 or (ends and not self._begun):
                 self._do(member.number, message, None)
+            case messages.StillWorking():
+                pass
             case _ if not self._begun:
-                if not self._ends:
+                if not ends:
                     self._early.append((member, message, event))
             case _ if self._token is not None:
                 self._token.take(member.number, message, event)
             case messages.EventMessage() | messages.Stop() | messages.NodeEnded():
                 self._do(member.number, message, event)
-            case messages.TimeToken() | messages.TokenRequest() | messages.StateReport() if (
-                not self._ends
-            ):
+            case _ if not ends:
                 raise WireError("expected the run to be in lockstep there, too")
 
     def lost(self, member: Member) -> None:
         """Deal with the loss of a process as its nodes' `on_error` says."""
         lost = set(member.nodes) - self.shutdown.ended_nodes
         self.shutdown.ended_nodes |= lost
-        gone = PeerError(f"{name_of(member.nodes)}: {member.over} ({member.place})")
-        if member.number in self._returning and not self._ends:
-            self._returning.discard(member.number)
+        gone = PeerError(f"{member.name}: {member.over} ({member.place})")
+        ended = self._membership.ended
+        if member.returning and ended is None:
             log.error("%s: waiting for its return again", gone)
             self._membership.settle(lost=member.nodes)
             return
-        if self._ends or not lost:
+        if ended is not None or not lost:
             if lost:
                 log.warning("%s: the run ends without it", gone)
-                if self._begun and self._token is not None and self._membership.ended is not None:
-                    # Others may wait for its return, and not for their turn.
-                    self._membership.broadcast(
-                        msgspec.structs.replace(self._membership.ended, apart=False)
-                    )
-            self._gather(at_once=self._ends)
+            if lost and ended is not None and self._begun and self._token is not None:
+                # Others may wait for its return, and not for their turn.
+                self._membership.broadcast(msgspec.structs.replace(ended, apart=False))
+            self._gather(at_once=ended is not None)
             return
         if self._follower is not None and self._follower.member is member:
             self._follower.go_on_alone()
-        if self._remote is not None:
-            self._remote.wants(member.number, ())
+        self._remote.wants(member.number, ())
         rules = {spec.on_error for spec in self._config.nodes if spec.name in lost}
         if "stop" in rules:
             log.error("%s", gone, extra={"reported": True})
             self._gather()
-            self._run.stop(f"{name_of(member.nodes)} lost", gone, by=min(lost))
+            self._stop(f"{member.name} lost", gone, by=min(lost))
         elif "restart" in rules:
             log.error("%s: waiting for its return", gone)
             self._membership.settle(lost=member.nodes)
             if self._token is not None:
-                self._awaited.add(member.number)
+                self._membership.seats[member.number].awaited = True
                 self._token.suspend()
         else:
             log.error("%s: left out from here on", gone)
             self._membership.settle(left_out=lost)
             self._gather()
-        self._run.connect()
+        self._reconnect()
 
     def joined(self, member: Member) -> None:
         """Handle a process joining or returning after the numbering of processes."""
         self._start.say_again(member)
-        if self._begun:  # until it is ready, the run goes on without it
-            self._returning.add(member.number)
+        member.returning = self._begun  # until it is ready, the run goes on without it
 
     def now(self, ago: int = 0) -> int:
         """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
         speed = self._clock.speed if isinstance(self._clock, RealClock) else 0
         return self._clock.now() - round(ago * speed)
 
-    def unsent(self, member: Member, error: VisnavError) -> None:
-        """Log a failure to send; the loss of a process is noticed elsewhere."""
-        if not self._ends:
-            log.warning("to %s: %s", name_of(member.nodes), error)
-
     def _do(self, number: int, message: messages.Ordered, event: Event | None) -> None:
         try:
             match message:
-                case messages.EventMessage() if self._remote is not None and event is not None:
-                    self._remote.arrive(number, message.output, event)
+                case messages.EventMessage():
+                    if event is not None:  # else it was invalid
+                        self._remote.arrive(number, message.output, event)
                 case messages.Stop():
                     member = self._membership.numbered(number)
-                    where = name_of(member.nodes) if member else "?"
+                    where = member.name if member else "?"
                     failed = PeerError(f"at {where}: {message.error}") if message.error else None
-                    self._run.stop(message.reason, failed, by=message.by, from_peer=True)
+                    self._stop(message.reason, failed, by=message.by, from_peer=True)
                 case messages.NodeEnded():
                     self.shutdown.ended_nodes.add(message.node)
         except WireError as error:
@@ -317,40 +289,48 @@ class Peers(Others):
     def _take_back(self, member: Member, *, begun: bool) -> None:
         """Readmit a process: a new instance, or (if `begun`) the same, reconnected."""
         what = "found again" if begun else "back"
-        log.warning("%s: %s, at %s", name_of(member.nodes), what, member.place)
+        log.warning("%s: %s, at %s", member.name, what, member.place)
         if not begun:
             now = self._clock.now()
             real = now / self._clock.speed if isinstance(self._clock, RealClock) else 0
             member.outbox.send(messages.FirstUpdate(time.monotonic_ns() - round(real), now))
-        elif member.number == self._followed:
+        elif self._follower and self._follower.member.number == member.number:
             self._follow(member)
         self.shutdown.ended_nodes -= {*member.nodes}
-        self._apart.discard(member.number)
-        self._awaited.discard(member.number)
-        self._gather(member.number)
-        self._run.connect()
+        seat = self._membership.seats[member.number]
+        seat.apart = seat.awaited = False
+        seat.new = True
+        self._gather()
+        self._reconnect()
 
-    def _gather(self, *new: int, at_once: bool = False) -> None:
+    def _time_stands(self) -> bool:
+        return any(seat.awaited for seat in self._membership.seats.values())
+
+    def _gather(self, *, at_once: bool = False) -> None:
         """In lockstep, share turns among the processes present, unless one is awaited."""
         if self._token is None or self._loop is None or not self._begun:
             return
-        self._new.update(new)
+        membership, seats = self._membership, self._membership.seats.values()
         if at_once:
-            self._awaited.clear()
-        if self._awaited:
+            for seat in seats:
+                seat.awaited = False
+        if self._time_stands():
             return
-        present = [m for m in self._membership.present() if m.number not in self._apart]
+        present = [seat.member for seat in seats if seat.member and not seat.apart]
         self._loop.gate = self._token if present else None
         if present:
-            numbers = [self._membership.me, *(m.number for m in present)]
             self._token.gather(
-                numbers, [self._membership.id, *(m.id for m in present)], [*self._new]
+                [membership.me, *(member.number for member in present)],
+                [membership.id, *(member.id for member in present)],
+                [number for number, seat in membership.seats.items() if seat.new],
             )
-        self._new.clear()
+        for seat in seats:
+            seat.new = False
 
     def _go_on_without(self, member: Member) -> None:
         """Exclude a process from the turns: not begun yet, or given up."""
-        self._apart.add(member.number)
+        if seat := self._membership.seats.get(member.number):
+            seat.apart = True
         for node in self._ended_here:  # what was to be sent at our turn is lost
             member.outbox.send(messages.NodeEnded(node))
         self._gather()
@@ -358,11 +338,11 @@ class Peers(Others):
     # Sending.
 
     def _broadcast_in_order(self, message: messages.Ordered) -> None:
-        for member in self._membership.present():
-            if self._token is not None and self._begun and member.number not in self._apart:
-                self._token.post(member.number, message)
-            else:
-                member.outbox.send(message)
+        for number, seat in self._membership.seats.items():
+            if self._token is not None and self._begun and seat.member and not seat.apart:
+                self._token.post(number, message)
+            elif seat.member:
+                seat.member.outbox.send(message)
 
     def _leave(self, process: int, output: str, event: Event, skip: bool) -> None:
         if self._token is not None:
@@ -376,3 +356,113 @@ class Peers(Others):
     def _send_to(self, number: int, message: messages.Message, event: Event | None) -> None:
         if member := self._membership.numbered(number):
             member.outbox.send(message, event)
+
+
+Leave = Callable[[int, str, Event, bool], None]
+"""Sends an event: process number, output, event, and whether a newer event may replace this."""
+
+
+class RemoteEvents:
+    """Outputs here with listeners in other processes, and outputs there with listeners here."""
+
+    def __init__(self, specs: Iterable[NodeSpec], membership: Membership, leave: Leave) -> None:
+        self._membership = membership
+        self._leave = leave
+        self._wanted: dict[int, list[_Wanted]] = {}
+        self._arrivals: dict[str, Sender[Any]] = {
+            (name := f"{spec.name}.{port}"): Sender(name, output.event)
+            for spec in specs
+            if spec.name not in membership.here
+            for port, output in spec.node.declared.outputs.items()
+        }
+
+    def wants(self, process: int, wanted: tuple[messages.Subscription, ...]) -> None:
+        """Record the subscriptions of a process, empty if gone; `WireError` for unknown events."""
+        self._wanted[process] = [
+            _Wanted(tuple(map(event_type, each.kinds)), each.source, each.latest) for each in wanted
+        ]
+
+    def listeners(self, output: str) -> list[Listener]:
+        """Return the listeners in other processes; before those here, to reach them in any case."""
+        return [
+            RemoteListener(process, output, wanted, self._leave)
+            for process, wanted in sorted(self._wanted.items())
+        ]
+
+    def connect(self, listeners: Iterable[Listener], fault: Fault) -> None:
+        """Connect the listeners here to outputs elsewhere."""
+        listeners = list(listeners)
+        for sender in self._arrivals.values():
+            sender.connect(listeners, fault=fault)
+
+    def arrive(self, process: int, output: str, event: Event) -> None:
+        """Deliver an event of another process; `WireError` if it has no such output."""
+        sender, node = self._arrivals.get(output), output.partition(".")[0]
+        if sender is None or node not in self._membership.seats[process].nodes:
+            raise WireError(f"expected an output of process {process}, found {output!r}")
+        if not isinstance(event, sender.event):
+            raise WireError(
+                f"{output}: expected {sender.event.__name__}, found {type(event).__name__}"
+            )
+        sender.send(event)
+
+
+class _Wanted(Listener):
+    """In the place of an input or handler there."""
+
+    __slots__ = ("latest",)
+
+    def __init__(self, events: tuple[type[Event], ...], source: str | None, latest: bool) -> None:
+        super().__init__("", bool, events, source)
+        self.latest = latest
+
+
+class RemoteListener(Listener):
+    """All inputs and handlers of another process, as a single listener of an output."""
+
+    __slots__ = ("_leave", "_may_skip", "_output", "_process", "_wanted", "name")
+
+    def __init__(self, process: int, output: str, wanted: Iterable[_Wanted], leave: Leave) -> None:
+        super().__init__("", self.offer, ())
+        self.name = output  # whose fault it is if it cannot leave
+        self._process = process
+        self._output = output
+        self._leave = leave
+        self._wanted = wanted
+        self._may_skip: dict[tuple[type[Event], str], bool] = {}
+
+    def may_receive(self, event: type[Event]) -> bool:
+        """Return whether anything there can receive from an output of this type."""
+        return any(each.may_receive(event) for each in self._wanted)
+
+    def receives_all(self, event: type[Event]) -> bool:
+        """Return whether any listener there receives all events of an output of this type."""
+        return any(each.receives_all(event) for each in self._wanted)
+
+    def receives(self, event: type[Event], source: str) -> bool:
+        """Return whether anything there receives events of this very type from this source."""
+        return any(each.receives(event, source) for each in self._wanted)
+
+    def offer(self, event: Event) -> None:
+        """Send an event there."""
+        key = (type(event), event.source)
+        skip = self._may_skip.get(key)
+        if skip is None:
+            skip = all(each.latest for each in self._wanted if each.receives(*key))
+            self._may_skip[key] = skip
+        self._leave(self._process, self._output, event, skip)
+
+
+def subscriptions(listeners: Iterable[Listener]) -> tuple[messages.Subscription, ...]:
+    """Return the subscriptions of these listeners, for other processes."""
+    found = {
+        messages.Subscription(
+            kinds=tuple(kind_of(event) for event in listener.events),
+            source=listener.source,
+            latest=listener.stream is not None
+            and listener.stream.bound == 1
+            and listener.stream.overflow == "drop_oldest",
+        ): None
+        for listener in listeners
+    }
+    return tuple(found)

@@ -12,7 +12,6 @@ Here are no sockets: messages go out through `send`, and come in by `take`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import msgspec
 
@@ -27,23 +26,10 @@ from runtime.peers.messages import (
     TimeToken,
     TokenRequest,
 )
+from runtime.time.lockstep import LockstepLoop
 
 Send = Callable[[int, Message, Event | None], None]
 Deliver = Callable[[int, Ordered, Event | None], None]
-
-
-class Timeline(Protocol):
-    """Simulated time of a process."""
-
-    @property
-    def now(self) -> int:
-        """Nanoseconds."""
-
-    def orders(self) -> tuple[int, int]:
-        """Return the next order numbers: of the schedule, and of the loop."""
-
-    def move(self, now: int, orders: tuple[int, int]) -> None:
-        """Go to a time, and go on with these numbers."""
 
 
 class TimeTokenHolder:
@@ -55,7 +41,7 @@ class TimeTokenHolder:
     """
 
     def __init__(
-        self, me: int, count: int, timeline: Timeline, send: Send, deliver: Deliver
+        self, me: int, count: int, timeline: LockstepLoop, send: Send, deliver: Deliver
     ) -> None:
         self.holding = False
         self._me = me
@@ -144,17 +130,18 @@ class TimeTokenHolder:
         event: Event | None,
     ) -> None:
         """Take in a message of another process; raise `WireError` if it counts other processes."""
+        count = len(self._keys)
         match message:
             case TimeToken():
-                if not message.fits(len(self._keys)):
-                    raise WireError(f"expected a turn of {len(self._keys)} processes")
+                if {len(message.keys), len(message.sent), *map(len, message.sent)} != {count}:
+                    raise WireError(f"expected a turn of {count} processes")
                 if message.epoch >= self._oldest:
                     self._next = message
             case TokenRequest():
                 self._calls.add(other)  # of all of us, since only one has the turn
             case StateReport():
-                if len(message.sent) != len(self._keys):
-                    raise WireError(f"expected a standing of {len(self._keys)} processes")
+                if len(message.sent) != count:
+                    raise WireError(f"expected a standing of {count} processes")
                 self._reports[other] = message
                 self._resume()
             case _:

@@ -35,7 +35,7 @@ from runtime.run.instruments import Instruments
 from runtime.run.node_runner import Create, NodeRunner
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND, Tick, Ticker
-from runtime.workers.costs import Costs
+from runtime.workers.process import Costs
 from runtime.workers.worker import Worker
 
 W = TypeVar("W")

@@ -31,7 +31,7 @@ from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
 from runtime.host import RunEnd
 from runtime.node import Node
-from runtime.peers.others import Others
+from runtime.peers import Others
 from runtime.run import graph
 from runtime.run.event_loop import RunTask
 from runtime.run.instruments import Instruments
@@ -94,7 +94,7 @@ class Supervisor:
         if self.state.several_processes:
             from runtime.peers.peers import Peers
 
-            self.others = Peers(config, only, clock, self)
+            self.others = Peers(config, only, clock, self.stop, self.connect)
         self._ended = asyncio.Event()
         self._startup: asyncio.Task[None] | None = None
         self._tasks: dict[asyncio.Task[Any], None] = {}
@@ -317,7 +317,7 @@ class Supervisor:
             failed=_give_up,
             voices=self._voices,
         )
-        await self.others.begin(self.connect)
+        await self.others.begin()
         return mine
 
     def _check_wanted(self) -> None:

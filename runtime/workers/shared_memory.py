@@ -129,6 +129,10 @@ class MappedFile:
         self.freed: collections.deque[int] = collections.deque()
         """Offsets of blocks no longer read; appended to from any thread."""
 
+    def take_freed(self) -> tuple[int, ...]:
+        """Return the blocks no longer read, each once."""
+        return tuple(self.freed.popleft() for _ in range(len(self.freed)))
+
     def view(self, offset: int, size: int) -> Any:
         """Return the bytes of a block, freed when the last array on them is gone."""
         if self._map is None or offset + size > len(self._map):
@@ -190,8 +194,7 @@ class SharedPipe:
             for offset, _ in spans:
                 self._arena.free(offset)
             raise
-        freed = [self._window.freed.popleft() for _ in range(len(self._window.freed))]
-        frame = pickle.dumps((freed, spans, body))
+        frame = pickle.dumps((self._window.take_freed(), spans, body))
         return _LENGTH.pack(len(frame)) + frame
 
     def post(self, packed: bytes) -> None:

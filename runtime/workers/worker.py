@@ -32,8 +32,7 @@ from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND
 from runtime.time.time_limits import Starvation
-from runtime.workers.costs import Costs
-from runtime.workers.output import Output, how_it_ended
+from runtime.workers.process import Costs, Output, how_it_ended
 from runtime.workers.shared_memory import SharedPipe, anonymous_file
 
 W = TypeVar("W")

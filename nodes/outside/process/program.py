@@ -28,7 +28,7 @@ from events import DepthImage, Image
 from nodes.outside.native import Endpoint, LinkAnswer, LinkError
 from nodes.outside.process.inputs import Message
 from runtime.channels.hold import Hold
-from runtime.workers.output import Output, how_it_ended
+from runtime.workers.process import Output, how_it_ended
 
 _AT_ONCE = 1 << 16  # bytes of a single read
 _REST = 1.0  # seconds to read the last output of an ended program, as others may still write

@@ -1,16 +1,23 @@
-"""What is sealed is heard once, in order, and as it was; everything else is not."""
+"""Who may take part: those who know a secret, which others cannot read.
+
+What they seal is heard once, in order, and as it was; everything else is not.
+"""
 
 from __future__ import annotations
 
+import threading
+from pathlib import Path
 from random import Random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runtime.config.model import Config, NetworkConfig, to_builtins
+from runtime.config.reading import parse
 from runtime.errors import PeerError, WireError
 from runtime.peers import authentication
-from runtime.peers.authentication import ForgedError, Seal, Sealing, derive, hello_seal
+from runtime.peers.authentication import ForgedError, Seal, Sealing, derive, hello_seal, secret_of
 
 A, B = ("a", b"1" * 16), ("b", b"2" * 16)
 MESSAGES = st.lists(st.tuples(st.binary(max_size=40), st.binary(max_size=40)), max_size=6)
@@ -86,3 +93,66 @@ def test_parts_of_a_key_do_not_run_together() -> None:
     assert Seal(derive(b"s", "a")).put_on(1, b"ab", b"c") != Seal(derive(b"s", "a")).put_on(
         1, b"a", b"bc"
     )
+
+
+LONG = "correct horse battery"
+
+
+def test_it_is_what_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "secret"
+    file.write_text(f"{LONG}\n")
+    file.chmod(0o600)
+    monkeypatch.setenv("OUR_SECRET", LONG)
+    for setting in (LONG, "env:OUR_SECRET", f"file:{file}"):
+        assert secret_of(setting) == LONG.encode()
+
+
+@pytest.mark.parametrize("setting", ["short", "env:NOT_THERE", "file:/not/there"])
+def test_what_is_none_is_named(setting: str) -> None:
+    with pytest.raises(PeerError, match=r"network.secret: expected .* found"):
+        secret_of(setting)
+
+
+def test_a_file_that_others_may_read_is_none(tmp_path: Path) -> None:
+    file = tmp_path / "secret"
+    file.write_text(LONG)
+    file.chmod(0o644)
+    with pytest.raises(PeerError, match="only its user may read, found mode 644"):
+        secret_of(f"file:{file}")
+
+
+def test_of_one_machine_it_is_a_private_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same for all, also if they begin at once."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    found: list[bytes] = []
+    threads = [threading.Thread(target=lambda: found.append(secret_of(""))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(set(found)) == 1
+    assert len(found) == 8
+    assert len(found[0]) == 64
+    (file,) = (tmp_path / "visnav").iterdir()
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+def test_without_a_folder_for_it_one_is_told_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "file"))
+    with pytest.raises(PeerError, match=r"network.secret: .*name a secret"):
+        secret_of("")
+
+
+def test_it_is_not_written_with_the_results() -> None:
+    def settings(secret: str) -> Config:
+        node = {"name": "a", "type": "tests.runtime.peers.samples:Asker"}
+        return parse({"network": {"secret": secret}, "nodes": [node]}, "test.toml")
+
+    assert LONG not in str(to_builtins(settings(LONG)))
+    assert to_builtins(settings("env:OURS"))["network"]["secret"] == "env:OURS"
+    assert NetworkConfig().secret == ""

@@ -12,8 +12,8 @@ from typing import Any, cast
 
 import pytest
 
-from runtime.peers.clock_sync import LIMIT, ClockFollower, PhaseLockedLoop
-from runtime.peers.member import KEPT, Exchange, Exchanges, Member
+from runtime.peers.member import KEPT, LIMIT, ClockFollower, Exchange, Member, PhaseLockedLoop
+from runtime.peers.messages import Hello
 from runtime.time.clock import RealClock
 from runtime.time.lockstep import LockstepLoop
 from runtime.time.schedule import SECOND
@@ -35,21 +35,23 @@ class Alarm:
         pass
 
 
-class RemoteListener:
-    """Another process, whose answers take a while that varies; stands in for a member."""
+def member(outbox: Any = None) -> Member:
+    return Member("far", Hello((), {}, "", 0.0), cast("Any", None), outbox)
 
-    def __init__(self, clock: RealClock, ours: Callable[[], int], theirs: Callable[[], int]):
-        self.outbox = self
-        self.exchanges = Exchanges()
-        self.drift_ppm: float | None = None
-        self._clock, self._ours, self._theirs = clock, ours, theirs
+
+class Far:
+    """Another process, whose answers take a while that varies; stands in for an outbox."""
+
+    def __init__(self, clock: RealClock, theirs: Callable[[], int]) -> None:
+        self.member = member(self)
+        self._clock, self._theirs = clock, theirs
         self._random = random.Random(0)
 
     def send(self, ping: Any) -> None:
         there, back = (round(self._random.expovariate(1 / 100e3)) + 30_000 for _ in "ab")
         half = (there + back) // 2
         late = self._theirs() - back - (self._clock.now() - round(half * self._clock.speed))
-        self.exchanges.add(Exchange(there + back, 0, late))
+        self.member.exchanges.append(Exchange(there + back, 0, late))
 
 
 def followed(
@@ -70,8 +72,8 @@ def followed(
     async def main() -> tuple[list[float], float]:
         clock = RealClock(loop)
         clock.start_at(ours() + round(behind * SECOND))
-        far = RemoteListener(clock, ours, theirs)
-        following = ClockFollower(clock, cast("Member", far))
+        far = Far(clock, theirs).member
+        following = ClockFollower(clock, far)
         late, before = [], 0
         for second in range(1, 10 * seconds + 1):
             await asyncio.sleep(0.1)
@@ -135,13 +137,12 @@ def test_alone_it_runs_as_quickly_as_the_other_did() -> None:
 
 
 def test_the_quickest_exchange_counts_of_those_that_are_kept() -> None:
-    exchanges = Exchanges()
-    assert exchanges.best() is None
+    far = member()
+    assert far.best() is None
     for n in range(KEPT + 5):
-        exchanges.add(Exchange(100 + n, n, -n))
-    assert exchanges.count == KEPT + 5
-    assert exchanges.best() == Exchange(105, 5, -5)
-    assert exchanges.best(3) == Exchange(KEPT + 102, KEPT + 2, -KEPT - 2)
+        far.exchanges.append(Exchange(100 + n, n, -n))
+    assert far.best() == Exchange(105, 5, -5)
+    assert far.best(3) == Exchange(KEPT + 102, KEPT + 2, -KEPT - 2)
 
 
 QUICKER = """

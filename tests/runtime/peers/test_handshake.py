@@ -12,7 +12,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from runtime.config.model import Config
-from runtime.errors import VisnavError
 from runtime.peers.authentication import derive
 from runtime.peers.handshake import Handshakes
 from runtime.peers.membership import Membership
@@ -31,9 +30,6 @@ class Nobody:
 
     def now(self, ago: int = 0) -> int:
         return -ago
-
-    def unsent(self, member: Any, error: VisnavError) -> None:
-        raise error
 
 
 class Pair:
@@ -188,7 +184,7 @@ def test_who_is_lost_before_the_loop_comes_to_who_waits_for_it_was_met() -> None
         pair.show("one", False)
         assert await asyncio.wait_for(waiting, 10) == 0
         assert pair.ends["one"].count == 2
-        assert [*pair.ends["one"].waiting.absent] == [0]
+        assert pair.ends["one"].seats[0].absent
 
     asyncio.run(example())
 

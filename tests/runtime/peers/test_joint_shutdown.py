@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -72,10 +72,10 @@ def test_an_end_between_readiness_and_the_first_update_ends_both(
     """One of them is told, or decides, that the run has begun, and ends before it does."""
     begin = Peers.begin
 
-    async def begin_and_end(peers: Peers, connect: Callable[[], None]) -> None:
+    async def begin_and_end(peers: Peers) -> None:
         if peers._membership.here == (who,):
-            peers._run.stop("enough", ValueError("of this"))
-        await begin(peers, connect)
+            peers._stop("enough", ValueError("of this"))
+        await begin(peers)
 
     monkeypatch.setattr(Peers, "begin", begin_and_end)
     config = settings(("asker", "Asker", {}), ("one", "Answerer", {}), clock=clock, duration=60)
@@ -94,7 +94,7 @@ def test_one_that_never_hears_that_the_run_has_begun_ends_all(
 
     def deaf(peers: Peers, member: object, message: AnyMessage, event: None) -> None:
         if isinstance(message, FirstUpdate) and peers._membership.here == ("one",):
-            peers._run.stop("Ctrl-C")
+            peers._stop("Ctrl-C")
         else:
             receive(peers, member, message, event)  # type: ignore[arg-type]
 

@@ -17,9 +17,9 @@ from runtime.channels.sender import Listener
 from runtime.peers.authentication import derive
 from runtime.peers.handshake import Handshakes
 from runtime.peers.joint import JointStart
+from runtime.peers.membership import Membership, Waiting
 from runtime.peers.messages import FirstUpdate
 from runtime.peers.peers import Peers
-from runtime.peers.waiting import Waiting
 from tests.runtime.peers import samples
 
 NODES = ("asker", "one", "other")
@@ -40,6 +40,11 @@ class Still:
         return 0
 
 
+def absent(membership: Membership) -> set[str]:
+    """Return the nodes that are awaited before the first update."""
+    return {node for seat in membership.seats.values() if seat.absent for node in seat.nodes}
+
+
 class Machine:
     """One process: its part in the meeting, step by step."""
 
@@ -49,7 +54,7 @@ class Machine:
         self.begun = False
         self.heard: list[str] = []
         self.steps = asyncio.Semaphore(0)
-        self.peers = Peers(CONFIG, [node], Still(), self)  # type: ignore[arg-type]
+        self.peers = Peers(CONFIG, [node], Still(), self.stop, self.connect)  # type: ignore[arg-type]
         self.membership = self.peers._membership
         self.membership.meet = self.membership.numbers  # type: ignore[method-assign]
         self._wire = wire
@@ -67,12 +72,12 @@ class Machine:
         reference = await self.peers._start.begin()
         assert self.peers._remote is not None
         assert {*self.peers._remote._wanted} >= {m.number for m in self.membership.present()}
-        assert reference is not None or not self.membership.waiting.absent
+        assert reference is not None or not absent(self.membership)
         await self.steps.acquire()  # in real time there is a while to the first update
-        absent = [*self.membership.waiting.absent.values()]
+        lost = absent(self.membership)
         self.connect()
         self.peers.nodes_run()
-        assert {*self.membership.hello.lost} >= {n for member in absent for n in member.nodes}
+        assert {*self.membership.hello.lost} >= lost
         self.begun = True
 
     # In the place of a run, and of a session with Zenoh.
@@ -185,8 +190,10 @@ def check(wire: Wire) -> None:
         assert machine.begun, f"{node} has not begun"
         assert machine.heard == [*NODES]
         assert machine.membership.complete()
-        assert not machine.membership.waiting.absent
-        assert not peers._returning, f"{node} has not taken all back"
+        assert not absent(machine.membership)
+        assert not any(m.returning for m in machine.membership.present()), (
+            f"{node} has not taken all back"
+        )
         assert peers._remote is not None
         wanted = peers._remote._wanted
         assert len(wanted) == 2
@@ -223,6 +230,22 @@ def test_all_begin_whatever_happens(
     asyncio.run(main())
 
 
+def test_who_is_back_before_it_was_missed_is_counted_once() -> None:
+    """Before all were there, the process that it was is not waited for, nor heard."""
+
+    async def main() -> None:
+        wire = Wire()
+        for _ in range(4):
+            await wire.do("drain", "asker", "one")
+            await wire.do("drain", "one", "asker")
+        wire.machines["one"].task.cancel()
+        wire.machines["one"] = Machine(wire, "one", "back")
+        await wire.settle()
+        check(wire)
+
+    asyncio.run(main())
+
+
 @pytest.mark.parametrize(
     ("told", "over", "begins"), [(True, "gone", True), (False, "gone", False), (True, "", True)]
 )
@@ -230,9 +253,7 @@ def test_who_was_told_that_the_run_begins_waits_for_nobody_who_is_gone(
     told: bool, over: str, begins: bool
 ) -> None:
     """It may have stood still while the others began, and ended; the loss is one of the run."""
-    membership: Any = SimpleNamespace(
-        present=list, largest=lambda: 1, waiting=Waiting(lambda: (), 1.0)
-    )
+    membership: Any = SimpleNamespace(present=list, here=(), seats={}, waiting=Waiting({}, 1.0))
     reference: Any = SimpleNamespace(over=over, begin=FirstUpdate(0, 0) if told else None)
     start = JointStart(membership, Still(), 1.0)  # type: ignore[arg-type]
     assert asyncio.run(start._decided(reference)) is begins
@@ -267,7 +288,9 @@ def test_in_lockstep_time_stands_until_all_that_were_lost_are_back() -> None:
         for _ in range(3):
             await wire.do("see", "one", "asker")
             await wire.round()
-        assert 1 in peers._returning
+        (one,) = peers._membership.present()
+        assert one.number == 1
+        assert one.returning
         await wire.kill("one")
         assert {what for what, _ in token.asked} == {"suspend"}
         await wire.settle()

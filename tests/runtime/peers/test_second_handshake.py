@@ -41,7 +41,8 @@ def die(membership: Membership) -> None:
     assert handshakes is not None
     handshakes._enough.set()
     handshakes._session._session.close()  # type: ignore[no-untyped-call]
-    membership._numbered.clear()
+    for seat in membership.seats.values():
+        seat.member = None
     raise DiedError
 
 
@@ -152,9 +153,9 @@ def test_who_does_not_come_back_is_named_after_the_limit(
     join = Membership.joined
 
     def joined(membership: Membership, member: Member) -> None:
-        before = bool(membership._numbers)
+        before = membership.count
         join(membership, member)
-        if membership._numbers and not before:
+        if membership.count and not before:
             have_met.release()
 
     def die_among_those_who_have_met(membership: Membership) -> None:

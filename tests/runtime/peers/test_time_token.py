@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from random import Random
-from typing import Any
+from typing import Any, cast
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +19,7 @@ Plan = list[tuple[int, int, int]]
 
 
 class Timeline:
-    """Simulated time: a heap of what is due."""
+    """Simulated time: a heap of what is due; stands in for a loop."""
 
     def __init__(self) -> None:
         self.now = 0
@@ -56,7 +56,11 @@ class Nodes:
         for me in range(self.count):
             self.turns.append(
                 TimeTokenHolder(
-                    me, self.count, self.timelines[me], self.sender(me), self.receiver(me)
+                    me,
+                    self.count,
+                    cast("Any", self.timelines[me]),
+                    self.sender(me),
+                    self.receiver(me),
                 )
             )
         for node, (begin, _, _) in enumerate(plan):
