@@ -176,8 +176,15 @@ class Raster(Stage):
             self._world, self._lens(view.info), _at(frame), _at(eyes), len(geoms), _at(geoms),
             _at(poses), len(lights), _at(lights), *map(_at, drawn),
         )  # fmt: skip
+        if rows is None:
+            return drawn
         wanted = slice(begin - first, end - first)
-        return Drawn(*(image if image is None else image[wanted] for image in drawn))
+        colours, depths, seen = drawn
+        return Drawn(
+            None if colours is None else colours[wanted],
+            None if depths is None else depths[wanted],
+            None if seen is None else seen[wanted],
+        )
 
     @override
     def _update(self) -> None:
