@@ -1,4 +1,4 @@
-"""Visual-inertial odometry: the RGB-D tracker's map, and a filter driven by the IMU.
+"""Visual-inertial odometry: its nodes, the RGB-D tracker's map, and a filter driven by the IMU.
 
 The IMU predicts the next image's pose, all landmarks found there correct the filter (tightly
 coupled), and the map grows from the filter's pose. Where landmarks are few, a camera with depth is
@@ -9,7 +9,7 @@ new map begins, in a frame of its own.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import msgspec
@@ -18,17 +18,30 @@ import numpy.typing as npt
 
 from events import CameraAnnouncement, ImuAnnouncement
 from events.geometry import inverse, pose_matrix
-from nodes.estimators import TrackingResult
+from nodes.estimators import (
+    EstimatorConfig,
+    RgbdInertialFrame,
+    StereoInertialFrame,
+    TrackingResult,
+)
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
-from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel, cross
+from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel
 from nodes.estimators.inertial_odometry.preintegration import Rows as ImageRows
-from nodes.estimators.odometry import Depth, Grey, rays
+from nodes.estimators.odometry import (
+    Depth,
+    Grey,
+    OdometryNode,
+    Surfaces,
+    rays,
+    transform,
+)
+from nodes.estimators.rig import cross
 from nodes.estimators.visual_odometry.alignment import Alignment
-from nodes.estimators.visual_odometry.features import BELIEVED, FeatureTracker
+from nodes.estimators.visual_odometry.features import BELIEVED, FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.landmarks import MapMatch
 from nodes.estimators.visual_odometry.patches import Rows
-from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings
-from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces, surfaces_at
+from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings, baseline
+from runtime import Bundle
 
 _KNOWN = 0.3, 0.03  # largest deviations of velocity (m/s) and gravity (rad) to use the IMU
 _READING = 0.8  # noise of a depth reading, relative to a single pixel's; errors of place included
@@ -67,17 +80,13 @@ class InertialTracker(FeatureTracker):
         stereo: StereoSettings,
     ) -> None:
         cv2.setNumThreads(1)
-        self._matcher = StereoMatcher(camera.info, baseline, stereo) if baseline else None
-        surfaces = surfaces_at
-        if self._matcher is not None:
-            features = msgspec.structs.replace(features, depth_noise=self._matcher.depth_noise)
-            surfaces = self._matcher.surfaces_at
-        super().__init__(camera.info, features, surfaces)
+        matcher = StereoMatcher(camera.info, baseline, stereo) if baseline else None
+        super().__init__(camera.info, features, matcher)
         # Blocks misjudge the depth of edges in front of nothing, by which they slide along.
-        self._aligns = self._matcher is None
+        self._aligns = matcher is None
         self._imu, self._inertial, self._readout = ImuModel(imu), inertial, camera.readout
         mounted = inverse(self._imu.pose) @ pose_matrix(camera.position, camera.orientation)
-        common = _COMMON if self._matcher is None else _COMMON_BY_EYES
+        common = _COMMON if matcher is None else _COMMON_BY_EYES
         self._filter = InertialFilter(self._imu, mounted, features.keyframes + 1, common)
         self._samples = np.empty((0, 7))
         self._time: float | None = None  # of the filter, seconds
@@ -91,21 +100,12 @@ class InertialTracker(FeatureTracker):
 
     def fuse(
         self,
-        stamp: int,  # exposure on the clock of the IMU (ns)
-        image: npt.NDArray[np.uint8],  # grey or colour, of the (left) camera
-        other: npt.NDArray[np.uint8] | Depth,
+        stamp: int,
+        image: npt.NDArray[np.uint8],  # of the (left) camera
+        other: npt.NDArray[np.uint8] | Depth,  # its depth, or the image of the right camera
         samples: Floats,
     ) -> TrackingResult:
-        """Return the pose of the next image.
-
-        Args:
-            other: Its depth in metres, or the image of the right camera.
-            samples: Of the IMU since the image before: stamp (ns), angular velocity, specific
-                force; shape (n, 7).
-
-        Raises:
-            ValueError: The size is not that of the camera.
-        """
+        """Return the pose of the next image; see `Tracker.track`."""
         self._epoch = stamp if self._epoch is None else self._epoch
         now = (stamp - self._epoch) / 1e9
         samples = self._imu.corrected(
@@ -115,13 +115,9 @@ class InertialTracker(FeatureTracker):
         self._rates = self._advance(now)
         if self._readout > 0:
             image, other = self._straightened(image, other)
-        if self._matcher is None:
-            depth = np.asarray(other, np.float32)
-        else:
-            depth = self._matcher.depth(image, np.asarray(other, np.uint8))
         self._now = now
         self._force = samples[:, 4:].mean(axis=0) if len(samples) else np.zeros(3)
-        result = self.track(stamp, image, depth)
+        result = self.track(stamp, image, other)
         if self._time is None:
             return result
         lost = result.lost
@@ -272,9 +268,10 @@ class InertialTracker(FeatureTracker):
                 self._time = self._seen_at = self._now
                 self._doubt = 0.0
             self._note(grey, inverse_of, False)
-        new = np.flatnonzero(self._map.keyframes == number)
-        read = self._surfaces_at(inverse_of, self._map.pixels[new], self._settings.depth_noise)
-        self._filter.remember(number, self._seen(new, self._map.pixels[new], read, _PLACED))
+        new = np.flatnonzero(self._map.table["keyframe"] == number)
+        pixels = self._map.table["pixel"][new]
+        read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
+        self._filter.remember(number, self._seen(new, pixels, read, _PLACED))
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
         """Return a lost result; after a while, start a map at the IMU's pose or in a new frame."""
@@ -296,9 +293,8 @@ class InertialTracker(FeatureTracker):
         return self._is_known and self._now - self._seen_at <= self._inertial.carry
 
     def _camera_pose(self) -> Floats:
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self._filter.state.rotation, self._filter.state.position
-        found: Floats = pose @ self._filter.camera
+        state = self._filter.state
+        found: Floats = transform(state.rotation, state.position) @ self._filter.camera
         return found
 
     def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:
@@ -320,4 +316,53 @@ class InertialTracker(FeatureTracker):
         noises = [noise[1] * _READING * self._settings.depth_noise, slant, _BENT * read.inverse]
         variance = sum(np.square(each) for each in noises)
         scale[:, 2] = np.where(read.continuous, 1.0 / np.sqrt(variance), 0.0)
-        return Sighting(self._map.places[rows], self._map.keyframes[rows], measured, scale)
+        these = self._map.table[rows]
+        return Sighting(these["place"], these["keyframe"], measured, scale)
+
+
+class InertialOdometryConfig(EstimatorConfig):
+    """Settings of visual-inertial odometry; the IMU's noise is as announced.
+
+    Attributes:
+        inertial: Settings of the fusion with the IMU.
+        features: Settings of the map; of a stereo rig, its ``depth_noise`` is that of the matching.
+        stereo: Settings of the matching of a stereo rig's images.
+    """
+
+    inertial: InertialSettings = InertialSettings()
+    features: FeatureSettings = FeatureSettings()
+    stereo: StereoSettings = StereoSettings()
+
+
+class _InertialOdometry(OdometryNode[InertialOdometryConfig]):
+    inertial = True
+    lenses = frozenset()
+    tracks = staticmethod(InertialTracker.fuse)
+
+    def tracker(self) -> tuple[Any, ...]:
+        """Return what makes the tracker, and its arguments."""
+        camera, config = self.the_camera(), self.config
+        if self.imu_announcement is None:
+            self.log.fatal("%s", self._missing())
+        apart = baseline(*self.cameras) if self.eyes == 2 else 0.0
+        settings = config.features, config.inertial, config.stereo
+        return InertialTracker, camera, self.imu_announcement, apart, *settings
+
+
+class RgbdInertialOdometry(_InertialOdometry):
+    """Estimates pose, velocity and covariance of a camera with depth and an IMU."""
+
+    needs = frozenset({"grey", "depth"})
+    method = "RGB-D-inertial odometry (filter)"
+
+    frames = Bundle(RgbdInertialFrame, keep="latest")
+
+
+class StereoInertialOdometry(_InertialOdometry):
+    """Estimates pose, velocity and covariance of a rectified stereo rig and an IMU."""
+
+    needs = frozenset({"grey"})
+    eyes = 2
+    method = "stereo-inertial odometry (filter)"
+
+    frames = Bundle(StereoInertialFrame, keep="latest")
