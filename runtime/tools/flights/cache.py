@@ -1,26 +1,39 @@
 """Flights by their content, in ``~/.cache/visnav-runtime/flights``.
 
 ``VISNAV_FLIGHTS_GB`` says how much they may take (20 if it does not); of more, those that were not
-used for longest are removed. A flight is written by one process at a time, and as a whole.
+used for longest are removed. A flight is written by one process at a time, and as a whole. Its
+name is made of all that it depends on: settings, sources, files, machine.
 """
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import errno
 import fcntl
+import functools
+import importlib.util
+import json
 import logging
 import os
-from collections.abc import Iterator
+import re
+import sys
+import threading
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from runtime.config.model import Config
+import msgspec
+import xxhash
+
+from runtime.config.model import Config, NodeSpec, to_builtins
 from runtime.errors import VisnavError
 from runtime.node import Node
-from runtime.tools.flights.player import opened, stand_ins
-from runtime.tools.flights.recorder import content_key, flight_of
-from runtime.tools.flights.recorder import record as fly
+from runtime.paths import written
+from runtime.run.graph import edges_of
+from runtime.run.summarise import environment
+from runtime.tools.flights.flight import opened, stand_ins
+from runtime.tools.flights.flight import record as record_flight
 
 _LOG = logging.getLogger("visnav.flights")
 
@@ -104,7 +117,7 @@ def _remove(file: Path, flight: Path) -> bool:
 def _write(part: Config, path: Path) -> None:
     new = _unfinished(path)
     try:
-        fly(part, new)
+        record_flight(part, new)
         limit = float(os.environ.get("VISNAV_FLIGHTS_GB", LIMIT))
         remove_beyond(max(limit - new.stat().st_size / 1e9, 0.0))
         new.rename(path)
@@ -128,3 +141,152 @@ def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
         yield
     finally:
         os.close(file)
+
+
+_DRIVERS = (
+    *("/usr/lib/*/libEGL*", "/usr/lib/*/libgallium*", "/usr/lib/*/libLLVM*", "/usr/lib/*/dri/*"),
+    "/proc/driver/nvidia/version",
+)
+_VARIABLES = re.compile("MUJOCO_|E?GL|_?_?E?GL[VX]?_|LIBGL_|GALLIUM_|MESA_|LP_")
+_PARSING = threading.Lock()
+"""Lock for Python 3.11's parser: all threads share a depth counter (cpython#106905)."""
+_NAMED = re.compile(r'\bfile\w*\s*=\s*"([^"]+)"')
+_FOLDERS = re.compile(r'(?:mesh|texture|asset)dir\s*=\s*"([^"]+)"')
+
+
+def flight_of(config: Config) -> Config | None:
+    """Return the flying part of a file; `None` if anything else affects the flight.
+
+    So does a node whose output a port of the flight takes, unless the port is narrowed to a source
+    of the flight. Nodes that write files, or give no equal results, have to run themselves.
+    """
+    flying = {spec.name: spec for spec in config.nodes if spec.node.flies}
+    if config.run.clock != "lockstep" or not flying:
+        return None
+    if any(
+        not s.node.deterministic or s.node.files or [*written(s.config)] for s in flying.values()
+    ):
+        return None
+    for sender, _, _, receiver, port in edges_of(config.nodes):
+        if receiver in flying and sender not in flying:
+            source = _narrowed(flying[receiver], port)
+            if source is None or source.partition("/")[0] not in flying:
+                return None
+    return msgspec.structs.replace(config, nodes=tuple(flying.values()))
+
+
+def _narrowed(spec: NodeSpec, port: str) -> str | None:
+    bundle = port.partition(".")[0]
+    declared = spec.node.declared
+    ports: dict[str, Any] = {**declared.inputs, **declared.bundles, **declared.handlers}
+    source: str | None = spec.inputs.get(port, spec.inputs.get(bundle, ports[bundle].source))
+    return source
+
+
+def settings_key(flight: Config) -> str:
+    """Return a key, equal for flights with equal settings."""
+    run = flight.run
+    nodes = to_builtins(flight)["nodes"]
+    return _hashed([json.dumps([run.seed, run.duration, nodes], default=str, sort_keys=True)])
+
+
+def content_key(flight: Config) -> str:
+    """Return the key of a flight: its settings, sources, files, libraries, drivers."""
+    texts = [settings_key(flight), json.dumps(environment())]
+    texts += [f"{k}={v}" for k, v in sorted(os.environ.items()) if _VARIABLES.match(k)]
+    for pattern in _DRIVERS:
+        for path in sorted(Path("/").glob(pattern[1:])):
+            found = path.stat()
+            texts.append(f"{path} {found.st_size} {found.st_mtime_ns}")
+    files = {*_sources([*(spec.node.__module__ for spec in flight.nodes), __name__])}
+    for path in _paths(to_builtins(flight)["nodes"]):
+        files |= _read_by(path)
+    texts += [f"{path} {_hashed([path.read_bytes()])}" for path in sorted(files)]
+    return _hashed(texts)
+
+
+def _hashed(parts: Iterable[str | bytes]) -> str:
+    digest = xxhash.xxh3_128()
+    for part in parts:
+        digest.update(part.encode() if isinstance(part, str) else part)
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def _sources(modules: Iterable[str]) -> Iterator[Path]:
+    """Yield the files of modules and their imports, without other installed packages."""
+    todo = [*modules, "events"]
+    roots = {name.partition(".")[0] for name in todo}
+    seen = {""}
+    while todo:
+        name = todo.pop()
+        root = name.partition(".")[0]
+        if name in seen or not (root in roots or _is_here(root)):
+            continue
+        seen.add(name)
+        path = _origin(name)
+        if path is None:
+            continue
+        package = path.name == "__init__.py"
+        yield from (p for p in path.parent.iterdir() if p.is_file()) if package else [path]
+        parent = name.rpartition(".")[0]
+        todo.append(parent)
+        todo += _imported(path, name if package else parent)
+
+
+def _imported(path: Path, package: str) -> Iterator[str]:
+    """Yield the modules imported anywhere in a package's file, and possible modules."""
+    if path.suffix not in {".py", ".pyi"}:
+        return
+    with contextlib.suppress(SyntaxError, ValueError):
+        with _PARSING:
+            todo: list[Any] = [ast.parse(path.read_bytes())]
+        while todo:  # statements only, which takes a third of the time of `ast.walk`
+            node = todo.pop()
+            for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+                todo += getattr(node, field, ())
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                with contextlib.suppress(ImportError):  # beyond the topmost package
+                    one = "." * node.level + (node.module or "")
+                    whole = importlib.util.resolve_name(one, package)
+                    yield from (whole, *(f"{whole}.{alias.name}" for alias in node.names))
+
+
+def _origin(name: str) -> Path | None:
+    try:
+        spec = importlib.util.find_spec(name)
+    except Exception:  # a package is imported for what is in it, and may raise anything
+        return None
+    return Path(spec.origin) if spec and spec.has_location and spec.origin else None
+
+
+@functools.cache
+def _is_here(root: str) -> bool:
+    path = None if not root or root in sys.stdlib_module_names else _origin(root)
+    return path is not None and not {"site-packages", "dist-packages"} & {*path.parts}
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """Yield the files named by settings; paths are absolute since the file was read."""
+    if isinstance(value, str) and value.startswith("/") and Path(value).exists():
+        yield Path(value)
+    elif isinstance(value, dict | list):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _paths(each)
+
+
+def _read_by(path: Path) -> set[Path]:
+    """Return a file and all files included by a MuJoCo model, or the files in a folder."""
+    if path.is_dir():
+        return {each for each in path.rglob("*") if each.is_file()}
+    found, todo, folders = {path}, [path], {path.parent}
+    while todo:
+        if (file := todo.pop()).suffix == ".xml":
+            text = file.read_text(encoding="utf-8", errors="replace")
+            folders |= {path.parent / name for name in _FOLDERS.findall(text)}
+            named = {folder / name for folder in folders for name in _NAMED.findall(text)}
+            todo += (new := sorted({each for each in named if each.is_file()} - found))
+            found.update(new)
+    return found

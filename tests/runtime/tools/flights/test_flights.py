@@ -19,9 +19,17 @@ from runtime.channels.digest import Digest
 from runtime.config.model import Config
 from runtime.config.reading import load
 from runtime.errors import NodeError
-from runtime.tools.flights.cache import home, kept, recorded, remove_beyond
-from runtime.tools.flights.player import Action, Writer, event_at
-from runtime.tools.flights.recorder import _imported, content_key, flight_of, record, settings_key
+from runtime.tools.flights.cache import (
+    _imported,
+    content_key,
+    flight_of,
+    home,
+    kept,
+    recorded,
+    remove_beyond,
+    settings_key,
+)
+from runtime.tools.flights.flight import event_at, put, record
 from tests.runtime.tools.flights import samples
 from tests.runtime.tools.flights.samples import Seen, events_of, flown
 from tests.runtime.tools.samples_cli import ROOT
@@ -265,11 +273,9 @@ def test_events_come_back_with_their_very_types(
 ) -> None:
     sent = Seen(stamp=1, source="craft", number=number, data=data.T if transposed else data)
     file = io.BytesIO(b"")
-    writer = Writer(file)
-    writer.event(sent)
-    place, sizes = writer.event(sent)
-    action = Action("send", "craft", -1, [], due=place, sizes=sizes)
-    again = event_at(memoryview(file.getvalue()), action)
+    put(file, sent)
+    place = put(file, sent)
+    again = event_at(memoryview(file.getvalue()), place)
     assert type(again.number) is type(number)
     digests = [Digest(), Digest()]
     for digest, event in zip(digests, (sent, again), strict=True):
@@ -313,7 +319,7 @@ def test_one_flies_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyP
         flights.append(path)
         record(config, path)
 
-    monkeypatch.setattr("runtime.tools.flights.cache.fly", counted)
+    monkeypatch.setattr("runtime.tools.flights.cache.record_flight", counted)
     found: list[set[str]] = []
     threads = [
         threading.Thread(target=lambda: found.append({*recorded(config, record=True)}))
