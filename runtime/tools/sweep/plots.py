@@ -72,29 +72,22 @@ def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) ->
     verdicts = [each for row in rows for each in row["estimators"].values()]
     aligned = len({each.get("alignment") for each in verdicts}) > 1
     short = _short([other.path for other in plan.parameters])
-    points: dict[tuple[str, tuple[str, ...]], dict[str, list[float]]] = {}
+    found: list[tuple[str, str, str, float]] = []
     for job, row in in_order(plan, rows):
         settings = dict(job.settings)
         here = settings.pop(parameter.path)
-        others = tuple(f"{short[path]}={text}" for path, text in settings.items())
+        others = ", ".join(f"{short[path]}={text}" for path, text in settings.items())
         for estimator, figures in row["estimators"].items():
             name = f"{estimator} ({figures.get('alignment', 'none')})" if aligned else estimator
-            for number in numbers([figures.get(figure)]):
-                line = points.setdefault((name, others), {})
-                line.setdefault(here, []).append(number)
-    if len(points) <= _MOST_LINES:
-        several = len({name for name, _ in points}) > 1
-        return [
-            _line(", ".join([name] * several + [*others]), line, parameter)
-            for (name, others), line in points.items()
-        ]
-    merged: dict[str, dict[str, list[float]]] = {}
-    for (name, _), line in points.items():
-        for text, found in line.items():
-            merged.setdefault(name, {}).setdefault(text, []).extend(found)
-    return [
-        _line(f"{name}, all others".lstrip(", "), line, parameter) for name, line in merged.items()
-    ]
+            found += [(name, others, here, number) for number in numbers([figures.get(figure)])]
+    several = len({name for name, *_ in found}) > 1
+    if len({(name, others) for name, others, *_ in found}) > _MOST_LINES:
+        several, found = True, [(name, "all others", here, n) for name, _, here, n in found]
+    points: dict[str, dict[str, list[float]]] = {}
+    for name, others, here, number in found:
+        label = ", ".join(filter(None, (name * several, others)))
+        points.setdefault(label, {}).setdefault(here, []).append(number)
+    return [_line(label, line, parameter) for label, line in points.items()]
 
 
 def _short(paths: Sequence[str]) -> dict[str, str]:
