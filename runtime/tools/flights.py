@@ -1,13 +1,25 @@
-"""Flights by their content, in ``~/.cache/visnav-runtime/flights``.
+"""Flights flown once and used by many runs: what their nodes' workers have answered.
 
-``VISNAV_FLIGHTS_GB`` says how much they may take (20 if it does not); of more, those that were not
-used for longest are removed. A flight is written by one process at a time, and as a whole. Its
-name is made of all that it depends on: settings, sources, files, machine.
+What a flight costs is rendering and scanning, which its nodes have done by workers. So a flight is
+recorded as the answers of these. In a run that uses it, all nodes run as ever, and the workers of
+those that fly give the recorded answers, without any process. Simulated time waits for either: the
+same events come at the same times in the same order, to the byte.
+
+Flights are kept by their content, in ``~/.cache/visnav-runtime/flights``. ``VISNAV_FLIGHTS_GB``
+says how much they may take (20 if it does not); of more, those that were not used for longest are
+removed. A flight is written by one process at a time, and as a whole. Its name is made of all that
+it depends on: settings, sources, files, machine. Its file:
+
+    answers      each pickled: the result, or else the error
+    calls        by worker, names of methods and places of the answers, in the order of the calls
+    u64 LE       where these begin
+    16 bytes     XXH3 hash of all before
 """
 
 from __future__ import annotations
 
 import ast
+import concurrent.futures
 import contextlib
 import errno
 import fcntl
@@ -15,29 +27,43 @@ import functools
 import importlib.util
 import json
 import logging
+import mmap
 import os
+import pickle
 import re
+import struct
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import msgspec
 import xxhash
 
 from runtime.config.model import Config, NodeSpec, to_builtins
-from runtime.errors import VisnavError
-from runtime.node import Node
+from runtime.errors import VisnavError, WorkerError
+from runtime.node import Node, NodeConfig
 from runtime.paths import written
+from runtime.run.execute import Watch, execute
 from runtime.run.graph import edges_of
+from runtime.run.instruments import Instrument
 from runtime.run.summarise import environment
-from runtime.tools.flights.flight import opened, stand_ins
-from runtime.tools.flights.flight import record as record_flight
+from runtime.run.supervisor import Supervisor
+from runtime.workers.worker import Worker
 
 _LOG = logging.getLogger("visnav.flights")
 
 LIMIT = 20.0  # gigabytes, unless ``VISNAV_FLIGHTS_GB`` says otherwise
+
+Calls = dict[str, list[tuple[str, int]]]
+"""By worker, the method and the place of the answer of each call; -1 for an answer that is none."""
+
+_BEGIN = struct.Struct("<Q")
+_CHECKSUM = 16
+_REST = 10.0  # seconds of the clock for a flight to go on without ticks: answers still arrive
+_DONE: concurrent.futures.Future[None] = concurrent.futures.Future()
+_DONE.set_result(None)
 
 
 class Kept(NamedTuple):
@@ -48,14 +74,14 @@ class Kept(NamedTuple):
     used: float
 
 
-def recorded(config: Config, *, record: bool) -> dict[str, type[Node[Any]]]:
-    """Return stand-ins for the flying nodes of a file, playing their recorded flight.
+def recorded(config: Config, *, record: bool) -> Watch | None:
+    """Return a `watch` for `execute` that has a file's flying nodes use their recorded flight.
 
-    There are none if the run itself has to fly. With `record`, a flight that is not kept is flown.
+    It is `None` if the run itself has to fly. With `record`, a flight that is not kept is flown.
     """
     part = flight_of(config)
     if part is None:
-        return {}
+        return None
     path = home() / f"{content_key(part)}.flight"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,18 +89,18 @@ def recorded(config: Config, *, record: bool) -> dict[str, type[Node[Any]]]:
             if each.exists() and not each.is_file():
                 raise OSError(errno.EEXIST, "what is no file", str(each))
         with _locked(path):  # whoever comes second waits, and finds it
-            found = opened(path)
+            found = _opened(path)
             if found is None and record:
                 _write(part, path)
-                found = opened(path)
-            if found is None or found[0].unfit:
-                return {}
+                found = _opened(path)
+            if found is None:
+                return None
             os.utime(path)
     except OSError as error:
         what = f"{error.filename or home()}: {error.strerror}"
         _LOG.warning("expected a cache of flights, found %s: the run flies itself", what)
-        return {}
-    return stand_ins(config, *found)
+        return None
+    return functools.partial(_played, *found)
 
 
 def home() -> Path:
@@ -117,7 +143,7 @@ def _remove(file: Path, flight: Path) -> bool:
 def _write(part: Config, path: Path) -> None:
     new = _unfinished(path)
     try:
-        record_flight(part, new)
+        fly(part, new)
         limit = float(os.environ.get("VISNAV_FLIGHTS_GB", LIMIT))
         remove_beyond(max(limit - new.stat().st_size / 1e9, 0.0))
         new.rename(path)
@@ -142,6 +168,149 @@ def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
     finally:
         os.close(file)
 
+
+# A flight, recorded and played.
+
+
+def fly(config: Config, path: Path) -> None:
+    """Fly, and write the flight into a file, complete on return.
+
+    Raises:
+        VisnavError: The flight failed.
+        KeyboardInterrupt: A signal ended it.
+        OSError: The file cannot be written.
+    """
+    rest = NodeSpec(
+        name="(rest)", type_name="", on_error="stop", inputs={}, links={}, node=_Rest,
+        config=NodeConfig(),
+    )  # fmt: skip
+    run = msgspec.structs.replace(config.run, digest=False, speed=None)
+    config = msgspec.structs.replace(config, run=run, nodes=(*config.nodes, rest))
+    with path.open("wb", buffering=1 << 20) as file:
+        recorder = _Recorder(file)
+        execute(config, watch=recorder.watch)
+        file.write(_BEGIN.pack(put(file, recorder.calls)))
+        file.flush()
+        file.write(xxhash.xxh3_128_digest(_content(path)))
+
+
+class _Rest(Node):
+    async def on_shutdown(self) -> None:
+        """Let time go on, the last node in the file being the first to end."""
+        await self.clock.sleep(_REST)
+
+
+class _Recorder(Instrument):
+    def __init__(self, file: IO[bytes]) -> None:
+        self.calls: Calls = {}
+        self._file = file
+        self._lock = threading.Lock()
+
+    @contextlib.contextmanager
+    def watch(self, supervisor: Supervisor) -> Iterator[None]:
+        supervisor.instruments.attach(self)
+        yield
+        if supervisor.state.stop_requested:  # whatever was to follow is not wanted either
+            raise KeyboardInterrupt
+
+    def worker_called(
+        self, process: str, method: str, answer: concurrent.futures.Future[Any]
+    ) -> None:
+        calls = self.calls.setdefault(process.partition("[")[0], [])
+        number = len(calls)
+        calls.append((method, -1))
+
+        def note(answer: concurrent.futures.Future[Any]) -> None:
+            error = answer.exception()
+            with self._lock:  # each process has a thread of its own
+                place = put(self._file, (None if error else answer.result(), error))
+            calls[number] = method, place
+
+        answer.add_done_callback(note)
+
+
+def put(file: IO[bytes], what: Any) -> int:
+    """Write an object that can be pickled; return its place."""
+    place = file.tell()
+    pickle.dump(what, file, pickle.HIGHEST_PROTOCOL)
+    return place
+
+
+def taken(content: memoryview, place: int) -> Any:
+    """Return the object at a place of a file's content."""
+    return pickle.loads(content[place:])  # noqa: S301  # of this user's own cache
+
+
+def _content(path: Path) -> memoryview:
+    with path.open("rb") as file:
+        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def _opened(path: Path) -> tuple[memoryview, Calls] | None:
+    """Return a file's content and a flight's calls; `None` if missing or not readable."""
+    if not path.is_file():  # a pipe would wait for ever
+        return None
+    try:
+        content = _content(path)
+        if xxhash.xxh3_128_digest(content[:-_CHECKSUM]) != content[-_CHECKSUM:]:
+            return None
+        (begin,) = _BEGIN.unpack_from(content, len(content) - _CHECKSUM - _BEGIN.size)
+        calls: Calls = taken(content, begin)
+        for place in {place for own in calls.values() for place in dict(own).values()} - {-1}:
+            taken(content, place)  # one of each method
+    except Exception:  # what was written by other code may raise anything
+        return None
+    return content, calls
+
+
+@contextlib.contextmanager
+def _played(content: memoryview, calls: Calls, supervisor: Supervisor) -> Iterator[None]:
+    state = supervisor.state
+    left = {name: iter(own) for name, own in calls.items()}
+
+    def make(name: str, *args: Any, **options: Any) -> Worker[Any]:
+        if name not in left:
+            return Worker(name, *args, **options)
+        state.costs.pop(name, None)  # it has none
+        worker = _Played(name, *args, **options)
+        worker.content, worker.left = content, left[name]
+        return worker
+
+    state.make_worker = make
+    yield
+
+
+class _Played(Worker[Any]):
+    """A worker without a process, to give recorded answers."""
+
+    content: memoryview
+    left: Iterator[tuple[str, int]]
+
+    def _start(self) -> list[concurrent.futures.Future[Any]]:
+        return [_DONE] * len(self._make)
+
+    def _request(
+        self,
+        method: Callable[..., Any],
+        args: Any,  # noqa: ARG002
+        kwargs: Any,  # noqa: ARG002
+    ) -> concurrent.futures.Future[Any]:
+        name, place = next(self.left, ("none", -1))
+        if place < 0 or name != method.__name__:
+            raise WorkerError(
+                f"worker {self.name}: expected the calls of the recorded flight, next {name}, "
+                f"found {method.__name__}: a sweep with --fly does without it"
+            )
+        result, error = taken(self.content, place)
+        work: concurrent.futures.Future[Any] = concurrent.futures.Future()
+        if error is not None:
+            work.set_exception(error)
+        else:
+            work.set_result(result)
+        return work
+
+
+# What flies, and what a flight depends on.
 
 _DRIVERS = (
     *("/usr/lib/*/libEGL*", "/usr/lib/*/libgallium*", "/usr/lib/*/libLLVM*", "/usr/lib/*/dri/*"),
