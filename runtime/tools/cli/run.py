@@ -201,7 +201,7 @@ def observed(
     trace: Path | None,
     top: bool,
     web: int | None,
-    flight: str,
+    flight: str = "",
 ) -> tuple[list[logging.Handler], Watch]:
     """Return where the log records of a run go, and its observers: `handlers` and `watch`.
 
