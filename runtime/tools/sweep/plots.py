@@ -155,7 +155,7 @@ def _draw(
             axes.set_ylim(-4, 125)  # with room for the legend
             axes.set_yticks(range(0, 101, 20))
             axes.legend(fontsize=8, loc="upper left", ncols=2)
-        elif _decades([v for line in own for s in line.spreads for v in (s.least, s.most)]):
+        elif decades([v for line in own for s in line.spreads for v in (s.least, s.most)]):
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
         else:
@@ -163,7 +163,7 @@ def _draw(
         if scale.words:
             axes.set_xticks(scale.places, parameter.texts)
             axes.set_xlim(-0.5, len(scale.places) - 0.5)
-        elif _decades(scale.places):
+        elif decades(scale.places):
             axes.set_xscale("log")
             axes.set_xticks(scale.places, [f"{at:g}" for at in scale.places])
             axes.minorticks_off()
@@ -178,7 +178,7 @@ def _draw(
     figure.savefig(path, dpi=120)
 
 
-def _decades(values: Sequence[float]) -> bool:
+def decades(values: Sequence[float]) -> bool:
     """Return whether values span more than a decade, all of them above 0."""
     return min(values) > 0 and max(values) > 10 * min(values)
 
