@@ -82,6 +82,7 @@ class CraftConfig(NodeConfig):
     latency: Duration = Duration(0.04)
     fail: bool = False
     last_words: bool = False
+    lens: bool = True
     signal: bool = False
 
 
@@ -96,6 +97,8 @@ class Craft(Node[CraftConfig]):
     async def on_startup(self) -> None:
         """Tick at a rate that is a setting."""
         self.heard = 0.0
+        if not self.config.lens:
+            return
         self.lens = await self.worker(Lens)
         try:
             await self.lens.call(Lens.fail)
@@ -122,6 +125,8 @@ class Craft(Node[CraftConfig]):
 
     def look(self, tick: Tick) -> None:
         """Measure, and tell later."""
+        if not self.config.lens:
+            return
         self.start(self._tell(tick.stamp, self.rng.integers(0, 256, (8, 9, 3), np.uint8)))
 
     async def _tell(self, stamp: int, data: npt.NDArray[np.uint8]) -> None:

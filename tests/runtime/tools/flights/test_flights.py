@@ -90,21 +90,24 @@ def test_a_played_flight_is_equal_to_the_event_and_in_their_order(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("run", ["duration = '0.5s'", "duration = '3s'", "seed = 4"])
-def test_it_ends_as_it_did(tmp_path: Path, run: str) -> None:
-    run = run if "duration" in run else "duration = '2s'"
-    assert_equal_when_played(tmp_path, run=run)
-
-
-@pytest.mark.slow
-def test_it_ends_earlier_if_another_node_ends_the_run(tmp_path: Path) -> None:
-    assert_equal_when_played(tmp_path, "guesser.end=0.4")
-
-
-@pytest.mark.slow
-def test_links_before_nodes_of_the_flight_and_others_are_the_same(tmp_path: Path) -> None:
-    links = ("captain.links.felt.delay=7ms", "captain.links.seen.delay=13ms")
-    assert_equal_when_played(tmp_path, "guesser.links.pairs.loss=0.2", flight=links)
+@pytest.mark.parametrize(
+    ("others", "flight", "run"),
+    [
+        ((), (), "duration = '0.5s'"),  # it ends before the captain has gone
+        ((), (), "duration = '3s'"),
+        (("guesser.end=0.4",), (), "duration = '3s'"),  # another node ends it
+        ((), ("craft.last_words=true",), "duration = '3s'"),
+        (
+            ("guesser.links.pairs.loss=0.2",),
+            ("captain.links.felt.delay=7ms", "captain.links.seen.delay=13ms"),
+            "duration = '3s'",
+        ),
+    ],
+)
+def test_it_ends_and_goes_by_its_links_as_it_did(
+    tmp_path: Path, others: tuple[str, ...], flight: tuple[str, ...], run: str
+) -> None:
+    assert_equal_when_played(tmp_path, *others, flight=flight, run=run)
 
 
 def test_what_else_has_an_influence_is_not_recorded(tmp_path: Path) -> None:
@@ -214,7 +217,7 @@ def test_every_way_to_import_is_known(statement: str, tmp_path: Path) -> None:
 def test_what_has_a_name_of_the_cache_neither_hangs_nor_fails_a_run(
     kind: str, name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    config = flown(tmp_path, "captain.end=0.2")
+    config = flown(tmp_path, "captain.end=0.2", "craft.lens=false", run="duration = '0.3s'")
     part = flight_of(config)
     assert part is not None
     path = home() / name.format(f"{content_key(part)}.flight") if name else home()
@@ -284,11 +287,6 @@ def test_answers_come_back_with_their_very_types(
     assert digests[0].hexdigest() == digests[1].hexdigest()
 
 
-@pytest.mark.slow
-def test_what_is_said_at_the_end_is_said_again(tmp_path: Path) -> None:
-    assert_equal_when_played(tmp_path, flight=("craft.last_words=true",))
-
-
 def test_calls_that_the_flight_does_not_know_are_an_error(tmp_path: Path) -> None:
     played = recorded(flown(tmp_path, "captain.end=0.1"), record=True)
     message = "worker craft.Lens: expected the calls of the recorded flight, next none, found mean"
@@ -297,7 +295,7 @@ def test_calls_that_the_flight_does_not_know_are_an_error(tmp_path: Path) -> Non
 
 
 def test_a_flight_that_fails_is_not_kept(tmp_path: Path) -> None:
-    config = flown(tmp_path, "craft.fail=true")
+    config = flown(tmp_path, "craft.fail=true", "craft.lens=false")
     assert recorded(config, record=True) is None
     assert kept() == []
     with pytest.raises(NodeError, match="out of order"):
@@ -305,7 +303,7 @@ def test_a_flight_that_fails_is_not_kept(tmp_path: Path) -> None:
 
 
 def test_a_signal_during_the_flight_ends_what_was_to_follow(tmp_path: Path) -> None:
-    config = flown(tmp_path, "craft.signal=true")
+    config = flown(tmp_path, "craft.signal=true", "craft.lens=false")
     with pytest.raises(KeyboardInterrupt):
         recorded(config, record=True)
     assert kept() == []
