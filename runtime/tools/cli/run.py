@@ -213,7 +213,7 @@ def observed(
     from runtime.logs import terminal_handler
     from runtime.tools.cli.brief import progress
     from runtime.tools.monitor.observer import LastRecords
-    from runtime.tools.tracing.record import tracing
+    from runtime.tools.tracing.write import tracing
 
     records = LastRecords()
     handlers: list[logging.Handler] = [records]

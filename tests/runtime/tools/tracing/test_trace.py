@@ -18,7 +18,7 @@ from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.cli.live import tables
 from runtime.tools.tracing import write
-from runtime.tools.tracing.record import Spool, tracing
+from runtime.tools.tracing.record import Spool
 from runtime.tools.tracing.write import (
     LOOP,
     SENSORS,
@@ -29,6 +29,7 @@ from runtime.tools.tracing.write import (
     paths,
     quantile,
     read_trace,
+    tracing,
 )
 from tests.runtime.samples_loop import (
     Camera,
