@@ -90,8 +90,8 @@ class Node(Generic[C]):
     deterministic: ClassVar[bool] = True
     """Whether equal inputs give equal outputs; if not, runs with this node promise no digest."""
     flies: ClassVar[bool] = False
-    """Whether the node is a part of the flight itself (a simulator, a pilot). A sweep records the
-    flight once for all runs where these are equal, if nothing else has an influence on it.
+    """Whether the node is a part of the flight itself (a simulator, a pilot). A sweep records once
+    what its workers answer, for all runs with the same flight, if nothing else affects that.
     """
     ends_run: ClassVar[Literal["", "plan", "hand"]] = ""
     """Meaning of the node ending the run: its ``plan`` is over (a pilot, a replay; the default of

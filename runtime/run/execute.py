@@ -10,10 +10,9 @@ import gc
 import logging
 import signal
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -52,7 +51,6 @@ def execute(
     log_events: bool = False,
     watch: Watch | None = None,
     only: Collection[str] = (),
-    stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
     digest: Digest | None = None,
     complete: Callable[[Summary], Summary] = lambda summary: summary,
 ) -> Summary:
@@ -61,7 +59,6 @@ def execute(
     Args:
         out: Folder for results, or its path; `None` writes nothing.
         only: Nodes to run here; the others run in other processes. All, if empty.
-        stand_ins: Classes that run in the place of some nodes' own, by the node's name.
         complete: Called with the summary before it is written; returns what is.
 
     Raises:
@@ -76,7 +73,7 @@ def execute(
             stack.enter_context(folder)
             results.write_config(folder.path, config)
             handlers.append(file_handler(folder.path / "log.txt"))
-        run = _Run(config, folder, log_events, watch, only, stand_ins, digest)
+        run = _Run(config, folder, log_events, watch, only, digest)
         stack.enter_context(logging_to(handlers, config.run.log, run.now))
         if folder is not None and folder.earlier is not None:
             log.info("the folder of the earlier run is now %s", folder.earlier)
@@ -121,7 +118,6 @@ class _Run:
     log_events: bool
     watch: Watch | None
     only: Collection[str]
-    stand_ins: Mapping[str, type[Node[Any]]]
     digest: Digest | None
     supervisor: Supervisor = field(init=False)
     clock: Clock | None = None
@@ -148,7 +144,7 @@ class _Run:
         if self.log_events:
             taps.append(_log_event)
         self.supervisor = supervisor = Supervisor(
-            self.config, clock, taps, self.private or out, self.only, self.stand_ins, out
+            self.config, clock, taps, self.private or out, self.only, out
         )
         if self.folder is not None:
             supervisor.state.before_first_update = self.folder.flown

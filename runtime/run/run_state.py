@@ -61,6 +61,7 @@ class RunState(Host):
         links: All links of the nodes that there are, by ``node.port``.
         environment: What nodes found of the machine on which figures depend.
         afterwards: Functions to call once the summary is written.
+        make_worker: The class of workers, or a function that makes one as that does.
         changes: Output for changes of settings; its listeners include the changed node.
     """
 
@@ -98,6 +99,7 @@ class RunState(Host):
         self.environment: dict[str, str] = {}
         self.costs: dict[str, Costs] = {}
         self.outside: dict[str, Answers] = {}
+        self.make_worker: Callable[..., Worker[Any]] = Worker
         self.before_first_update: Callable[[], None] = lambda: None
         self.afterwards: list[Callable[[Path], Any]] = []
         self.changes = Sender("run.parameters", ParameterChanged)
@@ -226,7 +228,7 @@ class RunState(Host):
             loop.call_soon_threadsafe(self._fault, node.name, error)
 
         name = f"{node.name}.{getattr(factory, '__name__', 'worker')}"
-        worker: Worker[W] = Worker(
+        worker: Worker[W] = self.make_worker(
             name,
             self.clock,
             factory,

@@ -16,13 +16,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Collection, Coroutine, Mapping, Sequence
+from collections.abc import Collection, Coroutine, Sequence
 from itertools import chain
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
-
-import msgspec
 
 from events import Announcement, EstimatorAnnouncement, Event, Shutdown, WindowClosed
 from runtime import code_location
@@ -30,7 +27,6 @@ from runtime.channels.sender import Deliver, Listener, Tap, Voices
 from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
 from runtime.host import RunEnd
-from runtime.node import Node
 from runtime.peers import Others
 from runtime.run import graph
 from runtime.run.event_loop import RunTask
@@ -56,7 +52,6 @@ class Supervisor:
         out: Folder for what nodes write, or `None`.
         out_of_programs: That for nodes that start programs, if it is another one.
         only: Nodes that run here, if others run in other processes.
-        stand_ins: Classes in the place of some nodes' own, by the node's name.
         scripted: Nodes that may send in any name: scripts of tests.
     """
 
@@ -67,15 +62,11 @@ class Supervisor:
         taps: Sequence[Tap] = (),
         out: Path | None = None,
         only: Collection[str] = (),
-        stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
         out_of_programs: Path | None = None,
         scripted: Collection[str] = (),
     ) -> None:
         here = [spec for spec in config.nodes if not only or spec.name in only]
-        runners = {}
-        for spec in here:
-            node = stand_ins.get(spec.name, spec.node)
-            runners[spec.name] = NodeRunner(msgspec.structs.replace(spec, node=node), self._own)
+        runners = {spec.name: NodeRunner(spec, self._own) for spec in here}
         self.instruments = Instruments(runners, self._reconnect)
         self.state = RunState(
             config,

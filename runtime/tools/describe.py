@@ -1,8 +1,15 @@
-"""Descriptions of nodes and settings from their declarations, for listings and reference pages.
+"""Descriptions of nodes and settings from their declarations, for listings, pages and editors.
 
 `describe` returns the `NodeDescription` of a class: its ports, ticks and settings, with their
 types, ranges, defaults and docstrings. `describe_settings` does the same for any table of a file,
 such as `RunConfig`. Both are pure; what they return holds text only, and `msgspec` can encode it.
+
+`schema` returns a JSON schema of configuration files, for editors to complete and check TOML:
+
+    #:schema https://…/config.schema.json     # or a path: the first line of a file
+
+What only a run can tell (whether a file is there, whether a camera is announced) is in no schema;
+``python -m runtime check`` says that.
 """
 
 from __future__ import annotations
@@ -10,18 +17,21 @@ from __future__ import annotations
 import inspect
 import json
 import re
-from collections.abc import Callable, Iterator
-from typing import Any, Literal, get_args
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Literal, NamedTuple, get_args
 
 import msgspec
 from msgspec import inspect as types
 
-from runtime.config.model import OnError
+from runtime.channels.links import LinkConfig
+from runtime.config.model import NetworkConfig, OnError, RunConfig
 from runtime.config.parameters import is_marked
 from runtime.config.reading import by_name_alone, presets_in
 from runtime.node import Node
 from runtime.run.graph import input_types
 from runtime.units import Duration, Latency, plain
+
+Schema = dict[str, Any]
 
 TYPE_DOC = "The class of the node: its name if a package lists it, else module:Class."
 
@@ -122,15 +132,15 @@ def describe_settings(table: type[msgspec.Struct]) -> tuple[SettingDescription, 
     docs = attribute_docs(table)
     found = []
     for field in msgspec.structs.fields(table):
-        info = types.type_info(field.type)
-        inner = next(_structs(info), None)
+        kind = kind_of(types.type_info(field.type))
+        inner = next(iter(kind.tables), None)
         found.append(
             SettingDescription(
                 name=field.encode_name,
-                type=_type(info),
+                type=kind.text,
                 default="" if inner else _default(field),
                 required=field.required,
-                constraint=_constraint(info),
+                constraint=kind.constraint,
                 doc=docs.get(field.name, ""),
                 changeable=is_marked(field.type),
                 settings=describe_settings(inner) if inner and inner is not table else (),
@@ -214,24 +224,6 @@ def _delivery(bound: int, overflow: str, keep: str) -> str:
     return f"up to {bound:,} wait; {beyond[overflow]}"
 
 
-def _structs(info: types.Type) -> Iterator[type[msgspec.Struct]]:
-    match info:
-        case types.StructType():
-            yield info.cls
-        case types.Metadata():
-            yield from _structs(info.type)
-        case types.UnionType():
-            for each in info.types:
-                yield from _structs(each)
-        case types.ListType() | types.VarTupleType():
-            yield from _structs(info.item_type)
-        case types.TupleType():
-            for each in info.item_types:
-                yield from _structs(each)
-        case types.DictType():
-            yield from _structs(info.value_type)
-
-
 def _default(field: Any) -> str:
     """Return a default as in TOML; JSON writes such values in the same way."""
     if field.required:
@@ -244,69 +236,240 @@ def _default(field: Any) -> str:
     return json.dumps(msgspec.to_builtins(default, enc_hook=plain), ensure_ascii=False)
 
 
-def _type(info: types.Type) -> str:
+class Kind(NamedTuple):
+    """Type of a setting.
+
+    Attributes:
+        text: In words: ``list of 2 float``.
+        constraint: Its range in words.
+        schema: As a JSON schema.
+        tables: The settings classes in it.
+    """
+
+    text: str
+    constraint: str
+    schema: Schema
+    tables: tuple[type[msgspec.Struct], ...] = ()
+
+
+_PLAIN = {
+    types.StrType: ("string", "string"),
+    types.BoolType: ("true or false", "boolean"),
+    types.IntType: ("integer", "integer"),
+    types.FloatType: ("float", "number"),
+}
+"""Types without parts, in words and in a schema."""
+
+_DURATION = r"^\s*[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?\s*([nuµμm]?s|min|h)\s*$"
+
+
+def kind_of(info: types.Type) -> Kind:
+    """Return the kind of a type that a setting may have; of any other, its name."""
     match info:
         case types.Metadata():
-            names = presets_in(info.extra)
-            return " or ".join(map(json.dumps, names)) if names else _type(info.type)
+            kind, presets = kind_of(info.type), [*presets_in(info.extra)]
+            return kind._replace(text=_any(presets), schema={"enum": presets}) if presets else kind
         case types.StructType():
-            return "table or the name of a preset" if by_name_alone(info.cls) else "table"
-        case types.CustomType() if issubclass(info.cls, Duration):
-            return "duration"
-        case types.UnionType():
-            kinds = [_type(t) for t in info.types if not isinstance(t, types.NoneType)]
-            return " or ".join(dict.fromkeys(kinds))
-        case types.LiteralType():
-            return " or ".join(json.dumps(value) for value in info.values)
-        case types.TupleType():
-            items = [_type(each) for each in info.item_types]
-            same = len(set(items)) == 1
-            return f"list of {len(items)} {items[0]}" if same else f"list of {', '.join(items)}"
-        case types.ListType() | types.VarTupleType() | types.FrozenSetType() | types.SetType():
-            return f"list of {_type(info.item_type)}"
-        case types.DictType():
-            return f"table of {_type(info.value_type)}"
-        case types.StrType():
-            return "string"
-        case types.BoolType():
-            return "true or false"
-        case types.IntType():
-            return "integer"
-        case types.FloatType():
-            return "float"
-    return type(info).__name__.removesuffix("Type").lower()
-
-
-_RANGES = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<", "multiple_of": "multiple of"}
-_LENGTHS = {"min_length": "at least", "max_length": "at most"}
-
-
-def _constraint(info: types.Type) -> str:
-    match info:
-        case types.Metadata():
-            return _constraint(info.type)
-        case types.UnionType():
-            return "; ".join(filter(None, map(_constraint, info.types)))
+            table = {"$ref": f"#/$defs/{_key(info.cls)}"}
+            if names := by_name_alone(info.cls):
+                either = {"anyOf": [{"enum": names}, table]}
+                return Kind("table or the name of a preset", "", either, (info.cls,))
+            return Kind("table", "", table, (info.cls,))
         case types.CustomType() if issubclass(info.cls, Duration):
             unit = "; above 1 s with a unit" if issubclass(info.cls, Latency) else ""
-            return f"≥ 0 s{unit}"
-    found = [
-        f"{sign} {value:g}"
-        for name, sign in _RANGES.items()
-        if (value := getattr(info, name, None)) is not None
+            written = [{"type": "number", "minimum": 0}, {"type": "string", "pattern": _DURATION}]
+            return Kind("duration", f"≥ 0 s{unit}", {"anyOf": written})
+        case types.LiteralType():
+            return Kind(_any(info.values), "", {"enum": list(info.values)})
+        case types.UnionType():
+            kinds = [kind_of(each) for each in info.types if not isinstance(each, types.NoneType)]
+            schemas = [each.schema for each in kinds]
+            return Kind(
+                " or ".join(dict.fromkeys(each.text for each in kinds)),
+                "; ".join(each.constraint for each in kinds if each.constraint),
+                schemas[0] if len(schemas) == 1 else {"anyOf": schemas},
+                tuple(table for each in kinds for table in each.tables),
+            )
+        case types.TupleType():
+            kinds = [kind_of(each) for each in info.item_types]
+            texts = [each.text for each in kinds]
+            each = "; ".join(dict.fromkeys(each.constraint for each in kinds if each.constraint))
+            number = len(kinds)
+            return Kind(
+                f"list of {f'{number} {texts[0]}' if len({*texts}) == 1 else ', '.join(texts)}",
+                f"each {each}" if each else "",
+                {
+                    "type": "array", "items": [each.schema for each in kinds],
+                    "minItems": number, "maxItems": number,
+                },
+                tuple(table for each in kinds for table in each.tables),
+            )  # fmt: skip
+        case types.ListType() | types.VarTupleType() | types.FrozenSetType() | types.SetType():
+            item, (words, bounds) = kind_of(info.item_type), _bounds(info, "Items", "items")
+            words += [f"each {item.constraint}"] if item.constraint else []
+            items = {"type": "array", "items": item.schema, **bounds}
+            return Kind(f"list of {item.text}", ", ".join(words), items, item.tables)
+        case types.DictType():
+            value = kind_of(info.value_type)
+            words, _ = _bounds(info, "Properties", "items")
+            values = {"type": "object", "additionalProperties": value.schema}
+            return Kind(f"table of {value.text}", ", ".join(words), values, value.tables)
+    text, name = _PLAIN.get(type(info), (type(info).__name__.removesuffix("Type").lower(), ""))
+    words, bounds = _bounds(info, "Length", "characters")
+    return Kind(text, ", ".join(words), {"type": name} | bounds if name else {})
+
+
+def _any(values: Iterable[Any]) -> str:
+    return " or ".join(map(json.dumps, values))
+
+
+def _key(cls: type[msgspec.Struct]) -> str:
+    return f"{cls.__module__}.{cls.__name__}"
+
+
+_BOUNDS = {
+    "ge": ("≥", "minimum"), "gt": (">", "exclusiveMinimum"), "le": ("≤", "maximum"),
+    "lt": ("<", "exclusiveMaximum"), "multiple_of": ("multiple of", "multipleOf"),
+    "min_length": ("at least", "min"), "max_length": ("at most", "max"),
+    "pattern": ("matches", "pattern"),
+}  # fmt: skip
+"""Bounds of msgspec's, in words and in a schema."""
+
+
+def _bounds(info: types.Type, of: str, unit: str) -> tuple[list[str], Schema]:
+    """Return the bounds of a type in words and in a schema, for lengths with what they count."""
+    words: list[str] = []
+    bounds: Schema = {}
+    for name, (sign, key) in _BOUNDS.items():
+        value = getattr(info, name, None)
+        if value is None:
+            continue
+        if name.endswith("_length"):
+            words.append(f"{sign} {value} {unit}")
+            bounds[key + of] = value
+        else:
+            words.append(f"{sign} {value}" if name == "pattern" else f"{sign} {value:g}")
+            bounds[key] = value
+    return words, bounds
+
+
+_NAME = {"type": "string", "pattern": r"^[A-Za-z_][\w-]*$", "not": {"enum": ["run", "network"]}}
+_TYPE = {"type": "string", "pattern": r"^\w+(\.\w+)*:\w+$"}
+
+
+def schema(nodes: Mapping[str, type[Node[Any]]]) -> Schema:
+    """Return the schema of a configuration file, with settings of these nodes, by name.
+
+    Those of nodes that a file names as ``module:Class`` may be any.
+    """
+    maker = _Maker()
+    by_type = [
+        {
+            "if": {"properties": {"type": {"const": name}}, "required": ["type"]},
+            "then": {"$ref": f"#/$defs/{maker.node(name, cls)}"},
+        }
+        for name, cls in nodes.items()
     ]
-    of = "characters" if isinstance(info, types.StrType) else "items"
-    found += [
-        f"{words} {value} {of}"
-        for name, words in _LENGTHS.items()
-        if (value := getattr(info, name, None)) is not None
-    ]
-    if pattern := getattr(info, "pattern", None):
-        found.append(f"matches {pattern}")
-    if isinstance(info, types.ListType | types.VarTupleType):
-        each = _constraint(info.item_type)
-        found += [f"each {each}"] if each else []
-    elif isinstance(info, types.TupleType):
-        each = "; ".join(dict.fromkeys(filter(None, map(_constraint, info.item_types))))
-        found += [f"each {each}"] if each else []
-    return ", ".join(found)
+    entry = {
+        "type": "object",
+        "required": ["name", "type"],
+        "properties": {**_schema_head(), "type": {"anyOf": [{"enum": list(nodes)}, _TYPE]}},
+        "allOf": by_type,
+    }
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": "A run of visnav-runtime",
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["nodes"],
+        "properties": {
+            "run": maker.struct(RunConfig),
+            "network": maker.struct(NetworkConfig),
+            "nodes": {"type": "array", "minItems": 1, "items": entry},
+        },
+        "$defs": dict(sorted(maker.definitions.items())),
+    }
+
+
+def _schema_head() -> Schema:
+    return {
+        "name": {**_NAME, "description": "Unique in the file."},
+        "type": {"type": "string", "description": TYPE_DOC},
+        "on_error": {
+            "enum": list(get_args(OnError)),
+            "default": "stop",
+            "description": "What an exception in the node does to the run.",
+        },
+        "inputs": {"type": "object", "additionalProperties": {"type": "string"}},
+        "links": {"type": "object"},
+    }
+
+
+class _Maker:
+    def __init__(self) -> None:
+        self.definitions: dict[str, Schema] = {}
+
+    def node(self, name: str, cls: type[Node[Any]]) -> str:
+        """Define the table of a node; return the name of the definition."""
+        key = name.replace(":", ".")
+        own = self._properties(cls.config_type)
+        ports = [*cls.declared.listening, *cls.declared.bundle_fields()]
+        link = self.struct(LinkConfig)
+        head = _schema_head()
+        head["inputs"] = {
+            "type": "object",
+            "description": "A port to the source to which it is narrowed.",
+            "properties": {port: {"type": "string"} for port in ports},
+            "additionalProperties": False,
+        }
+        head["links"] = {
+            "type": "object",
+            "description": "A port to what the way there does to events.",
+            "properties": dict.fromkeys(ports, link),
+            "additionalProperties": False,
+        }
+        self.definitions[key] = {
+            **own,
+            "description": summary(cls),
+            "properties": {**head, **own["properties"]},
+            "required": ["name", "type", *own.get("required", [])],
+        }
+        return key
+
+    def struct(self, cls: type[msgspec.Struct]) -> Schema:
+        """Define a struct; return its reference."""
+        key = _key(cls)
+        if key not in self.definitions:
+            self.definitions[key] = {}  # it may hold itself
+            self.definitions[key] = {"description": summary(cls), **self._properties(cls)}
+        return {"$ref": f"#/$defs/{key}"}
+
+    def _properties(self, cls: type[msgspec.Struct]) -> Schema:
+        documented = attribute_docs(cls)
+        properties, required = {}, []
+        for field in msgspec.structs.fields(cls):
+            kind = kind_of(types.type_info(field.type))
+            found = kind.schema
+            for table in kind.tables:
+                self.struct(table)
+            text = documented.get(field.name, "")
+            if is_marked(field.type):
+                text = f"{text} It can be changed in a run.".strip()
+            if field.required:
+                required.append(field.encode_name)
+            elif _may_stand(field.default):
+                default = msgspec.to_builtins(field.default, enc_hook=plain)
+                found = _beside(found, "default", default)
+            properties[field.encode_name] = _beside(found, "description", text) if text else found
+        made: Schema = {"type": "object", "properties": properties, "additionalProperties": False}
+        return made | ({"required": required} if required else {})
+
+
+def _beside(found: Schema, key: str, value: Any) -> Schema:
+    """Add a key; references go into ``allOf``: draft 7 ignores all keys beside them."""
+    return {"allOf": [found], key: value} if "$ref" in found else {**found, key: value}
+
+
+def _may_stand(default: Any) -> bool:
+    """Tell whether a default may stand in a file; a table's are those of its settings."""
+    return default not in (None, msgspec.NODEFAULT) and not isinstance(default, msgspec.Struct)

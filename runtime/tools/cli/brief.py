@@ -103,9 +103,7 @@ def print_tables(summary: Summary) -> None:
 
 def print_lines(summary: Summary, folder: Path) -> None:
     """Print the results of a run in a few lines, failures first."""
-    console = Console()
-    for line in lines(summary, folder):
-        console.print(line, highlight=False, soft_wrap=True)
+    _print_all(lines(summary, folder))
 
 
 def print_verdict(verdict: Verdict) -> None:
@@ -120,8 +118,12 @@ def print_verdict(verdict: Verdict) -> None:
 
 def print_failures(summary: Summary) -> None:
     """Print a line for each estimator that failed, and nothing else."""
+    _print_all(_failures(summary))
+
+
+def _print_all(shown: Iterable[str]) -> None:
     console = Console()
-    for line in _failures(summary):
+    for line in shown:
         console.print(line, highlight=False, soft_wrap=True)
 
 
@@ -234,35 +236,35 @@ def _flow(name: str, figures: Mapping[str, Any], summary: Summary) -> Iterator[s
 def run_tables(summary: Summary) -> Iterator[Table]:
     """Yield tables of events sent and dropped, tick lateness, worker costs, and more."""
     seconds = max(summary.sim_seconds, 1e-9)
-    yield _table(
+    yield table_of(
         "sent",
         ("output", "events", "per second"),
-        [(name, f"{n}", f"{n / seconds:.1f}") for name, n in sorted(summary.outputs.items())],
+        [(name, n, f"{n / seconds:.1f}") for name, n in sorted(summary.outputs.items())],
     )
-    inputs = _table(
+    inputs = table_of(
         "inputs",
         ("input", "dropped", "fullest", "holds", "unmatched"),
         [
-            (port, *map(str, (stream.dropped, stream.peak, stream.bound)), _sum(stream.missed))
-            for port, stream in sorted(summary.streams.items())
+            (port, of.dropped, of.peak, of.bound, sum(of.missed.values()) if of.missed else "")
+            for port, of in sorted(summary.streams.items())
         ],
     )
-    ticks = _table(
+    ticks = table_of(
         "ticks",
         ("tick", "Hz", "calls", "late p50 µs", "p99 µs", "max µs", "missed"),
         [
             (
                 name,
                 f"{tick.hz:g}",
-                f"{tick.calls}",
+                tick.calls,
                 *(f"{us:.0f}" for us in (tick.late_p50_us, tick.late_p99_us, tick.late_max_us)),
-                f"{tick.missed}",
+                tick.missed,
             )
             for name, tick in sorted(summary.ticks.items())
         ],
     )
     # Of the next two, the columns for which a terminal has room.
-    workers = _table(
+    workers = table_of(
         "calls of workers: milliseconds (median, 95 % below), peak memory",
         ("worker", "declared", "real", "p95", "CPU", "p95", "MB"),
         [
@@ -271,7 +273,7 @@ def run_tables(summary: Summary) -> Iterator[Table]:
         ],
     )
     names = ("sent", "answered", "empty", "init", "skipped", "no answer", "open", "real ms")
-    outside = _table(
+    outside = table_of(
         "systems outside the process: frames",  # first what together makes all that was sent
         ("system", *names, "inputs repeat", "answers repeat"),
         [
@@ -280,11 +282,11 @@ def run_tables(summary: Summary) -> Iterator[Table]:
         ],
     )
     longest = summary.longest_stalls
-    stalls = _table(
+    stalls = table_of(
         "the loop stood still",
         ("node", "times", "longest ms", "where"),
         [
-            (node, f"{count}", f"{longest[node].seconds * 1e3:.0f}", longest[node].line)
+            (node, count, f"{longest[node].seconds * 1e3:.0f}", longest[node].line)
             for node, count in sorted(summary.stalls.items())
         ],
     )
@@ -299,7 +301,7 @@ def verdict_table(verdict: Verdict) -> Table:
     rows = {
         figure: [each.get(figure, "") for each in verdict.estimators.values()] for figure in figures
     }
-    return _table(
+    return table_of(
         "verdict",
         ("figure", *verdict.estimators),
         [
@@ -310,10 +312,6 @@ def verdict_table(verdict: Verdict) -> Table:
     )
 
 
-def _sum(missed: Mapping[str, int]) -> str:
-    return f"{sum(missed.values())}" if missed else ""
-
-
 def _show(value: Any) -> str:
     if value is None:
         return "–"
@@ -322,15 +320,16 @@ def _show(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+def table_of(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> Table:
+    """Return a table, whose columns but the first and those of places are of numbers."""
     table = Table(*headings, title=title, title_justify="left")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(str, row))
     names = table.columns[0]
     names.min_width = min(max((len(str(cell)) for cell in names.cells), default=0), 24)
     names.overflow = "fold"
     for column in table.columns[1:]:
-        if column.header != "where":
+        if column.header not in {"where", "in"}:
             column.justify = "right"
     return table
 
@@ -342,22 +341,22 @@ _LINE_PERIOD = 10.0
 
 def progress(run: RunConfig, console: Console) -> Watch:
     """Return a progress bar on a console as the `watch` of `execute`; log lines appear above it."""
-    return lambda supervisor: _watching(run, supervisor, console)
 
+    @contextlib.contextmanager
+    def watching(supervisor: Supervisor) -> Iterator[None]:
+        end = threading.Event()
+        show = _draw if console.is_terminal else _print
+        thread = threading.Thread(
+            target=show, args=(run, supervisor, console, end), name="progress", daemon=True
+        )
+        thread.start()
+        try:
+            yield
+        finally:
+            end.set()
+            thread.join()
 
-@contextlib.contextmanager
-def _watching(run: RunConfig, supervisor: Supervisor, console: Console) -> Iterator[None]:
-    end = threading.Event()
-    show = _draw if console.is_terminal else _print
-    thread = threading.Thread(
-        target=show, args=(run, supervisor, console, end), name="progress", daemon=True
-    )
-    thread.start()
-    try:
-        yield
-    finally:
-        end.set()
-        thread.join()
+    return watching
 
 
 def _draw(run: RunConfig, supervisor: Supervisor, console: Console, end: threading.Event) -> None:

@@ -94,7 +94,7 @@ def of_comparison(each: Comparison, margin: float) -> list[Outcome]:
     If a figure fails, so do the scenarios in most of whose flights B is worse; all, if it is so in
     none.
     """
-    from runtime.tools.comparison.page import change
+    from runtime.tools.comparison.flying import change
 
     counts = each.by_scenario()
     guilty = [name for name, (worse, better, _) in counts.items() if worse > better]
@@ -121,7 +121,7 @@ def print_table(compared: Compared) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from runtime.tools.comparison.page import change, shown
+    from runtime.tools.comparison.flying import change, shown
 
     found = compared.rows
     headings = ("estimator", "figure", "A", "B", "change B - A", "verdict")

@@ -279,7 +279,7 @@ def schema(
     import json
 
     from runtime.config.reading import find_nodes
-    from runtime.tools.schema import schema as schema_of
+    from runtime.tools.describe import schema as schema_of
 
     text = json.dumps(schema_of(find_nodes(warn)), indent=1, ensure_ascii=False) + "\n"
     if out is None:

@@ -119,42 +119,40 @@ def trace(file: Annotated[Path, typer.Argument(help="A trace that run --trace wr
 
 def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
     """Return the paths of a trace, and its nodes, as a terminal of this encoding can show them."""
-    from rich.table import Table
     from rich.text import Text
 
+    from runtime.tools.cli.brief import table_of
     from runtime.tools.tracing.write import node_loads, paths, quantile
+
+    def shown(ms: list[float]) -> list[str]:
+        return [f"{each:.2f}" for each in (quantile(ms, 0.5), quantile(ms, 0.99), max(ms))]
 
     routes = paths(found)
     for number, route in enumerate(routes, 1):
         yield Text(f"path {number}: {_for(encoding, route.path)}")
-    latencies = Table(
-        *("path", "times", "run p50 ms", "p99", "max", "real p50 ms", "p99", "max"),
-        title="from sensor to set-point",
-    )
-    for number, route in enumerate(routes, 1):
-        figures = [
-            f"{figure:.2f}"
-            for each in (route.run_ms, route.real_ms)
-            for figure in (quantile(each, 0.5), quantile(each, 0.99), max(each))
-        ]
-        latencies.add_row(f"{number}", f"{len(route.run_ms)}", *figures)
-    loads = Table("node", "steps", "loop ms", "share", "longest ms", "in", title="on the loop")
-    for load in node_loads(found):
-        loads.add_row(
-            _for(encoding, load.node),
-            f"{load.steps}",
-            f"{load.busy_ms:.1f}",
-            f"{load.share:.1%}",
-            f"{load.longest_ms:.3f}",
-            _for(encoding, load.longest),
+    if routes:
+        yield table_of(
+            "from sensor to set-point",
+            ("path", "times", "run p50 ms", "p99", "max", "real p50 ms", "p99", "max"),
+            [
+                (number, len(route.run_ms), *shown(route.run_ms), *shown(route.real_ms))
+                for number, route in enumerate(routes, 1)
+            ],
         )
-    for table in (latencies, loads):
-        table.title_justify = "left"
-        for column in table.columns[1:]:
-            if column.header != "in":
-                column.justify = "right"
-    yield latencies if routes else Text("no set-point was sent that a sensor led to")
-    yield loads
+    else:
+        yield Text("no set-point was sent that a sensor led to")
+    loads = [
+        (
+            _for(encoding, each.node),
+            each.steps,
+            f"{each.busy_ms:.1f}",
+            f"{each.share:.1%}",
+            f"{each.longest_ms:.3f}",
+            _for(encoding, each.longest),
+        )
+        for each in node_loads(found)
+    ]
+    yield table_of("on the loop", ("node", "steps", "loop ms", "share", "longest ms", "in"), loads)
 
 
 def _for(encoding: str, text: str) -> str:

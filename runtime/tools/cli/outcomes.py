@@ -113,8 +113,7 @@ def writing(name: str, junit: Path | None, json: Path | None) -> Iterator[list[O
         if junit is not None:
             _write(junit, to_junit(name, outcomes))
         if json is not None:
-            text = msgspec.json.encode([msgspec.to_builtins(each) for each in outcomes])
-            _write(json, msgspec.json.format(text, indent=2) + b"\n")
+            _write(json, msgspec.json.format(msgspec.json.encode(outcomes), indent=2) + b"\n")
 
 
 def to_junit(name: str, outcomes: Sequence[Outcome]) -> bytes:

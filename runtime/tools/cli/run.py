@@ -114,12 +114,9 @@ def run(
         look_at(settings, nodes_here)
         name = "-".join([settings.run.name, *nodes_here[:1]])
         folder = Folder(out or Path("runs") / name, by_time=out is None)
-        stand_ins = {}
-        if flight:
-            from runtime.tools.flights.cache import recorded
-
-            stand_ins = recorded(settings, record=flight == "record")
-        handlers, watch = observed(settings, name, quiet=quiet, trace=trace, top=top, web=web)
+        handlers, watch = observed(
+            settings, name, quiet=quiet, trace=trace, top=top, web=web, flight=flight
+        )
         try:
             summary = (run_twice if twice else execute)(
                 settings,
@@ -128,7 +125,6 @@ def run(
                 log_events=log is Log.events,
                 watch=watch,
                 only=nodes_here,
-                stand_ins=stand_ins,
             )
         except Exception:
             if out is None and (more := folder.path / "log.txt").is_file():
@@ -198,7 +194,14 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
 
 
 def observed(
-    settings: Config, name: str, *, quiet: bool, trace: Path | None, top: bool, web: int | None
+    settings: Config,
+    name: str,
+    *,
+    quiet: bool,
+    trace: Path | None,
+    top: bool,
+    web: int | None,
+    flight: str = "",
 ) -> tuple[list[logging.Handler], Watch]:
     """Return where the log records of a run go, and its observers: `handlers` and `watch`.
 
@@ -210,7 +213,7 @@ def observed(
     from runtime.logs import terminal_handler
     from runtime.tools.cli.brief import progress
     from runtime.tools.monitor.observer import LastRecords
-    from runtime.tools.tracing.record import tracing
+    from runtime.tools.tracing.write import tracing
 
     records = LastRecords()
     handlers: list[logging.Handler] = [records]
@@ -223,6 +226,11 @@ def observed(
     watches.append(lambda supervisor: _monitored(supervisor, settings, name, records, top, web))
     if trace is not None:
         watches.append(lambda supervisor: tracing(supervisor, trace, name))
+    if flight:
+        from runtime.tools.flights import recorded
+
+        if (played := recorded(settings, record=flight == "record")) is not None:
+            watches.append(played)
 
     @contextlib.contextmanager
     def watching(supervisor: Supervisor) -> Iterator[None]:

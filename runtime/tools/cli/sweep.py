@@ -199,7 +199,7 @@ def flights(
     20 GB, or as many as VISNAV_FLIGHTS_GB says. What a flight depends on is a part of its name, so
     one that no longer fits is not used, and goes when it was not used for longest.
     """
-    from runtime.tools.flights.cache import home, kept, remove_beyond
+    from runtime.tools.flights import home, kept, remove_beyond
 
     if clear or keep is not None:
         removed = remove_beyond(0.0 if clear or keep is None else keep)

@@ -131,7 +131,7 @@ def compare_values(
     # Farther than any average of two differences: the sign of a failure's pair is all that counts.
     worst = 1e3 * (abs(found).max(initial=0.0) + 1.0)
     lost = [(a is None, b is None) for a, b in pairs.values() if a is None or b is None]
-    differences = np.concatenate([found, [sign * worst * (b - a) for a, b in map(_ints, lost)]])
+    differences = np.concatenate([found, [sign * worst * (int(b) - int(a)) for a, b in lost]])
     p, change, low, high = signed_rank(differences, error)
 
     def told(value: float) -> float:
@@ -148,19 +148,13 @@ def compare_values(
         verdict = "worse" if (low > 0) == (sign > 0) else "better"
     else:
         more = _more(len(differences), change, low, high, margin, error)
-    values = np.array(known).reshape(-1, 2)
+    medians = np.median(known, axis=0).tolist() if known else (None, None)
     return Comparison(
-        estimator=estimator, figure=name,
-        a=float(np.median([a for a, _ in known])) if known else None,
-        b=float(np.median(values[:, 1])) if known else None, change=change, low=low, high=high,
-        relative=relative, p=p, pairs=len(pairs),
+        estimator=estimator, figure=name, a=medians[0], b=medians[1], change=change, low=low,
+        high=high, relative=relative, p=p, pairs=len(pairs),
         failures=(sum(a for a, _ in lost), sum(b for _, b in lost)), verdict=verdict, more=more,
         flights={f"{scenario}, seed {seed}": pair for (scenario, seed), pair in pairs.items()},
     )  # fmt: skip
-
-
-def _ints(pair: tuple[bool, bool]) -> tuple[int, int]:
-    return int(pair[0]), int(pair[1])
 
 
 def signed_rank(differences: Floats, error: float) -> tuple[float, float, float, float]:

@@ -9,7 +9,6 @@ import concurrent.futures
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
 from typing import Any
 
 import msgspec
@@ -145,12 +144,7 @@ class Display(Watch):
         self._bar.start()
         return self
 
-    def __exit__(
-        self,
-        type_: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
     def begin(self, missing: Sequence[Job], finished: int) -> None:

@@ -20,7 +20,7 @@ from runtime.config.messages import given
 from runtime.config.model import Config, to_builtins
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
-from runtime.tools.flights.recorder import flight_of, settings_key
+from runtime.tools.flights import flight_of, settings_key
 from runtime.units import Duration
 
 _CLOSING = {"[": "]", "{": "}"}

@@ -72,29 +72,22 @@ def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) ->
     verdicts = [each for row in rows for each in row["estimators"].values()]
     aligned = len({each.get("alignment") for each in verdicts}) > 1
     short = _short([other.path for other in plan.parameters])
-    points: dict[tuple[str, tuple[str, ...]], dict[str, list[float]]] = {}
+    found: list[tuple[str, str, str, float]] = []
     for job, row in in_order(plan, rows):
         settings = dict(job.settings)
         here = settings.pop(parameter.path)
-        others = tuple(f"{short[path]}={text}" for path, text in settings.items())
+        others = ", ".join(f"{short[path]}={text}" for path, text in settings.items())
         for estimator, figures in row["estimators"].items():
             name = f"{estimator} ({figures.get('alignment', 'none')})" if aligned else estimator
-            for number in numbers([figures.get(figure)]):
-                line = points.setdefault((name, others), {})
-                line.setdefault(here, []).append(number)
-    if len(points) <= _MOST_LINES:
-        several = len({name for name, _ in points}) > 1
-        return [
-            _line(", ".join([name] * several + [*others]), line, parameter)
-            for (name, others), line in points.items()
-        ]
-    merged: dict[str, dict[str, list[float]]] = {}
-    for (name, _), line in points.items():
-        for text, found in line.items():
-            merged.setdefault(name, {}).setdefault(text, []).extend(found)
-    return [
-        _line(f"{name}, all others".lstrip(", "), line, parameter) for name, line in merged.items()
-    ]
+            found += [(name, others, here, number) for number in numbers([figures.get(figure)])]
+    several = len({name for name, *_ in found}) > 1
+    if len({(name, others) for name, others, *_ in found}) > _MOST_LINES:
+        several, found = True, [(name, "all others", here, n) for name, _, here, n in found]
+    points: dict[str, dict[str, list[float]]] = {}
+    for name, others, here, number in found:
+        label = ", ".join(filter(None, (name * several, others)))
+        points.setdefault(label, {}).setdefault(here, []).append(number)
+    return [_line(label, line, parameter) for label, line in points.items()]
 
 
 def _short(paths: Sequence[str]) -> dict[str, str]:
@@ -162,7 +155,7 @@ def _draw(
             axes.set_ylim(-4, 125)  # with room for the legend
             axes.set_yticks(range(0, 101, 20))
             axes.legend(fontsize=8, loc="upper left", ncols=2)
-        elif _decades([v for line in own for s in line.spreads for v in (s.least, s.most)]):
+        elif decades([v for line in own for s in line.spreads for v in (s.least, s.most)]):
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
         else:
@@ -170,7 +163,7 @@ def _draw(
         if scale.words:
             axes.set_xticks(scale.places, parameter.texts)
             axes.set_xlim(-0.5, len(scale.places) - 0.5)
-        elif _decades(scale.places):
+        elif decades(scale.places):
             axes.set_xscale("log")
             axes.set_xticks(scale.places, [f"{at:g}" for at in scale.places])
             axes.minorticks_off()
@@ -185,7 +178,7 @@ def _draw(
     figure.savefig(path, dpi=120)
 
 
-def _decades(values: Sequence[float]) -> bool:
+def decades(values: Sequence[float]) -> bool:
     """Return whether values span more than a decade, all of them above 0."""
     return min(values) > 0 and max(values) > 10 * min(values)
 

@@ -13,7 +13,7 @@ import csv
 import fcntl
 import json
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, NotRequired, TypedDict
 
@@ -189,35 +189,51 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
 
 def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     """Write the four tables into the plan's folder; rows of other plans are left out."""
-    paths = [p.path for p in plan.parameters]
     own = in_order(plan, rows)
-    _write(plan.out / "table.csv", *_table(paths, own))
-    seed = _seed(own)
-    header = ["run", *paths, *seed, "wall_seconds", "run_seconds", "sim_seconds"]
-    times = [
-        [*_head(job, seed), row["wall_seconds"], row["run_seconds"], row["sim_seconds"]]
-        for job, row in own
+    paths = [p.path for p in plan.parameters]
+    head = ["run", *paths, "seed", *["repeat"] * any(job.repeat > 1 for job, _ in own)]
+    runs: list[dict[str, Any]] = [
+        {**row, "run": job.id, "repeat": job.repeat, **dict(job.settings)} for job, row in own
     ]
-    _write(plan.out / "timing.csv", header, times)
-    workers = [
-        (_head(job, seed), name, costs)
-        for job, row in own
-        for name, costs in row.get("workers", {}).items()
+    times = ["wall_seconds", "run_seconds", "sim_seconds"]
+    _write(plan.out / "timing.csv", [*head, *times], runs)
+    costs = [
+        {**run, "worker": name, **costs}
+        for run in runs
+        for name, costs in run.get("workers", {}).items()
     ]
-    keys = list(dict.fromkeys(key for _, _, costs in workers for key in costs))
-    header = ["run", *paths, *seed, "worker", *keys]
-    costs_of_all = [[*h, name, *(costs.get(k) for k in keys)] for h, name, costs in workers]
-    _write(plan.out / "costs.csv", header, costs_of_all)
-    header = [*paths, "estimator", "alignment", "runs", "crashed", "failed", "passed", "repeatable"]
-    header += [f"{name}_{what}" for name in IN_SWEEPS for what in SPREAD]
-    lines = []
-    for each in summarise(plan, rows):
-        line: list[Any] = [*each.settings, each.estimator, each.alignment, each.runs]
-        line += [each.crashed, each.failed, each.passed, each.repeatable]
-        for name in IN_SWEEPS:
-            line += [getattr(each.figures.get(name), field, None) for field in SPREAD.values()]
-        lines.append(line)
-    _write(plan.out / "summary.csv", header, lines)
+    keys = dict.fromkeys(
+        key for _, row in own for c in row.get("workers", {}).values() for key in c
+    )
+    _write(plan.out / "costs.csv", [*head, "worker", *keys], costs)
+    head += ["exit_code", "error", "passed", "sim_seconds", "digest", "estimator"]
+    found = {key for _, row in own for figures in row["estimators"].values() for key in figures}
+    first = [name for name in ("alignment", *IN_SWEEPS) if name in found]
+    columns = {
+        name: f"estimator_{name}" if name in head else name
+        for name in [*first, *sorted(found - {*first})]
+    }
+    table = [
+        {**run, "estimator": name, **{column: figures.get(key) for key, column in columns.items()}}
+        for run in runs
+        for name, figures in (run["estimators"] or {"": {}}).items()
+    ]
+    _write(plan.out / "table.csv", [*head, *columns.values()], table)
+    head = [*paths, "estimator", "alignment", "runs", "crashed", "failed", "passed", "repeatable"]
+    head += [f"{name}_{what}" for name in IN_SWEEPS for what in SPREAD]
+    summary = [
+        {
+            **msgspec.structs.asdict(each),
+            **dict(zip(paths, each.settings, strict=True)),
+            **{
+                f"{name}_{what}": getattr(spread, field)
+                for name, spread in each.figures.items()
+                for what, field in SPREAD.items()
+            },
+        }
+        for each in summarise(plan, rows)
+    ]
+    _write(plan.out / "summary.csv", head, summary)
 
 
 def records(rows: Iterable[Row]) -> list[dict[str, Any]]:
@@ -300,38 +316,13 @@ def _repeatable(name: str, group: Sequence[Row]) -> str:
     return "differs" + f": {least:.3g} to {most:.3g} %" * (most > 0)
 
 
-def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], list[list[Any]]]:
-    header = ["run", *paths, *_seed(rows), "exit_code", "error", "passed", "sim_seconds", "digest"]
-    found = {key for _, row in rows for f in row["estimators"].values() for key in f}
-    figures = [name for name in ("alignment", *IN_SWEEPS) if name in found]
-    figures += sorted(found - {*figures})
-    lines = []
-    for job, row in rows:
-        head = [*_head(job, _seed(rows)), row["exit_code"], row["error"], row["passed"]]
-        head += [row["sim_seconds"], row["digest"]]
-        for name, own in (row["estimators"] or {"": {}}).items():
-            lines.append([*head, name, *(own.get(each) for each in figures)])
-    taken = {*header, "estimator"}
-    header.append("estimator")
-    header += [f"estimator_{name}" if name in taken else name for name in figures]
-    return header, lines
-
-
-def _seed(rows: Sequence[tuple[Job, Row]]) -> list[str]:
-    return ["seed", "repeat"] if any(job.repeat > 1 for job, _ in rows) else ["seed"]
-
-
-def _head(job: Job, columns: Sequence[str]) -> list[Any]:
-    own = [job.seed, job.repeat][: len(columns)]
-    return [job.id, *(text for _, text in job.settings), *own]
-
-
-def _write(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
+def _write(path: Path, head: Sequence[str], lines: Iterable[Mapping[str, Any]]) -> None:
+    """Write the columns of the head; what a line has besides is left out."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows([_cell(value) for value in line] for line in lines)
+        writer.writerow(head)
+        writer.writerows([_cell(line.get(name)) for name in head] for line in lines)
 
 
 def _cell(value: Any) -> str:

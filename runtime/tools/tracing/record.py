@@ -1,29 +1,186 @@
-"""An instrument to note a run's steps and events: no more than a tuple each on the loop."""
+"""An instrument to note a run's steps and events: no more than a tuple each on the loop.
+
+The notes go into a file during the run, to bound the memory. A thread encodes a list of notes at a
+time, which is short enough not to be felt on the loop.
+
+Causes of events, from a sensor's measurement through nodes to a set-point, are not declared by
+nodes; they are inferred by three rules, the most reliable first:
+
+1. An event has the stamp of one that its node received: an estimate has that of its image.
+2. Its node sent it while it handled another event.
+3. Its node had received another event: a controller with a rate of its own uses the newest.
+
+The third rule is a guess, and is marked as *held*: the latency of such a path is the age of the
+newest event that the node could have used.
+"""
 
 from __future__ import annotations
 
 import concurrent.futures
-import contextlib
 import logging
-import os
-import tempfile
+import queue
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
-from events import Event
+import msgspec
+
+from events import Category, Event, Image, Setpoint
 from runtime.channels.sender import Sender, Tap
-from runtime.errors import ConfigError
 from runtime.run.instruments import Call, Instrument
-from runtime.run.supervisor import Supervisor
 from runtime.time.clock import Clock, RealClock
-from runtime.tools.tracing.spool import CHUNK, ClockRate, Spool
-from runtime.tools.tracing.write import write_trace
 
 log = logging.getLogger("visnav.runtime")
+
+CHUNK = 1024  # notes per list, about; encoding a list takes some tenths of a millisecond
+
+_LENGTH_BYTES = 4
+
+
+class EventKind(msgspec.Struct, frozen=True):
+    """Properties of a type of event for traces.
+
+    Attributes:
+        measured: Whether it is a sensor's: a path may begin with it.
+        image: Whether it is a camera's, which is preferred to other sensors'.
+        setpoint: Whether it is a set-point: a path ends with it.
+    """
+
+    measured: bool
+    image: bool
+    setpoint: bool
+
+
+class EventNote(NamedTuple):
+    """The note of an event, as read from the spool.
+
+    Attributes:
+        time: Of sending, real time (ns).
+        run: Of sending, the run's clock (ns).
+        sender: ``node.port``.
+        identity: Its `id`.
+        given: The `id` of the event that the step which sent it was handling; 0 if none.
+    """
+
+    time: int
+    run: int
+    sender: str
+    event: str
+    source: str
+    stamp: int
+    identity: int
+    given: int
+
+
+class ClockRate(NamedTuple):
+    """How the run's clock follows real time; `run` of a note is then real time, too.
+
+    Attributes:
+        origin: When the run's clock showed 0.
+        speed: Its seconds per real second.
+    """
+
+    origin: int
+    speed: float
+
+    def run(self, real: int) -> int:
+        """Return the time of the run's clock (ns) at a real time; 0 before its begin."""
+        return max(round((real - self.origin) * self.speed), 0)
+
+
+class Spool:
+    """A file of notes.
+
+    Args:
+        path: Of the file; it is deleted when the notes have been read.
+
+    Attributes:
+        beside: Notes of other threads than the loop's.
+        kinds: What is known of each type of event, by name.
+        receivers: Nodes that hear events of a sender, type and source.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.beside: deque[tuple[Any, ...]] = deque()
+        self.rate: ClockRate | None = None
+        self.kinds: dict[str, EventKind] = {}
+        self.receivers: dict[tuple[str, str, str], tuple[str, ...]] = {}
+        self.origin = time.perf_counter_ns()
+        """Begin of the notes: `time.perf_counter_ns` before all of them."""
+        self.failed: OSError | None = None  # why there can be no trace any more
+        self._file = path.open("wb", buffering=0)
+        self._lists: queue.SimpleQueue[list[tuple[Any, ...]] | None] = queue.SimpleQueue()
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._thread = threading.Thread(target=self._write, name="trace", daemon=True)
+        self._thread.start()
+
+    def put(self, notes: list[tuple[Any, ...]]) -> None:
+        """Take a list of notes, in the order of their making."""
+        self._lists.put(notes)
+
+    def close(self) -> None:
+        """Write the remaining notes; nothing is taken afterwards."""
+        self._lists.put(None)
+        self._thread.join()
+        self._file.close()
+
+    def discard(self) -> None:
+        """Delete the file."""
+        self.path.unlink(missing_ok=True)
+
+    def read(self) -> Iterator[list[Any]]:
+        """Yield all notes in the order of taking, and delete the file."""
+        with self.path.open("rb") as file:
+            while length := file.read(_LENGTH_BYTES):
+                yield from msgspec.msgpack.decode(file.read(int.from_bytes(length, "little")))
+        self.discard()
+
+    def _write(self) -> None:
+        while (notes := self._lists.get()) is not None:
+            self._try_to_append(self._drained() + notes)
+        self._try_to_append(self._drained())
+
+    def _try_to_append(self, notes: list[tuple[Any, ...]]) -> None:
+        if self.failed is None:
+            try:
+                self._append(notes)
+            except OSError as error:  # a full disk, which must not spoil the run
+                self.failed = error
+                log.warning("no trace from here on: %s", error)
+
+    def _drained(self) -> list[tuple[Any, ...]]:
+        found = []
+        while self.beside:
+            found.append(self.beside.popleft())
+        return found
+
+    def _append(self, notes: list[tuple[Any, ...]]) -> None:
+        content = self._encode([self._plain(n) if n[0] == "event" else n for n in notes])
+        rest = memoryview(len(content).to_bytes(_LENGTH_BYTES, "little") + content)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+
+    def _plain(self, note: tuple[Any, ...]) -> tuple[Any, ...]:
+        _, time, run, sender, event, source, stamp, identity, cause, listeners = note
+        name = "run.announced" if sender is None else sender.name
+        key = (name, event.__name__, source)
+        if key not in self.receivers:
+            heard = (each.node for each in listeners or () if each.receives(event, source))
+            self.receivers[key] = tuple(dict.fromkeys(heard))
+            self.kinds[event.__name__] = _kind(event)
+        return ("event", *EventNote(time, run, *key, stamp, identity, cause))
+
+
+def _kind(event: type[Event]) -> EventKind:
+    return EventKind(
+        measured=bool(event.category & (Category.SENSOR | Category.GEOMETRY)),
+        image=issubclass(event, Image),
+        setpoint=issubclass(event, Setpoint),
+    )
 
 
 class TraceInstrument(Instrument):
@@ -131,38 +288,123 @@ class TraceInstrument(Instrument):
         self._notes.clear()
 
 
-@contextlib.contextmanager
-def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
-    """Trace a run while the block lasts, then write (``.gz``: compressed); or `ConfigError`."""
-    if not path.name or path.is_dir():
-        raise ConfigError(f"{path}: expected the name of a file for a trace, found a folder")
-    if path.exists() and not (path.is_file() or path.is_char_device()):
-        raise ConfigError(f"{path}: expected the name of a file for a trace, found none")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        folder = tempfile.gettempdir() if path.is_char_device() else path.parent
-        number, part = tempfile.mkstemp(".part", f"{path.name}.", folder)
-        os.close(number)
-        spool = Spool(Path(part))
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: expected a place for a trace, found: {error.strerror}"
-        ) from None
-    recorder = TraceInstrument(supervisor.state.clock, spool)
-    supervisor.instruments.attach(recorder)
-    try:
-        yield
-    finally:
-        recorder.close()
-        spool.close()
-        if spool.failed is None:
-            _write(spool, path, supervisor, name)
-        spool.discard()
+REMEMBERED = 512  # how many stamps of received events are kept per node
+IDENTITIES = 8192  # how many events are kept by identity
+
+How = Literal["begins", "follows", "holds"]
 
 
-def _write(spool: Spool, path: Path, supervisor: Supervisor, name: str) -> None:
-    order = [node.name for node in supervisor.state.all_nodes]
-    try:
-        write_trace(spool, path, name=name, clock=supervisor.state.clock.kind, nodes=order)
-    except OSError as error:  # a full disk: the run's other results must not go with the trace
-        log.error("%s: the trace could not be written: %s", path, error)
+class SentEvent(msgspec.Struct, eq=False):
+    """An event and its cause, an earlier event.
+
+    Attributes:
+        time: Of `time.perf_counter_ns`, when it was sent.
+        node: Sender.
+        seen: Whether its path begins with a camera.
+        how: ``begins`` a path, ``follows`` from `cause`, or ``holds`` it at best.
+        cause: The event that it follows from.
+    """
+
+    time: int
+    run: int
+    node: str
+    event: str
+    source: str
+    stamp: int
+    seen: bool = False
+    how: How = "begins"
+    cause: SentEvent | None = None
+
+    def path(self) -> list[SentEvent]:
+        """Return all events from the sensor's event to this."""
+        found: list[SentEvent] = []
+        each: SentEvent | None = self
+        while each is not None:
+            found.append(each)
+            each = each.cause
+        return found[::-1]
+
+
+class _HeardEvents:
+    def __init__(self) -> None:
+        self.by_stamp: OrderedDict[int, list[SentEvent]] = OrderedDict()
+        self.newest: SentEvent | None = None
+
+    def add(self, sent: SentEvent) -> None:
+        self.by_stamp.setdefault(sent.stamp, []).append(sent)
+        if len(self.by_stamp) > REMEMBERED:
+            self.by_stamp.popitem(last=False)
+        if sent.seen or self.newest is None or not self.newest.seen:
+            self.newest = sent
+
+    def of_stamp(self, stamp: int) -> Iterator[SentEvent]:
+        """Yield the events with this stamp, the most likely cause first."""
+        yield from sorted(
+            self.by_stamp.get(stamp, ()), key=lambda s: (s.seen, s.time), reverse=True
+        )
+
+
+class Causes:
+    """Inference of each event's cause, event by event in the order of sending.
+
+    Args:
+        receivers: The nodes that receive events of a sender, type and source.
+    """
+
+    def __init__(
+        self,
+        kinds: Mapping[str, EventKind],
+        receivers: Mapping[tuple[str, str, str], tuple[str, ...]],
+    ) -> None:
+        self._kinds = kinds
+        self._receivers = receivers
+        self._heard: dict[str, _HeardEvents] = {}
+        self._by_identity: OrderedDict[int, tuple[SentEvent, tuple[str, ...]]] = OrderedDict()
+        """Events with their receiving nodes, by `id`."""
+
+    def add(self, note: EventNote) -> SentEvent:
+        """Add the next event, and return the event with its cause."""
+        node, kind = note.sender.partition(".")[0], self._kinds[note.event]
+        sent = SentEvent(note.time, note.run, node, note.event, note.source, note.stamp)
+        # Another event may lie where one lay that has come from elsewhere.
+        found, heard = self._by_identity.get(note.given, (None, ()))
+        self._trace_back(sent, kind, found if node in heard else None)
+        sent.seen = kind.image if sent.cause is None else sent.cause.seen
+        receivers = self._receivers.get((note.sender, note.event, note.source), ())
+        self._by_identity[note.identity] = sent, receivers
+        self._by_identity.move_to_end(note.identity)
+        if len(self._by_identity) > IDENTITIES:
+            self._by_identity.popitem(last=False)
+        if not kind.setpoint and (kind.measured or sent.cause is not None):
+            for receiver in receivers:
+                if receiver != node:
+                    self._heard.setdefault(receiver, _HeardEvents()).add(sent)
+        return sent
+
+    def _trace_back(self, sent: SentEvent, kind: EventKind, given: SentEvent | None) -> None:
+        past = self._heard.get(sent.node) or _HeardEvents()
+        if given is not None and (given.node == sent.node or not self._leads_anywhere(given)):
+            given = None
+        followed: list[SentEvent] = []
+        if not kind.setpoint:  # whose stamp is when it was sent, and tells nothing
+            if given is not None and given.stamp == sent.stamp:
+                followed.append(given)
+            followed += past.of_stamp(sent.stamp)
+        if given is not None and not kind.measured:
+            followed.append(given)
+        for cause in followed:
+            if _passes(cause, sent.node):
+                sent.cause, sent.how = cause, "follows"
+                return
+        newest = past.newest
+        if newest is not None and not kind.measured and _passes(newest, sent.node):
+            sent.cause, sent.how = newest, "holds"
+
+    def _leads_anywhere(self, sent: SentEvent) -> bool:
+        kind = self._kinds[sent.event]
+        return not kind.setpoint and (kind.measured or sent.cause is not None)
+
+
+def _passes(sent: SentEvent, node: str) -> bool:
+    """Tell whether a path can go on to a node: each node is on a path only once."""
+    return all(each.node != node for each in sent.path())

@@ -8,7 +8,11 @@ run's clock stands in the arguments. Reading needs no run.
 from __future__ import annotations
 
 import bisect
+import contextlib
 import gzip
+import logging
+import os
+import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -18,8 +22,17 @@ import msgspec
 
 from runtime.errors import ConfigError
 from runtime.run.results import replacing
-from runtime.tools.tracing.causes import Causes, SentEvent
-from runtime.tools.tracing.spool import ClockRate, EventNote, Spool
+from runtime.run.supervisor import Supervisor
+from runtime.tools.tracing.record import (
+    Causes,
+    ClockRate,
+    EventNote,
+    SentEvent,
+    Spool,
+    TraceInstrument,
+)
+
+log = logging.getLogger("visnav.runtime")
 
 MADE_BY = "python -m runtime run --trace"  # mark of a trace made by this project
 LOOP, THREADS, WORKERS, SENSORS = 1, 2, 3, 4  # process numbers of the trace's groups of tracks
@@ -32,6 +45,43 @@ _TITLES = {
 }
 _MOMENT = 0.1
 """Microseconds of the slice of an instant, for an arrow to begin there; shorter than a delivery."""
+
+
+@contextlib.contextmanager
+def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
+    """Trace a run while the block lasts, then write (``.gz``: compressed); or `ConfigError`."""
+    if not path.name or path.is_dir():
+        raise ConfigError(f"{path}: expected the name of a file for a trace, found a folder")
+    if path.exists() and not (path.is_file() or path.is_char_device()):
+        raise ConfigError(f"{path}: expected the name of a file for a trace, found none")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = tempfile.gettempdir() if path.is_char_device() else path.parent
+        number, part = tempfile.mkstemp(".part", f"{path.name}.", folder)
+        os.close(number)
+        spool = Spool(Path(part))
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: expected a place for a trace, found: {error.strerror}"
+        ) from None
+    recorder = TraceInstrument(supervisor.state.clock, spool)
+    supervisor.instruments.attach(recorder)
+    try:
+        yield
+    finally:
+        recorder.close()
+        spool.close()
+        if spool.failed is None:
+            _write(spool, path, supervisor, name)
+        spool.discard()
+
+
+def _write(spool: Spool, path: Path, supervisor: Supervisor, name: str) -> None:
+    order = [node.name for node in supervisor.state.all_nodes]
+    try:
+        write_trace(spool, path, name=name, clock=supervisor.state.clock.kind, nodes=order)
+    except OSError as error:  # a full disk: the run's other results must not go with the trace
+        log.error("%s: the trace could not be written: %s", path, error)
 
 
 def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Iterable[str]) -> None:
@@ -77,14 +127,7 @@ class _Writer:
         for node in self._nodes:
             yield from self._track(LOOP, node)
         for kind, *note in self._spool.read():
-            if kind == "step":
-                yield from self._step(*note)
-            elif kind == "event":
-                yield from self._event(EventNote(*note))
-            elif kind == "thread":
-                yield from self._thread(*note)
-            else:
-                yield from self._worker(*note)
+            yield from getattr(self, f"_{kind}")(*note)
 
     def _track(self, process: int, name: str) -> Iterator[dict[str, Any]]:
         if (process, name) not in self._tracks:
@@ -112,7 +155,8 @@ class _Writer:
         run = self._moments.add(begin, run)
         yield from self._slice(LOOP, node, what, begin, end, run_s=run / 1e9)
 
-    def _event(self, note: EventNote) -> Iterator[dict[str, Any]]:
+    def _event(self, *of: Any) -> Iterator[dict[str, Any]]:
+        note = EventNote(*of)
         time, run = note.time, self._moments.add(note.time, note.run)
         sent = self._causes.add(note._replace(run=run))
         args: dict[str, Any] = {

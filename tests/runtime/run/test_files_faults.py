@@ -21,7 +21,7 @@ from runtime.errors import VisnavError
 from runtime.run.execute import execute
 from runtime.run.results import claim, write
 from runtime.testing import spec
-from runtime.tools.tracing.record import tracing
+from runtime.tools.tracing.write import tracing
 from runtime.units import Duration
 from tests.runtime.samples import Speaker
 from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, results, summary

@@ -13,8 +13,7 @@ import pytest
 from events import Image
 from runtime import Changeable, Duration, Input, Node, NodeConfig
 from runtime.config.reading import find_nodes
-from runtime.tools.describe import attribute_docs
-from runtime.tools.schema import schema
+from runtime.tools.describe import attribute_docs, schema
 
 ROOT = Path(__file__).parents[3]
 COMMITTED = ROOT / "docs" / "reference" / "config.schema.json"

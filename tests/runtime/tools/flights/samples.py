@@ -6,10 +6,9 @@ import asyncio
 import logging
 import os
 import signal
-import threading
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +52,29 @@ class Guess(Event):
     number: float
 
 
+class Look(NamedTuple):
+    """What a lens answers."""
+
+    number: float
+    data: npt.NDArray[np.uint8]
+
+
+class Lens:
+    """What measures, in a process of its own, and remembers how often."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def mean(self, data: npt.NDArray[np.uint8]) -> Look:
+        """Return a mean, with the picture, each darker than the one before."""
+        self.calls += 1
+        return Look(float(np.mean(data)), data - np.uint8(self.calls % 256))
+
+    def fail(self) -> None:
+        """Do not answer."""
+        raise LookupError("nothing to be seen")
+
+
 class CraftConfig(NodeConfig):
     """Settings of a craft."""
 
@@ -60,7 +82,7 @@ class CraftConfig(NodeConfig):
     latency: Duration = Duration(0.04)
     fail: bool = False
     last_words: bool = False
-    thing: bool = False
+    lens: bool = True
     signal: bool = False
 
 
@@ -75,6 +97,13 @@ class Craft(Node[CraftConfig]):
     async def on_startup(self) -> None:
         """Tick at a rate that is a setting."""
         self.heard = 0.0
+        if not self.config.lens:
+            return
+        self.lens = await self.worker(Lens)
+        try:
+            await self.lens.call(Lens.fail)
+        except LookupError as error:
+            self.note_environment("craft", str(error))
         self.every(self.config.rate, self.look, "look")
 
     def announce(self) -> Iterable[Announcement]:
@@ -83,7 +112,6 @@ class Craft(Node[CraftConfig]):
             stamp=0, source=self.name, mass=1.0, max_thrust=2.0, control_rate=100.0,
             position=(0.0, 0.0, 0.0), orientation=(1.0, 0.0, 0.0, 0.0),
         )  # fmt: skip
-        self.note_environment("craft", "a model")
 
     @every(hz=100)
     def feel(self, tick: Tick) -> None:
@@ -97,11 +125,14 @@ class Craft(Node[CraftConfig]):
 
     def look(self, tick: Tick) -> None:
         """Measure, and tell later."""
+        if not self.config.lens:
+            return
         self.start(self._tell(tick.stamp, self.rng.integers(0, 256, (8, 9, 3), np.uint8)))
 
     async def _tell(self, stamp: int, data: npt.NDArray[np.uint8]) -> None:
-        number = await self.offload_for(self.config.latency, np.mean, data)
-        event = Seen(stamp=stamp, source=self.name, number=float(number), data=data)
+        number, darker = await self.lens.call_for(self.config.latency, Lens.mean, data)
+        await self.offload(np.mean, data)
+        event = Seen(stamp=stamp, source=self.name, number=number, data=darker)
         self.seen.send(event)
         await asyncio.sleep(0)
         self.echoes.send(Echo(stamp=self.clock.now(), source=f"{self.name}/soon", number=0.0))
@@ -111,8 +142,6 @@ class Craft(Node[CraftConfig]):
         """Obey, and say so at once; nobody after it gets each seventh."""
         self.heard += order.number
         heard = round(self.heard) if order.number > 0.5 else self.heard  # whole, or a float
-        if self.config.thing:
-            heard = cast("float", threading.Lock())
         echo = Echo(stamp=order.stamp, source=f"{self.name}/echo", number=heard)
         self.echoes.send(echo)
         return int(order.number * 1e6) % 7 == 0

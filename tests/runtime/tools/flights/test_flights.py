@@ -19,9 +19,19 @@ from runtime.channels.digest import Digest
 from runtime.config.model import Config
 from runtime.config.reading import load
 from runtime.errors import NodeError
-from runtime.tools.flights.cache import home, kept, recorded, remove_beyond
-from runtime.tools.flights.player import Action, Writer, event_at
-from runtime.tools.flights.recorder import _imported, content_key, flight_of, record, settings_key
+from runtime.tools.flights import (
+    _imported,
+    content_key,
+    flight_of,
+    fly,
+    home,
+    kept,
+    put,
+    recorded,
+    remove_beyond,
+    settings_key,
+    taken,
+)
 from tests.runtime.tools.flights import samples
 from tests.runtime.tools.flights.samples import Seen, events_of, flown
 from tests.runtime.tools.samples_cli import ROOT
@@ -39,9 +49,8 @@ def assert_equal_when_played(
     config = flown(folder, *overrides, *flight, run=run)
     summary, lines = events_of(config)
     assert recorded(flown(folder, *flight, run=run), record=True)
-    stand_ins = recorded(config, record=False)
-    assert set(stand_ins) == {"craft", "captain"}
-    again, same_lines = events_of(config, stand_ins=stand_ins)
+    again, same_lines = events_of(config, watch=recorded(config, record=False))
+    assert (set(summary.workers), set(again.workers)) == ({"craft.Lens"}, set())
     assert same_lines == lines
     assert len(lines) > 100
     for field in (
@@ -54,7 +63,7 @@ def assert_equal_when_played(
         "outputs",
     ):
         assert getattr(again, field) == getattr(summary, field), field
-    assert again.environment["craft"] == "a model"
+    assert again.environment["craft"] == "nothing to be seen"
     ticks = {name: each.calls for name, each in summary.ticks.items()}
     assert {name: each.calls for name, each in again.ticks.items()} == ticks
 
@@ -81,28 +90,31 @@ def test_a_played_flight_is_equal_to_the_event_and_in_their_order(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("run", ["duration = '0.5s'", "duration = '3s'", "seed = 4"])
-def test_it_ends_as_it_did(tmp_path: Path, run: str) -> None:
-    run = run if "duration" in run else "duration = '2s'"
-    assert_equal_when_played(tmp_path, run=run)
-
-
-@pytest.mark.slow
-def test_it_ends_earlier_if_another_node_ends_the_run(tmp_path: Path) -> None:
-    assert_equal_when_played(tmp_path, "guesser.end=0.4")
-
-
-@pytest.mark.slow
-def test_links_before_nodes_of_the_flight_and_others_are_the_same(tmp_path: Path) -> None:
-    links = ("captain.links.felt.delay=7ms", "captain.links.seen.delay=13ms")
-    assert_equal_when_played(tmp_path, "guesser.links.pairs.loss=0.2", flight=links)
+@pytest.mark.parametrize(
+    ("others", "flight", "run"),
+    [
+        ((), (), "duration = '0.5s'"),  # it ends before the captain has gone
+        ((), (), "duration = '3s'"),
+        (("guesser.end=0.4",), (), "duration = '3s'"),  # another node ends it
+        ((), ("craft.last_words=true",), "duration = '3s'"),
+        (
+            ("guesser.links.pairs.loss=0.2",),
+            ("captain.links.felt.delay=7ms", "captain.links.seen.delay=13ms"),
+            "duration = '3s'",
+        ),
+    ],
+)
+def test_it_ends_and_goes_by_its_links_as_it_did(
+    tmp_path: Path, others: tuple[str, ...], flight: tuple[str, ...], run: str
+) -> None:
+    assert_equal_when_played(tmp_path, *others, flight=flight, run=run)
 
 
 def test_what_else_has_an_influence_is_not_recorded(tmp_path: Path) -> None:
     meddler = "[[nodes]]\nname = 'meddler'\ntype = 'tests.runtime.tools.flights.samples:Meddler'\n"
     meddled = flown(tmp_path, text=meddler)
     assert flight_of(meddled) is None
-    assert recorded(meddled, record=True) == {}
+    assert recorded(meddled, record=True) is None
     narrowed = flown(tmp_path, "craft.inputs.orders=captain", text=meddler)
     part = flight_of(narrowed)
     assert part is not None
@@ -205,7 +217,7 @@ def test_every_way_to_import_is_known(statement: str, tmp_path: Path) -> None:
 def test_what_has_a_name_of_the_cache_neither_hangs_nor_fails_a_run(
     kind: str, name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    config = flown(tmp_path, "captain.end=0.2")
+    config = flown(tmp_path, "captain.end=0.2", "craft.lens=false", run="duration = '0.3s'")
     part = flight_of(config)
     assert part is not None
     path = home() / name.format(f"{content_key(part)}.flight") if name else home()
@@ -238,20 +250,20 @@ def test_what_is_damaged_or_of_other_code_is_flown_again(tmp_path: Path, what: s
     )  # fmt: skip
     if what == "gone":
         flight.path.unlink()
-    assert recorded(config, record=False) == {}
+    assert recorded(config, record=False) is None
     assert recorded(config, record=True)
     assert flight.path.read_bytes() == content
 
 
 @pytest.mark.slow
-def test_an_event_that_other_code_has_written_is_flown_again(
+def test_an_answer_that_other_code_has_written_is_flown_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = flown(tmp_path, "captain.end=0.2")
     assert recorded(config, record=True)
     with monkeypatch.context() as patch:
-        patch.delattr(samples, "Seen")
-        assert recorded(config, record=False) == {}
+        patch.delattr(samples, "Look")
+        assert recorded(config, record=False) is None
     assert recorded(config, record=False)
 
 
@@ -260,16 +272,14 @@ def test_an_event_that_other_code_has_written_is_flown_again(
     st.sampled_from([0, 1.5, np.float32(2), True]),
     st.booleans(),
 )
-def test_events_come_back_with_their_very_types(
+def test_answers_come_back_with_their_very_types(
     data: npt.NDArray[np.uint8], number: float, transposed: bool
 ) -> None:
     sent = Seen(stamp=1, source="craft", number=number, data=data.T if transposed else data)
     file = io.BytesIO(b"")
-    writer = Writer(file)
-    writer.event(sent)
-    place, sizes = writer.event(sent)
-    action = Action("send", "craft", -1, [], due=place, sizes=sizes)
-    again = event_at(memoryview(file.getvalue()), action)
+    put(file, sent)
+    place = put(file, sent)
+    again = taken(memoryview(file.getvalue()), place)
     assert type(again.number) is type(number)
     digests = [Digest(), Digest()]
     for digest, event in zip(digests, (sent, again), strict=True):
@@ -277,28 +287,23 @@ def test_events_come_back_with_their_very_types(
     assert digests[0].hexdigest() == digests[1].hexdigest()
 
 
-def test_an_event_that_is_no_data_makes_a_flight_unfit(tmp_path: Path) -> None:
-    assert recorded(flown(tmp_path, "craft.thing=true", "run.digest=false"), record=True) == {}
-    assert [each.size < 999 for each in kept()] == [True]
-
-
-def test_what_cannot_be_played_again_is_remembered_as_such(tmp_path: Path) -> None:
-    config = flown(tmp_path, "craft.last_words=true")
-    for _ in range(2):
-        assert recorded(config, record=True) == {}
-        assert len(kept()) == 1
+def test_calls_that_the_flight_does_not_know_are_an_error(tmp_path: Path) -> None:
+    played = recorded(flown(tmp_path, "captain.end=0.1"), record=True)
+    message = "worker craft.Lens: expected the calls of the recorded flight, next none, found mean"
+    with pytest.raises(NodeError, match=message):
+        events_of(flown(tmp_path, "captain.end=1.0"), watch=played)
 
 
 def test_a_flight_that_fails_is_not_kept(tmp_path: Path) -> None:
-    config = flown(tmp_path, "craft.fail=true")
-    assert recorded(config, record=True) == {}
+    config = flown(tmp_path, "craft.fail=true", "craft.lens=false")
+    assert recorded(config, record=True) is None
     assert kept() == []
     with pytest.raises(NodeError, match="out of order"):
         events_of(config)
 
 
 def test_a_signal_during_the_flight_ends_what_was_to_follow(tmp_path: Path) -> None:
-    config = flown(tmp_path, "craft.signal=true")
+    config = flown(tmp_path, "craft.signal=true", "craft.lens=false")
     with pytest.raises(KeyboardInterrupt):
         recorded(config, record=True)
     assert kept() == []
@@ -311,19 +316,19 @@ def test_one_flies_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def counted(config: Config, path: Path) -> None:
         flights.append(path)
-        record(config, path)
+        fly(config, path)
 
-    monkeypatch.setattr("runtime.tools.flights.cache.fly", counted)
-    found: list[set[str]] = []
+    monkeypatch.setattr("runtime.tools.flights.fly", counted)
+    found: list[bool] = []
     threads = [
-        threading.Thread(target=lambda: found.append({*recorded(config, record=True)}))
+        threading.Thread(target=lambda: found.append(recorded(config, record=True) is not None))
         for _ in range(3)
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert found == [{"craft", "captain"}] * 3
+    assert found == [True] * 3
     assert len(flights) == 1
 
 
@@ -338,13 +343,13 @@ def test_those_not_used_for_longest_go_first(
         os.utime(each.path, (1000 - age, 1000 - age))
     newest, _, oldest = kept()
     used = next(c for c in configs if content_key(flight_of(c) or c) == oldest.path.stem)
-    stand_ins = recorded(used, record=False)
+    played = recorded(used, record=False)
     (removed,) = remove_beyond((oldest.size + newest.size + 9) / 1e9)
     assert removed.path not in {oldest.path, newest.path}
     assert [each.path for each in kept()] == [oldest.path, newest.path]
     remove_beyond(0)
     assert kept() == []
-    summary, lines = events_of(used, stand_ins=stand_ins)  # what is open stays
+    summary, lines = events_of(used, watch=played)  # what is open stays
     assert (summary.error, len(lines) > 50) == (None, True)
     monkeypatch.setenv("VISNAV_FLIGHTS_GB", "0.000001")
     for config in configs:
@@ -369,8 +374,8 @@ def test_real_flights_are_played_to_the_byte(name: str, seconds: int) -> None:
     overrides = [f"run.duration={seconds}s", "run.startup_limit=10min"]  # of a busy machine
     config = load(ROOT / name, overrides)
     summary, lines = events_of(config)
-    stand_ins = recorded(config, record=True)
-    assert stand_ins
-    again, same_lines = events_of(config, stand_ins=stand_ins)
+    played = recorded(config, record=True)
+    again, same_lines = events_of(config, watch=played)
+    assert set(summary.workers) - set(again.workers)
     assert same_lines == lines
     assert (again.digests, again.verdict) == (summary.digests, summary.verdict)

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from runtime.tools.flights.cache import kept
+from runtime.tools.flights import kept
 from runtime.tools.sweep import Children, make_plan, sweep, write_tables
 from runtime.tools.sweep.process import kill_tree, last_error, read_results
 from tests.runtime.tools.flights.samples import flight_file

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from runtime.tools.tracing.causes import Causes, SentEvent
-from runtime.tools.tracing.spool import EventKind, EventNote
+from runtime.tools.tracing.record import Causes, EventKind, EventNote, SentEvent
 
 KINDS = {
     "Image": EventKind(measured=True, image=True, setpoint=False),

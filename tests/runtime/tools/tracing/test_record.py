@@ -10,8 +10,7 @@ from typing import Any
 from runtime.channels.sender import Sender
 from runtime.time.lockstep import LockstepClock, LockstepLoop
 from runtime.time.schedule import Tick
-from runtime.tools.tracing.record import TraceInstrument
-from runtime.tools.tracing.spool import CHUNK, Spool
+from runtime.tools.tracing.record import CHUNK, Spool, TraceInstrument
 from tests.runtime.samples import Ping
 
 

@@ -17,8 +17,8 @@ from runtime.errors import ConfigError
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.cli.live import tables
-from runtime.tools.tracing import spool, write
-from runtime.tools.tracing.record import tracing
+from runtime.tools.tracing import write
+from runtime.tools.tracing.record import Spool
 from runtime.tools.tracing.write import (
     LOOP,
     SENSORS,
@@ -29,6 +29,7 @@ from runtime.tools.tracing.write import (
     paths,
     quantile,
     read_trace,
+    tracing,
 )
 from tests.runtime.samples_loop import (
     Camera,
@@ -150,7 +151,7 @@ def test_a_full_disk_costs_the_trace_and_not_the_run(
         raise OSError(28, "No space left on device")
 
     if when == "in the run":
-        monkeypatch.setattr(spool.Spool, "_append", full)
+        monkeypatch.setattr(Spool, "_append", full)
     else:
         monkeypatch.setattr(write._Writer, "_step", full)
     looked = look(NODES, watch=lambda s: tracing(s, tmp_path / "t.json", "loop"))
@@ -160,7 +161,7 @@ def test_a_full_disk_costs_the_trace_and_not_the_run(
 
 
 def test_time_in_a_trace_begins_before_all_that_is_in_it(tmp_path: Path) -> None:
-    notes = spool.Spool(tmp_path / "notes")
+    notes = Spool(tmp_path / "notes")
     begin = notes.origin
     late = 123_456_789_000_000_000  # of an announcement that bears the time of day, say
     announced = ("event", begin + 5_000, 0, None, PoseEstimate, "a", late, 7_000_000, 0, None)

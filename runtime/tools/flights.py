@@ -1,0 +1,461 @@
+"""Flights flown once and used by many runs: what their nodes' workers have answered.
+
+What a flight costs is rendering and scanning, which its nodes have done by workers. So a flight is
+recorded as the answers of these. In a run that uses it, all nodes run as ever, and the workers of
+those that fly give the recorded answers, without any process. Simulated time waits for either: the
+same events come at the same times in the same order, to the byte.
+
+Flights are kept by their content, in ``~/.cache/visnav-runtime/flights``. ``VISNAV_FLIGHTS_GB``
+says how much they may take (20 if it does not); of more, those that were not used for longest are
+removed. A flight is written by one process at a time, and as a whole. Its name is made of all that
+it depends on: settings, sources, files, machine. Its file:
+
+    answers      each pickled: the result, or else the error
+    calls        by worker, names of methods and places of the answers, in the order of the calls
+    u64 LE       where these begin
+    16 bytes     XXH3 hash of all before
+"""
+
+from __future__ import annotations
+
+import ast
+import concurrent.futures
+import contextlib
+import errno
+import fcntl
+import functools
+import importlib.util
+import json
+import logging
+import mmap
+import os
+import pickle
+import re
+import struct
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import msgspec
+import xxhash
+
+from runtime.config.model import Config, NodeSpec, to_builtins
+from runtime.errors import VisnavError, WorkerError
+from runtime.node import Node, NodeConfig
+from runtime.paths import written
+from runtime.run.execute import Watch, execute
+from runtime.run.graph import edges_of
+from runtime.run.instruments import Instrument
+from runtime.run.summarise import environment
+from runtime.run.supervisor import Supervisor
+from runtime.workers.worker import Worker
+
+_LOG = logging.getLogger("visnav.flights")
+
+LIMIT = 20.0  # gigabytes, unless ``VISNAV_FLIGHTS_GB`` says otherwise
+
+Calls = dict[str, list[tuple[str, int]]]
+"""By worker, the method and the place of the answer of each call; -1 for an answer that is none."""
+
+_BEGIN = struct.Struct("<Q")
+_CHECKSUM = 16
+_REST = 10.0  # seconds of the clock for a flight to go on without ticks: answers still arrive
+_DONE: concurrent.futures.Future[None] = concurrent.futures.Future()
+_DONE.set_result(None)
+
+
+class Kept(NamedTuple):
+    """A kept flight: its file, size (bytes), and time of last use (s)."""
+
+    path: Path
+    size: int
+    used: float
+
+
+def recorded(config: Config, *, record: bool) -> Watch | None:
+    """Return a `watch` for `execute` that has a file's flying nodes use their recorded flight.
+
+    It is `None` if the run itself has to fly. With `record`, a flight that is not kept is flown.
+    """
+    part = flight_of(config)
+    if part is None:
+        return None
+    path = home() / f"{content_key(part)}.flight"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for each in (path, _unfinished(path)):
+            if each.exists() and not each.is_file():
+                raise OSError(errno.EEXIST, "what is no file", str(each))
+        with _locked(path):  # whoever comes second waits, and finds it
+            found = _opened(path)
+            if found is None and record:
+                _write(part, path)
+                found = _opened(path)
+            if found is None:
+                return None
+            os.utime(path)
+    except OSError as error:
+        what = f"{error.filename or home()}: {error.strerror}"
+        _LOG.warning("expected a cache of flights, found %s: the run flies itself", what)
+        return None
+    return functools.partial(_played, *found)
+
+
+def home() -> Path:
+    """Return the folder of all flights."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "visnav-runtime" / "flights"
+
+
+def kept() -> list[Kept]:
+    """Return the kept flights, the last used first."""
+    found = []
+    for path in home().glob("[!.]*.flight"):
+        with contextlib.suppress(OSError):  # removed meanwhile
+            if path.is_file():
+                found.append(Kept(path, path.stat().st_size, path.stat().st_mtime))
+    return sorted(found, key=lambda each: -each.used)
+
+
+def remove_beyond(gigabytes: float) -> list[Kept]:
+    """Remove the least recently used flights beyond `gigabytes`, and return them.
+
+    What a run has open stays there for it. One that is being flown just now is left alone.
+    """
+    for unfinished in home().glob(".*.new"):  # left by a process that was killed, unless locked
+        if unfinished.is_file():
+            _remove(unfinished, unfinished.with_name(unfinished.stem[1:]))
+    sizes = 0
+    beyond = [each for each in kept() if (sizes := sizes + each.size) > gigabytes * 1e9]
+    return [each for each in beyond if _remove(each.path, each.path)]
+
+
+def _remove(file: Path, flight: Path) -> bool:
+    """Remove a file of a flight, unless the flight is locked; tell whether removed."""
+    with contextlib.suppress(OSError), _locked(flight, wait=False):
+        file.unlink(missing_ok=True)
+        return True
+    return False
+
+
+def _write(part: Config, path: Path) -> None:
+    new = _unfinished(path)
+    try:
+        fly(part, new)
+        limit = float(os.environ.get("VISNAV_FLIGHTS_GB", LIMIT))
+        remove_beyond(max(limit - new.stat().st_size / 1e9, 0.0))
+        new.rename(path)
+    except (VisnavError, OSError):  # the run itself meets the same, and says so
+        pass
+    finally:
+        new.unlink(missing_ok=True)
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(f".{path.name}.new")
+
+
+@contextlib.contextmanager
+def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
+    # Neither a pipe of this name nor a link makes it wait for ever, or write elsewhere.
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+    file = os.open(path.with_name(f".{path.name}.lock"), flags, 0o644)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        yield
+    finally:
+        os.close(file)
+
+
+# A flight, recorded and played.
+
+
+def fly(config: Config, path: Path) -> None:
+    """Fly, and write the flight into a file, complete on return.
+
+    Raises:
+        VisnavError: The flight failed.
+        KeyboardInterrupt: A signal ended it.
+        OSError: The file cannot be written.
+    """
+    rest = NodeSpec(
+        name="(rest)", type_name="", on_error="stop", inputs={}, links={}, node=_Rest,
+        config=NodeConfig(),
+    )  # fmt: skip
+    run = msgspec.structs.replace(config.run, digest=False, speed=None)
+    config = msgspec.structs.replace(config, run=run, nodes=(*config.nodes, rest))
+    with path.open("wb", buffering=1 << 20) as file:
+        recorder = _Recorder(file)
+        execute(config, watch=recorder.watch)
+        file.write(_BEGIN.pack(put(file, recorder.calls)))
+        file.flush()
+        file.write(xxhash.xxh3_128_digest(_content(path)))
+
+
+class _Rest(Node):
+    async def on_shutdown(self) -> None:
+        """Let time go on, the last node in the file being the first to end."""
+        await self.clock.sleep(_REST)
+
+
+class _Recorder(Instrument):
+    def __init__(self, file: IO[bytes]) -> None:
+        self.calls: Calls = {}
+        self._file = file
+        self._lock = threading.Lock()
+
+    @contextlib.contextmanager
+    def watch(self, supervisor: Supervisor) -> Iterator[None]:
+        supervisor.instruments.attach(self)
+        yield
+        if supervisor.state.stop_requested:  # whatever was to follow is not wanted either
+            raise KeyboardInterrupt
+
+    def worker_called(
+        self, process: str, method: str, answer: concurrent.futures.Future[Any]
+    ) -> None:
+        calls = self.calls.setdefault(process.partition("[")[0], [])
+        number = len(calls)
+        calls.append((method, -1))
+
+        def note(answer: concurrent.futures.Future[Any]) -> None:
+            error = answer.exception()
+            with self._lock:  # each process has a thread of its own
+                place = put(self._file, (None if error else answer.result(), error))
+            calls[number] = method, place
+
+        answer.add_done_callback(note)
+
+
+def put(file: IO[bytes], what: Any) -> int:
+    """Write an object that can be pickled; return its place."""
+    place = file.tell()
+    pickle.dump(what, file, pickle.HIGHEST_PROTOCOL)
+    return place
+
+
+def taken(content: memoryview, place: int) -> Any:
+    """Return the object at a place of a file's content."""
+    return pickle.loads(content[place:])  # noqa: S301  # of this user's own cache
+
+
+def _content(path: Path) -> memoryview:
+    with path.open("rb") as file:
+        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def _opened(path: Path) -> tuple[memoryview, Calls] | None:
+    """Return a file's content and a flight's calls; `None` if missing or not readable."""
+    if not path.is_file():  # a pipe would wait for ever
+        return None
+    try:
+        content = _content(path)
+        if xxhash.xxh3_128_digest(content[:-_CHECKSUM]) != content[-_CHECKSUM:]:
+            return None
+        (begin,) = _BEGIN.unpack_from(content, len(content) - _CHECKSUM - _BEGIN.size)
+        calls: Calls = taken(content, begin)
+        for place in {place for own in calls.values() for place in dict(own).values()} - {-1}:
+            taken(content, place)  # one of each method
+    except Exception:  # what was written by other code may raise anything
+        return None
+    return content, calls
+
+
+@contextlib.contextmanager
+def _played(content: memoryview, calls: Calls, supervisor: Supervisor) -> Iterator[None]:
+    state = supervisor.state
+    left = {name: iter(own) for name, own in calls.items()}
+
+    def make(name: str, *args: Any, **options: Any) -> Worker[Any]:
+        if name not in left:
+            return Worker(name, *args, **options)
+        state.costs.pop(name, None)  # it has none
+        worker = _Played(name, *args, **options)
+        worker.content, worker.left = content, left[name]
+        return worker
+
+    state.make_worker = make
+    yield
+
+
+class _Played(Worker[Any]):
+    """A worker without a process, to give recorded answers."""
+
+    content: memoryview
+    left: Iterator[tuple[str, int]]
+
+    def _start(self) -> list[concurrent.futures.Future[Any]]:
+        return [_DONE] * len(self._make)
+
+    def _request(
+        self,
+        method: Callable[..., Any],
+        args: Any,  # noqa: ARG002
+        kwargs: Any,  # noqa: ARG002
+    ) -> concurrent.futures.Future[Any]:
+        name, place = next(self.left, ("none", -1))
+        if place < 0 or name != method.__name__:
+            raise WorkerError(
+                f"worker {self.name}: expected the calls of the recorded flight, next {name}, "
+                f"found {method.__name__}: a sweep with --fly does without it"
+            )
+        result, error = taken(self.content, place)
+        work: concurrent.futures.Future[Any] = concurrent.futures.Future()
+        if error is not None:
+            work.set_exception(error)
+        else:
+            work.set_result(result)
+        return work
+
+
+# What flies, and what a flight depends on.
+
+_DRIVERS = (
+    *("/usr/lib/*/libEGL*", "/usr/lib/*/libgallium*", "/usr/lib/*/libLLVM*", "/usr/lib/*/dri/*"),
+    "/proc/driver/nvidia/version",
+)
+_VARIABLES = re.compile("MUJOCO_|E?GL|_?_?E?GL[VX]?_|LIBGL_|GALLIUM_|MESA_|LP_")
+_PARSING = threading.Lock()
+"""Lock for Python 3.11's parser: all threads share a depth counter (cpython#106905)."""
+_NAMED = re.compile(r'\bfile\w*\s*=\s*"([^"]+)"')
+_FOLDERS = re.compile(r'(?:mesh|texture|asset)dir\s*=\s*"([^"]+)"')
+
+
+def flight_of(config: Config) -> Config | None:
+    """Return the flying part of a file; `None` if anything else affects the flight.
+
+    So does a node whose output a port of the flight takes, unless the port is narrowed to a source
+    of the flight. Nodes that write files, or give no equal results, have to run themselves.
+    """
+    flying = {spec.name: spec for spec in config.nodes if spec.node.flies}
+    if config.run.clock != "lockstep" or not flying:
+        return None
+    if any(
+        not s.node.deterministic or s.node.files or [*written(s.config)] for s in flying.values()
+    ):
+        return None
+    for sender, _, _, receiver, port in edges_of(config.nodes):
+        if receiver in flying and sender not in flying:
+            source = _narrowed(flying[receiver], port)
+            if source is None or source.partition("/")[0] not in flying:
+                return None
+    return msgspec.structs.replace(config, nodes=tuple(flying.values()))
+
+
+def _narrowed(spec: NodeSpec, port: str) -> str | None:
+    bundle = port.partition(".")[0]
+    declared = spec.node.declared
+    ports: dict[str, Any] = {**declared.inputs, **declared.bundles, **declared.handlers}
+    source: str | None = spec.inputs.get(port, spec.inputs.get(bundle, ports[bundle].source))
+    return source
+
+
+def settings_key(flight: Config) -> str:
+    """Return a key, equal for flights with equal settings."""
+    run = flight.run
+    nodes = to_builtins(flight)["nodes"]
+    return _hashed([json.dumps([run.seed, run.duration, nodes], default=str, sort_keys=True)])
+
+
+def content_key(flight: Config) -> str:
+    """Return the key of a flight: its settings, sources, files, libraries, drivers."""
+    texts = [settings_key(flight), json.dumps(environment())]
+    texts += [f"{k}={v}" for k, v in sorted(os.environ.items()) if _VARIABLES.match(k)]
+    for pattern in _DRIVERS:
+        for path in sorted(Path("/").glob(pattern[1:])):
+            found = path.stat()
+            texts.append(f"{path} {found.st_size} {found.st_mtime_ns}")
+    files = {*_sources([*(spec.node.__module__ for spec in flight.nodes), __name__])}
+    for path in _paths(to_builtins(flight)["nodes"]):
+        files |= _read_by(path)
+    texts += [f"{path} {_hashed([path.read_bytes()])}" for path in sorted(files)]
+    return _hashed(texts)
+
+
+def _hashed(parts: Iterable[str | bytes]) -> str:
+    digest = xxhash.xxh3_128()
+    for part in parts:
+        digest.update(part.encode() if isinstance(part, str) else part)
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def _sources(modules: Iterable[str]) -> Iterator[Path]:
+    """Yield the files of modules and their imports, without other installed packages."""
+    todo = [*modules, "events"]
+    roots = {name.partition(".")[0] for name in todo}
+    seen = {""}
+    while todo:
+        name = todo.pop()
+        root = name.partition(".")[0]
+        if name in seen or not (root in roots or _is_here(root)):
+            continue
+        seen.add(name)
+        path = _origin(name)
+        if path is None:
+            continue
+        package = path.name == "__init__.py"
+        yield from (p for p in path.parent.iterdir() if p.is_file()) if package else [path]
+        parent = name.rpartition(".")[0]
+        todo.append(parent)
+        todo += _imported(path, name if package else parent)
+
+
+def _imported(path: Path, package: str) -> Iterator[str]:
+    """Yield the modules imported anywhere in a package's file, and possible modules."""
+    if path.suffix not in {".py", ".pyi"}:
+        return
+    with contextlib.suppress(SyntaxError, ValueError):
+        with _PARSING:
+            todo: list[Any] = [ast.parse(path.read_bytes())]
+        while todo:  # statements only, which takes a third of the time of `ast.walk`
+            node = todo.pop()
+            for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+                todo += getattr(node, field, ())
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                with contextlib.suppress(ImportError):  # beyond the topmost package
+                    one = "." * node.level + (node.module or "")
+                    whole = importlib.util.resolve_name(one, package)
+                    yield from (whole, *(f"{whole}.{alias.name}" for alias in node.names))
+
+
+def _origin(name: str) -> Path | None:
+    try:
+        spec = importlib.util.find_spec(name)
+    except Exception:  # a package is imported for what is in it, and may raise anything
+        return None
+    return Path(spec.origin) if spec and spec.has_location and spec.origin else None
+
+
+@functools.cache
+def _is_here(root: str) -> bool:
+    path = None if not root or root in sys.stdlib_module_names else _origin(root)
+    return path is not None and not {"site-packages", "dist-packages"} & {*path.parts}
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """Yield the files named by settings; paths are absolute since the file was read."""
+    if isinstance(value, str) and value.startswith("/") and Path(value).exists():
+        yield Path(value)
+    elif isinstance(value, dict | list):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _paths(each)
+
+
+def _read_by(path: Path) -> set[Path]:
+    """Return a file and all files included by a MuJoCo model, or the files in a folder."""
+    if path.is_dir():
+        return {each for each in path.rglob("*") if each.is_file()}
+    found, todo, folders = {path}, [path], {path.parent}
+    while todo:
+        if (file := todo.pop()).suffix == ".xml":
+            text = file.read_text(encoding="utf-8", errors="replace")
+            folders |= {path.parent / name for name in _FOLDERS.findall(text)}
+            named = {folder / name for folder in folders for name in _NAMED.findall(text)}
+            todo += (new := sorted({each for each in named if each.is_file()} - found))
+            found.update(new)
+    return found
