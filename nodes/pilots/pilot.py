@@ -50,11 +50,65 @@ from runtime.config.parameters import Changeable
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
-class PilotConfig(NodeConfig):
-    """Settings of a scripted flight.
+class VehicleControllerConfig(NodeConfig):
+    """Settings of any node that flies a vehicle.
 
     Attributes:
         vehicle: Name of the vehicle to fly; may be left out if there is only one.
+    """
+
+    vehicle: str = ""
+
+
+V = TypeVar("V", bound=VehicleControllerConfig, default=VehicleControllerConfig)
+E = TypeVar("E")
+
+
+class VehicleController(Node[V], ABC):
+    """Base of nodes that fly a vehicle; all that they send names it."""
+
+    commands = Output(Command)
+
+    def __init__(self) -> None:
+        self._vehicles: list[str] = []  # announced, and maybe the one to fly
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce the vehicle to fly."""
+        yield PilotAnnouncement(stamp=0, source=self.name, vehicle=self.config.vehicle)
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Note a vehicle that may be the one to fly."""
+        is_vehicle = isinstance(announcement, VehicleAnnouncement)
+        if is_vehicle and self.config.vehicle in ("", announcement.source):
+            self._vehicles.append(announcement.source)
+
+    @abstractmethod
+    def check(self) -> Iterable[str]:
+        """Say what is missing to fly, such as the vehicle."""
+
+    def refuse_several(self, why: str = "") -> None:
+        """Raise a `ValueError` if the vehicle is ambiguous."""
+        if len(self._vehicles) > 1:
+            first = self._vehicles[0]
+            raise ValueError(
+                f"of several vehicles, {self.name} was expected to say which it flies{why}: write "
+                f'vehicle = "{first}" into its entry, if it is {first}'
+            )
+
+    def send_command(self, command: type[Command], **fields: Any) -> None:
+        """Send a command to the vehicle."""
+        self.commands.send(self.made(command, **fields))
+
+    def made(self, event: Callable[..., E], **fields: Any) -> E:
+        """Return an event about the vehicle, stamped now."""
+        vehicle = self.config.vehicle
+        return event(stamp=self.clock.now(), source=self.name, vehicle=vehicle, **fields)
+
+
+class PilotConfig(VehicleControllerConfig):
+    """Settings of a scripted flight.
+
+    Attributes:
         waypoints: Places to pass, metres in ``map`` (x north, y east, z down: heights are
             negative). The path begins above the vehicle. May be left out beside a `figure_eight`.
         speed: Highest speed along the path, metres per second.
@@ -71,7 +125,6 @@ class PilotConfig(NodeConfig):
         end_run: Whether the run ends once the vehicle has landed.
     """
 
-    vehicle: str = ""
     waypoints: tuple[Vector3, ...] = ()
     speed: Positive = 1.3
     acceleration: Positive = 1.0
@@ -98,13 +151,11 @@ class PilotConfig(NodeConfig):
 
 
 C = TypeVar("C", bound=PilotConfig, default=PilotConfig)
-E = TypeVar("E")
-
 
 _REMINDER = 5.0  # seconds without a first pose after which that is said
 
 
-class Pilot(Node[C], ABC):
+class Pilot(VehicleController[C], ABC):
     """Base of pilots of a scripted flight: take off, follow a path, land, end the run.
 
     A subclass calls `update_pose` with its vehicle's pose, and implements `follow`.
@@ -112,7 +163,6 @@ class Pilot(Node[C], ABC):
 
     flies = True
     ends_run = "plan"
-    commands = Output(Command)
     shutdowns = Output(Shutdown)
 
     outcome = "flight completed"
@@ -120,22 +170,22 @@ class Pilot(Node[C], ABC):
 
     def announce(self) -> Iterable[Announcement]:
         """Announce the vehicle, the places to pass, and the room for the excitation."""
-        excitation, vehicle = self.config.excitation, self.config.vehicle
-        yield PilotAnnouncement(stamp=0, source=self.name, vehicle=vehicle)
+        yield from super().announce()
+        excitation = self.config.excitation
         yield PathAnnouncement(
             stamp=0,
             source=self.name,
-            vehicle=vehicle,
+            vehicle=self.config.vehicle,
             waypoints=tuple(self.config.places()),
             margin=0.0 if excitation is None else excitation.reach,
         )
 
     def __init__(self) -> None:
+        super().__init__()
         self.pose: Odometry | PoseEstimate | None = None
         self._pose_known = asyncio.Event()
         self._taken_off = asyncio.Event()
         self._landed = asyncio.Event()
-        self._vehicles: list[str] = []
         self._open_ports = [
             port
             for port, handles in self.declared.handlers.items()
@@ -145,19 +195,11 @@ class Pilot(Node[C], ABC):
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Listen to the pilot's vehicle; raise `ValueError` if the vehicle is ambiguous."""
-        if not isinstance(announcement, VehicleAnnouncement):
-            return
-        vehicle = self.config.vehicle
-        if vehicle in ("", announcement.source):
-            self._vehicles.append(announcement.source)
-        if self._open_ports and len(self._vehicles) > 1:
-            first = self._vehicles[0]
-            raise ValueError(
-                f"of several vehicles, {self.name} was expected to say which it flies, but it "
-                f'hears them all: write vehicle = "{first}" into its entry, if it is {first}'
-            )
-        for port in self._open_ports:
-            self.narrow(port, vehicle or announcement.source)
+        super().on_announcement(announcement)
+        if isinstance(announcement, VehicleAnnouncement) and self._open_ports:
+            self.refuse_several(", but it hears them all")
+            for port in self._open_ports:
+                self.narrow(port, self.config.vehicle or announcement.source)
 
     def check(self) -> Iterable[str]:
         """Say if there is nothing to fly."""
@@ -199,15 +241,6 @@ class Pilot(Node[C], ABC):
         if self.config.end_run:
             end = Shutdown(stamp=clock.now(), source=self.name, reason=self.outcome)
             self.shutdowns.send(end)
-
-    def send_command(self, command: type[Command], **fields: Any) -> None:
-        """Send a command to the pilot's vehicle."""
-        self.commands.send(self.made(command, **fields))
-
-    def made(self, event: Callable[..., E], **fields: Any) -> E:
-        """Return an event about the pilot's vehicle, stamped now."""
-        vehicle = self.config.vehicle
-        return event(stamp=self.clock.now(), source=self.name, vehicle=vehicle, **fields)
 
     def _plan(self, start: Odometry | PoseEstimate) -> WaypointPath | None:
         """Return the path from here; `None` without any length or excitation."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 
 from events import (
-    Announcement,
     Arm,
     Command,
     Disarm,
@@ -17,18 +16,16 @@ from events import (
     KeyPressed,
     KeyReleased,
     Land,
-    PilotAnnouncement,
     Shutdown,
     Takeoff,
     Vector3,
     VelocitySetpoint,
 )
 from events.base import KEYS
-from runtime import Node, NodeConfig, Output, Tick, every, on
+from nodes.pilots.pilot import Positive, VehicleController, VehicleControllerConfig
+from runtime import NodeConfig, Output, Tick, every, on
 from runtime.config.parameters import Changeable
 from runtime.errors import suggest
-
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 _MOTIONS: dict[str, tuple[int, int, int, int]] = {
     "forward": (1, 0, 0, 0),
@@ -90,7 +87,7 @@ class Keys(NodeConfig):
         return found
 
 
-class TeleopConfig(NodeConfig):
+class TeleopConfig(VehicleControllerConfig):
     """Settings of a `Teleop`.
 
     Attributes:
@@ -105,7 +102,6 @@ class TeleopConfig(NodeConfig):
         keys: The keys of each action.
     """
 
-    vehicle: str = ""
     speed: Changeable[Positive] = 2.0
     climb_rate: Changeable[Positive] = 1.0
     yaw_rate: Changeable[Positive] = 1.0
@@ -115,7 +111,7 @@ class TeleopConfig(NodeConfig):
     keys: Keys = Keys()
 
 
-class Teleop(Node[TeleopConfig]):
+class Teleop(VehicleController[TeleopConfig]):
     """Pilot of a vehicle, or a free camera, by keys.
 
     While a movement key is held, velocities in the vehicle's heading frame are sent at `rate`;
@@ -126,17 +122,17 @@ class Teleop(Node[TeleopConfig]):
 
     ends_run = "hand"
     setpoints = Output(VelocitySetpoint)
-    commands = Output(Command)
     shutdowns = Output(Shutdown)
 
     def __init__(self) -> None:
+        super().__init__()
         self._actions = self.config.keys.actions()
         self._held: set[str] = set()  # keys, because two may ask for the same
         self._velocity = _STILL
 
-    def announce(self) -> Iterable[Announcement]:
-        """Announce the vehicle to fly."""
-        yield PilotAnnouncement(stamp=0, source=self.name, vehicle=self.config.vehicle)
+    def check(self) -> Iterable[str]:
+        """Return nothing: a free camera, which is no vehicle, may be flown, too."""
+        return ()
 
     async def on_startup(self) -> None:
         """Log the keys of each action."""
@@ -192,24 +188,16 @@ class Teleop(Node[TeleopConfig]):
 
     def _send(self, velocity: Vector3, yaw_rate: float) -> None:
         self.setpoints.send(
-            VelocitySetpoint(
-                stamp=self.clock.now(),
-                source=self.name,
-                vehicle=self.config.vehicle,
-                frame_id="heading",
-                velocity=velocity,
-                yaw_rate=yaw_rate,
-            )
+            self.made(VelocitySetpoint, frame_id="heading", velocity=velocity, yaw_rate=yaw_rate)
         )
 
     def _send_command(self, action: str) -> None:
-        stamp, source = self.clock.now(), self.name
         if action == "quit":
+            stamp, source = self.clock.now(), self.name
             self.shutdowns.send(Shutdown(stamp=stamp, source=source, reason="quit by key"))
             return
-        fields: dict[str, Any] = {"vehicle": self.config.vehicle}
-        fields |= {"altitude": self.config.altitude} if action == "takeoff" else {}
-        self.commands.send(_COMMANDS[action](stamp=stamp, source=source, **fields))
+        fields = {"altitude": self.config.altitude} if action == "takeoff" else {}
+        self.send_command(_COMMANDS[action], **fields)
 
 
 def approach(now: Vector3, goal: Vector3, step: float) -> Vector3:
