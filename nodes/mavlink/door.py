@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from events.frames import Geodetic, from_rpy
 from nodes.mavlink.flight import Flight
 from nodes.mavlink.links import Links, mav
-from nodes.mavlink.missions import Missions, Parameters, chunks
-from nodes.mavlink.settings import MavlinkConfig, key_of
+from nodes.mavlink.missions import Missions, Parameters
 from nodes.mavlink.vehicle import SECOND, Telemetry, Vehicle
 from runtime.logs import NodeLogger
 
+if TYPE_CHECKING:
+    from nodes.mavlink.node import MavlinkConfig
+
 OLDEST = 10 * SECOND  # age of a vision stamp beyond which its clock is not ours
+MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it
 _COVARIANCE = np.triu_indices(6)
 
 
@@ -41,14 +44,15 @@ class Door:
         self._said: set[str] = set()
         self._told = 0
         self._is_lost = True  # until the first is heard
-        self.vehicle = vehicle = Vehicle(origin, config.gps)
-        self._telemetry = Telemetry(vehicle, self._send)
-        self._parameters = Parameters(self._send, self._tell)
-        self._missions = Missions(self._send, lambda item: self.flight.refused(item), self._tell)
-        parts = self._telemetry, self._missions, self._parameters
-        self.flight = Flight(vehicle, *parts, act, self._tell, log)
         ids = config.system_id, int(mav.MAV_COMP_ID_AUTOPILOT1)
-        self._links = Links(ids, key_of(config.signing_key), self._hear, log)
+        self._links = Links(ids, bytes.fromhex(config.signing_key), self._hear, log)
+        self._send = send = self._links.send
+        self.vehicle = vehicle = Vehicle(origin, config.gps)
+        self._telemetry = Telemetry(vehicle, send)
+        self._parameters = Parameters(send, self._tell)
+        self._missions = Missions(send, lambda item: self.flight.refused(item), self._tell)
+        parts = self._telemetry, self._missions, self._parameters
+        self.flight = Flight(vehicle, *parts, act, self._tell, self._once)
 
     def open(self) -> None:
         """Open the links; a `ValueError` if one cannot be."""
@@ -146,21 +150,16 @@ class Door:
         )
 
     def _once(self, words: str) -> None:
-        if words not in self._said:
+        if words not in self._said and len(self._said) < MOST_SAID:
             self._said.add(words)
             self._log.warning("%s", words)
 
-    def _send(self, message: Any) -> None:
-        self._links.send(message)
-
     def _tell(self, text: str) -> None:
         self._log.warning("%s", text)
-        parts = [*chunks(text)]
+        data = text.encode("ascii", "replace")
+        parts = [data[begin : begin + 50] for begin in range(0, len(data), 50)]
         self._told = self._told % 65535 + 1
         number = self._told if len(parts) > 1 else 0
         for index, part in enumerate(parts):
-            self._send(
-                mav.MAVLink_statustext_message(
-                    mav.MAV_SEVERITY_WARNING, part.encode(), number, index
-                )
-            )
+            level = mav.MAV_SEVERITY_WARNING
+            self._send(mav.MAVLink_statustext_message(level, part, number, index))

@@ -12,7 +12,6 @@ from events.frames import from_geodetic, yaw_of
 from nodes.mavlink.links import mav
 from nodes.mavlink.missions import Item, Missions, Parameters
 from nodes.mavlink.vehicle import MODES, SECOND, Telemetry, Vehicle
-from runtime.logs import NodeLogger
 
 OFFBOARD_TIMEOUT = SECOND // 2  # PX4's COM_OF_LOSS_T: without a set-point for longer it holds
 ARRIVED = 0.3  # metres from a place at which it is reached
@@ -36,6 +35,7 @@ class Flight:
     Args:
         act: Sends a command or a set-point of these fields to the vehicle.
         tell: Says a sentence to all programs, by ``STATUSTEXT``, and to the log.
+        once: Says a sentence to the log, the first time.
     """
 
     def __init__(
@@ -46,11 +46,11 @@ class Flight:
         parameters: Parameters,
         act: Callable[..., None],
         tell: Callable[[str], None],
-        log: NodeLogger,
+        once: Callable[[str], None],
     ) -> None:
         self._vehicle, self._telemetry = vehicle, telemetry
         self._missions, self._parameters = missions, parameters
-        self._act, self._tell, self._log = act, tell, log
+        self._act, self._tell, self._once = act, tell, once
         self._goal: tuple[Vector3, float] | None = None  # place and heading
         self._carrot: Vector3 = (0.0, 0.0, 0.0)  # goes there at the cruising speed
         self._speed: float | None = None
@@ -58,7 +58,6 @@ class Flight:
         self._followed: int | None = None  # stamp of the carrot's last step
         self._wait_until = 0
         self._offboard = -(1 << 62)  # stamp of the newest set-point
-        self._said: set[str] = set()
         self._commands: dict[int, Callable[[Sequence[float], int], int]] = {
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             mav.MAV_CMD_NAV_TAKEOFF: self._take_off,
@@ -187,11 +186,6 @@ class Flight:
         else:
             return None
         return found if all(abs(each) <= FARTHEST for each in found) else None
-
-    def _once(self, words: str) -> None:
-        if words not in self._said and len(self._said) < 100:
-            self._said.add(words)
-            self._log.warning("%s", words)
 
     def _arm(self, numbers: Sequence[float], now: int) -> int:  # noqa: ARG002
         vehicle = self._vehicle

@@ -1,4 +1,9 @@
-"""Sockets to MAVLink's programs: what they send is parsed, counted and bounded."""
+"""Sockets to MAVLink's programs, whose messages are parsed, counted and bounded; and to PX4.
+
+PX4 in the loop is as of its simulator interface (docs.px4.io, "Simulator MAVLink API"): it connects
+by TCP, is free to be silent while it starts, and from its first answer on gives one for each
+``HIL_SENSOR``.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +14,11 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import urlsplit
 
 from pymavlink.dialects.v20 import common
 
-from nodes.mavlink.settings import address_of
+from events import FluidPressure, Imu, MagneticField, NavSatFix
 from runtime.logs import NodeLogger
 
 mav: Any = common
@@ -22,6 +28,11 @@ BURST = 400  # messages of all peers that are read in a period; the kernel drops
 MOST_PEERS = 8  # programs on one TCP port
 LONGEST_QUEUE = 1 << 20  # bytes not yet taken by a program, beyond which it is hung up on
 _EPOCH_2015 = 1_420_070_400  # signatures' time begins there (mavlink.io, message signing)
+
+SLICE = 0.2  # real seconds between two looks at whether the run has ended
+STARTING = 0.004  # real seconds that PX4's answer may take before the first one has come
+_IMU, _MAGNETOMETER, _BAROMETER = 0b111111, 0b111000000, 0b1101000000000
+MOTORS = 4
 
 Receive = Callable[[int, int, Any], None]
 """Called with a sender's system, its component, and the message."""
@@ -75,14 +86,15 @@ class Links:
         Raises:
             OSError: It cannot be opened.
         """
-        protocol, host, port = address_of(link)
-        if protocol == "udp":
+        parts = urlsplit(link)
+        address = parts.hostname, parts.port
+        if parts.scheme == "udp":
             end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             end.setblocking(False)
-            end.connect((host, port))
+            end.connect(address)
             self._adopt(end, link, functools.partial(self._send_datagram, end), self._hear_datagram)
         else:
-            end = socket.create_server((host, port), backlog=MOST_PEERS)
+            end = socket.create_server(address, backlog=MOST_PEERS)
             end.setblocking(False)
             self._listeners.append(end)
             self._loop.add_reader(end, self._accept, end)
@@ -202,3 +214,114 @@ class Links:
         self._peers.pop(end, None)
         self._unsent.pop(end, None)
         end.close()
+
+
+class Wire:
+    """PX4's connection; its methods block, and are called beside the loop.
+
+    Raises:
+        OSError: Nobody can listen on this address.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._listener = socket.create_server((host, port), backlog=1)
+        self.address: tuple[str, int] = self._listener.getsockname()[:2]
+        self._peer: socket.socket | None = None
+        self._parser = mav.MAVLink(None, 1, 200)
+        self._parser.robust_parsing = True
+        self._closed = False
+        self.answers = 0
+
+    def accept(self, patience: float) -> None:
+        """Wait for PX4; a `TimeoutError` if it does not come."""
+        self._listener.settimeout(SLICE)
+        end = time.monotonic() + patience
+        while not self._closed:
+            try:
+                self._peer, _ = self._listener.accept()
+            except TimeoutError:
+                if time.monotonic() > end:
+                    raise TimeoutError(f"expected PX4 to connect, waited {patience:g} s") from None
+            else:
+                self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                return
+
+    def exchange(self, messages: list[Any], patience: float) -> Any:
+        """Send what was measured, and return the answer; `None` while PX4 starts, or at the end.
+
+        Raises:
+            ConnectionError: PX4 has gone.
+            TimeoutError: It has not answered in time.
+        """
+        if self._peer is None:
+            return None
+        self._peer.settimeout(patience)
+        try:
+            self._peer.sendall(b"".join(each.pack(self._parser) for each in messages))
+        except TimeoutError:
+            raise
+        except OSError as error:
+            raise ConnectionError(f"PX4 has gone after {self.answers} answers: {error}") from None
+        end = time.monotonic() + (patience if self.answers else STARTING)
+        while not self._closed:
+            left = end - time.monotonic()
+            if left <= 0:
+                if self.answers:
+                    raise TimeoutError(f"expected PX4's next answer, waited {patience:g} s")
+                return None
+            self._peer.settimeout(min(left, SLICE))
+            try:
+                data = self._peer.recv(65536)
+            except TimeoutError:
+                continue
+            except OSError:
+                data = b""
+            if not data and not self._closed:
+                raise ConnectionError(f"PX4 has gone after {self.answers} answers")
+            for found in self._parser.parse_buffer(data) or ():
+                if found.get_type() == "HIL_ACTUATOR_CONTROLS":
+                    self.answers += 1
+                    return found
+        return None
+
+    def close(self) -> None:
+        """Hang up, and end what waits."""
+        self._closed = True
+        self._listener.close()
+        if self._peer is not None:
+            self._peer.close()
+
+
+def sensors(imu: Imu, field: MagneticField | None, pressure: FluidPressure | None) -> Any:
+    """Return a ``HIL_SENSOR`` of an IMU's sample, and of what else is new."""
+    gauss = (0.0, 0.0, 0.0)
+    updated = _IMU
+    if field is not None:
+        x, y, z = field.magnetic_field
+        gauss, updated = (1e4 * x, 1e4 * y, 1e4 * z), updated | _MAGNETOMETER
+    air = (0.0, 0.0, 0.0, 0.0)  # hPa absolute and differential, metres, degrees Celsius
+    if pressure is not None:
+        pascal = pressure.fluid_pressure
+        # The standard atmosphere's altitude (ICAO Doc 7488).
+        altitude = 44330.8 * (1.0 - (pascal / 101325.0) ** 0.190263)
+        air, updated = (pascal / 100.0, 0.0, altitude, 25.0), updated | _BAROMETER
+    measured = *imu.linear_acceleration, *imu.angular_velocity
+    return mav.MAVLink_hil_sensor_message(imu.stamp // 1000, *measured, *gauss, *air, updated, 0)
+
+
+def satellites(fix: NavSatFix) -> Any:
+    """Return a ``HIL_GPS`` of a fix."""
+    north, east, down = (round(100 * each) for each in fix.velocity)
+    place = round(1e7 * fix.latitude), round(1e7 * fix.longitude), round(1e3 * fix.altitude)
+    speed = round((north**2 + east**2) ** 0.5)
+    kind = mav.GPS_FIX_TYPE_3D_FIX if fix.status >= 0 else mav.GPS_FIX_TYPE_NO_FIX
+    return mav.MAVLink_hil_gps_message(
+        fix.stamp // 1000, kind, *place, 90, 120, speed, north, east, down, 65535, 12
+    )
+
+
+def motors(answer: Any) -> tuple[bool, tuple[float, ...]]:
+    """Return whether PX4 has armed, and its first motors' commands, 0 to 1 of full thrust."""
+    armed = bool(answer.mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
+    values = (each if each == each else 0.0 for each in answer.controls[:MOTORS])
+    return armed, tuple(min(max(each, 0.0), 1.0) for each in values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from nodes.mavlink.links import mav
@@ -204,10 +204,3 @@ class Parameters(dict[str, float]):
         self._send(
             mav.MAVLink_param_value_message(name.encode(), self[name], real, len(self), index)
         )
-
-
-def chunks(text: str) -> Iterator[str]:
-    """Yield parts of a text that a ``STATUSTEXT`` can hold: ASCII, 50 characters."""
-    text = text.encode("ascii", "replace").decode()
-    for begin in range(0, len(text), 50):
-        yield text[begin : begin + 50]

@@ -1,35 +1,95 @@
-"""The node: its ports, and the vehicle that it flies."""
+"""The nodes, without MAVLink's library, which may not be there: their settings and ports."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+import msgspec
 
 from events import (
     Announcement,
+    Arm,
     Command,
+    Disarm,
     EstimatorAnnouncement,
+    FluidPressure,
+    Imu,
+    ImuAnnouncement,
+    MagneticField,
+    MotorSetpoint,
+    NavSatFix,
     Odometry,
-    PilotAnnouncement,
     PoseEstimate,
     Setpoint,
-    VehicleAnnouncement,
     VehicleEvent,
 )
-from nodes.mavlink.settings import MavlinkConfig
-from runtime import Node, Output, Tick, every, on
+from nodes.pilots.pilot import VehicleController, VehicleControllerConfig
+from runtime import Duration, Input, Node, Output, Tick, every, on
 from runtime.errors import MissingDependencyError
 from runtime.extras import install_command
 
 if TYPE_CHECKING:
     from nodes.mavlink.door import Door
+    from nodes.mavlink.links import Wire
 
 RATE = 50.0  # of telemetry, and of set-points on the way to a place, Hz
 ORIGIN = (47.397742, 8.545594, 488.0)  # PX4's in simulations, for vehicles that have none
+LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
-class Mavlink(Node[MavlinkConfig]):
+class MavlinkConfig(VehicleControllerConfig):
+    """Settings of the door.
+
+    Attributes:
+        vehicle: Vehicle to fly; may be left out if there is only one.
+        endpoints: ``udp://HOST:PORT`` sends to who listens there; ``tcp://HOST:PORT`` listens.
+            Whoever reaches one flies the vehicle.
+        system_id: MAVLink's number of the vehicle: another one for each of a run.
+        telemetry: Source of the pose in the telemetry: empty for the true one, or an estimator.
+        gps: Whether the telemetry has a global position.
+        vision: Whether poses come from outside (``ODOMETRY``, ``VISION_POSITION_ESTIMATE``); they
+            are judged as this node's estimates.
+        link_loss: What a flying vehicle does when nobody is heard any more.
+        link_timeout: Real time after which that is so.
+        signing_key: Secret of 64 hexadecimal digits, without which nobody is heard; empty for
+            none.
+    """
+
+    endpoints: tuple[str, ...] = ("udp://127.0.0.1:14540", "udp://127.0.0.1:14550")
+    system_id: Annotated[int, msgspec.Meta(ge=1, le=254)] = 1
+    telemetry: str = ""
+    gps: bool = True
+    vision: bool = False
+    link_loss: Literal["nothing", "hold", "land"] = "hold"
+    link_timeout: Duration = Duration(3.0)  # immutable
+    signing_key: str = ""
+
+    def __post_init__(self) -> None:
+        for link in self.endpoints:
+            if not _is_address(link):
+                raise ValueError(
+                    f"endpoints: expected udp://HOST:PORT or tcp://HOST:PORT, found {link!r}"
+                )
+        try:
+            size = len(bytes.fromhex(self.signing_key))
+        except ValueError:
+            size = -1
+        if size not in {0, 32}:
+            raise ValueError("signing_key: expected 64 hexadecimal digits, or nothing")
+
+
+def _is_address(link: str) -> bool:
+    try:
+        parts = urlsplit(link)
+        return parts.scheme in {"udp", "tcp"} and bool(parts.hostname) and parts.port is not None
+    except ValueError:
+        return False
+
+
+class Mavlink(VehicleController[MavlinkConfig]):
     """A vehicle as MAVSDK and ground stations know it: telemetry, commands, missions, offboard.
 
     It says to be PX4, whose modes and conventions programs know. MAVLink has no steps: programs act
@@ -39,7 +99,6 @@ class Mavlink(Node[MavlinkConfig]):
     deterministic = False
     flies = True
     ends_run = "hand"
-    commands = Output(Command)
     setpoints = Output(Setpoint)
     estimates = Output(PoseEstimate, when="vision")
 
@@ -47,47 +106,36 @@ class Mavlink(Node[MavlinkConfig]):
     """Real seconds, by which programs are missed."""
 
     def __init__(self) -> None:
-        self._vehicles: list[str] = []
+        super().__init__()
         self._estimators: list[str] = []
         self._door: Door | None = None
 
     async def on_startup(self) -> None:
         """Open the links."""
-        try:
-            from nodes.mavlink.door import Door
-        except ImportError as error:
-            wanted = install_command("mavlink")
-            raise MissingDependencyError(f"Mavlink needs pymavlink ({error}): {wanted}") from error
-        if not self.checking:
-            origins = [getattr(each.config, "origin", None) for each in self.siblings(Node)]
-            origin = next(filter(None, origins), ORIGIN)
-            now = self.clock.now
-            self._door = Door(self.config, origin, self._act, self._see, now, self.log)
-            self._door.open()
+        _expect_library("Mavlink")
+        if self.checking:
+            return
+        from nodes.mavlink.door import Door
+
+        origins = [getattr(each.config, "origin", None) for each in self.siblings(Node)]
+        origin = next(filter(None, origins), ORIGIN)
+        self._door = Door(self.config, origin, self._act, self._see, self.clock.now, self.log)
+        self._door.open()
 
     def announce(self) -> Iterable[Announcement]:
         """Announce the vehicle to fly, and an estimator outside."""
-        vehicle = self.config.vehicle
-        yield PilotAnnouncement(stamp=0, source=self.name, vehicle=vehicle)
+        yield from super().announce()
         if self.config.vision:
             yield EstimatorAnnouncement(
-                stamp=0, source=self.name, method="by MAVLink", vehicle=vehicle
+                stamp=0, source=self.name, method="by MAVLink", vehicle=self.config.vehicle
             )
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Find the vehicle; raise `ValueError` if it is ambiguous."""
+        super().on_announcement(announcement)
+        self.refuse_several()
         if isinstance(announcement, EstimatorAnnouncement):
             self._estimators.append(announcement.source)
-        if not isinstance(announcement, VehicleAnnouncement):
-            return
-        if self.config.vehicle in ("", announcement.source):
-            self._vehicles.append(announcement.source)
-        if len(self._vehicles) > 1:
-            first = self._vehicles[0]
-            raise ValueError(
-                f"of several vehicles, {self.name} was expected to say which it flies: write "
-                f'vehicle = "{first}" into its entry, if it is {first}'
-            )
 
     def check(self) -> Iterable[str]:
         """Say if there is nothing to fly, or time runs away from programs."""
@@ -133,8 +181,7 @@ class Mavlink(Node[MavlinkConfig]):
             self._door.close()
 
     def _act(self, kind: Callable[..., Command | Setpoint], **fields: Any) -> None:
-        vehicle = self.config.vehicle
-        event = kind(stamp=self.clock.now(), source=self.name, vehicle=vehicle, **fields)
+        event = self.made(kind, **fields)
         if isinstance(event, Command):
             self.commands.send(event)
         else:
@@ -142,3 +189,131 @@ class Mavlink(Node[MavlinkConfig]):
 
     def _see(self, **fields: Any) -> None:
         self.estimates.send(PoseEstimate(source=self.name, **fields))
+
+
+class Px4Config(VehicleControllerConfig):
+    """Settings of PX4 in the loop.
+
+    Attributes:
+        vehicle: Vehicle whose motors it drives; may be left out if there is only one.
+        host: Address to listen on.
+        port: Port to listen on, where PX4 looks for its simulator.
+        start: Real time in which PX4 must have connected.
+        answer: Real time in which it must have answered; simulated time waits for it.
+    """
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 4560
+    start: Duration = Duration(60.0)  # immutable
+    answer: Duration = Duration(10.0)
+
+
+class Px4(VehicleController[Px4Config]):
+    """PX4 by its simulator interface, in lockstep: time waits for the answer to each IMU sample.
+
+    PX4 connects to `port`, gets the vehicle's IMU, magnetometer, barometer and satellite fixes, and
+    drives the motors. Until its first answer it is free to be silent, and time runs as real time.
+    """
+
+    deterministic = False
+    flies = True
+    imu = Input(Imu)
+    setpoints = Output(MotorSetpoint)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._imus: list[ImuAnnouncement] = []
+        self._wire: Wire | None = None
+        self._field: MagneticField | None = None
+        self._pressure: FluidPressure | None = None
+        self._fix: NavSatFix | None = None
+        self._armed = False
+
+    async def on_startup(self) -> None:
+        """Listen for PX4."""
+        _expect_library("Px4")
+        if self.checking:
+            return
+        from nodes.mavlink.links import Wire
+
+        host, port = self.config.host, self.config.port
+        try:
+            self._wire = Wire(host, port)
+        except OSError as error:
+            raise ValueError(f"expected {host}:{port} free, found: {error.strerror}") from None
+        self.log.info("PX4 may connect to %s:%d", *self._wire.address)
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Find the vehicle and its IMU."""
+        super().on_announcement(announcement)
+        if isinstance(announcement, ImuAnnouncement):
+            self._imus.append(announcement)
+
+    def check(self) -> Iterable[str]:
+        """Say what is missing, or cannot be what PX4 expects."""
+        if len(self._vehicles) != 1:
+            found = ", ".join(self._vehicles) or "none"
+            yield f"expected one vehicle whose motors to drive, found {found}: set vehicle"
+        for each in self._imus:
+            if each.orientation != LEVEL:
+                yield f"expected an IMU along the body's axes, found {each.source} turned"
+        if not self._imus:
+            yield "expected an IMU, found none: add one to the vehicle"
+
+    @on(MagneticField)
+    def fields(self, event: MagneticField) -> None:
+        """Note the newest, for the next sample."""
+        self._field = event
+
+    @on(FluidPressure)
+    def pressures(self, event: FluidPressure) -> None:
+        """Note the newest, for the next sample."""
+        self._pressure = event
+
+    @on(NavSatFix)
+    def fixes(self, event: NavSatFix) -> None:
+        """Note the newest, for the next sample."""
+        self._fix = event
+
+    async def run(self) -> None:
+        """Give each sample to PX4, and its answer to the motors."""
+        from nodes.mavlink.links import motors, satellites, sensors
+
+        assert self._wire is not None
+        wire, config = self._wire, self.config
+        self.doing = "waiting for PX4 on {}:{}".format(*wire.address)
+        await self.offload(wire.accept, config.start)
+        self.doing = ""
+        async for sample in self.imu:
+            messages = [sensors(sample, self._field, self._pressure)]
+            if self._fix is not None:
+                messages.append(satellites(self._fix))
+            self._field = self._pressure = self._fix = None
+            answer = await self.offload(wire.exchange, messages, config.answer)
+            if answer is not None:
+                self._obey(*motors(answer))
+
+    async def on_shutdown(self) -> None:
+        """Hang up."""
+        if self._wire is not None:
+            self._wire.close()
+
+    def _obey(self, armed: bool, commands: tuple[float, ...]) -> None:
+        if armed != self._armed:
+            self._armed = armed
+            self.log.info("PX4 has %s", "armed" if armed else "disarmed")
+            self.send_command(Arm if armed else Disarm)
+        if armed:
+            m1, m2, m3, m4 = commands
+            self.setpoints.send(
+                self.made(MotorSetpoint, motor1=m1, motor2=m2, motor3=m3, motor4=m4)
+            )
+
+
+def _expect_library(node: str) -> None:
+    """Raise a `MissingDependencyError` if MAVLink's library cannot be imported."""
+    try:
+        import nodes.mavlink.links  # noqa: F401
+    except ImportError as error:
+        wanted = install_command("mavlink")
+        raise MissingDependencyError(f"{node} needs pymavlink ({error}): {wanted}") from error

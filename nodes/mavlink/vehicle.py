@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from events import Odometry, PoseEstimate, Vector3
-from events.frames import Geodetic, rotate, to_geodetic, yaw_of
+from events import Odometry, PoseEstimate, Quaternion, Vector3
+from events.frames import Geodetic, rotate, rotate_inverse, to_geodetic, yaw_of
 from nodes.mavlink.links import mav
 
 SECOND = 1_000_000_000
@@ -43,6 +44,7 @@ _ESTIMATED = (
 )
 
 
+@dataclass
 class Vehicle:
     """State of a vehicle: where it is by what flies it, armed or not, and its mode.
 
@@ -52,16 +54,16 @@ class Vehicle:
         gps: Whether it has a global position.
     """
 
-    def __init__(self, origin: Geodetic, gps: bool) -> None:
-        self.origin, self.gps = origin, gps
-        self.home: Vector3 | None = None
-        self.stamp = 0
-        self.position: Vector3 = (0.0, 0.0, 0.0)
-        self.velocity: Vector3 = (0.0, 0.0, 0.0)
-        self.rates: Vector3 = (0.0, 0.0, 0.0)
-        self.orientation = (1.0, 0.0, 0.0, 0.0)
-        self.armed = False
-        self.mode = "hold"
+    origin: Geodetic
+    gps: bool
+    home: Vector3 | None = None
+    stamp: int = 0
+    position: Vector3 = (0.0, 0.0, 0.0)
+    velocity: Vector3 = (0.0, 0.0, 0.0)
+    rates: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    armed: bool = False
+    mode: str = "hold"
 
     def note(self, pose: Odometry | PoseEstimate) -> None:
         """Take note of the newest pose."""
@@ -173,8 +175,7 @@ def _home_position(v: Vehicle, ms: int) -> Any:
 
 def _odometry(v: Vehicle, _: int) -> Any:
     unknown = [math.nan] + [0.0] * 20
-    w, x, y, z = v.orientation
-    body = rotate((w, -x, -y, -z), v.velocity)
+    body = rotate_inverse(v.orientation, v.velocity)
     frames = mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_FRD
     pose = *v.position, list(v.orientation)
     return mav.MAVLink_odometry_message(
@@ -248,12 +249,6 @@ class Telemetry:
         self._vehicle, self._send = vehicle, send
         self._periods = {n: round(SECOND / hz) for n, (hz, _) in TELEMETRY.items() if hz}
         self._due = dict.fromkeys(self._periods, 0)
-
-    def period(self, number: int) -> int:
-        """Return the microseconds between two of a message; 0 unknown, -1 never."""
-        if number not in TELEMETRY:
-            return 0
-        return self._periods[number] // 1000 if number in self._periods else -1
 
     def set_period(self, number: int, microseconds: float) -> bool:
         """Set a message's period; 0 its own, below never; `False` if there is no such message."""

@@ -15,8 +15,11 @@ import events as ev
 from events import Odometry
 from nodes.mavlink.door import Door
 from nodes.mavlink.links import BURST
-from nodes.mavlink.settings import MavlinkConfig, address_of
+from nodes.mavlink.node import Mavlink, MavlinkConfig, Px4
+from runtime.errors import VisnavError
 from runtime.logs import NodeLogger
+from runtime.testing import run_nodes, spec
+from tests.nodes.pilots.test_pilot import Vehicle
 from tests.runtime.tools.samples_cli import ROOT, command_here
 
 SECOND = 1_000_000_000
@@ -140,8 +143,12 @@ def item(seq: int, number: int, z: float = 2.0, frame: int = 6, p1: float = 0) -
     )
 
 
+def of(kind: str, messages: list[Any]) -> list[Any]:
+    return [each for each in messages if each.get_type() == kind]
+
+
 def results(answers: list[Any]) -> list[int]:
-    return [each.result for each in answers if each.get_type() == "COMMAND_ACK"]
+    return [each.result for each in of("COMMAND_ACK", answers)]
 
 
 async def test_it_is_seen_as_an_autopilot_that_can_fly(outside: Outside) -> None:
@@ -154,18 +161,16 @@ async def test_it_is_seen_as_an_autopilot_that_can_fly(outside: Outside) -> None
     assert "AUTOPILOT_VERSION" not in heard  # which comes when it is asked for
     (ack,) = results(answers := outside.say(command(mav.MAV_CMD_REQUEST_MESSAGE, 148)))
     assert ack == 0
-    assert any(each.get_type() == "AUTOPILOT_VERSION" for each in answers)
+    assert of("AUTOPILOT_VERSION", answers)
 
 
 async def test_rates_are_those_that_are_asked_for(outside: Outside) -> None:
     outside.passes(1.0)
-    count = [each.get_type() for each in outside.passes(2.0)].count("ATTITUDE")
-    assert count == pytest.approx(40, abs=1)
+    assert len(of("ATTITUDE", outside.passes(2.0))) == pytest.approx(40, abs=1)
     assert results(outside.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 1e5))) == [0]
-    count = [each.get_type() for each in outside.passes(2.0)].count("ATTITUDE")
-    assert count == pytest.approx(20, abs=1)
+    assert len(of("ATTITUDE", outside.passes(2.0))) == pytest.approx(20, abs=1)
     assert results(outside.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 30, -1))) == [0]
-    assert "ATTITUDE" not in [each.get_type() for each in outside.passes(1.0)]
+    assert of("ATTITUDE", outside.passes(1.0)) == []
     unknown = mav.MAV_RESULT_UNSUPPORTED
     assert results(outside.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 9999, 1e5))) == [unknown]
 
@@ -204,7 +209,7 @@ async def test_offboard_needs_setpoints_and_ends_without(outside: Outside) -> No
     assert outside.acts[-1].frame_id == "heading"
     outside.say(mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], 0.1, 0, 0, 0.5))
     assert outside.acts[-1].angular_velocity == pytest.approx((0.1, 0.0, 0.0))
-    texts = [each.text for each in outside.passes(1.0) if each.get_type() == "STATUSTEXT"]
+    texts = [each.text for each in of("STATUSTEXT", outside.passes(1.0))]
     assert "offboard: no set-point for 0.5 s: holding" in texts
     assert isinstance(outside.acts[-1], ev.Hover)
     assert outside.door.vehicle.mode == "hold"
@@ -227,10 +232,10 @@ async def test_a_place_is_approached_at_the_cruising_speed(outside: Outside) -> 
 async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> None:
     asked = outside.say(mav.MAVLink_mission_count_message(1, 1, 3, 0))
     assert [each.get_type() for each in asked] == ["MISSION_REQUEST_INT"]
-    assert [each.get_type() for each in outside.passes(1.1)].count("MISSION_REQUEST_INT") == 1
+    assert len(of("MISSION_REQUEST_INT", outside.passes(1.1))) == 1
     outside.say(item(0, mav.MAV_CMD_NAV_WAYPOINT), item(1, mav.MAV_CMD_NAV_WAYPOINT, z=3.0))
     answers = outside.say(item(2, mav.MAV_CMD_NAV_LAND))
-    assert [each.type for each in answers if each.get_type() == "MISSION_ACK"] == [0]
+    assert [each.type for each in of("MISSION_ACK", answers)] == [0]
     (count,) = outside.say(mav.MAVLink_mission_request_list_message(1, 1, 0))
     assert count.count == 3
     (second,) = outside.say(mav.MAVLink_mission_request_int_message(1, 1, 1, 0))
@@ -239,8 +244,7 @@ async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> No
     assert results(outside.say(command(mav.MAV_CMD_MISSION_START, 0, 0))) == [0]
     reached = []
     for _ in range(60):
-        heard = outside.passes(0.1)
-        reached += [each.seq for each in heard if each.get_type() == "MISSION_ITEM_REACHED"]
+        reached += [each.seq for each in of("MISSION_ITEM_REACHED", outside.passes(0.1))]
         if isinstance(outside.acts[-1], ev.PositionSetpoint):
             outside.at(outside.acts[-1].position)
     assert reached == [0, 1, 2]
@@ -248,18 +252,16 @@ async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> No
 
 
 async def test_what_cannot_be_flown_is_refused_at_its_upload(outside: Outside) -> None:
+    def results_of(answers: list[Any]) -> list[int]:
+        return [each.type for each in of("MISSION_ACK", answers)]
+
     outside.say(mav.MAVLink_mission_count_message(1, 1, 1, 0))
-    (ack,) = [
-        each.type
-        for each in outside.say(item(0, mav.MAV_CMD_NAV_SPLINE_WAYPOINT))
-        if each.get_type() == "MISSION_ACK"
-    ]
-    assert ack == mav.MAV_MISSION_UNSUPPORTED
+    spline = outside.say(item(0, mav.MAV_CMD_NAV_SPLINE_WAYPOINT))
+    assert results_of(spline) == [mav.MAV_MISSION_UNSUPPORTED]
     fence = outside.say(mav.MAVLink_mission_count_message(1, 1, 4, mav.MAV_MISSION_TYPE_FENCE))
-    assert [each.type for each in fence if each.get_type() == "MISSION_ACK"] == [ack]
+    assert results_of(fence) == [mav.MAV_MISSION_UNSUPPORTED]
     outside.say(mav.MAVLink_mission_count_message(1, 1, 2, 0))
-    late = [each.type for each in outside.passes(8.0) if each.get_type() == "MISSION_ACK"]
-    assert late == [mav.MAV_MISSION_OPERATION_CANCELLED]
+    assert results_of(outside.passes(8.0)) == [mav.MAV_MISSION_OPERATION_CANCELLED]
 
 
 async def test_parameters_are_listed_read_and_set(outside: Outside) -> None:
@@ -273,7 +275,7 @@ async def test_parameters_are_listed_read_and_set(outside: Outside) -> None:
     (now,) = outside.say(mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", 4.0, real))
     assert now.param_value == 4.0
     kept = outside.say(mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", math.nan, real))
-    assert [each.param_value for each in kept if each.get_type() == "PARAM_VALUE"] == [4.0]
+    assert [each.param_value for each in of("PARAM_VALUE", kept)] == [4.0]
     assert outside.say(mav.MAVLink_param_request_read_message(1, 1, b"CAL_GYRO0_ID", -1)) == []
 
 
@@ -341,21 +343,35 @@ def test_what_is_wrong_in_a_file_is_said_before_the_flight(change: str, message:
     assert message in " ".join(done.stderr.split())
 
 
-def test_endpoints_are_udp_or_tcp() -> None:
-    assert address_of("tcp://127.0.0.1:5760") == ("tcp", "127.0.0.1", 5760)
-    for wrong in (
-        "127.0.0.1:14540",
-        "udp://:14540",
-        "udp://127.0.0.1",
-        "http://a:1",
-        "udp://a:99999",
-    ):
-        with pytest.raises(
-            ValueError, match="endpoints: expected udp://HOST:PORT or tcp://HOST:PORT"
-        ):
-            MavlinkConfig(endpoints=(wrong,))
+@pytest.mark.parametrize(
+    ("node", "settings", "message"),
+    [
+        (Mavlink, {"endpoints": []}, r'to say which it flies: write vehicle = "v" into its entry'),
+        (Px4, {"port": 0}, r"expected one vehicle whose motors to drive, found v, w: set vehicle"),
+    ],
+)
+def test_of_several_vehicles_one_is_named(node: Any, settings: Any, message: str) -> None:
+    nodes = [spec(Vehicle, "v"), spec(Vehicle, "w"), spec(node, "outside", settings)]
+    with pytest.raises(VisnavError, match=message):
+        run_nodes(nodes, duration=1)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["127.0.0.1:14540", "udp://:14540", "udp://127.0.0.1", "http://a:1", "udp://a:99999"],
+)
+def test_endpoints_are_udp_or_tcp(wrong: str) -> None:
+    right = "tcp://127.0.0.1:5760"
+    MavlinkConfig(endpoints=(right,))
+    expected = "endpoints: expected udp://HOST:PORT or tcp://HOST:PORT, found"
+    with pytest.raises(ValueError, match=f"{expected} '{wrong}'"):
+        MavlinkConfig(endpoints=(right, wrong))
+
+
+@pytest.mark.parametrize("wrong", ["secret", "5a" * 31])
+def test_a_key_has_64_digits(wrong: str) -> None:
     with pytest.raises(ValueError, match="signing_key: expected 64 hexadecimal digits"):
-        MavlinkConfig(signing_key="secret")
+        MavlinkConfig(signing_key=wrong)
 
 
 KINDS = [

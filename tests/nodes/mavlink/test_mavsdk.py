@@ -9,12 +9,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
 import visnav
 from events import PoseEstimate
-from nodes.mavlink.settings import address_of
 from runtime import Node, NodeConfig, on
 from tests.runtime.tools.samples_cli import ROOT, start, summary
 
@@ -139,7 +139,8 @@ class Companion(Node[CompanionConfig]):
         from pymavlink.dialects.v20 import common as mav
 
         self._mav = mav.MAVLink(None, 1, 197)
-        self._socket = socket.create_connection(address_of(self.config.link)[1:])
+        link = urlsplit(self.config.link)
+        self._socket = socket.create_connection((link.hostname, link.port))
 
     @on(PoseEstimate)
     def poses(self, event: PoseEstimate) -> None:

@@ -6,6 +6,7 @@ import itertools
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +15,7 @@ from pymavlink.dialects.v20 import common as mav
 
 import visnav
 from events import Odometry
-from nodes.mavlink.hil import Wire
+from nodes.mavlink.links import Wire
 from runtime import Node, on
 from runtime.errors import VisnavError
 
@@ -80,38 +81,37 @@ class Heights(Node):
         self.found.append(-event.position[2])
 
 
-def flown(counterpart: Counterpart, port: int) -> visnav.Run:
-    table = {
-        "run": {"name": "px4", "duration": "2s"},
-        "nodes": [
-            {
-                "name": "drone", "type": "Multirotor", "world": "hall", "imu_rate": 250,
-                "barometer": {}, "magnetometer": {}, "gnss": {},
-            },
-            {"name": "heights", "type": Heights},
-            {"name": "px4", "type": "Px4", "port": port, "start": "20s", "answer": "5s"},
-        ],
-    }  # fmt: skip
-    counterpart.start()
-    return visnav.run(table, quiet=True)
-
-
 @pytest.fixture
-def port() -> int:
+def flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Flies with a counterpart; returns it, and the run."""
+    monkeypatch.chdir(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as found:
-        number: int = found.getsockname()[1]
-        return number
+        port = found.getsockname()[1]
+
+    def fly(goes: int = 0) -> tuple[Counterpart, visnav.Run]:
+        table = {
+            "run": {"name": "px4", "duration": "2s"},
+            "nodes": [
+                {
+                    "name": "drone", "type": "Multirotor", "world": "hall", "imu_rate": 250,
+                    "barometer": {}, "magnetometer": {}, "gnss": {},
+                },
+                {"name": "heights", "type": Heights},
+                {"name": "px4", "type": "Px4", "port": port, "start": "20s", "answer": "5s"},
+            ],
+        }  # fmt: skip
+        counterpart = Counterpart(port, goes=goes)
+        counterpart.start()
+        return counterpart, visnav.run(table, quiet=True)
+
+    return fly
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(120)
-def test_its_motors_lift_the_vehicle_and_no_sample_is_missed(
-    tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    px4 = Counterpart(port)
+def test_its_motors_lift_the_vehicle_and_no_sample_is_missed(flown: Callable[..., Any]) -> None:
     Heights.found.clear()
-    run = flown(px4, port)
+    px4, run = flown()
     stamps = [each.time_usec for each in px4.heard if each.get_type() == "HIL_SENSOR"]
     assert {b - a for a, b in itertools.pairwise(stamps)} == {4000}
     assert len(stamps) >= 498
@@ -126,12 +126,9 @@ def test_its_motors_lift_the_vehicle_and_no_sample_is_missed(
 
 @pytest.mark.slow
 @pytest.mark.timeout(120)
-def test_one_that_goes_ends_the_run_with_a_reason(
-    tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_one_that_goes_ends_the_run_with_a_reason(flown: Callable[..., Any]) -> None:
     with pytest.raises(VisnavError, match="PX4 has gone after 100 answers"):
-        flown(Counterpart(port, goes=100), port)
+        flown(goes=100)
 
 
 def test_one_that_never_comes_is_named() -> None:
