@@ -1,7 +1,6 @@
 """Estimators: base classes of nodes estimating poses from images or lidar scans."""
 
 from nodes.estimators.estimator import WORKER_ENVIRONMENT, Estimator, EstimatorConfig
-from nodes.estimators.result import TrackingResult
 from nodes.estimators.rig import (
     MonocularFrame,
     MonocularInertialFrame,
@@ -10,6 +9,7 @@ from nodes.estimators.rig import (
     RgbdInertialFrame,
     StereoFrame,
     StereoInertialFrame,
+    TrackingResult,
     sample_rows,
 )
 

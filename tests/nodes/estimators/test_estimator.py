@@ -31,7 +31,7 @@ from events import (
     VehicleAnnouncement,
 )
 from nodes.estimators import Estimator, RgbdFrame, TrackingResult
-from nodes.estimators.result import check_result
+from nodes.estimators.rig import check_result
 from nodes.judging.evaluation.record import EstimatorRecord
 from runtime import Bundle
 from runtime.config.reading import find_node
