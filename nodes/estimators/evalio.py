@@ -17,13 +17,7 @@ import numpy.typing as npt
 
 from events import Event, Imu, ImuAnnouncement, LidarAnnouncement, LidarScan
 from events.geometry import pose_matrix
-from nodes.estimators import (
-    WORKER_ENVIRONMENT,
-    Estimator,
-    EstimatorConfig,
-    TrackingResult,
-    sample_rows,
-)
+from nodes.estimators import Estimator, EstimatorConfig, TrackingResult, sample_rows
 from runtime import Input, on
 from runtime.errors import MissingDependencyError, suggest
 from runtime.extras import install_command
@@ -293,14 +287,8 @@ class Evalio(Estimator[EvalioConfig]):
 
     async def on_ready(self) -> None:
         """Start the pipeline, in a process of its own."""
-        self._pipeline = await self.worker(
-            EvalioProcess,
-            self.config,
-            self.the_lidar(),
-            self.imu_announcement,
-            latency=self.config.latency,
-            env=WORKER_ENVIRONMENT,
-        )
+        told = self.config, self.the_lidar(), self.imu_announcement
+        self._pipeline = await self.start_tracker(EvalioProcess, *told)
 
     async def run(self) -> None:
         """Track each scan; estimates start with the first scan of enough points."""

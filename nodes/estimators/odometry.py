@@ -1,4 +1,4 @@
-"""Tools of the odometries: grey images, corners followed by flow, poses, relocalization.
+"""Tools of the odometries: node, grey images, flow, surfaces, poses, relocalization.
 
 Images are of the announced size and without distortion; flow goes from one to another, and back.
 Poses come from pixels and depths of landmarks by robust Gauss-Newton with Huber's weights;
@@ -9,19 +9,69 @@ E. Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
 
 from __future__ import annotations
 
-from typing import Any
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import CameraInfo
+from events import CameraInfo, DepthImage, Image
 from events.geometry import inverse
+from nodes.estimators.estimator import C, Estimator
+from nodes.estimators.rig import TrackingResult, sample_rows
+from runtime import Bundle
 
 Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]
+
+
+class Tracker(Protocol):
+    """Tracker of an odometry."""
+
+    def track(self, stamp: int, *data: Any) -> TrackingResult | None:
+        """Return the pose of the next frame; `None` before there is a map.
+
+        Args:
+            stamp: Of the exposure on the clock of the IMU (ns).
+            data: Of each field of the frame: an image, shape (h, w, 3) red, green, blue, or (h, w)
+                grey; depth, metres along the optical axis, shape (h, w), ``inf`` where nothing was
+                measured; samples of the IMU since the frame before, as of `sample_rows`.
+
+        Raises:
+            ValueError: The size is not that of the camera.
+        """
+
+
+class OdometryNode(Estimator[C]):
+    """Base of nodes around a tracker, in a process of its own."""
+
+    frames: Bundle[Any]
+    tracks: Callable[..., TrackingResult | None] = staticmethod(Tracker.track)
+    """Method of the tracker that takes a frame; its arguments are those of `Tracker.track`."""
+
+    @abstractmethod
+    def tracker(self) -> tuple[Any, ...]:
+        """Return what makes the tracker, and its arguments."""
+
+    async def on_ready(self) -> None:
+        """Start the tracker."""
+        self._tracker = await self.start_tracker(*self.tracker())
+
+    async def run(self) -> None:
+        """Track each frame; those arriving meanwhile are skipped, samples of the IMU are not."""
+        async for frame in self.frames:
+            image = frame[0]
+            data = [
+                each.data if isinstance(each, Image | DepthImage) else sample_rows(each)
+                for each in frame
+            ]
+            result = await self._tracker.call(self.tracks, self.exposed_at(image), *data)
+            if result is not None:  # there is a map
+                self.publish(image, result)
 
 
 def refuse_distortion(info: CameraInfo) -> None:
@@ -96,61 +146,93 @@ def follow_both_ways(
     return found, good & inside(found, image.shape, 3)
 
 
+REACH = 6  # radius of continuous surface required around a corner by optical flow, pixels
+NEAREST = 0.05  # least depth, metres; smaller values are ignored, as of dirt on the lens
+_FARTHEST = 0.02  # 1/m: beyond 50 m depth says nothing about a motion of metres
+_HOLE = -200.0  # placeholder for no depth, 1/m: so low, a smoothed neighbour stays below zero
+_TORN = 0.02  # largest deviation of a neighbourhood from a plane, relative to inverse depth
+_NOISY = 2.0  # the same, in standard deviations of a reading
+_GRID = np.array([(x, y) for y in range(-REACH, REACH + 1, 3) for x in range(-REACH, REACH + 1, 3)])
+_SPREAD = float((_GRID[:, 0] ** 2).sum())
+
+
+class Surfaces(msgspec.Struct, frozen=True, eq=False):
+    """The planes around some pixels."""
+
+    inverse: Floats  # inverse depth at each, 1/m, shape (n,)
+    slope: Floats  # its change by column and by row, 1/m, shape (n, 2)
+    continuous: npt.NDArray[np.bool_]  # mask, shape (n,): elsewhere depth is torn or missing
+
+    def take(self, rows: npt.NDArray[np.bool_]) -> Surfaces:
+        """Return some of them."""
+        return Surfaces(self.inverse[rows], self.slope[rows], self.continuous[rows])
+
+
+def inverse_depth(depth: Depth) -> Depth:
+    """Return inverse depth in 1/m, the mean of 3×3 pixels; below zero by holes, shape (h, w)."""
+    with np.errstate(divide="ignore"):
+        inverse = np.reciprocal(depth)
+    unknown = ~((depth > NEAREST) & (depth < np.inf))
+    if unknown.any():
+        inverse[unknown] = _HOLE
+    return np.asarray(cv2.blur(inverse, (3, 3)))
+
+
+def surfaces_at(
+    inverse: Depth,  # as of `inverse_depth`, shape (h, w)
+    pixels: Floats,  # column and row, shape (n, 2)
+    noise: float,  # standard deviation of one pixel's inverse depth, 1/m
+) -> Surfaces:
+    """Fit a plane to inverse depth around each pixel."""
+    height, width = inverse.shape
+    centre = np.rint(pixels).astype(int)
+    columns = np.clip(centre[:, 0, None] + _GRID[:, 0], 0, width - 1)
+    rows = np.clip(centre[:, 1, None] + _GRID[:, 1], 0, height - 1)
+    around = inverse[rows, columns].astype(np.float64)
+    mean = around.mean(axis=1)
+    slope = around @ _GRID / _SPREAD
+    bend = np.abs(around - mean[:, None] - slope @ _GRID.T).max(axis=1)
+    continuous = (around.min(axis=1) > 0) & (bend < np.maximum(_TORN * mean, _NOISY * noise))
+    value = mean + ((pixels - centre) * slope).sum(axis=1)
+    continuous &= value > _FARTHEST
+    return Surfaces(np.where(continuous, value, 0.0), slope, continuous)
+
+
 _HUBER = 2.0  # Huber threshold of a residual, standard deviations
 _STEPS = 8
 _SMALL = 1e-7
 _DAMPING = 1e-9  # damping of each motion, relative to its own information
 
 
-class Observations(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks observed in a single image."""
-
-    landmarks: Floats  # metres in the world, shape (n, 3)
-    pixels: Floats  # column and row, shape (n, 2)
-    inverse: Floats  # measured inverse depth, 1/m, shape (n,)
-    measured: npt.NDArray[np.bool_]  # mask of measured inverse depths, shape (n,)
-
-    @classmethod
-    def without_depth(cls, landmarks: Floats, pixels: Floats) -> Observations:
-        """Return observations of pixels only."""
-        count = len(landmarks)
-        return cls(landmarks, pixels, np.zeros(count), np.zeros(count, np.bool_))
-
-    def take(self, rows: npt.NDArray[np.bool_]) -> Observations:
-        """Return some of them, by a mask (n,)."""
-        seen = self.landmarks[rows], self.pixels[rows]
-        return Observations(*seen, self.inverse[rows], self.measured[rows])
-
-
-class Solution(msgspec.Struct, frozen=True, eq=False):
-    """Pose, and the errors of the landmarks."""
-
-    pose: Floats  # world to camera, shape (4, 4)
-    errors: Floats  # reprojection errors in standard deviations, shape (n,)
-
-
 def solve_pose(
-    seen: Observations,  # at least four landmarks, or fewer with `information`
+    landmarks: Floats,  # metres in the world, shape (n, 3), n > 3 (or less with `information`)
+    pixels: Floats,  # theirs: column and row, shape (n, 2)
     start: Floats,  # initial pose, world to camera, shape (4, 4)
     matrix: Floats,  # K, shape (3, 3)
     pixel_noise: float,  # standard deviation of a coordinate, pixels
-    depth_noise: float,  # standard deviation of inverse depth, 1/m
+    read: Surfaces | None = None,  # their inverse depth, where measured
+    depth_noise: float = 1.0,  # standard deviation of inverse depth, 1/m
     information: Floats | None = None,
-) -> Solution:
+) -> tuple[Floats, Floats]:
     """Return the pose with the least sum of robust squared residuals.
 
     Args:
         information: Inverse covariance of the initial pose, if known: of a small motion of the
             camera's frame, translation, then rotation, shape (6, 6).
+
+    Returns:
+        World to camera, shape (4, 4), and the landmarks' reprojection errors in standard
+        deviations, shape (n,).
     """
     fx, fy, cx, cy = intrinsics(matrix)
-    pose, count = start.copy(), len(seen.pixels)
+    pose, count = start.copy(), len(pixels)
     # In rows of contiguous memory: coordinates, and derivatives of each by the six motions.
-    landmarks = np.ascontiguousarray(seen.landmarks.T)
-    target = np.stack([(seen.pixels[:, 0] - cx) / fx, (seen.pixels[:, 1] - cy) / fy, seen.inverse])
-    scale = np.empty((3, count))
+    landmarks = np.ascontiguousarray(landmarks.T)
+    target, scale = np.zeros((3, count)), np.zeros((3, count))
+    target[0], target[1] = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
     scale[0], scale[1] = fx / pixel_noise, fy / pixel_noise
-    scale[2] = np.where(seen.measured, 1.0 / depth_noise, 0.0)
+    if read is not None:
+        target[2], scale[2] = read.inverse, read.continuous / depth_noise
     jacobian = np.zeros((6, 3, count))
     image, errors = np.empty((3, count)), np.empty((2, count))
     for _ in range(_STEPS):
@@ -185,7 +267,7 @@ def solve_pose(
         if np.abs(step).max() < _SMALL:
             break
     errors[0, ~ahead] = np.inf
-    return Solution(pose, errors[0])
+    return pose, errors[0]
 
 
 def moved(pose: Floats, step: Floats) -> Floats:

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from events import CameraInfo
 from events.geometry import pose_matrix
-from nodes.estimators import Estimator, EstimatorConfig, MonocularFrame, TrackingResult
+from nodes.estimators import EstimatorConfig, MonocularFrame, TrackingResult
+from nodes.estimators.odometry import OdometryNode
 from runtime import Bundle
 from runtime.errors import MissingDependencyError
 
@@ -113,14 +114,9 @@ class SvoProcess:
         self._maps = 0  # put where the camera was last known to be
 
     def track(self, stamp: int, image: npt.NDArray[np.uint8]) -> TrackingResult | None:
-        """Return the pose of the next image; `None` while there has been no map yet.
-
-        Args:
-            stamp: Of the exposure (ns), rising.
-            image: Grey, or red, green and blue; shape (h, w) or (h, w, 3).
+        """Return the pose of the next image; see `Tracker.track`.
 
         Raises:
-            ValueError: The image has another size than the camera.
             RuntimeError: A pose was not understood: another release of `svo_cpp` is needed.
         """
         if image.shape[:2] != self._shape:
@@ -209,7 +205,7 @@ class SvoConfig(EstimatorConfig):
     svo: SvoSettings = SvoSettings()
 
 
-class Svo(Estimator[SvoConfig]):
+class Svo(OdometryNode[SvoConfig]):
     """Estimator of a single camera's pose by SVO, in a process and a unit of length of its own.
 
     C. Forster, M. Pizzoli and D. Scaramuzza, "SVO: Fast Semi-Direct Monocular Visual Odometry",
@@ -224,15 +220,6 @@ class Svo(Estimator[SvoConfig]):
 
     frames = Bundle(MonocularFrame, keep="latest")
 
-    async def on_ready(self) -> None:
-        """Start SVO, in a process of its own."""
-        info = self.the_camera().info
-        self._svo = await self.start_tracker(SvoProcess, info, self.config.svo)
-
-    async def run(self) -> None:
-        """Track each image; nothing is sent until there is a map."""
-        async for (image,) in self.frames:
-            stamp = self.exposed_at(image)
-            result = await self._svo.call(SvoProcess.track, stamp, image.data)
-            if result is not None:
-                self.publish(image, result)
+    def tracker(self) -> tuple[Any, ...]:
+        """Return what makes the tracker, and its arguments."""
+        return SvoProcess, self.the_camera().info, self.config.svo

@@ -1,6 +1,6 @@
 """Visual-inertial odometry: a camera with depth, or a stereo rig, and an IMU, tightly coupled."""
 
-from nodes.estimators.inertial_odometry.node import (
+from nodes.estimators.inertial_odometry.tracker import (
     InertialOdometryConfig,
     RgbdInertialOdometry,
     StereoInertialOdometry,

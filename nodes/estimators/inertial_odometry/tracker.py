@@ -1,4 +1,4 @@
-"""Visual-inertial odometry: the RGB-D tracker's map, and a filter driven by the IMU.
+"""Visual-inertial odometry: its nodes, the RGB-D tracker's map, and a filter driven by the IMU.
 
 The IMU predicts the next image's pose, all landmarks found there correct the filter (tightly
 coupled), and the map grows from the filter's pose. Where landmarks are few, a camera with depth is
@@ -9,7 +9,7 @@ new map begins, in a frame of its own.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import msgspec
@@ -18,17 +18,22 @@ import numpy.typing as npt
 
 from events import CameraAnnouncement, ImuAnnouncement
 from events.geometry import inverse, pose_matrix
-from nodes.estimators import TrackingResult
+from nodes.estimators import (
+    EstimatorConfig,
+    RgbdInertialFrame,
+    StereoInertialFrame,
+    TrackingResult,
+)
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
 from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel, cross
 from nodes.estimators.inertial_odometry.preintegration import Rows as ImageRows
-from nodes.estimators.odometry import Depth, Grey, rays
+from nodes.estimators.odometry import Depth, Grey, OdometryNode, Surfaces, rays, surfaces_at
 from nodes.estimators.visual_odometry.alignment import Alignment
-from nodes.estimators.visual_odometry.features import BELIEVED, FeatureTracker
+from nodes.estimators.visual_odometry.features import BELIEVED, FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.landmarks import MapMatch
 from nodes.estimators.visual_odometry.patches import Rows
-from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings
-from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces, surfaces_at
+from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings, baseline
+from runtime import Bundle
 
 _KNOWN = 0.3, 0.03  # largest deviations of velocity (m/s) and gravity (rad) to use the IMU
 _READING = 0.8  # noise of a depth reading, relative to a single pixel's; errors of place included
@@ -91,21 +96,12 @@ class InertialTracker(FeatureTracker):
 
     def fuse(
         self,
-        stamp: int,  # exposure on the clock of the IMU (ns)
-        image: npt.NDArray[np.uint8],  # grey or colour, of the (left) camera
-        other: npt.NDArray[np.uint8] | Depth,
+        stamp: int,
+        image: npt.NDArray[np.uint8],  # of the (left) camera
+        other: npt.NDArray[np.uint8] | Depth,  # its depth, or the image of the right camera
         samples: Floats,
     ) -> TrackingResult:
-        """Return the pose of the next image.
-
-        Args:
-            other: Its depth in metres, or the image of the right camera.
-            samples: Of the IMU since the image before: stamp (ns), angular velocity, specific
-                force; shape (n, 7).
-
-        Raises:
-            ValueError: The size is not that of the camera.
-        """
+        """Return the pose of the next image; see `Tracker.track`."""
         self._epoch = stamp if self._epoch is None else self._epoch
         now = (stamp - self._epoch) / 1e9
         samples = self._imu.corrected(
@@ -321,3 +317,51 @@ class InertialTracker(FeatureTracker):
         variance = sum(np.square(each) for each in noises)
         scale[:, 2] = np.where(read.continuous, 1.0 / np.sqrt(variance), 0.0)
         return Sighting(self._map.places[rows], self._map.keyframes[rows], measured, scale)
+
+
+class InertialOdometryConfig(EstimatorConfig):
+    """Settings of visual-inertial odometry; the IMU's noise is as announced.
+
+    Attributes:
+        inertial: Settings of the fusion with the IMU.
+        features: Settings of the map; of a stereo rig, its ``depth_noise`` is that of the matching.
+        stereo: Settings of the matching of a stereo rig's images.
+    """
+
+    inertial: InertialSettings = InertialSettings()
+    features: FeatureSettings = FeatureSettings()
+    stereo: StereoSettings = StereoSettings()
+
+
+class _InertialOdometry(OdometryNode[InertialOdometryConfig]):
+    inertial = True
+    lenses = frozenset()
+    tracks = staticmethod(InertialTracker.fuse)
+
+    def tracker(self) -> tuple[Any, ...]:
+        """Return what makes the tracker, and its arguments."""
+        camera, config = self.the_camera(), self.config
+        if self.imu_announcement is None:
+            self.log.fatal("%s", self._missing())
+        apart = baseline(*self.cameras) if self.eyes == 2 else 0.0
+        settings = config.features, config.inertial, config.stereo
+        return InertialTracker, camera, self.imu_announcement, apart, *settings
+
+
+class RgbdInertialOdometry(_InertialOdometry):
+    """Estimates pose, velocity and covariance of a camera with depth and an IMU."""
+
+    needs = frozenset({"grey", "depth"})
+    method = "RGB-D-inertial odometry (filter)"
+
+    frames = Bundle(RgbdInertialFrame, keep="latest")
+
+
+class StereoInertialOdometry(_InertialOdometry):
+    """Estimates pose, velocity and covariance of a rectified stereo rig and an IMU."""
+
+    needs = frozenset({"grey"})
+    eyes = 2
+    method = "stereo-inertial odometry (filter)"
+
+    frames = Bundle(StereoInertialFrame, keep="latest")

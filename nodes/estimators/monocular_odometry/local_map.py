@@ -18,7 +18,7 @@ from nodes.estimators.monocular_odometry.geometry import (
     reprojection_errors,
     triangulate,
 )
-from nodes.estimators.odometry import Floats, Grey, Observations, follow_both_ways, rays, solve_pose
+from nodes.estimators.odometry import Floats, Grey, follow_both_ways, rays, solve_pose
 
 _SNAPSHOT = 5.0  # median motion between stored views, pixels
 _GOOD = 2.0  # largest reprojection error of a corner in agreement with a motion, pixels
@@ -141,8 +141,8 @@ class Initialization:
         return total
 
     def _pose_of(self, points: Floats, pixels: Floats) -> Floats:
-        seen = Observations.without_depth(points, pixels)
-        return solve_pose(seen, np.eye(4), self._matrix, self._settings.pixel_noise, 1.0).pose
+        noise = self._settings.pixel_noise
+        return solve_pose(points, pixels, np.eye(4), self._matrix, noise)[0]
 
 
 def _median_shift(before: Floats, after: Floats) -> float:
@@ -199,9 +199,6 @@ class Tracks:
         self.pixels = np.concatenate([self.pixels, more.pixels])
         self.points = np.concatenate([self.points, more.points])
         self.views += more.views
-
-
-"""Pixels of reprojection error up to which a landmark is kept."""
 
 
 class LocalMap:

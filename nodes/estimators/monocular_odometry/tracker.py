@@ -9,6 +9,7 @@ The unit of length is the first map's.
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,14 +17,13 @@ import numpy.typing as npt
 
 from events import CameraInfo
 from events.geometry import inverse
-from nodes.estimators import Estimator, EstimatorConfig, MonocularFrame, TrackingResult
+from nodes.estimators import EstimatorConfig, MonocularFrame, TrackingResult
 from nodes.estimators.monocular_odometry.geometry import Indices, Keyframe, MonocularSettings
 from nodes.estimators.monocular_odometry.local_map import Initialization, LocalMap
 from nodes.estimators.odometry import (
     Floats,
     Grey,
-    Observations,
-    Solution,
+    OdometryNode,
     describe,
     detect_and_describe,
     follow_both_ways,
@@ -60,15 +60,7 @@ class MonocularTracker:
         self._maps = 0  # begun at a guessed pose, with a guessed unit
 
     def track(self, stamp: int, image: npt.NDArray[np.uint8]) -> TrackingResult | None:
-        """Return the pose of the next image; `None` before there is a map.
-
-        Args:
-            stamp: Of the exposure (ns).
-            image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
-
-        Raises:
-            ValueError: The size is not that of the camera.
-        """
+        """Return the pose of the next image; see `Tracker.track`."""
         grey = grey_image(self._info, image)
         if self._map is None:
             return self._initialize(grey)
@@ -76,14 +68,15 @@ class MonocularTracker:
         rows, pixels = self._follow(grey, self._map, expected)
         tracks = self._map.tracks
         known = tracks.known[rows]
-        solution = self._solve(tracks.points[rows][known], pixels[known], expected)
-        if solution is None:
+        found = self._solve(tracks.points[rows][known], pixels[known], expected)
+        if found is None:
             return self._lost(stamp, grey, pixels)
         reason = "" if self._lost_since is None else "against a key frame"
         self._lost_since = self._initialization = None
-        self._pose = self._guess = solution.pose
+        self._pose, errors = found
+        self._guess = self._pose
         agree = np.ones(len(rows), np.bool_)
-        agree[known] = solution.errors < _AGREES
+        agree[known] = errors < _AGREES
         seen = known & agree
         self._before = grey, tracks.points[rows][seen], pixels[seen]
         result = TrackingResult(
@@ -152,7 +145,7 @@ class MonocularTracker:
         )
         if 2 * good.sum() < settings.min_inliers:
             return self._guess
-        return self._refine(points[few][good], there[good], self._guess).pose
+        return self._refine(points[few][good], there[good], self._guess)[0]
 
     def _follow(self, grey: Grey, world: LocalMap, expected: Floats) -> tuple[Indices, Floats]:
         """Follow the newest key frame's corners; return found rows and their pixels."""
@@ -170,23 +163,22 @@ class MonocularTracker:
         pixels, good = follow_both_ways(world.image, grey, start, guess[rows], window, 1)
         return rows[good], pixels[good]
 
-    def _solve(self, points: Floats, pixels: Floats, expected: Floats) -> Solution | None:
-        """Return the pose; `None` if too few landmarks agree."""
+    def _solve(
+        self, points: Floats, pixels: Floats, expected: Floats
+    ) -> tuple[Floats, Floats] | None:
+        """Return the pose and errors of `solve_pose`; `None` if too few landmarks agree."""
         least = self._settings.min_inliers
         if len(points) < least:
             return None
-        solution = self._refine(points, pixels, expected)
-        agree = solution.errors < _AGREES
+        pose, errors = self._refine(points, pixels, expected)
+        agree = errors < _AGREES
         if agree.sum() < max(least, 0.4 * len(agree)):
             return None
-        final = self._refine(points[agree], pixels[agree], solution.pose)
-        errors = solution.errors.copy()
-        errors[agree] = final.errors
-        return Solution(final.pose, errors)
+        pose, errors[agree] = self._refine(points[agree], pixels[agree], pose)
+        return pose, errors
 
-    def _refine(self, points: Floats, pixels: Floats, start: Floats) -> Solution:
-        seen = Observations.without_depth(points, pixels)
-        return solve_pose(seen, start, self._matrix, self._settings.pixel_noise, 1.0)
+    def _refine(self, points: Floats, pixels: Floats, start: Floats) -> tuple[Floats, Floats]:
+        return solve_pose(points, pixels, start, self._matrix, self._settings.pixel_noise)
 
     # Lost.
 
@@ -226,7 +218,7 @@ class MonocularOdometryConfig(EstimatorConfig):
     tracker: MonocularSettings = MonocularSettings()
 
 
-class MonocularOdometry(Estimator[MonocularOdometryConfig]):
+class MonocularOdometry(OdometryNode[MonocularOdometryConfig]):
     """Estimates the pose of a single camera, in a unit of length of its own."""
 
     needs = frozenset({"grey"})
@@ -236,17 +228,9 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
 
     frames = Bundle(MonocularFrame, keep="latest")
 
-    async def on_ready(self) -> None:
-        """Start the tracker, in a process of its own."""
-        info = self.the_camera().info
-        self._tracker = await self.start_tracker(make_tracker, info, self.config.tracker)
-
-    async def run(self) -> None:
-        """Track each image; nothing is sent until there is a map."""
-        async for (image,) in self.frames:
-            result = await self._tracker.call(MonocularTracker.track, image.stamp, image.data)
-            if result is not None:
-                self.publish(image, result)
+    def tracker(self) -> tuple[Any, ...]:
+        """Return what makes the tracker, and its arguments."""
+        return make_tracker, self.the_camera().info, self.config.tracker
 
 
 def make_tracker(info: CameraInfo, settings: MonocularSettings) -> MonocularTracker:

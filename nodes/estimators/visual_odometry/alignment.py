@@ -27,8 +27,8 @@ from nodes.estimators.odometry import (
     motion_between,
     moved,
     rays,
+    surfaces_at,
 )
-from nodes.estimators.visual_odometry.surfaces import surfaces_at
 
 _LEVELS = 4
 _CELL = 4  # side of the squares of the half-sized image with at most a single edge pixel each

@@ -11,9 +11,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -25,14 +26,15 @@ from nodes.estimators.odometry import (
     Depth,
     Floats,
     Grey,
-    Observations,
-    Solution,
+    Surfaces,
     detect_and_describe,
     from_rotation_vector,
     grey_and_depth,
+    inverse_depth,
     refuse_distortion,
     relocalize,
     solve_pose,
+    surfaces_at,
 )
 from nodes.estimators.visual_odometry.alignment import Alignment, Motion, View
 from nodes.estimators.visual_odometry.landmarks import (
@@ -45,12 +47,6 @@ from nodes.estimators.visual_odometry.landmarks import (
     squares,
 )
 from nodes.estimators.visual_odometry.patches import References, Rows, find_patches, half_width
-from nodes.estimators.visual_odometry.surfaces import (
-    FeatureSettings,
-    Surfaces,
-    inverse_depth,
-    surfaces_at,
-)
 
 _FLOW_WINDOW = 15
 _LARGE = 320  # least side (pixels) of images halved before following corners
@@ -65,6 +61,38 @@ _SURE = 0.6  # least share of agreeing landmarks, among those searched, in a rel
 _NEAR = 64.0  # margin around the image for landmarks soon in view, pixels
 _SOON = 8  # images between updates of the list of such landmarks
 _READING = 0.5  # noise of a depth reading, a mean of many pixels, relative to a single pixel's
+
+
+class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the method on features.
+
+    Attributes:
+        spacing: Side of image squares with a landmark each, pixels; time grows with their number.
+        window: Side of compared patches, pixels; odd.
+        levels: Times that flow halves the image for large motions between two images.
+        pixel_noise: Standard deviation of a patch's position, pixels.
+        depth_noise: Standard deviation of inverse depth, 1/m: k of a sensor with sigma = k z².
+        keyframes: Stored key frames, each of the size of a grey image.
+        keyframe_overlap: Share of the last key frame's landmarks in view below which another is
+            made,
+        keyframe_rotation: or rotation since the last one, degrees,
+        keyframe_shift: or motion since the last one, pixels at the median depth.
+        min_inliers: Agreeing landmarks below which the camera is lost.
+        reset_timeout: Seconds of mere relocalization of a lost camera; then a new map starts at its
+            last pose.
+    """
+
+    spacing: Annotated[int, msgspec.Meta(ge=12, le=128)] = 28
+    window: Annotated[int, msgspec.Meta(ge=7, le=31)] = 11
+    levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 4
+    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.3
+    depth_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.002
+    keyframes: Annotated[int, msgspec.Meta(ge=2, le=10_000)] = 200
+    keyframe_overlap: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.6
+    keyframe_rotation: Annotated[float, msgspec.Meta(gt=0)] = 12.0
+    keyframe_shift: Annotated[float, msgspec.Meta(gt=0)] = 40.0
+    min_inliers: Annotated[int, msgspec.Meta(ge=6)] = 15
+    reset_timeout: Annotated[float, msgspec.Meta(ge=0)] = 1.0
 
 
 class FeatureTracker:
@@ -218,9 +246,9 @@ class FeatureTracker:
             return None
         places = self._map.places[rows[good]]
         there = self._reduction * there.reshape(-1, 2)[good].astype(np.float64)
-        solution = self._solve(Observations.without_depth(places, there), self._pose)
-        if (solution.errors < 2 * _AGREES).mean() > 0.6:
-            return solution.pose
+        pose, errors = self._solve(places, there, self._pose)
+        if (errors < 2 * _AGREES).mean() > 0.6:
+            return pose
         cv2.setRNGSeed(1)
         found, rotation, translation, _ = cv2.solvePnPRansac(
             places, there, self._matrix, None, flags=cv2.SOLVEPNP_EPNP, reprojectionError=2.0
@@ -258,20 +286,28 @@ class FeatureTracker:
         if len(rows) < least:
             return None
         read = self._surfaces_at(inverse_of, pixels, settings.depth_noise)
-        seen = Observations(landmarks.places[rows], pixels, read.inverse, read.continuous)
-        first = self._solve(seen, expected, information)
-        agree = first.errors < _AGREES
+        places = landmarks.places[rows]
+        start, errors = self._solve(places, pixels, expected, read, information)
+        agree = errors < _AGREES
         if agree.sum() < max(least, 0.4 * len(agree)):
             return None
-        start = first.pose if information is None else expected
-        last = self._solve(seen.take(agree), start, information)
-        return MapMatch(last.pose, rows, pixels, agree, missed)
+        start = start if information is None else expected
+        seen = places[agree], pixels[agree], start, read.take(agree)
+        pose, _ = self._solve(*seen, information)
+        return MapMatch(pose, rows, pixels, agree, missed)
 
     def _solve(
-        self, seen: Observations, start: Floats, information: Floats | None = None
-    ) -> Solution:
-        noise = self._settings.pixel_noise, _READING * self._settings.depth_noise
-        return solve_pose(seen, start, self._matrix, *noise, information)
+        self,
+        places: Floats,
+        pixels: Floats,
+        start: Floats,
+        read: Surfaces | None = None,
+        information: Floats | None = None,
+    ) -> tuple[Floats, Floats]:
+        pixel_noise, noise = self._settings.pixel_noise, _READING * self._settings.depth_noise
+        return solve_pose(
+            places, pixels, start, self._matrix, pixel_noise, read, noise, information
+        )
 
     def _is_far(self, rows: Rows) -> bool:
         """Return whether the last key frame is nearly out of sight."""

@@ -19,12 +19,13 @@ from nodes.estimators.odometry import (
     DescribedPoints,
     Floats,
     Grey,
+    Surfaces,
     detect_and_describe,
     intrinsics,
     rays,
+    surfaces_at,
 )
 from nodes.estimators.visual_odometry.patches import Patches, Rows
-from nodes.estimators.visual_odometry.surfaces import Surfaces, surfaces_at
 
 _SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5  # limits of a landmark's look relative to the first
 _MEAN_OF = 20.0  # depth readings in the mean of a landmark's depth; a moving mean beyond
@@ -119,7 +120,7 @@ class Landmarks:
 
         Args:
             pose: World to camera, shape (4, 4).
-            inverse_depth: As of `surfaces.inverse_depth`, shape (h, w).
+            inverse_depth: As of `odometry.inverse_depth`, shape (h, w).
             noise: Standard deviation of a reading, 1/m.
         """
         pixels, z = self.project(pose, rows)

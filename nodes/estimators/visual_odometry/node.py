@@ -9,7 +9,7 @@ lost.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import cv2
 import msgspec
@@ -17,10 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from nodes.estimators import Estimator, EstimatorConfig, RgbdFrame, TrackingResult
-from nodes.estimators.odometry import Depth, Floats, grey_and_depth, refuse_distortion
-from nodes.estimators.visual_odometry.features import FeatureTracker
-from nodes.estimators.visual_odometry.surfaces import FeatureSettings
+from nodes.estimators import EstimatorConfig, RgbdFrame, TrackingResult
+from nodes.estimators.odometry import (
+    Depth,
+    Floats,
+    OdometryNode,
+    grey_and_depth,
+    refuse_distortion,
+)
+from nodes.estimators.visual_odometry.features import FeatureSettings, FeatureTracker
 from runtime import Bundle
 
 
@@ -129,22 +134,6 @@ class DenseTracker:
         return settings
 
 
-class Tracker(Protocol):
-    """A method of RGB-D odometry."""
-
-    def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> TrackingResult:
-        """Return the pose of the next image.
-
-        Args:
-            stamp: Of the exposure (ns).
-            image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
-            depth: Metres along the optical axis, shape (h, w); ``inf`` where nothing was measured.
-
-        Raises:
-            ValueError: The size is not that of the camera.
-        """
-
-
 class VisualOdometryConfig(EstimatorConfig):
     """Settings of visual odometry.
 
@@ -160,7 +149,7 @@ class VisualOdometryConfig(EstimatorConfig):
     dense: DenseSettings = DenseSettings()
 
 
-class VisualOdometry(Estimator[VisualOdometryConfig]):
+class VisualOdometry(OdometryNode[VisualOdometryConfig]):
     """Estimates the pose of a camera with depth from its images alone."""
 
     needs = frozenset({"grey", "depth"})
@@ -172,20 +161,12 @@ class VisualOdometry(Estimator[VisualOdometryConfig]):
         example = ", an example" if self.config.method == "dense" else ""
         self.method = f"RGB-D odometry ({self.config.method}{example})"
 
-    async def on_ready(self) -> None:
-        """Start the tracker, in a process of its own."""
-        info = self.the_camera().info
-        self._tracker = await self.start_tracker(make_tracker, self.config, info)
-
-    async def run(self) -> None:
-        """Track each image; images arriving meanwhile are skipped."""
-        async for image, depth in self.frames:
-            self.publish(
-                image, await self._tracker.call(Tracker.track, image.stamp, image.data, depth.data)
-            )
+    def tracker(self) -> tuple[Any, ...]:
+        """Return what makes the tracker of the chosen method."""
+        return make_tracker, self.config, self.the_camera().info
 
 
-def make_tracker(config: VisualOdometryConfig, info: CameraInfo) -> Tracker:
+def make_tracker(config: VisualOdometryConfig, info: CameraInfo) -> DenseTracker | FeatureTracker:
     """Make the tracker chosen by the settings; for a call in the worker's process."""
     cv2.setNumThreads(1)
     if config.method == "dense":

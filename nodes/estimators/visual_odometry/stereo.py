@@ -18,11 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, CameraInfo
-from nodes.estimators import Estimator, EstimatorConfig, StereoFrame, TrackingResult
-from nodes.estimators.odometry import Depth, Floats, Grey, follow_both_ways, grey_image
-from nodes.estimators.visual_odometry.features import FeatureTracker
+from nodes.estimators import EstimatorConfig, StereoFrame, TrackingResult
+from nodes.estimators.odometry import (
+    Depth,
+    Floats,
+    Grey,
+    OdometryNode,
+    Surfaces,
+    follow_both_ways,
+    grey_image,
+    surfaces_at,
+)
+from nodes.estimators.visual_odometry.features import FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.patches import SAME, around, correlation
-from nodes.estimators.visual_odometry.surfaces import FeatureSettings, Surfaces, surfaces_at
 from runtime import Bundle
 
 _LARGE = 320  # least side (pixels) of images halved before block matching
@@ -107,7 +115,7 @@ class StereoMatcher:
 
     def surfaces_at(
         self,
-        inverse: Depth,  # of its coarse depth, as of `surfaces.inverse_depth`, shape (h, w)
+        inverse: Depth,  # of its coarse depth, as of `inverse_depth`, shape (h, w)
         pixels: Floats,  # column and row, shape (n, 2)
         noise: float,  # standard deviation of inverse depth, 1/m
     ) -> Surfaces:
@@ -175,7 +183,7 @@ class StereoOdometryConfig(EstimatorConfig):
     features: FeatureSettings = FeatureSettings()
 
 
-class StereoOdometry(Estimator[StereoOdometryConfig]):
+class StereoOdometry(OdometryNode[StereoOdometryConfig]):
     """Estimates the pose of the left camera of a rectified stereo rig from its images alone."""
 
     needs = frozenset({"grey"})
@@ -185,21 +193,10 @@ class StereoOdometry(Estimator[StereoOdometryConfig]):
 
     frames = Bundle(StereoFrame, keep="latest")
 
-    async def on_ready(self) -> None:
-        """Start the tracker, in a process of its own."""
-        left, right = self.the_camera(), self.cameras[1]
+    def tracker(self) -> tuple[Any, ...]:
+        """Return what makes the tracker, and its arguments."""
         settings = self.config.stereo, self.config.features
-        self._tracker = await self.start_tracker(
-            StereoTracker, left.info, baseline(left, right), *settings
-        )
-
-    async def run(self) -> None:
-        """Track each pair; pairs arriving meanwhile are skipped."""
-        async for left, right in self.frames:
-            self.publish(
-                left,
-                await self._tracker.call(StereoTracker.track, left.stamp, left.data, right.data),
-            )
+        return StereoTracker, self.the_camera().info, baseline(*self.cameras), *settings
 
 
 class StereoTracker:
@@ -216,7 +213,7 @@ class StereoTracker:
     def track(
         self, stamp: int, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8]
     ) -> TrackingResult:
-        """Return the pose of the left camera at the next pair; see `FeatureTracker.track`."""
+        """Return the pose of the left camera at the next pair; see `Tracker.track`."""
         return self._tracker.track(stamp, left, self._matcher.depth(left, right))
 
 

@@ -9,7 +9,6 @@ from nodes.estimators.monocular_odometry.geometry import new_corners
 from nodes.estimators.odometry import (
     DescribedPoints,
     Floats,
-    Observations,
     describe,
     detect_and_describe,
     rays,
@@ -65,6 +64,5 @@ def test_landmarks_in_one_column_of_pixels_leave_open_what_they_do_not_tell() ->
             pixels[:] = pixels[0]
         matrix = INFO.matrix()
         landmarks = depth * rays(pixels, matrix)
-        seen = Observations.without_depth(landmarks, pixels)
-        found = solve_pose(seen, np.eye(4), matrix, 0.3, 0.001)
-        assert np.allclose(found.pose, np.eye(4), atol=1e-6)
+        found, _ = solve_pose(landmarks, pixels, np.eye(4), matrix, 0.3)
+        assert np.allclose(found, np.eye(4), atol=1e-6)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from events import CameraAnnouncement
+from nodes.estimators.odometry import inverse_depth, surfaces_at
 from nodes.estimators.rectification import ALIGNED, misalignment
+from nodes.estimators.visual_odometry.features import FeatureSettings
 from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings, StereoTracker
-from nodes.estimators.visual_odometry.surfaces import FeatureSettings, inverse_depth, surfaces_at
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
 BASELINE = 0.1

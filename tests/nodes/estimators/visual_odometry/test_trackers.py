@@ -11,11 +11,11 @@ import pytest
 from events import CameraInfo
 from nodes.estimators import TrackingResult
 from nodes.estimators.odometry import Floats
-from nodes.estimators.visual_odometry.features import FeatureTracker
-from nodes.estimators.visual_odometry.node import DenseSettings, DenseTracker, Tracker
-from nodes.estimators.visual_odometry.surfaces import FeatureSettings
+from nodes.estimators.visual_odometry.features import FeatureSettings, FeatureTracker
+from nodes.estimators.visual_odometry.node import DenseSettings, DenseTracker
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
+Tracker = FeatureTracker | DenseTracker
 Make = Callable[[CameraInfo], Tracker]
 METHODS = pytest.mark.parametrize("make", [FeatureTracker, DenseTracker])
 FRAME = 33_000_000
