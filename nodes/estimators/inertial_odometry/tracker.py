@@ -268,9 +268,10 @@ class InertialTracker(FeatureTracker):
                 self._time = self._seen_at = self._now
                 self._doubt = 0.0
             self._note(grey, inverse_of, False)
-        new = np.flatnonzero(self._map.keyframes == number)
-        read = self._surfaces_at(inverse_of, self._map.pixels[new], self._settings.depth_noise)
-        self._filter.remember(number, self._seen(new, self._map.pixels[new], read, _PLACED))
+        new = np.flatnonzero(self._map.table["keyframe"] == number)
+        pixels = self._map.table["pixel"][new]
+        read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
+        self._filter.remember(number, self._seen(new, pixels, read, _PLACED))
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
         """Return a lost result; after a while, start a map at the IMU's pose or in a new frame."""
@@ -316,7 +317,8 @@ class InertialTracker(FeatureTracker):
         noises = [noise[1] * _READING * self._settings.depth_noise, slant, _BENT * read.inverse]
         variance = sum(np.square(each) for each in noises)
         scale[:, 2] = np.where(read.continuous, 1.0 / np.sqrt(variance), 0.0)
-        return Sighting(self._map.places[rows], self._map.keyframes[rows], measured, scale)
+        these = self._map.table[rows]
+        return Sighting(these["place"], these["keyframe"], measured, scale)
 
 
 class InertialOdometryConfig(EstimatorConfig):

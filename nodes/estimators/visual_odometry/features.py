@@ -244,7 +244,7 @@ class FeatureTracker:
         good = arrived.ravel() == 1
         if good.sum() < self._settings.min_inliers:
             return None
-        places = self._map.places[rows[good]]
+        places = self._map.table["place"][rows[good]]
         there = self._reduction * there.reshape(-1, 2)[good].astype(np.float64)
         pose, errors = self._solve(places, there, self._pose)
         if (errors < 2 * _AGREES).mean() > 0.6:
@@ -286,7 +286,7 @@ class FeatureTracker:
         if len(rows) < least:
             return None
         read = self._surfaces_at(inverse_of, pixels, settings.depth_noise)
-        places = landmarks.places[rows]
+        places = landmarks.table["place"][rows]
         start, errors = self._solve(places, pixels, expected, read, information)
         agree = errors < _AGREES
         if agree.sum() < max(least, 0.4 * len(agree)):

@@ -33,31 +33,31 @@ _CONTRADICTS = 5.0  # largest difference of a depth reading from a landmark's, s
 _HIDES = 0.05  # least difference of another surface from a landmark, relative to inverse depth
 
 
-class Landmarks:
-    """Points of the world, by rows."""
+_LANDMARK = np.dtype(
+    [
+        ("place", float, 3),  # metres in the world
+        ("keyframe", np.int64),  # number of its first key frame; ascending in a table
+        ("pixel", float, 2),  # there
+        ("directions", float, (3, 3)),  # in the world: change by a column, by a row; the ray
+        ("origin", float, 3),  # of the ray
+        ("inverse", float),  # depth along it, 1/m
+        ("slope", float, 2),  # its change by column and by row, 1/m
+        ("readings", float),  # of depth, in the mean
+        ("missed", np.int64),  # times in a row
+        ("inactive_until", np.int64),
+    ]
+)
 
-    _COLUMNS = (
-        "places", "keyframes", "pixels", "_directions", "_origins", "_inverse", "_slopes",
-        "_readings", "_missed", "_inactive_until",
-    )  # fmt: skip
+
+class Landmarks:
+    """Points of the world, by rows of `table`."""
 
     def __init__(self, matrix: Floats) -> None:
         self._matrix = matrix
-        self.places = np.empty((0, 3))  # metres in the world, shape (n, 3)
-        # Number of each's first key frame, ascending, shape (n,).
-        self.keyframes: Rows = np.empty(0, np.int64)
-        self.pixels = np.empty((0, 2))  # pixels there, shape (n, 2)
-        # In the world: the change by one column, that by one row, and the ray.
-        self._directions = np.empty((0, 3, 3))
-        self._origins = np.empty((0, 3))
-        self._inverse = np.empty(0)
-        self._slopes = np.empty((0, 2))
-        self._readings = np.empty(0)
-        self._missed: Rows = np.empty(0, np.int64)
-        self._inactive_until: Rows = np.empty(0, np.int64)
+        self.table = np.empty(0, _LANDMARK)
 
     def __len__(self) -> int:
-        return len(self.places)
+        return len(self.table)
 
     def add(self, number: int, pose: Floats, pixels: Floats, seen: Surfaces) -> Rows:
         """Add landmarks of a key frame and return their rows.
@@ -67,32 +67,23 @@ class Landmarks:
             pose: World to camera, shape (4, 4).
             seen: Their surfaces, all continuous.
         """
-        back, count, before = inverse(pose), len(pixels), len(self)
+        back, new = inverse(pose), np.zeros(len(pixels), _LANDMARK)
         fx, fy, *_ = intrinsics(self._matrix)
-        axes = np.zeros((count, 3, 3))
+        axes = np.zeros((len(new), 3, 3))
         axes[:, 0, 0], axes[:, 1, 1] = 1 / fx, 1 / fy
         axes[:, :, 2] = rays(pixels, self._matrix)
         directions = back[:3, :3] @ axes
-        origins = np.tile(back[:3, 3], (count, 1))
-        places = origins + directions[:, :, 2] / seen.inverse[:, None]
-        none = np.zeros(count, np.int64)
-        self.places = np.concatenate([self.places, places])
-        self.keyframes = np.concatenate([self.keyframes, none + number])
-        self.pixels = np.concatenate([self.pixels, pixels])
-        self._directions = np.concatenate([self._directions, directions])
-        self._origins = np.concatenate([self._origins, origins])
-        self._inverse = np.concatenate([self._inverse, seen.inverse])
-        self._slopes = np.concatenate([self._slopes, seen.slope])
-        self._readings = np.concatenate([self._readings, np.ones(count)])
-        self._missed = np.concatenate([self._missed, none])
-        self._inactive_until = np.concatenate([self._inactive_until, none])
-        return np.arange(before, len(self))
+        new["directions"], new["origin"] = directions, back[:3, 3]
+        new["place"] = back[:3, 3] + directions[:, :, 2] / seen.inverse[:, None]
+        new["keyframe"], new["pixel"] = number, pixels
+        new["inverse"], new["slope"], new["readings"] = seen.inverse, seen.slope, 1.0
+        self.table = np.concatenate([self.table, new])
+        return np.arange(len(self) - len(new), len(self))
 
     def forget_before(self, number: int) -> int:
         """Remove landmarks of earlier key frames; return their number."""
-        gone = int(np.searchsorted(self.keyframes, number))
-        for name in self._COLUMNS:
-            setattr(self, name, getattr(self, name)[gone:])
+        gone = int(np.searchsorted(self.table["keyframe"], number))
+        self.table = self.table[gone:]
         return gone
 
     def in_view(self, pose: Floats, size: tuple[int, int], margin: float, rows: Rows) -> Rows:
@@ -110,7 +101,7 @@ class Landmarks:
     def project(self, pose: Floats, rows: Rows) -> tuple[Floats, Floats]:
         """Return the pixels of landmarks, shape (n, 2), and their depth, metres, shape (n,)."""
         fx, fy, cx, cy = intrinsics(self._matrix)
-        points = self.places[rows] @ pose[:3, :3].T + pose[:3, 3]
+        points = self.table["place"][rows] @ pose[:3, :3].T + pose[:3, 3]
         z = points[:, 2]
         ahead = np.where(z > 0.05, z, 1.0)
         return np.stack([fx * points[:, 0] / ahead + cx, fy * points[:, 1] / ahead + cy], 1), z
@@ -131,19 +122,19 @@ class Landmarks:
 
     def active(self, now: int, rows: Rows) -> Rows:
         """Return those of some landmarks to search now, as set by `update_found`."""
-        return np.asarray(rows[self._inactive_until[rows] <= now])
+        return np.asarray(rows[self.table["inactive_until"][rows] <= now])
 
     def patches(self, pose: Floats, rows: Rows) -> tuple[Rows, Patches]:
         """Return rows whose view is alike enough, and patches, warped by planes' homographies."""
         fx, fy, *_ = intrinsics(self._matrix)
         expected, z = self.project(pose, rows)
-        x = (self.places[rows] @ pose[:3, :3].T + pose[:3, 3]) / z[:, None]
-        turn = pose[:3, :3] @ self._directions[rows, :, :2]
-        origin = self._origins[rows] @ pose[:3, :3].T + pose[:3, 3]
+        these = self.table[rows]
+        x = (these["place"] @ pose[:3, :3].T + pose[:3, 3]) / z[:, None]
+        turn = pose[:3, :3] @ these["directions"][:, :, :2]
+        origin = these["origin"] @ pose[:3, :3].T + pose[:3, 3]
         # A neighbour's point, times its inverse depth, is direction + inverse depth × origin.
-        change = (turn + origin[:, :, None] * self._slopes[rows][:, None]) / (
-            self._inverse[rows] * z
-        )[:, None, None]
+        change = turn + origin[:, :, None] * these["slope"][:, None]
+        change /= (these["inverse"] * z)[:, None, None]
         warps = np.stack(
             [
                 fx * (change[:, 0] - x[:, :1] * change[:, 2]),
@@ -154,34 +145,35 @@ class Landmarks:
         area = np.linalg.det(warps)
         good = (area > _SHRUNK**2) & (area < _GROWN**2)
         good &= np.abs(warps).max(axis=(1, 2)) < _SHEARED
-        rows = rows[good]
-        return rows, Patches(self.keyframes[rows], self.pixels[rows], expected[good], warps[good])
+        these = these[good]
+        found = Patches(these["keyframe"], these["pixel"], expected[good], warps[good])
+        return rows[good], found
 
     def update_found(self, now: int, found: Rows, missed: Rows) -> None:
         """Record found landmarks; repeatedly missed ones are left out the longer."""
-        self._missed[found] = 0
-        self._missed[missed] += 1
-        self._inactive_until[missed] = now + 1 + self._missed[missed] ** 2
+        self.table["missed"][found] = 0
+        self.table["missed"][missed] += 1
+        self.table["inactive_until"][missed] = now + 1 + self.table["missed"][missed] ** 2
 
     def fuse(self, pose: Floats, rows: Rows, read: Surfaces, noise: float) -> None:
         """Move landmarks along their first rays to the mean of all readings (noise in 1/m)."""
         _, z = self.project(pose, rows)
         use = read.continuous & (np.abs(read.inverse - 1.0 / z) < _CONTRADICTS * noise)
         rows, now = rows[use], read.inverse[use]
-        origin = self._origins[rows] @ pose[2, :3] + pose[2, 3]
-        ahead = self._directions[rows, :, 2] @ pose[2, :3]
+        origin = self.table["origin"][rows] @ pose[2, :3] + pose[2, 3]
+        ahead = self.table["directions"][rows, :, 2] @ pose[2, :3]
         beyond = 1.0 / now - origin
         again = ahead / beyond
         # By how much the reading's noise grows on its way to the first key frame.
         gain = again / (beyond * now**2)
         use = (beyond > 0.05) & (gain > 0.2)
         rows, again, weight = rows[use], again[use], 1.0 / gain[use] ** 2
-        total = self._readings[rows] + weight
-        self._inverse[rows] += (again - self._inverse[rows]) * weight / total
-        self._readings[rows] = np.minimum(total, _MEAN_OF)
-        self.places[rows] = (
-            self._origins[rows] + self._directions[rows, :, 2] / self._inverse[rows][:, None]
-        )
+        these = self.table[rows]
+        total = these["readings"] + weight
+        these["inverse"] += (again - these["inverse"]) * weight / total
+        these["readings"] = np.minimum(total, _MEAN_OF)
+        these["place"] = these["origin"] + these["directions"][:, :, 2] / these["inverse"][:, None]
+        self.table[rows] = these
 
 
 class MapMatch(msgspec.Struct, frozen=True, eq=False):

@@ -75,7 +75,7 @@ def test_warps_are_what_a_pixel_beside_a_landmark_does() -> None:
     first, then = pose(yaw=20.0), pose(x=0.5, z=0.4, yaw=5.0, pitch=6.0)
     landmarks = mapped(seen_from=first)
     rows, patches = landmarks.patches(inverse(then), np.arange(len(landmarks)))
-    wall = landmarks.places[rows, 2] > 2.5
+    wall = landmarks.table["place"][rows, 2] > 2.5
     rows, patches = rows[wall], patches.take(np.flatnonzero(wall))
     for axis in (0, 1):
         beside = rays(patches.pixels + 0.01 * np.eye(2)[axis], MATRIX) @ first[:3, :3].T
@@ -108,8 +108,8 @@ def test_patches_are_found_to_a_tenth_of_a_pixel_where_they_look_otherwise(there
 
 def test_what_stands_behind_the_box_is_hidden() -> None:
     landmarks = mapped(seen_from=pose(x=2.2))
-    behind = np.abs(landmarks.places[:, :2]).max(axis=1) < 0.7
-    behind &= landmarks.places[:, 2] > 2.5
+    behind = np.abs(landmarks.table["place"][:, :2]).max(axis=1) < 0.7
+    behind &= landmarks.table["place"][:, 2] > 2.5
     _, depth = look(pose())
     rows = landmarks.in_view(np.eye(4), SIZE, -12.0, np.arange(len(landmarks)))
     seen = landmarks.unhidden(np.eye(4), inverse_depth(depth), rows, 0.002)
@@ -129,8 +129,8 @@ def test_readings_of_depth_from_elsewhere_average_out() -> None:
     corners, seen = corners[seen.continuous], seen.take(seen.continuous)
     landmarks = Landmarks(MATRIX)
     rows = landmarks.add(0, np.eye(4), corners, seen)
-    wall = np.where(landmarks.places[:, 2] > 2.5, 3.0, 2.0)
-    first = np.abs(landmarks.places[:, 2] - wall).mean()
+    wall = np.where(landmarks.table["place"][:, 2] > 2.5, 3.0, 2.0)
+    first = np.abs(landmarks.table["place"][:, 2] - wall).mean()
     for step in range(16):
         there = pose(x=0.02 * step, z=0.02 * step)
         _, depth = look(there)
@@ -138,7 +138,7 @@ def test_readings_of_depth_from_elsewhere_average_out() -> None:
         pixels, _ = landmarks.project(inverse(there), rows)
         read = surfaces_at(inverse_depth(noisy), pixels, 0.02)
         landmarks.fuse(inverse(there), rows, read, 0.02)
-    assert np.abs(landmarks.places[:, 2] - wall).mean() < 0.5 * first
+    assert np.abs(landmarks.table["place"][:, 2] - wall).mean() < 0.5 * first
 
 
 def test_a_landmark_that_is_missed_rests_and_comes_back() -> None:
@@ -161,7 +161,7 @@ def test_forgetting_a_key_frame_leaves_the_others_as_they_were() -> None:
     more = np.array([[40.0, 40.0], [280.0, 200.0]])
     landmarks.add(1, np.eye(4), more, surfaces_at(inverse_depth(depth), more, 0.002))
     assert landmarks.forget_before(1) == count
-    assert landmarks.pixels.tolist() == more.tolist()
+    assert landmarks.table["pixel"].tolist() == more.tolist()
     _, patches = landmarks.patches(np.eye(4), np.arange(2))
     assert patches.expected == pytest.approx(more)
     assert patches.warps == pytest.approx(np.stack([np.eye(2)] * 2), abs=1e-6)
