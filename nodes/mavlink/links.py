@@ -8,7 +8,7 @@ by TCP, is free to be silent while it starts, and from its first answer on gives
 from __future__ import annotations
 
 import asyncio
-import functools
+import math
 import socket
 import time
 from collections import Counter
@@ -39,12 +39,14 @@ Receive = Callable[[int, int, Any], None]
 
 
 class Peer:
-    """A program at the other end, with its own parser and numbering."""
+    """A program at the other end of a socket, with its own parser and numbering."""
 
-    def __init__(self, name: str, send: Callable[[bytes], None], ids: tuple[int, int], key: bytes):
-        self.name = name
-        self.heard = -float("inf")
-        self._send = send
+    def __init__(self, end: socket.socket, name: str, ids: tuple[int, int], key: bytes) -> None:
+        end.setblocking(False)
+        self.end, self.name = end, name
+        self.is_stream = end.type == socket.SOCK_STREAM
+        self.unsent = bytearray()  # of a stream
+        self.heard = -math.inf
         self.parser = mav.MAVLink(None, *ids)
         self.parser.robust_parsing = True
         if key:
@@ -52,16 +54,12 @@ class Peer:
             signing.secret_key, signing.sign_outgoing = key, True
             signing.timestamp = int((time.time() - _EPOCH_2015) * 1e5)
 
-    def hear(self, data: bytes, is_whole: bool) -> list[Any]:
-        """Return the messages in some bytes; what `is_whole` goes on from nothing before it."""
-        if is_whole:
+    def messages(self, data: bytes) -> list[Any]:
+        """Return the messages in some bytes; a datagram goes on from nothing before it."""
+        if not self.is_stream:
             self.parser.buf, self.parser.buf_index = bytearray(), 0
             self.parser.expected_length = mav.HEADER_LEN_V1 + 2
         return self.parser.parse_buffer(data) or []
-
-    def send(self, message: Any) -> None:
-        """Send a message, with this peer's sequence number and signature."""
-        self._send(message.pack(self.parser))
 
 
 class Links:
@@ -73,11 +71,10 @@ class Links:
     def __init__(self, ids: tuple[int, int], key: bytes, receive: Receive, log: NodeLogger) -> None:
         self._ids, self._key, self._receive, self._log = ids, key, receive, log
         self._loop = asyncio.get_running_loop()
-        self._peers: dict[socket.socket, Peer] = {}
-        self._unsent: dict[socket.socket, bytearray] = {}
+        self.peers: list[Peer] = []
         self._listeners: list[socket.socket] = []
         self._now, self._left = 0.0, BURST
-        self._muted: list[socket.socket] = []
+        self._muted: list[Peer] = []
         self.counts: Counter[str] = Counter()
 
     def open(self, link: str) -> None:
@@ -90,9 +87,8 @@ class Links:
         address = parts.hostname, parts.port
         if parts.scheme == "udp":
             end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            end.setblocking(False)
             end.connect(address)
-            self._adopt(end, link, functools.partial(self._send_datagram, end), self._hear_datagram)
+            self._adopt(end, link)
         else:
             end = socket.create_server(address, backlog=MOST_PEERS)
             end.setblocking(False)
@@ -100,71 +96,69 @@ class Links:
             self._loop.add_reader(end, self._accept, end)
 
     def send(self, message: Any) -> None:
-        """Send a message to every peer."""
-        for peer in [*self._peers.values()]:
-            peer.send(message)
+        """Send a message to every peer, with its sequence number and signature."""
+        for peer in [*self.peers]:
+            data = message.pack(peer.parser)
+            if peer.is_stream:
+                self._send_on(peer, data)
+                continue
+            try:
+                peer.end.send(data)
+            except OSError:  # nobody listens, or its buffer is full: datagrams may get lost
+                self.counts["datagrams not taken"] += 1
 
     def quiet_for(self, now: float) -> float:
         """Return the seconds since any peer was heard; infinite if never."""
-        return now - max((peer.heard for peer in self._peers.values()), default=-float("inf"))
+        return now - max((peer.heard for peer in self.peers), default=-math.inf)
 
     def refill(self, now: float) -> None:
         """Begin a period: what waits is read again."""
         self._now, self._left = now, BURST
         muted, self._muted = self._muted, []
-        for end in muted:
-            if peer := self._peers.get(end):
-                hear = self._hear_datagram if end.type == socket.SOCK_DGRAM else self._hear_stream
-                self._loop.add_reader(end, hear, end, peer)
+        for peer in muted:
+            if peer in self.peers:
+                self._loop.add_reader(peer.end, self.hear, peer)
+
+    def hear(self, peer: Peer) -> None:
+        """Read what has come from a peer; hang up where a stream has ended."""
+        try:
+            data = peer.end.recv(4096 if peer.is_stream else 65535)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError:  # of datagrams: nobody listens there yet
+            data = b""
+        if data:
+            self._take(peer, data)
+        elif peer.is_stream:
+            self._hang_up(peer)
 
     def close(self) -> None:
         """Close all sockets; log what was odd."""
-        for end in [*self._peers]:
-            self._hang_up(end)
+        for peer in [*self.peers]:
+            self._hang_up(peer)
         for end in self._listeners:
             self._loop.remove_reader(end)
             end.close()
         odd = ", ".join(f"{n} {what}" for what, n in self.counts.items() if what != "messages")
         self._log.info("%d messages heard%s", self.counts["messages"], odd and f"; {odd}")
 
-    def _adopt(self, end: socket.socket, name: str, send: Any, hear: Any) -> None:
-        peer = self._peers[end] = Peer(name, send, self._ids, self._key)
-        self._loop.add_reader(end, hear, end, peer)
+    def _adopt(self, end: socket.socket, name: str) -> None:
+        self.peers.append(peer := Peer(end, name, self._ids, self._key))
+        self._loop.add_reader(end, self.hear, peer)
 
     def _accept(self, listener: socket.socket) -> None:
         try:
             end, (host, port, *_) = listener.accept()
         except OSError:
             return
-        if sum(each.type == socket.SOCK_STREAM for each in self._peers) >= MOST_PEERS:
+        if sum(peer.is_stream for peer in self.peers) >= MOST_PEERS:
             self.counts["connections refused"] += 1
             end.close()
             return
-        end.setblocking(False)
-        self._unsent[end] = bytearray()
-        send = functools.partial(self._send_stream, end)
-        self._adopt(end, f"tcp://{host}:{port}", send, self._hear_stream)
+        self._adopt(end, f"tcp://{host}:{port}")
 
-    def _hear_datagram(self, end: socket.socket, peer: Peer) -> None:
-        try:
-            self._take(end, peer, end.recv(65535))
-        except OSError:  # nobody listens there yet
-            return
-
-    def _hear_stream(self, end: socket.socket, peer: Peer) -> None:
-        try:
-            data = end.recv(4096)
-        except (BlockingIOError, InterruptedError):
-            return
-        except OSError:
-            data = b""
-        if data:
-            self._take(end, peer, data)
-        else:
-            self._hang_up(end)
-
-    def _take(self, end: socket.socket, peer: Peer, data: bytes) -> None:
-        for message in peer.hear(data, end.type == socket.SOCK_DGRAM):
+    def _take(self, peer: Peer, data: bytes) -> None:
+        for message in peer.messages(data):
             if message.get_type() == "BAD_DATA":
                 self.counts["pieces of garbage"] += 1
             elif (message.get_srcSystem(), message.get_srcComponent()) == self._ids:
@@ -174,46 +168,37 @@ class Links:
                 peer.heard = self._now
                 self._receive(message.get_srcSystem(), message.get_srcComponent(), message)
             self._left -= 1
-        if self._left <= 0 and end in self._peers:
+        if self._left <= 0 and peer in self.peers:
             self.counts["pauses in a flood"] += 1
-            self._loop.remove_reader(end)
-            self._muted.append(end)
+            self._loop.remove_reader(peer.end)
+            self._muted.append(peer)
 
-    def _send_datagram(self, end: socket.socket, data: bytes) -> None:
+    def _send_on(self, peer: Peer, data: bytes) -> None:
+        peer.unsent += data
+        if len(peer.unsent) > LONGEST_QUEUE:
+            self._log.warning("%s takes nothing: hung up", peer.name)
+            self._hang_up(peer)
+        elif len(peer.unsent) == len(data):
+            self._flush(peer)
+
+    def _flush(self, peer: Peer) -> None:
         try:
-            end.send(data)
-        except OSError:  # nobody listens, or its buffer is full: datagrams may get lost
-            self.counts["datagrams not taken"] += 1
-
-    def _send_stream(self, end: socket.socket, data: bytes) -> None:
-        unsent = self._unsent[end]
-        unsent += data
-        if len(unsent) > LONGEST_QUEUE:
-            self._log.warning("%s takes nothing: hung up", self._peers[end].name)
-            self._hang_up(end)
-        elif len(unsent) == len(data):
-            self._flush(end)
-
-    def _flush(self, end: socket.socket) -> None:
-        unsent = self._unsent[end]
-        try:
-            del unsent[: end.send(unsent)]
+            del peer.unsent[: peer.end.send(peer.unsent)]
         except (BlockingIOError, InterruptedError):
             pass
         except OSError:
-            self._hang_up(end)
+            self._hang_up(peer)
             return
-        if unsent:
-            self._loop.add_writer(end, self._flush, end)
+        if peer.unsent:
+            self._loop.add_writer(peer.end, self._flush, peer)
         else:
-            self._loop.remove_writer(end)
+            self._loop.remove_writer(peer.end)
 
-    def _hang_up(self, end: socket.socket) -> None:
-        self._loop.remove_reader(end)
-        self._loop.remove_writer(end)
-        self._peers.pop(end, None)
-        self._unsent.pop(end, None)
-        end.close()
+    def _hang_up(self, peer: Peer) -> None:
+        self._loop.remove_reader(peer.end)
+        self._loop.remove_writer(peer.end)
+        self.peers = [each for each in self.peers if each is not peer]
+        peer.end.close()
 
 
 class Wire:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import socket
 from typing import Any
@@ -14,7 +15,7 @@ from pymavlink.dialects.v20 import common as mav
 import events as ev
 from events import Odometry
 from nodes.mavlink.door import Door
-from nodes.mavlink.links import BURST
+from nodes.mavlink.links import BURST, MOST_PEERS, Links
 from nodes.mavlink.node import Mavlink, MavlinkConfig, Px4
 from runtime.errors import VisnavError
 from runtime.logs import NodeLogger
@@ -47,7 +48,7 @@ class Outside:
         if config.signing_key:
             self.parser.signing.secret_key = bytes.fromhex(config.signing_key)
             self.parser.signing.sign_outgoing = True
-            (peer,) = self.door._links._peers.values()
+            (peer,) = self.door._links.peers
             self.parser.signing.timestamp = peer.parser.signing.timestamp
         self.at(GROUND)
 
@@ -82,9 +83,9 @@ class Outside:
         return self.hear()
 
     def _hand_in(self, data: bytes) -> None:
-        ((end, peer),) = self.door._links._peers.items()
-        self._socket.sendto(data, end.getsockname())
-        self.door._links._hear_datagram(end, peer)
+        (peer,) = self.door._links.peers
+        self._socket.sendto(data, peer.end.getsockname())
+        self.door._links.hear(peer)
 
     def passes(self, seconds: float, heartbeat: bool = True) -> list[Any]:
         """Let time pass, as the node does; return what is sent."""
@@ -326,6 +327,35 @@ async def test_a_flood_waits_and_our_own_name_is_not_heard(outside: Outside) -> 
     outside.parser = mav.MAVLink(None, 1, 1)
     assert outside.say(arm(1)) == []
     assert outside.acts == []
+
+
+async def polled() -> None:
+    """Let the loop look at its sockets, as often as one leads to another."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+async def test_streams_are_so_many_are_answered_and_end() -> None:
+    heard: list[Any] = []
+    links = Links((1, 1), b"", lambda *each: heard.append(each), NodeLogger("mavlink"))
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        address = found.getsockname()
+    links.open("tcp://{}:{}".format(*address))
+    ends = [socket.create_connection(address) for _ in range(MOST_PEERS + 1)]
+    ping = mav.MAVLink_ping_message(0, 1, 0, 0)
+    ends[0].sendall(ping.pack(mav.MAVLink(None, 245, 190)))
+    await polled()
+    assert [(system, component) for system, component, _ in heard] == [(245, 190)]
+    assert len(links.peers) == MOST_PEERS
+    assert links.counts["connections refused"] == 1
+    links.send(ping)
+    (answer,) = mav.MAVLink(None).parse_buffer(ends[0].recv(4096))
+    assert answer.get_srcSystem() == 1
+    for end in ends:
+        end.close()
+    await polled()
+    assert links.peers == []
+    links.close()
 
 
 @pytest.mark.parametrize(
