@@ -253,7 +253,7 @@ def solve_pose(
         by *= scale
         np.hypot(residuals[0], residuals[1], out=errors[0])
         np.abs(residuals[2], out=errors[1])
-        weights = _huber(errors) * ahead
+        weights = huber(errors, _HUBER) * ahead
         weighted = (by * weights[[0, 0, 1]]).reshape(6, -1)
         normal = weighted @ by.reshape(6, -1).T
         # In units of its own, as what landmarks in one column leave open is lost in rounding else.
@@ -272,10 +272,8 @@ def solve_pose(
 
 def moved(pose: Floats, step: Floats) -> Floats:
     """Return a pose, world to camera, after a small motion of the camera's frame, shape (6,)."""
-    turn, there = cv2.Rodrigues(step[3:])[0], np.eye(4)
-    there[:3, :3] = turn @ pose[:3, :3]
-    there[:3, 3] = turn @ pose[:3, 3] + step[:3]
-    return there
+    turn = cv2.Rodrigues(step[3:])[0]
+    return transform(turn @ pose[:3, :3], turn @ pose[:3, 3] + step[:3])
 
 
 def motion_between(before: Floats, after: Floats) -> Floats:
@@ -284,8 +282,9 @@ def motion_between(before: Floats, after: Floats) -> Floats:
     return np.concatenate([between[:3, 3], cv2.Rodrigues(between[:3, :3])[0].ravel()])
 
 
-def _huber(errors: Floats) -> Floats:
-    return np.asarray(np.minimum(1.0, _HUBER / np.maximum(errors, _HUBER)))
+def huber(errors: Floats, threshold: float) -> Floats:
+    """Return Huber's weights of errors, both of one shape."""
+    return np.asarray(threshold / np.maximum(errors, threshold))
 
 
 def intrinsics(matrix: Floats) -> tuple[float, float, float, float]:
@@ -301,10 +300,10 @@ def rays(pixels: Floats, matrix: Floats) -> Floats:
     )
 
 
-def from_rotation_vector(rotation: npt.NDArray[Any], translation: npt.NDArray[Any]) -> Floats:
-    """Return the transform, shape (4, 4), of a rotation vector and a translation, as OpenCV's."""
+def transform(rotation: npt.NDArray[Any], translation: npt.NDArray[Any]) -> Floats:
+    """Return the transform, shape (4, 4), of a rotation, shape (3, 3), and a translation."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+    pose[:3, :3], pose[:3, 3] = rotation, translation.ravel()
     return pose
 
 
@@ -375,7 +374,7 @@ def relocalize(
     )
     if not found or inliers is None or len(inliers) < _MIN_INLIERS:
         return None
-    return from_rotation_vector(rotation, translation)
+    return transform(cv2.Rodrigues(rotation)[0], translation)
 
 
 def _orientations(image: Grey, pixels: Floats) -> Floats:

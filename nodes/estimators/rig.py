@@ -340,7 +340,7 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
             moved = np.eye(6)
             moved[:3, :3] = moved[3:, 3:] = turn
             lever = body[:3, 3] - (body @ self.camera)[:3, 3]
-            moved[:3, 3:] = -_cross(lever) @ turn
+            moved[:3, 3:] = -cross(lever) @ turn
             covariance = tuple((moved @ result.covariance @ moved.T).ravel().tolist())
         return PoseEstimate(
             stamp=stamp,
@@ -379,7 +379,7 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
         return bodies
 
 
-def _cross(vector: Floats) -> Floats:
+def cross(vector: Floats) -> Floats:
     """Return the matrix of a cross product with a vector from the left, shape (3, 3)."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -23,9 +23,10 @@ from nodes.estimators.inertial_odometry.preintegration import (
     Floats,
     ImuModel,
     Preintegrated,
-    cross,
     crosses,
 )
+from nodes.estimators.odometry import huber
+from nodes.estimators.rig import cross
 
 THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))  # slices of the error state
 G = slice(15, 17)  # slice of gravity's direction: small rotations about the two level axes
@@ -71,21 +72,6 @@ class State(msgspec.Struct, frozen=True, eq=False):
             self.velocity + error[V],
             self.bias + error[BG.start : BA.stop],
             self.level @ Rotation.from_rotvec([*error[G], 0.0]).as_matrix(),
-        )
-
-    def error_of(self, other: State) -> Floats:
-        """Return the difference of another state from this state, shape (17,)."""
-        x, y, z = self.level.T @ other.level[:, 2]
-        tilt = np.array([-y, x]) * (np.arctan2(np.hypot(x, y), z) / max(np.hypot(x, y), 1e-12))
-        turn = Rotation.from_matrix(self.rotation.T @ other.rotation).as_rotvec()
-        return np.concatenate(
-            [
-                turn,
-                other.position - self.position,
-                other.velocity - self.velocity,
-                other.bias - self.bias,
-                tilt,
-            ]
         )
 
 
@@ -304,7 +290,7 @@ class InertialFilter:
         residual = (seen.measured - image) * seen.scale
         size = np.abs(residual)
         size[:, :2] = np.hypot(residual[:, 0], residual[:, 1])[:, None]
-        weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(size, _HUBER))) * ahead[:, None]
+        weight = np.sqrt(huber(size, _HUBER)) * ahead[:, None]
         by_point = np.zeros((len(image), 3, 3))
         by_point[:, 0, 0] = by_point[:, 1, 1] = inverse
         by_point[:, :, 2] = -image * inverse[:, None]

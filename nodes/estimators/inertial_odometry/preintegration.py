@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from events import CameraInfo, ImuAnnouncement
 from events.geometry import pose_matrix
 from nodes.estimators.odometry import Depth, rays
+from nodes.estimators.rig import cross
 
 Floats = npt.NDArray[np.float64]
 
@@ -116,12 +117,6 @@ class ImuModel:
             rotation = rotation @ turn
         seconds = float(samples[-1, 0] - samples[0, 0])
         return Preintegrated(seconds, rotation, velocity, position, by_bias, covariance)
-
-
-def cross(vector: Floats) -> Floats:
-    """Return the matrix of a cross product with a vector from the left, shape (3, 3)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def crosses(vectors: Floats) -> Floats:

@@ -25,9 +25,18 @@ from nodes.estimators import (
     TrackingResult,
 )
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
-from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel, cross
+from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel
 from nodes.estimators.inertial_odometry.preintegration import Rows as ImageRows
-from nodes.estimators.odometry import Depth, Grey, OdometryNode, Surfaces, rays, surfaces_at
+from nodes.estimators.odometry import (
+    Depth,
+    Grey,
+    OdometryNode,
+    Surfaces,
+    rays,
+    surfaces_at,
+    transform,
+)
+from nodes.estimators.rig import cross
 from nodes.estimators.visual_odometry.alignment import Alignment
 from nodes.estimators.visual_odometry.features import BELIEVED, FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.landmarks import MapMatch
@@ -293,9 +302,8 @@ class InertialTracker(FeatureTracker):
         return self._is_known and self._now - self._seen_at <= self._inertial.carry
 
     def _camera_pose(self) -> Floats:
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self._filter.state.rotation, self._filter.state.position
-        found: Floats = pose @ self._filter.camera
+        state = self._filter.state
+        found: Floats = transform(state.rotation, state.position) @ self._filter.camera
         return found
 
     def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:

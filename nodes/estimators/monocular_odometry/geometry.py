@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from nodes.estimators.odometry import Floats, Grey
+from nodes.estimators.odometry import Floats, Grey, huber, transform
 
 Indices = npt.NDArray[np.int64]
 
@@ -128,7 +128,7 @@ def linearise(
     by_pose = np.concatenate([by_camera, turning], axis=2)
     by_point = by_camera @ turns
     size = np.linalg.norm(residuals, axis=1)
-    weights = np.where(ahead, _HUBER / np.maximum(size, _HUBER), 0.0)
+    weights = np.where(ahead, huber(size, _HUBER), 0.0)
     return residuals, by_pose, by_point, weights
 
 
@@ -194,19 +194,13 @@ def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
         _, turns, shifts, _ = cv2.decomposeHomographyMat(plane, matrix)
         for turn, shift in zip(turns, shifts, strict=True):
             if (length := float(np.linalg.norm(shift))) > 1e-6:
-                found.append(_pose(turn, shift / length))
+                found.append(transform(turn, shift / length))
     essential: Any
     essential, _ = cv2.findEssentialMat(first, second, matrix, cv2.RANSAC, 0.999, _EPIPOLAR)
     if essential is not None and essential.shape == (3, 3):
         one, other, shift = cv2.decomposeEssentialMat(essential)
-        found += [_pose(turn, sign * shift) for turn in (one, other) for sign in (1.0, -1.0)]
+        found += [transform(turn, sign * shift) for turn in (one, other) for sign in (1.0, -1.0)]
     return found
-
-
-def _pose(turn: npt.NDArray[Any], shift: npt.NDArray[Any]) -> Floats:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, np.asarray(shift).ravel()
-    return pose
 
 
 class Keyframe(msgspec.Struct, frozen=True, eq=False):

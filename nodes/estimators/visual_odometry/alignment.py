@@ -22,6 +22,7 @@ from nodes.estimators.odometry import (
     Depth,
     Floats,
     Grey,
+    huber,
     inside,
     intrinsics,
     motion_between,
@@ -239,10 +240,6 @@ def _motions(image: Floats) -> tuple[Floats, Floats, Floats]:
     )
 
 
-def _huber(errors: Floats) -> Floats:
-    return np.asarray(_HUBER / np.maximum(np.abs(errors), _HUBER))
-
-
 def _brightness(
     reference: Reference, view: View, level: int, pose: Floats, brightness: Floats, matrix: Floats
 ) -> _Residuals:
@@ -262,7 +259,7 @@ def _brightness(
     by = np.concatenate([across * fx * dx + down * fy * dy, [-own, -np.ones(len(own))]])
     spread = 1.4826 * float(np.median(np.abs(residual))) if len(good) else 0.0
     deviation = max(spread, _BRIGHTNESS_NOISE)
-    weights = _huber(residual / deviation) * visible / deviation**2
+    weights = huber(np.abs(residual / deviation), _HUBER) * visible / deviation**2
     limit = _AGREES * _BRIGHTNESS_NOISE + _OFF * np.hypot(across, down)
     agree = visible & (np.abs(residual) < limit)
     return _Residuals(residual, weights, by, pixels, agree, int(visible.sum()))
@@ -283,7 +280,7 @@ def _distances(
     by = np.concatenate([planes[0] * dx + planes[1] * dy - dw, np.zeros((2, len(good)))])
     errors = np.abs(residual) / noise
     close = (measured > 0) & (errors < np.maximum(_OTHER, _OTHER_SHARE * image[2] / noise))
-    weights = _huber(errors) * close / noise**2
+    weights = huber(errors, _HUBER) * close / noise**2
     return _Residuals(residual, weights, by, pixels, close & (errors < _AGREES), len(good))
 
 

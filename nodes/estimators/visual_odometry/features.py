@@ -28,13 +28,13 @@ from nodes.estimators.odometry import (
     Grey,
     Surfaces,
     detect_and_describe,
-    from_rotation_vector,
     grey_and_depth,
     inverse_depth,
     refuse_distortion,
     relocalize,
     solve_pose,
     surfaces_at,
+    transform,
 )
 from nodes.estimators.visual_odometry.alignment import Alignment, Motion, View
 from nodes.estimators.visual_odometry.landmarks import (
@@ -255,7 +255,7 @@ class FeatureTracker:
         )
         if not found:
             return None
-        return from_rotation_vector(rotation, translation)
+        return transform(cv2.Rodrigues(rotation)[0], translation)
 
     def _reduced(self, grey: Grey) -> Grey:
         """Return the image for following corners: half-sized, if large."""
