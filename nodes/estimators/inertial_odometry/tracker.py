@@ -33,7 +33,6 @@ from nodes.estimators.odometry import (
     OdometryNode,
     Surfaces,
     rays,
-    surfaces_at,
     transform,
 )
 from nodes.estimators.rig import cross
@@ -81,17 +80,13 @@ class InertialTracker(FeatureTracker):
         stereo: StereoSettings,
     ) -> None:
         cv2.setNumThreads(1)
-        self._matcher = StereoMatcher(camera.info, baseline, stereo) if baseline else None
-        surfaces = surfaces_at
-        if self._matcher is not None:
-            features = msgspec.structs.replace(features, depth_noise=self._matcher.depth_noise)
-            surfaces = self._matcher.surfaces_at
-        super().__init__(camera.info, features, surfaces)
+        matcher = StereoMatcher(camera.info, baseline, stereo) if baseline else None
+        super().__init__(camera.info, features, matcher)
         # Blocks misjudge the depth of edges in front of nothing, by which they slide along.
-        self._aligns = self._matcher is None
+        self._aligns = matcher is None
         self._imu, self._inertial, self._readout = ImuModel(imu), inertial, camera.readout
         mounted = inverse(self._imu.pose) @ pose_matrix(camera.position, camera.orientation)
-        common = _COMMON if self._matcher is None else _COMMON_BY_EYES
+        common = _COMMON if matcher is None else _COMMON_BY_EYES
         self._filter = InertialFilter(self._imu, mounted, features.keyframes + 1, common)
         self._samples = np.empty((0, 7))
         self._time: float | None = None  # of the filter, seconds
@@ -120,13 +115,9 @@ class InertialTracker(FeatureTracker):
         self._rates = self._advance(now)
         if self._readout > 0:
             image, other = self._straightened(image, other)
-        if self._matcher is None:
-            depth = np.asarray(other, np.float32)
-        else:
-            depth = self._matcher.depth(image, np.asarray(other, np.uint8))
         self._now = now
         self._force = samples[:, 4:].mean(axis=0) if len(samples) else np.zeros(3)
-        result = self.track(stamp, image, depth)
+        result = self.track(stamp, image, other)
         if self._time is None:
             return result
         lost = result.lost

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import cv2
 import msgspec
@@ -47,6 +46,9 @@ from nodes.estimators.visual_odometry.landmarks import (
     squares,
 )
 from nodes.estimators.visual_odometry.patches import References, Rows, find_patches, half_width
+
+if TYPE_CHECKING:
+    from nodes.estimators.visual_odometry.stereo import StereoMatcher
 
 _FLOW_WINDOW = 15
 _LARGE = 320  # least side (pixels) of images halved before following corners
@@ -96,7 +98,11 @@ class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class FeatureTracker:
-    """Tracker of an RGB-D camera without distortion; reproducible to the bit."""
+    """Tracker of a camera without distortion, with depth or by stereo; reproducible to the bit.
+
+    Args:
+        matcher: Measures depth by the image of the right camera, which then comes in its place.
+    """
 
     _aligns: bool = True
     """Whether edges and surfaces are aligned where landmarks are few."""
@@ -105,12 +111,16 @@ class FeatureTracker:
         self,
         info: CameraInfo,
         settings: FeatureSettings | None = None,
-        surfaces: Callable[[Depth, Floats, float], Surfaces] = surfaces_at,
+        matcher: StereoMatcher | None = None,
     ) -> None:
         refuse_distortion(info)
         self._info = info
         self._settings = settings or FeatureSettings()
-        self._surfaces_at = surfaces
+        self._matcher, self._surfaces_at = matcher, surfaces_at
+        if matcher is not None:
+            noise = matcher.depth_noise
+            self._settings = msgspec.structs.replace(self._settings, depth_noise=noise)
+            self._surfaces_at = matcher.surfaces_at
         self._matrix = info.matrix()
         large = self._settings.levels and min(info.width, info.height) >= _LARGE
         self._reduction = 2 if large else 1
@@ -126,9 +136,13 @@ class FeatureTracker:
         self._references = References(self._matrix, self._settings.depth_noise)
         self._clear_map()
 
-    def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> TrackingResult:
+    def track(
+        self, stamp: int, image: npt.NDArray[np.uint8], other: npt.NDArray[np.uint8] | Depth
+    ) -> TrackingResult:
         """Return the pose of the next image; see `Tracker.track`."""
-        grey, depth = grey_and_depth(self._info, image, depth)
+        if self._matcher is not None:
+            other = self._matcher.depth(image, np.asarray(other, np.uint8))
+        grey, depth = grey_and_depth(self._info, image, np.asarray(other, np.float32))
         inverse_of = inverse_depth(depth)
         self._count += 1
         if not self._keyframes:

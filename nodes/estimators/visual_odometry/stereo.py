@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, CameraInfo
-from nodes.estimators import EstimatorConfig, StereoFrame, TrackingResult
+from nodes.estimators import EstimatorConfig, StereoFrame
 from nodes.estimators.odometry import (
     Depth,
     Floats,
@@ -199,22 +199,14 @@ class StereoOdometry(OdometryNode[StereoOdometryConfig]):
         return StereoTracker, self.the_camera().info, baseline(*self.cameras), *settings
 
 
-class StereoTracker:
-    """Tracker of a rectified pair's left camera, a baseline (m) apart; reproducible to the bit."""
+class StereoTracker(FeatureTracker):
+    """Tracker of a rectified pair's left camera, a baseline (m) apart."""
 
     def __init__(
         self, info: CameraInfo, baseline: float, stereo: StereoSettings, features: FeatureSettings
     ) -> None:
         cv2.setNumThreads(1)
-        self._matcher = StereoMatcher(info, baseline, stereo)
-        features = msgspec.structs.replace(features, depth_noise=self._matcher.depth_noise)
-        self._tracker = FeatureTracker(info, features, self._matcher.surfaces_at)
-
-    def track(
-        self, stamp: int, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8]
-    ) -> TrackingResult:
-        """Return the pose of the left camera at the next pair; see `Tracker.track`."""
-        return self._tracker.track(stamp, left, self._matcher.depth(left, right))
+        super().__init__(info, features, StereoMatcher(info, baseline, stereo))
 
 
 def baseline(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
