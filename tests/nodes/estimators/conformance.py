@@ -46,6 +46,7 @@ class Case(NamedTuple):
         begins: Good images, standing ones included, after which it must have said a pose.
         tolerance: Metres by which a pose may be off in the 1.5 m up to the white image, after the
             alignment that its frame asks for.
+        maps: Whether it begins another map after a loss, in a frame of its own.
         width: Of the images, pixels.
         script: What becomes of the images; see `tests.nodes.estimators.flight.SCRIPT`.
         worker: Whether its tracker needs a process of its own in every test; those that do not
@@ -59,6 +60,7 @@ class Case(NamedTuple):
     settings: Mapping[str, Any] = MappingProxyType({})
     begins: int = 2
     tolerance: float = 0.05
+    maps: bool = False
     width: int = 240
     script: str = SCRIPT
     worker: bool = False
@@ -302,12 +304,20 @@ def says_sound_poses(record: Record, case: Case) -> Iterator[str]:
 
 
 def stays_in_one_frame(record: Record, case: Case) -> Iterator[str]:
-    frames = {(pose.frame_id, pose.child_frame_id) for pose in record.of(PoseEstimate)}
-    if len(frames) > 1:
-        yield f"{frames}"
-    for frame, _ in frames:
-        if frame == "map" and record.said.scale_free:
+    """Unless it begins another map after a loss, which is told before its first pose."""
+    before: PoseEstimate | None = None
+    lost = False
+    for event in record.of(PoseEstimate, TrackingEvent):
+        if isinstance(event, TrackingEvent):
+            lost = lost or isinstance(event, TrackingLost)
+            continue
+        if event.frame_id == "map" and record.said.scale_free:
             yield "in map, in a unit of length of its own"
+        if before is not None and event.child_frame_id != before.child_frame_id:
+            yield f"of {event.child_frame_id} after one of {before.child_frame_id}"
+        if before is not None and event.frame_id != before.frame_id and not (case.maps and lost):
+            yield f"in {event.frame_id} after one in {before.frame_id}"
+        before, lost = event, False
 
 
 def marks_loss(record: Record, case: Case) -> Iterator[str]:

@@ -70,7 +70,7 @@ def orb_slam3(mode: str) -> Case:
             pytest.skip(str(error))
 
     plain = Case(OrbSlam3, {"mode": mode}, width=480, worker=True, slow=True, needs="pyorbslam3")
-    return plain._replace(begins=6, tolerance=0.5, built=built)
+    return plain._replace(begins=6, tolerance=0.5, maps=True, built=built)
 
 
 CASES = {
