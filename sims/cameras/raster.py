@@ -82,6 +82,8 @@ class Raster(Stage):
         ValueError: The model has skins, flexes or geoms that are not drawn.
     """
 
+    keeps_rows = True
+
     def __init__(
         self,
         model: Any,
@@ -215,7 +217,6 @@ class Raster(Stage):
                 to["position"], to["direction"] = of.pos, of.dir
         return found
 
-    @override
     @override
     def keep(self, camera_id: int, qpos: Floats, seconds: float) -> None:
         self._place(qpos, seconds)

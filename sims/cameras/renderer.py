@@ -222,7 +222,6 @@ class CameraRenderer:
         self._views = {spec.name: View(camera_info(spec), is_plain(spec)) for spec in cameras}
         infos = tuple(view.info for view in self._views.values())
         self._stage = open_stage(renderer, model, infos, threads, dynamics)
-        self._rows_move = renderer == "raster"
 
     def expose(self, shots: tuple[Shot, ...]) -> tuple[Frame, ...]:
         """Return the frames of some exposures. The same arguments give the same bits."""
@@ -262,9 +261,9 @@ class CameraRenderer:
         readout = float(spec.readout) if shot.moves() else 0.0
         bands: list[tuple[int, int]] = [(0, spec.height)]
         times = [0.0]
-        if exposure > 0.0 or (readout > 0.0 and not self._rows_move):
+        if exposure > 0.0 or (readout > 0.0 and not stage.keeps_rows):
             speeds = self._speeds(shot, spec, number, exposure + readout)
-            if not self._rows_move:
+            if not stage.keeps_rows:
                 finer = FINER_FOR_DEPTH if "depth" in kinds else 1.0
                 bands = row_bands(spec.height, float(speeds.max()) * readout * finer)
             times = moments(exposure, float(np.quantile(speeds, 0.9)) * exposure)
@@ -276,7 +275,7 @@ class CameraRenderer:
         for rows in bands:
             middle = row_time(readout, (rows[0] + rows[1] - 1) / 2.0, spec.height)
             for pieces, moment in zip(drawn, times, strict=True):
-                if self._rows_move and readout:
+                if stage.keeps_rows and readout:
                     for late in np.linspace(-0.5, 0.5, math.ceil(readout / KEPT) + 1) * readout:
                         since = float(late) + moment
                         state = shot.state(self._model, since)

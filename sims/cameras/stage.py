@@ -59,6 +59,9 @@ class Stage(ABC):
     Not thread-safe: stay in the thread that made it.
     """
 
+    keeps_rows = False
+    """Whether it draws each row at its own time, by `keep`."""
+
     def __init__(self, model: Any, dynamics: Changing | None = None) -> None:
         self.model = model
         self._dynamics = dynamics
@@ -86,7 +89,7 @@ class Stage(ABC):
         """Give back what it holds. Further calls do nothing."""
 
     def keep(self, camera_id: int, qpos: Floats, seconds: float) -> None:
-        """Keep a camera's view of a state and time for the next drawing, if rows are drawn singly.
+        """Keep a camera's view of a state and time for the rows of the next drawing.
 
         Of kept states the first is that of the first row and the last that of the last row, with
         the others between at equal steps. The drawing's light is that of the state last looked at.

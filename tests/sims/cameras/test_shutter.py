@@ -116,8 +116,8 @@ def test_rows_and_bands_look_like_one_drawing_for_each_row(
 ) -> None:
     """Bands but for edges, a quarter of a pixel elsewhere; and not like a global shutter."""
     (by_row,) = renderer.expose((moving(name),))
-    rolls = renderer._rows_move
-    monkeypatch.setattr(renderer, "_rows_move", False)
+    rolls = renderer._stage.keeps_rows
+    monkeypatch.setattr(renderer._stage, "keeps_rows", False)
     (found,) = renderer.expose((moving(name),))
     monkeypatch.setattr("sims.cameras.renderer.row_bands", each_row)
     (expected,) = renderer.expose((moving(name),))
