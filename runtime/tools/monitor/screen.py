@@ -50,6 +50,9 @@ class Screen(App[str]):
     #below { height: 30%; min-height: 12; }
     #paths { width: 5fr; height: 100%; }
     RichLog { width: 7fr; height: 100%; }
+    .-short #below { height: 5; min-height: 5; }
+    .-short DataTable#estimators { max-height: 4; }
+    .-short DataTable#nodes { max-height: 8; }
     #prompt { display: none; }
     #prompt.asking { display: block; }
     """
@@ -67,6 +70,7 @@ class Screen(App[str]):
         Binding("escape", "leave_prompt", show=False),
     ]
     ENABLE_COMMAND_PALETTE = False
+    VERTICAL_BREAKPOINTS = [(0, "-short"), (32, "-tall")]  # noqa: RUF012  # Textual's are so
 
     def __init__(self, connection: protocol.Client, leave: bool = False) -> None:
         super().__init__()

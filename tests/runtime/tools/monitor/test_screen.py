@@ -31,11 +31,21 @@ from tests.runtime.tools.monitor.samples import FakeClient, snapshot
 
 
 @asynccontextmanager
-async def shown(stand: FakeClient, **options: Any) -> AsyncIterator[tuple[Screen, Pilot[Any]]]:
+async def shown(
+    stand: FakeClient, size: tuple[int, int] = (140, 40), **options: Any
+) -> AsyncIterator[tuple[Screen, Pilot[Any]]]:
     screen = Screen(stand, **options)  # type: ignore[arg-type]  # it stands for a client
-    async with screen.run_test(size=(140, 40)) as pilot:
+    async with screen.run_test(size=size) as pilot:
         await pilot.pause()
         yield screen, pilot
+
+
+@pytest.mark.slow
+async def test_a_usual_terminal_shows_estimators_nodes_outputs_and_the_log() -> None:
+    async with shown(FakeClient(snapshot()), size=(80, 24)) as (screen, _):
+        image = screen.export_screenshot().replace("&#160;", " ")
+        for words in ("0.31", "drone ", "pilot ", "drone.images", "[b]wind[/b]"):
+            assert words in image
 
 
 def text(screen: Screen, name: str) -> str:
