@@ -136,6 +136,7 @@ struct Placed {  // a geom of the frame
     Vec3 shift;                    // of its mesh's origin from the eye, in the optical frame
     Matrix turn;                   // from the mesh's axes to the optical frame
     std::int32_t parts;            // how many those before it have
+    bool is_seen;                  // whether the following are known
     std::vector<Vec3> seen;        // its vertices in the optical frame
     std::vector<Lens::Pixel> pixels;  // and, by a lens, in the image
     int square, column, row, side;  // the smallest of the lens's squares about it, if it has any
@@ -174,7 +175,7 @@ class Scene {
     using Movings = std::vector<std::vector<Moving>>;
 
     void draw_rows(int first, int last, const Geom* geoms, const Pose* poses, int count,
-                   const Images& images);
+                   const Images& images, bool fresh);
     void place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) const;
     void see(Placed& placed) const;
     int beyond(const Placed& placed) const;

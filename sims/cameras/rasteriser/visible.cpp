@@ -38,19 +38,22 @@ void Scene::draw(const Lens& lens, const View& view, const Pose* eyes, const Geo
     middle_eye_ = eyes[middle];
     if (images.rgb)  // the light of the middle is that of all rows
         for (int k = 0; k < count; ++k) slots_[k].pose = poses[std::size_t(middle) * count + k];
+    bool fresh = true;
     for (int k = 0; k < std::max(steps, 1); ++k) {
         step_ = steps ? (view.height - 1.0) / steps : 1.0, start_ = k * step_;
         eye_ = eyes[k], next_eye_ = eyes[std::min(k + 1, steps)];
         const int first = std::max(static_cast<int>(std::ceil(start_)), view.first);
         const int end = k + 1 >= steps ? view.height : static_cast<int>(std::ceil(start_ + step_));
         const int last = std::min(end, view.last);
-        if (first < last)
-            draw_rows(first, last, geoms, poses + std::size_t(k) * count, count, images);
+        if (first >= last) continue;
+        if (!fresh) std::swap(placed_, later_);  // where all came to
+        draw_rows(first, last, geoms, poses + std::size_t(k) * count, count, images, fresh);
+        fresh = false;
     }
 }
 
 void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses, int count,
-                      const Images& images) {
+                      const Images& images, bool fresh) {
     first_ = first, last_ = last;
     const bool rolling = view_.poses > 1;
     std::vector<std::pair<double, int>> order;
@@ -58,7 +61,7 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
     for (int index = 0; index < count; ++index) {
         Placed& placed = placed_[index];
         if (!(geoms[index].rgba[3] > 0.0f)) continue;
-        place(geoms[index], poses[index], eye_, placed);
+        if (fresh) place(geoms[index], poses[index], eye_, placed);
         placed.parts = parts, parts += placed.mesh->part_count;
         if (rolling) place(geoms[index], poses[count + index], next_eye_, later_[index]);
         if (lens_->pinhole) {
@@ -113,6 +116,7 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
 
 void Scene::place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) const {
     placed.geom = &geom;
+    placed.is_seen = false;
     placed.mesh = meshes[geom.mesh].get();
     placed.shift = eye.turn.back({pose.position[0] - eye.position[0],
                                   pose.position[1] - eye.position[1],
@@ -127,6 +131,8 @@ void Scene::place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& p
 }
 
 void Scene::see(Placed& placed) const {
+    if (placed.is_seen) return;
+    placed.is_seen = true;
     placed.seen.resize(placed.mesh->points.size());
     for (std::size_t at = 0; at < placed.seen.size(); ++at) {
         const Vec3f p = placed.mesh->points[at];
