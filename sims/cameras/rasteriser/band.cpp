@@ -61,9 +61,13 @@ void Band::draw() {
 
 void Band::finish() {
     smooth_outlines();
+    if (images_.numbers && !images_.rgb)  // else they are known by now
+        for (int y = first_; y < last_; ++y)
+            runs(y, [&](int left, int right, std::int32_t seen) {
+                number(y, left, right, seen < 0 ? nullptr : &triangle(seen));
+            });
     blend();
     if (images_.depth) measure();
-    if (images_.numbers) number();
 }
 
 // Call found(y, x, inside, inverse depth) for pixels side by side, some of them in a triangle.
@@ -254,7 +258,7 @@ void Band::blend() {
                 for (int k = 0; k < lanes && x + k < lens_.width; ++k) {
                     if (!wins[k] || !owned(triangle, number, x + k, y)) continue;
                     float& most = front[here - at(first_) + k];
-                    if (q[k] > most) most = q[k], visible_[here + k] = number;
+                    if (q[k] > most) most = q[k], this->number(y, x + k, x + k + 1, &triangle);
                     if (images_.rgb) mix(x + k, y, q[k], number);
                 }
             });
@@ -284,16 +288,11 @@ void Band::measure() const {
     }
 }
 
-// Number of each pixel's geom; -1 for none.
-void Band::number() const {
-    for (int y = first_; y < last_; ++y) {
-        std::int32_t* to = images_.numbers + std::size_t(y - view_.first) * lens_.width;
-        runs(y, [&](int left, int right, std::int32_t number) {
-            const std::int32_t found =
-                number < 0 ? -1 : scene_.placed_[triangle(number).geom].geom->number;
-            std::fill(to + left, to + right, found);
-        });
-    }
+// Write the number of a geom, -1 for none, into pixels side by side.
+void Band::number(int y, int left, int right, const Triangle* seen) const {
+    if (!images_.numbers) return;
+    std::int32_t* to = images_.numbers + std::size_t(y - view_.first) * lens_.width;
+    std::fill(to + left, to + right, seen ? scene_.placed_[seen->geom].geom->number : -1);
 }
 
 }  // namespace raster

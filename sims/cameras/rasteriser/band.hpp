@@ -88,7 +88,7 @@ class Band {
     void smooth_outlines() const;
     void blend();
     void measure() const;
-    void number() const;
+    void number(int y, int left, int right, const Triangle* seen) const;
 
     std::size_t at(int y) const { return std::size_t(y - view_.first) * lens_.stride; }
     std::size_t leaf(int x, int y) const {

@@ -65,10 +65,8 @@ const Triangle* Band::seen_by(std::int32_t number, int y, Triangle& row) const {
     if (number < 0) return nullptr;
     if (view_.poses == 1) return &triangle(number);
     if (y >= scene_.first_) return seen(row = triangle(number), number, y) ? &row : nullptr;
-    // A row of the rows before these. What was see-through there counts as nothing.
-    if (std::size_t(number) >= scene_.before_.size()) return nullptr;
     const Moving& moving = scene_.before_moving_[number];
-    row = scene_.before_[number];
+    row = scene_.before_[number];  // it is above these rows
     row.see({moving.from, moving.to, (y - scene_.start_) / scene_.step_ + 1});
     return &row;
 }
@@ -101,9 +99,9 @@ Band::End Band::end(const Triangle& triangle, const Planes& planes, Vec3f from, 
         corner = mesh.beyond[corner + edge];
         if (corner < 0) return found;
         const std::int32_t* corners = mesh.corners.data() + corner;
-        const Corners next({point(corners[0]), point(corners[1]), point(corners[2])});
-        if (!(next.away < 0)) return found;
-        at = Planes(next);
+        const Vec3 next[3] = {point(corners[0]), point(corners[1]), point(corners[2])};
+        if (!(dot(cross(next[1] - next[0], next[2] - next[0]), next[0]) < 0)) return found;
+        at = Planes(Corners(next));
     }
     return found;
 }
@@ -155,7 +153,7 @@ void Band::smooth(int x, int y, bool below) {
                          std::abs(parts - 128)});
 }
 
-// Find the pixels that outlines cross, once all rows are shaded.
+// Find the pixels that outlines cross, once all rows are shaded, and number all of them.
 void Band::find_outlines() {
     outlines_.clear();
     std::vector<std::int32_t> rows[2];  // parts that each pixel of a row, and of that above, sees
@@ -171,6 +169,7 @@ void Band::find_outlines() {
                                        number < 0 ? nullptr : &this->triangle(number);
             const std::int32_t part = triangle ? triangle->part : -1;
             std::fill(parts + left, parts + right, part);
+            if (mine) this->number(y, left, right, triangle);
             if (mine && left && part != parts[left - 1]) smooth(left - 1, y, false);
         });
         if (y == top) continue;
