@@ -5,6 +5,7 @@
 // two surfaces meet) says where between the middles it runs, and so how much of a pixel is the
 // other's (E. Persson, "Geometric Post-process Anti-aliasing", 2011). Textures stay as they are.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <numeric>
 #include <tuple>
@@ -18,10 +19,13 @@ namespace raster {
 void Mesh::find_parts() {
     std::vector<std::int32_t> root(points.size()), same(points.size());
     std::iota(root.begin(), root.end(), 0), std::iota(same.begin(), same.end(), 0);
-    const auto less = [&](std::int32_t a, std::int32_t b) {
-        const int order = std::memcmp(&points[a], &points[b], sizeof points[a]);
-        return order ? order < 0 : std::memcmp(&normals[a], &normals[b], sizeof normals[a]) < 0;
-    };
+    std::vector<std::array<std::int64_t, 6>> places;  // rounded: a turn ends where it began
+    for (std::size_t k = 0; k < points.size(); ++k) {
+        const Vec3f p = points[k] * 1e5f, n = normals[k] * 1e3f;
+        places.push_back({std::llrint(p.x), std::llrint(p.y), std::llrint(p.z), std::llrint(n.x),
+                          std::llrint(n.y), std::llrint(n.z)});
+    }
+    const auto less = [&](std::int32_t a, std::int32_t b) { return places[a] < places[b]; };
     const auto find = [&](std::int32_t at) {
         while (root[at] != at) at = root[at] = root[root[at]];
         return at;
@@ -39,9 +43,13 @@ void Mesh::find_parts() {
         std::int32_t low, high, side;  // ends, and its number among all triangles' sides
     };
     std::vector<Side> sides;
-    for (std::size_t k = 0; k < corners.size(); ++k) {
-        const std::int32_t from = first[corners[k]], to = first[corners[k % 3 == 2 ? k - 2 : k + 1]];
-        sides.push_back({std::min(from, to), std::max(from, to), static_cast<std::int32_t>(k)});
+    for (std::int32_t k = 0; k < static_cast<std::int32_t>(corners.size()); k += 3) {
+        const std::int32_t a = first[corners[k]], b = first[corners[k + 1]];
+        const std::int32_t c = first[corners[k + 2]];
+        if (a == b || b == c || c == a) continue;  // at the pole of a ball
+        sides.push_back({std::min(a, b), std::max(a, b), k});
+        sides.push_back({std::min(b, c), std::max(b, c), k + 1});
+        sides.push_back({std::min(c, a), std::max(c, a), k + 2});
     }
     std::sort(sides.begin(), sides.end(), [](const Side& a, const Side& b) {
         return std::tie(a.low, a.high, a.side) < std::tie(b.low, b.high, b.side);
