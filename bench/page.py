@@ -211,7 +211,8 @@ def plot_boxes(rows: Sequence[Row], title: str, out: Path) -> None:
 def write(results: Results, out: Path, page_path: Path) -> None:
     """Write the page of results, its plots, and the figures themselves."""
     out.mkdir(parents=True, exist_ok=True)
-    encoded = msgspec.json.format(msgspec.json.encode(results), indent=1)
+    numbers = msgspec.json.encode(results, enc_hook=float)  # some are NumPy's
+    encoded = msgspec.json.format(numbers, indent=1)
     (out / "results.json").write_bytes(encoded + b"\n")
     plots = draw(results.rows, out, (2, 128))
     folder = os.path.relpath(out, page_path.parent)

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from bench.bridge import BridgeRow
 from bench.driver import Row
+from bench.frame import FrameRow
 from bench.lockstep import LockstepRow
 from bench.page import Results, write
 from bench.results import compare
@@ -104,6 +106,17 @@ def test_the_page_says_first_what_its_numbers_do_not_show(tmp_path: Path) -> Non
     assert "| small, streams | asyncio.Queue (uvloop) | 2 | 0.25 | ≤ 0.33 |" in text
     assert "camera in a worker | no camera | | 1.20 | ≤ 1.25 |" in text
     assert text.rstrip().endswith("- trio channels: not installed")
+
+
+def test_figures_of_numpy_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the end of half an hour nothing may be lost for a number's type."""
+    monkeypatch.setattr("bench.page.draw", lambda *_: {})
+    row = FrameRow(
+        world="hall", camera="pinhole", raster_ms=np.float64(2.5), mujoco_ms=None, ratio=None
+    )
+    write(msgspec.structs.replace(results(), frame=[row]), tmp_path, tmp_path / "RESULTS.md")
+    written = msgspec.json.decode((tmp_path / "results.json").read_bytes())
+    assert written["frame"][0]["raster_ms"] == 2.5
 
 
 @pytest.mark.slow
