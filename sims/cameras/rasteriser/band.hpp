@@ -46,7 +46,7 @@ class Band {
     static constexpr int most_triangles = 64;  // of a pixel that are walked over
     static constexpr int run = 16;  // pixels side by side with one level of a mipmap
     // A mipmap's level whose texels are as large as a pixel blurs more than the pixel; so many 256ths
-    // below it come nearest to the mean of 16 samples, also in how many corners are found.
+    // below it are nearer to the mean of 16 samples. 128 would be nearest, but too far from MuJoCo's.
     static constexpr int sharper = 64;
 
     const Triangle& triangle(std::int32_t number) const;

@@ -45,7 +45,7 @@ struct Lens {
         return by_level_[level][std::size_t(row / side) * (largest / side) + column / side];
     }
 
-    // Where the ray in a direction is, pixels, within half a pixel; column -1 if that is not known.
+    // Where the ray in a direction is, pixels, nearly; column -1 if that is not known.
     struct Pixel {
         float column, row;
     };

@@ -254,11 +254,11 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
         float low[2] = {1e9f, 1e9f}, high[2] = {-1e9f, -1e9f};
         for (int k = 0; k < count; ++k) {
             const auto [column, row] = pixels[k];
-            if (!(column >= 0)) return true;
+            if (!(column >= 0 && column < 1e6f && row > -1e6f && row < 1e6f)) return true;
             low[0] = std::min(low[0], column), high[0] = std::max(high[0], column);
             low[1] = std::min(low[1], row), high[1] = std::max(high[1], row);
         }
-        const double more = 1.5 + lens_->bend * share;
+        const double more = 1.5 + lens_->bend * (share + 0.0005);  // the latter: of `pixel`
         triangle.left = std::max(triangle.left, static_cast<int>(low[0] - more));
         triangle.right = std::min(triangle.right, static_cast<int>(high[0] + more) + 1);
         triangle.top = std::max(triangle.top, static_cast<int>(low[1] - more));
