@@ -14,6 +14,8 @@ Corners = npt.NDArray[np.int64]
 
 FARTHEST = 2000.0  # half length of a plane without end, metres
 
+MOST_CELLS = 40  # along a side of a plane; MuJoCo's 200 look the same, and cost more
+
 _Kind = mujoco.mjtGeom
 
 
@@ -56,7 +58,7 @@ def mesh_of(model: Any, kind: int, *of: Any) -> Mesh:
         case _Kind.mjGEOM_HFIELD:
             return _height_field(model, *of)
         case _Kind.mjGEOM_PLANE:
-            return _plane(size, quads)
+            return _plane(size)
         case _Kind.mjGEOM_BOX:
             return _box(size, quads)
         case _Kind.mjGEOM_SPHERE:
@@ -180,18 +182,25 @@ def _directions(
     return found, _grid(slices, stacks), around, up
 
 
-def _plane(half: Floats, cells: int) -> Mesh:
-    """Return a level rectangle; without end where a half length is 0."""
+def _plane(size: Floats) -> Mesh:
+    """Return a level rectangle in cells of the third size; without end where a half length is 0."""
+    half, cell = size[:2], size[2]
     far = np.append(0.0, np.geomspace(1.0, FARTHEST, 24))
     endless = np.append(-far[:0:-1], far)
     across, along = (
-        np.linspace(-length, length, cells + 1) if length > 0.0 else endless for length in half[:2]
+        np.linspace(-length, length, _cells(2.0 * length / cell) + 1) if length else endless
+        for length in half
     )
     flat = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
     points = np.column_stack([flat, np.zeros(len(flat))])
     corners = _grid(len(across) - 1, len(along) - 1)
-    u, v = (flat / half[:2]).T if half[:2].all() else (points[:, :2] - (1.0, -1.0)).T
+    u, v = (flat / half).T if half.all() else (points[:, :2] - (1.0, -1.0)).T
     return Mesh(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), corners, _unit(u, -v))
+
+
+def _cells(count: float) -> int:
+    """Return a whole number of cells along a side of a plane."""
+    return int(np.clip(round(count), 1, MOST_CELLS))
 
 
 def _unit(u: Floats, v: Floats) -> Floats:

@@ -22,6 +22,7 @@ from sims.cameras.lens import MARGIN, Face, Maps, faces
 from sims.cameras.stage import (
     FAR,
     NEAR,
+    SHADOW_SIZE,
     Changing,
     Floats,
     GraphicsError,
@@ -112,6 +113,8 @@ class OpenGL(Stage):
         self._scene.flags[:] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
         self._scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = 1
+        self._shadows = model.vis.quality.shadowsize > 0 and bool(model.light_castshadow.any())
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
         self._scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = dynamics is not None and dynamics.fog
         self._option = _surfaces_only()
         self._gl = open_context(width, height, threads)
@@ -257,7 +260,8 @@ class OpenGL(Stage):
         self, size: Size, rgb: Colours | None, depth: Depths | None, plain: bool = False
     ) -> None:
         """Draw and read an image, bottom row first; `plain`: each object's number as its colour."""
-        self.model.geom_group[:] = np.where(self._in_view(size), self._groups, _OUT_OF_VIEW)
+        drawn = self._in_view(size) | (self._shadows and not plain)  # others may throw theirs here
+        self.model.geom_group[:] = np.where(drawn, self._groups, _OUT_OF_VIEW)
         scene, category = self._scene, mujoco.mjtCatBit.mjCAT_ALL
         scene.ngeom = 0
         mujoco.mjv_addGeoms(self.model, self._data, self._option, self._nobody, category, scene)
@@ -319,7 +323,7 @@ def _set_quality(model: Any, width: int, height: int) -> None:
     """Switch off costly effects of software rendering, and set the clipping planes."""
     visual = model.vis
     visual.quality.offsamples = 0  # multisampling would also blur depth and numbers
-    visual.quality.shadowsize = 0
+    visual.quality.shadowsize = min(visual.quality.shadowsize, SHADOW_SIZE)
     visual.global_.offwidth = max(visual.global_.offwidth, width)
     visual.global_.offheight = max(visual.global_.offheight, height)
     visual.map.znear = NEAR / model.stat.extent

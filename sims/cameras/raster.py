@@ -21,22 +21,30 @@ from events import CameraInfo
 from events.camera_info import srgb_light
 from sims.cameras.lens import pixel_rays
 from sims.cameras.meshes import Mesh, mesh_of, shape_of
-from sims.cameras.stage import NEAR, Changing, Floats, GraphicsError, Stage, object_numbers
+from sims.cameras.stage import (
+    NEAR,
+    SHADOW_SIZE,
+    Changing,
+    Floats,
+    GraphicsError,
+    Stage,
+    object_numbers,
+)
 from sims.cameras.view import RANGE, Drawn, View
 
 GEOM = np.dtype(
     [
-        ("mesh", "i4"), ("texture", "i4"), ("number", "i4"), ("culled", "i4"), ("rgba", "f4", 4),
-        ("emission", "f4"), ("specular", "f4"), ("shininess", "f4"), ("repeat", "f4", 2),
-        ("offset", "f4"), ("cube", "f4", 3), ("unused", "f4"),
+        ("mesh", "i4"), ("texture", "i4"), ("number", "i4"), ("rgba", "f4", 4), ("emission", "f4"),
+        ("specular", "f4"), ("shininess", "f4"), ("repeat", "f4", 2), ("offset", "f4"),
+        ("cube", "f4", 3),
     ]
 )  # fmt: skip
 POSE = np.dtype([("position", "f8", 3), ("turn", "f8", 9)])
 LIGHT = np.dtype(
     [
-        ("kind", "i4"), ("unused", "i4"), ("ambient", "f4", 3), ("diffuse", "f4", 3),
+        ("kind", "i4"), ("size", "i4"), ("ambient", "f4", 3), ("diffuse", "f4", 3),
         ("specular", "f4", 3), ("attenuation", "f4", 3), ("cutoff", "f4"), ("exponent", "f4"),
-        ("position", "f8", 3), ("direction", "f8", 3),
+        ("position", "f8", 3), ("direction", "f8", 3), ("map", "u8"), ("step", "f8"), ("eye", POSE),
     ]
 )  # fmt: skip
 VIEW = np.dtype(
@@ -50,6 +58,7 @@ VIEW = np.dtype(
 
 _Kind = mujoco.mjtGeom
 _OPTICAL = np.tile([1.0, -1.0, -1.0], 3)  # MuJoCo's camera looks along -z, with y up
+SUN_AWAY = 200.0  # distance at which a directional light's map is drawn, in half widths of it
 _GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing is said
 
 
@@ -94,6 +103,11 @@ class Raster(Stage):
         super().__init__(model, dynamics)
         self._threads = threads
         self._colours = b""  # those that the geoms have
+        self._map_size = min(int(model.vis.quality.shadowsize), SHADOW_SIZE)
+        self._maps: list[npt.NDArray[Any]] = []  # of the lights that throw shadows
+        self._mapped: list[bytes] = []  # what each shows
+        self._map_lenses: dict[float, int] = {}
+        self._sun_reach = float(model.stat.extent * model.vis.map.shadowclip)  # metres
         self._kept: list[tuple[npt.NDArray[Any], npt.NDArray[Any]]] = []  # poses of eye and geoms
         for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
             if count:
@@ -173,6 +187,8 @@ class Raster(Stage):
             frame["fogged"], frame["fog"] = 1, self.model.vis.rgba.fog[:3]
             frame["fog_start"], frame["fog_end"] = fog
         geoms, lights = self._coloured(), self._lights()
+        if colour:
+            self._draw_shadows(lights, geoms, self._kept[len(self._kept) // 2][1])
         self._kept = []
         self._library.raster_draw(
             self._world, self._lens(view.info), _at(frame), _at(eyes), len(geoms), _at(geoms),
@@ -215,7 +231,52 @@ class Raster(Stage):
             # camera, and the light on all surfaces would be computed anew.
             if to["kind"] or of.diffuse.any() or of.specular.any():
                 to["position"], to["direction"] = of.pos, of.dir
+                if of.castshadow and to["kind"] != 1:
+                    self._cast(to, of)
         return found
+
+    def _cast(self, light: Any, of: Any) -> None:
+        """Have a light throw shadows, by a map of what MuJoCo's map covers."""
+        ahead = of.dir.astype(float)
+        if not self._map_size or not (length := float(np.linalg.norm(ahead))):
+            return
+        ahead /= length
+        aside = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
+        aside /= np.linalg.norm(aside)
+        reach, back = math.tan(math.radians(min(of.cutoff, 80.0))), 0.0
+        if light["kind"] == 0:  # rays of a sun are parallel: seen from far away
+            reach, back = 1.0 / SUN_AWAY, SUN_AWAY * self._sun_reach
+        light["size"], light["step"] = self._map_size, 2.0 * reach / self._map_size
+        light["eye"]["position"] = of.pos - back * ahead
+        light["eye"]["turn"] = np.stack([aside, np.cross(ahead, aside), ahead], axis=1).ravel()
+
+    def _draw_shadows(self, lights: Any, geoms: Any, poses: Any) -> None:
+        """Draw what each light that throws shadows sees, unless it has seen just that before."""
+        casting, size = [lights[k] for k in np.flatnonzero(lights["size"])], self._map_size
+        for _ in casting[len(self._maps) :]:
+            self._maps.append(np.empty((size, size), np.float32))
+            self._mapped.append(b"")
+        for light, depth in zip(casting, self._maps, strict=False):
+            light["map"] = depth.ctypes.data
+        for number, (light, depth) in enumerate(zip(casting, self._maps, strict=False)):
+            seen = b"".join(each.tobytes() for each in (light["eye"], geoms["rgba"], poses))
+            if seen == self._mapped[number]:
+                continue
+            self._mapped[number] = seen
+            frame = np.zeros(1, VIEW)
+            frame["width"] = frame["height"] = frame["last"] = size
+            frame["sky"], frame["poses"], frame["threads"] = -1, 1, self._threads
+            frame["near"], frame["far"] = NEAR, np.inf
+            if (step := float(light["step"])) not in self._map_lenses:
+                rays = ((np.arange(size) - 0.5 * (size - 1)) * step).astype(np.float32)
+                self._map_lenses[step] = self._library.raster_lens(
+                    self._world, size, size, _at(rays), _at(rays), None
+                )
+            eye = np.array([light["eye"]], POSE)
+            self._library.raster_draw(
+                self._world, self._map_lenses[step], _at(frame), _at(eye), len(geoms),
+                _at(geoms), _at(poses), len(lights), _at(lights), None, _at(depth), None,
+            )  # fmt: skip
 
     @override
     def keep(self, camera_id: int, qpos: Floats, seconds: float) -> None:
@@ -242,7 +303,7 @@ class Raster(Stage):
         # A material's colour, unless the geom has one of its own.
         plain = (model.geom_matid[drawn] >= 0) & (rgba == _GREY).all(axis=1)
         rgba[plain] = model.mat_rgba[model.geom_matid[drawn[plain]]]
-        geoms["rgba"], geoms["culled"] = rgba, rgba[:, 3] >= 1.0
+        geoms["rgba"] = rgba
         return geoms
 
     def _describe(self) -> None:

@@ -39,6 +39,8 @@ NEAR = 0.02
 FAR = 20_000.0
 """Clipping planes, metres."""
 
+SHADOW_SIZE = 1024  # pixels; the most columns and rows of a light's map of what it shines on
+
 LOOK = ".look"  # suffix of looks: geom `<name>.look` is the image of geom `<name>`, with its number
 
 

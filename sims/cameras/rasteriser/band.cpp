@@ -33,7 +33,7 @@ Corners Band::between_poses(std::int32_t number, int y) const {
 // A triangle as a row sees it; false if it does not.
 bool Band::seen(Triangle& triangle, std::int32_t number, int y) const {
     const Corners corners = between_poses(number, y);
-    if (corners.away >= 0 && scene_.placed_[triangle.geom].geom->culled) return false;
+    if (corners.away >= 0) return false;
     triangle.see(corners);
     return true;
 }

@@ -111,6 +111,7 @@ class Band {
     std::vector<Outline> outlines_;
     std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
     std::vector<Surface> surfaces_;
+    std::vector<Shade> shades_;
     std::vector<std::vector<std::int32_t>> surface_of_;  // by part and triangle; -1: none yet
 };
 

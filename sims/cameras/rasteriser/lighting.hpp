@@ -38,19 +38,21 @@ inline Vec3 unit(Vec3 a) {
     return length > 0 ? a * (1.0 / length) : a;
 }
 
-// Light of a point with a unit normal, both in the world; each part from 0 to 1.
-inline Vec3f lit(const Geom& geom, const std::vector<Light>& lights, Vec3 point, Vec3 normal,
-                 Vec3 eye) {
+// Light of a point with a unit normal, both in the world, each part from 0 to 1; and after it, so far
+// apart, what each light that throws shadows adds where it shines.
+inline void lit(const Geom& geom, const std::vector<Light>& lights, Vec3 point, Vec3 normal,
+                Vec3 eye, Vec3f* to, std::size_t apart) {
     float sums[3];
+    const auto within = [](float part) { return std::min(std::max(part, 0.0f), 1.0f); };
     for (int k = 0; k < 3; ++k) sums[k] = geom.emission * geom.rgba[k];
+    Vec3f* added = to;
     for (const Light& light : lights) {
         Vec3 towards{-light.direction[0], -light.direction[1], -light.direction[2]};
         double strength = 1;
         if (light.kind != 0) {
-            const Vec3 apart =
-                Vec3{light.position[0], light.position[1], light.position[2]} - point;
-            const double distance = root(dot(apart, apart));
-            const Vec3 ray = unit(apart);
+            const Vec3 way = Vec3{light.position[0], light.position[1], light.position[2]} - point;
+            const double distance = root(dot(way, way));
+            const Vec3 ray = unit(way);
             strength = 1.0 / (light.attenuation[0] + light.attenuation[1] * distance +
                               light.attenuation[2] * distance * distance);
             if (light.kind == 2) {
@@ -70,13 +72,15 @@ inline Vec3f lit(const Geom& geom, const std::vector<Light>& lights, Vec3 point,
                 shine = power_of_2(std::max(
                     geom.shininess * 128.0f * log_2(static_cast<float>(half)), -100.0f));
         }
+        float parts[3];
         for (int k = 0; k < 3; ++k)
-            sums[k] += static_cast<float>(
+            parts[k] = static_cast<float>(
                 strength * (geom.rgba[k] * (light.ambient[k] + light.diffuse[k] * facing) +
                             geom.specular * light.specular[k] * shine));
+        if (light.size) *(added += apart) = {parts[0], parts[1], parts[2]};
+        else for (int k = 0; k < 3; ++k) sums[k] += parts[k];
     }
-    const auto within = [](float part) { return std::min(std::max(part, 0.0f), 1.0f); };
-    return {within(sums[0]), within(sums[1]), within(sums[2])};
+    *to = {within(sums[0]), within(sums[1]), within(sums[2])};
 }
 
 }  // namespace raster

@@ -119,10 +119,18 @@ struct Moving {  // a triangle that is seen from one pose in its first row, and 
     Corners from, to;
 };
 
+struct Shade {  // of a light that throws shadows, on a triangle: all but `depth` times the ray
+    bool shines;
+    float light[3][3];
+    float place[3][3];  // seen from the light
+    float depth[3];     // inverse depth, times a ray of the light's
+};
+
 struct Surface {  // what is interpolated on a triangle, each times the ray
     float depth[3];
     float u[3], v[3], w[3];  // w of a cube, in which they are a direction
     float light[3][3];
+    std::int32_t shades;  // number of the first
     bool flat;
     std::uint16_t same[3];  // the light of a flat one, in 65536ths
     const Texture* texture;
@@ -165,7 +173,7 @@ class Scene {
   private:
     friend class Band;
 
-    struct Slot {  // light on a geom's vertices; if it is see-through, then from behind
+    struct Slot {  // light on a geom's vertices, and then that of each light that throws shadows
         Geom geom;
         Pose pose;
         int frame;
@@ -194,6 +202,7 @@ class Scene {
     double start_ = 0, step_ = 0;  // row of the first pose, and how many there are to the next one
     Pose eye_{}, next_eye_{}, middle_eye_{};
     std::vector<Light> lights_;
+    std::vector<Light> casters_;  // those that throw shadows
     std::vector<Placed> placed_, later_;  // for the first pose, and the next one
     std::vector<Slot> slots_;
     Triangles solid_, clear_;  // of these rows, in parts

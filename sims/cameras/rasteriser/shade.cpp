@@ -6,6 +6,8 @@
 
 namespace raster {
 
+constexpr float rounding = 2e-6f;  // of a depth by the inverse depth of the plane that it is on
+
 // Light on a geom's vertices; that of before, if nothing has moved.
 void Scene::light(const Geom& geom, const Pose& pose, Slot& slot) const {
     if (slot.frame == frame_ && !slot.light.empty()) return;
@@ -14,21 +16,20 @@ void Scene::light(const Geom& geom, const Pose& pose, Slot& slot) const {
     bool shines = false;
     for (const Light& each : lights_)
         shines |= geom.specular > 0 && (each.specular[0] + each.specular[1] + each.specular[2]) > 0;
-    const std::size_t sides = geom.culled ? 1 : 2;
-    if (!shines && slot.light.size() == sides * mesh.points.size() &&
+    const std::size_t count = mesh.points.size();
+    if (!shines && slot.light.size() == count * (1 + casters_.size()) &&
         !std::memcmp(&slot.geom, &geom, sizeof geom) &&
         !std::memcmp(&slot.pose, &pose, sizeof pose))
         return;
     const Vec3 eye{middle_eye_.position[0], middle_eye_.position[1], middle_eye_.position[2]};
     const Vec3 origin{pose.position[0], pose.position[1], pose.position[2]};
-    slot.light.clear();
-    for (std::size_t side = 0; side < sides; ++side)
-        for (std::size_t k = 0; k < mesh.points.size(); ++k) {
-            const Vec3f p = mesh.points[k], n = mesh.normals[k];
-            const Vec3 normal = unit(pose.turn * Vec3{n.x, n.y, n.z}) * (side ? -1.0 : 1.0);
-            const Vec3 point = pose.turn * Vec3{p.x, p.y, p.z} + origin;
-            slot.light.push_back(lit(geom, lights_, point, normal, eye));
-        }
+    slot.light.resize(count * (1 + casters_.size()));
+    for (std::size_t k = 0; k < count; ++k) {
+        const Vec3f p = mesh.points[k], n = mesh.normals[k];
+        const Vec3 normal = unit(pose.turn * Vec3{n.x, n.y, n.z});
+        const Vec3 point = pose.turn * Vec3{p.x, p.y, p.z} + origin;
+        lit(geom, lights_, point, normal, eye, &slot.light[k], count);
+    }
     slot.geom = geom, slot.pose = pose;
 }
 
@@ -41,7 +42,7 @@ const Surface& Band::surface(std::int32_t number, int y) {
         if (known >= 0) return surfaces_[known];
         known = static_cast<std::int32_t>(surfaces_.size());
     } else {
-        surfaces_.clear();
+        surfaces_.clear(), shades_.clear();
     }
     const Triangle& triangle = this->triangle(number);
     const Placed& placed = scene_.placed_[triangle.geom];
@@ -58,7 +59,7 @@ const Surface& Band::surface(std::int32_t number, int y) {
     };
     Surface made{};
     put(made.depth, weights[0] + weights[1] + weights[2]);
-    made.opacity = geom.rgba[3];
+    made.opacity = 1.0f - (1.0f - geom.rgba[3]) * (1.0f - geom.rgba[3]);  // MuJoCo draws it twice
     if (geom.texture >= 0) {
         made.texture = scene_.textures[geom.texture].get();
         made.width = static_cast<float>(made.texture->width());
@@ -79,10 +80,11 @@ const Surface& Band::surface(std::int32_t number, int y) {
             plane(made.v, place(0, 1), place(1, 1), place(2, 1));
         }
     }
-    const Vec3f* light = scene_.slots_[triangle.geom].light.data() +
-                         (share > 0 && !geom.culled ? mesh.points.size() : 0);
+    const Scene::Slot& slot = scene_.slots_[triangle.geom];
+    const Vec3f* light = slot.light.data();
     const Vec3f l[3] = {light[corners[0]], light[corners[1]], light[corners[2]]};
-    made.flat = !std::memcmp(&l[0], &l[1], sizeof l[0]) && !std::memcmp(&l[0], &l[2], sizeof l[0]);
+    made.flat = !std::memcmp(&l[0], &l[1], sizeof l[0]) &&
+                !std::memcmp(&l[0], &l[2], sizeof l[0]) && scene_.casters_.empty();
     if (made.flat) {
         made.same[0] = static_cast<std::uint16_t>(l[0].x * 65535.0f);
         made.same[1] = static_cast<std::uint16_t>(l[0].y * 65535.0f);
@@ -92,8 +94,61 @@ const Surface& Band::surface(std::int32_t number, int y) {
         plane(made.light[1], l[0].y, l[1].y, l[2].y);
         plane(made.light[2], l[0].z, l[1].z, l[2].z);
     }
+    made.shades = static_cast<std::int32_t>(shades_.size());
+    for (const Light& caster : scene_.casters_) {
+        light += slot.light.size() / (1 + scene_.casters_.size());
+        Vec3 at[3];  // of the corners, seen from the light
+        for (int k = 0; k < 3; ++k) {
+            const Vec3f p = mesh.points[corners[k]];
+            const Pose &pose = slot.pose, &eye = caster.eye;
+            const Vec3 turned = pose.turn * Vec3{p.x, p.y, p.z};
+            at[k] = eye.turn.back({turned.x + (pose.position[0] - eye.position[0]),
+                                   turned.y + (pose.position[1] - eye.position[1]),
+                                   turned.z + (pose.position[2] - eye.position[2])});
+        }
+        const Vec3f a = light[corners[0]], b = light[corners[1]], c = light[corners[2]];
+        const Corners from(at);
+        Shade shade;
+        shade.shines = a.x + a.y + a.z + b.x + b.y + b.z + c.x + c.y + c.z > 0;
+        plane(shade.light[0], a.x, b.x, c.x);
+        plane(shade.light[1], a.y, b.y, c.y);
+        plane(shade.light[2], a.z, b.z, c.z);
+        plane(shade.place[0], at[0].x, at[1].x, at[2].x);
+        plane(shade.place[1], at[0].y, at[1].y, at[2].y);
+        plane(shade.place[2], at[0].z, at[1].z, at[2].z);
+        put(shade.depth, (from.edges[0] + from.edges[1] + from.edges[2]) * (1.0 / from.away));
+        shades_.push_back(shade);
+    }
     surfaces_.push_back(made);
     return surfaces_.back();
+}
+
+// How much of a light reaches points, which are seen from it: of four pixels of its map about each,
+// those that see nothing before the triangle's plane, weighted by their distance. So no surface is
+// in its own shadow, however steep.
+static fv reaches(const Light& light, const Shade& shade, fv x, fv y, fv z) {
+    const auto step = static_cast<float>(light.step), per_step = static_cast<float>(1 / light.step);
+    const float middle = 0.5f * static_cast<float>(light.size - 1);
+    const fv inverse = per_step / z, column = x * inverse + middle, row = y * inverse + middle;
+    const iv inside = (column >= 0.0f) & (column < 2 * middle) & (row >= 0.0f) &
+                      (row < 2 * middle) & (z > 0.0f);
+    const fv left = floored(inside ? column : fv{}), top = floored(inside ? row : fv{});
+    const fv right_share = column - left, lower_share = row - top;
+    std::int32_t first[lanes];
+    store(first, as_whole(top) * light.size + as_whole(left));
+    fv lit{};
+    for (int k = 0; k < 4; ++k) {
+        const int right = k & 1, lower = k >> 1;
+        float depths[lanes];
+        for (int lane = 0; lane < lanes; ++lane)
+            depths[lane] = light.map[first[lane] + right + lower * light.size];
+        const fv across = (left + (right - middle)) * step, down = (top + (lower - middle)) * step;
+        const fv plane = across * shade.depth[0] + (down * shade.depth[1] + shade.depth[2]);
+        const fv share = (right ? right_share : 1.0f - right_share) *
+                         (lower ? lower_share : 1.0f - lower_share);
+        lit += load<fv>(depths) * plane < 1.0f - rounding ? fv{} : share;
+    }
+    return inside ? lit : fv{} + 1.0f;
 }
 
 static float times(const float (&plane)[3], Vec3f ray) {
@@ -163,9 +218,18 @@ void Band::place(const Surface& surface, int x, int y, const float* nearest, int
             taps_.set(Taps::red_blue, x, iv{} + (surface.same[0] | surface.same[2] << 16));
             taps_.set(Taps::green, x, iv{} + surface.same[1]);
         } else {
-            taps_.set(Taps::red_blue, x, share(times(surface.light[0])) |
-                                             share(times(surface.light[2])) << 16);
-            taps_.set(Taps::green, x, share(times(surface.light[1])));
+            fv light[3];
+            for (int k = 0; k < 3; ++k) light[k] = times(surface.light[k]);
+            const Shade* shade = shades_.data() + surface.shades;
+            for (const Light& caster : scene_.casters_) {
+                const Shade& of = *shade++;
+                if (!of.shines) continue;
+                const fv lit = reaches(caster, of, times(of.place[0]), times(of.place[1]),
+                                       times(of.place[2]));
+                for (int k = 0; k < 3; ++k) light[k] += lit * times(of.light[k]);
+            }
+            taps_.set(Taps::red_blue, x, share(light[0]) | share(light[2]) << 16);
+            taps_.set(Taps::green, x, share(light[1]));
         }
         if (view_.fogged)
             taps_.set(Taps::clear, x, twice(share((view_.fog_end - inverse * rz) /

@@ -140,11 +140,10 @@ struct Matrix {  // 3 x 3, row by row
 struct Geom {
     std::int32_t mesh, texture;  // numbers of theirs; texture -1 for none
     std::int32_t number;         // in the image of numbers
-    std::int32_t culled;         // whether it is seen from the front only
     float rgba[4];
     float emission, specular, shininess;
     float repeat[2], offset;  // of the places in the texture
-    float cube[3], unused;    // times a point of the mesh: its direction in a cube of textures
+    float cube[3];            // times a point of the mesh: its direction in a cube of textures
 };
 
 struct Pose {
@@ -153,10 +152,14 @@ struct Pose {
 };
 
 struct Light {
-    std::int32_t kind, unused;  // 0 directional, 1 point, 2 spot
+    std::int32_t kind;  // 0 directional, 1 point, 2 spot
+    std::int32_t size;  // of its map: columns and rows; 0 if it throws no shadows
     float ambient[3], diffuse[3], specular[3], attenuation[3];
     float cutoff, exponent;  // cosine of the cone's half angle
     double position[3], direction[3];
+    const float* map;  // depth of what is nearest to an eye at the light, by row and column
+    double step;       // a pixel's width and height at z = 1
+    Pose eye;
 };
 
 struct View {

@@ -30,6 +30,9 @@ void Scene::draw(const Lens& lens, const View& view, const Pose* eyes, const Geo
         (light_count && std::memcmp(lights_.data(), lights, sizeof(Light) * light_count))) {
         slots_.clear();
         lights_.assign(lights, lights + light_count);
+        casters_.clear();
+        for (const Light& light : lights_)
+            if (light.size) casters_.push_back(light);
     }
     slots_.resize(count), placed_.resize(count), later_.resize(count);
     nearest_.resize(std::size_t(view.last - view.first) * lens.stride + widest);
@@ -199,10 +202,10 @@ bool Scene::in_squares(Placed& placed, const Placed& later) const {
     }
 }
 
-// Add a geom's triangles to the frame, unless they are out of view.
+// Add a geom's triangles to the frame, unless they are out of view or seen from behind.
 void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) const {
     const Placed& placed = placed_[index];
-    const bool rolling = view_.poses > 1, culled = placed.geom->culled;
+    const bool rolling = view_.poses > 1;
     const std::vector<std::int32_t>& corners = placed.mesh->corners;
     for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
         Vec3 points[6];  // now, and for the next pose
@@ -221,7 +224,7 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         triangle.part = placed.parts + placed.mesh->parts[corner / 3];
         if (!rolling) {
             const double away = dot(cross(now[1] - now[0], now[2] - now[0]), now[0]);
-            if (away == 0 || (away > 0 && culled)) continue;
+            if (!(away < 0)) continue;
             if (!bounded(triangle, points, pixels, 3)) continue;
             triangle.see(Corners(now));
             to.push_back(triangle);
@@ -230,7 +233,7 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         put(later_[index], 3);
         if (!bounded(triangle, points, pixels, 6)) continue;
         const Corners from(now), next(*reinterpret_cast<Vec3(*)[3]>(points + 3));
-        if (culled && from.away >= 0 && next.away >= 0) continue;
+        if (from.away >= 0 && next.away >= 0) continue;
         triangle.see(from);
         to.push_back(triangle);
         moving.push_back({from, next});
