@@ -1,4 +1,4 @@
-"""Make the documentation's images of all worlds and sensors: worlds.jpg and sensors.jpg.
+"""Make the documentation's images of worlds, sensors and renderers: worlds.jpg and so on.
 
 The worlds are seen from a place each; the sensors are those of one flight, `tools/sensors.toml`.
 """
@@ -16,6 +16,8 @@ from events.frames import from_rpy
 from runtime.config.reading import load
 from runtime.testing import run_nodes
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
+from sims.cameras.renderer import Shot
+from sims.cameras.stage import RendererName
 from sims.worlds import WORLDS, load_scene
 
 DOCS = Path("docs/images")
@@ -31,21 +33,35 @@ VIEWS = {  # north, east, down, metres; roll, pitch, yaw, degrees
 
 
 def main() -> None:
-    """Make both images."""
+    """Make all images."""
     _write("worlds.jpg", {name: _seen(name) for name in WORLDS}, 3)
     _write("sensors.jpg", _sensed(), 5)
+    _write("renderers.jpg", _compared(("yard", "office", "forest")), 3)
 
 
-def _seen(name: str) -> Any:
+def _compared(names: tuple[str, ...]) -> dict[str, Any]:
+    found = {}
+    for name in names:
+        ours, other = _seen(name), _seen(name, "mujoco")
+        found[f"{name}: raster"], found[f"{name}: mujoco"] = ours, other
+        apart = np.abs(ours.astype(int) - other)
+        caption = f"8 x the difference, {apart.mean():.1f} levels on average"
+        found[caption] = np.minimum(8 * apart, 255).astype(np.uint8)
+    return found
+
+
+def _seen(name: str, renderer: RendererName = "raster") -> Any:
     world, dynamics = load_scene(name, 1)
     camera = CameraSpec(name="camera", images=("rgb",), width=SIZE[0], height=SIZE[1])
     prefix = add_free_camera(world, "free", (camera,))
-    renderer = CameraRenderer(model_to_bytes(world.compile()), (camera,), prefix, 0, 2, dynamics)
+    packed = model_to_bytes(world.compile())
+    stage = CameraRenderer(packed, (camera,), prefix, 0, 2, dynamics, renderer=renderer)
     north, east, down, *angles = VIEWS[name]
     roll, pitch, yaw = np.radians(angles).tolist()
     state = pose_to_qpos((north, east, down), from_rpy(roll, pitch, yaw))
-    image = renderer.render(3_000_000_000, state, ("camera",))["camera"].rgb
-    renderer.close()
+    (frame,) = stage.expose((Shot("camera", 3_000_000_000, state),))
+    image = frame.rgb
+    stage.close()
     assert image is not None
     return image[..., ::-1]
 

@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 
 from events.frames import from_rpy
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
+from sims.cameras.renderer import Shot
 from sims.worlds import load_scene
 
 TOUR, RUNS, DOCS = Path("runs/tour/latest/plots"), Path("runs/office/runs"), Path("docs/images")
@@ -114,7 +115,8 @@ def _from_outside() -> Any:
     renderer = CameraRenderer(model_to_bytes(world.compile()), (_camera(),), prefix, 0, 2, dynamics)
     north_east_down, angles = VIEW
     state = pose_to_qpos(north_east_down, from_rpy(*np.radians(angles).tolist()))
-    image = np.array(renderer.render(3_000_000_000, state, ("camera",))["camera"].rgb)
+    (frame,) = renderer.expose((Shot("camera", 3_000_000_000, state),))
+    image = np.array(frame.rgb)
     renderer.close()
     image[(image == 0).all(axis=2)] = [int(GROUND[at : at + 2], 16) for at in (1, 3, 5)]
     return image
