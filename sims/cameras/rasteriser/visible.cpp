@@ -261,7 +261,8 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
             low[0] = std::min(low[0], column), high[0] = std::max(high[0], column);
             low[1] = std::min(low[1], row), high[1] = std::max(high[1], row);
         }
-        const double more = 1.5 + lens_->bend * (share + 0.0005);  // the latter: of `pixel`
+        // 0.0005: of `pixel`. Of a lens that sees right behind itself, more than there are pixels.
+        const double more = std::min(1.5 + lens_->bend * (share + 0.0005), 1e6);
         triangle.left = std::max(triangle.left, static_cast<int>(low[0] - more));
         triangle.right = std::min(triangle.right, static_cast<int>(high[0] + more) + 1);
         triangle.top = std::max(triangle.top, static_cast<int>(low[1] - more));

@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,11 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
+from events import CameraInfo
+from events.camera_info import DistortionModel
 from events.frames import from_rpy
 from sims.cameras import CameraSpec, GraphicsError, add_free_camera, pose_to_qpos
 from sims.cameras.lens import Lens, pixel_rays
@@ -414,6 +419,80 @@ def test_outlines_and_textures_are_near_the_mean_of_many_samples(spec: CameraSpe
     assert np.mean(elsewhere) < 3.5
     assert np.mean(at_edges) < 7.0
     raster.close()
+
+
+@cache
+def swarm() -> tuple[Raster, npt.NDArray[Any], npt.NDArray[Any]]:
+    """Return a stage at rest among small balls on all sides, their middles seen and their radii."""
+    random = np.random.default_rng(4)
+    middles = random.normal(size=(60, 3))
+    middles *= random.uniform(0.8, 5.0, (60, 1)) / np.linalg.norm(middles, axis=1)[:, None]
+    radii = random.uniform(0.03, 0.3, 60)
+    balls = "".join(
+        f'<geom type="sphere" size="{r}" pos="{x} {y} {z}"/>'
+        for (x, y, z), r in zip(middles, radii, strict=True)
+    )
+    raster = Raster(shaped(balls))
+    drawn(raster, PINHOLE, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    # Ahead is MuJoCo's x, to the left its y, and up its z.
+    return raster, middles @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), radii
+
+
+@given(
+    model=st.sampled_from(["plumb_bob", "rational_polynomial", "equidistant"]),
+    bend=st.tuples(*[st.floats(-0.08, 0.08)] * 4),
+    size=st.tuples(st.integers(20, 160), st.integers(20, 160)),
+    focal=st.floats(15.0, 400.0),
+    stretch=st.floats(0.8, 1.25),
+    middle=st.tuples(st.floats(0.1, 0.9), st.floats(0.1, 0.9)),
+)
+@example(
+    model="equidistant",
+    bend=(0.0, 0.01171875, 0.0, 0.0),
+    size=(112, 85),
+    focal=15.0,
+    stretch=1.0,
+    middle=(0.25, 0.25),
+)
+@settings(max_examples=60, deadline=None)
+def test_no_pixel_of_small_triangles_is_missed_by_any_lens(
+    model: DistortionModel,
+    bend: tuple[float, ...],
+    size: tuple[int, int],
+    focal: float,
+    stretch: float,
+    middle: tuple[float, float],
+) -> None:
+    """Where a ray meets a ball, the ball is drawn or what is before it."""
+    raster, middles, radii = swarm()
+    k1, k2, k3, k4 = bend
+    if model != "equidistant":
+        bend = k1, k2, 0.02 * k3, 0.02 * k4, 0.0
+    if model == "rational_polynomial":
+        bend = *bend, 0.1, 0.02, 0.0
+    width, height = size
+    info = CameraInfo(
+        width=width,
+        height=height,
+        fx=focal,
+        fy=focal * stretch,
+        cx=middle[0] * width,
+        cy=middle[1] * height,
+        distortion_model=model,
+        distortion=bend,
+    )
+    _, depth, numbers = raster.draw(View(info), False, True, True)
+    assert depth is not None
+    assert numbers is not None
+    rays = pixel_rays(info).reshape(-1, 3)
+    along = rays @ middles.T
+    aside = np.sqrt(np.maximum((middles**2).sum(axis=1) - along**2, 0.0))
+    met = (along > 0.0) & (aside < 0.93 * radii)  # triangles are within their ball
+    distance = np.where(met, along, np.inf).min(axis=1)
+    wanted = np.isfinite(distance)
+    assert (numbers.ravel()[wanted] >= 0).all()
+    ahead = wanted & (rays[:, 2] > 0.01)
+    assert (depth.ravel()[ahead] <= (distance * rays[:, 2])[ahead] + 1e-4).all()
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
