@@ -5,29 +5,28 @@ for one thing as quickly as it is answered, in every other window of a second: a
 state, an image, each in turns. Each such window is compared with the quiet one just before it,
 and the median of all such pairs is told, as in `bench.flood`.
 
-``python -m bench.airsim PORT ROUNDS`` is the client: it prints a line for each window.
+``python -m bench.airsim PORT ROUNDS`` is the client: it prints a line for each window, with the
+round trips (ns).
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from bench.lateness import LateRow, figures, hover, lateness, ratios
+from bench.benchmarks import Progress, Row
+from bench.harness import silent
+from bench.lateness import WINDOW, Window, figures, lateness, windows_beside
 from bench.system import free_port
 from sims.airsim.client.connection import RpcClient
 from sims.airsim.wire import ImageRequest
 
-WINDOW = 1.0  # seconds
 START = 12.0  # seconds from the start of the run until the first window at the latest
 
 IMAGE = ImageRequest("0", 0, False, False)
@@ -39,69 +38,33 @@ CASES: dict[str, tuple[Any, ...]] = {
 """AirSim requests to measure, by their names in the results."""
 
 
-class AirsimRow(LateRow, frozen=True, kw_only=True):
-    """Figures of a kind of window; `ratio_p99`: median ratio to paired quiet window.
-
-    Attributes:
-        case: ``quiet``, or the request.
-        per_second: Answers.
-        median_us: Round trip as the client sees it; so `p99_us`.
-    """
-
-    case: str
-    per_second: float | None = None
-    median_us: float | None = None
-    p99_us: float | None = None
-
-
-class Window(NamedTuple):
-    """When a window began and ended (monotonic clock, ns), and its round trips (ns)."""
-
-    begin: int
-    end: int
-    round_trips: list[int]
-
-
-def measure(
-    *, rounds: int = 10, progress: Callable[[str], None] = lambda _: None
-) -> list[AirsimRow]:
+def measure(*, rounds: int = 10, progress: Progress = silent) -> list[Row]:
     """Measure quiet windows and others, in turns."""
-    progress(f"airsim: {2 * rounds * len(CASES)} windows of {WINDOW:g} s")
-    port = free_port()
-    windows: list[Window] = []
-    command = [sys.executable, "-m", "bench.airsim", str(port), str(rounds)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as client:
-        assert client.stdout is not None
-        lines = client.stdout
-        reading = threading.Thread(
-            target=lambda: windows.extend(Window(*json.loads(line)) for line in lines)
-        )
-        reading.start()
-        seconds = 2 * rounds * len(CASES) * WINDOW + START
-        hover("airsim", seconds, {"name": "airsim", "type": "AirsimServer", "port": port})
-        reading.join()
-    quiet, busy = windows[0::2], windows[1::2]
-    if len(busy) < rounds * len(CASES):
-        raise RuntimeError(f"expected {rounds * len(CASES)} busy windows, found {len(busy)}")
-    late = [lateness(window.begin, window.end) for window in quiet]
-    rows = [AirsimRow(case="quiet", **figures(late))]
+    count = rounds * len(CASES)
+    progress(f"airsim: {2 * count} windows of {WINDOW:g} s")
+    server = {"name": "airsim", "type": "AirsimServer", "port": free_port()}
+    words = (server["port"], rounds)
+    quiet, busy = windows_beside("bench.airsim", words, 2 * count * WINDOW + START, server)
+    if len(busy) < count:
+        raise RuntimeError(f"expected {count} busy windows, found {len(busy)}")
+    late = [*map(lateness, quiet)]
+    nothing = {"per_second": None, "median_us": None, "p99_us": None}
+    rows: list[Row] = [{**figures(late, late), "case": "quiet", **nothing}]
     for index, case in enumerate(CASES):
         rows.append(_row(case, busy[index :: len(CASES)], late[index :: len(CASES)]))
     return rows
 
 
-def _row(case: str, windows: list[Window], quiet: list[Any]) -> AirsimRow:
-    late = [lateness(window.begin, window.end) for window in windows]
-    trips = np.concatenate([window.round_trips for window in windows]) / 1e3
+def _row(case: str, windows: list[Window], quiet: list[Any]) -> Row:
+    trips = np.concatenate([window.found for window in windows]) / 1e3
     seconds = sum(window.end - window.begin for window in windows) / 1e9
-    return AirsimRow(
-        case=case,
-        per_second=len(trips) / seconds,
-        median_us=float(np.median(trips)),
-        p99_us=float(np.percentile(trips, 99)),
-        ratio_p99=ratios(late, quiet)[1],
-        **figures(late),
-    )
+    return {
+        **figures([*map(lateness, windows)], quiet),
+        "case": case,
+        "per_second": len(trips) / seconds,
+        "median_us": float(np.median(trips)),
+        "p99_us": float(np.percentile(trips, 99)),
+    }
 
 
 async def ask(port: int, rounds: int) -> None:

@@ -13,20 +13,19 @@ only the time to set.
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 
-from bench.system import free_port, in_turns, pair, zenoh_config, zenoh_publisher, zenoh_subscriber
+from bench.benchmarks import Progress, Row
+from bench.harness import in_turns, pair, program, silent
+from bench.lockstep import random_images
+from bench.system import free_port, zenoh_publisher, zenoh_session, zenoh_subscriber
 from events import Event, Image
 from nodes.ros2.messages.images import ImageWriter
 from nodes.ros2.messages.typestore import TypeStore
@@ -42,44 +41,12 @@ ENCODED_FIRST = 20  # images encoded by both sides before the first measurement
 
 IMAGE = "sensor_msgs/msg/Image"
 FRAME = "camera_optical_frame"
-IMAGES = {"512×512 rgb8": (512, 512, 3), "1080×1080 rgb8": (1080, 1080, 3)}
-
-
-class BridgeRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Round trips of a kind of event, ours and raw Zenoh's: medians, 99th percentiles.
-
-    Attributes:
-        bytes: Of its payload.
-        ours_per_second: Events of a burst that came through, each second.
-    """
-
-    case: str
-    bytes: int
-    samples: int
-    ours_us: float
-    zenoh_us: float
-    ratio: float
-    ours_p99_us: float
-    zenoh_p99_us: float
-    ours_per_second: float
-    zenoh_per_second: float
-
-
-class RosImageRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Encoding time of a kind of image, by the bridge and rosbags' ``serialize_cdr``.
-
-    Attributes:
-        bytes: Of a message.
-    """
-
-    case: str
-    bytes: int
-    samples: int
-    ours_us: float
-    rosbags_us: float
-    ratio: float
-    ours_p99_us: float
-    rosbags_p99_us: float
+CASES: dict[str, tuple[int, ...] | None] = {
+    "small event": None,
+    "512×512 rgb8": (512, 512, 3),
+    "1080×1080 rgb8": (1080, 1080, 3),
+}
+"""Shapes of the images, by what is measured."""
 
 
 class Asked(Event):
@@ -127,104 +94,81 @@ class Asker(Node):
 
     samples = 1000
     raw: Raw
-    rows: list[BridgeRow]
-    progress: Callable[[str], None]
+    rows: list[Row]
+    progress: Progress
 
     async def run(self) -> None:
         """Measure, and end the run."""
-        cls = type(self)
-        cls.rows = [await self._measure("small event", None)]
-        for case, shape in IMAGES.items():
-            cls.rows.append(await self._measure(case, shape))
+        for case, shape in CASES.items():
+            self.progress(case)
+            self.rows.append(await self._measure(case, shape))
         self.stop("measured")
 
-    async def _measure(self, case: str, shape: tuple[int, ...] | None) -> BridgeRow:
-        self.progress(case)
+    async def _measure(self, case: str, shape: tuple[int, ...] | None) -> Row:
         data = None if shape is None else np.random.default_rng(0).integers(0, 255, shape, np.uint8)
         samples = self.samples if data is None else max(self.samples // 4, BLOCK)
         taken: dict[str, list[int]] = {"ours": [], "zenoh": []}
         for _, side in in_turns(taken, -(-(samples + WARM_UP) // BLOCK)):
             if side == "ours":
-                taken[side] += [await self._round_trip(data) for _ in range(BLOCK)]
+                taken[side] += [await self._exchange(data) for _ in range(BLOCK)]
             else:
                 taken[side] += await asyncio.to_thread(self.raw.round_trips, data, BLOCK)
         burst = 200 if data is None else 20
-        ours_burst = [await self._burst(data, burst) for _ in range(5)]
-        raw_burst = [await asyncio.to_thread(self.raw.burst, data, burst) for _ in range(5)]
-        return BridgeRow(
-            case=case,
-            bytes=64 if data is None else data.nbytes,
-            samples=samples,
-            ours_per_second=float(np.median(ours_burst)),
-            zenoh_per_second=float(np.median(raw_burst)),
+        bursts = {
+            "ours": [await self._exchange(data, burst) for _ in range(5)],
+            "zenoh": [await asyncio.to_thread(self.raw.exchange, data, burst) for _ in range(5)],
+        }
+        return {
+            "case": case,
+            "bytes": 64 if data is None else data.nbytes,
+            "samples": samples,
             **pair({side: times[WARM_UP:] for side, times in taken.items()}),
-        )
+            **{
+                f"{side}_per_second": burst * 1e9 / float(np.median(times))
+                for side, times in bursts.items()
+            },
+        }
 
-    async def _round_trip(self, data: npt.NDArray[np.uint8] | None) -> int:
-        begin = time.perf_counter_ns()
-        self._ask(data)
-        await anext(self.answers)
-        return time.perf_counter_ns() - begin
-
-    async def _burst(self, data: npt.NDArray[np.uint8] | None, count: int) -> float:
-        """Return events per second in a burst; only the last event is answered."""
+    async def _exchange(self, data: npt.NDArray[np.uint8] | None, count: int = 1) -> int:
+        """Return the nanoseconds of a burst; of small events only the last is answered."""
         begin = time.perf_counter_ns()
         for number in range(count):
-            self._ask(data, answer=number == count - 1)
+            now = self.clock.now()
+            if data is None:
+                last = number == count - 1
+                self.questions.send(Asked(stamp=now, source=self.name, number=0, answer=last))
+            else:
+                self.images.send(Image(stamp=now, source=self.name, frame_id="f", data=data))
         for _ in range(1 if data is None else count):
             await anext(self.answers)
-        return count * 1e9 / (time.perf_counter_ns() - begin)
-
-    def _ask(self, data: npt.NDArray[np.uint8] | None, *, answer: bool = True) -> None:
-        now = self.clock.now()
-        if data is None:
-            self.questions.send(Asked(stamp=now, source=self.name, number=0, answer=answer))
-        else:
-            self.images.send(Image(stamp=now, source=self.name, frame_id="f", data=data))
+        return time.perf_counter_ns() - begin
 
 
 class Raw:
     """The asking end of two bare sessions."""
 
     def __init__(self, locator: str) -> None:
-        import zenoh
-
-        self._session = zenoh.open(zenoh_config(listen=locator))
-        self._put = zenoh_publisher(self._session, "asked").put
+        self.session = zenoh_session(listen=locator)
+        self._put = zenoh_publisher(self.session, "asked").put
         self._answered = threading.Semaphore(0)
-        self._kept = zenoh_subscriber(self._session, "answered", lambda _: self._answered.release())
+        self._kept = zenoh_subscriber(self.session, "answered", lambda _: self._answered.release())
 
     def round_trips(self, data: npt.NDArray[np.uint8] | None, count: int) -> list[int]:
         """Return the nanoseconds of each."""
-        taken = []
-        for _ in range(count):
-            begin = time.perf_counter_ns()
-            self._ask(data)
-            self._answered.acquire()
-            taken.append(time.perf_counter_ns() - begin)
-        return taken
+        return [self.exchange(data) for _ in range(count)]
 
-    def burst(self, data: npt.NDArray[np.uint8] | None, count: int) -> float:
-        """Return events a second."""
+    def exchange(self, data: npt.NDArray[np.uint8] | None, count: int = 1) -> int:
+        """Return the nanoseconds of a burst."""
         begin = time.perf_counter_ns()
         for _ in range(count):
-            self._ask(data)
+            # Zenoh takes no arrays; their bytes are new each time, as an image is.
+            self._put(b"x" * 64 if data is None else data.tobytes())
         for _ in range(count):
             self._answered.acquire()
-        return count * 1e9 / (time.perf_counter_ns() - begin)
-
-    def close(self) -> None:
-        """End the session."""
-        self._session.close()  # type: ignore[no-untyped-call]
-
-    def _ask(self, data: npt.NDArray[np.uint8] | None) -> None:
-        # Zenoh takes no arrays; their bytes are new each time, as an image is.
-        self._put(b"x" * 64 if data is None else data.tobytes())
+        return time.perf_counter_ns() - begin
 
 
-def measure(
-    samples: int = 1000, progress: Callable[[str], None] = lambda _: None
-) -> list[BridgeRow]:
+def measure(*, samples: int = 1000, progress: Progress = silent) -> list[Row]:
     """Measure small events and images.
 
     Args:
@@ -232,20 +176,18 @@ def measure(
     """
     meet, locator = f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
     Asker.samples, Asker.progress, Asker.rows = samples, staticmethod(progress), []
-    with _other_process(meet, locator):
+    code = f"from bench.bridge import mirror; mirror({meet!r}, {locator!r})"
+    with program("-c", code) as process:
         Asker.raw = Raw(locator)
-        try:
+        with Asker.raw.session:
             execute(_config(meet), only=["asker"])
-        finally:
-            Asker.raw.close()
+        process.wait(10)
     return Asker.rows
 
 
 def mirror(meet: str, locator: str) -> None:
     """Run the answering process: a node, and a bare Zenoh session."""
-    import zenoh
-
-    with zenoh.open(zenoh_config(connect=locator)) as session:
+    with zenoh_session(connect=locator) as session:
         answer = zenoh_publisher(session, "answered").put
 
         def asked(sample: Any) -> None:
@@ -262,44 +204,27 @@ def _config(meet: str) -> Config:
     return parse({"run": run, "network": {"meet": meet}, "nodes": nodes}, "bench bridge")
 
 
-@contextmanager
-def _other_process(meet: str, locator: str) -> Iterator[None]:
-    code = f"from bench.bridge import mirror; mirror({meet!r}, {locator!r})"
-    process = subprocess.Popen([sys.executable, "-c", code])
-    try:
-        yield
-        process.wait(10)
-    finally:
-        process.kill()
-        process.wait()
-
-
-def measure_ros_images(repeats: int = 300) -> list[RosImageRow]:
+def measure_ros_images(*, repeats: int = 300, progress: Progress = silent) -> list[Row]:
     """Measure a colour image and a depth image of 512×512."""
-    drawn = np.random.default_rng(0)
-    return [
-        _measure_encoding("rgb8", drawn.integers(0, 256, (512, 512, 3), np.uint8), repeats),
-        _measure_encoding(
-            "32FC1", drawn.uniform(0.3, 20.0, (512, 512)).astype(np.float32), repeats
-        ),
-    ]
+    progress("images for ROS")
+    colours, depth = random_images(512)
+    return [_measure_encoding(*side, repeats) for side in (("rgb8", colours), ("32FC1", depth))]
 
 
-def _measure_encoding(encoding: str, data: npt.NDArray[Any], repeats: int) -> RosImageRow:
-    ours, theirs = _by_the_bridge(encoding, data), _by_rosbags(encoding, data)
+def _measure_encoding(encoding: str, data: npt.NDArray[Any], repeats: int) -> Row:
+    encoders = {"ours": _by_the_bridge(encoding, data), "rosbags": _by_rosbags(encoding, data)}
+    ours, theirs = encoders.values()
     for number in range(ENCODED_FIRST):
         if bytes(ours(number)) != bytes(theirs(number)):
             raise AssertionError(f"{encoding}: expected the same bytes of both")
-    encoders = {"ours": ours, "rosbags": theirs}
     taken: dict[str, list[int]] = {side: [] for side in encoders}
     for number, side in in_turns(encoders, repeats):
         begin = time.perf_counter_ns()
         encoders[side](number)
         taken[side].append(time.perf_counter_ns() - begin)
     height, width = data.shape[:2]
-    return RosImageRow(
-        case=f"{width}×{height} {encoding}", bytes=len(ours(0)), samples=repeats, **pair(taken)
-    )
+    case = f"{width}×{height} {encoding}"
+    return {"case": case, "bytes": len(ours(0)), "samples": repeats, **pair(taken)}
 
 
 def _by_the_bridge(encoding: str, data: npt.NDArray[Any]) -> Callable[[int], Any]:

@@ -1,16 +1,16 @@
-"""Commands ``python -m runtime bench …``, a benchmark each."""
+"""Commands ``python -m runtime bench …``: those of the table of benchmarks, and some of its own."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import inspect
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from bench.system import CaseName
+from bench.benchmarks import BENCHMARKS, CHANGES, FEW_NODES, NODES, Benchmark, Progress, latency
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -29,9 +29,8 @@ Repeats = Annotated[int, typer.Option(min=1, help="Rounds, each in an order of i
 Only = Annotated[
     list[str] | None, typer.Option("--system", help="Only systems with this in their name.")
 ]
+ALL_NODES, SOME_NODES = (",".join(map(str, numbers)) for numbers in (NODES, FEW_NODES))
 Plots = Annotated[Path | None, typer.Option(help="Folder for box and scaling plots (PNG).")]
-
-ALL_NODES = "2,4,8,10,16,32,50,64,100,128"
 
 
 @app.command()
@@ -46,7 +45,7 @@ def small(
 ) -> None:
     """Measure the round trip from node 1 to N-1 listeners; the last listener replies."""
     counts = {"samples": samples, "warm_up": warm_up, "repeats": repeats}
-    _latency("small", json, nodes, only, plots, **counts)
+    _latency(json, nodes, plots, case="small", only=only or (), **counts)
 
 
 @app.command()
@@ -55,7 +54,7 @@ def large(
     shared: Annotated[
         bool, typer.Option("--shared", help="Pass the array by reference instead of copying it.")
     ] = False,
-    nodes: Nodes = "2,16,128",
+    nodes: Nodes = SOME_NODES,
     samples: SampleCount = 2_000,
     warm_up: WarmUp = 200,
     repeats: Repeats = 3,
@@ -63,155 +62,48 @@ def large(
     plots: Plots = None,
 ) -> None:
     """Measure the same with 1080×1080 float32 (4.67 MB) in each ping."""
-    case: CaseName = "large-shared" if shared else "large"
+    case = "large-shared" if shared else "large"
     counts = {"samples": samples, "warm_up": warm_up, "repeats": repeats}
-    _latency(case, json, nodes, only, plots, **counts)
+    _latency(json, nodes, plots, case=case, only=only or (), **counts)
 
 
-@app.command()
-def stall(
-    json: Json = None,
-    seconds: Annotated[float, typer.Option(min=0.5, help="Length of each run.")] = 6.0,
-    repeats: Annotated[int, typer.Option(min=1, help="Runs of each mode, interleaved.")] = 3,
-    rate: Annotated[float, typer.Option(min=0.1, help="Hertz of the camera.")] = 10.0,
-    size: Annotated[int, typer.Option(min=16, help="Width and height of its images.")] = 512,
-) -> None:
-    """Measure 400 Hz tick lateness: no camera, camera inline, camera beside the loop."""
-    from bench.stall import measure
+def _add_command(name: str, benchmarks: Sequence[Benchmark]) -> None:
+    """Add the command that runs benchmarks of the table, with the options of all."""
 
-    options: dict[str, Any] = {"seconds": seconds, "repeats": repeats, "rate": rate, "size": size}
-    _show(json, stall=lambda say: measure(progress=say, **options))
+    def command(json: Path | None, **values: float) -> None:
+        from rich.console import Console
 
+        from bench.results import write_json
 
-@app.command()
-def throughput(json: Json = None) -> None:
-    """Measure events and images a second, through handlers, streams and workers."""
-    from bench.throughput import measure
+        measured = []
+        with _status() as say:
+            for benchmark in benchmarks:
+                say(benchmark.name.replace("_", " "))
+                measured.append(benchmark.run(values, say))
+        for benchmark, rows in zip(benchmarks, measured, strict=True):
+            Console().print(benchmark.table.terminal(rows))
+        if json is not None:
+            write_json(json, [row for rows in measured for row in rows])
 
-    _show(json, throughput=lambda _: measure())
-
-
-@app.command()
-def idle(
-    json: Json = None,
-    seconds: Annotated[float, typer.Option(min=0.5, help="Length of the run.")] = 10.0,
-) -> None:
-    """Measure the processor time of a single 100 Hz timer node."""
-    from bench.throughput import measure_idle
-
-    _show(json, idle=lambda _: [measure_idle(seconds)])
-
-
-@app.command()
-def lockstep(
-    json: Json = None,
-    seconds: Annotated[float, typer.Option(min=1.0, help="Simulated, of each run.")] = 30.0,
-    repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 5,
-) -> None:
-    """Measure simulated seconds a second beside a bare loop, and where a frame's time goes."""
-    from bench.lockstep import measure, measure_parts
-
-    _show(
-        json,
-        lockstep=lambda say: measure(seconds=seconds, repeats=repeats, progress=say),
-        parts=lambda _: measure_parts(seconds=seconds / 3, repeats=repeats),
+    # Typer reads a command's options from its signature.
+    parameters = {"json": inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=None)}
+    annotations: dict[str, Any] = {"json": Json, "return": None}
+    for option in (option for benchmark in benchmarks for option in benchmark.options):
+        if option.name not in parameters:
+            parameters[option.name] = parameters["json"].replace(
+                name=option.name, default=option.default
+            )
+            setting = typer.Option(min=option.least, help=option.help)
+            annotations[option.name] = Annotated[type(option.default), setting]
+    command.__annotations__ = annotations
+    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [p.replace(annotation=annotations[p.name]) for p in parameters.values()]
     )
+    app.command(name, help=benchmarks[0].help)(command)
 
 
-@app.command()
-def frame(
-    json: Json = None,
-    places: Annotated[int, typer.Option(min=1, help="Views of each world.")] = 5,
-    repeats: Annotated[int, typer.Option(min=1, help="Starts of each run.")] = 5,
-) -> None:
-    """Measure a drawn frame by world and lens, and the time from a start to the first image."""
-    from bench.frame import measure, measure_first_image
-
-    _show(
-        json,
-        frame=lambda say: measure(places=places, progress=say),
-        first_image=lambda _: measure_first_image(repeats=repeats),
-    )
-
-
-@app.command()
-def bridge(
-    json: Json = None,
-    samples: Annotated[
-        int, typer.Option(min=100, help="Round trips with small events; a quarter with images.")
-    ] = 2000,
-    repeats: Annotated[int, typer.Option(min=30, help="Images encoded for ROS.")] = 300,
-) -> None:
-    """Measure events between two processes against raw Zenoh, and ROS image encoding."""
-    from bench.bridge import measure, measure_ros_images
-
-    _show(
-        json,
-        bridge=lambda say: measure(samples, say),
-        ros_images=lambda _: measure_ros_images(repeats),
-    )
-
-
-@app.command()
-def link(
-    json: Json = None,
-    samples: Annotated[int, typer.Option(min=30, help="Frames each way, in turns.")] = 1000,
-) -> None:
-    """Measure a frame to a program outside and back, beside a call of a worker."""
-    from bench.outside import measure_link
-
-    _show(json, link=lambda _: measure_link(samples))
-
-
-@app.command()
-def held(
-    json: Json = None,
-    seconds: Annotated[float, typer.Option(min=2.0, help="Simulated, of each flight.")] = 8.0,
-    repeats: Annotated[int, typer.Option(min=1, help="Flights of each side, in turns.")] = 5,
-) -> None:
-    """Measure a lockstep flight with odometry in an outside program, and in a worker."""
-    from bench.outside import measure_held
-
-    _show(json, held=lambda say: measure_held(seconds=seconds, repeats=repeats, progress=say))
-
-
-@app.command()
-def recording(
-    json: Json = None,
-    seconds: Annotated[float, typer.Option(min=3.0, help="Length of each run.")] = 6.0,
-    repeats: Annotated[int, typer.Option(min=1, help="Runs of each kind, in turns.")] = 5,
-    rate: Annotated[float, typer.Option(min=1.0, help="Hertz of the camera.")] = 30.0,
-) -> None:
-    """Measure the lateness of a 400 Hz tick with and without a recorder."""
-    from bench.lateness import measure_recording
-
-    options: dict[str, Any] = {"seconds": seconds, "repeats": repeats, "rate": rate}
-    _show(json, recording=lambda say: measure_recording(progress=say, **options))
-
-
-@app.command()
-def flood(
-    json: Json = None,
-    windows: Annotated[
-        int, typer.Option(min=4, help="Of a second each, every other flooded.")
-    ] = 30,
-    rate: Annotated[float, typer.Option(min=1, help="Messages a second of a flood.")] = 10_000.0,
-) -> None:
-    """Measure how late a 400 Hz tick is while ROS 2 messages flood in."""
-    from bench.flood import measure
-
-    _show(json, flood=lambda say: measure(windows=windows, rate=rate, progress=say))
-
-
-@app.command()
-def airsim(
-    json: Json = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Windows of a second of each case.")] = 10,
-) -> None:
-    """Measure how quickly AirSim's server answers, and how late a 400 Hz tick is meanwhile."""
-    from bench.airsim import measure
-
-    _show(json, airsim=lambda say: measure(rounds=rounds, progress=say))
+for _name in [benchmark.name for benchmark in BENCHMARKS if not benchmark.command]:
+    _add_command(_name, [b for b in BENCHMARKS if _name in (b.name, b.command)])
 
 
 @app.command("all")
@@ -223,11 +115,12 @@ def everything(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer nodes, rounds, samples.")] = False,
 ) -> None:
     """Run every benchmark, and write the page of results."""
-    from bench.page import measure, write
+    from bench.page import write
+    from bench.results import measure_everything
 
     path = page or out / "RESULTS.md"
     with _status() as say:
-        write(measure(quick=quick, progress=say), out, path)
+        write(measure_everything(quick=quick, progress=say), out, path)
     print(path)
 
 
@@ -240,32 +133,23 @@ def compare(
     from rich.console import Console
 
     from bench.results import compare as changes_between
-    from bench.tables import TABLES
 
     changes = changes_between(before, after)
-    real = [change for change in changes if change.real]
+    real = [change for change in changes if change["real"]]
     if real:
-        Console().print(TABLES["changes"].terminal(real))
+        Console().print(CHANGES.terminal(real))
     print(f"{len(real)} of {len(changes)} figures changed beyond the noise")
 
 
-def _latency(
-    case: CaseName,
-    json: Path | None,
-    nodes: str,
-    only: list[str] | None,
-    plots: Path | None,
-    **counts: int,
-) -> None:
+def _latency(json: Path | None, nodes: str, plots: Path | None, **options: Any) -> None:
     from rich.console import Console
 
     from bench.driver import measure_all
     from bench.results import write_json
-    from bench.tables import latency
 
     numbers = _numbers(nodes)
     with _status() as say:
-        outcome = measure_all(case, nodes=numbers, only=only or (), progress=say, **counts)
+        outcome = measure_all(nodes=numbers, progress=say, **options)
     if plots is not None:
         from bench.page import draw
 
@@ -291,7 +175,7 @@ def _numbers(nodes: str) -> list[int]:
 
 
 @contextlib.contextmanager
-def _status() -> Iterator[Callable[..., None]]:
+def _status() -> Iterator[Progress]:
     """Show a status line of the current work, on a terminal only."""
     from rich.console import Console
 
@@ -299,20 +183,3 @@ def _status() -> Iterator[Callable[..., None]]:
         yield lambda what, share=None: status.update(
             what if share is None else f"{share:4.0%}  {what}"
         )
-
-
-def _show(json: Path | None, **benchmarks: Callable[[Callable[..., None]], list[Any]]) -> None:
-    from rich.console import Console
-
-    from bench.results import write_json
-    from bench.tables import TABLES
-
-    measured = {}
-    with _status() as say:
-        for name, measure in benchmarks.items():
-            say(name.replace("_", " "))
-            measured[name] = measure(say)
-    for name, rows in measured.items():
-        Console().print(TABLES[name].terminal(rows))
-    if json is not None:
-        write_json(json, [row for rows in measured.values() for row in rows])

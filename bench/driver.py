@@ -15,37 +15,17 @@ import pkgutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from bench.system import Case, CaseName, Mode, Samples, System, in_turns
+from bench.benchmarks import Progress, Row
+from bench.harness import in_turns, silent
+from bench.system import Case, CaseName, Mode, Samples, System
 
 _LIMIT = 120.0  # time limit of a measurement, seconds
-
-
-class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """Statistics of a system at a number of nodes, over all rounds' pooled samples.
-
-    Attributes:
-        rounds_us: Median of each round.
-    """
-
-    case: str
-    system: str
-    mode: str
-    nodes: int
-    place: str
-    samples: int
-    median_us: float
-    mean_us: float
-    q1_us: float
-    q3_us: float
-    p99_us: float
-    max_us: float
-    rounds_us: tuple[float, ...]
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -82,7 +62,7 @@ def measure_all(
     repeats: int,
     only: Iterable[str] = (),
     budget: float = 1.0,
-    progress: Callable[[str, float], None] = lambda *_: None,
+    progress: Progress = silent,
 ) -> Outcome:
     """Measure a case with all installed systems.
 
@@ -129,7 +109,7 @@ def measure_all(
             missing[f"{system.name}, {mode}, {n} nodes"] = _reason(error)
     places = {s.name: s.place for entries in known.values() for s in entries}
     rows = [_row(case, *key, places[key[0]], runs) for key, runs in taken.items()]
-    rows.sort(key=lambda r: (r.mode, r.nodes, r.median_us))
+    rows.sort(key=lambda r: (r["mode"], r["nodes"], r["median_us"]))
     return Outcome(rows, missing, versions)
 
 
@@ -162,13 +142,15 @@ def _reason(error: Exception) -> str:
 
 
 def _row(case: str, system: str, mode: str, nodes: int, place: str, runs: Sequence[Samples]) -> Row:
+    """Return the figures of all rounds' pooled samples; ``rounds_us`` are each round's medians."""
     pooled = np.concatenate(runs) / 1e3
     q1, median, q3, p99 = np.percentile(pooled, [25, 50, 75, 99]).tolist()
-    return Row(
-        case=case, system=system, mode=mode, nodes=nodes, place=place, samples=len(pooled),
-        median_us=median, mean_us=float(pooled.mean()), q1_us=q1, q3_us=q3, p99_us=p99,
-        max_us=float(pooled.max()), rounds_us=tuple(float(np.median(run)) / 1e3 for run in runs),
-    )  # fmt: skip
+    figures = {"median_us": median, "mean_us": pooled.mean(), "q1_us": q1, "q3_us": q3}
+    figures |= {"p99_us": p99, "max_us": pooled.max()}
+    which = {"case": case, "system": system, "mode": mode, "nodes": nodes, "place": place}
+    rounds = [float(np.median(run)) / 1e3 for run in runs]
+    numbers = {key: float(value) for key, value in figures.items()}
+    return {**which, "samples": len(pooled), **numbers, "rounds_us": rounds}
 
 
 def find(module: str, name: str) -> System:

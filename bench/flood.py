@@ -13,19 +13,17 @@ line of input then ends it; a number in it is the size of a last message, that o
 
 from __future__ import annotations
 
-import contextlib
 import json
-import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import zenoh
 
-from bench.lateness import LateRow, figures, hover, lateness, ratios
-from bench.system import free_port, zenoh_config
+from bench.benchmarks import Progress, Row
+from bench.harness import silent
+from bench.lateness import WINDOW, Window, figures, lateness, ratios, windows_beside
+from bench.system import free_port, zenoh_session
 from nodes.ros2.bridge.keys import data_key
 from nodes.ros2.messages.topics import Topic
 from nodes.ros2.messages.typestore import TypeStore
@@ -33,27 +31,8 @@ from nodes.ros2.messages.typestore import TypeStore
 TWIST = "geometry_msgs/msg/Twist"
 BURST = 0.001  # seconds between bursts of messages
 
-RATE = 10_000.0
-WINDOW = 1.0  # seconds
 
-
-class FloodRow(LateRow, frozen=True, kw_only=True):
-    """Figures of a kind of window; `ratio_p99`: median ratio to paired quiet window.
-
-    Attributes:
-        case: ``quiet`` or ``flood``.
-        messages_per_second: Received.
-        ratio_p50: Median of the pairs' ratios of medians.
-    """
-
-    case: str
-    messages_per_second: float
-    ratio_p50: float
-
-
-def measure(
-    *, windows: int = 30, rate: float = RATE, progress: Callable[[str], None] = lambda _: None
-) -> list[FloodRow]:
+def measure(*, windows: int = 30, rate: float = 10_000.0, progress: Progress = silent) -> list[Row]:
     """Measure quiet windows and flooded ones, in turns.
 
     Args:
@@ -62,73 +41,35 @@ def measure(
     """
     progress(f"{windows} windows of {WINDOW:g} s, every other with {rate:g} messages a second")
     port = free_port()
-    found: list[tuple[int, int, int]] = []
-    with _flooder(port, rate, windows, found):
-        bridge = {
-            "name": "ros2",
-            "type": "Ros2Bridge",
-            "connect": [],
-            "listen": [f"tcp/127.0.0.1:{port}"],
-            "subscriptions": [{"topic": "/cmd_vel", "type": TWIST, "as": "velocity"}],
-        }
-        hover("flood", windows * WINDOW + 8.0, bridge)
-    quiet, flood = found[0::2], found[1::2]
+    bridge = {
+        "name": "ros2",
+        "type": "Ros2Bridge",
+        "connect": [],
+        "listen": [f"tcp/127.0.0.1:{port}"],
+        "subscriptions": [{"topic": "/cmd_vel", "type": TWIST, "as": "velocity"}],
+    }
+    key = data_key(0, Topic(name="/cmd_vel", type=TWIST, hash=TypeStore().hash(TWIST)))
+    words = (port, key, rate, WINDOW, windows)
+    quiet, flood = windows_beside("bench.flood", words, windows * WINDOW + 8.0, bridge)
     return [_row("quiet", quiet, quiet), _row("flood", flood, quiet)]
 
 
-@contextlib.contextmanager
-def _flooder(
-    port: int, rate: float, windows: int, found: list[tuple[int, int, int]]
-) -> Iterator[None]:
-    """Run the flood beside the block; `found` gets begin, end and number sent of each window."""
-    type_hash = TypeStore().hash(TWIST)
-    key = data_key(0, Topic(name="/cmd_vel", type=TWIST, hash=type_hash))
-    words = [str(port), key, str(rate), str(WINDOW), str(windows)]
-    command = [sys.executable, "-m", "bench.flood", *words]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        reading = threading.Thread(target=_read, args=(process, found), daemon=True)
-        reading.start()
-        try:
-            yield
-        finally:
-            process.kill()
-            reading.join()
-
-
-def _read(process: subprocess.Popen[str], found: list[tuple[int, int, int]]) -> None:
-    assert process.stdin is not None
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line == "ready\n":
-            time.sleep(1.0)  # for the vehicle to have taken off
-            process.stdin.write("go\n")
-            process.stdin.flush()
-        else:
-            found.append(tuple(json.loads(line)))
-
-
-def _row(
-    case: str, windows: list[tuple[int, int, int]], quiet: list[tuple[int, int, int]]
-) -> FloodRow:
-    lates, befores = ([lateness(*window[:2]) for window in side] for side in (windows, quiet))
-    ratio_p50, ratio_p99 = ratios(lates, befores)
-    seconds = sum(end - begin for begin, end, _ in windows) / 1e9
-    return FloodRow(
-        case=case,
-        messages_per_second=sum(sent for *_, sent in windows) / seconds,
-        ratio_p50=ratio_p50,
-        ratio_p99=ratio_p99,
-        **figures(lates),
-    )
+def _row(case: str, windows: list[Window], quiet: list[Window]) -> Row:
+    lates, befores = ([*map(lateness, side)] for side in (windows, quiet))
+    seconds = sum(window.end - window.begin for window in windows) / 1e9
+    return {
+        **figures(lates, befores),
+        "case": case,
+        "messages_per_second": sum(window.found for window in windows) / seconds,
+        "ratio_p50": ratios(lates, befores)[0],
+    }
 
 
 def main(port: int, key: str, rate: float, seconds: float, windows: int) -> None:
     """Send a flood of messages in every second window; the first window is quiet."""
     store = TypeStore()
     twist = bytes(store.serialize(store.zero(TWIST)))
-    with zenoh.open(zenoh_config(connect=f"tcp/127.0.0.1:{port}")) as session:
+    with zenoh_session(connect=f"tcp/127.0.0.1:{port}") as session:
         publisher: Any = session.declare_publisher(
             key, congestion_control=zenoh.CongestionControl.BLOCK
         )

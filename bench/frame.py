@@ -8,20 +8,20 @@ of the places the median.
 
 from __future__ import annotations
 
+import functools
 import math
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import msgspec
 import numpy as np
 
-from bench.system import in_turns
+from bench.benchmarks import Progress, Row
+from bench.harness import lines_of, paired, silent, timed
 from events import Image
 from events.frames import from_rpy
 from runtime import Input, Node
@@ -59,23 +59,6 @@ CAMERAS = {
 }
 
 
-class FrameRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Cost of a frame: colour, depth and object numbers."""
-
-    world: str
-    camera: str
-    raster_ms: float
-    mujoco_ms: float | None  # None: there is no OpenGL here
-    ratio: float | None  # of MuJoCo's to ours
-
-
-class FirstImageRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Seconds from the start of ``python -m runtime run`` to its first image, median."""
-
-    world: str
-    seconds: float
-
-
 class Firsts(Node):
     """Ends the run at the first image."""
 
@@ -88,7 +71,7 @@ class Firsts(Node):
             self.stop("it came")
 
 
-def measure(*, places: int = 5, progress: Callable[[str], None] = lambda _: None) -> list[FrameRow]:
+def measure(*, places: int = 5, progress: Progress = silent) -> list[Row]:
     """Measure at a number of places of each world, with both renderers in turns."""
     rows = []
     for world in WORLDS:
@@ -97,7 +80,7 @@ def measure(*, places: int = 5, progress: Callable[[str], None] = lambda _: None
     return rows
 
 
-def _measure_world(world: str, places: int) -> list[FrameRow]:
+def _measure_world(world: str, places: int) -> list[Row]:
     spec = load_world(world)
     prefix = add_free_camera(spec, "free", tuple(CAMERAS.values()))
     model = spec.compile()
@@ -114,29 +97,26 @@ def _measure_world(world: str, places: int) -> list[FrameRow]:
         place = np.asarray(tour[number * len(tour) // places])
         for camera, each in CAMERAS.items():
             shot = _shot(each, model.nq, place, 0.9 * number)
-            for _, name in in_turns(renderers, 1):
-                times = []
-                for _ in range(3):
-                    start = time.perf_counter()
-                    renderers[name].expose((shot,))
-                    times.append(time.perf_counter() - start)
-                taken.setdefault((camera, name), []).append(1e3 * min(times))
-    for renderer in renderers.values():
-        renderer.close()
-    rows = []
+            sides = {
+                name: functools.partial(_draw, renderer, shot)
+                for name, renderer in renderers.items()
+            }
+            for renderer, times in paired(sides, 1).items():
+                taken.setdefault((camera, renderer), []).extend(times)
+    for each_renderer in renderers.values():
+        each_renderer.close()
+    rows: list[Row] = []
     for camera in CAMERAS:
         ours, other = (median(taken.get((camera, name), [math.nan])) for name in RENDERERS)
-        known = not math.isnan(other)
-        rows.append(
-            FrameRow(
-                world=world,
-                camera=camera,
-                raster_ms=ours,
-                mujoco_ms=other if known else None,
-                ratio=other / ours if known else None,
-            )
-        )
+        known = not math.isnan(other)  # without OpenGL there are no figures
+        compared = {"mujoco_ms": other if known else None, "ratio": other / ours if known else None}
+        rows.append({"world": world, "camera": camera, "raster_ms": ours, **compared})
     return rows
+
+
+def _draw(renderer: CameraRenderer, shot: Shot) -> float:
+    """Return the milliseconds of the best of three drawings."""
+    return min(timed(lambda: renderer.expose((shot,))) for _ in range(3)) / 1e6
 
 
 def _shot(spec: CameraSpec, nq: int, place: Any, heading: float) -> Shot:
@@ -169,28 +149,29 @@ type = "bench.frame:Firsts"
 """
 
 
-def measure_first_image(*, repeats: int = 5) -> list[FirstImageRow]:
-    """Measure whole processes, from their start to their first image and end."""
-    rows = []
+def measure_first_image(*, repeats: int = 5, progress: Progress = silent) -> list[Row]:
+    """Measure whole processes, from their start to their first image and end; medians."""
+    rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         for world in ("hall", "yard"):
             path = Path(folder) / f"{world}.toml"
             path.write_text(_FILE.format(world=world), encoding="utf-8")
             taken = []
-            for _ in range(repeats + 1):
-                start = time.perf_counter()
-                with subprocess.Popen(
-                    [sys.executable, "-u", "-m", "runtime", "run", str(path)],
-                    cwd=folder,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.STDOUT,
-                    text=True,
-                ) as process:
-                    assert process.stdout is not None
-                    for line in process.stdout:
-                        if "first image" in line:
-                            taken.append(time.perf_counter() - start)
-                            break
-                    process.stdout.read()
-            rows.append(FirstImageRow(world=world, seconds=median(taken[1:])))  # textures drawn
+            for number in range(repeats + 1):
+                progress(f"first image of {world}, {number} of {repeats}")
+                taken.append(_start(path))
+            rows.append({"world": world, "seconds": median(taken[1:])})  # textures drawn
     return rows
+
+
+def _start(path: Path) -> float:
+    """Return the seconds from a run's start to its first image, after its end."""
+    begin, seconds = time.perf_counter(), math.nan
+    command = [sys.executable, "-u", "-m", "runtime", "run", str(path)]
+    with subprocess.Popen(
+        command, cwd=path.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        for line in lines_of(process):
+            if "first image" in line and math.isnan(seconds):
+                seconds = time.perf_counter() - begin
+    return seconds

@@ -6,17 +6,20 @@ clock. Runs with a recorder and without take turns, and the ratio is the median 
 
 from __future__ import annotations
 
+import functools
+import json
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from bench.system import in_turns
+from bench.benchmarks import Progress, Row
+from bench.harness import lines_of, paired, program, silent
 from events import Takeoff
 from runtime import Node, NodeConfig, Output, Tick, every
 from runtime.config.reading import parse
@@ -24,22 +27,10 @@ from runtime.run.execute import execute
 
 C = TypeVar("C", bound=NodeConfig)
 
+EDGE_NS = 30_000_000
+"""Margin at both ends of a window whose ticks are left out, ns: messages may be late."""
 
-class LateRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Base of the rows.
-
-    Attributes:
-        late_p50_us: Median lateness of the 400 Hz tick, microseconds.
-        late_p99_us: Its 99th percentile; of several runs, the median of theirs.
-        ratio_p99: Of the 99th percentile, to that of the row or of the runs that it is held
-            against.
-    """
-
-    ticks: int
-    late_p50_us: float
-    late_p99_us: float
-    late_max_us: float
-    ratio_p99: float = 1.0
+WINDOW = 1.0  # seconds
 
 
 class Beat(NamedTuple):
@@ -50,9 +41,6 @@ class Beat(NamedTuple):
     late: int
     missed: int
 
-
-EDGE_NS = 30_000_000
-"""Margin at both ends of a window whose ticks are left out, ns: messages may be late."""
 
 BEATS: list[Beat] = []  # ticks of this process's probe; the measuring code clears the list
 
@@ -87,21 +75,61 @@ def hover(benchmark: str, seconds: float, *nodes: dict[str, Any]) -> None:
     execute(parse({"run": run, "nodes": here}, f"bench {benchmark}"))
 
 
-def figures(runs: Sequence[Any]) -> dict[str, Any]:
-    """Return the fields of a row; each run is a list of lateness, nanoseconds."""
+class Window(NamedTuple):
+    """Window of time: begin and end (monotonic clock, ns), and what a program tells of it."""
+
+    begin: int
+    end: int
+    found: Any
+
+
+def windows_beside(
+    module: str, words: Sequence[object], seconds: float, node: dict[str, Any]
+) -> tuple[list[Window], list[Window]]:
+    """Hover while a program has quiet windows and busy ones in turns; return both.
+
+    The program prints a line for each window, as JSON. One that says ``ready`` gets a line as soon
+    as the vehicle has taken off.
+    """
+    windows: list[Window] = []
+    with program("-m", module, *words) as beside:
+        reading = threading.Thread(target=_read, args=(beside, windows), daemon=True)
+        reading.start()
+        hover(module.rpartition(".")[2], seconds, node)
+        beside.kill()
+        reading.join()
+    return windows[0::2], windows[1::2]
+
+
+def _read(process: Any, windows: list[Window]) -> None:
+    for line in lines_of(process):
+        if line == "ready\n":
+            time.sleep(1.0)  # for the vehicle to have taken off
+            process.stdin.write("go\n")
+            process.stdin.flush()
+        else:
+            windows.append(Window(*json.loads(line)))
+
+
+def figures(runs: Sequence[Any], beside: Sequence[Any]) -> Row:
+    """Return figures of runs or windows, held against others; lateness is in nanoseconds.
+
+    ``late_p99_us`` is the median of the runs' 99th percentiles; ``ratio_p99`` is as of `ratios`.
+    """
     late = np.concatenate(runs) / 1e3
     return {
         "ticks": len(late),
         "late_p50_us": float(np.median(late)),
         "late_p99_us": float(np.median([np.percentile(run, 99) for run in runs])) / 1e3,
         "late_max_us": float(late.max()),
+        "ratio_p99": ratios(runs, beside)[1],
     }
 
 
-def lateness(begin: int, end: int) -> npt.NDArray[np.float64]:
-    """Return how late the ticks of a window of time (monotonic clock, ns) were, nanoseconds."""
-    inside = (beat.late for beat in BEATS if begin + EDGE_NS < beat.at < end - EDGE_NS)
-    return np.array([*inside], np.float64)
+def lateness(window: Window) -> npt.NDArray[np.float64]:
+    """Return how late the ticks of a window were, nanoseconds."""
+    begin, end = window.begin + EDGE_NS, window.end - EDGE_NS
+    return np.array([beat.late for beat in BEATS if begin < beat.at < end], np.float64)
 
 
 def ratios(runs: Sequence[Any], beside: Sequence[Any]) -> tuple[float, float]:
@@ -117,88 +145,53 @@ def ratios(runs: Sequence[Any], beside: Sequence[Any]) -> tuple[float, float]:
     return p50, p99
 
 
-class RecordingRow(LateRow, frozen=True, kw_only=True):
-    """Runs of a kind, pooled; `ratio_p99` is the median of the pairs' ratios.
-
-    Attributes:
-        frames: Pairs of images received.
-        megabytes: Written.
-        dropped: Events missing from the recordings.
-    """
-
-    case: str
-    frames: int
-    megabytes: float
-    dropped: int
-
-
-class _Run(msgspec.Struct):
-    """Measurements of a run; lateness in nanoseconds."""
-
-    late: list[int] = []
-    frames: int = 0
-    megabytes: float = 0.0
-    dropped: int = 0
-
-
 WARM_UP = 1_500_000_000  # nanoseconds left out at the start of each run
 
-CASES: dict[str, dict[str, object] | None] = {
-    "no recorder": None,
-    "recorded, zstd": {"compression": "zstd"},
-    "recorded, lz4": {"compression": "lz4"},
+CASES: dict[str, list[dict[str, Any]]] = {
+    "no recorder": [],
+    "recorded, zstd": [{"name": "recorder", "type": "McapRecorder", "compression": "zstd"}],
+    "recorded, lz4": [{"name": "recorder", "type": "McapRecorder", "compression": "lz4"}],
 }
 
 
 def measure_recording(
-    *,
-    seconds: float = 6.0,
-    repeats: int = 5,
-    rate: float = 30.0,
-    progress: Callable[[str], None] = lambda _: None,
-) -> list[RecordingRow]:
+    *, seconds: float = 6.0, repeats: int = 5, rate: float = 30.0, progress: Progress = silent
+) -> list[Row]:
     """Measure all cases, in turns.
 
     Args:
         rate: Of the camera, Hz.
     """
-    found: dict[str, list[_Run]] = {case: [] for case in CASES}
-    for number, case in in_turns(CASES, repeats):
-        progress(f"{case}, {number + 1} of {repeats}")
-        found[case].append(_measure(CASES[case], seconds, rate))
-    late = {case: [run.late for run in runs] for case, runs in found.items()}
+    sides = {
+        case: functools.partial(_record, recorder, seconds, rate)
+        for case, recorder in CASES.items()
+    }
+    found = paired(sides, repeats, progress)
+    late = {case: [lates for lates, _ in runs] for case, runs in found.items()}
     return [
-        RecordingRow(
-            case=case,
-            ratio_p99=ratios(late[case], late["no recorder"])[1],
-            frames=sum(run.frames for run in runs),
-            megabytes=sum(run.megabytes for run in runs),
-            dropped=sum(run.dropped for run in runs),
-            **figures(late[case]),
-        )
+        {
+            **figures(late[case], late["no recorder"]),
+            "case": case,
+            **{key: sum(counts[key] for _, counts in runs) for key in runs[0][1]},
+        }
         for case, runs in found.items()
     ]
 
 
-def _measure(recorder: dict[str, object] | None, seconds: float, rate: float) -> _Run:
+def _record(recorder: list[dict[str, Any]], seconds: float, rate: float) -> tuple[list[int], Row]:
+    """Return the lateness of a run's ticks (ns), and pairs of images, megabytes and drops."""
     BEATS.clear()
     camera = {"name": "camera", "images": ["rgb", "depth"], "rate": rate}
-    nodes: list[dict[str, Any]] = [
-        {"name": "drone", "type": "Multirotor", "cameras": [camera]},
-        PROBE,
-    ]
-    if recorder is not None:
-        table = {"name": "recorder", "type": "McapRecorder"}
-        nodes.insert(0, table | recorder)
+    drone = {"name": "drone", "type": "Multirotor", "cameras": [camera]}
     run = {"clock": "real", "duration": seconds, "stall": 0, "log": "fatal"}
+    config = parse({"run": run, "nodes": [*recorder, drone, PROBE]}, "bench recording")
     with tempfile.TemporaryDirectory() as folder:
-        summary = execute(parse({"run": run, "nodes": nodes}, "bench recording"), Path(folder))
+        summary = execute(config, Path(folder))
         files = Path(folder).glob("*.mcap")
         megabytes = sum(file.stat().st_size for file in files) / 1e6
     time.sleep(0.5)  # what the last run leaves to do must not fall on the next
-    return _Run(
-        late=[beat.late for beat in BEATS if beat.stamp > WARM_UP],
-        frames=summary.events.get("DepthImage", 0),
-        megabytes=megabytes,
-        dropped=sum(summary.drops.values()),
-    )
+    return [beat.late for beat in BEATS if beat.stamp > WARM_UP], {
+        "frames": summary.events.get("DepthImage", 0),
+        "megabytes": megabytes,
+        "dropped": sum(summary.drops.values()),
+    }

@@ -20,16 +20,17 @@ from collections.abc import Callable
 from statistics import median
 from typing import Any
 
-import msgspec
 import numpy as np
 
+from bench.benchmarks import Progress, Row
+from bench.harness import paired, silent
 from bench.lateness import TakeoffNode
-from bench.system import in_turns
 from events import DepthImage, Image, Takeoff, VelocitySetpoint
 from runtime import NodeConfig, Output, Tick, every
 from runtime.channels.digest import Digest
 from runtime.config.reading import parse
 from runtime.run.execute import execute
+from runtime.summary import Summary
 from runtime.workers.shared_memory import SharedPipe, anonymous_file
 from sims.cameras import CameraSpec
 from sims.cameras.development import Development
@@ -42,31 +43,6 @@ CONTROL, IMU = 400, 200
 RATE, SIDE = 30, 512
 NOISE, DEPTH_NOISE = 2.0, 0.0015
 SHORT = 2.0
-
-
-class LockstepRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Speed of a way to simulate.
-
-    Attributes:
-        speed: Simulated seconds per second, median.
-        share: Of the time that is the runtime's own (`run` only).
-    """
-
-    case: str
-    speed: float
-    share: float | None = None
-
-
-class PartRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Part of the cost of a frame.
-
-    Attributes:
-        ms: Processor time of all processes, milliseconds a frame, median.
-    """
-
-    part: str
-    ms: float
-    share: float
 
 
 class Starter(TakeoffNode[NodeConfig]):
@@ -91,9 +67,7 @@ def _curve(stamp: int) -> VelocitySetpoint:
     return VelocitySetpoint(stamp=stamp, source="pilot", velocity=velocity)
 
 
-def measure(
-    *, seconds: float = 30.0, repeats: int = 5, progress: Callable[[str], None] = lambda _: None
-) -> list[LockstepRow]:
+def measure(*, seconds: float = 30.0, repeats: int = 5, progress: Progress = silent) -> list[Row]:
     """Measure, interleaved.
 
     Args:
@@ -104,38 +78,25 @@ def measure(
         "run": lambda: _run(seconds, []),
         "run with cameras": lambda: _run(seconds / 5, [{"name": "front"}]),
     }
-    taken: dict[str, list[float]] = {way: [] for way in ways}
-    for number, way in in_turns(ways, repeats):
-        progress(f"round {number + 1} of {repeats}")
-        taken[way].append(ways[way]())
-    bare, run, cameras = (median(times) for times in taken.values())
+    bare, run, cameras = (median(times) for times in paired(ways, repeats, progress).values())
     return [
-        LockstepRow(case="bare loop", speed=seconds / bare),
-        LockstepRow(case="run", speed=seconds / run, share=1 - bare / run),
-        LockstepRow(case="run with cameras", speed=seconds / 5 / cameras),
+        {"case": "bare loop", "speed": seconds / bare, "share": None},
+        {"case": "run", "speed": seconds / run, "share": 1 - bare / run},
+        {"case": "run with cameras", "speed": seconds / 5 / cameras, "share": None},
     ]
 
 
 def _run(seconds: float, cameras: list[dict[str, Any]]) -> float:
-    summary = execute(
-        parse(
-            {
-                "run": {"duration": seconds, "log": "error", "stall": 1},
-                "nodes": [
-                    {"name": "pilot", "type": f"{__name__}:Pilot"},
-                    {
-                        "name": "drone",
-                        "type": "Multirotor",
-                        "cameras": cameras,
-                        "control_rate": CONTROL,
-                        "imu_rate": IMU,
-                    },
-                ],
-            },
-            "bench lockstep",
-        )
-    )
-    return summary.wall_seconds
+    rates = {"control_rate": CONTROL, "imu_rate": IMU}
+    pilot = {"name": "pilot", "type": f"{__name__}:Pilot"}
+    drone = {"name": "drone", "type": "Multirotor", "cameras": cameras, **rates}
+    return lockstep_run(seconds, pilot, drone).wall_seconds
+
+
+def lockstep_run(seconds: float, *nodes: dict[str, Any]) -> Summary:
+    """Run nodes in lockstep as fast as possible, and return the summary."""
+    run = {"duration": seconds, "log": "error", "stall": 1}
+    return execute(parse({"run": run, "nodes": [*nodes]}, "bench lockstep"))
 
 
 def _bare(seconds: float) -> float:
@@ -161,45 +122,47 @@ def _bare(seconds: float) -> float:
     return time.monotonic() - begin
 
 
-def measure_parts(*, seconds: float = 10.0, repeats: int = 3) -> list[PartRow]:
+def measure_parts(
+    *, seconds: float = 30.0, repeats: int = 3, progress: Progress = silent
+) -> list[Row]:
     """Measure; pairs of a long and a short run follow each other.
 
     Args:
-        seconds: Simulated, by which the longer run is longer.
+        seconds: Simulated; by a third of it the longer run is longer.
     """
     wholes, workers = [], []
-    for _ in range(repeats):
+    for number in range(repeats):
+        progress(f"parts: {number + 1} of {repeats}")
         short, _ = _fly(SHORT)
-        long, cpu = _fly(SHORT + seconds)
-        wholes.append(1e3 * (long - short) / (seconds * RATE))
+        long, cpu = _fly(SHORT + seconds / 3)
+        wholes.append(1e3 * (long - short) / (seconds / 3 * RATE))
         workers.append(cpu)
     whole, drawn, odometry = median(wholes), *map(median, zip(*workers, strict=True))
     noise, copies, hashing = _noise(), _copies(), _hashing()
     parts = {"rendering": drawn - noise, "noise": noise, "copies": copies}
     parts |= {"odometry": odometry, "hashing": hashing}
     parts |= {"rest": whole - sum(parts.values()), "all": whole}
-    return [PartRow(part=part, ms=ms, share=ms / whole) for part, ms in parts.items()]
+    return [{"part": part, "ms": ms, "share": ms / whole} for part, ms in parts.items()]
 
 
 def _fly(seconds: float) -> tuple[float, tuple[float, float]]:
     """Return the processor time of a run (s), and of a call of renderer and odometry (ms)."""
     camera = {"name": "camera", "rate": RATE, "noise": NOISE, "depth_noise": DEPTH_NOISE}
-    nodes: list[dict[str, Any]] = [
+    before = sum(os.times()[:4])
+    summary = lockstep_run(
+        seconds,
         {"name": "drone", "type": "Multirotor", "cameras": [camera]},
         {"name": "pilot", "type": f"{__name__}:Starter"},
         {"name": "odometry", "type": "VisualOdometry"},
         {"name": "evaluation", "type": "Evaluation"},
-    ]
-    before = sum(os.times()[:4])
-    run = {"duration": seconds, "log": "error", "stall": 1}
-    summary = execute(parse({"run": run, "nodes": nodes}, "bench lockstep"))
+    )
     spent = sum(os.times()[:4]) - before
     cpu = {name.partition(".")[0]: worker.cpu_p50_ms for name, worker in summary.workers.items()}
     return spent, (cpu["drone"], cpu["odometry"])
 
 
 def _noise() -> float:
-    colours, depth = _images()
+    colours, depth = random_images(SIDE)
     random = generator(1, "camera", 0)
 
     camera = Development(CameraSpec(name="camera", noise=NOISE, depth_noise=DEPTH_NOISE))
@@ -217,7 +180,7 @@ def _copies() -> float:
     ours, theirs = socket.socketpair()
     here = SharedPipe(ours, *files)
     there = SharedPipe(theirs, *map(os.dup, reversed(files)))
-    images = _images()
+    images = random_images(SIDE)
 
     def hand_over() -> None:
         for _ in range(2):
@@ -232,7 +195,7 @@ def _copies() -> float:
 
 
 def _hashing() -> float:
-    colours, depth = _images()
+    colours, depth = random_images(SIDE)
     digest = Digest()
     image = Image(stamp=0, source="drone/camera", frame_id="camera", data=colours)
     far = DepthImage(stamp=0, source="drone/camera", frame_id="camera", data=depth)
@@ -244,10 +207,11 @@ def _hashing() -> float:
     return _cost(take_in)
 
 
-def _images() -> tuple[Any, Any]:
+def random_images(side: int) -> tuple[Any, Any]:
+    """Return a colour image and a depth image of random pixels."""
     random = np.random.default_rng(0)
-    colours = random.integers(0, 256, (SIDE, SIDE, 3), np.uint8)
-    return colours, random.uniform(1.0, 8.0, (SIDE, SIDE)).astype(np.float32)
+    colours = random.integers(0, 256, (side, side, 3), np.uint8)
+    return colours, random.uniform(1.0, 8.0, (side, side)).astype(np.float32)
 
 
 def _cost(do: Callable[[], None], calls: int = 100) -> float:

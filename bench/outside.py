@@ -13,8 +13,7 @@ outside: with ``answer`` it answers every frame, with ``track`` it is the odomet
 from __future__ import annotations
 
 import asyncio
-import os
-import subprocess
+import functools
 import sys
 import tempfile
 import time
@@ -28,35 +27,20 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 
-from bench.system import in_turns
+from bench.benchmarks import Progress, Row
+from bench.harness import in_turns, pair, paired, program, silent
+from bench.lockstep import lockstep_run, random_images
 from events import CameraInfo
 from nodes.estimators import WORKER_ENVIRONMENT
 from nodes.estimators.visual_odometry.node import VisualOdometryConfig, make_tracker
 from nodes.outside.native import Endpoint, LinkAnswer
 from nodes.outside.native.client import Link
-from runtime.config.reading import parse
-from runtime.run.execute import execute
 from runtime.summary import Summary
 from runtime.time.clock import RealClock
 from runtime.workers.worker import Worker
 
 WARM_UP = 30
 ESTIMATES = "odometry.estimates"
-
-
-class LinkRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Medians of a kind of frame: round trip by the native interface, call of a worker.
-
-    Attributes:
-        bytes: Of its images.
-    """
-
-    case: str
-    bytes: int
-    samples: int
-    link_us: float
-    worker_us: float
-    ratio: float
 
 
 class Taker:
@@ -66,11 +50,11 @@ class Taker:
         """Take a frame."""
 
 
-def measure_link(samples: int = 1000) -> list[LinkRow]:
+def measure_link(*, samples: int = 1000, progress: Progress = silent) -> list[Row]:
     """Measure an RGB-D frame of 512×512."""
-    drawn = np.random.default_rng(0)
-    colours = drawn.integers(0, 256, (512, 512, 3), np.uint8)
-    depth = drawn.uniform(0.3, 20.0, (512, 512)).astype(np.float32)
+    progress("a frame to a program and back")
+    colours, depth = random_images(512)
+    size = colours.nbytes + depth.nbytes
     with (
         tempfile.TemporaryDirectory() as folder,
         asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner,
@@ -86,7 +70,7 @@ def measure_link(samples: int = 1000) -> list[LinkRow]:
             path,
             {"cameras": [{"body_from_camera": np.eye(4).tolist()}], "inputs": [], "outputs": []},
             slots=2,
-            slot_bytes=colours.nbytes + depth.nbytes,
+            slot_bytes=size,
             answered=take,
             gone=lambda _: None,
             logged=lambda _: None,
@@ -97,33 +81,30 @@ def measure_link(samples: int = 1000) -> list[LinkRow]:
             await answers.get()
 
         endpoint.listen()
-        environment = {**os.environ, "VISNAV_SOCKET": str(path)}
-        with subprocess.Popen([sys.executable, "-m", "bench.outside", "answer"], env=environment):
+        with program("-m", "bench.outside", "answer", environment={"VISNAV_SOCKET": str(path)}):
             try:
                 endpoint.wait(60.0)
-                times = runner.run(_measure(by_link, (colours, depth), samples))
+                taken = runner.run(_measure(by_link, (colours, depth), samples))
             finally:
                 endpoint.close()
-    link, worker = np.median(times, axis=1) / 1e3
-    size = colours.nbytes + depth.nbytes
-    case = "512×512 rgb8, depth32f"
-    microseconds = {"link_us": link, "worker_us": worker, "ratio": link / worker}
-    return [LinkRow(case=case, bytes=size, samples=samples, **microseconds)]
+    figures = pair(taken)
+    shown = {key: figures[key] for key in ("link_us", "worker_us", "ratio")}
+    return [{"case": "512×512 rgb8, depth32f", "bytes": size, "samples": samples, **shown}]
 
 
 async def _measure(
     by_link: Callable[[], Awaitable[None]], frame: tuple[Any, Any], samples: int
-) -> list[list[int]]:
+) -> dict[str, list[int]]:
     clock = RealClock(asyncio.get_running_loop())
     worker = Worker("taker", clock, Taker, niceness=0)
     try:
         await worker.ready()
-        sides: list[Callable[[], Awaitable[None]]] = [
-            by_link,
-            lambda: worker.call(Taker.take, *frame),
-        ]
-        taken: list[list[int]] = [[] for _ in sides]
-        for number, side in in_turns(range(len(sides)), WARM_UP + samples):
+        sides: dict[str, Callable[[], Awaitable[None]]] = {
+            "link": by_link,
+            "worker": lambda: worker.call(Taker.take, *frame),
+        }
+        taken: dict[str, list[int]] = {side: [] for side in sides}
+        for number, side in in_turns(sides, WARM_UP + samples):
             begin = time.perf_counter_ns()
             await sides[side]()
             if number >= WARM_UP:
@@ -132,44 +113,6 @@ async def _measure(
     finally:
         await asyncio.to_thread(worker.close)
         clock.close()
-
-
-class HeldRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Simulated seconds per second: a way to an outside program, and a worker.
-
-    Attributes:
-        rounds: Flights of each side; speeds are medians.
-        equal: Whether all flights had the same estimates at the same times.
-    """
-
-    case: str
-    rounds: int
-    outside_speed: float
-    worker_speed: float
-    ratio: float
-    equal: bool
-
-
-def measure_held(
-    *, seconds: float = 8.0, repeats: int = 5, progress: Callable[[str], None] = lambda _: None
-) -> list[HeldRow]:
-    """Measure, interleaved."""
-    found: dict[str, list[Summary]] = {side: [] for side in _ESTIMATORS}
-    for number, side in in_turns(_ESTIMATORS, repeats):
-        progress(f"held: round {number + 1} of {repeats}")
-        found[side].append(_fly(seconds, _ESTIMATORS[side]))
-    outside, worker = (seconds / median(s.wall_seconds for s in side) for side in found.values())
-    said = {summary.digests[ESTIMATES] for side in found.values() for summary in side}
-    return [
-        HeldRow(
-            case="native interface",
-            rounds=repeats,
-            outside_speed=outside,
-            worker_speed=worker,
-            ratio=outside / worker,
-            equal=len(said) == 1,
-        )
-    ]
 
 
 _ESTIMATORS: dict[str, dict[str, Any]] = {
@@ -183,15 +126,28 @@ _ESTIMATORS: dict[str, dict[str, Any]] = {
 }
 
 
+def measure_held(
+    *, seconds: float = 8.0, repeats: int = 5, progress: Progress = silent
+) -> list[Row]:
+    """Measure, interleaved; ``equal`` if all flights had the same estimates at the same times."""
+    sides = {
+        side: functools.partial(_fly, seconds, estimator) for side, estimator in _ESTIMATORS.items()
+    }
+    found = paired(sides, repeats, progress)
+    outside, worker = (seconds / median(s.wall_seconds for s in side) for side in found.values())
+    said = {summary.digests[ESTIMATES] for side in found.values() for summary in side}
+    speeds = {"outside_speed": outside, "worker_speed": worker, "ratio": outside / worker}
+    return [{"case": "native interface", "rounds": repeats, **speeds, "equal": len(said) == 1}]
+
+
 def _fly(seconds: float, estimator: dict[str, Any]) -> Summary:
-    run = {"duration": seconds, "log": "error", "stall": 1}
     camera = {"name": "camera", "rate": 30, "noise": 2.0, "depth_noise": 0.0015}
-    nodes = [
+    return lockstep_run(
+        seconds,
         {"name": "pilot", "type": "bench.lockstep:Pilot"},
         {"name": "drone", "type": "Multirotor", "cameras": [camera]},
         {"name": "odometry", "latency": "15ms", **estimator},
-    ]
-    return execute(parse({"run": run, "nodes": nodes}, "bench held"))
+    )
 
 
 def track() -> None:

@@ -1,225 +1,31 @@
-"""All benchmarks in a single run, and ``RESULTS.md``: figures and plots, by ``page.md.jinja``."""
+"""Page of results, ``RESULTS.md``: figures by ``page.md.jinja``, and plots."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
-import msgspec
 from matplotlib.figure import Figure
 
-from bench import airsim, bridge, flood, frame, lateness, lockstep, outside, stall, throughput
-from bench.airsim import AirsimRow
-from bench.bridge import BridgeRow, RosImageRow
-from bench.driver import Outcome, Row, measure_all
-from bench.flood import FloodRow
-from bench.frame import FirstImageRow, FrameRow
-from bench.lateness import RecordingRow
-from bench.lockstep import LockstepRow, PartRow
-from bench.outside import HeldRow, LinkRow
-from bench.results import environment
-from bench.stall import StallRow
-from bench.system import NODES, CaseName
-from bench.tables import TABLES, latency
-from bench.throughput import IdleRow, ThroughputRow
+from bench.benchmarks import BENCHMARKS, ROUND_TRIPS, SECTIONS, Row, latency
+from bench.results import encode
 
 OURS = "visnav"
 
 
-class Results(msgspec.Struct, frozen=True, kw_only=True):
-    """All measurements; the content of ``results.json``."""
-
-    environment: dict[str, str]
-    quick: bool
-    rows: list[Row]
-    stall: list[StallRow]
-    throughput: list[ThroughputRow]
-    idle: IdleRow
-    lockstep: list[LockstepRow]
-    parts: list[PartRow] = []
-    frame: list[FrameRow] = []
-    first_image: list[FirstImageRow] = []
-    bridge: list[BridgeRow] = []
-    link: list[LinkRow] = []
-    held: list[HeldRow] = []
-    ros_images: list[RosImageRow] = []
-    recording: list[RecordingRow] = []
-    flood: list[FloodRow] = []
-    airsim: list[AirsimRow] = []
-    missing: dict[str, str]
-    versions: dict[str, str]
-
-
-QUICK_SYSTEMS = ("visnav", "plain", "asyncio.queue", "pyee", "thesis")
-"""Parts of the names of the systems in a quick run: systems quick to start."""
-
-
-def measure(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> Results:
-    """Run all benchmarks.
-
-    Args:
-        quick: Measure less: under two minutes.
-    """
-    few = (2, 16, 128)
-    outcomes: list[Outcome] = []
-    cases: list[tuple[CaseName, Sequence[int]]] = [
-        ("small", few if quick else NODES),
-        ("large", (2,) if quick else few),
-        ("large-shared", (2,) if quick else few),
-    ]
-    for case, nodes in cases:
-        outcome = measure_all(
-            case,
-            nodes=nodes,
-            samples=20_000 if case == "small" else 1_000,
-            warm_up=2_000 if case == "small" else 100,
-            repeats=3 if case == "small" and not quick else 2,
-            only=QUICK_SYSTEMS if quick else (),
-            budget=0.3 if quick else 0.5,
-            progress=progress,
-        )
-        outcomes.append(outcome)
-    progress("throughput")
-    through = throughput.measure()
-    progress("idle")
-    idling = throughput.measure_idle(3.0 if quick else 10.0)
-    return Results(
-        environment=environment(),
-        quick=quick,
-        rows=[row for outcome in outcomes for row in outcome.rows],
-        stall=stall.measure(
-            seconds=2.0 if quick else 6.0, repeats=2 if quick else 5, progress=progress
-        ),
-        throughput=through,
-        idle=idling,
-        lockstep=lockstep.measure(repeats=2 if quick else 5, progress=progress),
-        parts=lockstep.measure_parts(repeats=1 if quick else 5),
-        **beside(quick=quick, progress=progress),
-        missing={k: v for outcome in outcomes for k, v in outcome.missing.items()},
-        versions={k: v for outcome in outcomes for k, v in outcome.versions.items()},
-    )
-
-
-def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> dict[str, Any]:
-    """Run the benchmarks between processes and beside the loop, by field of `Results`."""
-    return {
-        "frame": frame.measure(places=1 if quick else 5, progress=progress),
-        "first_image": frame.measure_first_image(repeats=1 if quick else 5),
-        "bridge": bridge.measure(200 if quick else 2000, progress),
-        "link": outside.measure_link(100 if quick else 1000),
-        "held": outside.measure_held(
-            seconds=2.0 if quick else 8.0, repeats=1 if quick else 5, progress=progress
-        ),
-        "ros_images": bridge.measure_ros_images(50 if quick else 300),
-        "recording": lateness.measure_recording(
-            seconds=3.0 if quick else 5.0, repeats=1 if quick else 9, progress=progress
-        ),
-        "flood": flood.measure(windows=4 if quick else 30, progress=progress),
-        "airsim": airsim.measure(rounds=1 if quick else 10, progress=progress),
-    }
-
-
-def draw(rows: Sequence[Row], out: Path, boxes: Iterable[int]) -> dict[str, list[str]]:
-    """Draw the plots of each case into a folder, made if missing; return their names by case.
-
-    Args:
-        boxes: Numbers of nodes that get a box plot, where there are rows with so many.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    drawn: dict[str, list[str]] = {}
-    for case in dict.fromkeys(row.case for row in rows):
-        own = [row for row in rows if row.case == case]
-        names = drawn.setdefault(case, [])
-        if len({row.nodes for row in own}) > 1:
-            names.append(f"{case}-scaling.png")
-            plot_scaling(own, f"{case} message", out / names[-1])
-        for n in boxes:
-            if boxed := [row for row in own if row.nodes == n]:
-                names.append(f"{case}-{n}.png")
-                plot_boxes(boxed, f"{case} message, {n} nodes", out / names[-1])
-    return drawn
-
-
-def label(row: Row) -> str:
-    """Return a row's label: system and mode."""
-    return f"{row.system}, {row.mode}"
-
-
-def _colour(name: str, index: int) -> Any:
-    from matplotlib import colormaps
-
-    return "#c1121f" if name.startswith(OURS) else colormaps["tab20"](index % 20)
-
-
-def plot_scaling(rows: Sequence[Row], title: str, out: Path) -> None:
-    """Draw the median against the number of nodes, with the quartiles as a band."""
-    figure = Figure(figsize=(10, 6.5), layout="constrained")
-    axes: Any = figure.add_subplot()
-    last = {label(r): r.median_us for r in sorted(rows, key=lambda r: r.nodes)}
-    styles = {"handler": "-", "stream": "--", "routed": ":"}
-    for index, name in enumerate(sorted(last, key=lambda n: -last[n])):
-        own = sorted((r for r in rows if label(r) == name), key=lambda r: r.nodes)
-        colour, n = _colour(name, index), [r.nodes for r in own]
-        axes.plot(
-            n,
-            [r.median_us for r in own],
-            styles[own[0].mode],
-            marker=".",
-            color=colour,
-            lw=2.4 if name.startswith(OURS) else 1.2,
-            label=name,
-        )
-        axes.fill_between(
-            n, [r.q1_us for r in own], [r.q3_us for r in own], color=colour, alpha=0.12, lw=0
-        )
-    ticks = sorted({r.nodes for r in rows})
-    axes.set(xscale="log", yscale="log", xlabel="nodes", ylabel="round trip (µs)", title=title)
-    axes.set_xticks(ticks, [str(t) for t in ticks])
-    axes.minorticks_off()
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    figure.savefig(out, dpi=120)
-
-
-def plot_boxes(rows: Sequence[Row], title: str, out: Path) -> None:
-    """Draw a box (quartiles, median) with whiskers to the 99th percentile for each system."""
-    own = sorted(rows, key=lambda r: r.median_us, reverse=True)
-    figure = Figure(figsize=(9, 0.9 + 0.34 * len(own)), layout="constrained")
-    axes: Any = figure.add_subplot()
-    boxes = [
-        {
-            "label": label(r),
-            "med": r.median_us,
-            "q1": r.q1_us,
-            "q3": r.q3_us,
-            "whislo": r.q1_us,
-            "whishi": r.p99_us,
-        }
-        for r in own
-    ]
-    drawn = axes.bxp(boxes, orientation="horizontal", showfliers=False, patch_artist=True)
-    for row, box in zip(own, drawn["boxes"], strict=True):
-        box.set_facecolor("#f2b5b8" if row.system.startswith(OURS) else "#dcebf7")
-    axes.set(xscale="log", xlabel="round trip (µs); whiskers to the 99th percentile", title=title)
-    axes.grid(alpha=0.3, axis="x", which="both")
-    figure.savefig(out, dpi=120)
-
-
-def write(results: Results, out: Path, page_path: Path) -> None:
+def write(results: Mapping[str, Any], out: Path, page_path: Path) -> None:
     """Write the page of results, its plots, and the figures themselves."""
     out.mkdir(parents=True, exist_ok=True)
-    numbers = msgspec.json.encode(results, enc_hook=float)  # some are NumPy's
-    encoded = msgspec.json.format(numbers, indent=1)
-    (out / "results.json").write_bytes(encoded + b"\n")
-    plots = draw(results.rows, out, (2, 128))
+    (out / "results.json").write_bytes(encode(results, indent=1))
+    plots = draw(results["rows"], out, (2, 128))
     folder = os.path.relpath(out, page_path.parent)
     page_path.write_text(page(results, plots, folder), encoding="utf-8")
 
 
-def page(results: Results, plots: Mapping[str, Sequence[str]], folder: str) -> str:
+def page(results: Mapping[str, Any], plots: Mapping[str, Sequence[str]], folder: str) -> str:
     """Return the whole page as Markdown; the plots of each case are in `folder`."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -231,7 +37,9 @@ def page(results: Results, plots: Mapping[str, Sequence[str]], folder: str) -> s
     text = environment.get_template("page.md.jinja").render(
         results=results,
         goals=_goals(results),
-        tables=TABLES,
+        sections=SECTIONS,
+        benchmarks=BENCHMARKS,
+        cases=ROUND_TRIPS,
         latency=latency,
         plots=plots,
         folder=folder,
@@ -239,8 +47,31 @@ def page(results: Results, plots: Mapping[str, Sequence[str]], folder: str) -> s
     return text.rstrip() + "\n"
 
 
-def _goals(results: Results) -> Iterator[tuple[Any, ...]]:
-    medians = {(r.case, r.system, r.mode, r.nodes): r.median_us for r in results.rows}
+def _goals(results: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    yield from _latency_goals(results["rows"])
+    burst = next(row for row in results["throughput"] if "one wake" in row["case"])
+    microseconds = f"{burst['per_event_us']:.2f} µs"
+    yield "burst of 256 events in one wake, each", "", "", microseconds, "≤ 0.5 µs"
+    late = "p99 lateness of a 400 Hz tick"
+    p99 = {row["mode"]: row["late_p99_us"] for row in results["stall"]}
+    ratio = f"{p99['worker'] / p99['none']:.2f}"
+    yield f"{late}, camera in a worker", "no camera", "", ratio, "≤ 1.25"
+    percent = f"{results['idle']['cpu_percent']:.2f} %"
+    yield "processor time of a 100 Hz timer", "one core", "", percent, "≤ 1 %"
+    for row in results.get("bridge", []):
+        mark = "≤ 2" if row["bytes"] < 1000 else "≤ 1.3"
+        yield f"{row['case']} to another process and back", "Zenoh", 2, f"{row['ratio']:.2f}", mark
+    for name, what, beside, mark in (
+        ("recording", "{case}", "no recorder", "≤ 1.25"),
+        ("flood", "{messages_per_second:,.0f} messages a second", "quiet", "≤ 1.5"),
+        ("airsim", "AirSim's client asks for {case}", "quiet", "≤ 1.25"),
+    ):
+        for row in results.get(name, [])[1:]:
+            yield f"{late}, {what.format(**row)}", beside, "", f"{row['ratio_p99']:.2f}", mark
+
+
+def _latency_goals(rows: Sequence[Row]) -> Iterator[tuple[Any, ...]]:
+    medians = {(r["case"], r["system"], r["mode"], r["nodes"]): r["median_us"] for r in rows}
     nodes = sorted({nodes for case, _, _, nodes in medians if case == "small"})
     ros, cpp, queue = "ROS 1 nodelets", "thesis client (C++)", "asyncio.Queue (uvloop)"
     comparisons = [
@@ -269,28 +100,89 @@ def _goals(results: Results) -> Iterator[tuple[Any, ...]]:
     for what, beside, n, ours, theirs, mark in comparisons:
         if ours in medians and theirs in medians:
             yield what, beside, n, f"{medians[ours] / medians[theirs]:.2f}", mark
-    bursts = next(r for r in results.throughput if "one wake" in r.case)
-    yield (
-        "burst of 256 events in one wake, each",
-        "",
-        "",
-        f"{bursts.per_event_us:.2f} µs",
-        "≤ 0.5 µs",
-    )
-    late = "p99 lateness of a 400 Hz tick"
-    p99 = {row.mode: row.late_p99_us for row in results.stall}
-    ratio = f"{p99['worker'] / p99['none']:.2f}"
-    yield f"{late}, camera in a worker", "no camera", "", ratio, "≤ 1.25"
-    percent = results.idle.cpu_percent
-    yield "processor time of a 100 Hz timer", "one core", "", f"{percent:.2f} %", "≤ 1 %"
-    for b in results.bridge:
-        mark = "≤ 2" if b.bytes < 1000 else "≤ 1.3"
-        yield f"{b.case} to another process and back", "Zenoh", 2, f"{b.ratio:.2f}", mark
-    for row in results.recording[1:]:
-        yield f"{late}, {row.case}", "no recorder", "", f"{row.ratio_p99:.2f}", "≤ 1.25"
-    for flooded in results.flood[1:]:
-        what = f"{late}, {flooded.messages_per_second:,.0f} messages a second"
-        yield what, "quiet", "", f"{flooded.ratio_p99:.2f}", "≤ 1.5"
-    for asked in results.airsim[1:]:
-        what = f"{late}, AirSim's client asks for {asked.case}"
-        yield what, "quiet", "", f"{asked.ratio_p99:.2f}", "≤ 1.25"
+
+
+def draw(rows: Sequence[Row], out: Path, boxes: Iterable[int]) -> dict[str, list[str]]:
+    """Draw the plots of each case into a folder, made if missing; return their names by case.
+
+    Args:
+        boxes: Numbers of nodes that get a box plot, where there are rows with so many.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    drawn: dict[str, list[str]] = {}
+    for case in dict.fromkeys(row["case"] for row in rows):
+        own = [row for row in rows if row["case"] == case]
+        names = drawn.setdefault(case, [])
+        if len({row["nodes"] for row in own}) > 1:
+            names.append(f"{case}-scaling.png")
+            plot_scaling(own, f"{case} message", out / names[-1])
+        for n in boxes:
+            if boxed := [row for row in own if row["nodes"] == n]:
+                names.append(f"{case}-{n}.png")
+                plot_boxes(boxed, f"{case} message, {n} nodes", out / names[-1])
+    return drawn
+
+
+def label(row: Row) -> str:
+    """Return a row's label: system and mode."""
+    return f"{row['system']}, {row['mode']}"
+
+
+def _colour(name: str, index: int) -> Any:
+    from matplotlib import colormaps
+
+    return "#c1121f" if name.startswith(OURS) else colormaps["tab20"](index % 20)
+
+
+def plot_scaling(rows: Sequence[Row], title: str, out: Path) -> None:
+    """Draw the median against the number of nodes, with the quartiles as a band."""
+    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    axes: Any = figure.add_subplot()
+    last = {label(r): r["median_us"] for r in sorted(rows, key=lambda r: r["nodes"])}
+    styles = {"handler": "-", "stream": "--", "routed": ":"}
+    for index, name in enumerate(sorted(last, key=lambda n: -last[n])):
+        own = sorted((r for r in rows if label(r) == name), key=lambda r: r["nodes"])
+        colour, n = _colour(name, index), [r["nodes"] for r in own]
+        axes.plot(
+            n,
+            [r["median_us"] for r in own],
+            styles[own[0]["mode"]],
+            marker=".",
+            color=colour,
+            lw=2.4 if name.startswith(OURS) else 1.2,
+            label=name,
+        )
+        axes.fill_between(
+            n, [r["q1_us"] for r in own], [r["q3_us"] for r in own], color=colour, alpha=0.12, lw=0
+        )
+    ticks = sorted({r["nodes"] for r in rows})
+    axes.set(xscale="log", yscale="log", xlabel="nodes", ylabel="round trip (µs)", title=title)
+    axes.set_xticks(ticks, [str(t) for t in ticks])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.savefig(out, dpi=120)
+
+
+def plot_boxes(rows: Sequence[Row], title: str, out: Path) -> None:
+    """Draw a box (quartiles, median) with whiskers to the 99th percentile for each system."""
+    own = sorted(rows, key=lambda r: r["median_us"], reverse=True)
+    figure = Figure(figsize=(9, 0.9 + 0.34 * len(own)), layout="constrained")
+    axes: Any = figure.add_subplot()
+    boxes = [
+        {
+            "label": label(r),
+            "med": r["median_us"],
+            "q1": r["q1_us"],
+            "q3": r["q3_us"],
+            "whislo": r["q1_us"],
+            "whishi": r["p99_us"],
+        }
+        for r in own
+    ]
+    drawn = axes.bxp(boxes, orientation="horizontal", showfliers=False, patch_artist=True)
+    for row, box in zip(own, drawn["boxes"], strict=True):
+        box.set_facecolor("#f2b5b8" if row["system"].startswith(OURS) else "#dcebf7")
+    axes.set(xscale="log", xlabel="round trip (µs); whiskers to the 99th percentile", title=title)
+    axes.grid(alpha=0.3, axis="x", which="both")
+    figure.savefig(out, dpi=120)

@@ -1,16 +1,58 @@
-"""Result files: environment and versions of the measurements, and changes between two files."""
+"""Results: all benchmarks in a single run, result files, and the changes between two of them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from bench.benchmarks import BENCHMARKS, ROUND_TRIPS, Progress, Row
+from bench.driver import measure_all
+from bench.harness import silent
 from runtime.errors import ConfigError
 from runtime.run.summarise import commit
 from runtime.run.summarise import environment as versions
+
+QUICK_SYSTEMS = ("visnav", "plain", "asyncio.queue", "pyee", "thesis")
+"""Parts of the names of the systems in a quick run: systems quick to start."""
+
+
+def measure_everything(*, quick: bool, progress: Progress = silent) -> dict[str, Any]:
+    """Run all benchmarks, and return the content of ``results.json``.
+
+    Args:
+        quick: Measure less: under two minutes.
+    """
+    outcomes = [
+        measure_all(
+            case.name,
+            nodes=case.quick_nodes if quick else case.nodes,
+            samples=case.samples,
+            warm_up=case.warm_up,
+            repeats=2 if quick else case.repeats,
+            only=QUICK_SYSTEMS if quick else (),
+            budget=0.3 if quick else 0.5,
+            progress=progress,
+        )
+        for case in ROUND_TRIPS
+    ]
+    measured: dict[str, Any] = {}
+    for benchmark in BENCHMARKS:
+        progress(benchmark.name.replace("_", " "))
+        options = {option.name: option.in_all(quick=quick) for option in benchmark.options}
+        rows = benchmark.run(options, progress)
+        measured[benchmark.name] = rows[0] if benchmark.single else rows
+    return {
+        "environment": environment(),
+        "quick": quick,
+        "rows": [row for outcome in outcomes for row in outcome.rows],
+        **measured,
+        "missing": {k: v for outcome in outcomes for k, v in outcome.missing.items()},
+        "versions": {k: v for outcome in outcomes for k, v in outcome.versions.items()},
+    }
 
 
 def environment() -> dict[str, str]:
@@ -18,10 +60,15 @@ def environment() -> dict[str, str]:
     return {**versions(), "cpu": _cpu(), "commit": commit(Path(__file__).parent) or "unknown"}
 
 
-def write_json(path: Path, rows: list[Any], **more: Any) -> None:
+def write_json(path: Path, rows: list[Row], **more: Any) -> None:
     """Write ``environment``, ``rows`` and whatever else, indented."""
     content = {"environment": environment(), "rows": rows, **more}
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n")
+    path.write_bytes(encode(content, indent=2))
+
+
+def encode(content: Mapping[str, Any], indent: int) -> bytes:
+    """Return a result file's bytes; some of the figures are NumPy's."""
+    return msgspec.json.format(msgspec.json.encode(content, enc_hook=float), indent=indent) + b"\n"
 
 
 def _cpu() -> str:
@@ -32,31 +79,27 @@ def _cpu() -> str:
     return next((x.partition(":")[2].strip() for x in lines if x.startswith("model name")), "?")
 
 
-class Change(msgspec.Struct, frozen=True):
-    """Change of a figure between two files.
+def compare(before: Path, after: Path) -> list[Row]:
+    """Return the changes of all figures common to both files, largest first.
 
-    Attributes:
-        what: Case, system, mode, nodes.
-        noise: Ratio that noise explains: the product of both files' spreads between rounds.
+    A change is ``real`` if its ratio exceeds the ``noise``: the product of both files' spreads
+    between rounds.
     """
-
-    what: str
-    before_us: float
-    after_us: float
-    ratio: float
-    noise: float
-
-    @property
-    def real(self) -> bool:
-        """Whether the change exceeds the noise."""
-        return abs(math.log(self.ratio)) > math.log(self.noise)
+    old, new = _rows(before), _rows(after)
+    changes: list[Row] = []
+    for what in old.keys() & new.keys():
+        there, here = old[what]["median_us"], new[what]["median_us"]
+        change = {"what": what, "before_us": there, "after_us": here, "ratio": here / there}
+        noise = _spread(old[what]) * _spread(new[what])
+        real = abs(math.log(here / there)) > math.log(noise)
+        changes.append({**change, "noise": noise, "real": real})
+    return sorted(changes, key=lambda change: -abs(math.log(change["ratio"])))
 
 
-def read_rows(path: Path) -> dict[str, dict[str, Any]]:
+def _rows(path: Path) -> dict[str, Row]:
     """Return a file's latency rows by case, system, mode and nodes; or raise `ConfigError`."""
     try:
-        content = msgspec.json.decode(path.read_bytes())
-        rows = content["rows"]
+        rows = msgspec.json.decode(path.read_bytes())["rows"]
         return {
             f"{r['case']}, {r['system']}, {r['mode']}, {r['nodes']} nodes": r
             for r in rows
@@ -68,23 +111,7 @@ def read_rows(path: Path) -> dict[str, dict[str, Any]]:
         raise ConfigError(f"{path}: expected a result file of bench, found: {error!r}") from None
 
 
-def compare(before: Path, after: Path) -> list[Change]:
-    """Return the changes of all figures common to both files, largest first."""
-    old, new = read_rows(before), read_rows(after)
-    changes = [
-        Change(
-            what,
-            old[what]["median_us"],
-            new[what]["median_us"],
-            new[what]["median_us"] / old[what]["median_us"],
-            _spread(old[what]) * _spread(new[what]),
-        )
-        for what in old.keys() & new.keys()
-    ]
-    return sorted(changes, key=lambda c: -abs(math.log(c.ratio)))
-
-
-def _spread(row: dict[str, Any]) -> float:
+def _spread(row: Row) -> float:
     """Return largest to smallest round median, at least 1.02; 1.1 for a single round."""
     rounds = row.get("rounds_us") or [1.0]
     return max(max(rounds) / min(rounds), 1.02) if len(rounds) > 1 else 1.1

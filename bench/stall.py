@@ -21,20 +21,20 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import functools
 import itertools
 import socket
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
 
-import msgspec
 import numpy as np
 
-from bench.lateness import BEATS, Beat, LateRow, figures, hover
-from bench.system import in_turns
+from bench.benchmarks import Progress, Row
+from bench.harness import lines_of, paired, program, silent
+from bench.lateness import BEATS, figures, hover
 from events import Odometry
 from runtime import Input, Node, NodeConfig, Tick, Worker, every
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
@@ -44,53 +44,17 @@ from sims.worlds import load_world
 Mode = Literal["none", "inline", "thread", "worker", "fetch inline", "fetch"]
 DELAY = 0.08  # response time of the server, seconds
 WARM_UP = 1_000_000_000  # nanoseconds left out at the start of each run
-MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker", "fetch inline", "fetch")
+MODES: tuple[Mode, ...] = get_args(Mode)
 
-
-class StallRow(LateRow, frozen=True, kw_only=True):
-    """Statistics of a mode of fetching images.
-
-    Attributes:
-        missed: Ticks left out because an earlier one came too late.
-        frames: How many pairs of images came.
-        fetch_ms_median: From asking for a pair to having it; 0 without any.
-    """
-
-    mode: str
-    missed: int
-    update_mean_ms: float
-    update_median_ms: float
-    update_sd_ms: float
-    frames: int
-    fetch_ms_median: float
-
-
-class _Samples(msgspec.Struct):
-    late: list[int] = []
-    update: list[int] = []
-    fetch: list[int] = []
-    missed: int = 0
-
-    def add(self, beats: list[Beat]) -> None:
-        """Add a run's ticks, after a second of warm-up."""
-        for before, beat in itertools.pairwise(beats):
-            if beat.stamp > WARM_UP:
-                self.late.append(beat.late)
-                self.missed += beat.missed
-                self.update.append(beat.at - before.at)
-
-
-_collected: dict[str, _Samples] = {}
+FETCHES: list[int] = []  # times of this process's camera, ns; the measuring code clears the list
 
 
 class CameraConfig(NodeConfig):
     """Settings of the camera under test."""
 
     mode: Mode
-    width: int = 512
-    height: int = 512
+    size: int = 512
     rate: float = 10.0
-    world: str = "hall"
     port: int = 0
 
 
@@ -101,55 +65,55 @@ class Camera(Node[CameraConfig]):
 
     async def on_startup(self) -> None:
         """Start the renderer, or connect to the server, as the mode requires."""
-        config = self.config
-        self._samples = _collected.setdefault(config.mode, _Samples())
-        self._fetch: Callable[..., Any] | None = None
-        if config.mode == "none":
-            return
-        if config.mode in {"fetch", "fetch inline"}:
+        mode = self.config.mode
+        self._at_end = contextlib.AsyncExitStack()
+        self._fetch: Callable[[tuple[Shot, ...]], Any] | None = None
+        if mode in {"fetch", "fetch inline"}:
             await self._connect()
-            return
-        spec = CameraSpec(name="eye", width=config.width, height=config.height)
-        arguments = (await self.offload(_model, config.world, spec), (spec,), "free/", 0)
+        elif mode != "none":
+            await self._render()
+
+    async def _render(self) -> None:
+        config = self.config
+        spec = CameraSpec(name="eye", width=config.size, height=config.size)
+        arguments = (await self.offload(_model, spec), (spec,), "free/", 0)
         if config.mode == "worker":
             worker: Worker[CameraRenderer] = await self.worker(CameraRenderer, *arguments)
-            self._fetch = lambda *args: worker.call(CameraRenderer.expose, *args)
+            self._fetch = lambda shots: worker.call(CameraRenderer.expose, shots)
             return
         # An OpenGL context belongs to one thread: the pool's, or the loop's for `inline`.
-        self._pool = concurrent.futures.ThreadPoolExecutor(1)
-        if config.mode == "thread":
-            renderer = await self.clock.beside(self._pool.submit(CameraRenderer, *arguments))
-            self._fetch = lambda *args: self.clock.beside(self._pool.submit(renderer.expose, *args))
-            self._close = renderer.close
-        else:
-            renderer = CameraRenderer(*arguments)
+        pool = concurrent.futures.ThreadPoolExecutor(1)
 
-            async def render(*args: Any) -> Any:
-                return renderer.expose(*args)
+        async def call(function: Callable[..., Any], *arguments: Any) -> Any:
+            if config.mode == "inline":
+                return function(*arguments)
+            return await self.clock.beside(pool.submit(function, *arguments))
 
-            self._fetch = render
-            self._close = renderer.close
+        renderer = await call(CameraRenderer, *arguments)
+        self._fetch = functools.partial(call, renderer.expose)
+        self._at_end.callback(pool.shutdown)
+        self._at_end.push_async_callback(call, renderer.close)
 
     async def _connect(self) -> None:
-        config = self.config
-        size = pair_size(config.width, config.height)
-        if config.mode == "fetch":
-            reader, self._writer = await asyncio.open_connection(
-                "127.0.0.1", config.port, limit=size
-            )
+        address = ("127.0.0.1", self.config.port)
+        size = pair_size(self.config.size)
+        if self.config.mode == "fetch":
+            reader, writer = await asyncio.open_connection(*address, limit=size)
+            self._at_end.push_async_callback(writer.wait_closed)
+            self._at_end.callback(writer.close)
 
-            async def fetch(*_: Any) -> None:
-                self._writer.write(b"?")
+            async def fetch(_: Any) -> None:
+                writer.write(b"?")
                 await reader.readexactly(size)
         else:
-            self._socket = socket.create_connection(("127.0.0.1", config.port))
-            pair = bytearray(size)
+            link = self._at_end.enter_context(socket.create_connection(address))
+            pair = memoryview(bytearray(size))
 
-            async def fetch(*_: Any) -> None:
-                self._socket.sendall(b"?")
+            async def fetch(_: Any) -> None:
+                link.sendall(b"?")
                 got = 0
                 while got < size:
-                    got += self._socket.recv_into(memoryview(pair)[got:])
+                    got += link.recv_into(pair[got:])
 
         self._fetch = fetch
 
@@ -163,74 +127,86 @@ class Camera(Node[CameraConfig]):
         pose = pose_to_qpos(here.position, here.orientation)
         await self._fetch((Shot("eye", here.stamp, pose),))
         if tick.stamp > WARM_UP:
-            self._samples.fetch.append(time.monotonic_ns() - asked)
+            FETCHES.append(time.monotonic_ns() - asked)
 
     async def on_shutdown(self) -> None:
-        """Close the renderer, in its own thread for mode ``thread``."""
-        if self.config.mode == "thread":
-            await self.clock.beside(self._pool.submit(self._close))
-            self._pool.shutdown()
-        elif self.config.mode == "inline":
-            self._close()
-        elif self.config.mode == "fetch":
-            self._writer.close()
-            await self._writer.wait_closed()
-        elif self.config.mode == "fetch inline":
-            self._socket.close()
+        """Close the renderer, in its own thread for mode ``thread``, or the connection."""
+        await self._at_end.aclose()
 
 
-def pair_size(width: int, height: int) -> int:
-    """Return the bytes of a colour image with its depth."""
-    return width * height * (3 + 4)
+def pair_size(side: int) -> int:
+    """Return the bytes of a square colour image with its depth."""
+    return side * side * (3 + 4)
 
 
-def _model(world: str, camera: CameraSpec) -> bytes:
-    spec = load_world(world)
+def _model(camera: CameraSpec) -> bytes:
+    spec = load_world("hall")
     add_free_camera(spec, "free", (camera,))
     return model_to_bytes(spec.compile())
+
+
+class Run(NamedTuple):
+    """Run of a mode: lateness, times between ticks and fetches (ns), and count of missed ticks."""
+
+    late: list[int]
+    update: list[int]
+    fetch: list[int]
+    missed: int
 
 
 def measure(
     *,
     seconds: float,
     repeats: int,
-    modes: tuple[Mode, ...] = MODES,
     rate: float = 10.0,
     size: int = 512,
-    progress: Callable[[str], None] = lambda _: None,
-) -> list[StallRow]:
+    progress: Progress = silent,
+) -> list[Row]:
     """Measure all modes.
 
     Args:
         seconds: Of each run, after a second of warm-up.
     """
-    _collected.clear()
-    with slow_server(pair_size(size, size)) as port:
-        for number, mode in in_turns(modes, repeats):
-            progress(f"round {number + 1} of {repeats}: {mode}")
-            settings = {"mode": mode, "rate": rate, "width": size, "height": size, "port": port}
-            camera = {"name": "camera", "type": f"{__name__}:Camera", **settings}
-            hover("stall", seconds + 1.0, camera)
-            _collected.setdefault(mode, _Samples()).add(BEATS)
-    rows = [_row(mode, _collected[mode]) for mode in modes]
-    return [
-        msgspec.structs.replace(row, ratio_p99=row.late_p99_us / rows[0].late_p99_us)
-        for row in rows
-    ]
+    with program("-m", "bench.stall", DELAY, pair_size(size)) as server:
+        port = int(next(lines_of(server)))
+        settings = {"rate": rate, "size": size, "port": port}
+        camera = {"name": "camera", "type": f"{__name__}:Camera", **settings}
+        sides = {mode: functools.partial(_run, seconds, camera | {"mode": mode}) for mode in MODES}
+        found = paired(sides, repeats, progress)
+    return [_row(mode, runs, found["none"]) for mode, runs in found.items()]
 
 
-def _row(mode: str, samples: _Samples) -> StallRow:
-    update = np.array(samples.update) / 1e6
-    return StallRow(
-        mode=mode,
-        missed=samples.missed,
-        update_mean_ms=float(update.mean()),
-        update_median_ms=float(np.median(update)),
-        update_sd_ms=float(update.std()),
-        frames=len(samples.fetch),
-        fetch_ms_median=float(np.median(samples.fetch) / 1e6) if samples.fetch else 0.0,
-        **figures([samples.late]),
+def _run(seconds: float, camera: dict[str, Any]) -> Run:
+    FETCHES.clear()
+    hover("stall", seconds + 1.0, camera)
+    ticks = [(old, new) for old, new in itertools.pairwise(BEATS) if new.stamp > WARM_UP]
+    return Run(
+        late=[new.late for _, new in ticks],
+        update=[new.at - old.at for old, new in ticks],
+        fetch=[*FETCHES],
+        missed=sum(new.missed for _, new in ticks),
     )
+
+
+def _row(mode: str, runs: Sequence[Run], without: Sequence[Run]) -> Row:
+    """Return the figures of a mode beside those of no camera.
+
+    ``missed`` is of ticks left out because an earlier one came too late, ``fetch_ms_median`` from
+    asking for a pair to having it; 0 without any.
+    """
+    late, beside = (np.concatenate([run.late for run in side]) for side in (runs, without))
+    update = np.concatenate([run.update for run in runs]) / 1e6
+    fetch = np.concatenate([run.fetch for run in runs]) / 1e6
+    return {
+        **figures([late], [beside]),
+        "mode": mode,
+        "missed": sum(run.missed for run in runs),
+        "update_mean_ms": float(update.mean()),
+        "update_median_ms": float(np.median(update)),
+        "update_sd_ms": float(update.std()),
+        "frames": len(fetch),
+        "fetch_ms_median": float(np.median(fetch)) if len(fetch) else 0.0,
+    }
 
 
 def main(delay: float, size: int) -> None:
@@ -249,24 +225,6 @@ def _serve(server: socket.socket, delay: float, answer: bytes) -> None:
             while connection.recv(1):
                 time.sleep(delay)  # the fetch that is simulated
                 connection.sendall(answer)
-
-
-@contextlib.contextmanager
-def slow_server(size: int, delay: float = DELAY) -> Iterator[int]:
-    """Run the server while the block runs, and give its port.
-
-    An answer has `size` bytes and takes `delay` seconds.
-    """
-    command = [sys.executable, "-m", "bench.stall", str(delay), str(size)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        try:
-            yield int(process.stdout.readline())
-        finally:
-            process.stdin.close()
 
 
 if __name__ == "__main__":

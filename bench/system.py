@@ -10,10 +10,9 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import json
-import random
 import socket
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Literal, TypeVar
+from collections.abc import Callable
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -21,14 +20,14 @@ import numpy.typing as npt
 
 from events import Event
 
-T = TypeVar("T")
 CaseName = Literal["small", "large", "large-shared"]
 Mode = Literal["handler", "stream", "routed"]
 Place = Literal["one process", "processes"]
 
-LARGE_SHAPE = (1080, 1080)  # of the large message: float32, 4.67 MB
+ALL_CASES: tuple[CaseName, ...] = ("small", "large", "large-shared")
+COPIED_CASES: tuple[CaseName, ...] = ("small", "large")  # of systems that pass nothing by reference
 
-NODES = (2, 4, 8, 10, 16, 32, 50, 64, 100, 128)
+LARGE_SHAPE = (1080, 1080)  # of the large message: float32, 4.67 MB
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,7 +72,7 @@ class System(msgspec.Struct, frozen=True):
     modes: tuple[Mode, ...]
     measure: Callable[[Case], Samples]
     slowness: float = 1.0
-    cases: tuple[CaseName, ...] = ("small", "large", "large-shared")
+    cases: tuple[CaseName, ...] = ALL_CASES
     place: Place = "one process"
     max_nodes: int = 128
     missing: Callable[[], str | None] = lambda: None
@@ -85,12 +84,12 @@ def in_processes(
     modes: tuple[Mode, ...],
     measure: Callable[[Case], Samples],
     slowness: float,
-    max_nodes: int = 16,
+    cases: tuple[CaseName, ...] = COPIED_CASES,
     **options: Any,
 ) -> System:
-    """Return a system whose nodes have processes of their own."""
-    options = {"cases": ("small", "large"), **options}
-    return System(name, modes, measure, slowness, place="processes", max_nodes=max_nodes, **options)
+    """Return a system whose nodes have processes of their own, by default 16 at most."""
+    options = {"max_nodes": 16, **options}
+    return System(name, modes, measure, slowness, cases, "processes", **options)
 
 
 def large_array() -> npt.NDArray[np.float32]:
@@ -161,15 +160,16 @@ def free_port() -> int:
         return port
 
 
-def zenoh_config(**endpoints: str) -> Any:
-    """Return the configuration of a Zenoh peer without scouting: only ``listen`` or ``connect``."""
-    made = importlib.import_module("zenoh").Config()
+def zenoh_session(**endpoints: str) -> Any:
+    """Open the session of a Zenoh peer without scouting: only ``listen`` or ``connect``."""
+    zenoh: Any = importlib.import_module("zenoh")
+    made = zenoh.Config()
     made.insert_json5("mode", '"peer"')
     made.insert_json5("scouting/multicast/enabled", "false")
     made.insert_json5("scouting/gossip/enabled", "false")
     for way in ("listen", "connect"):
         made.insert_json5(f"{way}/endpoints", json.dumps([*filter(None, [endpoints.get(way)])]))
-    return made
+    return zenoh.open(made)
 
 
 def zenoh_publisher(session: Any, key: str) -> Any:
@@ -182,25 +182,3 @@ def zenoh_subscriber(session: Any, key: str, callback: Callable[[Any], None]) ->
     """Return a subscriber whose callback runs where Zenoh delivers, with no thread between."""
     direct = importlib.import_module("zenoh").handlers.Callback(callback, indirect=False)
     return session.declare_subscriber(key, direct)
-
-
-def in_turns(sides: Iterable[T], rounds: int) -> Iterator[tuple[int, T]]:
-    """Yield the number of a round and a side, for all sides in each round's own random order."""
-    order, shuffle = [*sides], random.Random(0).shuffle
-    for number in range(rounds):
-        shuffle(order)
-        for side in order:
-            yield number, side
-
-
-def pair(taken: Mapping[str, Sequence[int]]) -> dict[str, float]:
-    """Return the fields of a row to compare two sides: times (ns) by the prefix of their fields.
-
-    Medians and 99th percentiles are in microseconds; `ratio` is that of the two medians.
-    """
-    found: dict[str, float] = {}
-    for side, times in taken.items():
-        middle, high = np.percentile(times, (50, 99)) / 1e3
-        found |= {f"{side}_us": float(middle), f"{side}_p99_us": float(high)}
-    ours, theirs = (found[f"{side}_us"] for side in taken)
-    return {**found, "ratio": ours / theirs}

@@ -8,14 +8,17 @@ And what a run takes through which nothing goes: processor time of one 100 Hz ti
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
+from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import uvloop
 
-from bench.system import Ping, in_turns
+from bench.benchmarks import Progress, Row
+from bench.harness import paired, silent, timed
+from bench.system import Ping
 from events import Event, Image, PoseEstimate, Quaternion, Vector3
 from runtime import Node, Tick, every
 from runtime.channels.sender import Listener, Sender
@@ -25,36 +28,6 @@ from runtime.run import event_loop
 from runtime.run.execute import execute
 from runtime.time.clock import RealClock
 from runtime.workers.worker import Worker
-
-
-class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Throughput of a case.
-
-    Attributes:
-        batch: How many at a time.
-        bytes_per_second: Of payload.
-    """
-
-    case: str
-    batch: int
-    per_event_us: float
-    events_per_second: float
-    bytes_per_second: float
-
-    @property
-    def megabytes_per_second(self) -> float:
-        """Return the same in megabytes."""
-        return self.bytes_per_second / 1e6
-
-
-class IdleRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Processor load in a run of a timer: percent of one core, all threads together."""
-
-    hz: float
-    seconds: float
-    ticks: int
-    cpu_percent: float
-
 
 BATCH = 256  # events of a burst: as many as a reader may take before the loop gets a turn
 
@@ -77,67 +50,72 @@ class Mirror:
         return image
 
 
-def measure(bursts: int = 400) -> list[ThroughputRow]:
+def measure(*, bursts: int = 400, progress: Progress = silent) -> list[Row]:
     """Measure all ways."""
+    progress("throughput")
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         return runner.run(_measure(bursts))
 
 
-async def _measure(bursts: int) -> list[ThroughputRow]:
+async def _measure(bursts: int) -> list[Row]:
     event_loop.install(asyncio.get_running_loop())
     event = Ping(stamp=0, source="one", receiver=2, number=0)
     pixels = np.zeros((512, 512, 3), np.uint8)
     image = Image(stamp=0, source="drone/front", frame_id="f", data=pixels)
-    at_once = "events, stream, reader resumed by each"
-    in_one_wake = "events, stream, all in one wake"
+    times = {
+        **_by_making(bursts),
+        "events, handler": _by_handler(event, bursts),
+        "events, stream, reader resumed by each": await _by_stream(event, bursts, soon=False),
+        "events, stream, all in one wake": await _by_stream(event, bursts, soon=True),
+    }
+    by_reference = await _by_stream(image, bursts, soon=False)
     return [
-        *_making_rows(bursts),
-        _row("events, handler", BATCH, _by_handler(event, bursts), 0),
-        _row(at_once, BATCH, await _by_stream(event, bursts, soon=False), 0),
-        _row(in_one_wake, BATCH, await _by_stream(event, bursts, soon=True), 0),
-        _row(
-            "images by reference, stream",
-            BATCH,
-            await _by_stream(image, bursts, soon=False),
-            pixels.nbytes,
-        ),
-        *await _worker_rows(pixels),
+        *(_row(case, BATCH, of_bursts) for case, of_bursts in times.items()),
+        _row("images by reference, stream", BATCH, by_reference, pixels.nbytes),
+        *await _by_worker(pixels),
     ]
 
 
-def _making_rows(bursts: int) -> list[ThroughputRow]:
-    place, turn = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
-    taken: dict[type[Unchecked] | type[PoseEstimate], list[float]] = {
-        Unchecked: [],
-        PoseEstimate: [],
+def _row(case: str, batch: int, bursts: Sequence[int], size: int = 0) -> Row:
+    """Return the figures of a case, of the times of its bursts (ns); `size` is in bytes."""
+    each = float(np.median(bursts)) / batch
+    return {
+        "case": case,
+        "batch": batch,
+        "per_event_us": each / 1e3,
+        "events_per_second": 1e9 / each,
+        "bytes_per_second": size * 1e9 / each,
     }
-    for _, event in in_turns(taken, bursts):
-        begin = time.perf_counter_ns()
+
+
+def _by_making(bursts: int) -> dict[str, list[int]]:
+    place, turn = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
+
+    def make(event: type[Unchecked] | type[PoseEstimate]) -> None:
         for stamp in range(BATCH):
             event(stamp=stamp, source="one", position=place, orientation=turn)
-        taken[event].append((time.perf_counter_ns() - begin) / BATCH)
-    plain, checked = (float(np.median(each)) for each in taken.values())
-    return [
-        _row("poses made, without checks", BATCH, plain, 0),
-        _row("poses made, as they are", BATCH, checked, 0),
-    ]
+
+    kinds = {
+        "poses made, without checks": functools.partial(make, Unchecked),
+        "poses made, as they are": functools.partial(make, PoseEstimate),
+    }
+    return paired({kind: functools.partial(timed, kinds[kind]) for kind in kinds}, bursts)
 
 
-def _by_handler(event: Event, bursts: int) -> float:
-    """Return nanoseconds an event."""
+def _by_handler(event: Event, bursts: int) -> list[int]:
     sender: Sender[Event] = Sender("one.out", type(event))
     sender.connect([Listener("two", lambda _: None, (type(event),))])
-    send, taken = sender.send, []
-    for _ in range(bursts):
-        begin = time.perf_counter_ns()
+    send = sender.send
+
+    def burst() -> None:
         for _ in range(BATCH):
             send(event)
-        taken.append((time.perf_counter_ns() - begin) / BATCH)
-    return float(np.median(taken))
+
+    return [timed(burst) for _ in range(bursts)]
 
 
-async def _by_stream(event: Event, bursts: int, *, soon: bool) -> float:
-    """Return nanoseconds an event, until the reader has had the last of a burst."""
+async def _by_stream(event: Event, bursts: int, *, soon: bool) -> list[int]:
+    """Return the time of each burst, until the reader has had its last event."""
     stream: Stream[Event] = Stream("two.in", bound=BATCH, soon=soon)
     sender: Sender[Event] = Sender("one.out", type(event))
     sender.connect([Listener("two", stream.offer, (type(event),), None, stream)])
@@ -159,16 +137,15 @@ async def _by_stream(event: Event, bursts: int, *, soon: bool) -> float:
         for _ in range(BATCH):
             send(event)
         await read_all.wait()
-        taken.append((time.perf_counter_ns() - begin) / BATCH)
+        taken.append(time.perf_counter_ns() - begin)
         await asyncio.sleep(0)
     stream.close()
     await reader
-    return float(np.median(taken))
+    return taken
 
 
-async def _worker_rows(pixels: npt.NDArray[np.uint8]) -> list[ThroughputRow]:
-    loop = asyncio.get_running_loop()
-    clock = RealClock(loop)
+async def _by_worker(pixels: npt.NDArray[np.uint8]) -> list[Row]:
+    clock = RealClock(asyncio.get_running_loop())
     worker = Worker("mirror", clock, Mirror)
     try:
         await worker.ready()
@@ -178,23 +155,12 @@ async def _worker_rows(pixels: npt.NDArray[np.uint8]) -> list[ThroughputRow]:
             for _ in range(100):
                 begin = time.perf_counter_ns()
                 await asyncio.gather(*(worker.call(Mirror.echo, pixels) for _ in range(batch)))
-                taken.append((time.perf_counter_ns() - begin) / batch)
-            case = "images to a worker and back"
-            rows.append(_row(case, batch, float(np.median(taken)), 2 * pixels.nbytes))
+                taken.append(time.perf_counter_ns() - begin)
+            rows.append(_row("images to a worker and back", batch, taken, 2 * pixels.nbytes))
         return rows
     finally:
         await asyncio.to_thread(worker.close)
         clock.close()
-
-
-def _row(case: str, batch: int, nanoseconds: float, size: int) -> ThroughputRow:
-    return ThroughputRow(
-        case=case,
-        batch=batch,
-        per_event_us=nanoseconds / 1e3,
-        events_per_second=1e9 / nanoseconds,
-        bytes_per_second=size * 1e9 / nanoseconds,
-    )
 
 
 _marks: list[tuple[float, float]] = []
@@ -209,15 +175,12 @@ class Timer(Node):
         _marks.append((time.monotonic(), time.process_time()))
 
 
-def measure_idle(seconds: float = 10.0) -> IdleRow:
-    """Measure the cost of a nearly idle run: a timer for some seconds."""
+def measure_idle(*, seconds: float = 10.0, progress: Progress = silent) -> list[Row]:
+    """Measure the cost of a nearly idle run: percent of a core, all threads together."""
+    progress("idle")
     _marks.clear()
     node = {"name": "timer", "type": f"{__name__}:Timer"}
     execute(parse({"run": {"clock": "real", "duration": seconds}, "nodes": [node]}, "bench idle"))
     (begin, cpu_begin), (end, cpu_end) = _marks[0], _marks[-1]
-    return IdleRow(
-        hz=100,
-        seconds=end - begin,
-        ticks=len(_marks),
-        cpu_percent=100 * (cpu_end - cpu_begin) / (end - begin),
-    )
+    percent = 100 * (cpu_end - cpu_begin) / (end - begin)
+    return [{"hz": 100, "seconds": end - begin, "ticks": len(_marks), "cpu_percent": percent}]

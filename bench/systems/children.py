@@ -13,7 +13,6 @@ that is still on its way loses no ping.
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import importlib
 import os
 import signal
@@ -23,8 +22,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import IO, Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import IO, Any, Self
 
 import msgspec
 import numpy as np
@@ -62,18 +61,49 @@ class PeerError(RuntimeError):
 
 
 class Crew:
-    """The processes of nodes 2 to N."""
+    """Programs of a measurement, such as the processes of nodes 2 to N; they end with the block.
 
-    def __init__(self, nodes: dict[int, tuple[subprocess.Popen[bytes], IO[bytes]]]) -> None:
-        self._nodes = nodes
+    Their output is kept, to be told when one fails. A program whose standard input was a pipe gets
+    the end of it and `grace` seconds before it is killed.
+    """
+
+    def __init__(self, grace: float = 0.0) -> None:
+        self._grace = grace
+        self._programs: dict[subprocess.Popen[bytes], tuple[str, IO[bytes]]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._programs:
+            if process.stdin is not None:
+                process.stdin.close()
+        for process, (_name, output) in self._programs.items():
+            try:
+                process.wait(self._grace)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            output.close()
+
+    def add(self, name: str, command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+        """Start a program; options are those of `subprocess.Popen`."""
+        output = tempfile.TemporaryFile()  # noqa: SIM115
+        process = subprocess.Popen(command, stdout=output, stderr=output, **options)
+        self._programs[process] = name, output
+        return process
+
+    def failure(self, process: subprocess.Popen[bytes], what: str) -> PeerError:
+        """Return the error of a program, with the end of its output."""
+        name, output = self._programs[process]
+        output.seek(0)
+        return PeerError(f"{name} {what}: {output.read().decode(errors='replace').strip()[-2000:]}")
 
     def check(self, since: int, awaited: str) -> None:
-        """Raise `PeerError` if a process ended, or the wait since `since` (ns) is too long."""
-        for node, (process, output) in self._nodes.items():
+        """Raise `PeerError` if a program ended, or the wait since `since` (ns) is too long."""
+        for process in self._programs:
             if process.poll() is not None:
-                output.seek(0)
-                text = output.read().decode(errors="replace").strip()[-2000:]
-                raise PeerError(f"node {node} ended with {process.returncode}: {text}")
+                raise self.failure(process, f"ended with {process.returncode}")
         if time.perf_counter_ns() - since > TIMEOUT * 1e9:
             raise PeerError(f"{awaited}: nothing came for {TIMEOUT:g} s")
 
@@ -81,19 +111,13 @@ class Crew:
         """Call the roll, then measure; raise `PeerError` if nodes are silent."""
         now = time.perf_counter_ns
         taken = np.empty(case.warm_up + case.samples, np.int64)
-        try:
-            _end_if_stuck()
-            self._call_roll(case.nodes, send, receive)
-            for number in range(len(taken)):
-                if number % 1000 == 0:
-                    _end_if_stuck()
-                begin = now()
-                send(begin, case.nodes, number)
-                while receive() != number:
-                    self.check(begin, f"reply to ping {number}")
-                taken[number] = now() - begin
-        finally:
-            faulthandler.cancel_dump_traceback_later()
+        self._call_roll(case.nodes, send, receive)
+        for number in range(len(taken)):
+            begin = now()
+            send(begin, case.nodes, number)
+            while receive() != number:
+                self.check(begin, f"reply to ping {number}")
+            taken[number] = now() - begin
         return taken[case.warm_up :]
 
     def _call_roll(self, nodes: int, send: Send, receive: Receive) -> None:
@@ -110,20 +134,12 @@ class Crew:
 @contextlib.contextmanager
 def children(module: str, case: Case, address: str, variant: str = "") -> Iterator[Crew]:
     """Run nodes 2 to N, each in a process, and end them with the block."""
-    nodes: dict[int, tuple[subprocess.Popen[bytes], IO[bytes]]] = {}
-    with contextlib.ExitStack() as stack:
-        stack.callback(_end, nodes)
+    with Crew(2 * GRACE) as crew:
         for node in range(2, case.nodes + 1):
             job = Job(node=node, nodes=case.nodes, case=case.case, address=address, variant=variant)
-            output = stack.enter_context(tempfile.TemporaryFile())
-            process = subprocess.Popen(
-                [sys.executable, "-m", __name__, module, msgspec.json.encode(job).decode()],
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=output,
-            )
-            nodes[node] = process, output
-        yield Crew(nodes)
+            words = ("-m", __name__, module, msgspec.json.encode(job).decode())
+            crew.add(f"node {node}", [sys.executable, *words], stdin=subprocess.PIPE)
+        yield crew
 
 
 def answer(node: int, receiver: int, number: int) -> int | None:
@@ -144,24 +160,6 @@ def number_of(pong: Any) -> int:
     """Return the number of a pong from its bytes."""
     number: int = PONG.unpack_from(pong)[1]
     return number
-
-
-def _end_if_stuck() -> None:
-    # For a `send` that never returns, in a library that does not even let Python handle Ctrl-C.
-    faulthandler.dump_traceback_later(5 * TIMEOUT, exit=True)
-
-
-def _end(nodes: dict[int, tuple[subprocess.Popen[bytes], IO[bytes]]]) -> None:
-    processes = [process for process, _ in nodes.values()]
-    for process in processes:
-        if process.stdin is not None:
-            process.stdin.close()
-    for process in processes:
-        try:
-            process.wait(2 * GRACE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 def _end_with_parent() -> None:

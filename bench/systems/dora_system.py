@@ -16,36 +16,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from bench import system
-from bench.systems.children import (
-    PING,
-    TIMEOUT,
-    Crew,
-    Job,
-    PeerError,
-    children,
-    number_of,
-    reply_to,
-)
+from bench.systems.children import PING, TIMEOUT, Crew, PeerError, number_of, reply_to
+from bench.systems.compiled import guarded
 
 _DORA = (sys.executable, "-c", "import sys, dora_cli; sys.exit(dora_cli.py_main())")
 _POOL = 1 << 26
-_SUPERVISOR = "BENCH_SUPERVISOR"
-_STARTED = "started"
-
-
-class _Address(msgspec.Struct, frozen=True):
-    """Where the dataflow is, and the ports of coordinator and daemon."""
-
-    directory: str
-    coordinator: int
-    daemon: int
 
 
 def _dataflow(case: system.Case) -> bytes:
@@ -68,9 +50,12 @@ def _dataflow(case: system.Case) -> bytes:
 
 
 @contextlib.contextmanager
-def _running(address: _Address, *arguments: str) -> Iterator[None]:
-    process = subprocess.Popen([*_DORA, *arguments], cwd=address.directory, start_new_session=True)
+def _running(directory: str, port: int, *arguments: str) -> Iterator[None]:
+    """Run a part of dora beside the block, which begins once something listens on the port."""
+    command = guarded([*_DORA, *arguments])
+    process = subprocess.Popen(command, cwd=directory, start_new_session=True)
     try:
+        _retry(lambda: socket.create_connection(("127.0.0.1", port), 1.0).close())
         yield
     finally:
         process.terminate()
@@ -81,55 +66,29 @@ def _running(address: _Address, *arguments: str) -> Iterator[None]:
         process.wait()
 
 
-def _wait_for_port(port: int) -> None:
-    until = time.monotonic() + TIMEOUT
-    while time.monotonic() < until:
-        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
-            return
-        time.sleep(0.02)
-    raise PeerError(f"dora: nothing listens on port {port} after {TIMEOUT:g} s")
+def _start(directory: str, port: int) -> None:
+    command = [*_DORA, "start", "flow.yml", "--detach", "--coordinator-port", str(port)]
+    subprocess.run(command, cwd=directory, capture_output=True, timeout=TIMEOUT, check=True)
 
 
-def _start(address: _Address) -> None:
-    arguments = ("start", "flow.yml", "--detach", "--coordinator-port", str(address.coordinator))
+def _retry(do: Callable[[], None]) -> None:
+    """Do something as soon as it works; raise `PeerError` if it does not."""
     until = time.monotonic() + TIMEOUT / 2
     while True:
-        done = subprocess.run(
-            [*_DORA, *arguments],
-            cwd=address.directory,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=TIMEOUT,
-            check=False,
-        )
-        if done.returncode == 0:
-            return
-        if time.monotonic() > until:
-            raise PeerError(f"dora start: {done.stdout.decode(errors='replace')[:2000]}")
-        time.sleep(0.1)
-
-
-def serve(job: Job) -> None:
-    """Run the dataflow, in the only child of the measuring process."""
-    address = msgspec.json.decode(job.address, type=_Address)
-    port = str(address.coordinator)
-    os.environ[_SUPERVISOR] = str(os.getpid())
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
-    coordinator = ("coordinator", "--port", port, "--store", "memory", "--quiet")
-    daemon = ("daemon", "--coordinator-port", port, "--local-listen-port", str(address.daemon))
-    with _running(address, *coordinator):
-        _wait_for_port(address.coordinator)
-        with _running(address, *daemon):
-            _wait_for_port(address.daemon)
-            _start(address)
-            Path(address.directory, _STARTED).touch()
-            signal.pause()
+        try:
+            return do()
+        except (OSError, subprocess.CalledProcessError) as error:
+            if time.monotonic() > until:
+                output = getattr(error, "stderr", b"") or b""
+                raise PeerError(f"dora: {error}: {output.decode(errors='replace')}") from None
+        time.sleep(0.05)
 
 
 def run(number: int, case: str) -> None:
-    """Be a node."""
+    """Be a node, as long as the daemon is there."""
+    daemon = os.getppid()
     node: Any = importlib.import_module("dora").Node()
-    while _is_alive(int(os.environ[_SUPERVISOR])):
+    while os.getppid() == daemon:
         event = node.next(timeout=1.0)
         if event is None or event["type"] != "INPUT":
             continue
@@ -142,33 +101,24 @@ def run(number: int, case: str) -> None:
         pong = reply_to(number, header)
         if pong is not None:
             node.send_output("pong", pong)
-    # The daemon is gone, too; parting from it in form would wait for it.
+    # Parting from the daemon in form would wait for it.
     os._exit(0)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def measure(case: system.Case) -> system.Samples:
     """Measure round trips."""
+    port, listening = system.free_port(), system.free_port()
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    coordinator = ("coordinator", "--port", str(port), "--store", "memory", "--quiet")
+    daemon = ("daemon", "--coordinator-port", str(port), "--local-listen-port", str(listening))
     with tempfile.TemporaryDirectory() as directory:
         Path(directory, "flow.yml").write_bytes(_dataflow(case))
-        address = _Address(directory, system.free_port(), system.free_port())
-        daemon = msgspec.structs.replace(case, nodes=2)
-        with children(__name__, daemon, msgspec.json.encode(address).decode()) as crew:
-            begin = time.perf_counter_ns()
-            while not Path(directory, _STARTED).exists():
-                crew.check(begin, "start of the dataflow")
-                time.sleep(0.02)
-            return _exchange(case, crew, address.daemon)
+        with _running(directory, port, *coordinator), _running(directory, listening, *daemon):
+            _retry(lambda: _start(directory, port))
+            return _exchange(case, listening)
 
 
-def _exchange(case: system.Case, crew: Crew, port: int) -> system.Samples:
+def _exchange(case: system.Case, port: int) -> system.Samples:
     dora: Any = importlib.import_module("dora")
     pyarrow: Any = importlib.import_module("pyarrow")
     os.environ["DORA_NODE_SHM_POOL_SIZE"] = str(_POOL)
@@ -188,19 +138,15 @@ def _exchange(case: system.Case, crew: Crew, port: int) -> system.Samples:
             return None
         return number_of(event["value"].to_numpy(zero_copy_only=True))
 
-    return crew.exchange(case, send, receive)
+    return Crew().exchange(case, send, receive)
 
 
-SYSTEMS = (
-    system.in_processes(
-        "dora",
-        ("stream",),
-        measure,
-        slowness=400,
-        missing=system.needs(dora="dora-rs", dora_cli="dora-rs-cli", pyarrow="pyarrow"),
-        version=system.versions("dora-rs"),
-    ),
-)
+_PACKAGES: dict[str, Any] = {
+    "missing": system.needs(dora="dora-rs", dora_cli="dora-rs-cli", pyarrow="pyarrow"),
+    "version": system.versions("dora-rs"),
+}
+
+SYSTEMS = (system.in_processes("dora", ("stream",), measure, 400, **_PACKAGES),)
 
 
 if __name__ == "__main__":

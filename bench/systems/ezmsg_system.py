@@ -9,7 +9,6 @@ memory, large arrays out of band, in buffers that are large enough from the star
 from __future__ import annotations
 
 import asyncio
-import functools
 import importlib
 import multiprocessing
 import os
@@ -20,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from bench.system import Case, Ping, Pong, Samples, System, in_processes, packaged, payloads
-from bench.systems.children import ALL, TIMEOUT, PeerError, answer
+from bench.systems.children import ALL, PeerError, answer
 
 _BUFFER = 1 << 23
 _Method = TypeVar("_Method", bound=Callable[..., Any])
@@ -63,11 +62,6 @@ class Exchange:
         self.done = self._number == len(self.taken)
         return not self.done
 
-    @property
-    def progress(self) -> tuple[int, int]:
-        """Progress of the exchange, constant in a stall: ping number, absent nodes."""
-        return self._number, len(self.absent)
-
 
 class _OfStream(Protocol):
     """Type of ezmsg's ``publisher`` and ``subscriber`` decorators of methods."""
@@ -90,15 +84,6 @@ def _units(ez: Any) -> tuple[Any, Any]:
             while self.exchange.absent:
                 yield self.PING, self.exchange.ping()
                 await asyncio.sleep(0.1)
-
-        @task
-        async def watch(self) -> None:
-            before, since = self.exchange.progress, time.monotonic()
-            while time.monotonic() - since < TIMEOUT:
-                await asyncio.sleep(1.0)
-                if self.exchange.progress != before:
-                    before, since = self.exchange.progress, time.monotonic()
-            raise ez.NormalTermination
 
         @subscriber(PONG)
         @publisher(PING)
@@ -131,7 +116,7 @@ def _units(ez: Any) -> tuple[Any, Any]:
     return Sender, Listener
 
 
-def measure(case: Case, *, processes: bool) -> Samples:
+def measure(case: Case, *, processes: bool = False) -> Samples:
     """Measure round trips between units."""
     os.environ["EZMSG_LOGLEVEL"] = "ERROR"
     # The units' classes are made here, and reach the other processes with a fork only.
@@ -160,24 +145,19 @@ def measure(case: Case, *, processes: bool) -> Samples:
     finally:
         server.stop()
     if not sender.exchange.done:
-        raise PeerError(f"ezmsg: ended after {sender.exchange.progress[0]} pings")
+        raise PeerError("ezmsg: ended before the last ping")
     taken: Samples = sender.exchange.taken[case.warm_up :]
     return taken
 
 
+def measure_processes(case: Case) -> Samples:
+    """Measure round trips between processes."""
+    return measure(case, processes=True)
+
+
+_PACKAGE = packaged(ezmsg="ezmsg")
+
 SYSTEMS = (
-    System(
-        "ezmsg (one process)",
-        ("handler",),
-        functools.partial(measure, processes=False),
-        slowness=30,
-        **packaged(ezmsg="ezmsg"),
-    ),
-    in_processes(
-        "ezmsg (processes)",
-        ("handler",),
-        functools.partial(measure, processes=True),
-        slowness=250,
-        **packaged(ezmsg="ezmsg"),
-    ),
+    System("ezmsg (one process)", ("handler",), measure, 30, **_PACKAGE),
+    in_processes("ezmsg (processes)", ("handler",), measure_processes, 250, **_PACKAGE),
 )

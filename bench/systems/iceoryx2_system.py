@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import LARGE_SHAPE, Case, Samples, in_processes, large_array, packaged
+from bench.system import ALL_CASES, LARGE_SHAPE, Case, Samples, in_processes, large_array, packaged
 from bench.systems.children import Job, answer, children
 
 _BYTES = int(np.prod(LARGE_SHAPE)) * 4
@@ -164,8 +164,8 @@ SYSTEMS = tuple(
         ("stream",),
         functools.partial(measure, variant=variant),
         slowness,
-        max_nodes,
-        cases=("small", "large", "large-shared"),
+        ALL_CASES,
+        max_nodes=max_nodes,
         **packaged(iceoryx2="iceoryx2"),
     )
     for variant, slowness, max_nodes in (

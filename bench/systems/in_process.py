@@ -143,12 +143,14 @@ async def _by_streams(
     return samples
 
 
-def _measure_on(new_loop: Callable[[], asyncio.AbstractEventLoop]) -> Callable[[Case], Samples]:
-    def measure(case: Case) -> Samples:
-        with asyncio.Runner(loop_factory=new_loop) as runner:
-            return runner.run(_by_queues(case))
+def measure_asyncio(case: Case) -> Samples:
+    """Measure round trips through queues on asyncio's own loop."""
+    return asyncio.run(_by_queues(case))
 
-    return measure
+
+def measure_uvloop(case: Case) -> Samples:
+    """Measure round trips through queues on uvloop."""
+    return uvloop.run(_by_queues(case))
 
 
 def measure_anyio(case: Case) -> Samples:
@@ -168,29 +170,17 @@ def measure_trio(case: Case) -> Samples:
     return samples
 
 
+def _python() -> str:
+    return f"Python {platform.python_version()}"
+
+
+_ANYIO = packaged(anyio="anyio", uvloop="uvloop")
+
 SYSTEMS = (
     System("plain calls", ("handler",), measure_calls, 0.5),
     System("pyee", ("handler",), measure_pyee, 2, **packaged(pyee="pyee")),
-    System(
-        "asyncio.Queue (asyncio)",
-        ("stream",),
-        _measure_on(asyncio.new_event_loop),
-        slowness=10,
-        version=lambda: f"Python {platform.python_version()}",
-    ),
-    System(
-        "asyncio.Queue (uvloop)",
-        ("stream",),
-        _measure_on(uvloop.new_event_loop),
-        slowness=5,
-        version=versions("uvloop"),
-    ),
-    System(
-        "anyio streams (uvloop)",
-        ("stream",),
-        measure_anyio,
-        slowness=6,
-        **packaged(anyio="anyio", uvloop="uvloop"),
-    ),
+    System("asyncio.Queue (asyncio)", ("stream",), measure_asyncio, 10, version=_python),
+    System("asyncio.Queue (uvloop)", ("stream",), measure_uvloop, 5, version=versions("uvloop")),
+    System("anyio streams (uvloop)", ("stream",), measure_anyio, 6, **_ANYIO),
     System("trio channels", ("stream",), measure_trio, 12, **packaged(trio="trio")),
 )

@@ -16,17 +16,18 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import shutil
-import signal
 import subprocess
 import tempfile
 import time
 import xmlrpc.client
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from bench.system import Case, Samples, System, free_port, in_processes
+from bench.system import ALL_CASES, Case, Samples, System, free_port, in_processes
+from bench.systems.children import Crew
 from bench.systems.compiled import (
     KEEP_MEMORY,
     arguments,
@@ -42,24 +43,28 @@ MASTER = Path("/usr/bin/rosmaster")
 CLOSING = 10.0  # seconds for the other nodes to end after node 1
 
 
-class GraphError(RuntimeError):
-    """The master does not come up, or a node failed or did not end in time."""
-
-
-class Graph:
+class Graph(Crew):
     """A master and its nodes. Made by `graph`."""
 
-    def __init__(self, directory: Path, stack: contextlib.ExitStack) -> None:
+    def __init__(self, directory: Path) -> None:
+        super().__init__()
         self.directory = directory
-        self._stack = stack
-        port = free_port()
-        self._uri = f"http://127.0.0.1:{port}"
-        self._outputs: dict[int, IO[bytes]] = {}
-        self._await_master(self.start([MASTER, "--core", "-p", str(port)]))
+        self._port = free_port()
+        self._uri = f"http://127.0.0.1:{self._port}"
+
+    def start_master(self) -> None:
+        """Start the master, and wait for its answer."""
+        self.start([MASTER, "--core", "-p", str(self._port)])
+        begin = time.perf_counter_ns()
+        while True:
+            self.check(begin, "answer of the master")
+            with contextlib.suppress(OSError), xmlrpc.client.ServerProxy(self._uri) as master:
+                master.getPid("/bench")
+                return
+            time.sleep(0.05)
 
     def start(self, command: Sequence[str | Path]) -> subprocess.Popen[bytes]:
         """Start a node, ended at the latest with the graph."""
-        output = self._stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
         environment = {
             # Of this Python's packages Debian's is to see nothing.
             **{k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "ROS_"))},
@@ -70,16 +75,8 @@ class Graph:
             "ROS_LOG_DIR": str(self.directory),
             "TMPDIR": str(self.directory),
         }
-        process = subprocess.Popen(
-            guarded(command),
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-        )
-        self._stack.callback(_end, process)
-        self._outputs[process.pid] = output
-        return process
+        words = guarded(command)
+        return self.add(shlex.join(words), words, env=environment, stdin=subprocess.DEVNULL)
 
     def finish(
         self,
@@ -87,15 +84,15 @@ class Graph:
         others: Sequence[subprocess.Popen[bytes]],
         deadline: float,
     ) -> None:
-        """Wait for node 1, then for the others; raise `GraphError` if one fails or is late."""
+        """Wait for node 1, then for the others; raise `PeerError` if one fails or is late."""
         until = time.monotonic() + deadline
         while first.poll() is None:
             for process in others:
                 # A listener that has heard all leaves a moment before node 1 does.
                 if process.poll():
-                    raise self._error(process, f"ended with {process.returncode}")
+                    raise self.failure(process, f"ended with {process.returncode}")
             if time.monotonic() > until:
-                raise self._error(first, f"expected to end within {deadline:g} s")
+                raise self.failure(first, f"expected to end within {deadline:g} s")
             with contextlib.suppress(subprocess.TimeoutExpired):
                 first.wait(0.05)
         until = time.monotonic() + CLOSING
@@ -103,42 +100,20 @@ class Graph:
             try:
                 code = process.wait(max(0.01, until - time.monotonic()))
             except subprocess.TimeoutExpired:
-                raise self._error(process, "expected to end after the last ping") from None
+                raise self.failure(process, "expected to end after the last ping") from None
             if code:
-                raise self._error(process, f"ended with {code}")
-
-    def _await_master(self, process: subprocess.Popen[bytes]) -> None:
-        until = time.monotonic() + 20
-        while time.monotonic() < until:
-            if process.poll() is not None:
-                raise self._error(process, f"ended with {process.returncode}")
-            with contextlib.suppress(OSError), xmlrpc.client.ServerProxy(self._uri) as master:
-                master.getPid("/bench")
-                return
-            time.sleep(0.05)
-        raise self._error(process, "expected to answer within 20 s")
-
-    def _error(self, process: subprocess.Popen[bytes], what: str) -> GraphError:
-        output = self._outputs[process.pid]
-        output.seek(0)
-        text = output.read().decode(errors="replace").strip()[-2000:]
-        return GraphError(f"{process.args!r} {what}: {text}")
+                raise self.failure(process, f"ended with {code}")
 
 
 @contextlib.contextmanager
 def graph() -> Iterator[Graph]:
-    """Run a master, which ends with all nodes with the block; else raise `GraphError`."""
+    """Run a master, which ends with all nodes with the block; else raise `PeerError`."""
     with (
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as directory,
-        contextlib.ExitStack() as stack,
+        Graph(Path(directory)) as made,
     ):
-        yield Graph(Path(directory), stack)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.send_signal(signal.SIGKILL)
-    process.wait()
+        made.start_master()
+        yield made
 
 
 PYTHON = Path("/usr/bin/python3")
@@ -219,27 +194,16 @@ _ROSCPP = {"libroscpp-dev": INCLUDE / "ros/ros.h"}
 _NODELET = {**_ROSCPP, "libnodeletlib-dev": INCLUDE / "nodelet/nodelet.h"}
 _ROSPY = {"python3-rospy": PACKAGES / "rospy", "python3-numpy": PACKAGES / "numpy"}
 _CPP = _packaged("roscpp", "libroscpp-dev", _ROSCPP)
-_PYTHON = {
-    "cases": ("small", "large", "large-shared"),
-    **_packaged("rospy", "python3-rospy", _ROSPY, compiled=False),
-}
+_NODELETS = _packaged("nodelet", "libnodeletlib-dev", _NODELET)
+_PYTHON = _packaged("rospy", "python3-rospy", _ROSPY, compiled=False)
 
 SYSTEMS = (
     System("roscpp, one process", ("handler",), measure_roscpp, 1.5, **_CPP),
-    System(
-        "ROS 1 nodelets",
-        ("handler",),
-        measure_nodelets,
-        slowness=50,
-        **_packaged("nodelet", "libnodeletlib-dev", _NODELET),
+    System("ROS 1 nodelets", ("handler",), measure_nodelets, 50, **_NODELETS),
+    in_processes(
+        "roscpp, processes", ("handler",), measure_roscpp_processes, 100, ALL_CASES, **_CPP
     ),
     in_processes(
-        "roscpp, processes",
-        ("handler",),
-        measure_roscpp_processes,
-        slowness=100,
-        cases=("small", "large", "large-shared"),
-        **_CPP,
+        "rospy, processes", ("handler",), measure_rospy_processes, 70, ALL_CASES, **_PYTHON
     ),
-    in_processes("rospy, processes", ("handler",), measure_rospy_processes, 70, **_PYTHON),
 )

@@ -37,13 +37,15 @@ def test_a_row_sums_up_the_samples_of_all_rounds(monkeypatch: pytest.MonkeyPatch
     outcome = measure_all(
         "small", nodes=(2, 3), samples=60, warm_up=5, repeats=2, only=("plain calls",)
     )
-    assert [(r.system, r.nodes, r.samples) for r in outcome.rows] == [
+    assert [(r["system"], r["nodes"], r["samples"]) for r in outcome.rows] == [
         ("plain calls", 2, 120),
         ("plain calls", 3, 120),
     ]
     for row in outcome.rows:
-        assert 0 < row.q1_us <= row.median_us <= row.q3_us <= row.p99_us <= row.max_us
-        assert len(row.rounds_us) == 2
+        assert (
+            0 < row["q1_us"] <= row["median_us"] <= row["q3_us"] <= row["p99_us"] <= row["max_us"]
+        )
+        assert len(row["rounds_us"]) == 2
     assert outcome.missing == {}
 
 
@@ -71,7 +73,7 @@ def test_without_a_checkout_nothing_else_is_measured(
     monkeypatch.setattr(driver, "RIVALS", tmp_path / "systems")
     monkeypatch.setattr(driver, "_measure", lambda *_: np.arange(1, 31, dtype=np.int64))
     outcome = measure_all("small", nodes=(2,), samples=30, warm_up=0, repeats=1)
-    assert {row.system for row in outcome.rows} == {"visnav", "visnav, fingerprinted"}
+    assert {row["system"] for row in outcome.rows} == {"visnav", "visnav, fingerprinted"}
     assert [*outcome.missing] == ["all other systems"]
 
 

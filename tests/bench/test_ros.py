@@ -5,18 +5,18 @@ from __future__ import annotations
 import pytest
 
 from bench import bridge, flood, lateness
-from bench.lateness import Beat
+from bench.lateness import Beat, Window
 
 
 def test_both_encoders_are_measured_and_compared() -> None:
     """A row for each kind of image; that both make the same bytes is checked while warming up."""
     rows = bridge.measure_ros_images(repeats=5)
-    assert [row.case for row in rows] == ["512×512 rgb8", "512×512 32FC1"]
+    assert [row["case"] for row in rows] == ["512×512 rgb8", "512×512 32FC1"]
     for row, size in zip(rows, (3, 4), strict=True):
-        assert row.samples == 5
-        assert 0 < row.bytes - 512 * 512 * size < 200
-        assert row.ratio == pytest.approx(row.ours_us / row.rosbags_us)
-        assert 0.0 < row.ours_us <= row.ours_p99_us
+        assert row["samples"] == 5
+        assert 0 < row["bytes"] - 512 * 512 * size < 200
+        assert row["ratio"] == pytest.approx(row["ours_us"] / row["rosbags_us"])
+        assert 0.0 < row["ours_us"] <= row["ours_p99_us"]
 
 
 def test_each_flooded_window_is_compared_with_the_quiet_one_before_it(
@@ -28,12 +28,12 @@ def test_each_flooded_window_is_compared_with_the_quiet_one_before_it(
         ticks += [(window * second + n * 2_500_000, late * 1000) for n in range(400)]
         ticks.append((window * second + 1_000_000, 10**9))
     monkeypatch.setattr(lateness, "BEATS", [Beat(at, at, late, 0) for at, late in ticks])
-    windows = [(w * second, (w + 1) * second, 10_000 * (w % 2)) for w in range(6)]
+    windows = [Window(w * second, (w + 1) * second, 10_000 * (w % 2)) for w in range(6)]
     row = flood._row("flood", windows[1::2], windows[0::2])
-    assert (row.late_p50_us, row.late_p99_us, row.late_max_us) == (130.0, 130.0, 6000.0)
-    assert row.ratio_p50 == row.ratio_p99 == pytest.approx(1.2)
-    assert row.messages_per_second == 10_000.0
-    assert row.ticks == 3 * sum(12 < n < 388 for n in range(400))
+    assert (row["late_p50_us"], row["late_p99_us"], row["late_max_us"]) == (130.0, 130.0, 6000.0)
+    assert row["ratio_p50"] == row["ratio_p99"] == pytest.approx(1.2)
+    assert row["messages_per_second"] == 10_000.0
+    assert row["ticks"] == 3 * sum(12 < n < 388 for n in range(400))
 
 
 @pytest.mark.slow
@@ -41,8 +41,8 @@ def test_each_flooded_window_is_compared_with_the_quiet_one_before_it(
 def test_a_flood_makes_ticks_hardly_later() -> None:
     """The margin is for a machine that does other things; `bench bridge` tells the figure."""
     quiet, flooded = flood.measure(windows=12)
-    assert quiet.messages_per_second == 0.0
-    assert flooded.messages_per_second > 500
-    assert min(quiet.ticks, flooded.ticks) > 500
-    assert flooded.ratio_p50 < 2.0
-    assert min(flooded.ratio_p99, flooded.late_p99_us / quiet.late_p99_us) < 4.0
+    assert quiet["messages_per_second"] == 0.0
+    assert flooded["messages_per_second"] > 500
+    assert min(quiet["ticks"], flooded["ticks"]) > 500
+    assert flooded["ratio_p50"] < 2.0
+    assert min(flooded["ratio_p99"], flooded["late_p99_us"] / quiet["late_p99_us"]) < 4.0

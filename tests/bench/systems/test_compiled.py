@@ -13,7 +13,8 @@ import pytest
 
 from bench.system import Case, CaseName, System
 from bench.systems import compiled, ros1
-from bench.systems.ros1 import GraphError, graph
+from bench.systems.children import PeerError
+from bench.systems.ros1 import graph
 
 SYSTEMS = (*compiled.SYSTEMS, *ros1.SYSTEMS)
 
@@ -94,7 +95,7 @@ def test_graph_ends_its_nodes_when_one_fails(roscpp: System) -> None:
     with graph() as ros:
         steady = ros.start(["sleep", "60"])
         failing = ros.start(["false"])
-        with pytest.raises(GraphError, match="ended with 1"):
+        with pytest.raises(PeerError, match="ended with 1"):
             ros.finish(steady, [failing], 20)
     assert steady.returncode == -signal.SIGKILL
 
