@@ -30,7 +30,7 @@ from events.geometry import Pose, relative
 from runtime.errors import CommandError, expect_known
 from runtime.run.run_state import RunState
 from runtime.time.schedule import SECOND
-from runtime.tools.monitor.protocol import Points, Rows
+from runtime.tools.monitor.protocol import Points
 
 GAP = SECOND // 2
 """Silence that counts as lost, nanoseconds; as an evaluation's, if its file sets no other."""
@@ -195,24 +195,20 @@ class Measured:
 
     # What a snapshot asks.
 
-    def rows(self) -> Rows:
-        """Return the rows of the estimators' table."""
+    def rows(self) -> list[tuple[object, ...]]:
+        """Return the values of the estimators' table."""
         _ = self._vehicles
-        now = self._state.clock.now()
+        now, score = self._state.clock.now(), self._scores.get
         return [
             (
                 name,
                 each.tracking(now),
-                self._last(name, "ate_rmse", "{:.3f}"),
-                self._last(name, "ate_percent", "{:.2f}"),
-                "" if each.heard is None else f"{each.latency / 1e6:.1f}",
+                score((name, "ate_rmse")),
+                score((name, "ate_percent")),
+                None if each.heard is None else each.latency / 1e6,
             )
             for name, each in self._estimators.items()
         ]
-
-    def _last(self, estimator: str, metric: str, how: str) -> str:
-        value = self._scores.get((estimator, metric))
-        return "" if value is None else how.format(value)
 
     def paths(self) -> dict[str, Points]:
         """Return the paths of vehicles and estimators: metres east, metres north."""

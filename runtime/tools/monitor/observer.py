@@ -11,8 +11,7 @@ import collections
 import itertools
 import logging
 import time
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import msgspec
@@ -25,7 +24,7 @@ from runtime.errors import CommandError, expect_known
 from runtime.node import NodeConfig, senders, streams
 from runtime.run.instruments import Call, Instrument
 from runtime.run.node_runner import NodeRunner
-from runtime.run.summarise import count_drops
+from runtime.run.summarise import count_drops, count_events, tick_summaries
 from runtime.run.supervisor import Supervisor
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND
@@ -230,50 +229,38 @@ class Observer:
         return self._measured.image(camera)
 
     def _sample(self) -> Sample:
-        sent: Counter[str] = Counter()
-        for node in self._state.all_nodes:
-            for sender in senders(node).values():
-                sent[sender.name] += sender.sent().total()
+        _, sent = count_events(self._state)
         return Sample(time.perf_counter(), self._state.clock.now(), sent, self._meter.take())
 
     def _tables(self, sample: Sample) -> dict[str, protocol.Rows]:
         state, runners = self._state, self._state.runners
-        return {
+        values: dict[str, Iterable[tuple[object, ...]]] = {
             "estimators": self._measured.rows(),
-            "nodes": [self._node(runner) for runner in runners.values()],
-            "outputs": self._outputs(sample),
+            "nodes": map(self._node, runners.values()),
+            "ticks": (
+                (name, each.hz, each.calls, each.missed, each.late_p99_us, each.late_max_us)
+                for name, each in tick_summaries(state).items()
+            ),
             "inputs": self._inputs(),
-            "links": [
-                (link.name, f"{link.lost}", f"{link.thinned}") for link in state.links.values()
-            ],
-            "ticks": [
-                (
-                    name,
-                    f"{ticker.hz:g}",
-                    f"{ticker.calls}",
-                    f"{ticker.missed}",
-                    f"{ticker.late.quantile(0.99) / 1e3:.0f}",
-                    f"{ticker.late.maximum / 1e3:.0f}",
-                )
-                for name, ticker in state.tickers.items()
-            ],
-            "settings": [
+            "links": ((each.name, each.lost, each.thinned) for each in state.links.values()),
+            "outputs": self._outputs(sample),
+            "settings": (
                 (f"{name}.{key}", value)
                 for name, runner in runners.items()
                 for key, value in self._shown(runner).items()
-            ],
+            ),
         }
+        return {name: protocol.formatted(name, rows) for name, rows in values.items()}
 
-    def _node(self, runner: NodeRunner) -> tuple[str, ...]:
+    def _node(self, runner: NodeRunner) -> tuple[object, ...]:
         steps, real = self._recent.amount(runner.spec.name), self._recent.real
-        calls = sum(worker.outstanding() for worker in runner.workers)
         return (
             runner.spec.name,
             self._condition(runner) + (f" ({runner.failures})" if runner.failures else ""),
-            f"{steps.total / 1e9 / real:.1%}",
-            f"{steps.times / real:.0f}",
-            f"{steps.longest / 1e6:.2f}",
-            f"{calls}" if calls else "",
+            steps.total / 1e9 / real,
+            steps.times / real,
+            steps.longest / 1e6,
+            sum(worker.outstanding() for worker in runner.workers) or None,
         )
 
     def _shown(self, runner: NodeRunner) -> dict[str, str]:
@@ -294,38 +281,30 @@ class Observer:
             return "starting"
         return "running" if self._state.running else "ready"
 
-    def _outputs(self, sample: Sample) -> protocol.Rows:
+    def _outputs(self, sample: Sample) -> Iterator[tuple[object, ...]]:
         events = {
             sender.name: sender.event.__name__
             for node in self._state.all_nodes
             for sender in senders(node).values()
         }
-        last = self._meter.last
-        found: protocol.Rows = []
         for name, event in events.items():
-            flow = self._recent.amount(name)
-            found.append(
-                (
-                    name,
-                    event,
-                    f"{sample.sent[name]}",
-                    f"{self._recent.rate(name):.1f}",
-                    f"{(sample.run - last[name]) / SECOND:.2f}" if name in last else "",
-                    f"{flow.total / flow.times / 1e6:.2f}" if flow.times else "",
-                    f"{flow.longest / 1e6:.2f}" if flow.times else "",
-                )
+            flow, last = self._recent.amount(name), self._meter.last.get(name)
+            yield (
+                name,
+                event,
+                sample.sent[name],
+                self._recent.rate(name),
+                None if last is None else (sample.run - last) / SECOND,
+                flow.total / flow.times / 1e6 if flow.times else None,
+                flow.longest / 1e6 if flow.times else None,
             )
-        return found
 
-    def _inputs(self) -> protocol.Rows:
+    def _inputs(self) -> Iterator[tuple[object, ...]]:
         drops = count_drops(self._state)
-        found: protocol.Rows = []
         for runner in self._state.runners.values():
             for stream in streams(runner.node).values() if runner.node is not None else ():
                 of = drops[stream.name]
-                held = stream.statistics().buffered
-                found.append((stream.name, *map(str, (held, of.peak, of.bound, of.dropped))))
-        return found
+                yield stream.name, stream.statistics().buffered, of.peak, of.bound, of.dropped
 
     # Commands.
 

@@ -8,12 +8,12 @@ connection of its own.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import re
 import socket
 import threading
-from collections.abc import AsyncIterator
-from contextlib import closing
+from collections.abc import AsyncIterator, Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -27,35 +27,49 @@ SLOWEST, QUICKEST = 1e-3, 1e6  # limits of the speed, in simulated seconds per r
 Rows = list[tuple[str, ...]]
 Points = list[tuple[float, ...]]
 
-COLUMNS: dict[str, tuple[str, ...]] = {
-    "estimators": ("estimator", "tracking", "ATE m", "ATE %", "latency ms"),
-    "nodes": ("node", "condition", "loop", "steps/s", "longest ms", "calls"),
-    "ticks": ("tick", "Hz", "calls", "missed", "late p99 µs", "max µs"),
-    "inputs": ("input", "holds", "fullest", "of", "dropped"),
-    "links": ("link", "lost", "thinned"),
-    "outputs": ("output", "event", "sent", "per s", "age s", "latency ms", "max"),
-    "settings": ("setting that can change", "value"),
-}
-"""Titles of columns, by table; the first column of each row is unique.
+COLUMNS: dict[str, dict[str, str]] = {
+    "estimators": {
+        "estimator": "", "tracking": "", "ATE m": ".3f", "ATE %": ".2f", "latency ms": ".1f",
+    },
+    "nodes": {
+        "node": "", "condition": "", "loop": ".1%", "steps/s": ".0f", "longest ms": ".2f",
+        "calls": "d",
+    },
+    "ticks": {
+        "tick": "", "Hz": "g", "calls": "d", "missed": "d", "late p99 µs": ".0f", "max µs": ".0f",
+    },
+    "inputs": {"input": "", "holds": "d", "fullest": "d", "of": "d", "dropped": "d"},
+    "links": {"link": "", "lost": "d", "thinned": "d"},
+    "outputs": {
+        "output": "", "event": "", "sent": "d", "per s": ".1f", "age s": ".2f",
+        "latency ms": ".2f", "max": ".2f",
+    },
+    "settings": {"setting that can change": "", "value": ""},
+}  # fmt: skip
+"""Titles of columns with the formats of their numbers (none: text), by table.
 
-Of estimators, the ATE is the last that a node sent as `Score`, and the latency is that of the last
-estimate. Of nodes, times are real, over the last second or so: the share of the loop's time that a
-node took, how often the loop called it, its longest step without the calls of other nodes in it;
-and the calls of its workers that are not answered yet. Of outputs, rate, mean and longest latency
-(from an event's stamp to its delivery) are on the run's clock over the last real second or so. All
-else is since the run began.
+The first column of each row is unique. Of estimators, the ATE is the last that a node sent as
+`Score`, and the latency is that of the last estimate. Of nodes, times are real, over the last
+second or so: the share of the loop's time that a node took, how often the loop called it, its
+longest step without the calls of other nodes in it; and the calls of its workers that are not
+answered yet. Of outputs, rate, mean and longest latency (from an event's stamp to its delivery) are
+on the run's clock over the last real second or so. All else is since the run began.
 """
 
 STACKS = (("estimators",), ("nodes", "ticks", "inputs", "links"), ("outputs", "settings"))
 """Tables above, and in the left and in the right column."""
 
-_WORDS = {"tracking", "condition", "event", "value"}
-"""Columns of text; all others but the first hold numbers."""
 
-
-def is_number(table: str, column: int) -> bool:
-    """Tell whether a column holds numbers, to be aligned right."""
-    return column > 0 and COLUMNS[table][column] not in _WORDS
+def formatted(table: str, values: Iterable[tuple[object, ...]]) -> Rows:
+    """Return values as the rows of a table; `None` leaves a cell empty."""
+    forms = COLUMNS[table].values()
+    return [
+        tuple(
+            "" if value is None else format(value, form)
+            for value, form in zip(row, forms, strict=True)
+        )
+        for row in values
+    ]
 
 
 class LogLine(msgspec.Struct, frozen=True, kw_only=True):
@@ -98,52 +112,57 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Request(
-    msgspec.Struct, frozen=True, kw_only=True, tag_field="do", forbid_unknown_fields=True
+    msgspec.Struct,
+    frozen=True,
+    kw_only=True,
+    tag_field="do",
+    tag=str.lower,
+    forbid_unknown_fields=True,
 ):
     """Base of all that a run can be asked."""
 
 
-class Pause(_Request, frozen=True, tag="pause"):
+class Pause(_Request, frozen=True):
     """Pause simulated time."""
 
 
-class Resume(_Request, frozen=True, tag="resume"):
+class Resume(_Request, frozen=True):
     """Resume simulated time."""
 
 
-class Step(_Request, frozen=True, tag="step"):
+class Step(_Request, frozen=True):
     """Run for some seconds and pause; without a number, up to the next due time."""
 
     seconds: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
 
 
-class Speed(_Request, frozen=True, tag="speed"):
+class Speed(_Request, frozen=True):
     """Set how many simulated seconds pass per real second; without a number, as many as can."""
 
     factor: Annotated[float, msgspec.Meta(ge=SLOWEST, le=QUICKEST)] | None = None
 
 
-class Restart(_Request, frozen=True, tag="restart"):
+class Restart(_Request, frozen=True):
     """Restart a node: shut down, then start again."""
 
     node: str
 
 
-class Stop(_Request, frozen=True, tag="stop"):
+class Stop(_Request, frozen=True):
     """End the run in order."""
 
 
-class Set(_Request, frozen=True, tag="set"):
+class Set(_Request, frozen=True):
     """Change a setting of a node: ``node.key=value``, the value in TOML or a bare word."""
 
     text: str
 
 
-class Watch(_Request, frozen=True, tag="watch"):
+class Watch(_Request, frozen=True):
     """Send snapshots, and no answer, for as long as the connection lasts."""
 
 
-class Look(_Request, frozen=True, tag="look"):
+class Look(_Request, frozen=True):
     """Answer with the newest image of a snapshot's camera, while somebody watches."""
 
     camera: str
@@ -190,45 +209,49 @@ class Client:
         self._path = path
         self._turn = asyncio.Lock()
 
-    async def snapshots(self) -> AsyncIterator[Snapshot]:
-        """Yield snapshots until the run is over, or raise `CommandError` if none listens."""
+    @contextlib.asynccontextmanager
+    async def lines(self, request: Request | bytes) -> AsyncIterator[asyncio.StreamReader]:
+        """Send a request, encoded or not, on a connection of its own, and hold what comes back.
+
+        Raises:
+            CommandError: No run listens.
+        """
         try:
             reader, writer = await asyncio.open_unix_connection(self._path, limit=LONGEST_LINE)
         except OSError as error:
             raise _not_listening(self._path, error) from None
-        with closing(writer):
-            writer.write(encode(Watch()) + b"\n")
+        with contextlib.closing(writer):
+            line = request if isinstance(request, bytes) else encode(request)
+            writer.write(line + b"\n")
+            yield reader
+
+    async def snapshots(self) -> AsyncIterator[Snapshot]:
+        """Yield snapshots until the run is over, or raise `CommandError` if none listens."""
+        async with self.lines(Watch()) as lines:
             try:
-                async for line in reader:
+                async for line in lines:
                     yield decode_snapshot(line)
             except OSError:
                 pass
             except UNREADABLE as error:
                 raise CommandError(f"expected a run of this version: {error}") from None
 
-    async def ask(self, command: Command) -> Answer:
-        """Send a command to the run after those before it, and return its answer."""
-        async with self._turn:
-            return await request(self._path, encode(command))
-
-
-async def request(path: Path, line: bytes) -> Answer:
-    """Send an encoded request to a run, and return its answer, or why there is none."""
-    try:
-        async with asyncio.timeout(ANSWER_TIMEOUT):
-            reader, writer = await asyncio.open_unix_connection(path, limit=LONGEST_LINE)
-            with closing(writer):
-                writer.write(line + b"\n")
-                return decode_answer(await reader.readline())
-    except TimeoutError:
-        return Answer(done=False, text="the run does not answer")
-    except (OSError, *UNREADABLE) as error:
-        return Answer(done=False, text=str(_not_listening(path, error)))
+    async def ask(self, request: Request | bytes) -> Answer:
+        """Send a request to the run after those before it; return its answer, or why none came."""
+        try:
+            async with self._turn, asyncio.timeout(ANSWER_TIMEOUT), self.lines(request) as lines:
+                return decode_answer(await lines.readline())
+        except TimeoutError:
+            return Answer(done=False, text="the run does not answer")
+        except CommandError as error:
+            return Answer(done=False, text=str(error))
+        except (OSError, *UNREADABLE) as error:
+            return Answer(done=False, text=str(_not_listening(self._path, error)))
 
 
 def ask(path: Path, command: Command) -> str:
     """Send a command to a run, without a loop, and return the answer; `CommandError` if refused."""
-    answer = asyncio.run(request(path, encode(command)))
+    answer = asyncio.run(Client(path).ask(command))
     if not answer.done:
         raise CommandError(answer.text)
     return answer.text

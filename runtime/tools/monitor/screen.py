@@ -59,10 +59,10 @@ class Screen(App[str]):
     BINDINGS: ClassVar[list[Any]] = [
         Binding("space", "pause", "pause/go on"),
         Binding("full_stop", "step", "step"),
-        Binding("s", "step_far", "step 1 s"),
+        Binding("s", "step(1.0)", "step 1 s"),
         Binding("plus,equals_sign", "speed(2.0)", "faster", key_display="+"),
         Binding("minus", "speed(0.5)", "slower", key_display="-"),
-        Binding("m", "fastest", "fastest"),
+        Binding("m", "speed(None)", "fastest"),
         Binding("r", "restart", "restart node"),
         Binding("p", "prompt", "set parameter"),
         Binding("x,ctrl+c", "stop", "end run", key_display="x x"),
@@ -103,8 +103,8 @@ class Screen(App[str]):
         for name in protocol.COLUMNS:
             table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
             table.border_title = name
-            for column, title in enumerate(protocol.COLUMNS[name]):
-                table.add_column(_cell(name, column, title), key=title)
+            for title, form in protocol.COLUMNS[name].items():
+                table.add_column(_cell(title, form), key=title)
         self.query_one("#nodes").focus()
         self.run_worker(self._listen(), exclusive=True)
 
@@ -140,20 +140,22 @@ class Screen(App[str]):
 
     def _fill(self, name: str, snapshot: protocol.Snapshot) -> None:
         """Update a table's rows in place, to keep the cursor."""
+        columns = protocol.COLUMNS[name]
         table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
-        found = snapshot.tables[name]
+        found = {
+            row[0]: [_cell(*each) for each in zip(row, columns.values(), strict=True)]
+            for row in snapshot.tables[name]
+        }
         table.set_class(not found, "none")
-        if [row[0] for row in found] != [key.value for key in table.rows]:
+        if [*found] != [key.value for key in table.rows]:
             table.clear()
-            for row in found:
-                table.add_row(*(_cell(name, n, text) for n, text in enumerate(row)), key=row[0])
+            for key, cells in found.items():
+                table.add_row(*cells, key=key)
             return
-        for row in found:
-            for column, text in enumerate(row):
-                cell = _cell(name, column, text)
-                title = protocol.COLUMNS[name][column]
-                if table.get_cell(row[0], title) != cell:
-                    table.update_cell(row[0], title, cell, update_width=True)
+        for key, cells in found.items():
+            for title, cell in zip(columns, cells, strict=True):
+                if table.get_cell(key, title) != cell:
+                    table.update_cell(key, title, cell, update_width=True)
 
     # Keys.
 
@@ -172,24 +174,18 @@ class Screen(App[str]):
             self._ask(protocol.Resume() if paused else protocol.Pause())
             self._expect(paused=not paused)
 
-    def action_step(self) -> None:
-        """Step to the next due time."""
-        self._ask(protocol.Step())
+    def action_step(self, seconds: float | None = None) -> None:
+        """Step by some seconds, or else to the next due time."""
+        self._ask(protocol.Step(seconds=seconds))
 
-    def action_step_far(self) -> None:
-        """Step by 1 s."""
-        self._ask(protocol.Step(seconds=1.0))
-
-    def action_speed(self, factor: float) -> None:
-        """Multiply the speed of time."""
-        if self.snapshot is not None:
+    def action_speed(self, factor: float | None) -> None:
+        """Multiply the speed of time, or let time run as fast as possible."""
+        if factor is None:
+            self._ask(protocol.Speed())
+        elif self.snapshot is not None:
             asked = min(max(self.snapshot.speed * factor, protocol.SLOWEST), protocol.QUICKEST)
             self._ask(protocol.Speed(factor=asked))
             self._expect(speed=asked)
-
-    def action_fastest(self) -> None:
-        """Let time run as fast as possible."""
-        self._ask(protocol.Speed(factor=None))
 
     def _expect(self, **changes: Any) -> None:
         """Assume a command's effect until the next snapshot, for keys pressed before."""
@@ -246,8 +242,8 @@ def _table(name: str) -> DataTable[Text]:
     return DataTable(id=name, cursor_type="row", show_cursor=name == "nodes", zebra_stripes=True)
 
 
-def _cell(table: str, column: int, text: str) -> Text:
-    return Text(text, justify="right" if protocol.is_number(table, column) else "left")
+def _cell(text: str, form: str) -> Text:
+    return Text(text, justify="right" if form else "left")
 
 
 def drawn(paths: dict[str, protocol.Points], width: int, height: int) -> Text:

@@ -14,7 +14,6 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from urllib.parse import parse_qs, quote, urlsplit
 import jinja2
 import msgspec
 
+from runtime.errors import CommandError
 from runtime.tools.monitor import protocol
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
@@ -87,9 +87,9 @@ class _Handler(BaseHTTPRequestHandler):
             case "GET", "/":
                 self._page()
             case "GET", "/events":
-                self._events()
+                asyncio.run(self._events())
             case "GET", "/image":
-                answer = self._ask(protocol.encode(protocol.Look(camera=query.get("camera", ""))))
+                answer = self._ask(protocol.Look(camera=query.get("camera", "")))
                 if not answer.done:
                     raise HttpError(404, answer.text)
                 self._send(200, answer.jpeg, "image/jpeg")
@@ -121,8 +121,11 @@ class _Handler(BaseHTTPRequestHandler):
             raise HttpError(413, f"expected at most {LONGEST_BODY} bytes")
         return self.rfile.read(int(length)).replace(b"\n", b" ")
 
-    def _ask(self, line: bytes) -> protocol.Answer:
-        return asyncio.run(protocol.request(self.server.run, line))
+    def _ask(self, request: protocol.Request | bytes) -> protocol.Answer:
+        return asyncio.run(self._client().ask(request))
+
+    def _client(self) -> protocol.Client:
+        return protocol.Client(self.server.run)
 
     def _page(self) -> None:
         nonce = secrets.token_urlsafe(16)
@@ -131,8 +134,7 @@ class _Handler(BaseHTTPRequestHandler):
         content = page.from_string(text).render(
             nonce=nonce, slowest=protocol.SLOWEST, quickest=protocol.QUICKEST,
             token=self.server.token, stacks=protocol.STACKS, columns=protocol.COLUMNS,
-            first=msgspec.json.decode(next(self._snapshots(timeout=2.0), b"null")),
-            is_number=protocol.is_number,
+            first=msgspec.json.decode(asyncio.run(self._newest())),
         )  # fmt: skip
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
@@ -141,19 +143,20 @@ class _Handler(BaseHTTPRequestHandler):
         )
         self._send(200, content.encode(), "text/html; charset=utf-8", policy)
 
-    def _events(self) -> None:
+    async def _newest(self) -> bytes:
+        with contextlib.suppress(OSError, CommandError):  # a time-out is an OSError, too
+            async with asyncio.timeout(2.0), self._client().lines(protocol.Watch()) as lines:
+                return await lines.readline() or b"null"
+        return b"null"
+
+    async def _events(self) -> None:
         """Send the run's snapshots as events, each a line; and ``null`` when it is over."""
         self._head(200, "text/event-stream")
-        for line in self._snapshots():
-            self.wfile.write(b"data: " + line + b"\n")
+        with contextlib.suppress(OSError, CommandError):
+            async with self._client().lines(protocol.Watch()) as lines:
+                async for line in lines:
+                    self.wfile.write(b"data: " + line + b"\n")
         self.wfile.write(b"data: null\n\n")
-
-    def _snapshots(self, timeout: float | None = None) -> Iterator[bytes]:
-        with contextlib.suppress(OSError), connected(self.server.run) as run:
-            run.settimeout(timeout)
-            run.sendall(protocol.encode(protocol.Watch()) + b"\n")
-            with run.makefile("rb") as lines:
-                yield from lines
 
     def _send(
         self, status: int, content: bytes, kind: str = "text/plain; charset=utf-8", policy: str = ""
@@ -174,7 +177,8 @@ class _Handler(BaseHTTPRequestHandler):
 
 def serve(server: PageServer) -> None:
     """Serve a run's page until the run is over."""
-    with server, contextlib.suppress(OSError), connected(server.run) as run:
+    with server, contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as run:
+        run.connect(str(server.run))
         print(f"the monitor is at {server.address}", flush=True)
         threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True).start()
         try:
@@ -182,11 +186,3 @@ def serve(server: PageServer) -> None:
             time.sleep(0.5)  # the pages receive the end
         finally:
             server.shutdown()
-
-
-@contextlib.contextmanager
-def connected(path: Path) -> Iterator[socket.socket]:
-    """Hold a connection to a run."""
-    with socket.socket(socket.AF_UNIX) as run:
-        run.connect(str(path))
-        yield run

@@ -23,6 +23,7 @@ from events import (
 from events.frames import from_yaw
 from runtime.time.schedule import SECOND
 from runtime.tools.monitor.estimators import MOST_POINTS, Measured, Path
+from runtime.tools.monitor.protocol import formatted
 
 MS = SECOND // 1000
 
@@ -63,7 +64,7 @@ class Run:
             )
 
     def row(self) -> dict[str, str]:
-        (row,) = self.measured.rows()
+        (row,) = formatted("estimators", self.measured.rows())
         return dict(zip(("name", "tracking", "m", "percent", "latency"), row, strict=True))
 
 

@@ -31,9 +31,7 @@ from runtime.tools.monitor.protocol import (
     Speed,
     Stop,
     ask,
-    encode,
     find,
-    request,
     runs,
     socket_of,
 )
@@ -115,9 +113,9 @@ def test_images_come_to_those_who_watch_and_ask() -> None:
 
 async def _images(cameras: list[str]) -> None:
     assert cameras == ["drone.images: drone/front"]
-    found = await request(find(None), encode(Look(camera=cameras[0])))
+    found = await Client(find(None)).ask(Look(camera=cameras[0]))
     assert found.jpeg[:2] == b"\xff\xd8"
-    refused = await request(find(None), encode(Look(camera="drone.images: drone/rear")))
+    refused = await Client(find(None)).ask(Look(camera="drone.images: drone/rear"))
     assert not refused.done
     assert refused.text.startswith("expected a camera that has sent images")
 
@@ -138,7 +136,9 @@ def test_a_command_needs_no_more_than_a_line(sockets: Path) -> None:
 
 def test_nonsense_is_answered_and_does_no_harm() -> None:
     def outside() -> None:
-        for nonsense in (b"\xff\x00\n", b'{"do":"ask"}\n', b'{"a":' * 5000 + b"\n", b"no end"):
+        long = b"x" * 2 * protocol.LONGEST_COMMAND + b"\n"
+        deep = b'{"a":' * 5000 + b"\n"
+        for nonsense in (b"\xff\x00\n", b'{"do":"ask"}\n', deep, long, b"no end"):
             with socket.socket(socket.AF_UNIX) as connection:
                 connection.connect(str(find(None)))
                 connection.sendall(nonsense)
