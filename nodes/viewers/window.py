@@ -16,26 +16,8 @@ from events.base import KEYS, LABELS
 from runtime import Input, Node, NodeConfig, Output, Tick, Worker, every
 from runtime.errors import MissingDependencyError
 
-
-class Key(msgspec.Struct, frozen=True, gc=False):
-    """A key went down or came up."""
-
-    name: str
-    down: bool
-
-
-class Size(msgspec.Struct, frozen=True, gc=False):
-    """The window has a new size in pixels."""
-
-    width: int
-    height: int
-
-
-class Close(msgspec.Struct, frozen=True, gc=False):
-    """The user wants the window closed."""
-
-
-Change = Key | Size | Close
+Change = KeyPressed | KeyReleased | WindowResized | WindowClosed
+_UNSTAMPED: Any = {"stamp": 0, "source": ""}  # the node stamps and signs them
 
 
 class GlfwWindow:
@@ -72,7 +54,7 @@ class GlfwWindow:
         self._canvas = _Canvas(wayland=glfw.get_platform() == glfw.PLATFORM_WAYLAND)
 
     def poll(self, image: npt.NDArray[np.uint8] | None = None) -> list[Change]:
-        """Show an image, and return the changes since the last poll, in order.
+        """Show an image, and return the changes since the last poll, in order and without stamps.
 
         Args:
             image: uint8, shape (height, width, 3) RGB or (height, width) grey; `None` keeps the
@@ -103,9 +85,9 @@ class GlfwWindow:
         physical = key if key != self._glfw.KEY_UNKNOWN else -scancode
         if action == self._glfw.PRESS and physical not in self._held:
             self._held[physical] = name = self._name(key, scancode)
-            self._changes.append(Key(name, down=True))
+            self._changes.append(KeyPressed(key=name, **_UNSTAMPED))
         elif action == self._glfw.RELEASE and physical in self._held:
-            self._changes.append(Key(self._held.pop(physical), down=False))
+            self._changes.append(KeyReleased(key=self._held.pop(physical), **_UNSTAMPED))
 
     def _name(self, key: int, scancode: int) -> str:
         position: str = self._positions.get(key, f"scancode_{scancode}")
@@ -118,14 +100,14 @@ class GlfwWindow:
         # Their releases will not be reported, and a stuck key flies a vehicle away. GLFW releases
         # the keys that it knows, after this.
         if not focused:
-            self._changes += [Key(name, down=False) for name in self._held.values()]
+            self._changes += [KeyReleased(key=name, **_UNSTAMPED) for name in self._held.values()]
             self._held.clear()
 
     def _on_close(self, _: Any) -> None:
-        self._changes.append(Close())  # and the window stays until the run ends
+        self._changes.append(WindowClosed(**_UNSTAMPED))  # and the window stays until the run ends
 
     def _on_size(self, _: Any, width: int, height: int) -> None:
-        self._changes.append(Size(width, height))
+        self._changes.append(WindowResized(width=width, height=height, **_UNSTAMPED))
         self._stale = True
 
     def _on_damage(self, _: Any) -> None:
@@ -279,32 +261,26 @@ class ImageWindow(Node[ImageWindowConfig]):
         """Show the newest image, and send the window's changes."""
         image = self._newest() if self.config.show_images else None
         for change in await self._window.call(GlfwWindow.poll, image.data if image else None):
-            match change:
-                case Key(name, down=True):
-                    self._press(name)
-                case Key(name):
-                    self._release(name)
-                case Size(width, height):
-                    self.sizes.send(
-                        WindowResized(
-                            stamp=self.clock.now(), source=self.name, width=width, height=height
-                        )
-                    )
-                case Close():
-                    self.closures.send(WindowClosed(stamp=self.clock.now(), source=self.name))
+            self._send(change)
 
     async def on_shutdown(self) -> None:
         """Release the held keys, since no later poll can."""
         for key in sorted(self._held):
-            self._release(key)
+            self._send(KeyReleased(key=key, **_UNSTAMPED))
 
-    def _press(self, key: str) -> None:
-        self._held.add(key)
-        self.key_presses.send(KeyPressed(stamp=self.clock.now(), source=self.name, key=key))
-
-    def _release(self, key: str) -> None:
-        self._held.discard(key)
-        self.key_releases.send(KeyReleased(stamp=self.clock.now(), source=self.name, key=key))
+    def _send(self, change: Change) -> None:
+        change = msgspec.structs.replace(change, stamp=self.clock.now(), source=self.name)
+        match change:
+            case KeyPressed(key=key):
+                self._held.add(key)
+                self.key_presses.send(change)
+            case KeyReleased(key=key):
+                self._held.discard(key)
+                self.key_releases.send(change)
+            case WindowResized():
+                self.sizes.send(change)
+            case WindowClosed():
+                self.closures.send(change)
 
     def _newest(self) -> Image | None:
         try:

@@ -151,17 +151,16 @@ class Recorder:
         for _, event in batch:
             if isinstance(event, TrackedFeatures):
                 self._world.vehicles.tracked(event)  # before the estimates are placed
-        together: dict[tuple[type[Event], str], list[Any]] = {}
+        together: dict[type[Event], dict[str, list[Any]]] = {kind: {} for kind in self._columns}
         for number, event in batch:
-            kind = next((kind for kind in self._columns if isinstance(event, kind)), None)
+            kind = next((kind for kind in together if isinstance(event, kind)), None)
             if kind is not None:
-                together.setdefault((kind, event.source), []).append((number, event))
-        for kind, put_columns in self._columns.items():
-            for (found, source), events in together.items():
-                if found is kind:
-                    put_columns(source, events)
-                    if kind is Wind:
-                        self._world.wind(source, events)
+                together[kind].setdefault(event.source, []).append((number, event))
+        for kind, sources in together.items():
+            for source, events in sources.items():
+                self._columns[kind](source, events)
+                if kind is Wind:
+                    self._world.wind(source, events)
         for number, event in batch:
             self._entities.now = number, event.stamp
             put = next((put for kind, put in self._puts.items() if isinstance(event, kind)), None)
