@@ -368,7 +368,7 @@ class VisualPilot(Pilot[VisualPilotConfig]):
             then = min(max(round((self.pose.stamp - start) / step), 0), last)
             config = self.config  # which may change during the flight
             correction = config.gain * (path.position[then] - self.pose.position)
-            size = math.sqrt(float(correction @ correction))
+            size = math.hypot(*correction)
             if size > config.max_correction:
                 correction *= config.max_correction / size
             north, east, down = (path.velocity[index] + correction).tolist()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -10,6 +11,7 @@ import numpy.typing as npt
 
 from events import Vector3
 from runtime import Duration
+from runtime.portable import directions, gaussian, sines
 
 Floats = npt.NDArray[np.float64]
 
@@ -95,7 +97,7 @@ def _round_corners(points: Floats, radius: float) -> Floats:
         ends = []
         for other in (before, after):
             way = other - corner
-            distance = float(np.linalg.norm(way))
+            distance = math.hypot(*way)
             ends.append(corner + way * min(radius, distance / 2) / distance)
         t = np.linspace(0.0, 1.0, 33)[:, None]
         rounded.append((1 - t) ** 2 * ends[0] + 2 * t * (1 - t) * corner + t**2 * ends[1])
@@ -129,7 +131,7 @@ def _speeds(points: Floats, along: Floats, speed: float, acceleration: float) ->
 def _headings(velocity: Floats, yaw: float) -> Floats:
     """Return the direction of flight, kept from before where the path hardly moves."""
     moving = np.hypot(velocity[:, 0], velocity[:, 1]) > 0.2
-    heading = np.arctan2(velocity[:, 1], velocity[:, 0])
+    heading = directions(velocity)
     last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), -1))
     held = np.where(last >= 0, heading[last], yaw)
     return np.unwrap(np.concatenate([[yaw], held]))[1:]
@@ -140,9 +142,7 @@ def _smooth(values: Floats, width: int) -> Floats:
     if width < 1:
         return values
     reach = 3 * width
-    window = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
-    padded = np.pad(values, reach, mode="edge")
-    return np.convolve(padded, window / window.sum(), mode="valid")
+    return gaussian(np.pad(values, reach, mode="edge"), width, reach)
 
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -210,9 +210,9 @@ class FigureEight(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     def places(self) -> Floats:
         """Return the places of a lap, metres in ``map``, shape (65, 3); the last is the first."""
         t = np.linspace(0.0, 2.0 * np.pi, 65)
-        along, across = self.length / 2.0 * np.sin(t), self.width / 2.0 * np.sin(2.0 * t)
-        c, s = np.cos(np.radians(self.direction)), np.sin(np.radians(self.direction))
-        offset = [c * along - s * across, s * along + c * across, -self.rise * np.sin(t)]
+        along, across = self.length / 2.0 * sines(t), self.width / 2.0 * sines(2.0 * t)
+        c, s = math.cos(math.radians(self.direction)), math.sin(math.radians(self.direction))
+        offset = [c * along - s * across, s * along + c * across, -self.rise * sines(t)]
         places: Floats = np.asarray(self.centre) + np.stack(offset, axis=1)
         return places
 
@@ -222,9 +222,9 @@ def excited(excitation: Excitation, place: Vector3, yaw: float, step: float) -> 
     seconds = np.arange(0.0, excitation.duration + step / 2.0, step)
     ramp = min(2.0, excitation.duration / 3.0)  # seconds in which it swells, and fades
     share = np.clip(np.minimum(seconds, seconds[-1] - seconds) / ramp, 0.0, 1.0)
-    swell = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    swell = share * share * share * (10.0 - 15.0 * share + 6.0 * share * share)
     phase = 2.0 * np.pi * excitation.frequency * seconds
-    north, east, down, turn = (np.sin(ratio * phase) * swell for ratio in (1.0, 1.3, 0.8, 0.6))
+    north, east, down, turn = (sines(ratio * phase) * swell for ratio in (1.0, 1.3, 0.8, 0.6))
     moves = excitation.amplitude * np.stack([north, east, down], axis=1)
     return timed(np.asarray(place) + moves, yaw + np.radians(excitation.yaw) * turn, step)
 
@@ -243,7 +243,7 @@ def headed(path: WaypointPath, heading: Heading, yaw: float) -> WaypointPath:
         return timed(path.position, np.full_like(path.yaw, yaw), path.step)
     seconds = np.arange(len(path.yaw)) * path.step
     swell = np.clip(np.minimum(seconds, seconds[-1] - seconds), 0.0, 1.0)
-    sweep = _SWEEP_ANGLE * swell * np.sin(2.0 * np.pi / _SWEEP_PERIOD * seconds)
+    sweep = _SWEEP_ANGLE * swell * sines(2.0 * np.pi / _SWEEP_PERIOD * seconds)
     return timed(path.position, path.yaw + sweep, path.step)
 
 

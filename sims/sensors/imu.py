@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from events import ImuAnnouncement, Quaternion, Vector3
 from events.frames import cross, inverse, multiply, rotate, rotate_inverse, slerp
+from runtime.portable import sines
 from sims.presets import IMUS
 from sims.sensors.sensor import Mount, Mounted, NonNegative, Place
 
@@ -208,8 +209,9 @@ class ImuModel(Mounted[ImuParameters]):
             rates, force = self._shake(rates, force, thrusts)
         if not self._linear:
             gyroscope, accelerometer = self.matrices
-            turned = gyroscope @ rates + self.spec.g_sensitivity * np.asarray(force)
-            rates, force = _vector(turned), _vector(accelerometer @ force)
+            # Not by matrix products, whose last bits are the processor's.
+            turned = (gyroscope * rates).sum(axis=1) + self.spec.g_sensitivity * np.asarray(force)
+            rates, force = _vector(turned), _vector((accelerometer * force).sum(axis=1))
         rates, force = self._noise.add(rates, force)
         return _limited(rates, *self._limits[0]), _limited(force, *self._limits[1])
 
@@ -235,11 +237,11 @@ class ImuModel(Mounted[ImuParameters]):
         for index, strength in enumerate(vibration.harmonics, start=1):
             weight = strength * share
             if self.spec.sampling == "mean":
-                weight = weight * np.sinc(index * speeds / self._rate)
-            cosine, sine = (
-                weight @ np.cos(index * self._phases),
-                weight @ np.sin(index * self._phases),
-            )
+                turns = np.maximum(math.pi * index * speeds / self._rate, 1e-9)
+                weight = weight * sines(turns) / turns
+            phases = (index * self._phases).tolist()
+            cosine = sum(w * math.cos(phase) for w, phase in zip(weight, phases, strict=True))
+            sine = sum(w * math.sin(phase) for w, phase in zip(weight, phases, strict=True))
             total += np.array((cosine, sine, 0.0) if index % 2 else (0.0, 0.0, cosine))
         x, y, z = rotate(self._from_body, _vector(total))
         a, b = vibration.angular_amplitude, vibration.amplitude

@@ -161,7 +161,7 @@ class Mixer:
         ).T  # fmt: skip
         if np.linalg.matrix_rank(effect) < 4:
             raise ValueError("expected motors that can make thrust, roll, pitch and yaw")
-        inverse = np.linalg.inv(effect)
+        inverse = np.round(np.linalg.inv(effect), 9)  # the last bits are the processor's
         if not np.allclose(inverse[:, 0], inverse[0, 0], rtol=1e-6):
             raise ValueError("expected motors that do not turn the vehicle at equal thrust")
         self.max_thrust = parameters.max_thrust

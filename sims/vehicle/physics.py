@@ -129,7 +129,7 @@ class Physics:
         now = _state(self._pose, self._twist).orientation
         fx, fy, fz = rotate_inverse(now, (x, y, z - self.parameters.gravity))
         # Of all forces the rotors' change most within a step, and they are fixed to the body.
-        fz -= float(self._gains @ self.data.act_dot[self._rotors]) * ahead * 1e-9
+        fz -= float((self._gains * self.data.act_dot[self._rotors]).sum()) * ahead * 1e-9
         ax, ay, az = cross(turning, self._lever)
         bx, by, bz = cross(rates, cross(rates, self._lever))
         force = (fx + ax + bx, fy + ay + by, fz + az + bz)

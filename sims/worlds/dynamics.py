@@ -20,6 +20,7 @@ import numpy as np
 from events import Vector3
 from events.frames import flip_yz
 from runtime.errors import suggest
+from runtime.portable import Floats, directions, gaussian
 from runtime.units import Duration
 
 
@@ -125,13 +126,14 @@ def path_through(
     from scipy.interpolate import CubicSpline  # a tenth of a second, which only moving bodies need
 
     spline = CubicSpline(times, places, bc_type="periodic" if loop else "clamped")
+    spline.c[:] = np.round(spline.c, 10)  # the last bits of what was solved are the processor's
     at = np.arange(times[0], times[-1] + 2 * _YAW_STEP, _YAW_STEP)
     velocity = spline(np.minimum(at, times[-1]), 1)
     moving = np.hypot(velocity[:, 0], velocity[:, 1]) > 0.02
     last = np.maximum.accumulate(np.where(moving, np.arange(len(at)), -1))
     if loop and moving.any():  # what stands at the beginning has come from the end
         last = np.where(last < 0, int(np.flatnonzero(moving)[-1]), last)
-    heading = np.arctan2(velocity[:, 1], velocity[:, 0])
+    heading = directions(velocity)
     yaws = np.unwrap(np.where(last >= 0, heading[last], yaw))
     cubics: Any = spline.c.transpose(1, 0, 2).tolist()
     return Path(
@@ -142,13 +144,10 @@ def path_through(
     )
 
 
-def _smoothed(
-    yaws: np.ndarray[tuple[int], np.dtype[np.float64]], loop: bool
-) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _smoothed(yaws: Floats, loop: bool) -> Floats:
     """Smooth headings with a Gaussian window; loops continue, with their turns."""
     width = _TURN / _YAW_STEP
     reach = min(math.ceil(3 * width), len(yaws) - 1)
-    window = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
     if loop:
         turns = yaws[-1] - yaws[0]
         turns = round(turns / math.tau) * math.tau
@@ -156,7 +155,7 @@ def _smoothed(
         padded = np.unwrap(np.concatenate([before, yaws, after]))
     else:
         padded = np.pad(yaws, reach, mode="edge")
-    return np.convolve(padded, window / window.sum(), mode="valid")
+    return gaussian(padded, width, reach)
 
 
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from runtime.portable import sines
 from sims.worlds import materials
 from sims.worlds.builder import TOURS, Builder, Material, Vector
 from sims.worlds.dynamics import Dynamics, Motion, Scene
@@ -40,7 +41,7 @@ class Sway(Motion, frozen=True):
         count = len(self.swing)
         first = int(model.body("sway_0").mocapid[0])
         phases = 2.4 * np.arange(count)
-        slow, quick = np.sin(1.9 * seconds + phases), np.sin(5.3 * seconds + 2.7 * phases)
+        slow, quick = sines(1.9 * seconds + phases), sines(5.3 * seconds + 2.7 * phases)
         offset = np.stack([0.7 * slow + 0.3 * quick, 0.6 * quick - 0.3 * slow, quick], axis=1)
         data.mocap_pos[first : first + count] = self.swing * offset
 

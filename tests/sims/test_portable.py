@@ -1,0 +1,86 @@
+"""A flight is the same on processors of other kinds: its inputs are, to the byte."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy._core import _multiarray_umath as numpy_core
+
+from runtime.portable import directions, gaussian, sines
+
+ROOT = Path(__file__).parents[2]
+FLIGHT = """
+[run]
+name = "flight"
+clock = "lockstep"
+duration = "{seconds}s"
+
+[[nodes]]
+name = "world"
+type = "World"
+world = "hall"
+wind = {{ velocity = [2.0, 0.5, 0.0], turbulence = "light" }}
+bodies = [
+    {{ name = "walker", kind = "person", waypoints = [[0.6, -1.4, 0.0], [1.0, 1.4, 0.0]] }},
+]
+
+[[nodes]]
+name = "drone"
+type = "Multirotor"
+position = [-2.5, 0.0]
+imu = {{ vibration = {{ amplitude = 2.0 }}, gyroscope_misalignment = 0.01 }}
+barometer = {{}}
+magnetometer = {{}}
+gnss = {{}}
+cameras = [{{ name = "camera", width = 64, height = 48, rate = 5 }}]
+
+[[nodes]]
+name = "pilot"
+type = "WaypointFollower"
+{path}
+"""
+PATHS = {
+    "waypoints": "waypoints = [[-2.5, 0.0, -1.4], [2.0, 1.0, -1.5], [1.0, 2.0, -1.2]]",
+    "excitation": "waypoints = [[-2.5, 0.0, -1.4]]\nexcitation = { duration = '5s' }",
+    "eight": "figure_eight = { centre = [0.0, 0.0, -1.5] }",
+}
+
+
+def inputs(file: Path, **environment: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", "runtime", "run", str(file), "--quiet", "--out", "out"]
+    subprocess.run(
+        command, cwd=file.parent, env={**os.environ, **environment}, check=True, timeout=300
+    )
+    summary = json.loads((file.parent / "out/summary.json").read_text(encoding="utf-8"))
+    assert len(summary["inputs"]) > 8
+    return dict(summary["inputs"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="OpenBLAS's kernels are named by kind")
+@pytest.mark.parametrize("path", PATHS)
+def test_inputs_depend_on_no_width_of_vectors_and_no_kernels(path: str, tmp_path: Path) -> None:
+    file = tmp_path / "flight.toml"
+    file.write_text(FLIGHT.format(seconds=12, path=PATHS[path]), encoding="utf-8")
+    here = {k for k in numpy_core.__cpu_dispatch__ if numpy_core.__cpu_features__[k]}
+    plain = inputs(file, NPY_DISABLE_CPU_FEATURES=" ".join(here), OPENBLAS_CORETYPE="Prescott")
+    assert plain == inputs(file)
+
+
+def test_the_functions_are_those_of_numpy() -> None:
+    values = np.random.default_rng(1).normal(size=(200, 3))
+    np.testing.assert_allclose(sines(values[:, 0]), np.sin(values[:, 0]), rtol=1e-14)
+    angles = np.arctan2(values[:, 1], values[:, 0])
+    np.testing.assert_allclose(directions(values), angles, rtol=1e-14)
+    window = np.exp(-0.5 * (np.arange(-9, 10) / 2.5) ** 2)
+    expected = np.convolve(values[:, 0], window / window.sum(), mode="valid")
+    np.testing.assert_allclose(gaussian(values[:, 0], 2.5, 9), expected, rtol=1e-12, atol=1e-14)
