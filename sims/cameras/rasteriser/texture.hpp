@@ -109,7 +109,6 @@ class Texture {
 
     void border(std::vector<std::uint32_t>& all, const std::vector<std::uint32_t>& texels,
                 int width, int height) const {
-        all.reserve(all.size() + texels.size() + 12 * (width + height + 2));
         for (auto side = texels.begin(); side != texels.end(); side += std::size_t(width) * height)
             for (int y = -1; y <= height; ++y) {
                 const int beyond = is_cube ? std::min(std::max(y, 0), height - 1)
