@@ -11,16 +11,15 @@ from typing import Any
 
 import cv2
 import jinja2
-import msgspec
 import numpy as np
 
-from bench.estimators.plan import Entrant, Suite
+from bench.estimators.plan import Suite
 from runtime.channels.digest import combined
 from runtime.errors import ConfigError
 from runtime.run.results import write
 from runtime.run.summarise import commit, environment
 from runtime.tools.sweep.plan import Plan
-from runtime.tools.sweep.tables import Row, Spread, crashed, in_order, numbers, summarise
+from runtime.tools.sweep.tables import Combination, Row, combine, crashed, in_order, summarise
 
 COLUMNS = {
     "flight_ate_percent": "error, whole flight, %",
@@ -40,66 +39,42 @@ RANKED = "flight_ate_percent"
 """Figure to compare estimators by: ATE over the whole flight, lost time as 100 % drift."""
 
 
-class Cell(msgspec.Struct, frozen=True, kw_only=True):
-    """Result of an estimator in a scenario, over all seeds and repeats.
-
-    Attributes:
-        entrant: The estimator.
-        runs: Number of runs.
-        passed: Number of runs within the thresholds.
-        reasons: Why runs failed, each once, with the figures of the first of them.
-        figures: Figure to its spread over the runs that have it.
-    """
-
-    entrant: Entrant
-    runs: int
-    passed: int
-    reasons: tuple[str, ...]
-    figures: Mapping[str, Spread]
-
-    @property
-    def verdict(self) -> str:
-        """In words: passed, failed, or how often of how many."""
-        if self.passed == self.runs:
-            return "passed"
-        return "**failed**" + f" {self.runs - self.passed} of {self.runs}" * bool(self.passed)
-
-    @property
-    def short(self) -> str:
-        """Cell in the overall table: the error, and the verdict unless all runs passed."""
-        error = self.figures.get(RANKED)
-        words = "" if error is None else f"{error.median:.3g}"
-        if error is not None and f"{error.least:.3g}" != f"{error.most:.3g}":
-            words += f" ({error.least:.3g} to {error.most:.3g})"
-        return words if self.passed == self.runs else f"{words} {self.verdict}".strip()
+def verdict(cell: Combination) -> str:
+    """Return in words: passed, failed, or how often of how many; a crash is a failure."""
+    if cell.passed == cell.runs:
+        return "passed"
+    return "**failed**" + f" {cell.runs - (cell.passed or 0)} of {cell.runs}" * bool(cell.passed)
 
 
-def cells(suite: Suite, plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Cell]]:
-    """Return each estimator's results, by scenario and estimator.
+def short(cell: Combination) -> str:
+    """Return a cell of the overall table: the error, and the verdict unless all runs passed."""
+    error = cell.figures.get(RANKED)
+    words = "" if error is None else f"{error.median:.3g}"
+    if error is not None and f"{error.least:.3g}" != f"{error.most:.3g}":
+        words += f" ({error.least:.3g} to {error.most:.3g})"
+    return words if cell.passed == cell.runs else f"{words} {verdict(cell)}".strip()
+
+
+def cells(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Combination]]:
+    """Return each estimator's results over all seeds and repeats, by scenario and estimator.
 
     A run equal to another to the bit adds nothing, and is left out. A run that crashed before it
-    came to its end counts for both: who crashes now and then has not passed.
+    came to its end counts for both: who crashes now and then has not passed. What the estimator's
+    worker cost stands among its figures. A flaw of the flight is not its own.
     """
-    different: dict[tuple[Any, ...], Row] = {}
+    groups: dict[tuple[str, ...], dict[tuple[Any, ...], Row]] = {}
     for job, row in in_order(plan, rows):
-        place, name = (text for _, text in job.settings)
-        different[place, name, job.seed, row.get("digests", {}).get(name, job.id)] = row
+        scenario, name = (text for _, text in job.settings)
+        different = groups.setdefault((scenario, name), {})
+        figures = row["estimators"].get(name, {}) | _costs(name, row)
+        key = job.seed, row.get("digests", {}).get(name, job.id)
+        different[key] = row | {"estimators": {name: figures}}
         for index, error in enumerate(row.get("crashes", [])):
-            different[place, name, job.seed, (job.id, index)] = crashed(job, error)
-    groups: dict[tuple[Any, ...], list[Row]] = {}
-    for key, row in different.items():
-        groups.setdefault(key[:2], []).append(row)
-    found: dict[str, dict[str, Cell]] = {}
-    for scenario in suite.scenarios:
-        for entrant in suite.estimators:
-            if group := groups.get((scenario.name, entrant.name)):
-                found.setdefault(scenario.name, {})[entrant.name] = Cell(
-                    entrant=entrant,
-                    runs=len(group),
-                    passed=sum(_passed(entrant.name, row) for row in group),
-                    reasons=_reasons(entrant.name, group),
-                    figures=_figures(entrant.name, group),
-                )
+            different[job.seed, job.id, index] = crashed(job, error)
+    found: dict[str, dict[str, Combination]] = {}
+    for (scenario, name), group in groups.items():
+        cell = combine((scenario, name), name, [*group.values()], COLUMNS)
+        found.setdefault(scenario, {})[name] = cell
     return found
 
 
@@ -147,27 +122,6 @@ def flaws(plan: Plan, rows: Sequence[Row]) -> dict[str, tuple[str, ...]]:
     return {scenario: tuple(reasons) for scenario, reasons in found.items()}
 
 
-def _passed(name: str, row: Row) -> bool:
-    """Tell whether an estimator passed: a flaw of the flight is not its own."""
-    return not row["error"] and row["estimators"].get(name, {}).get("passed") is True
-
-
-def _reasons(name: str, group: Sequence[Row]) -> tuple[str, ...]:
-    """Return why runs came to nothing or missed a threshold; each threshold once."""
-    found: dict[str, str] = {}
-    for row in group:
-        missed = row["estimators"].get(name, {}).get("failed") or []
-        for reason in [row["error"]] * bool(row["error"]) + missed:
-            found.setdefault(reason.partition(":")[0], reason)
-    return tuple(found.values())
-
-
-def _figures(name: str, group: Sequence[Row]) -> dict[str, Spread]:
-    figures = [row["estimators"].get(name, {}) | _costs(name, row) for row in group]
-    values = {figure: numbers(each.get(figure) for each in figures) for figure in COLUMNS}
-    return {figure: Spread.of(each) for figure, each in values.items() if each}
-
-
 def _costs(name: str, row: Row) -> dict[str, float | None]:
     """Return the cost of an estimator's worker process, keyed as in `COLUMNS`."""
     for worker, costs in row.get("workers", {}).items():
@@ -180,7 +134,7 @@ HEIGHT = 240
 """Of the cameras' pictures, pixels."""
 
 
-def draw(suite: Suite, cells: Mapping[str, Mapping[str, Cell]], path: Path) -> None:
+def draw(suite: Suite, cells: Mapping[str, Mapping[str, Combination]], path: Path) -> None:
     """Draw the error of each estimator in each scenario, with its range; crosses have failed."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
@@ -246,7 +200,7 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
     """
     folder = path.parent / "suite"
     folder.mkdir(parents=True, exist_ok=True)
-    found = cells(suite, plan, rows)
+    found = cells(plan, rows)
     there = {name for each in found.values() for name in each}
     draw(suite, found, folder / "suite.png")
     text = _template().render(
@@ -257,6 +211,8 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
         entrants=[each for each in suite.estimators if each.name in there],
         absent=[each for each in suite.estimators if each.name not in there],
         cells=found,
+        verdict=verdict,
+        short=short,
         repeats=repeating(plan, rows),
         flights=flights(suite, plan),
         flaws=flaws(plan, rows),

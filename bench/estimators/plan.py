@@ -14,7 +14,7 @@ import msgspec
 from runtime.config.messages import override
 from runtime.config.reading import parse
 from runtime.errors import CommandError, ConfigError, suggest
-from runtime.tools.sweep.plan import Parameter, Plan, make_job, sharing
+from runtime.tools.sweep import Plan, make_job, plan_of
 
 FOLDER = Path(__file__).parent
 LEVELS = ("easy", "medium", "hard", "brutal")
@@ -119,7 +119,7 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
     """
     folder = Path(suite.rig).parent
     entrants = [each for each in suite.estimators if each.installed(folder)]
-    jobs = [
+    jobs = (
         make_job(
             parse(_table(suite, scenario, entrant), suite.rig, folder),
             (("scenario", scenario.name), ("estimator", entrant.name)),
@@ -129,12 +129,8 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
         for seed in range(1, seeds + 1)
         for entrant in entrants
         for repeat in range(1, repeats + 1 if (scenario, seed) == (suite.scenarios[0], 1) else 2)
-    ]
-    parameters = (
-        Parameter("scenario", tuple(each.name for each in suite.scenarios)),
-        Parameter("estimator", tuple(each.name for each in entrants)),
     )
-    return Plan(parameters=parameters, jobs=sharing(jobs), out=out)
+    return plan_of(jobs, out)
 
 
 def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -27,8 +26,7 @@ from runtime.tools.comparison.statistics import (
     compare_rows,
     compare_until_sure,
 )
-from runtime.tools.sweep import Plan, Row, make_job, run_here, sharing
-from runtime.tools.sweep.plan import Parameter
+from runtime.tools.sweep import Job, Plan, Row, make_plan, plan_of, run_here
 from runtime.tools.sweep.plots import decades, template
 from runtime.tools.sweep.process import Ended
 from runtime.tools.sweep.tables import decode_rows
@@ -109,30 +107,22 @@ def _fly(
     fly: Fly,
     options: Mapping[str, Any],
 ) -> list[Comparison]:
-    first: dict[Path, int] = {}
-    planned = []
-    for file, (side, own) in itertools.product(files, zip("AB", changes, strict=True)):
-        config = load_configuration(file, [*overrides, *own])
-        first.setdefault(file, config.run.seed)
-        settings = (("side", side), ("scenario", file.stem))
-        numbers = range(first[file], first[file] + seeds), range(1, repeats + 1)
-        for seed, number in itertools.product(*numbers):
-            planned.append(make_job(config, settings, seed, file.resolve().parent, out, number))
-    begin = {file.stem: seed for file, seed in first.items()}
-    if len(begin) < len(first):
+    begin: dict[str, int] = {}  # first seed by scenario
+    planned: list[Job] = []
+    for file in files:
+        seed = begin[file.stem] = load_configuration(file, [*overrides, *changes[0]]).run.seed
+        for side, own in zip("AB", changes, strict=True):
+            equal = [*overrides, *own, f"run.seed={seed}"]
+            flown = make_plan(file, overrides=equal, seeds=seeds, repeats=repeats, out=out)
+            settings = (("side", side), ("scenario", file.stem))
+            planned += [msgspec.structs.replace(job, settings=settings) for job in flown.jobs]
+    if len(begin) < len({*files}):
         raise ConfigError(f"compare: expected files of different names, found {[*map(str, files)]}")
-    parameters = (
-        Parameter(path="side", texts=("A", "B")),
-        Parameter(path="scenario", texts=tuple(begin)),
-    )
+    whole = plan_of(planned, out)
 
     def compare_first(flights: int, error: float) -> list[Comparison]:
-        now = [
-            job
-            for job in sharing(planned)
-            if job.seed < begin[dict(job.settings)["scenario"]] + flights
-        ]
-        rows = fly(Plan(parameters=parameters, jobs=tuple(now), out=out))
+        now = [j for j in whole.jobs if j.seed < begin[dict(j.settings)["scenario"]] + flights]
+        rows = fly(msgspec.structs.replace(whole, jobs=tuple(now)))
         sides: dict[str, dict[Key, list[Row]]] = {"A": {}, "B": {}}
         for job, row in zip(now, rows, strict=True):
             (_, side), (_, scenario) = job.settings

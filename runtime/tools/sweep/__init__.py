@@ -24,12 +24,12 @@ ran it unless the sweep's folder is shared. The rows come back in any case.
 """
 
 from runtime.tools.sweep.console import Watch, run_here, sweep
-from runtime.tools.sweep.plan import Job, Plan, make_job, make_plan, sharing
+from runtime.tools.sweep.plan import Job, Plan, make_job, make_plan, plan_of
 from runtime.tools.sweep.plots import draw_plots, write_page
 from runtime.tools.sweep.process import Children, run_job
 from runtime.tools.sweep.tables import Row, records, summarise, write_tables
 
 __all__ = [
-    "Children", "Job", "Plan", "Row", "Watch", "draw_plots", "make_job", "make_plan", "records",
-    "run_here", "run_job", "sharing", "summarise", "sweep", "write_page", "write_tables",
+    "Children", "Job", "Plan", "Row", "Watch", "draw_plots", "make_job", "make_plan", "plan_of",
+    "records", "run_here", "run_job", "summarise", "sweep", "write_page", "write_tables",
 ]  # fmt: skip

@@ -169,14 +169,20 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     """A whole sweep.
 
     Attributes:
-        parameters: What is varied.
         jobs: All runs: the first parameter changes slowest, then the seed, the repeat quickest.
         out: Absolute path of the folder for everything.
     """
 
-    parameters: tuple[Parameter, ...]
     jobs: tuple[Job, ...]
     out: Path
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What is varied, with its values in the order of the jobs."""
+        texts: dict[str, dict[str, None]] = {}
+        for path, text in (setting for job in self.jobs for setting in job.settings):
+            texts.setdefault(path, {})[text] = None
+        return tuple(Parameter(path, tuple(own)) for path, own in texts.items())
 
 
 def make_plan(
@@ -208,37 +214,37 @@ def make_plan(
     for option, count in (("--seeds", seeds), ("--repeat", repeats)):
         if count < 1:
             raise ConfigError(f"{option}: expected at least 1, found {count}")
-    parameters = tuple(parameter(change) for change in vary)
+    parameters = [parameter(change) for change in vary]
     _refuse_repeated([p.path for p in parameters], [o.partition("=")[0] for o in overrides])
-    loaded = []
-    for texts in itertools.product(*(p.texts for p in parameters)):
-        settings = tuple(zip((p.path for p in parameters), texts, strict=True))
-        loaded.append((settings, _load(config, overrides, settings)))
-    first = loaded[0][1].run
+    pairs = ([(p.path, text) for text in p.texts] for p in parameters)
+    loaded = {each: _load(config, overrides, each) for each in itertools.product(*pairs)}
+    first = loaded[next(iter(loaded))].run
     out = (out or Path("sweeps") / first.name).absolute()
     jobs: dict[str, Job] = {}
-    for settings, resolved in loaded:
-        runs = itertools.product(range(first.seed, first.seed + seeds), range(1, repeats + 1))
-        for seed, repeat in runs:
-            job = make_job(resolved, settings, seed, config.resolve().parent, out, repeat)
-            if job.id in jobs:
-                raise ConfigError(
-                    f"--vary: expected combinations that differ, found the same settings for "
-                    f"{jobs[job.id]} and {job}"
-                )
-            jobs[job.id] = msgspec.structs.replace(
-                job, limit=limit or job.limit, flight="" if fly else job.flight
+    numbers = range(first.seed, first.seed + seeds), range(1, repeats + 1)
+    for (settings, resolved), seed, repeat in itertools.product(loaded.items(), *numbers):
+        job = make_job(resolved, settings, seed, config.resolve().parent, out, repeat)
+        if job.id in jobs:
+            raise ConfigError(
+                f"--vary: expected combinations that differ, found the same settings for "
+                f"{jobs[job.id]} and {job}"
             )
-    return Plan(parameters=parameters, jobs=sharing(jobs.values()), out=out)
+        jobs[job.id] = msgspec.structs.replace(
+            job, limit=limit or job.limit, flight="" if fly else job.flight
+        )
+    return plan_of(jobs.values(), out)
 
 
-def sharing(jobs: Iterable[Job]) -> tuple[Job, ...]:
-    """Return the jobs, with `record` set for jobs of a shared flight."""
+def plan_of(jobs: Iterable[Job], out: Path) -> Plan:
+    """Return the plan of some jobs, with `record` set for jobs of a shared flight."""
     found = tuple(jobs)
     counts = Counter(job.flight for job in found)
-    return tuple(
-        msgspec.structs.replace(job, record=job.flight != "" and counts[job.flight] > 1)
-        for job in found
+    return Plan(
+        jobs=tuple(
+            msgspec.structs.replace(job, record=job.flight != "" and counts[job.flight] > 1)
+            for job in found
+        ),
+        out=out,
     )
 
 

@@ -173,7 +173,8 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
             there were no two of them.
         alignment: How its trajectories were laid on the truth, ``origin``; ``origin or sim3`` if
             the runs differ in it. Errors after different alignments are different things.
-        figures: Main figure to its spread.
+        figures: Figure to its spread, of the main ones or those asked for.
+        reasons: Why runs came to nothing or missed a threshold, each with its first figures.
     """
 
     settings: tuple[str, ...]
@@ -185,6 +186,7 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
     failed: int = 0
     repeatable: str = ""
     figures: dict[str, Spread]
+    reasons: tuple[str, ...] = ()
 
 
 def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
@@ -267,7 +269,7 @@ def summarise(plan: Plan, rows: Iterable[Row]) -> list[Combination]:
         groups.setdefault(tuple(text for _, text in job.settings), []).append(row)
     names = list(dict.fromkeys(name for _, row in own for name in row["estimators"]))
     return [
-        _combination(settings, name, group)
+        combine(settings, name, group)
         for settings, group in groups.items()
         for name in [n for n in names if any(n in row["estimators"] for row in group)] or [""]
     ]
@@ -278,19 +280,27 @@ def numbers(values: Iterable[Any]) -> list[float]:
     return [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
 
 
-def _combination(settings: tuple[str, ...], name: str, group: Sequence[Row]) -> Combination:
-    figures = [row["estimators"][name] for row in group if name in row["estimators"]]
+def combine(
+    settings: tuple[str, ...],
+    name: str,
+    group: Sequence[Row],
+    wanted: Iterable[str] = IN_SWEEPS,
+) -> Combination:
+    """Sum up the runs of a combination for one estimator, by its name."""
+    figures = [row["estimators"].get(name, {}) for row in group]
     passed = [f["passed"] for f in figures if isinstance(f.get("passed"), bool)]
-    spreads = {}
-    for main in IN_SWEEPS:
-        if found := numbers(f.get(main) for f in figures):
-            spreads[main] = Spread.of(found)
+    values = {figure: numbers(f.get(figure) for f in figures) for figure in wanted}
+    reasons: dict[str, str] = {}
+    for row, own in zip(group, figures, strict=True):
+        for reason in [*[row["error"]] * bool(row["error"]), *(own.get("failed") or [])]:
+            reasons.setdefault(reason.partition(":")[0], reason)
     return Combination(
         settings=settings, estimator=name,
         alignment=" or ".join(sorted({f["alignment"] for f in figures if f.get("alignment")})),
         runs=len(group), crashed=sum(bool(row["error"]) for row in group),
         passed=sum(passed) if passed else None, failed=passed.count(False),
-        repeatable=_repeatable(name, group), figures=spreads,
+        repeatable=_repeatable(name, group), reasons=tuple(reasons.values()),
+        figures={figure: Spread.of(each) for figure, each in values.items() if each},
     )  # fmt: skip
 
 

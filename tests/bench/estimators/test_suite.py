@@ -263,8 +263,7 @@ def test_flights_that_differ_are_refused(small: Path, tmp_path: Path) -> None:
 
 
 def test_an_estimator_without_rows_has_no_cell(small: Path) -> None:
-    suite = read_suite(small)
-    assert cells(suite, make_plan(suite, out=Path("out")), []) == {}
+    assert cells(make_plan(read_suite(small), out=Path("out")), []) == {}
 
 
 @pytest.mark.slow
