@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from runtime.figures import figure
 from runtime.run.results import write
 from runtime.tools.cli.commands import Overrides
 from runtime.tools.cli.outcomes import JUnit, Outcome, State, writing
@@ -94,8 +93,6 @@ def of_comparison(each: Comparison, margin: float) -> list[Outcome]:
     If a figure fails, so do the scenarios in most of whose flights B is worse; all, if it is so in
     none.
     """
-    from runtime.tools.comparison.flying import change
-
     counts = each.by_scenario()
     guilty = [name for name, (worse, better, _) in counts.items() if worse > better]
     found = []
@@ -105,7 +102,7 @@ def of_comparison(each: Comparison, margin: float) -> list[Outcome]:
             state = "failed" if name in guilty or not guilty else "passed"
         elif each.verdict in {"not enough runs", "not comparable"}:
             state = "not judged"
-        reason = f"{each.words}: {change(each)} in all; worse in {worse} of {flights} flights here"
+        reason = f"{each.words}: {each.interval} in all; worse in {worse} of {flights} flights here"
         reasons = [] if state == "passed" else [reason]
         label = f"{each.estimator} {each.figure}"
         found.append(Outcome(run=name, estimator=label, state=state, reasons=reasons))
@@ -119,33 +116,21 @@ def print_table(compared: Compared) -> None:
     """Print a line for each figure."""
     from rich import box
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    from runtime.tools.comparison.flying import change, shown
-
-    found = compared.rows
-    headings = ("estimator", "figure", "A", "B", "change B - A", "verdict")
-    table = Table(*headings, box=box.SIMPLE_HEAD)
-    for column in table.columns[2:5]:
-        column.justify, column.no_wrap = "right", True
-    table.columns[1].no_wrap = True
+    names = [Column(heading, no_wrap=True) for heading in ("figure", "A", "B", "change B - A")]
+    for number in names[1:]:
+        number.justify = "right"
+    table = Table("estimator", *names, "verdict", box=box.SIMPLE_HEAD)
     style = {"better": "green", "worse": "red"}
-    for each in found:
-        unit = figure(each.figure).unit
-        table.add_row(
-            each.estimator,
-            each.figure,
-            shown(each.a, unit, each.failures[0]),
-            shown(each.b, unit, each.failures[1]),
-            change(each),
-            each.words,
-            style=style.get(each.verdict, ""),
-        )
+    for each in compared.rows:
+        cells = each.estimator, each.figure, *each.medians, each.interval, each.words
+        table.add_row(*cells, style=style.get(each.verdict, ""))
     console = Console()
     if not console.is_terminal:
         console.width = WIDTH
     console.print(table)
-    flights = max((each.pairs for each in found), default=0)
+    flights = max((each.pairs for each in compared.rows), default=0)
     console.print(
         f"{flights} flights, medians; the page is {compared.page}", highlight=False, soft_wrap=True
     )

@@ -55,7 +55,7 @@ class Compared(msgspec.Struct, frozen=True):
         return any(each.fails(self.margin) for each in self.rows)
 
     def __repr__(self) -> str:
-        told = [f"{e.estimator} {e.figure}: {change(e)}, {e.words}" for e in self.rows]
+        told = [f"{e.estimator} {e.figure}: {e.interval}, {e.words}" for e in self.rows]
         return "\n".join([*told, f"page: {self.page}"])
 
 
@@ -147,20 +147,18 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
             found.setdefault((settings or "run", row["seed"]), []).append(row)
         return found
     try:
-        data = (newest(folder) / "summary.json").read_bytes()
-        ended = msgspec.json.decode(data, type=Ended)
-        head = msgspec.json.decode(data)
+        ended = msgspec.json.decode((newest(folder) / "summary.json").read_bytes(), type=Ended)
     except (OSError, msgspec.MsgspecError) as error:
         raise ConfigError(
             f"{folder}: expected the folder of a sweep (rows.jsonl) or of a run, found: {error}"
         ) from None
     verdict = ended.verdict
     row = Row(
-        id="", parameters={}, seed=head["seed"], exit_code=0, error=head.get("error") or "",
+        id="", parameters={}, seed=ended.seed, exit_code=0, error=ended.error or "",
         passed=verdict.passed if verdict else None, digest=None, sim_seconds=ended.sim_seconds,
         run_seconds=None, wall_seconds=None, estimators=verdict.estimators if verdict else {},
     )  # fmt: skip
-    return {("run", head["seed"]): [row]}
+    return {("run", ended.seed): [row]}
 
 
 COLOURS = {
@@ -172,39 +170,13 @@ COLOURS = {
 }
 
 
-def change(each: Comparison) -> str:
-    """Return the change with its interval: ``+12 % (+4.1 to +21)``."""
-    ends = " to ".join(map(_signed, (each.low, each.high)))
-    return f"{_signed(each.change)} {each.unit} ({ends})"
-
-
-def _signed(value: float) -> str:
-    if math.isinf(value):
-        return "+∞" if value > 0 else "-∞"
-    return f"{value:+.3g}"
-
-
-def shown(value: float | None, unit: str, failures: int) -> str:
-    """Return a median with the number of flights without the figure: ``0.31 m (2 failed)``."""
-    text = "–" if value is None else f"{value:.4g} {unit}"
-    return f"{text} ({failures} failed)" if failures else text
-
-
 def write_page(found: Sequence[Comparison], out: Path, a: Sequence[str], b: Sequence[str]) -> Path:
     """Write ``compare.html`` into a folder, made if missing; return its path."""
     out.mkdir(parents=True, exist_ok=True)
-    kinds = {"better": "good", "worse": "bad", "no difference": ""}
-    rows = []
-    for each in found:
-        row = figure(each.figure)
-        medians = zip((each.a, each.b), each.failures, strict=True)
-        a_and_b = (shown(median, row.unit, failures) for median, failures in medians)
-        cells = [each.estimator, row.meaning, *a_and_b, change(each), f"{each.p:.2g}"]
-        rows.append((cells, kinds.get(each.verdict, "doubt"), each.words))
     page = template(Path(__file__).with_name("page.html.jinja")).render(
         sides=[(side, " ".join(said)) for side, said in (("A", a), ("B", b)) if said],
-        flights=max((each.pairs for each in found), default=0),
-        rows=rows,
+        found=found,
+        figure=figure,
         image=base64.b64encode(_slopes(found)).decode(),
     )
     path = out / "compare.html"

@@ -87,6 +87,22 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
             return f"not comparable: after {' and '.join(self.alignments)}"
         return self.verdict
 
+    @property
+    def medians(self) -> list[str]:
+        """Of A and of B, each with its flights without the figure: ``0.31 m (2 failed)``."""
+        unit = figure(self.figure).unit
+        return [
+            ("–" if value is None else f"{value:.4g} {unit}") + f" ({lost} failed)" * bool(lost)
+            for value, lost in zip((self.a, self.b), self.failures, strict=True)
+        ]
+
+    @property
+    def interval(self) -> str:
+        """Change with its interval: ``+12 % (+4.1 to +21)``."""
+        values = (self.change, self.low, self.high)
+        change, low, high = (f"{value:+.3g}".replace("inf", "∞") for value in values)
+        return f"{change} {self.unit} ({low} to {high})"
+
     def by_scenario(self) -> dict[str, tuple[int, int, int]]:
         """Return the flights of each scenario: where B is worse, where it is better, and all."""
         sign = -1.0 if figure(self.figure).limit == "least" else 1.0

@@ -33,11 +33,13 @@ LIFELINE = "VISNAV_LIFELINE"
 
 
 class Ended(msgspec.Struct, frozen=True):
-    """Fields of a run's ``summary.json`` read by a sweep."""
+    """Fields of a run's ``summary.json`` read by a sweep or a comparison."""
 
     reason: str
     sim_seconds: float
     wall_seconds: float
+    seed: int = 0
+    error: str | None = None
     digest: str | None = None
     digests: dict[str, str] = {}
     not_deterministic: list[str] = []
