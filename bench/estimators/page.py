@@ -5,20 +5,20 @@ from __future__ import annotations
 import contextlib
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
-import jinja2
 import numpy as np
 
-from bench.estimators.plan import Suite
+from bench.estimators.plan import FOLDER, Suite
 from runtime.channels.digest import combined
 from runtime.errors import ConfigError
 from runtime.run.results import write
 from runtime.run.summarise import commit, environment
-from runtime.tools.sweep.plan import Plan
+from runtime.tools.sweep.plan import Job, Plan
+from runtime.tools.sweep.plots import template
 from runtime.tools.sweep.tables import Combination, Row, combine, crashed, in_order, summarise
 
 COLUMNS = {
@@ -88,6 +88,13 @@ def repeating(plan: Plan, rows: Sequence[Row]) -> dict[str, str]:
     return found
 
 
+def summaries(plan: Plan) -> Iterator[tuple[Job, dict[str, Any]]]:
+    """Yield the jobs with a readable ``summary.json``, and its contents."""
+    for job in plan.jobs:
+        with contextlib.suppress(OSError, ValueError):
+            yield job, json.loads((Path(job.out) / "summary.json").read_text(encoding="utf-8"))
+
+
 def flights(suite: Suite, plan: Plan) -> dict[str, dict[int, str]]:
     """Return the digest of all that the suite's vehicle sent, by scenario and seed.
 
@@ -98,16 +105,14 @@ def flights(suite: Suite, plan: Plan) -> dict[str, dict[int, str]]:
     """
     flying = {node["name"] for node in tomllib.loads(Path(suite.rig).read_text())["nodes"]}
     found: dict[str, dict[int, str]] = {}
-    for job in plan.jobs:
-        with contextlib.suppress(OSError, ValueError):
-            summary = json.loads((Path(job.out) / "summary.json").read_text(encoding="utf-8"))
-            if summary.get("error"):  # it ended early: its digest is that of a part
-                continue
-            sent = {k: v for k, v in summary["digests"].items() if k.partition(".")[0] in flying}
-            scenario = dict(job.settings)["scenario"]
-            digest = found.setdefault(scenario, {}).setdefault(job.seed, combined(sent))
-            if digest != combined(sent):
-                raise ConfigError(f"{job}: expected the flight of the others, found another")
+    for job, summary in summaries(plan):
+        if summary.get("error"):  # it ended early: its digest is that of a part
+            continue
+        sent = {k: v for k, v in summary["digests"].items() if k.partition(".")[0] in flying}
+        scenario = dict(job.settings)["scenario"]
+        digest = found.setdefault(scenario, {}).setdefault(job.seed, combined(sent))
+        if digest != combined(sent):
+            raise ConfigError(f"{job}: expected the flight of the others, found another")
     return found
 
 
@@ -203,7 +208,7 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
     found = cells(plan, rows)
     there = {name for each in found.values() for name in each}
     draw(suite, found, folder / "suite.png")
-    text = _template().render(
+    text = template(FOLDER / "SUITE.md.jinja").render(
         command=command,
         runs=len(rows),
         seeds=len({job.seed for job in plan.jobs}),
@@ -227,20 +232,5 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
 
 def _graphics(plan: Plan) -> dict[str, str]:
     """Return the ``graphics`` entry of the first summary to contain any."""
-    for job in plan.jobs:
-        with contextlib.suppress(OSError, ValueError, KeyError):
-            summary = json.loads((Path(job.out) / "summary.json").read_text(encoding="utf-8"))
-            if "graphics" in summary["environment"]:
-                return {"graphics": summary["environment"]["graphics"]}
-    return {}
-
-
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=False,  # noqa: S701  # Markdown is no HTML
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    return environment.get_template("SUITE.md.jinja")
+    places = (summary.get("environment", {}) for _, summary in summaries(plan))
+    return next(({"graphics": each["graphics"]} for each in places if "graphics" in each), {})

@@ -133,22 +133,14 @@ def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> li
     Raises:
         typer.Exit: With 130, after Ctrl-C or another signal that ends it.
     """
-    from concurrent.futures import ThreadPoolExecutor
-
     from rich.console import Console
 
-    from runtime.tools import sweep as sweeping
-    from runtime.tools.sweep.console import Display, at_once
+    from runtime.tools.sweep.console import Display, run_here
 
-    children = sweeping.Children()
-    display = Display(children, Console(stderr=True))
+    display = Display(Console(stderr=True))
     try:
-        with (
-            _signals_interrupt(children),
-            display,
-            ThreadPoolExecutor(jobs or at_once(plan), "run") as executor,
-        ):
-            return sweeping.sweep(plan, executor, run=children.run, watch=display, fresh=fresh)
+        with _signals_interrupt(display.children), display:
+            return run_here(plan, jobs=jobs, fresh=fresh, display=display)
     except KeyboardInterrupt:
         typer.echo(f"interrupted; the same command runs what is missing in {plan.out}", err=True)
         raise typer.Exit(130) from None
@@ -164,16 +156,12 @@ def _signals_interrupt(children: Children) -> Iterator[None]:
         if first:  # what follows it is not to be interrupted itself
             raise KeyboardInterrupt
 
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.getsignal(number) for number in numbers}
-    heard = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
-    for number in heard:
-        signal.signal(number, stop)
-    try:
+    with contextlib.ExitStack() as before:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if (handler := signal.getsignal(number)) is not signal.SIG_IGN:
+                before.callback(signal.signal, number, handler)
+                signal.signal(number, stop)
         yield
-    finally:
-        for number in heard:
-            signal.signal(number, before[number])
 
 
 def _seconds(duration: str | None) -> float | None:

@@ -66,17 +66,15 @@ def sweep(
     with Rows(plan.out / "rows.jsonl", fresh=fresh) as rows:
         missing = [job for job in plan.jobs if (row := rows.get(job)) is None or row["error"]]
         watch.begin(missing, len(plan.jobs) - len(missing))
-        futures: dict[concurrent.futures.Future[Row], Job] = {}
-        noted: set[concurrent.futures.Future[Row]] = set()
+        futures: dict[concurrent.futures.Future[Row], Job] = {}  # those without a row
         try:
             for job in missing:
                 futures[_submit(executor, run, job)] = job
-            for future in concurrent.futures.as_completed(futures):
+            for future in concurrent.futures.as_completed([*futures]):
                 row = rows.add(_row(future, futures[future]))
-                noted.add(future)
-                watch.done(futures[future], row)
+                watch.done(futures.pop(future), row)
         except BaseException:
-            left = [f for f in futures if f not in noted and not f.cancel()]
+            left = [future for future in futures if not future.cancel()]
             watch.interrupted()
             for row in [_row(future, futures[future]) for future in left]:  # waits
                 if not row["error"]:
@@ -85,11 +83,18 @@ def sweep(
         return [row for job in plan.jobs if (row := rows.get(job)) is not None]
 
 
-def run_here(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> list[Row]:
-    """Run the missing jobs of a plan on this machine, and show nothing; see `sweep`."""
-    children = Children()
-    watch = Watch()
-    watch.interrupted = children.interrupt  # type: ignore[method-assign]
+def run_here(
+    plan: Plan, *, jobs: int | None = None, fresh: bool = False, display: Display | None = None
+) -> list[Row]:
+    """Run the missing jobs of a plan on this machine; see `sweep`.
+
+    Args:
+        jobs: Runs at the same time; if not given, as many as fit on the cores.
+        display: Shows them, and has their processes.
+    """
+    children, watch = (display.children, display) if display else (Children(), Watch())
+    if display is None:
+        watch.interrupted = children.interrupt  # type: ignore[method-assign]
     with concurrent.futures.ThreadPoolExecutor(jobs or at_once(plan), "run") as executor:
         return sweep(plan, executor, run=children.run, watch=watch, fresh=fresh)
 
@@ -119,12 +124,16 @@ def _row(future: concurrent.futures.Future[Row], job: Job) -> Row:
 
 
 class Display(Watch):
-    """A bar in a terminal, else a line per finished run; a context manager."""
+    """A bar in a terminal, else a line per finished run; a context manager.
 
-    def __init__(self, children: Children, console: Console) -> None:
+    Attributes:
+        children: The processes of the runs; whoever interrupts the sweep ends them.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.children = Children()
         self.crashed = 0
         self.finished = 0
-        self._children = children
         self._console = console
         self._missing = 0
         self._usage, self._looked = (0, 0.0), 0.0
@@ -180,10 +189,10 @@ class Display(Watch):
             until = self._last + each * (self._missing - self.finished)
             left = _clock(max(until - time.monotonic(), 0))
         if time.monotonic() - self._looked > 1.0:
-            self._usage, self._looked = self._children.usage(), time.monotonic()
+            self._usage, self._looked = self.children.usage(), time.monotonic()
         processes, memory = self._usage
         using = f" ({processes} process{'es' * (processes > 1)}, {memory:.1f} GB)" * bool(processes)
-        return f"{self.crashed} crashed, {len(self._children)} running{using}, {left} left"
+        return f"{self.crashed} crashed, {len(self.children)} running{using}, {left} left"
 
     def _count(self) -> str:
         return f"{self.finished}/{self._missing}"

@@ -186,19 +186,7 @@ def decades(values: Sequence[float]) -> bool:
 def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
     """Write the page of a sweep into its folder, beside its tables and plots, and return it."""
     combinations = summarise(plan, rows)
-    figures = [n for n in MAIN if any(n in each.figures for each in combinations)]
     aligned = Counter(each.alignment for each in combinations if each.alignment)
-    summary = []
-    for each in combinations:
-        counts = {
-            "runs": each.runs,
-            "crashed": _share(each.crashed, each.runs),
-            "failed": _share(each.failed, each.runs),
-            "passed": "" if each.passed is None else each.passed,
-        }
-        cells = [_cell(each.figures.get(name)) for name in figures]
-        words = [*each.settings, each.estimator]
-        summary.append((words, counts.values(), each.repeatable, each.alignment, cells))
     runs, repeated = [], any(job.repeat > 1 for job in plan.jobs)
     for job, row in in_order(plan, rows):
         report = Path(job.out) / "report.html"
@@ -210,10 +198,9 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
     page = template(Path(__file__).with_name("page.html.jinja")).render(
         name=plan.out.name,
         parameters=[parameter.path for parameter in plan.parameters],
-        counts=["runs", "crashed", "failed", "passed"],
-        figures=[name.replace("_", " ") for name in figures],
+        figures=[n for n in MAIN if any(n in each.figures for each in combinations)],
         alignments=[name for name, _ in aligned.most_common()],
-        summary=summary,
+        summary=combinations,
         repeated=repeated,
         runs=runs,
         plots=[f"plots/{path.name}" for path in sorted((plan.out / "plots").glob("*.png"))],
@@ -223,27 +210,14 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
     return path
 
 
-def _cell(spread: Spread | None) -> tuple[str, ...]:
-    if spread is None:
-        return ()
-    if spread.least == spread.most:
-        return (f"{spread.median:.3g}", "", "")
-    return (
-        f"{spread.median:.3g}",
-        f"{spread.first:.3g} to {spread.third:.3g}",
-        f"{spread.least:.3g} to {spread.most:.3g}",
-    )
-
-
-def _share(count: int, runs: int) -> str:
-    return f"{count} ({count / runs:.0%})" if count else "0"
-
-
 def template(path: Path) -> jinja2.Template:
-    """Return a page's template, escaping all values; it may extend ``base.html.jinja``, here."""
+    """Return the template of a page; it may extend ``base.html.jinja``, here.
+
+    Values are escaped in HTML, and in nothing else.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([path.parent, Path(__file__).parent]),
-        autoescape=True,
+        autoescape=jinja2.select_autoescape(["html.jinja"]),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
