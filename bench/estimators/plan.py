@@ -13,7 +13,7 @@ import msgspec
 
 from runtime.config.messages import override
 from runtime.config.reading import parse
-from runtime.errors import CommandError, ConfigError, suggest
+from runtime.errors import CommandError, ConfigError, expect_known
 from runtime.tools.sweep import Plan, make_job, plan_of
 
 FOLDER = Path(__file__).parent
@@ -156,9 +156,6 @@ def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]
 def _named(what: str, known: tuple[Any, ...], names: Sequence[str]) -> tuple[Any, ...]:
     by_name = {each.name: each for each in known}
     for name in names:
-        if name not in by_name:
-            raise CommandError(
-                f"--{what}: expected one of {', '.join(by_name)}, found {name}"
-                + suggest(name, by_name)
-            )
+        message = f"--{what}: expected one of {', '.join(by_name)}, found {name}"
+        expect_known(name, by_name, message, CommandError)
     return tuple(by_name[name] for name in by_name if not names or name in names)

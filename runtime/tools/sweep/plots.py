@@ -187,22 +187,16 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
     """Write the page of a sweep into its folder, beside its tables and plots, and return it."""
     combinations = summarise(plan, rows)
     aligned = Counter(each.alignment for each in combinations if each.alignment)
-    runs, repeated = [], any(job.repeat > 1 for job in plan.jobs)
-    for job, row in in_order(plan, rows):
-        report = Path(job.out) / "report.html"
-        link = report.relative_to(plan.out).as_posix() if report.is_file() else ""
-        state = {True: "passed", False: "failed", None: "not judged"}[row["passed"]]
-        settings = [text for _, text in job.settings]
-        own = [job.seed, *[job.repeat] * repeated]
-        runs.append(([*settings, *own], row["error"] or state, link, bool(row["error"])))
     page = template(Path(__file__).with_name("page.html.jinja")).render(
         name=plan.out.name,
         parameters=[parameter.path for parameter in plan.parameters],
         figures=[n for n in MAIN if any(n in each.figures for each in combinations)],
         alignments=[name for name, _ in aligned.most_common()],
         summary=combinations,
-        repeated=repeated,
-        runs=runs,
+        repeated=any(job.repeat > 1 for job in plan.jobs),
+        runs=in_order(plan, rows),
+        reports={job.id for job in plan.jobs if (Path(job.out) / "report.html").is_file()},
+        states={True: "passed", False: "failed", None: "not judged"},
         plots=[f"plots/{path.name}" for path in sorted((plan.out / "plots").glob("*.png"))],
     )
     path = plan.out / "index.html"

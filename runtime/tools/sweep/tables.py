@@ -292,7 +292,7 @@ def combine(
     values = {figure: numbers(f.get(figure) for f in figures) for figure in wanted}
     reasons: dict[str, str] = {}
     for row, own in zip(group, figures, strict=True):
-        for reason in [*[row["error"]] * bool(row["error"]), *(own.get("failed") or [])]:
+        for reason in map(str, filter(None, [row["error"], *(own.get("failed") or [])])):
             reasons.setdefault(reason.partition(":")[0], reason)
     return Combination(
         settings=settings, estimator=name,
