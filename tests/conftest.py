@@ -5,9 +5,12 @@ Threads of OpenBLAS and OpenCV that wait for work keep a core busy, which anothe
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
+from collections.abc import Generator
 
+import pytest
 from hypothesis import settings
 
 # Whoever runs the tests under nohup does not mean the runs that they start and interrupt.
@@ -17,6 +20,18 @@ for number in (signal.SIGHUP, signal.SIGINT):
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Exclude the tests themselves, a million objects, from garbage collection."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.freeze()
+
 
 # A deadline is real time, of which a busy machine may take any amount.
 settings.register_profile("without deadlines", deadline=None)

@@ -247,9 +247,18 @@ def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> It
         signal.signal(signal.SIGUSR2, usual)
 
 
+_FROZEN_AT_IMPORT = gc.get_freeze_count()  # Python 3.12 itself has frozen some
+
+
 @contextlib.contextmanager
 def _no_long_collections() -> Iterator[None]:
-    """Exclude existing objects from garbage collection, whose pauses delay ticks."""
+    """Exclude existing objects from garbage collection, whose pauses delay ticks.
+
+    A program that has excluded its own before is left to it: its choice outlives the run.
+    """
+    if gc.get_freeze_count() > _FROZEN_AT_IMPORT:
+        yield
+        return
     gc.collect()
     gc.freeze()
     try:
