@@ -12,10 +12,13 @@ from events import EstimatorAnnouncement, PoseEstimate, TrackingLost, TrackingRe
 from nodes.estimators import Estimator, RgbdFrame, TrackingResult
 from runtime import Bundle
 from tests.nodes.estimators.conformance import Case, faults, lacks, refusal_faults, run
-from tests.nodes.estimators.flight import fly
+from tests.nodes.estimators.flight import Flight, fly
 
-FLIGHT = fly(("depth", "grey"), 1, 240)
 COUNT = itertools.count()
+
+
+def flight() -> Flight:
+    return fly(("depth", "grey"), 1, 240)
 
 
 class Good(Estimator):
@@ -43,9 +46,9 @@ class Good(Estimator):
         mount = np.eye(4)
         mount[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
         mount[0, 3] = 0.1
-        start = FLIGHT.truth[min(FLIGHT.truth)] @ mount
-        pose = np.linalg.inv(start) @ FLIGHT.truth[stamp] @ mount
-        lost = FLIGHT.kinds[stamp] in "bwrhz"
+        start = flight().truth[min(flight().truth)] @ mount
+        pose = np.linalg.inv(start) @ flight().truth[stamp] @ mount
+        lost = flight().kinds[stamp] in "bwrhz"
         return TrackingResult(pose, lost, "it is dark" if lost else "")
 
 
@@ -108,7 +111,7 @@ class OtherStamps(Good):
 
 class NoUnit(Good):
     def say(self, image: Any, result: TrackingResult) -> None:
-        position = tuple(FLIGHT.truth[image.stamp][:3, 3].tolist())
+        position = tuple(flight().truth[image.stamp][:3, 3].tolist())
         self.estimates.send(
             PoseEstimate(
                 stamp=image.stamp, source=self.name, position=position,
@@ -155,7 +158,7 @@ class WrongTrajectory(Good):
 
 class Gives(Good):
     async def on_end(self) -> None:
-        stamps = [*FLIGHT.truth][4:9]
+        stamps = [*flight().truth][4:9]
         poses = np.stack([self.track(stamp).pose for stamp in stamps])
         self.publish_trajectory(np.array(stamps), poses)
 
@@ -193,12 +196,12 @@ BAD: dict[type[Good], str] = {
 
 @pytest.mark.parametrize("node", [Good, Gives])
 def test_a_good_one_passes(node: type[Good]) -> None:
-    assert not faults(run(Case(node), FLIGHT), Case(node))
+    assert not faults(run(Case(node), flight()), Case(node))
 
 
 @pytest.mark.parametrize("node", BAD)
 def test_a_bad_one_is_found_out(node: type[Good]) -> None:
-    found = faults(run(Case(node), FLIGHT), Case(node))
+    found = faults(run(Case(node), flight()), Case(node))
     assert BAD[node] in {fault.partition(":")[0] for fault in found}
 
 
@@ -209,9 +212,9 @@ def test_equal_outcomes_are_equal_to_the_last_bit() -> None:
             found.pose[0, 3] += 1e-15 * next(COUNT)
             return found
 
-    first, second = (run(Case(Random), FLIGHT).outcome() for _ in range(2))
+    first, second = (run(Case(Random), flight()).outcome() for _ in range(2))
     assert first != second
-    assert run(Case(Good), FLIGHT).outcome() == run(Case(Good), FLIGHT).outcome()
+    assert run(Case(Good), flight()).outcome() == run(Case(Good), flight()).outcome()
 
 
 def test_one_that_takes_what_it_cannot_use_is_found_out() -> None:

@@ -124,7 +124,7 @@ def test_known_points_fall_on_their_pixels(spec: CameraSpec, draws: RendererName
     info = camera_info(spec)
     centres, radii = balls(info)
     world = mujoco.MjSpec()
-    world.visual.quality.numslices = world.visual.quality.numstacks = 160
+    world.visual.quality.numslices = world.visual.quality.numstacks = 80
     for part in ("ambient", "diffuse", "specular"):
         setattr(world.visual.headlight, part, [0.0, 0.0, 0.0])
     world.add_material(name="white", emission=1.0, rgba=[1, 1, 1, 1])

@@ -101,8 +101,8 @@ def residuals(spec: CameraSpec, info: CameraInfo) -> Array:
     in_body = centres @ rotation(said.orientation).T + said.position
     in_map = in_body @ rotation(ORIENTATION).T + POSITION
     world = mujoco.MjSpec()
-    world.visual.quality.numslices = 160
-    world.visual.quality.numstacks = 160
+    world.visual.quality.numslices = 80
+    world.visual.quality.numstacks = 80
     for number, ((x, y, z), radius) in enumerate(zip(in_map, radii, strict=True)):
         world.worldbody.add_geom(
             name=f"ball_{number}",

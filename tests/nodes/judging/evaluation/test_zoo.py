@@ -57,7 +57,7 @@ TRUTH = Trajectory(
 def judged(animal: Animal) -> dict[str, Any]:
     """Return its figures."""
     record = EstimatorRecord(animal.scale_free, "test", animal.reads)
-    for now, event in animal.sent:
+    for now, event in animal.sent():
         if now > animal.end.stamp:
             continue
         if isinstance(event, PoseEstimate):
