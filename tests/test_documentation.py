@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 import types
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ from tests.runtime.tools.samples_cli import command_here, start, summary
 
 ROOT = Path(__file__).parents[1]
 SCHEMA = json.loads((ROOT / "docs/reference/config.schema.json").read_text(encoding="utf-8"))
+VALIDATOR = jsonschema.Draft7Validator(SCHEMA)
 PAGES = sorted(
     [
         *(ROOT / "docs").rglob("*.md"),
@@ -113,7 +115,7 @@ def test_toml_keeps_to_the_schema(block: Block) -> None:
         return
     if set(table) <= {"run", "network", "nodes"}:
         whole = {"nodes": [{"name": "any", "type": "any:Any"}], **table}
-        jsonschema.validate(whole, SCHEMA)
+        VALIDATOR.validate(whole)
 
 
 def test_a_file_is_shown_as_it_is() -> None:
@@ -131,11 +133,16 @@ def test_a_file_is_shown_as_it_is() -> None:
     assert not [page for page in PAGES if "--8<--" in page.read_text(encoding="utf-8")]
 
 
+@cache
+def help_of(command: str) -> subprocess.CompletedProcess[str]:
+    return command_here(command, "--help", folder=ROOT)
+
+
 @pytest.mark.parametrize("words", sorted(set(commands())))
 def test_commands_name_what_there_is(words: str) -> None:
     """The command exists, so do its files and options, and the settings that it changes."""
     name, *arguments = shlex.split(words)
-    help_ = command_here(name, "--help", folder=ROOT)
+    help_ = help_of(name)
     assert help_.returncode == 0, help_.stderr
     for option in (each for each in arguments if each.startswith("--")):
         assert option in help_.stdout, option

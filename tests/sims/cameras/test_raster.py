@@ -55,6 +55,12 @@ def compiled(world: Any) -> Any:
     return world.compile()
 
 
+@cache
+def model_of(name: str) -> Any:
+    """Return the model of a world, which no stage changes."""
+    return compiled(fresh(name))
+
+
 def drawn(stage: Stage, spec: CameraSpec, place: Any, turn: Any) -> Drawn:
     camera = mujoco.mj_name2id(stage.model, mujoco.mjtObj.mjOBJ_CAMERA, f"free/{spec.name}")
     qpos = np.zeros(stage.model.nq)
@@ -96,7 +102,7 @@ WORLD = [name if name == "hall" else pytest.param(name, marks=SLOW) for name in 
 @pytest.mark.parametrize("name", WORLD)
 @pytest.mark.timeout(300)
 def test_every_world_looks_as_mujoco_draws_it(name: str) -> None:
-    model = compiled(fresh(name))
+    model = model_of(name)
     raster, reference = Raster(model), OpenGL(model, tuple(map(camera_info, SPECS)), 1)
     for place, turn in itertools.islice(places(name), None, None, 3):
         numbers, levels, depth = difference(
@@ -401,7 +407,7 @@ def test_outlines_and_textures_are_near_the_mean_of_many_samples(spec: CameraSpe
         cx=(info.cx + 0.5) * samples - 0.5,
         cy=(info.cy + 0.5) * samples - 0.5,
     )
-    raster = Raster(compiled(fresh("hall")))
+    raster = Raster(model_of("hall"))
     at_edges, elsewhere = [], []
     for place, turn in itertools.islice(places("hall"), None, None, 3):
         image, _, numbers = drawn(raster, spec, place, turn)
@@ -497,7 +503,7 @@ def test_no_pixel_of_small_triangles_is_missed_by_any_lens(
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
 def test_some_rows_are_those_of_the_whole_image(spec: CameraSpec) -> None:
-    raster = Raster(compiled(fresh("hall")))
+    raster = Raster(model_of("hall"))
     place, turn = next(places("hall"))
     whole = drawn(raster, spec, place, turn)
     for first, last in ((0, 1), (7, 60), (spec.height - 17, spec.height)):
@@ -509,7 +515,7 @@ def test_some_rows_are_those_of_the_whole_image(spec: CameraSpec) -> None:
 
 
 def test_each_image_is_the_same_alone() -> None:
-    raster = Raster(compiled(fresh("hall")))
+    raster = Raster(model_of("hall"))
     whole = drawn(raster, PINHOLE, *next(places("hall")))
     for wanted in itertools.product((False, True), repeat=3):
         colour, depth, numbers = wanted
@@ -522,7 +528,7 @@ def test_each_image_is_the_same_alone() -> None:
 
 
 def hash_of(name: str, instructions: str, threads: int = 1) -> str:
-    model, total = compiled(fresh(name)), hashlib.sha256()
+    model, total = model_of(name), hashlib.sha256()
     raster = Raster(model, threads=threads, instructions=instructions)
     for place, turn in itertools.islice(places(name), 9):
         for spec in SPECS:
