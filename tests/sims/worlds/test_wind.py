@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import welch
 
 from runtime.units import Duration
 from sims.worlds.wind import FOOT, Gust, Turbulence, WindSpec, scales, turned
@@ -59,6 +58,8 @@ def test_intensities_and_lengths_are_those_of_the_standard() -> None:
 @pytest.mark.slow
 def test_the_spectrum_is_that_of_the_formula() -> None:
     """In each octave, from half the corner frequency to 16 times it."""
+    from scipy.signal import welch
+
     step, speed, height, w20 = 0.02, 40.0, 50.0, 15.4
     felt = series(6000.0, step, speed=speed)
     for axis in range(3):

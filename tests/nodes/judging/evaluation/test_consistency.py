@@ -11,7 +11,6 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from events import PoseEstimate
 from nodes.judging.evaluation.judging import judge
@@ -57,6 +56,8 @@ def test_a_true_covariance_is_consistent(seed: int) -> None:
 
 
 def test_one_pose_is_the_quadratic_form_and_the_bounds_are_those_of_chi_squared() -> None:
+    from scipy.stats import chi2
+
     truth = walk(2)
     p = repeated(np.diag([0.01, 0.04, 0.09, 1.0, 1.0, 1.0]), 2)
     for share in (0.024, 0.026, 0.974, 0.976):
