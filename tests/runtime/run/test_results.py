@@ -9,6 +9,7 @@ import sys
 import threading
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -16,6 +17,7 @@ import visnav
 from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError, ResultsError
 from runtime.node import Node
+from runtime.run import execute as execution
 from runtime.run.execute import execute
 from runtime.run.results import MARKER, Folder, clear, run_folder, time_of
 from runtime.testing import spec
@@ -273,3 +275,14 @@ def test_whatever_takes_a_run_takes_its_name(
     words = ["--truth", "runs/sample", "--estimate", "none.tum"]
     done = command_here("judge", *words, folder=tmp_path)
     assert done.stderr == "error: none.tum: No such file or directory\n"
+
+
+def test_a_run_excludes_objects_from_collection_unless_its_program_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for more, expected in ((0, ["collect", "freeze", "unfreeze"]), (1, [])):
+        collector = mock.Mock()
+        collector.get_freeze_count.return_value = execution._FROZEN_AT_IMPORT + more
+        monkeypatch.setattr(execution, "gc", collector)
+        execute(Config(run=RunConfig(duration=Duration(0.1)), nodes=(spec(Speaker, "speaker"),)))
+        assert [name for name, *_ in collector.method_calls[1:]] == expected
