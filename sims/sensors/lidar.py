@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from events import LidarAnnouncement, LidarScan
 from events.frames import flip_yz, flip_yz_rotation
@@ -220,6 +219,8 @@ class Scanner:
 
     def _poses(self, spec: LidarSpec, states: Floats, times: Floats) -> tuple[Floats, Floats]:
         """Return the sensor's place at each state, and its rotation at each time (NWU)."""
+        from scipy.spatial.transform import Rotation  # a quarter of a second, for lidars only
+
         poses = states[:, self._pose]
         body = Rotation.from_quat(poses[:, 3:], scalar_first=True)
         origins = poses[:, :3] + body.apply(flip_yz(spec.position))
