@@ -70,6 +70,7 @@ class Plot(msgspec.Struct, frozen=True, eq=False):
         """Write the figure as PNG, and in other formats; return the PNG's path. Reproducible."""
         path = folder / f"{self.name}.png"
         self.figure.savefig(path, dpi=DPI, metadata={"Software": None})
+        self.figure.set_layout_engine("none")  # all stays where it is: finding places takes long
         for each in {"svg", "pdf"}.intersection(() if self.raster else formats):
             date = {"svg": "Date", "pdf": "CreationDate"}[each]
             self.figure.savefig(path.with_suffix(f".{each}"), metadata={date: None})
