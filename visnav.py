@@ -98,7 +98,7 @@ class Run:
     def show(self) -> list[Figure]:
         """Draw trajectories and errors; a notebook displays the figures."""
         from nodes.judging.report.curves import draw_errors
-        from nodes.judging.report.style import drawing
+        from nodes.judging.report.tables import drawing
         from nodes.judging.report.trajectories import draw_trajectories
 
         with drawing():
@@ -359,7 +359,7 @@ def judge(
         ConfigError: A setting is wrong.
     """
     _check_runtime()
-    from nodes.judging.judge import judging, sources
+    from nodes.judging import judgement
     from runtime.config.reading import convert
 
     config = convert(
@@ -369,35 +369,35 @@ def judge(
             "axes": axes,
             "thresholds": dict(thresholds or {}),
         },
-        judging.JudgeConfig,
+        judgement.JudgeConfig,
         "judge",
     )
     true = (
-        sources.read_truth(str(truth), "")
+        judgement.read_truth(str(truth), "")
         if isinstance(truth, str | Path)
-        else sources.Source(name="truth", file="truth", poses=_trajectory(truth, "truth"))
+        else judgement.Source(name="truth", file="truth", poses=_trajectory(truth, "truth"))
     )
     named = estimates if isinstance(estimates, Mapping) else {"": estimates}
     found = []
     for name, each in named.items():
         if isinstance(each, str | Path):
             text = f"{name}={each}" if name else str(each)
-            found.append(sources.read(text, config.axes))
+            found.append(judgement.read(text, config.axes))
         else:
             name = name or "estimate"
-            found.append(sources.Source(name=name, file=name, poses=_trajectory(each, name)))
-    stamps = sources.read_stamps(Path(frames)) if isinstance(frames, str | Path) else frames
-    judgements, verdict, notes = judging.judge_all(true, found, stamps, config)
+            found.append(judgement.Source(name=name, file=name, poses=_trajectory(each, name)))
+    stamps = judgement.read_stamps(Path(frames)) if isinstance(frames, str | Path) else frames
+    judgements, verdict, notes = judgement.judge_all(true, found, stamps, config)
     for note in notes:
         warnings.warn(note, stacklevel=2)
     if out is not None:
-        judging.write(Path(out), true, judgements, verdict, notes)
+        judgement.write(Path(out), true, judgements, verdict, notes)
         return load(out)
-    return Run(judging.in_memory(true, judgements, verdict, notes), None)
+    return Run(judgement.in_memory(true, judgements, verdict, notes), None)
 
 
 def _settings(config: str | Path | Mapping[str, Any], changes: Mapping[str, Any]) -> Config:
-    from runtime.config.messages import override
+    from runtime.config.model import override
     from runtime.config.reading import find_modules_in, load_configuration, parse
 
     if not isinstance(config, Mapping):

@@ -34,7 +34,7 @@ from sims.cameras import (
     model_to_bytes,
     pose_to_qpos,
 )
-from sims.cameras.lens import Lens
+from sims.cameras.optics import Lens
 from sims.cameras.renderer import Motion, Shot
 from sims.cameras.spec import ImageKind
 from sims.cameras.stage import RendererName

@@ -27,14 +27,14 @@ from bench.harness import paired, silent
 from bench.lateness import TakeoffNode
 from events import DepthImage, Image, Takeoff, VelocitySetpoint
 from runtime import NodeConfig, Output, Tick, every
-from runtime.channels.digest import Digest
+from runtime.channels.wire import Digest
 from runtime.config.reading import parse
 from runtime.run.execute import execute
 from runtime.summary import Summary
-from runtime.workers.shared_memory import SharedPipe, anonymous_file
+from runtime.workers.process import SharedPipe, anonymous_file
 from sims.cameras import CameraSpec
 from sims.cameras.development import Development
-from sims.cameras.response import generator
+from sims.cameras.optics import generator
 from sims.sensors import ImuNoise, ImuParameters
 from sims.vehicle import STANDING_HEIGHT, Autopilot, Physics, attach_vehicle
 from sims.worlds import load_world

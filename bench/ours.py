@@ -14,7 +14,7 @@ import uvloop
 
 from bench.system import Case, Ping, Pong, Samples, System, payloads
 from runtime import Input, Node, NodeConfig, Output, on
-from runtime.channels.digest import Digest
+from runtime.channels.wire import Digest
 from runtime.config.model import Config, RunConfig
 from runtime.run import event_loop
 from runtime.run.supervisor import Supervisor

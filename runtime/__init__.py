@@ -4,16 +4,16 @@ Read the core in this order:
 
 - Writing a node: `node` (its `host` is the run), with its declarations in `channels.ports` and
   `channels.bundles`.
-- Delivery of events: `channels.sender`, `streams` and `links`, as `run.graph` has connected them;
+- Delivery of events: `channels.sender` and `streams`, as `run.graph` has connected them;
   its speed: `channels.tasks`, `run.event_loop`.
-- Time: `time.schedule`, `clock`, `lockstep`, `stepping`, `time_limits`.
-- A run: `run.node_runner`, `run_state`, `supervisor`, `execute`; `watchdogs` and
-  `code_location` find the node that blocks the loop or holds up the run, `instruments` are for
-  observers.
-- Results: `channels.digest`, `summary` (made by `run.summarise`), `run.results`, `logs`.
+- Time: `time.clock` and `lockstep`.
+- A run: `run.node_runner`, `run_state` (with the instruments of observers), `supervisor`,
+  `execute`; `watchdogs` find the node that blocks the loop or holds up the run.
+- Results: the digest in `channels.wire`, `summary` (made by `run.summarise`), `run.results`,
+  `logs`.
 - `config`: the file, and changes during a run; `units` and `paths` are types of settings.
 - `workers`: objects in processes of their own. `channels.hold`, `answers`: outside systems.
-- `wire` and `peers`: events as bytes, and a run in several processes. `figures`: those of a
+- `channels.wire`: events as bytes. `peers`: a run in several processes. `figures`: those of a
   verdict.
 
 `testing` is for tests of nodes. `tools` is no part of the core: the command line, the monitor,
@@ -34,8 +34,7 @@ from runtime.channels.streams import Stream
 from runtime.config.parameters import Changeable
 from runtime.errors import RefusedError, VisnavError
 from runtime.node import Node, NodeConfig
-from runtime.time.clock import Clock
-from runtime.time.schedule import Tick
+from runtime.time.clock import Clock, Tick
 from runtime.units import Duration
 from runtime.workers.worker import Worker
 

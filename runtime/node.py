@@ -26,12 +26,10 @@ from runtime.channels.ports import MAX_HZ
 from runtime.channels.sender import Listener, Sender
 from runtime.channels.streams import Stream
 from runtime.errors import DeclarationError, expect_known
-from runtime.host import Host, RunEnd, Sibling
+from runtime.host import Host, RunEnd, Sibling, Stepping
 from runtime.logs import NodeLogger
 from runtime.summary import plain
-from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND, Tick, Ticker
-from runtime.time.stepping import Stepping
+from runtime.time.clock import SECOND, Clock, Tick, Ticker
 from runtime.workers.worker import Worker
 
 P = ParamSpec("P")

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from runtime.channels.answers import Answers, Outcome, Wrong
-from runtime.channels.digest import combined
+from runtime.channels.wire import combined
 from runtime.workers.process import Costs
 
 

@@ -16,9 +16,8 @@ from events.frames import from_rpy, from_yaw, multiply, normalize, rotate, yaw_o
 from runtime import Tick, every, on
 from runtime.paths import InputPath
 from sims.cameras import CameraSpec, add_free_camera, check_cameras, pose_to_qpos, qvel_between
-from sims.simulator import Simulator, SimulatorConfig
 from sims.vehicle import State
-from sims.world import Rate, join_world
+from sims.world import Rate, Simulator, SimulatorConfig, join_world
 from sims.worlds import Dynamics, Scene
 
 Course = Callable[[int], tuple[Vector3, Quaternion]]  # poses in ``map`` at times (ns)

@@ -12,7 +12,6 @@ from events import Vector3
 from runtime import Output, Tick, every, on
 from sims.cameras import CameraSpec, add_camera, check_cameras
 from sims.sensors import SensorsConfig, SensorSuite, mount_imu
-from sims.simulator import Simulator
 from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,
@@ -25,7 +24,7 @@ from sims.vehicle import (
 )
 from sims.vehicle.autopilot import FALL, Clearance, trouble_at_start, trouble_on_path
 from sims.vehicle.physics import Contact
-from sims.world import Rate, join_world
+from sims.world import Rate, Simulator, join_world
 from sims.worlds import Dynamics, Scene
 
 FRAME = "base_link"  # frame of the vehicle's body

@@ -20,7 +20,7 @@ import pytest
 
 import visnav
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import write_tum
+from nodes.trajectory_files import write_tum
 from runtime.errors import ConfigError, NodeError, ResultsError, VisnavError
 from tests.runtime.samples import Noise, Reader
 from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, results

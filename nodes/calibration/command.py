@@ -19,9 +19,9 @@ from nodes.calibration import proofs
 from nodes.calibration.proofs import Curve, Figure, Points, needed, noise
 from nodes.calibration.room import CENTRE, Motion, _Collector, mjcf
 from nodes.data.dataset.recording import choose
-from nodes.judging.report import style
+from nodes.judging.report import tables
 from nodes.judging.report.page import embedded, page_of
-from nodes.trajectory.formats import tum_row
+from nodes.trajectory_files import tum_row
 from runtime.config.model import Config, NodeSpec, to_builtins
 from runtime.config.reading import load_configuration, parse
 from runtime.errors import ConfigError
@@ -243,8 +243,8 @@ def selftest(
                 f"{spec.name}: {proof}. {TITLES[proof]}: {state if figures else 'not applicable'}"
             )
             for figure in figures:
-                limit = "" if figure.limit is None else f" (at most {style.number(figure.limit)})"
-                value = f"{style.number(figure.value)}{limit} {figure.unit}"
+                limit = "" if figure.limit is None else f" (at most {tables.number(figure.limit)})"
+                value = f"{tables.number(figure.value)}{limit} {figure.unit}"
                 print(f"    {figure.subject}: {figure.name}: {value}")
                 if figure.remark:
                     print(f"        {figure.remark}")
@@ -284,23 +284,23 @@ def lint(
 
 def write_page(path: Path, name: str, results: Sequence[Result]) -> None:
     """Write the self-test page and its plots; an `OSError` says if a file cannot be written."""
-    with style.drawing():
+    with tables.drawing():
         plots = {r.vehicle: [embedded(plot, path.parent) for plot in _plots(r)] for r in results}
     page = page_of(Path(__file__).with_name("selftest.html.jinja")).render(
-        name=name, results=results, titles=TITLES, plots=plots, text=style.number
+        name=name, results=results, titles=TITLES, plots=plots, text=tables.number
     )
     path.write_text(page, encoding="utf-8", newline="\n")
 
 
-def _plots(result: Result) -> Iterator[style.Plot]:
+def _plots(result: Result) -> Iterator[tables.Plot]:
     for source, points in result.points.items():
-        figure = style.sheet(5.0, width=6.0)
+        figure = tables.sheet(5.0, width=6.0)
         axes = figure.add_subplot()
         longest = float(np.nanmax(np.abs(points.off), initial=1e-3))
-        axes.quiver(*points.pixels.T, *points.off.T, angles="xy", width=0.002, color=style.LINE)
+        axes.quiver(*points.pixels.T, *points.off.T, angles="xy", width=0.002, color=tables.LINE)
         axes.invert_yaxis()
         axes.set(aspect="equal", xlabel="column", ylabel="row")
-        yield style.Plot(
+        yield tables.Plot(
             f"points_{source_file(source)}",
             figure,
             f"{source}: points beside their pixels",
@@ -308,17 +308,17 @@ def _plots(result: Result) -> Iterator[style.Plot]:
             "errors they are short and point anywhere.",
         )
     if result.curves:
-        figure = style.sheet(3.4)
+        figure = tables.sheet(3.4)
         for place, curve in enumerate(result.curves, 1):
             axes = figure.add_subplot(1, 2, place)
-            axes.loglog(curve.seconds, curve.measured, "o", ms=4, color=style.LINE)
+            axes.loglog(curve.seconds, curve.measured, "o", ms=4, color=tables.LINE)
             axes.loglog(curve.seconds, curve.announced, color="#3a3a3a")
             unit = "rad/s" if curve.name == "gyroscope" else "m/s²"
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_major_formatter(lambda value, _: f"{value:g}")
                 axis.set_minor_formatter(lambda *_: "")
             axes.set(title=curve.name, xlabel="averaging time (s)", ylabel=f"deviation ({unit})")
-        yield style.Plot(
+        yield tables.Plot(
             f"allan_{result.vehicle}",
             figure,
             "Allan deviation",

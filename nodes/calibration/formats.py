@@ -48,7 +48,7 @@ from nodes.data.dataset.recording import (
 from nodes.ros2.messages.images import depth_in_steps
 from nodes.ros2.messages.mappings import TopicKind, publication
 from nodes.ros2.messages.topics import PublishingConfig
-from nodes.trajectory.table import EPOCH, epoch_of
+from nodes.trajectory_files import EPOCH, epoch_of
 from runtime.run.results import claim
 
 DEPTH_FACTOR = 5000.0  # steps of an exported depth image per metre, as TUM's
@@ -260,7 +260,7 @@ def export_calibration(
     written = [folder / name for name in files]
     if form != "vslamlab" or not recording.is_file():
         return written
-    from nodes.data.replay.recorded import Recorded  # which wants what reads MCAP
+    from nodes.data.replay.bags import Recorded  # which wants what reads MCAP
 
     for number in range(len(rig.cameras)):
         for kind in ("rgb", "depth"):

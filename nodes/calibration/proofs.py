@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from events import CameraAnnouncement, Imu, ImuAnnouncement
 from events.geometry import pose_matrix
 from nodes.calibration.formats import FORMATS, GRAVITY, imu_axes, write_files
-from nodes.calibration.readers import read
-from nodes.calibration.room import NEAREST, Floats, Motion, _Collector, hits, spheres
+from nodes.calibration.room import NEAREST, Floats, Motion, _Collector, hits, read, spheres
 from nodes.data.dataset.recording import Rig
 
 INTEGRATED = 5.0  # seconds of IMU integration

@@ -23,9 +23,8 @@ from events import Event, Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD
 from events.geometry import pose_matrix
 from events.sensors import MEASURED, fields_of, numbers
-from nodes.trajectory.formats import read_tum, write_euroc, write_kitti, write_tum
-from nodes.trajectory.table import EPOCH, epoch_of
-from nodes.trajectory.trajectory import Trajectory, associate
+from nodes.trajectory import Trajectory, associate
+from nodes.trajectory_files import EPOCH, epoch_of, read_tum, write_euroc, write_kitti, write_tum
 from runtime.paths import source_file
 from runtime.run.results import run_folder
 
@@ -225,7 +224,7 @@ def export_measurements(run: Path, out: Path | None = None, epoch: int | str = E
 
 
 def _measurements(recording: Path) -> Iterator[Event]:
-    from nodes.data.replay.recorded import Recorded  # which needs mcap
+    from nodes.data.replay.bags import Recorded  # which needs mcap
 
     reader = Recorded(recording)
     wanted = reader.events(0, None, lambda kind, _: bool(fields_of(kind)))

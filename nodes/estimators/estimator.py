@@ -37,13 +37,7 @@ from events import (
 )
 from events.camera_info import COEFFICIENTS
 from nodes.estimators.rectification import ALIGNED, Rectification, misalignment
-from nodes.estimators.rig import (
-    Mount,
-    SensorChoice,
-    TrackingResult,
-    check_result,
-    check_trajectory,
-)
+from nodes.estimators.rig import Mount, SensorChoice, TrackingResult, check_result, check_trajectory
 from runtime import Bundle, Node, NodeConfig, Output, Worker, on
 from runtime.errors import DeclarationError, NodeError, suggest
 from runtime.extras import why_missing

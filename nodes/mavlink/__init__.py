@@ -3,9 +3,8 @@
     `node`       settings and ports: the vehicle of the run; PX4, if that flies it
     `door`       who gets which message
     `links`      sockets, parsers, signing, floods      bytes ↔ messages
-    `vehicle`    what is known of the vehicle           events → telemetry
+    `vehicle`    what is known of the vehicle           events → telemetry, missions, parameters
     `flight`     modes, commands, offboard              messages → set-points
-    `missions`   missions and parameters, their protocols
 
 Facts are of MAVLink's common dialect (mavlink.io), and of PX4's conventions, which programs expect.
 """

@@ -11,8 +11,7 @@ import numpy as np
 from events.frames import Geodetic, from_rpy
 from nodes.mavlink.flight import Flight
 from nodes.mavlink.links import Links, mav
-from nodes.mavlink.missions import Missions, Parameters
-from nodes.mavlink.vehicle import SECOND, Telemetry, Vehicle
+from nodes.mavlink.vehicle import SECOND, Missions, Parameters, Telemetry, Vehicle
 from runtime.logs import NodeLogger
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 from events import Event, PlannedPose, PoseEstimate, PositionSetpoint, Quaternion, Vector3
 from events.geometry import pose_matrix, pose_tuples
 from nodes.trajectory import RecentPoses
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 Colour = tuple[int, int, int]  # red, green, blue, 0 to 255
 TRUTH: Colour = (80, 220, 120)

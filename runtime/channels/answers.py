@@ -18,10 +18,10 @@ import msgspec
 import xxhash
 from typing_extensions import Buffer
 
-from runtime.channels.digest import combined, fingerprint
+from runtime.channels.wire import combined, fingerprint
 from runtime.errors import ConfigError
 from runtime.paths import source_file
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 from runtime.workers.process import Costs
 
 Outcome = Literal["answered", "empty", "initialising", "skipped", "lost"]

@@ -31,7 +31,7 @@ from events import Event
 from runtime.channels.ports import Handles, Input, Output, Ticks, _Port
 from runtime.channels.streams import Overflow, Stream, StreamStatistics
 from runtime.errors import AmbiguousSourceError, DeclarationError
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 B = TypeVar("B", bound=tuple[Any, ...])
 

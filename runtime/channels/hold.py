@@ -32,11 +32,10 @@ import msgspec
 from typing_extensions import Buffer
 
 from runtime.channels.answers import Answers, Outcome, Settled, Wrong, read_latencies
-from runtime.channels.digest import fingerprint
+from runtime.channels.wire import fingerprint
 from runtime.errors import MissingAnswerError
 from runtime.paths import InputPath
-from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND, Clock
 from runtime.units import Duration
 
 T = TypeVar("T")

@@ -2,7 +2,7 @@
 
 Declarations are read from the class, so that the graph is known, drawn and checked before
 anything runs. Their counterparts at run time are in `runtime.channels.streams`,
-`runtime.channels.sender` and `runtime.time.schedule`.
+`runtime.channels.sender` and `runtime.time.clock`.
 """
 
 from __future__ import annotations

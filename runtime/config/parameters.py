@@ -18,8 +18,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar, get_origin
 import msgspec
 import tomli_w
 
-from runtime.config.messages import override, struct_in, types_of
-from runtime.config.model import without_none
+from runtime.config.model import override, struct_in, types_of, without_none
 from runtime.config.reading import convert
 from runtime.errors import ConfigError
 from runtime.node import NodeConfig

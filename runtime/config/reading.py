@@ -48,12 +48,22 @@ from typing import Any, TypeVar, get_origin
 
 import msgspec
 
-from runtime.channels.links import LinkConfig
 from runtime.channels.ports import MAX_HZ
-from runtime.config.messages import explain, override, show, struct_in, types_of
-from runtime.config.model import Config, NetworkConfig, NodeSpec, OnError, RunConfig
-from runtime.config.plugins import CONFIGURATIONS, NODES, offers
+from runtime.channels.sender import LinkConfig
+from runtime.config.model import (
+    Config,
+    NetworkConfig,
+    NodeSpec,
+    OnError,
+    RunConfig,
+    explain,
+    override,
+    show,
+    struct_in,
+    types_of,
+)
 from runtime.errors import ConfigError, DeclarationError, VisnavError, expect_known, suggest
+from runtime.extras import CONFIGURATIONS, NODES, offers
 from runtime.node import Node
 from runtime.paths import resolve, unmarked
 from runtime.units import Duration

@@ -1,10 +1,8 @@
 """A run in several processes: each has some of the file's nodes, and events cross over.
 
     messages         what processes send each other
-    zenoh_session    how it gets there: Zenoh, in this module only
-    authentication   the secret of a run, and seals on messages
-    outbox           the way out to another process, and common memory for large events
-    member           another process, and keeping our clock with that of its machine
+    session          how it gets there: Zenoh, in this module only, and seals on messages
+    member           another process: our clock beside its machine's, and the way out to it
     handshake        how two processes that see each other come to a session, and whether they fit
     membership       who is there, who comes and who goes, and waiting for them
     time_token       lockstep: one process at a time goes on, the one with the next thing due

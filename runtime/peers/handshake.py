@@ -20,15 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from runtime.config.messages import show
-from runtime.config.model import Config, to_builtins
+from runtime.config.model import Config, show, to_builtins
 from runtime.errors import PeerError, VisnavError, WireError
 from runtime.paths import file_names
-from runtime.peers.authentication import NONCE, ForgedError, Sealing, hello_seal
-from runtime.peers.member import Member
+from runtime.peers.member import Member, Outbox
 from runtime.peers.messages import Hello, decode, encode
-from runtime.peers.outbox import Outbox
-from runtime.peers.zenoh_session import OnMessage, Session
+from runtime.peers.session import NONCE, ForgedError, OnMessage, Sealing, Session, hello_seal
 
 if TYPE_CHECKING:
     from runtime.peers.membership import Membership

@@ -37,6 +37,7 @@ from collections.abc import Callable, Iterable, Mapping
 import msgspec
 
 from events import Announcement
+from runtime.channels.wire import pack, unpack
 from runtime.errors import PeerError, WireError
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
@@ -51,9 +52,7 @@ from runtime.peers.messages import (
 )
 from runtime.summary import ProcessSummary, Summary, merged
 from runtime.time.clock import Clock, RealClock
-from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.time_limits import call_after, real_time_limit
-from runtime.wire import pack, unpack
+from runtime.time.lockstep import LockstepClock, LockstepLoop, call_after, real_time_limit
 
 log = logging.getLogger("visnav.runtime")
 

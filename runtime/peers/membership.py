@@ -23,13 +23,10 @@ from events import Event
 from runtime.config.model import Config
 from runtime.errors import PeerError, VisnavError, WireError
 from runtime.peers import messages
-from runtime.peers.authentication import ForgedError, derive, is_hello, secret_of
 from runtime.peers.handshake import Handshakes, check_fits, what_all_share
-from runtime.peers.member import Exchange, Member
-from runtime.peers.outbox import Incoming, Outgoing
-from runtime.peers.zenoh_session import Session, certified
-from runtime.time.lockstep import LockstepLoop
-from runtime.time.time_limits import real_time_limit
+from runtime.peers.member import Exchange, Incoming, Member, Outgoing
+from runtime.peers.session import ForgedError, Session, certified, derive, is_hello, secret_of
+from runtime.time.lockstep import LockstepLoop, real_time_limit
 
 if TYPE_CHECKING:
     from runtime.peers.peers import Peers

@@ -51,7 +51,7 @@ class Hello(Message, frozen=True):
 
 
 class Announcements(Message, frozen=True):
-    """Announcements of each node of the sender, as frames of `runtime.wire`."""
+    """Announcements of each node of the sender, as frames of `runtime.channels.wire`."""
 
     by_node: dict[str, tuple[bytes, ...]]
 
@@ -60,7 +60,7 @@ class Subscription(msgspec.Struct, frozen=True):
     """Events received by an input or handler.
 
     Attributes:
-        kinds: Types of events, by `runtime.wire.kind_of`; their subclasses come too.
+        kinds: Types of events, by `runtime.channels.wire.kind_of`; their subclasses come too.
         source: Only this source and those below it; `None` for all.
         latest: Whether all but the newest may be skipped.
     """

@@ -13,6 +13,7 @@ import msgspec
 from events import Announcement, Event
 from runtime.channels.sender import Listener, Sender
 from runtime.channels.tasks import Fault
+from runtime.channels.wire import event_type, kind_of
 from runtime.config.model import Config, NodeSpec
 from runtime.errors import ChannelFullError, PeerError, WireError
 from runtime.peers import Others, messages
@@ -23,7 +24,6 @@ from runtime.peers.time_token import TimeTokenHolder
 from runtime.summary import Summary
 from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.wire import event_type, kind_of
 
 log = logging.getLogger("visnav.runtime")
 

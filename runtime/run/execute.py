@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 
 from events import Event
-from runtime.channels.digest import Digest
 from runtime.channels.sender import Sender, Tap
+from runtime.channels.wire import Digest
 from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError, VisnavError
 from runtime.logs import file_handler, logging_to

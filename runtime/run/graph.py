@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from events import Announcement, CameraAnnouncement, Odometry, PoseStamped, VehicleAnnouncement
-from runtime.channels.links import Link
-from runtime.channels.sender import Deliver, Listener, Tap, Voices
+from runtime.channels.sender import Deliver, Link, Listener, Tap, Voices
 from runtime.channels.tasks import Fault
 from runtime.config.model import NodeSpec
 from runtime.node import Node, senders

@@ -19,10 +19,8 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from typing import Any, Literal
 
 from events import Announcement
-from runtime import code_location
 from runtime.channels.hold import Hold
-from runtime.channels.links import Link
-from runtime.channels.sender import Voices
+from runtime.channels.sender import Link, Voices
 from runtime.config.model import NodeSpec
 from runtime.errors import (
     ChannelSourceError,
@@ -33,9 +31,10 @@ from runtime.errors import (
 )
 from runtime.host import Host
 from runtime.node import Node, make_node, streams
+from runtime.run import event_loop
 from runtime.summary import plain
-from runtime.time.schedule import Ticker
-from runtime.time.time_limits import ended
+from runtime.time.clock import Ticker
+from runtime.time.lockstep import ended
 from runtime.workers.worker import Worker
 
 log = logging.getLogger("visnav.runtime")
@@ -208,7 +207,7 @@ class NodeRunner:
         self.phase, self.phase_task = what, task
         try:
             late = await ended([task], limit)
-            place = code_location.of_task(task)[1] if late else ""
+            place = event_loop.of_task(task)[1] if late else ""
         finally:
             if not task.done():
                 task.cancel()
@@ -240,8 +239,7 @@ class NodeRunner:
         late = await ended(tasks, max(seconds, 0.0))
         self.phase = ""
         wrong: list[NodeError] = [
-            self._too_late(what, limit or seconds, code_location.of_task(task)[1])
-            for task in late[:1]
+            self._too_late(what, limit or seconds, event_loop.of_task(task)[1]) for task in late[:1]
         ]
         for error in wrong:
             log_error(error, last=False)
@@ -260,27 +258,27 @@ class NodeRunner:
 def log_error(error: NodeError, *, last: bool) -> None:
     """Log a node's error, with the traceback of a foreign one; `last`: it is printed, too."""
     cause = error.__cause__
-    ours = isinstance(code_location.leaf(error if cause is None else cause), VisnavError)
+    ours = isinstance(event_loop.leaf(error if cause is None else cause), VisnavError)
     log.error("%s", with_place(error), exc_info=None if ours else cause, extra={"reported": last})
 
 
 def with_place(error: Exception) -> str:
     """Return an error's message, with the raising line if known."""
     place = getattr(error, "place", "")
-    return f"{error} ({code_location.short(place)})" if place else str(error)
+    return f"{error} ({event_loop.short(place)})" if place else str(error)
 
 
 def wrap(name: str, error: BaseException) -> NodeError:
     """Return a node's exception as a `NodeError` naming the node; a `NodeError` as is."""
     if isinstance(error, NodeError):
         return error
-    found = code_location.leaf(error)
+    found = event_loop.leaf(error)
     if isinstance(found, VisnavError):  # says all there is to say; others need their type
         wrapped = NodeError(name, str(found).removeprefix(f"{name}: "))
     else:
         wrapped = NodeError(name, _described(found))
         there = getattr(found, "place_in_worker", "")
-        wrapped.place = there or (code_location.of_error(found)[1] if found.__traceback__ else "")
+        wrapped.place = there or (event_loop.of_error(found)[1] if found.__traceback__ else "")
     wrapped.__cause__ = error
     return wrapped
 
@@ -288,7 +286,7 @@ def wrap(name: str, error: BaseException) -> NodeError:
 def _described(error: BaseException) -> str:
     """Return an exception's type and message as a line; of a group, those of its parts."""
     if isinstance(error, BaseExceptionGroup):
-        parts = [_described(code_location.leaf(part)) for part in error.exceptions]
+        parts = [_described(event_loop.leaf(part)) for part in error.exceptions]
         return f"{len(parts)} errors: " + "; ".join(parts)
     try:
         text = " ".join(str(error).split())

@@ -24,7 +24,7 @@ from events import (
     PilotAnnouncement,
 )
 from runtime.channels.answers import Answers
-from runtime.channels.digest import Digest, combined, fingerprint
+from runtime.channels.wire import Digest, combined, fingerprint
 from runtime.node import matchers, senders, streams
 from runtime.run.run_state import RunState
 from runtime.summary import (
@@ -38,7 +38,7 @@ from runtime.summary import (
     plain,
     verdict_of,
 )
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 
 def environment() -> dict[str, str]:

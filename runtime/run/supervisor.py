@@ -22,19 +22,16 @@ from pathlib import Path
 from typing import Any
 
 from events import Announcement, EstimatorAnnouncement, Event, Shutdown, WindowClosed
-from runtime import code_location
 from runtime.channels.sender import Deliver, Listener, Tap, Voices
 from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
 from runtime.host import RunEnd
 from runtime.peers import Others
-from runtime.run import graph
+from runtime.run import event_loop, graph
 from runtime.run.event_loop import RunTask
-from runtime.run.instruments import Instruments
 from runtime.run.node_runner import Announced, NodeRunner, Phase, log_error, start_up, wrap
-from runtime.run.run_state import RunState
-from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND, Once
+from runtime.run.run_state import Instruments, RunState
+from runtime.time.clock import SECOND, Clock, Once
 
 log = logging.getLogger("visnav.runtime")
 
@@ -169,7 +166,7 @@ class Supervisor:
 
     def escaped(self, error: BaseException) -> None:
         """Handle an exception raised out of the loop by a task or callback."""
-        name, place = code_location.of_error(error)
+        name, place = event_loop.of_error(error)
         if name in self.state.runners:
             self.fault(name, error)
             return
@@ -185,7 +182,7 @@ class Supervisor:
             return
         wrapped = wrap(name, error)
         fatal = (
-            isinstance(code_location.leaf(error), FatalError)
+            isinstance(event_loop.leaf(error), FatalError)
             or runner.spec.on_error == "stop"
             or not self.state.running
         )
@@ -342,7 +339,7 @@ class Supervisor:
                 runner.receive_announcements(self.state.announcements)
                 await runner.get_ready(self.state.config.run.startup_limit)
             except NodeError as error:
-                if isinstance(code_location.leaf(error.__cause__ or error), FatalError):
+                if isinstance(event_loop.leaf(error.__cause__ or error), FatalError):
                     log_error(error, last=True)
                     self.stop(f"{name} failed", error, by=name)
                     return

@@ -25,16 +25,15 @@ from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
-from runtime import code_location
-from runtime.code_location import frame_of
 from runtime.errors import NodeTimeoutError
+from runtime.host import Stepping
+from runtime.run import event_loop
+from runtime.run.event_loop import frame_of
 from runtime.run.node_runner import NodeRunner
 from runtime.run.run_state import RunState
 from runtime.summary import Stall
 from runtime.time import lockstep
-from runtime.time.lockstep import LockstepLoop
-from runtime.time.stepping import Stepping
-from runtime.time.time_limits import Starvation
+from runtime.time.lockstep import LockstepLoop, Starvation
 
 _LONGEST_PAUSE = 0.05  # seconds between two looks at most; a run's end waits for the last of them
 
@@ -99,7 +98,7 @@ class LoopWatchdog:
                 return
             if self._signed.wait(self._limit) or self._end.is_set():
                 continue
-            node, line = code_location.of_thread(frame_of(self._thread_id))
+            node, line = event_loop.of_thread(frame_of(self._thread_id))
             self._signed.wait()
             if not self._end.is_set():
                 self._count(Stall(node, line, time.monotonic() - asked))
@@ -211,7 +210,7 @@ class ProgressWatchdog:
 
         def explain() -> None:
             answer = self._explain()
-            answers.append((answer, code_location.ready_on(self._loop) if answer == "busy" else []))
+            answers.append((answer, event_loop.ready_on(self._loop) if answer == "busy" else []))
 
         while not self._end.is_set():
             for _, running in answers[known:]:
@@ -227,7 +226,7 @@ class ProgressWatchdog:
                     return ""
             frame = frame_of(self._thread_id)
             if not known and frame is not None and not idle(frame):
-                seen[code_location.of_thread(frame)] += 1
+                seen[event_loop.of_thread(frame)] += 1
             del frame
             if time.monotonic() >= until:
                 break
@@ -252,14 +251,14 @@ class ProgressWatchdog:
         places_seen = [place for place, _ in seen.most_common()] or [("runtime", "?")]
         node, line = places_seen[0]
         if answer is None:
-            where = code_location.short(line)
+            where = event_loop.short(line)
             return f"the loop has not turned for {seconds:.1f} s: {node}, at {where}"
         if answer == "busy":
             of_nodes = [place for place in places_seen if place[0] != "runtime"] or places_seen[:1]
             names = ", ".join(list(dict(of_nodes))[:_MOST_NAMED])
             return (
                 f"no time has passed for {seconds:.1f} s, while these run again and again: "
-                f"{names}, at {code_location.short(of_nodes[0][1])}"
+                f"{names}, at {event_loop.short(of_nodes[0][1])}"
             )
         return f"for {seconds:.1f} s the run has waited for {answer}"
 
@@ -271,7 +270,7 @@ class ProgressWatchdog:
         return run.config.run.startup_limit if run.first_update is None else float("inf")
 
     def _interrupt(self) -> None:
-        node, line = code_location.of_thread(frame_of(self._thread_id))
+        node, line = event_loop.of_thread(frame_of(self._thread_id))
         if node == "runtime":  # it is not a node that blocks, or does no more
             return
         setting = "startup_limit" if self._state.first_update is None else "shutdown_limit"
@@ -301,9 +300,9 @@ def _explain_time(loop: LockstepLoop, run: RunState) -> str:
     if not isinstance(wait, asyncio.Future):
         return "" if wait == "pace" else f"nothing: nothing is due any more{_all(run)}"
     for task in asyncio.all_tasks(loop):
-        if code_location.waits_for(task, wait):
-            node, line = code_location.of_task(task)
-            return f"{node}: slow work, at {code_location.short(line)}"
+        if event_loop.waits_for(task, wait):
+            node, line = event_loop.of_task(task)
+            return f"{node}: slow work, at {event_loop.short(line)}"
     return "slow work beside the loop"
 
 
@@ -316,4 +315,4 @@ def _all(run: RunState) -> str:
 
 def _at(tasks: Any) -> str:
     waiting = [task for task in tasks if not task.done()]
-    return f", at {code_location.short(code_location.of_task(waiting[0])[1])}" if waiting else ""
+    return f", at {event_loop.short(event_loop.of_task(waiting[0])[1])}" if waiting else ""

@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import msgspec
 from msgspec import inspect as types
 
-from runtime.channels.links import LinkConfig
+from runtime.channels.sender import LinkConfig
 from runtime.config.model import NetworkConfig, OnError, RunConfig
 from runtime.config.parameters import is_marked
 from runtime.config.reading import by_name_alone, presets_in

@@ -47,7 +47,7 @@ from runtime.node import Node, NodeConfig
 from runtime.paths import written
 from runtime.run.execute import Watch, execute
 from runtime.run.graph import edges_of
-from runtime.run.instruments import Instrument
+from runtime.run.run_state import Instrument
 from runtime.run.summarise import environment
 from runtime.run.supervisor import Supervisor
 from runtime.workers.worker import Worker

@@ -32,8 +32,8 @@ import msgspec
 from events import Announcement, EstimatorAnnouncement, Shutdown, WindowClosed
 from runtime.channels.sender import Listener, Voices
 from runtime.config.model import Config, NodeSpec
-from runtime.config.plugins import offers
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
+from runtime.extras import offers
 from runtime.host import Host
 from runtime.node import Node
 from runtime.paths import written
@@ -42,8 +42,7 @@ from runtime.run.execute import make_clock, make_loop
 from runtime.run.graph import circles, edges_of, input_types, unconnected
 from runtime.run.node_runner import Announced, NodeRunner, Phase, start_up
 from runtime.run.run_state import siblings
-from runtime.time.clock import Clock
-from runtime.time.schedule import Tick, Ticker
+from runtime.time.clock import Clock, Tick, Ticker
 
 RUN_FILES = ("config.toml", "log.txt", "summary.json")
 """Files written by the run itself into its folder."""

@@ -15,8 +15,8 @@ from typing import Any
 from msgspec.structs import replace
 
 from events import Event
-from runtime.channels.digest import Digest
 from runtime.channels.sender import Sender
+from runtime.channels.wire import Digest
 from runtime.config.model import Config
 from runtime.errors import ConfigError
 from runtime.run.execute import execute

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from runtime.workers.shared_memory import SharedPipe
+from runtime.workers.process import SharedPipe
 
 _LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
 """Folders of libraries: code not of the worker's own."""

@@ -29,11 +29,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
-from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND
-from runtime.time.time_limits import Starvation
-from runtime.workers.process import Costs, Output, how_it_ended
-from runtime.workers.shared_memory import SharedPipe, anonymous_file
+from runtime.time.clock import SECOND, Clock
+from runtime.time.lockstep import Starvation
+from runtime.workers.process import Costs, Output, SharedPipe, anonymous_file, how_it_ended
 
 W = TypeVar("W")
 R = TypeVar("R")

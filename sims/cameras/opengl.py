@@ -18,18 +18,23 @@ import numpy.typing as npt
 from typing_extensions import override
 
 from events import CameraInfo
-from sims.cameras.lens import MARGIN, Face, Maps, faces
+from sims.cameras.optics import MARGIN, Face, Maps, faces
 from sims.cameras.stage import (
     FAR,
     NEAR,
+    RANGE,
     SHADOW_SIZE,
     Changing,
+    Colours,
+    Depths,
+    Drawn,
     Floats,
     GraphicsError,
     Stage,
+    View,
+    looked_up,
     object_numbers,
 )
-from sims.cameras.view import RANGE, Colours, Depths, Drawn, View, looked_up
 
 INSTALL = "apt-get install libegl1 libgl1 libgl1-mesa-dri"
 

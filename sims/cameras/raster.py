@@ -19,18 +19,20 @@ from typing_extensions import override
 
 from events import CameraInfo
 from events.camera_info import srgb_light
-from sims.cameras.lens import pixel_rays
 from sims.cameras.meshes import Mesh, mesh_of, shape_of
+from sims.cameras.optics import pixel_rays
 from sims.cameras.stage import (
     NEAR,
+    RANGE,
     SHADOW_SIZE,
     Changing,
+    Drawn,
     Floats,
     GraphicsError,
     Stage,
+    View,
     object_numbers,
 )
-from sims.cameras.view import RANGE, Drawn, View
 
 GEOM = np.dtype(
     [

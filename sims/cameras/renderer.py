@@ -19,19 +19,22 @@ from events import CameraInfo
 from events.base import Quaternion, Vector3
 from events.geometry import pose_matrix
 from sims.cameras.development import Development
-from sims.cameras.lens import undistorted
 from sims.cameras.opengl import OpenGL
+from sims.cameras.optics import generator, grey_of, moments, undistorted
 from sims.cameras.raster import Raster
-from sims.cameras.response import generator, grey_of, moments
 from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain
-from sims.cameras.stage import Changing, Floats, RendererName, Stage, keep_memory
-from sims.cameras.view import (
+from sims.cameras.stage import (
     FINER_FOR_DEPTH,
+    Changing,
     Colours,
     Depths,
     Drawn,
+    Floats,
+    RendererName,
+    Stage,
     View,
     image_speeds,
+    keep_memory,
     looked_up,
     row_bands,
     row_time,

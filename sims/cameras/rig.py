@@ -15,9 +15,8 @@ import events as ev
 from events.base import Quaternion, Vector3
 from runtime import Node, Worker
 from runtime.channels.sender import Sender
-from sims.cameras.lens import undistorted
+from sims.cameras.optics import ExposureControl, undistorted
 from sims.cameras.renderer import CameraRenderer, Frame, Motion, Shot, delay_of, stamp_error
-from sims.cameras.response import ExposureControl
 from sims.cameras.spec import CameraSpec, announcement, eyes, optical_frame, optical_in_body
 from sims.cameras.stage import RendererName
 

@@ -30,8 +30,7 @@ from events.frames import (
 from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
-from sims.cameras.lens import Intrinsics, Lens, intrinsics
-from sims.cameras.response import AutoExposure, noise_at, read_response
+from sims.cameras.optics import AutoExposure, Intrinsics, Lens, intrinsics, noise_at, read_response
 from sims.presets import CAMERAS, DEPTH_SENSORS
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from events import LidarAnnouncement, LidarScan
 from events.frames import flip_yz, flip_yz_rotation
 from runtime import Node, Tick, Worker
+from sims.cameras.optics import generator
 from sims.cameras.renderer import model_from_bytes
-from sims.cameras.response import generator
 from sims.cameras.rig import DrawnWorld
 from sims.cameras.stage import object_numbers
 from sims.presets import LIDARS

@@ -13,21 +13,24 @@ from events import Announcement, Event, Imu, TransformStamped
 from events.frames import flip_yz, flip_yz_rotation
 from runtime import Node, Tick
 from sims.cameras.rig import DrawnWorld
-from sims.sensors.earth import (
+from sims.sensors.imu import ImuModel, ImuParameters, Motion, mean_between, motion_at
+from sims.sensors.lidar import Lidar, LidarRig, LidarSpec
+from sims.sensors.rays import RangeFinder, RangeFinderSpec, Rays
+from sims.sensors.sensor import (
     Barometer,
     BarometerSpec,
     Gnss,
     GnssSpec,
     Magnetometer,
     MagnetometerSpec,
+    Mounted,
+    Place,
+    Sensor,
+    Truth,
+    generator_of,
 )
-from sims.sensors.imu import ImuModel, ImuParameters, Motion, mean_between, motion_at
-from sims.sensors.lidar import Lidar, LidarRig, LidarSpec
-from sims.sensors.rays import RangeFinder, RangeFinderSpec, Rays
-from sims.sensors.sensor import Mounted, Place, Sensor, Truth, generator_of
-from sims.simulator import SimulatorConfig
 from sims.vehicle import Physics, State
-from sims.world import Rate
+from sims.world import Rate, SimulatorConfig
 
 _RATE = 200
 

@@ -9,18 +9,19 @@ Everything here is pure: time is an argument, nothing waits, nothing is sent. On
 
 from sims.vehicle.autopilot import Autopilot, Phase
 from sims.vehicle.control import Controller, Motors, Setpoint
-from sims.vehicle.model import (
+from sims.vehicle.physics import Contact, Physics, State
+from sims.vehicle.position import Gains, Limits
+from sims.vehicle.simulation import (
     STANDING_HEIGHT,
     TIMESTEP_NS,
     Mixer,
     Motor,
+    PhysicsDivergedError,
+    Simulation,
     VehicleParameters,
     attach_vehicle,
     read_parameters,
 )
-from sims.vehicle.physics import Contact, Physics, State
-from sims.vehicle.position import Gains, Limits
-from sims.vehicle.simulation import PhysicsDivergedError, Simulation
 
 __all__ = [
     "STANDING_HEIGHT", "TIMESTEP_NS", "Autopilot", "Contact", "Controller", "Gains", "Limits",

@@ -39,9 +39,9 @@ import events as ev
 from events import Vector3
 from events.frames import flip_yz, yaw_of
 from sims.vehicle.control import Controller, Motors, Setpoint, fault
-from sims.vehicle.model import STANDING_HEIGHT, VehicleParameters, mover_of, name_of
 from sims.vehicle.physics import State
 from sims.vehicle.position import Gains, Limits
+from sims.vehicle.simulation import STANDING_HEIGHT, VehicleParameters, mover_of, name_of
 
 _STOPPED: Motors = (0.0, 0.0, 0.0, 0.0)
 _IDLE: Motors = (0.05, 0.05, 0.05, 0.05)

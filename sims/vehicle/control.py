@@ -13,7 +13,6 @@ import numpy as np
 import events as ev
 from events import Quaternion, Vector3
 from events.frames import inverse, multiply, normalize, yaw_of
-from sims.vehicle.model import Mixer, VehicleParameters
 from sims.vehicle.physics import State
 from sims.vehicle.position import (
     Derivative,
@@ -24,6 +23,7 @@ from sims.vehicle.position import (
     shortened,
     wrapped,
 )
+from sims.vehicle.simulation import Mixer, VehicleParameters
 
 
 class AttitudeController:

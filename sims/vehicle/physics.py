@@ -24,9 +24,15 @@ from events.frames import (
     rotate,
     rotate_inverse,
 )
-from sims.vehicle.model import TIMESTEP_NS, VehicleParameters, mover_of, name_of, read_parameters
-from sims.vehicle.simulation import Simulation
-from sims.worlds.wind import Turbulence, WindSpec, turned
+from sims.vehicle.simulation import (
+    TIMESTEP_NS,
+    Simulation,
+    VehicleParameters,
+    mover_of,
+    name_of,
+    read_parameters,
+)
+from sims.worlds.dynamics import Turbulence, WindSpec, turned
 
 Floats = npt.NDArray[np.float64]
 

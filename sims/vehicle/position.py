@@ -12,8 +12,8 @@ import msgspec
 
 from events import Quaternion, Vector3
 from events.frames import from_rpy, yaw_of
-from sims.vehicle.model import VehicleParameters
 from sims.vehicle.physics import State
+from sims.vehicle.simulation import VehicleParameters
 
 Factor = Annotated[float, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]

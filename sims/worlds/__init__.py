@@ -16,11 +16,10 @@ import mujoco
 
 from runtime import VisnavError
 from sims.worlds.builder import CLEARANCE, TOURS
-from sims.worlds.corridor import corridor
 from sims.worlds.dynamics import Dynamics, Motion, Scene
 from sims.worlds.forest import forest
 from sims.worlds.hall import hall
-from sims.worlds.office import office
+from sims.worlds.indoors import corridor, office
 from sims.worlds.yard import night, yard
 
 __all__ = [

@@ -19,11 +19,10 @@ import numpy as np
 
 from events.base import Vector3
 from events.frames import from_rpy
-from sims.worlds import shapes
+from sims.worlds import surfaces
 from sims.worlds.decals import tile
 from sims.worlds.materials import Canvas, sky
-from sims.worlds.shapes import FACES, STEP, Surface, Window
-from sims.worlds.textures import Draw, own_generator, texture
+from sims.worlds.surfaces import FACES, STEP, Draw, Surface, Window, own_generator, texture
 
 LOOK_GROUP, SOLID_GROUP = 0, 3
 Vector = tuple[float, float, float]
@@ -269,12 +268,12 @@ class Builder:
         faces = {
             face: chosen[face]
             if face in chosen
-            else self.cut(material, *shapes.face_size(face, size))
+            else self.cut(material, *surfaces.face_size(face, size))
             for face in FACES
             if face not in hidden
         }
         middle = place if tilt else (place[0], place[1], place[2] + size[2] / 2.0)
-        self.look(f"{name}.look", shapes.box(size, faces), material, middle, turn, tilt)
+        self.look(f"{name}.look", surfaces.box(size, faces), material, middle, turn, tilt)
         half = [length / 2.0 for length in size]
         self.solid(name, mujoco.mjtGeom.mjGEOM_BOX, half, middle, turn, tilt)
 
@@ -304,7 +303,7 @@ class Builder:
         top = top or self.cut(material, 2.0 * radius, 2.0 * radius)
         middle = (place[0], place[1], place[2] + height / 2.0)
         self.look(
-            f"{name}.look", shapes.cylinder(radius, height, side, top, sides), material, middle
+            f"{name}.look", surfaces.cylinder(radius, height, side, top, sides), material, middle
         )
         self.solid(name, mujoco.mjtGeom.mjGEOM_CYLINDER, [radius, height / 2.0], middle)
 
@@ -312,7 +311,7 @@ class Builder:
         """Add a tree's crown: a bumpy ellipsoid about `place`, never outside its solid."""
         bumps = self.random.uniform(0.80, 1.0, (11, 19))
         window = self.cut(material, 4.0 * radii[0], 2.0 * radii[2])
-        self.look(f"{name}.look", shapes.blob(radii, bumps, window), material, place)
+        self.look(f"{name}.look", surfaces.blob(radii, bumps, window), material, place)
         self.solid(name, mujoco.mjtGeom.mjGEOM_ELLIPSOID, radii, place)
 
     def wall(
@@ -374,7 +373,7 @@ class Builder:
         up: float,
         step: float,
     ) -> None:
-        surface = shapes.quad(
+        surface = surfaces.quad(
             np.array([up * half[0], half[1], 0.0]),
             np.array([0.0, -2.0 * half[1], 0.0]),
             np.array([-2.0 * up * half[0], 0.0, 0.0]),
@@ -394,7 +393,7 @@ class Builder:
     ) -> None:
         """Hang up an image, without collisions, facing degrees from north to the west."""
         width, height = size
-        surface = shapes.quad(
+        surface = surfaces.quad(
             np.array([0.0, -width / 2.0, height / 2.0]),
             np.array([0.0, width, 0.0]),
             np.array([0.0, 0.0, -height]),
@@ -422,7 +421,7 @@ class Builder:
             self.box(f"{name}/{which}", material, (depth, leg, rise), foot, turn=turn)
         spring = (place[0], place[1], place[2] + rise)
         scale = (1.0 / material.width, 1.0 / material.height)
-        ring = shapes.arch(inner, inner + leg, depth, 16, scale)
+        ring = surfaces.arch(inner, inner + leg, depth, 16, scale)
         self.look(f"{name}/ring.look", ring, material, spring, turn)
         pieces = 12
         for piece in range(pieces):

@@ -19,7 +19,7 @@ from sims.worlds import materials
 from sims.worlds.builder import TOURS, Builder, Material, Vector
 from sims.worlds.dynamics import Dynamics, Motion, Scene
 from sims.worlds.materials import Canvas, Image, mix, shade, share, smooth
-from sims.worlds.shapes import Surface, cylinder
+from sims.worlds.surfaces import Surface, cylinder
 
 HALF = 20.0
 DENSITY = 60.0

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import events
 from events import Category, Event, PoseEstimate, PoseStamped, Quaternion, Vector3
-from runtime.wire import pack, unpack
+from runtime.channels.wire import pack, unpack
 
 UNCHECKED = Category.WINDOW | Category.INPUT | Category.LIFECYCLE
 CHECKED = [

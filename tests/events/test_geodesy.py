@@ -8,13 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from events.frames import (
-    Geodetic,
-    from_ecef,
-    from_geodetic,
-    to_ecef,
-    to_geodetic,
-)
+from events.frames import Geodetic, from_ecef, from_geodetic, to_ecef, to_geodetic
 
 HOME = (47.641468, -122.140165, 122.0)
 

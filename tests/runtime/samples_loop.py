@@ -11,8 +11,8 @@ import numpy as np
 
 from events import Event, Image, ParameterChanged, PoseEstimate, VelocitySetpoint
 from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on
-from runtime.channels.digest import Digest
 from runtime.channels.sender import Sender
+from runtime.channels.wire import Digest
 from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.config.parameters import Changeable
 from runtime.node import senders

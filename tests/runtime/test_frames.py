@@ -9,11 +9,11 @@ import threading
 
 import pytest
 
-from runtime.code_location import frame_of
+from runtime.run.event_loop import frame_of
 
 DEADLOCK = """
 import gc, os, sys, threading, weakref
-from runtime.code_location import frame_of
+from runtime.run.event_loop import frame_of
 
 class Garbage:
     def __init__(self):

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from events import Event, Image, PointCloud, PositionSetpoint
-from runtime.channels.digest import Digest
+from runtime.channels.wire import ALIGNED, Digest, event_type, kind_of, pack, unpack
 from runtime.errors import WireError
-from runtime.wire import ALIGNED, event_type, kind_of, pack, unpack
 
 DTYPES = ["uint8", "int32", ">i4", "float32", "float64", "bool", "complex64"]
 arrays = st.sampled_from(DTYPES).flatmap(

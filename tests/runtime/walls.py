@@ -8,9 +8,8 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Protocol, TypeVar
 
 from runtime.run import event_loop as task_factory
-from runtime.time.clock import Clock, RealClock
+from runtime.time.clock import SECOND, Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.schedule import SECOND
 from tests.runtime.loops import turns
 
 R = TypeVar("R")

@@ -10,10 +10,9 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from events import Announcement, DepthImage, Image, Imu, Odometry, PoseStamped
-from nodes.data.dataset.euroc import Euroc
+from nodes.data.dataset.layouts import Euroc, TumMono, TumRgbd
 from nodes.data.dataset.recording import ImageFile, Recording, choose
-from nodes.data.dataset.tum import TumMono, TumRgbd
-from nodes.trajectory.table import EPOCH, epoch_of, part_name
+from nodes.trajectory_files import EPOCH, epoch_of, part_name
 from runtime import Input, Node, NodeConfig, Stream, on
 from runtime.errors import ConfigError
 from runtime.paths import OutputPath

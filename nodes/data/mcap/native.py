@@ -1,8 +1,9 @@
 """Records of an MCAP file, intact or damaged, and events in their own encoding.
 
 The only module that imports mcap (mcap.dev/spec). An event is a ``std_msgs/msg/UInt8MultiArray``:
-``ros2 bag`` refuses files that mix encodings with CDR. Its data is a frame of `runtime.wire`; or,
-if the arrays stand in another message of the same time, the frame's beginning, up to its arrays.
+``ros2 bag`` refuses files that mix encodings with CDR. Its data is a frame of
+`runtime.channels.wire`; or, if the arrays stand in another message of the same time, the frame's
+beginning, up to its arrays.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from nodes.data.mcap import layout
 from nodes.data.mcap.layout import RecordingError
 from nodes.ros2.messages.images import COMPRESSED, LIDAR_POINT, POINT, decode_compressed
 from nodes.ros2.messages.typestore import TypeStore
+from runtime.channels.wire import ALIGNED, unpack
 from runtime.errors import MissingDependencyError, WireError
 from runtime.extras import install_command
-from runtime.wire import ALIGNED, unpack
 
 TYPE = "std_msgs/msg/UInt8MultiArray"
 _LENGTH = struct.Struct("<I")
@@ -46,7 +47,7 @@ class Shape(msgspec.Struct, frozen=True):
 
 
 def message(frame: bytes | bytearray | memoryview, arrays: bool = True) -> bytes:
-    """Return a frame of `runtime.wire` as a message, with or without its arrays."""
+    """Return a frame of `runtime.channels.wire` as a message, with or without its arrays."""
     size = len(frame) if arrays else _LENGTH.size + _LENGTH.unpack_from(frame)[0]
     return b"".join((_HEAD.pack(_CDR, 0, 0, size), memoryview(frame)[:size]))
 

@@ -9,9 +9,14 @@ from pathlib import Path
 
 from events import Announcement, Event
 from nodes.data.mcap.layout import RecordingError
-from nodes.data.recorder.pipe import McapRecorderConfig, WriteRequest
-from nodes.data.recorder.writer_process import STANDSTILL, Backlog, WriterProcess
-from nodes.trajectory.table import part_name
+from nodes.data.recorder.writer_process import (
+    STANDSTILL,
+    Backlog,
+    McapRecorderConfig,
+    WriteRequest,
+    WriterProcess,
+)
+from nodes.trajectory_files import part_name
 from runtime import Input, Node
 from runtime.workers.worker import spare_cores
 

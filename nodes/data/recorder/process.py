@@ -29,13 +29,13 @@ from nodes.data.mcap import native
 from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import McapWriter
 from nodes.data.mcap.native import HOLDERS
-from nodes.data.recorder import pipe
-from nodes.data.recorder.pipe import McapRecorderConfig, Reply, WriteRequest
+from nodes.data.recorder import writer_process
+from nodes.data.recorder.writer_process import McapRecorderConfig, Reply, WriteRequest
 from nodes.ros2.messages.mappings import LARGE, SMALL, Publishing
 from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, Topic, ros_name
 from nodes.ros2.messages.typestore import Stamps, TypeStore
+from runtime.channels.wire import event_type, unpack
 from runtime.errors import MissingDependencyError, WireError
-from runtime.wire import event_type, unpack
 
 PREFIX = "/visnav"  # before the topics of events as they are
 _LEFT_OUT = ("clock", "paths")  # topic groups left out, as they only repeat other topics
@@ -76,7 +76,7 @@ class EventWriter:
         self._holder = ""  # topic holding the arrays of the current event
 
     def write(self, time: int, frame: bytes | bytearray, announcement: bool) -> None:
-        """Write a frame of `runtime.wire`, published at a time (ns); or raise a `WireError`."""
+        """Write a frame of `channels.wire`, published at a time (ns); or raise a `WireError`."""
         self._time = time
         self._holder = ""
         kind, source = native.describe(frame)
@@ -182,9 +182,9 @@ class FileWriter:
         """Write the pieces from a file descriptor, and close the file."""
         last = 0
         try:
-            for piece in pipe.read_all(file, LONGEST / 2, self._while_idle):
+            for piece in writer_process.read_all(file, LONGEST / 2, self._while_idle):
                 last = piece.time
-                if piece.what == pipe.END:
+                if piece.what == writer_process.END:
                     break
                 self._write(piece)
             self._end_chunk()
@@ -201,9 +201,9 @@ class FileWriter:
             return self._reply("error", str(error))
         return self._reply("done")
 
-    def _write(self, piece: pipe.Piece) -> None:
+    def _write(self, piece: writer_process.Piece) -> None:
         try:
-            self._events.write(piece.time, piece.frame, piece.what == pipe.ANNOUNCEMENT)
+            self._events.write(piece.time, piece.frame, piece.what == writer_process.ANNOUNCEMENT)
             self._written += 1
             self._in_chunk += 1
         except WireError as error:

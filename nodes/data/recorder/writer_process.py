@@ -1,8 +1,15 @@
-"""The writing process as seen by the run: its backlog and its threads.
+"""The writing process of a recording, as seen by the run: protocol, backlog and threads.
 
 The loop puts events into the backlog, and waits for nothing here. One thread feeds the process,
 another reads its replies. No `runtime.workers.worker.Worker`, which copies on the loop, and ends
 its process soon after the run: this one outlives a killed run, or a slow disk, and closes its file.
+
+Events go through a pipe, which a thread feeds:
+
+i64 LE   time of publication (ns), or of the end
+u32 LE   length of the frame
+u8       0: an event, 1: an announcement, 2: the end
+frame    of `runtime.channels.wire`
 """
 
 from __future__ import annotations
@@ -11,25 +18,29 @@ import contextlib
 import fcntl
 import math
 import os
+import select
 import signal
+import struct
 import subprocess
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 
 from events import Announcement, Event
 from nodes.data.mcap.layout import RecordingError
-from nodes.data.recorder import pipe
-from nodes.data.recorder.pipe import Reply, WhenFull, WriteRequest
+from nodes.data.mcap.mcap_file import Compression
+from nodes.ros2.messages.typestore import Distribution
+from runtime import NodeConfig
+from runtime.channels.wire import Packed, pack
 from runtime.errors import MissingDependencyError, WireError
-from runtime.wire import pack
+from runtime.paths import OutputPath
 
 SMALL = 512  # assumed size of an event without arrays, bytes
 _LARGE = 1 << 14  # least size of an event dropped by ``drop_images``, bytes
@@ -265,7 +276,7 @@ class WriterProcess:
             os.sched_setaffinity(0, spare)
         try:
             self._hand_over()
-            pipe.write(self._events, self._end, pipe.END)
+            write(self._events, self._end, END)
             self._events.flush()
         except (OSError, ValueError):
             pass  # the process is gone, or its pipe is closed, and the listener knows why
@@ -311,9 +322,7 @@ class WriterProcess:
         except WireError as error:
             self._complain(str(error))
             return
-        pipe.write(
-            self._events, waiting.time, pipe.ANNOUNCEMENT if is_announced else pipe.EVENT, packed
-        )
+        write(self._events, waiting.time, ANNOUNCEMENT if is_announced else EVENT, packed)
 
     # The thread that listens.
 
@@ -335,3 +344,116 @@ class WriterProcess:
                 self._child.wait(1.0)
             code = self._child.returncode
             return Reply("gone", f"{self.path}: the process that writes it ended with {code}")
+
+
+WhenFull = Literal["wait", "drop_images", "drop_oldest"]
+Bytes = Annotated[int, msgspec.Meta(ge=1 << 16)]
+ChunkBytes = Annotated[int, msgspec.Meta(ge=1 << 16, le=1 << 28)]
+
+
+class McapRecorderConfig(NodeConfig):
+    """Settings of a recording.
+
+    Attributes:
+        file: Its name in the run's folder; replaces an older file.
+        image_format: How images are kept: ``raw``, ``png`` (smaller, and no loss), or ``jpeg``
+            (small, with loss).
+        depth_format: How depth images are kept: ``raw``, or ``png``: whole millimetres, up to 65 m.
+        jpeg_quality: 1 to 100.
+        compression: Of the file's chunks: ``zstd``, ``lz4`` (quicker, larger) or ``none``.
+        chunk_size: Bytes of a chunk before compression. A chunk also ends 0.4 s after its first
+            event, real or on the run's clock.
+        memory: Bytes of events that may wait to be written.
+        when_full: What happens beyond. ``wait``: simulated time waits for the disk (a process
+            without a sign of life for 10 s ends the run); real time cannot, and does as
+            ``drop_images``: images and clouds are left out until there is room. ``drop_oldest``:
+            the oldest events are left out. Drops are counted and logged. The remainder at the run's
+            end is written before the command returns.
+        fsync: Wait for the disk at the end of each chunk. Without it, data survives the process,
+            but not a power cut.
+        distribution: Of ROS 2, for the messages' types.
+    """
+
+    file: Annotated[OutputPath, msgspec.Meta(pattern=r"^[^/]+\.mcap$")] = "recording.mcap"
+    image_format: Literal["raw", "png", "jpeg"] = "raw"
+    depth_format: Literal["raw", "png"] = "raw"
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
+    compression: Compression = "zstd"
+    chunk_size: ChunkBytes = 4 << 20
+    memory: Bytes = 256 << 20
+    when_full: WhenFull = "wait"
+    fsync: bool = False
+    distribution: Distribution = "jazzy"
+
+
+class WriteRequest(msgspec.Struct, frozen=True):
+    """A file to write, and how."""
+
+    path: str
+    config: McapRecorderConfig = McapRecorderConfig()
+    attachment: str = ""  # a file to add, if it is there
+    niceness: int = 0  # of the process, as of nice(1)
+    cores: tuple[int, ...] = ()  # to run on; all if empty
+    metadata: str = ""  # file beside it that makes their folder a bag of ROS 2; none if empty
+
+    def command(self) -> list[str]:
+        """Return the command to start the writing process."""
+        text = msgspec.json.encode(self).decode()
+        return [sys.executable, "-m", "nodes.data.recorder.process", text]
+
+
+class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Line sent by the writing process."""
+
+    # ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``; ``gone`` stands for
+    # a process that ended without a reply.
+    what: str
+    text: str = ""
+    written: int = 0
+    size: int = 0  # bytes of the file
+
+
+EVENT, ANNOUNCEMENT, END = 0, 1, 2
+_HEAD = struct.Struct("<qIB")
+_PART = 1 << 16  # bytes written at once: the kernel does not let go of the core meanwhile
+
+
+class Piece(NamedTuple):
+    """Unit of the pipe: an event, an announcement, or the end."""
+
+    time: int
+    what: int
+    frame: bytearray
+
+
+def write(file: IO[bytes], time: int, what: int, event: Packed | None = None) -> None:
+    """Write a piece to a buffered pipe, without the GIL; an `OSError` if the reader is gone."""
+    file.write(_HEAD.pack(time, 0 if event is None else event.size, what))
+    for part in () if event is None else event.parts():
+        view = memoryview(part)
+        for at in range(0, len(view), _PART):
+            file.write(view[at : at + _PART])
+
+
+def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator[Piece]:
+    """Yield pieces to the end of the pipe; call `while_idle` after `idle` seconds of silence."""
+    while True:
+        while not select.select([file], [], [], idle)[0]:
+            while_idle()
+        head = _read(file, _HEAD.size)
+        if len(head) < _HEAD.size:
+            return
+        time, length, what = _HEAD.unpack(head)
+        frame = _read(file, length)
+        if len(frame) < length:
+            return
+        yield Piece(time, what, frame)
+
+
+def _read(file: int, size: int) -> bytearray:
+    """Return as many bytes, or fewer at the end."""
+    buffer = bytearray(size)
+    view, got = memoryview(buffer), 0
+    while got < size and (count := os.readv(file, [view[got:]])):
+        got += count
+    return bytearray(view[:got]) if got < size else buffer

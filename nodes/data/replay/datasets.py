@@ -43,8 +43,7 @@ from nodes.data.replay.folders import (
     read_sensor,
 )
 from nodes.data.replay.reader import Pinhole, ReplayConfig, ReplayError
-from nodes.trajectory.formats import euroc_rows, read_kitti, read_tum
-from nodes.trajectory.table import Row, read_rows
+from nodes.trajectory_files import Row, euroc_rows, read_kitti, read_rows, read_tum
 
 _MODELS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 """Kalibr's names of distortion models, and ours."""

@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Announcement, Event, Odometry, TrajectoryEstimate, VehicleAnnouncement
+from nodes.data.replay.bags import Recorded, RosBag, is_ours
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError, Timed
-from nodes.data.replay.recorded import Recorded, is_ours
 from runtime import Node, Output
 from runtime.run.results import newest
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 Batch = list[Timed]
 
@@ -125,8 +125,6 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
         )
     if path.is_file() and path.suffix not in {".db3", ".bag"} and is_ours(path):
         return Recorded(path)
-    from nodes.data.replay.rosbag import RosBag
-
     return RosBag(path, config.topics, vehicle)
 
 

@@ -18,29 +18,16 @@ import numpy.typing as npt
 
 from events import CameraAnnouncement, ImuAnnouncement
 from events.geometry import inverse, pose_matrix
-from nodes.estimators import (
-    EstimatorConfig,
-    RgbdInertialFrame,
-    StereoInertialFrame,
-    TrackingResult,
-)
+from nodes.estimators import EstimatorConfig, RgbdInertialFrame, StereoInertialFrame, TrackingResult
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
 from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel
 from nodes.estimators.inertial_odometry.preintegration import Rows as ImageRows
-from nodes.estimators.odometry import (
-    Depth,
-    Grey,
-    OdometryNode,
-    Surfaces,
-    rays,
-    transform,
-)
+from nodes.estimators.odometry import Depth, Grey, OdometryNode, Surfaces, rays, transform
 from nodes.estimators.rig import cross
 from nodes.estimators.visual_odometry.alignment import Alignment
 from nodes.estimators.visual_odometry.features import BELIEVED, FeatureSettings, FeatureTracker
-from nodes.estimators.visual_odometry.landmarks import MapMatch
-from nodes.estimators.visual_odometry.patches import Rows
-from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings, baseline
+from nodes.estimators.visual_odometry.landmarks import MapMatch, Rows
+from nodes.estimators.visual_odometry.node import StereoMatcher, StereoSettings, baseline
 from runtime import Bundle
 
 _KNOWN = 0.3, 0.03  # largest deviations of velocity (m/s) and gravity (rad) to use the IMU

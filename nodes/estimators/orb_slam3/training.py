@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from events import Image
-from nodes.estimators.orb_slam3.vocabulary import (
+from nodes.estimators.orb_slam3.settings import (
     Bytes,
     TreeShape,
     cached_vocabulary,

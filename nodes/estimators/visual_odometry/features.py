@@ -42,13 +42,16 @@ from nodes.estimators.visual_odometry.landmarks import (
     Keyframe,
     Landmarks,
     MapMatch,
+    References,
+    Rows,
     find_corners,
+    find_patches,
+    half_width,
     squares,
 )
-from nodes.estimators.visual_odometry.patches import References, Rows, find_patches, half_width
 
 if TYPE_CHECKING:
-    from nodes.estimators.visual_odometry.stereo import StereoMatcher
+    from nodes.estimators.visual_odometry.node import StereoMatcher
 
 _FLOW_WINDOW = 15
 _LARGE = 320  # least side (pixels) of images halved before following corners

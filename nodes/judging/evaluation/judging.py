@@ -45,7 +45,7 @@ from nodes.judging.evaluation.record import (
     seconds,
 )
 from nodes.trajectory import PoseRows, RecentPoses, Trajectory, associate
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 
 def held_errors(

@@ -32,11 +32,17 @@ from events.frames import angle_between
 from events.geometry import Pose, pose_matrix, pose_tuples
 from nodes.judging.evaluation.judging import Flight, Judgement, collision_rows, judge
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.results import FRAMES, Album, write_results
-from nodes.judging.evaluation.verdict import Thresholds, conclude, node_of, planned_end
+from nodes.judging.evaluation.verdict import (
+    FRAMES,
+    Album,
+    Thresholds,
+    conclude,
+    node_of,
+    planned_end,
+    write_results,
+)
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import tum_row
-from nodes.trajectory.table import GrowingFile
+from nodes.trajectory_files import GrowingFile, tum_row
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
 from runtime.figures import FIGURES

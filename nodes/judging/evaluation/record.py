@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from events import PoseEstimate, TrackingEvent, TrackingLost, TrajectoryEstimate
 from nodes.trajectory import PoseRows, Trajectory
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]

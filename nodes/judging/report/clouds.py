@@ -8,9 +8,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.judging.report.style import DPI, WIDTH, Plot, label, sheet
-from nodes.judging.report.tables import Run
-from nodes.mapping.cloud import Cloud, read_ply
+from nodes.judging.report.tables import DPI, WIDTH, Plot, Run, label, sheet
+from nodes.mapping import Cloud, read_ply
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -11,8 +11,17 @@ from matplotlib.ticker import NullFormatter
 
 from nodes.judging.evaluation.metrics import path_pairs, relative_errors
 from nodes.judging.report.folder import Floats, broken
-from nodes.judging.report.style import Plot, label, legend_above, number, sheet, thin, wide_range
-from nodes.judging.report.tables import Estimator, Run
+from nodes.judging.report.tables import (
+    Estimator,
+    Plot,
+    Run,
+    label,
+    legend_above,
+    number,
+    sheet,
+    thin,
+    wide_range,
+)
 from nodes.trajectory import Trajectory
 
 SECOND = 1e9

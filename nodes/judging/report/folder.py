@@ -13,14 +13,13 @@ import numpy.typing as npt
 
 from nodes.judging.evaluation.judging import Errors, judge
 from nodes.judging.evaluation.record import EstimatorRecord, Interval, cover, seconds
-from nodes.judging.evaluation.results import read_errors
-from nodes.judging.report.style import COLORS
-from nodes.judging.report.tables import Estimator, Facts, Run, Verdict
+from nodes.judging.evaluation.verdict import read_errors
+from nodes.judging.report.tables import COLORS, Estimator, Facts, Run, Verdict
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import read_tum
+from nodes.trajectory_files import read_tum
 from runtime.paths import source_file, source_of
 from runtime.run.results import run_folder
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 Floats = npt.NDArray[np.float64]
 

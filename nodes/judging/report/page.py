@@ -22,8 +22,7 @@ from nodes.judging.report.curves import (
     draw_relative,
 )
 from nodes.judging.report.folder import read_run
-from nodes.judging.report.style import Plot, drawing
-from nodes.judging.report.tables import Run
+from nodes.judging.report.tables import Plot, Run, drawing
 from nodes.judging.report.trajectories import draw_frames, draw_trajectories
 from runtime import Node, NodeConfig
 from runtime.run.results import run_folder

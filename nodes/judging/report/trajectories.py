@@ -15,13 +15,14 @@ from matplotlib.figure import Figure
 
 from nodes.judging.evaluation.record import Interval
 from nodes.judging.report.folder import Floats, broken
-from nodes.judging.report.style import (
+from nodes.judging.report.tables import (
     DPI,
     HIT,
     PLAN,
     TRUTHS,
     WIDTH,
     Plot,
+    Run,
     bounds,
     label,
     legend_columns,
@@ -29,7 +30,6 @@ from nodes.judging.report.style import (
     sheet,
     thin,
 )
-from nodes.judging.report.tables import Run
 from nodes.trajectory import Trajectory
 from runtime.paths import source_file, source_of
 

@@ -43,9 +43,8 @@ from nodes.calibration.formats import variables
 from nodes.data.dataset.recording import Rig
 from nodes.estimators import Estimator, Mount, TrackingResult
 from nodes.outside.native import LinkAnswer, LinkError, LinkOrder, describe
-from nodes.outside.process.inputs import Inputs
 from nodes.outside.process.launch import Launch, ProcessConfig, ProgramError
-from nodes.outside.process.program import KINDS, Exposure, Feed, Program
+from nodes.outside.process.program import KINDS, Exposure, Feed, Inputs, Program
 from nodes.ros2.messages.mappings import TopicKind, publication
 from nodes.ros2.messages.topics import PublishingConfig
 from runtime import Node, Output, on

@@ -39,7 +39,7 @@ from nodes.ros2.messages.topics import (
 from nodes.ros2.messages.typestore import MessageError, TypeStore
 from runtime import Node
 from runtime.errors import VisnavError
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 Serve = Callable[[Any], Awaitable[dict[str, Any]]]  # response's fields by request, or `VisnavError`
 Finish = Callable[[bytearray | str], None]

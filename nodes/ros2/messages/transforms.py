@@ -30,7 +30,7 @@ from events.frames import OPTICAL_TO_FLU, Axes, convert_rotation, convert_vector
 from events.geometry import Pose, relative
 from nodes.ros2.messages.topics import FrameNames, PublishingConfig, ros_name
 from nodes.ros2.messages.typestore import Time, TypeStore
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 _LINK_IN_OPTICAL = inverse(OPTICAL_TO_FLU)
 

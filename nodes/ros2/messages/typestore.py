@@ -24,7 +24,7 @@ import numpy as np
 from nodes.ros2.messages.topics import NO_HASH, FrameNames, dds_type
 from runtime.errors import MissingDependencyError, suggest
 from runtime.extras import install_command
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 

@@ -62,7 +62,7 @@ from nodes.viewers.common import (
 from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 from runtime import Node, Stream, Tick, every, on
 from runtime.errors import MissingDependencyError, VisnavError
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 
 
 class Messages:

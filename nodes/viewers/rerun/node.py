@@ -39,10 +39,9 @@ from events import (
     Wind,
 )
 from events.sensors import MEASURED
-from nodes.trajectory.table import part_name
+from nodes.trajectory_files import part_name
 from nodes.viewers.common import ImageSelection
-from nodes.viewers.rerun.entities import EntityLog, Eye, Numbered, layout
-from nodes.viewers.rerun.plots import GROUPS, Plots
+from nodes.viewers.rerun.entities import GROUPS, EntityLog, Eye, Numbered, Plots, layout
 from nodes.viewers.rerun.sdk import RerunConfig, Viewer, load
 from nodes.viewers.rerun.world import World
 from runtime import Node, Stream, on

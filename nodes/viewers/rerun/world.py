@@ -44,8 +44,7 @@ from nodes.viewers.common import (
     truth_colour,
 )
 from nodes.viewers.rerun import entities
-from nodes.viewers.rerun.entities import EntityLog, Numbered
-from nodes.viewers.rerun.plots import ScenePoints
+from nodes.viewers.rerun.entities import EntityLog, Numbered, ScenePoints
 from nodes.viewers.rerun.sdk import RerunConfig
 
 CENTIMETRES = 100.0  # steps of a depth image per metre; finer ones would be noise

@@ -1,6 +1,6 @@
 """The command line: ``python -m runtime run config.toml`` and its companions.
 
-The commands are the entry points of all installed packages (`runtime.config.plugins`): those about
+The commands are the entry points of all installed packages (`runtime.extras`): those about
 running nodes are modules of this package, others stand beside what they use. Every error becomes
 one line on standard error and exit code 2.
 """

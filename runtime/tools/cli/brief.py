@@ -19,8 +19,8 @@ from rich.table import Table
 
 from runtime.errors import ResultsError
 from runtime.summary import Summary, Verdict
-from runtime.time.schedule import SECOND
-from runtime.tools.cli.outcomes import NOBODY
+from runtime.time.clock import SECOND
+from runtime.tools.cli.commands import NOBODY
 
 if TYPE_CHECKING:
     from runtime.config.model import RunConfig

@@ -29,7 +29,7 @@ from events.frames import rotate
 from events.geometry import Pose, relative
 from runtime.errors import CommandError, expect_known
 from runtime.run.run_state import RunState
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 from runtime.tools.monitor.protocol import Points
 
 GAP = SECOND // 2

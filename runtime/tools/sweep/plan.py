@@ -16,8 +16,7 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from runtime.config.messages import given
-from runtime.config.model import Config, to_builtins
+from runtime.config.model import Config, given, to_builtins
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
 from runtime.tools.flights import flight_of, settings_key

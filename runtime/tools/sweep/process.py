@@ -17,7 +17,7 @@ from pathlib import Path
 
 import msgspec
 
-from runtime.channels.digest import combined
+from runtime.channels.wire import combined
 from runtime.run.results import clear
 from runtime.summary import Verdict
 from runtime.tools.sweep.plan import Job

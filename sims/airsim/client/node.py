@@ -14,12 +14,12 @@ import msgspec
 import events as ev
 from runtime import Node, Output, Worker, on
 from runtime.errors import UncheckableError
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 from sims.airsim.client import remote
 from sims.airsim.client.connection import Connection, ImageSet, ImageSource, RpcCallError
 from sims.airsim.client.remote import FRAME, AirsimClientConfig, Orders, ask
 from sims.airsim.wire import CollisionInfo, ImuData, MultirotorState
-from sims.simulator import Addressee
+from sims.world import Addressee
 
 T = TypeVar("T")
 E = TypeVar("E", bound=ev.Event)

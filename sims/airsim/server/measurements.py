@@ -24,7 +24,7 @@ import events as ev
 from events import Quaternion, Vector3, announcements, sensors
 from events.frames import inverse, multiply, normalize, rotate
 from runtime.node import Node
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 from runtime.units import Duration
 from sims.airsim import wire
 from sims.airsim.server.cameras import Cameras, Images
@@ -32,7 +32,7 @@ from sims.airsim.server.methods import Caller, RpcError, rpc
 from sims.airsim.server.vehicles import FIRST, ServedMultirotor, ServedVehicle, Vehicles
 from sims.airsim.wire import GeoPoint, ImageRequest, ImageResponse, Pose, Quaternionr, Vector3r
 from sims.cameras import GraphicsError
-from sims.sensors.earth import altitude_at
+from sims.sensors.sensor import altitude_at
 from sims.vehicle import TIMESTEP_NS
 from sims.world import SharedWorld
 

@@ -18,8 +18,7 @@ from typing import NamedTuple
 import events as ev
 from events import Vector3
 from events.frames import from_rpy, yaw_of
-from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND, Clock
 from sims.airsim.server.vehicles import ServedMultirotor, ServedVehicle
 from sims.vehicle import State, VehicleParameters
 

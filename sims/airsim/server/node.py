@@ -16,11 +16,10 @@ import msgspec
 
 from events import Announcement, Command, PoseEstimate, Setpoint, VehicleEvent
 from runtime import Duration, NodeConfig, Output, Tick, every, on
+from runtime.host import Stepping
 from runtime.node import Node
 from runtime.paths import JsonOrPath, NameOrPath
-from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND, Once
-from runtime.time.stepping import Stepping
+from runtime.time.clock import SECOND, Clock, Once
 from sims.airsim.server.cameras import Cameras, Images, ServedCamera
 from sims.airsim.server.connections import Listener
 from sims.airsim.server.flight import Control, Flight
@@ -47,8 +46,7 @@ from sims.airsim.server.vehicles import (
 from sims.cameras.stage import RendererName
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
-from sims.simulator import Count, Simulator
-from sims.world import Inhabitant, join_world
+from sims.world import Count, Inhabitant, Simulator, join_world
 from sims.worlds import Dynamics, Scene
 
 R = TypeVar("R")

@@ -25,9 +25,9 @@ from sims.airsim.server.methods import RpcError, rpc
 from sims.airsim.server.vehicles import FIRST, ServedVehicle, Vehicles
 from sims.airsim.wire import NAN, GeoPoint, Pose, Quaternionr, Vector3r
 from sims.cameras.stage import LOOK
-from sims.vehicle.model import mover_of
+from sims.vehicle.simulation import mover_of
 from sims.world import SharedWorld
-from sims.worlds.wind import check_strength
+from sims.worlds.dynamics import check_strength
 
 FARTHEST = 1e4  # metres from the origin within which objects can be put
 FARTHEST_PLACE = 1e9  # degrees, and metres above the sea

@@ -23,8 +23,17 @@ from events.geometry import pose_matrix
 from sims.airsim import wire
 from sims.cameras.renderer import model_from_bytes, open_stage
 from sims.cameras.spec import CameraSpec, camera_info, is_plain, vertical_fov
-from sims.cameras.stage import Changing, Floats, RendererName, Stage, keep_memory
-from sims.cameras.view import Colours, Depths, Drawn, View
+from sims.cameras.stage import (
+    Changing,
+    Colours,
+    Depths,
+    Drawn,
+    Floats,
+    RendererName,
+    Stage,
+    View,
+    keep_memory,
+)
 
 Form = Literal["float", "rgb", "bgr", "png"]
 Mount = tuple[Vector3, Quaternion]

@@ -22,7 +22,7 @@ from sims.airsim.server.methods import Named, RpcError, rpc
 from sims.airsim.wire import Pose, Quaternionr, Vector3r
 from sims.cameras import pose_to_qpos
 from sims.cameras.spec import CameraSpec, camera_info, eyes
-from sims.sensors.earth import pressure_at, temperature_at
+from sims.sensors.sensor import pressure_at, temperature_at
 from sims.vehicle import Physics, State
 from sims.vehicle.physics import Contact
 from sims.world import SharedWorld

@@ -13,7 +13,7 @@ import pytest
 import visnav
 from bench.estimators.page import cells, flights, write_page
 from bench.estimators.plan import FOLDER, LEVELS, Entrant, Scenario, Suite, make_plan, read_suite
-from runtime.config.messages import override
+from runtime.config.model import override
 from runtime.errors import CommandError, ConfigError
 from runtime.tools.sweep.tables import Row, crashed
 from tests.runtime.tools.samples_cli import command

@@ -21,7 +21,7 @@ from events import Announcement, CameraInfo
 from events.frames import convert_vector, from_rpy
 from events.geometry import pose_matrix
 from nodes.calibration.formats import FORMATS, export_calibration, write_files
-from nodes.calibration.readers import READERS, ReadCamera, read
+from nodes.calibration.room import READERS, ReadCamera, read
 from nodes.data.dataset.recording import Rig
 from runtime.config.reading import parse
 from runtime.run.execute import execute

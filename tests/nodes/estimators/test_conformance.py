@@ -17,21 +17,14 @@ import pytest
 from nodes.estimators.inertial_odometry import RgbdInertialOdometry, StereoInertialOdometry
 from nodes.estimators.monocular_odometry import MonocularOdometry
 from nodes.estimators.orb_slam3 import OrbSlam3
-from nodes.estimators.orb_slam3.vocabulary import find_vocabulary
+from nodes.estimators.orb_slam3.settings import find_vocabulary
 from nodes.estimators.svo import Svo
 from nodes.estimators.visual_odometry import VisualOdometry
-from nodes.estimators.visual_odometry.stereo import StereoOdometry
+from nodes.estimators.visual_odometry.node import StereoOdometry
 from nodes.outside.native import client as client_module
 from nodes.outside.process import Process
 from nodes.outside.vit import Vit
-from tests.nodes.estimators.conformance import (
-    Case,
-    Lack,
-    faults,
-    lacks,
-    refusal_faults,
-    run,
-)
+from tests.nodes.estimators.conformance import Case, Lack, faults, lacks, refusal_faults, run
 from tests.nodes.estimators.flight import fly
 from tests.nodes.outside.vit.library import stub_settings
 

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from events import CameraInfo
-from nodes.mapping.cloud import VoxelCloud, back_project, rays_of, read_ply, write_ply
+from nodes.mapping import VoxelCloud, back_project, rays_of, read_ply, write_ply
 
 INFO = CameraInfo.from_fov(64, 48, math.radians(80.0))
 

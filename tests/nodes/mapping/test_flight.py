@@ -10,8 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from events import Odometry
-from nodes.mapping import Mapping
-from nodes.mapping.cloud import read_ply
+from nodes.mapping import Mapping, read_ply
 from nodes.pilots import WaypointFollower
 from runtime.testing import run_nodes, spec
 from sims.multirotor import Multirotor

@@ -20,8 +20,7 @@ from events import (
     PointCloud,
     PoseStamped,
 )
-from nodes.mapping import Mapping
-from nodes.mapping.cloud import read_ply
+from nodes.mapping import Mapping, read_ply
 from runtime.errors import NodeError, RefusedError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 

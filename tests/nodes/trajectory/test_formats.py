@@ -18,7 +18,9 @@ from evo.tools import file_interface
 from hypothesis import given, settings
 
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import (
+from nodes.trajectory_files import (
+    GrowingFile,
+    part_name,
     read_euroc,
     read_kitti,
     read_tum,
@@ -26,7 +28,6 @@ from nodes.trajectory.formats import (
     write_kitti,
     write_tum,
 )
-from nodes.trajectory.table import GrowingFile, part_name
 from runtime import Node, Tick, every
 from runtime.errors import NodeError
 from runtime.testing import run_node, run_nodes, spec

@@ -15,8 +15,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
-from nodes.trajectory import PoseRows, RecentPoses, Trajectory
-from nodes.trajectory.trajectory import HISTORY
+from nodes.trajectory import HISTORY, PoseRows, RecentPoses, Trajectory
 from tests.nodes.trajectory.samples import angle, as_evo, walk
 
 SEEDS = st.integers(0, 2**32 - 1)

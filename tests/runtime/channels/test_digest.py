@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 
 from events import Event
 from runtime import Duration, Node, Output
-from runtime.channels.digest import Digest
+from runtime.channels.wire import Digest
 from runtime.config.model import Config, RunConfig
 from runtime.errors import ChannelTypeError, NodeError
 from runtime.run.execute import execute

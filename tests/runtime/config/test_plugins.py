@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from runtime.config import plugins
-from runtime.config.plugins import COMMANDS, NODES, OURS, Offer, offers
+from runtime import extras
 from runtime.config.reading import is_base
 from runtime.errors import CommandError, MissingDependencyError
+from runtime.extras import COMMANDS, NODES, OURS, Offer, offers
 from runtime.node import Node
 from runtime.tools.cli.commands import load
 from tests.runtime.tools.samples_cli import command
@@ -154,8 +154,8 @@ def test_an_installed_package_is_found_by_its_metadata(
 
     point = EntryPoint("run", "runtime.tools.cli.run:run", COMMANDS)
     vars(point).update(dist=Distribution)
-    monkeypatch.setattr(plugins, "_PROJECT", tmp_path / "pyproject.toml")
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [point])
+    monkeypatch.setattr(extras, "_PROJECT", tmp_path / "pyproject.toml")
+    monkeypatch.setattr(extras, "entry_points", lambda group: [point])
     assert offers(COMMANDS) == (Offer(OURS, "run", "runtime.tools.cli.run:run"),)
 
 
@@ -164,7 +164,7 @@ def test_a_project_of_somebody_else_around_ours_is_not_taken_for_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "pyproject.toml").write_text("[project]\nname = 'theirs'\n")
-    monkeypatch.setattr(plugins, "_PROJECT", tmp_path / "pyproject.toml")
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [])
+    monkeypatch.setattr(extras, "_PROJECT", tmp_path / "pyproject.toml")
+    monkeypatch.setattr(extras, "entry_points", lambda group: [])
     with pytest.raises(CommandError, match=r"expected the package visnav-runtime to be installed"):
         offers(COMMANDS)

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from runtime.config.model import Config, NetworkConfig, to_builtins
 from runtime.config.reading import parse
 from runtime.errors import PeerError, WireError
-from runtime.peers import authentication
-from runtime.peers.authentication import ForgedError, Seal, Sealing, derive, hello_seal, secret_of
+from runtime.peers import session
+from runtime.peers.session import ForgedError, Seal, Sealing, derive, hello_seal, secret_of
 
 A, B = ("a", b"1" * 16), ("b", b"2" * 16)
 MESSAGES = st.lists(st.tuples(st.binary(max_size=40), st.binary(max_size=40)), max_size=6)
@@ -83,7 +83,7 @@ def test_a_hello_holds_for_one_pair_and_one_run_and_one_version(
     ):
         with pytest.raises(ForgedError):
             other.take_off(0, hello)
-    monkeypatch.setattr(authentication, "VERSION", 99)
+    monkeypatch.setattr(session, "VERSION", 99)
     with pytest.raises(PeerError, match="version 99"):
         hello_seal(key, "a", "b").take_off(0, hello)
 

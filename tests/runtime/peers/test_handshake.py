@@ -12,10 +12,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from runtime.config.model import Config
-from runtime.peers.authentication import derive
 from runtime.peers.handshake import Handshakes
 from runtime.peers.membership import Membership
 from runtime.peers.peers import Peers
+from runtime.peers.session import derive
 from tests.runtime.peers.samples import settings
 
 CONFIG: Config = settings(("asker", "Asker", {}), ("one", "Answerer", {}), shared=False, meet="x/y")

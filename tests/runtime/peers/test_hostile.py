@@ -18,7 +18,6 @@ import pytest
 import zenoh
 
 from runtime.config.model import Config
-from runtime.peers.authentication import Seal
 from runtime.peers.messages import (
     NEVER,
     Ack,
@@ -42,6 +41,7 @@ from runtime.peers.messages import (
     TokenRequest,
     encode,
 )
+from runtime.peers.session import Seal
 from runtime.run.execute import execute
 from tests.runtime.peers.samples import Process, free_port, settings
 from tests.runtime.peers.test_runs import THREE

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from events import Image
 from runtime.channels.sender import Listener
-from runtime.peers.authentication import derive
 from runtime.peers.handshake import Handshakes
 from runtime.peers.joint import JointStart
 from runtime.peers.membership import Membership, Waiting
 from runtime.peers.messages import FirstUpdate
 from runtime.peers.peers import Peers
+from runtime.peers.session import derive
 from tests.runtime.peers import samples
 
 NODES = ("asker", "one", "other")

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from events import Image
+from runtime.channels.wire import Packed, pack, unpack
 from runtime.errors import WireError
-from runtime.peers import outbox
+from runtime.peers import member
+from runtime.peers.member import SMALL, Incoming, Outbox, Outgoing
 from runtime.peers.messages import EventMessage, MemoryMapped, Message, Ready, decode
-from runtime.peers.outbox import SMALL, Incoming, Outbox, Outgoing
-from runtime.wire import Packed, pack, unpack
-from runtime.workers.shared_memory import anonymous_file
+from runtime.workers.process import anonymous_file
 from tests.runtime.peers.samples import apart, settings
 from tests.runtime.peers.test_runs import THREE
 
@@ -72,7 +72,7 @@ def test_a_frame_stays_until_its_last_array_is_gone_and_then_its_place_is_used_a
 
 
 def test_there_is_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox, "LIMIT", 100_000)
+    monkeypatch.setattr(member, "LIMIT", 100_000)
     outgoing, _ = both()
     packed = pack(sample_image())
     assert [outgoing.put(packed) is None for _ in range(4)] == [False, False, True, True]
@@ -235,7 +235,7 @@ def test_images_pass_through_it_if_the_file_says_so(
         return put(outgoing, packed)
 
     monkeypatch.setattr(Outgoing, "put", noted)
-    monkeypatch.setattr("runtime.peers.outbox.SMALL", 4096)  # less than an image of the sample
+    monkeypatch.setattr("runtime.peers.member.SMALL", 4096)  # less than an image of the sample
     config = settings(*THREE, shared=shared)
     one, other = apart(config, "asker", "one,other")
     assert one.outputs == other.outputs

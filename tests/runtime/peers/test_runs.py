@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from runtime.errors import PeerError
+from runtime.peers.member import Outbox
 from runtime.peers.messages import FinalSummary, Message
-from runtime.peers.outbox import Outbox
 from runtime.run.execute import execute
 from tests.runtime.peers.samples import Process, apart, settings
 

@@ -12,12 +12,11 @@ from typing import Any
 import pytest
 
 from runtime.errors import PeerError, WireError
-from runtime.peers.authentication import secret_of
 from runtime.peers.joint import JointStart
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
 from runtime.peers.messages import Message
-from runtime.peers.zenoh_session import Session
+from runtime.peers.session import Session, secret_of
 from runtime.run.execute import execute
 from tests.runtime.peers.samples import Offer, Process, settings
 from tests.runtime.peers.test_losses import Rig

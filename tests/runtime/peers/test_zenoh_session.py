@@ -12,7 +12,7 @@ import pytest
 
 from runtime.config.model import NetworkConfig
 from runtime.errors import PeerError
-from runtime.peers.zenoh_session import Session, _configuration, _warn_if_open
+from runtime.peers.session import Session, _configuration, _warn_if_open
 from tests.runtime.peers.samples import free_port
 
 KEYS = ("mode", "scouting/multicast/enabled", "listen/endpoints", "connect/endpoints")

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.estimators.orb_slam3.vocabulary import Vocabulary, write_vocabulary
-from nodes.mapping.cloud import write_ply
+from nodes.estimators.orb_slam3.settings import Vocabulary, write_vocabulary
+from nodes.mapping import write_ply
 from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
 from runtime.run.execute import execute

@@ -29,7 +29,7 @@ from runtime.run.execute import execute
 from runtime.run.summarise import command_line, commit
 from runtime.summary import Summary, merged
 from runtime.testing import run_nodes, spec
-from runtime.time.schedule import Tick
+from runtime.time.clock import Tick
 from runtime.tools.cli.brief import run_tables
 from tests.runtime.samples import Diarist, Failing, Painter, Ping, Reader, Speaker
 

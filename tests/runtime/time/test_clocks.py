@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND, Tick, Ticker
+from runtime.time.clock import SECOND, Clock, Tick, Ticker
 from tests.runtime.loops import turns
 from tests.runtime.walls import RunClock
 

@@ -7,8 +7,7 @@ import concurrent.futures
 
 import pytest
 
-from runtime.time.clock import Clock
-from runtime.time.schedule import SECOND, Once
+from runtime.time.clock import SECOND, Clock, Once
 from tests.runtime.walls import RunClock
 
 Work = concurrent.futures.Future[str]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.time.schedule import DurationHistogram
+from runtime.time.clock import DurationHistogram
 
 durations = st.lists(st.integers(0, 10**12) | st.integers(0, 200), min_size=1, max_size=200)
 

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 import pytest
 
 from runtime.testing import run_in_lockstep
+from runtime.time.clock import SECOND, Once, Tick, Ticker
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.schedule import SECOND, Once, Tick, Ticker
 
 R = TypeVar("R")
 MS = 1_000_000

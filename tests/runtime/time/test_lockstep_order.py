@@ -12,9 +12,8 @@ import pytest
 
 from runtime.channels.streams import Stream
 from runtime.testing import run_in_lockstep
-from runtime.time.clock import Clock
+from runtime.time.clock import Clock, Tick, Ticker
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.schedule import Tick, Ticker
 
 R = TypeVar("R")
 MS = 1_000_000

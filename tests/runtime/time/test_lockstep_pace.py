@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from runtime.time import lockstep
+from runtime.time.clock import Tick, Ticker
 from runtime.time.lockstep import LockstepLoop
-from runtime.time.schedule import Tick, Ticker
 
 
 class Wall:

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 import uvloop
 
-from runtime.time.clock import Alarm, LoopAlarm, RealClock, TimerFd
-from runtime.time.schedule import Tick, Ticker
+from runtime.time.clock import Alarm, LoopAlarm, RealClock, Tick, Ticker, TimerFd
 
 MS = 1_000_000
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.time.schedule import SECOND, Once, Schedule, Tick, Ticker
+from runtime.time.clock import SECOND, Once, Schedule, Tick, Ticker
 
 MS = 1_000_000
 

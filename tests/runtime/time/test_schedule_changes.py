@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.time.schedule import Once, Schedule, Tick, Ticker
+from runtime.time.clock import Once, Schedule, Tick, Ticker
 
 
 def run_until(schedule: Schedule, end: int) -> None:

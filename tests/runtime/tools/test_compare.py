@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 import visnav
 from runtime.errors import ConfigError
 from runtime.node import Node, NodeConfig
-from runtime.tools.cli.compare import of_comparison
+from runtime.tools.cli.sweep import of_comparison
 from runtime.tools.comparison import Comparison, Key, compare_rows, compare_values, read_folder
 from runtime.tools.comparison.statistics import compare_until_sure, signed_rank
 from runtime.tools.sweep import Row

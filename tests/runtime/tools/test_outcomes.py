@@ -12,7 +12,7 @@ import pytest
 
 from runtime.node import Node, NodeConfig
 from runtime.summary import Verdict
-from runtime.tools.cli.outcomes import NOBODY, Outcome, of_verdict, to_junit, writing
+from runtime.tools.cli.commands import NOBODY, Outcome, of_verdict, to_junit, writing
 from tests.runtime.tools.samples_cli import command_here
 
 

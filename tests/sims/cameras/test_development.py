@@ -30,7 +30,7 @@ from sims.cameras import (
     pose_to_qpos,
 )
 from sims.cameras.development import DepthMeter, Development
-from sims.cameras.response import generator
+from sims.cameras.optics import generator
 from sims.cameras.spec import DepthSensor
 from tests.sims.cameras.scenes import frames_of
 

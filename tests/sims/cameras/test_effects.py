@@ -32,7 +32,7 @@ from sims.cameras import (
     qvel_between,
 )
 from sims.cameras.development import Development
-from sims.cameras.response import AutoExposure, ExposureControl, generator, moments
+from sims.cameras.optics import AutoExposure, ExposureControl, generator, moments
 from tests.sims.cameras.scenes import frames_of, renderer_of
 
 EXPOSURE = 0.02

@@ -23,7 +23,7 @@ from sims.cameras import (
     model_to_bytes,
     pose_to_qpos,
 )
-from sims.cameras.lens import LARGEST, Lens, faces, pixel_rays, undistorted
+from sims.cameras.optics import LARGEST, Lens, faces, pixel_rays, undistorted
 from sims.cameras.stage import RendererName
 from tests.sims.cameras.scenes import frames_of, renderer_of
 

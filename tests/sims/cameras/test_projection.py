@@ -31,7 +31,7 @@ from sims.cameras import (
     pose_to_qpos,
 )
 from sims.cameras.development import Passes
-from sims.cameras.response import MOST, defocused, moments
+from sims.cameras.optics import MOST, defocused, moments
 from sims.worlds import TOURS
 from tests.sims.cameras.scenes import ALL, CAMERAS, Scene, frames_of, renderer_of, scene
 

@@ -24,12 +24,11 @@ from events import CameraInfo
 from events.camera_info import DistortionModel
 from events.frames import from_rpy
 from sims.cameras import CameraSpec, GraphicsError, add_free_camera, pose_to_qpos
-from sims.cameras.lens import Lens, pixel_rays
 from sims.cameras.opengl import OpenGL
+from sims.cameras.optics import Lens, pixel_rays
 from sims.cameras.raster import Raster, libraries
 from sims.cameras.spec import camera_info
-from sims.cameras.stage import Stage
-from sims.cameras.view import Drawn, View
+from sims.cameras.stage import Drawn, Stage, View
 from sims.worlds import TOURS, WORLDS
 from tests.sims.cameras.scenes import fresh
 

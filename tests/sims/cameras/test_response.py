@@ -22,16 +22,9 @@ from events import CameraAnnouncement, Image
 from events.camera_info import srgb_light
 from runtime.testing import NodeResult, run_node
 from sims.cameras import CameraSpec
-from sims.cameras.development import (
-    Development,
-    Passes,
-    _at,
-    _quantiles,
-    noise_key,
-    random_words,
-)
+from sims.cameras.development import Development, Passes, _at, _quantiles, noise_key, random_words
+from sims.cameras.optics import generator
 from sims.cameras.raster import libraries
-from sims.cameras.response import generator
 from sims.cameras.spec import DepthSensor
 from sims.computer_vision import FreeCamera
 

@@ -26,9 +26,9 @@ from sims.cameras import (
     model_to_bytes,
     pose_to_qpos,
 )
-from sims.cameras.lens import Lens
+from sims.cameras.optics import Lens
 from sims.cameras.renderer import Motion, Shot
-from sims.cameras.view import MOST_BANDS, OFF, row_bands, row_time
+from sims.cameras.stage import MOST_BANDS, OFF, row_bands, row_time
 from tests.sims.cameras.scenes import frames_of, renderer_of
 
 Array = npt.NDArray[np.float64]

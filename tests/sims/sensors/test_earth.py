@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from events.frames import from_geodetic, from_rpy
-from sims.sensors.earth import (
+from sims.sensors.sensor import (
     Barometer,
     BarometerSpec,
     Gnss,

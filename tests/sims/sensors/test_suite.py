@@ -24,7 +24,7 @@ from events import (
 from runtime.errors import ConfigError
 from runtime.testing import NodeResult, run_node, spec
 from sims.multirotor import Multirotor
-from sims.sensors.earth import pressure_at
+from sims.sensors.sensor import pressure_at
 from tests.sims.vehicle.flight import WORLD
 
 SECOND = 1_000_000_000

@@ -28,7 +28,7 @@ from sims.vehicle import (
     attach_vehicle,
 )
 from sims.vehicle.physics import Air, drag, equivalent_box
-from sims.worlds.wind import STRONGEST, Gust, WindSpec
+from sims.worlds.dynamics import STRONGEST, Gust, WindSpec
 from tests.sims.vehicle.flight import UP, WORLD, compiled
 
 MS = 1_000_000

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sims.worlds import WORLDS, load_world, textures
+from sims.worlds import WORLDS, load_world, surfaces
 from sims.worlds.builder import Builder
 from sims.worlds.materials import Canvas, Image
 
@@ -83,7 +83,7 @@ def test_each_is_drawn_once(home: Path) -> None:
     first = drawings.world()
     assert drawings.world() == first
     assert drawings.count == 1
-    assert [file.name for file in textures.folder().iterdir()] == ["mine-0-stone"]
+    assert [file.name for file in surfaces.folder().iterdir()] == ["mine-0-stone"]
     assert len({first, drawings.world(seed=1), drawings.world(name="other")}) == 3
 
 
@@ -98,7 +98,7 @@ def test_none_is_drawn_where_nobody_sees(home: Path) -> None:
 def test_what_is_not_whole_is_drawn_anew(home: Path, spoil: bytes | None) -> None:
     drawings = Drawings()
     first = drawings.world()
-    (file,) = textures.folder().iterdir()
+    (file,) = surfaces.folder().iterdir()
     whole = file.read_bytes()
     file.write_bytes(whole[:-1] if spoil is None else spoil)
     assert drawings.world() == first
@@ -109,13 +109,13 @@ def test_what_is_not_whole_is_drawn_anew(home: Path, spoil: bytes | None) -> Non
 def test_another_version_has_its_own(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawings = Drawings()
     drawings.world()
-    monkeypatch.setattr(textures, "_version", lambda: "later")
+    monkeypatch.setattr(surfaces, "_version", lambda: "later")
     drawings.world()
     assert drawings.count == 2
-    monkeypatch.setattr(textures, "_UNUSED", -1.0)
-    monkeypatch.setattr(textures, "_version", lambda: "latest")
+    monkeypatch.setattr(surfaces, "_UNUSED", -1.0)
+    monkeypatch.setattr(surfaces, "_version", lambda: "latest")
     drawings.world()
-    assert [version.name for version in textures.folder().parent.iterdir()] == ["latest"]
+    assert [version.name for version in surfaces.folder().parent.iterdir()] == ["latest"]
 
 
 def test_it_works_without_a_cache(home: Path) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.units import Duration
-from sims.worlds.wind import FOOT, Gust, Turbulence, WindSpec, scales, turned
+from sims.worlds.dynamics import FOOT, Gust, Turbulence, WindSpec, scales, turned
 
 
 def spectrum(axis: int, omega: float, speed: float, height: float, w20: float) -> float:

@@ -14,20 +14,13 @@ import pytest
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
-from events import (
-    Announcement,
-    CameraAnnouncement,
-    Event,
-    ImuAnnouncement,
-    Odometry,
-    Shutdown,
-)
+from events import Announcement, CameraAnnouncement, Event, ImuAnnouncement, Odometry, Shutdown
 from events.frames import from_rpy, rotate
 from nodes.data.dataset import DatasetWriter
 from nodes.data.dataset.recording import ImageFile
 from nodes.data.replay.node import open_reader
 from nodes.data.replay.reader import ReplayConfig
-from nodes.trajectory.formats import read_euroc, read_tum
+from nodes.trajectory_files import read_euroc, read_tum
 from runtime.errors import ConfigError, FatalError, NodeError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from tests.nodes.data.dataset.samples import (

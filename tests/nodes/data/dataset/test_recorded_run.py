@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from nodes.data.dataset import DatasetWriter
-from nodes.trajectory.formats import read_euroc, read_tum
+from nodes.trajectory_files import read_euroc, read_tum
 from runtime import Duration
 from runtime.config.model import Config, RunConfig
 from runtime.run.execute import execute

@@ -13,7 +13,7 @@ import pytest
 from events import CameraInfo, Event, Image
 from events.camera_info import srgb_light, vignette_map
 from nodes.data.dataset import DatasetWriter
-from nodes.trajectory.formats import read_tum
+from nodes.trajectory_files import read_tum
 from runtime.errors import NodeError
 from runtime.testing import run_node
 from tests.nodes.data.dataset.samples import camera, flight, image, png, pose

@@ -9,7 +9,7 @@ import typer
 from typer.testing import CliRunner
 
 from nodes.data.export import export
-from nodes.trajectory.formats import write_tum
+from nodes.trajectory_files import write_tum
 from runtime.errors import ConfigError, ResultsError
 from tests.nodes.trajectory.samples import walk
 

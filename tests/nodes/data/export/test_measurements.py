@@ -10,9 +10,9 @@ import pytest
 from events import Event, FluidPressure, NavSatFix, Range
 from nodes.data.export import export_measurements
 from nodes.data.mcap.mcap_file import McapWriter
-from nodes.data.recorder.pipe import McapRecorderConfig
 from nodes.data.recorder.process import EventWriter
-from runtime.wire import pack
+from nodes.data.recorder.writer_process import McapRecorderConfig
+from runtime.channels.wire import pack
 
 
 def record(path: Path, events: list[Event]) -> None:

@@ -14,7 +14,7 @@ import pytest
 from nodes.data.export import export_trajectories, load
 from nodes.judging.evaluation.metrics import absolute_errors, align, path_errors
 from nodes.trajectory import Trajectory, associate
-from nodes.trajectory.formats import read_euroc, read_kitti, read_tum, write_tum
+from nodes.trajectory_files import read_euroc, read_kitti, read_tum, write_tum
 from tests.nodes.trajectory.samples import moved, noisy, walk
 
 ROOT = Path(__file__).parents[4]

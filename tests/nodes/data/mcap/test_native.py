@@ -8,8 +8,8 @@ import pytest
 from events import Event
 from nodes.data.mcap import native
 from nodes.ros2.messages.typestore import TypeStore
+from runtime.channels.wire import kind_of, pack
 from runtime.errors import WireError
-from runtime.wire import kind_of, pack
 from tests.nodes.data.recorder.samples import announcements, cloud, depth, image, imu, said, same
 
 ALL = [*announcements(), *said(5)]

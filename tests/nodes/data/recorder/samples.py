@@ -37,7 +37,7 @@ from events import (
     VehicleAnnouncement,
     Wind,
 )
-from runtime.wire import pack
+from runtime.channels.wire import pack
 
 CAMERA = "drone/front"
 OPTICAL = "drone/front_optical"

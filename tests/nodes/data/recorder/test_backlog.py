@@ -8,8 +8,7 @@ import msgspec
 import numpy as np
 
 from events import Image
-from nodes.data.recorder.pipe import WhenFull
-from nodes.data.recorder.writer_process import SMALL, Backlog
+from nodes.data.recorder.writer_process import SMALL, Backlog, WhenFull
 from tests.nodes.data.recorder.samples import depth, image, imu
 
 LARGE = SMALL + 400 * 400 * 3

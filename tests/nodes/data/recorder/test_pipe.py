@@ -9,17 +9,17 @@ import threading
 import pytest
 
 from events import Event
-from nodes.data.recorder import pipe
-from runtime.wire import pack, unpack
+from nodes.data.recorder import writer_process
+from runtime.channels.wire import pack, unpack
 from tests.nodes.data.recorder.samples import announcements, image, imu, said, same
 
 
-def through(data: list[Event], cut: int = 0) -> list[pipe.Piece]:
+def through(data: list[Event], cut: int = 0) -> list[writer_process.Piece]:
     """Send events through a pipe, without the last `cut` bytes."""
     there, here = os.pipe()
     sent = io.BytesIO()
     for event in data:
-        pipe.write(sent, event.stamp + 1, pipe.EVENT, pack(event))
+        writer_process.write(sent, event.stamp + 1, writer_process.EVENT, pack(event))
 
     def send() -> None:
         with os.fdopen(here, "wb") as file:
@@ -27,7 +27,7 @@ def through(data: list[Event], cut: int = 0) -> list[pipe.Piece]:
 
     sender = threading.Thread(target=send)
     sender.start()
-    found = list(pipe.read_all(there, 10.0, lambda: None))
+    found = list(writer_process.read_all(there, 10.0, lambda: None))
     sender.join()
     os.close(there)
     return found
@@ -57,9 +57,11 @@ def test_silence_is_noticed() -> None:
         calls.append(1)
         if len(calls) == 2:
             with os.fdopen(here, "wb") as file:
-                pipe.write(file, 9, pipe.END)
+                writer_process.write(file, 9, writer_process.END)
 
-    assert [each.what for each in pipe.read_all(there, 0.001, while_idle)] == [pipe.END]
+    assert [each.what for each in writer_process.read_all(there, 0.001, while_idle)] == [
+        writer_process.END
+    ]
     assert len(calls) == 2
     os.close(there)
 
@@ -69,4 +71,4 @@ def test_nobody_reading_is_an_error() -> None:
     there, here = os.pipe()
     os.close(there)
     with pytest.raises(BrokenPipeError), os.fdopen(here, "wb") as file:
-        pipe.write(file, 9, pipe.END)
+        writer_process.write(file, 9, writer_process.END)

@@ -12,10 +12,10 @@ from rosbags.highlevel import AnyReader
 from events import Announcement, DepthImage, Event, Image
 from nodes.data.mcap import native
 from nodes.data.mcap.mcap_file import McapWriter
-from nodes.data.recorder.pipe import McapRecorderConfig
 from nodes.data.recorder.process import EventWriter
-from nodes.data.replay.recorded import Recorded
-from runtime.wire import pack
+from nodes.data.recorder.writer_process import McapRecorderConfig
+from nodes.data.replay.bags import Recorded
+from runtime.channels.wire import pack
 from tests.nodes.data.recorder.samples import announcements, depth, image, odometry, said, same
 
 SECOND = 1_000_000_000

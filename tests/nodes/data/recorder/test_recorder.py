@@ -17,15 +17,14 @@ from rosbags.rosbag2 import Reader
 from events import Event, Image, Odometry
 from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import McapWriter, contents, read
-from nodes.data.recorder import McapRecorder, McapRecorderConfig, pipe
-from nodes.data.recorder.pipe import WriteRequest
+from nodes.data.recorder import McapRecorder, McapRecorderConfig, writer_process
 from nodes.data.recorder.process import FileWriter
-from nodes.data.recorder.writer_process import Backlog, WriterProcess
-from nodes.data.replay.recorded import Recorded
+from nodes.data.recorder.writer_process import Backlog, WriteRequest, WriterProcess
+from nodes.data.replay.bags import Recorded
 from runtime import Tick, every
+from runtime.channels.wire import pack
 from runtime.errors import FatalError, NodeError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
-from runtime.wire import pack
 from tests.nodes.data.recorder.samples import announcements, imu, said, same
 
 SECOND = 1_000_000_000
@@ -137,7 +136,7 @@ def test_what_a_failed_chunk_had_is_not_counted(
     there, here = os.pipe()
     with os.fdopen(here, "wb") as file:
         for stamp in (0, SECOND, 2 * SECOND):
-            pipe.write(file, stamp, pipe.EVENT, pack(imu(stamp)))
+            writer_process.write(file, stamp, writer_process.EVENT, pack(imu(stamp)))
     reply = process.run(there)
     os.close(there)
     assert (reply.what, reply.text, reply.written) == ("error", "full", 0)

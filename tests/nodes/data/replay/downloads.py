@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from events import CameraInfo
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import write_euroc, write_kitti
+from nodes.trajectory_files import write_euroc, write_kitti
 from tests.nodes.estimators.flight import PERIOD, SCENE, camera_in_first
 from tests.nodes.estimators.monocular_odometry.world import Floats, Grey, look_with_depth
 

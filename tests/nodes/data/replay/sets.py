@@ -16,12 +16,12 @@ from rosbags.typesys import Stores, get_typestore
 from events import Announcement, Event
 from nodes.data.dataset import DatasetWriter
 from nodes.data.mcap.mcap_file import McapWriter
-from nodes.data.recorder.pipe import McapRecorderConfig
 from nodes.data.recorder.process import EventWriter
+from nodes.data.recorder.writer_process import McapRecorderConfig
 from nodes.data.replay.node import open_reader
 from nodes.data.replay.reader import Reader, ReplayConfig
+from runtime.channels.wire import pack
 from runtime.testing import run_node
-from runtime.wire import pack
 from tests.nodes.data.dataset.samples import flight
 from tests.nodes.data.recorder.samples import announcements
 

@@ -25,13 +25,12 @@ from events import (
 )
 from events.frames import rotate
 from events.geometry import pose_matrix
-from nodes.data.dataset.euroc import Euroc
+from nodes.data.dataset.layouts import Euroc, TumRgbd
 from nodes.data.dataset.recording import choose, in_grey
-from nodes.data.dataset.tum import TumRgbd
 from nodes.data.replay.folders import read_sensor
 from nodes.data.replay.node import open_reader
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError
-from nodes.trajectory.table import epoch_of
+from nodes.trajectory_files import epoch_of
 from tests.nodes.data.dataset.samples import (
     camera,
     depth,

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from nodes.data.mcap.mcap_file import contents, read
+from nodes.data.replay.bags import Recorded
 from nodes.data.replay.reader import Timed
-from nodes.data.replay.recorded import Recorded
-from runtime.wire import pack
+from runtime.channels.wire import pack
 
 ROOT = Path(__file__).parents[4]
 

@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from events import CameraAnnouncement
 from nodes.data.mcap.mcap_file import contents
 from nodes.data.recorder.recover import recover_file
+from nodes.data.replay.bags import Recorded
 from nodes.data.replay.reader import MOST_TROUBLE, ReplayError
-from nodes.data.replay.recorded import Recorded
 from nodes.ros2.messages.typestore import Bag
 from tests.nodes.data.replay import sets
 

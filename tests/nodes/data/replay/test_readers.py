@@ -7,16 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from events import (
-    Announcement,
-    CameraAnnouncement,
-    DepthImage,
-    Event,
-    Image,
-    Odometry,
-)
+from events import Announcement, CameraAnnouncement, DepthImage, Event, Image, Odometry
 from nodes.data.replay.reader import Choice, ReplayError, Timed
-from runtime.wire import pack
+from runtime.channels.wire import pack
 from tests.nodes.data.replay.sets import SETS, reader
 
 ALL = Choice(("Event",))

@@ -22,9 +22,9 @@ from events import (
 from nodes.data.replay import Replay
 from nodes.data.replay.node import Timeline
 from runtime import Node, on
+from runtime.channels.wire import pack
 from runtime.errors import ConfigError, FatalError
 from runtime.testing import NodeResult, run_nodes, spec
-from runtime.wire import pack
 from tests.nodes.data.dataset.samples import flight
 from tests.nodes.data.replay import sets
 

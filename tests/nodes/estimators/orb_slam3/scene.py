@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, CameraInfo, Image, ImuAnnouncement
-from nodes.estimators.orb_slam3.process import OrbSlam3Result, check_arrays
+from nodes.estimators.orb_slam3.node import OrbSlam3Result, check_arrays
 from nodes.estimators.orb_slam3.settings import Settings
 from runtime import Node, Output, Tick, every
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nodes.estimators.orb_slam3.process import (
+from nodes.estimators.orb_slam3.node import (
     Anchor,
     KeyFrame,
     OrbSlam3Process,
@@ -23,9 +23,15 @@ from nodes.estimators.orb_slam3.process import (
     check_arrays,
     first_key_frame,
 )
-from nodes.estimators.orb_slam3.settings import Mode, OrbSettings, make_settings
+from nodes.estimators.orb_slam3.settings import (
+    Mode,
+    OrbSettings,
+    TreeShape,
+    make_settings,
+    train,
+    write_vocabulary,
+)
 from nodes.estimators.orb_slam3.training import describe
-from nodes.estimators.orb_slam3.vocabulary import TreeShape, train, write_vocabulary
 from runtime.errors import MissingDependencyError
 from runtime.testing import run_in_lockstep
 from runtime.time.lockstep import LockstepClock, LockstepLoop
@@ -234,9 +240,7 @@ def test_a_missing_library_is_an_error_that_says_what_to_install(
 @pytest.mark.slow
 def test_importing_the_module_does_not_import_the_library() -> None:
     """In a fresh interpreter, since other tests of this process may have used it."""
-    code = (
-        "import sys, nodes.estimators.orb_slam3.process as p; sys.exit('pyorbslam3' in sys.modules)"
-    )
+    code = "import sys, nodes.estimators.orb_slam3.node as p; sys.exit('pyorbslam3' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.estimators.orb_slam3.vocabulary import (
+from nodes.estimators.orb_slam3.settings import (
     Bytes,
     TreeShape,
     Vocabulary,

@@ -8,8 +8,13 @@ import pytest
 from events.geometry import inverse
 from nodes.estimators.odometry import Floats, inverse_depth, rays, surfaces_at
 from nodes.estimators.visual_odometry.features import FeatureSettings, FeatureTracker
-from nodes.estimators.visual_odometry.landmarks import Landmarks, find_corners, squares
-from nodes.estimators.visual_odometry.patches import Patches, find_patches
+from nodes.estimators.visual_odometry.landmarks import (
+    Landmarks,
+    Patches,
+    find_corners,
+    find_patches,
+    squares,
+)
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
 MATRIX = INFO.matrix()

@@ -30,8 +30,8 @@ from events import (
     VehicleAnnouncement,
 )
 from nodes.judging.evaluation import Evaluation
-from nodes.judging.evaluation.results import read_errors
-from nodes.trajectory.formats import read_tum
+from nodes.judging.evaluation.verdict import read_errors
+from nodes.trajectory_files import read_tum
 from runtime import Duration, Node, Output
 from runtime.config.model import Config, RunConfig
 from runtime.errors import ConfigError, NodeError

@@ -29,7 +29,7 @@ from nodes.judging.evaluation.metrics import (
 )
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory, associate
-from nodes.trajectory.formats import read_tum
+from nodes.trajectory_files import read_tum
 from runtime.figures import KITTI_LENGTHS, SHARES
 from tests.nodes.trajectory.samples import as_evo, moved, noisy, walk
 

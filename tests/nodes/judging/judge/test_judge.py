@@ -19,7 +19,7 @@ from nodes.data.export import export_trajectories
 from nodes.judging.evaluation import Evaluation
 from nodes.judging.report.folder import read_run
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import read_tum, write_euroc, write_kitti, write_tum
+from nodes.trajectory_files import read_tum, write_euroc, write_kitti, write_tum
 from runtime.testing import run_node
 from tests.nodes.judging.evaluation import flights
 from tests.nodes.judging.judge import bags
@@ -45,7 +45,7 @@ def judge(folder: Path, *words: Any, code: int = 0) -> dict[str, Any]:
 
 def said(folder: Path, *words: Any) -> subprocess.CompletedProcess[str]:
     """Run the command without drawing."""
-    with mock.patch("nodes.judging.judge.judging.write_report", lambda out: out / "report.html"):
+    with mock.patch("nodes.judging.judgement.write_report", lambda out: out / "report.html"):
         return command_here("judge", *words, folder=folder)
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from nodes.judging import judgement
 from nodes.judging.evaluation.judging import Judgement
-from nodes.judging.judge import judging
-from nodes.judging.judge.sources import read, read_mounting, read_stamps, read_truth
+from nodes.judging.judgement import read, read_mounting, read_stamps, read_truth
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import read_vslamlab, write_euroc, write_kitti, write_tum
+from nodes.trajectory_files import read_vslamlab, write_euroc, write_kitti, write_tum
 from tests.nodes.judging.judge import bags
 from tests.nodes.judging.judge.test_judge import said
 from tests.nodes.trajectory.samples import angle, walk
@@ -185,7 +185,7 @@ def judged(tmp_path: Path, truth: Trajectory, estimate: Trajectory, **config: An
     write_tum(tmp_path / "truth", truth)
     write_tum(tmp_path / "vo", estimate)
     true, found = read_truth(str(tmp_path / "truth"), ""), read(str(tmp_path / "vo"), None)
-    judgements, _, _ = judging.judge_all(true, [found], None, judging.JudgeConfig(**config))
+    judgements, _, _ = judgement.judge_all(true, [found], None, judgement.JudgeConfig(**config))
     return judgements["vo"]
 
 
@@ -208,10 +208,10 @@ def test_two_estimates_of_one_name_need_another(tmp_path: Path) -> None:
     write_tum(tmp_path / "vo.tum", walk(5))
     one = read(str(tmp_path / "vo.tum"), None)
     with pytest.raises(ValueError, match=r"vo\.tum: expected a name of its own, NAME=/"):
-        judging.judge_all(one, [one, one], None, judging.JudgeConfig())
+        judgement.judge_all(one, [one, one], None, judgement.JudgeConfig())
     truth = read(f"truth={tmp_path / 'vo.tum'}", None)  # whose file it would overwrite
     with pytest.raises(ValueError, match="expected a name of its own"):
-        judging.judge_all(one, [truth], None, judging.JudgeConfig())
+        judgement.judge_all(one, [truth], None, judgement.JudgeConfig())
 
 
 @pytest.mark.parametrize(

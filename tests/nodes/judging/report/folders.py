@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 from events import PoseEstimate
 from nodes.judging.evaluation.judging import Judgement, judge
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.results import write_results
-from nodes.judging.evaluation.verdict import Thresholds
+from nodes.judging.evaluation.verdict import Thresholds, write_results
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import write_tum
+from nodes.trajectory_files import write_tum
 from runtime.paths import source_file
 
 SECOND = 1_000_000_000

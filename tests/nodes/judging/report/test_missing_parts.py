@@ -13,9 +13,9 @@ from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.judging.evaluation.verdict import Thresholds
 from nodes.judging.report.folder import read_run
 from nodes.judging.report.page import write_report
-from nodes.judging.report.style import Floats
+from nodes.judging.report.tables import Floats
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import tum_row, write_tum
+from nodes.trajectory_files import tum_row, write_tum
 from runtime.errors import ResultsError
 from tests.nodes.judging.report.folders import SECOND, evaluated, ply, recorded, summary, walk
 from tests.nodes.judging.report.test_report import Page

@@ -12,11 +12,11 @@ from nodes.judging.evaluation.verdict import Thresholds
 from nodes.judging.report.clouds import Shown, View, paint
 from nodes.judging.report.curves import draw_latency
 from nodes.judging.report.folder import broken, gaps, read_poses, read_run
-from nodes.judging.report.style import drawing, label, number
+from nodes.judging.report.tables import drawing, label, number
 from nodes.judging.report.trajectories import draw_trajectories
-from nodes.mapping.cloud import read_ply
+from nodes.mapping import read_ply
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import read_tum, write_tum
+from nodes.trajectory_files import read_tum, write_tum
 from tests.nodes.judging.report.folders import SECOND, evaluated, ply, recorded, walk
 
 

@@ -19,7 +19,7 @@ from nodes.judging.evaluation.verdict import Thresholds
 from nodes.judging.report.folder import read_run
 from nodes.judging.report.page import report, write_report
 from nodes.trajectory import Trajectory
-from nodes.trajectory.formats import write_tum
+from nodes.trajectory_files import write_tum
 from runtime.channels.answers import Answers, Settled
 from runtime.errors import ConfigError
 from runtime.summary import OutsideSummary

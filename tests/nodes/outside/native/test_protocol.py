@@ -22,14 +22,7 @@ from hypothesis import strategies as st
 from nodes.outside.native import LinkError
 from nodes.outside.native.answers import read_done, read_order, read_pose
 from nodes.outside.native.client import RECORDS, Frame, Link, ProtocolError
-from tests.nodes.outside.native.samples_link import (
-    LIMIT,
-    Raw,
-    images,
-    listening,
-    pose,
-    program,
-)
+from tests.nodes.outside.native.samples_link import LIMIT, Raw, images, listening, pose, program
 
 ROOT = Path(__file__).parents[4]
 QUICK = settings(

@@ -18,8 +18,8 @@ from pathlib import Path
 
 from events import Image
 from nodes.data.mcap.mcap_file import contents
-from nodes.data.replay.recorded import Recorded
-from nodes.trajectory.formats import read_tum
+from nodes.data.replay.bags import Recorded
+from nodes.trajectory_files import read_tum
 from runtime import Node, NodeConfig, on
 from tests.nodes.outside.process.rig import ROOT
 from tests.nodes.outside.process.test_program import gone_soon

@@ -34,7 +34,7 @@ from events import (
     TrackingLost,
     VelocitySetpoint,
 )
-from nodes.outside.process.inputs import MOST_BYTES, Inputs
+from nodes.outside.process.program import MOST_BYTES, Inputs
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from runtime.config.model import NodeSpec
 from runtime.errors import ConfigError, VisnavError

@@ -10,11 +10,7 @@ import pytest
 
 from events import Image, LidarScan, PointCloud
 from nodes.ros2.messages import incoming, outgoing
-from nodes.ros2.messages.images import (
-    ImageWriter,
-    depth_pixels,
-    image_pixels,
-)
+from nodes.ros2.messages.images import ImageWriter, depth_pixels, image_pixels
 from nodes.ros2.messages.incoming import MessageContext
 from nodes.ros2.messages.outgoing import Outgoing
 from nodes.ros2.messages.topics import PublishingConfig

@@ -7,13 +7,7 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
-from events import (
-    BodyAnnouncement,
-    LidarAnnouncement,
-    PoseEstimate,
-    PoseStamped,
-    TransformStamped,
-)
+from events import BodyAnnouncement, LidarAnnouncement, PoseEstimate, PoseStamped, TransformStamped
 from events.geometry import pose_matrix
 from nodes.ros2.messages.topics import FrameNames
 from nodes.ros2.messages.transforms import Transform, Transforms

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nodes.viewers.rerun.plots import ScenePoints
+from nodes.viewers.rerun.entities import ScenePoints
 from tests.nodes.viewers.common.samples import CAMERA, MS, camera_pose, depth, image
 
 

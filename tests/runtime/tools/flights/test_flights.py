@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from runtime.channels.digest import Digest
+from runtime.channels.wire import Digest
 from runtime.config.model import Config
 from runtime.config.reading import load
 from runtime.errors import NodeError

@@ -20,14 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runtime.tools.samples_cli import (
-    ROOT,
-    command_here,
-    config_file,
-    results,
-    start,
-    summary,
-)
+from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, results, start, summary
 
 pytestmark = pytest.mark.timeout(240)
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")

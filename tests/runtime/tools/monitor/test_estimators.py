@@ -21,7 +21,7 @@ from events import (
     TrackingRegained,
 )
 from events.frames import from_yaw
-from runtime.time.schedule import SECOND
+from runtime.time.clock import SECOND
 from runtime.tools.monitor.estimators import MOST_POINTS, Measured, Path
 from runtime.tools.monitor.protocol import formatted
 

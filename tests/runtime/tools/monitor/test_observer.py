@@ -27,16 +27,7 @@ from runtime.tools.monitor.observer import (
     Sample,
     describe,
 )
-from runtime.tools.monitor.protocol import (
-    COLUMNS,
-    Pause,
-    Restart,
-    Set,
-    Snapshot,
-    Speed,
-    Step,
-    Stop,
-)
+from runtime.tools.monitor.protocol import COLUMNS, Pause, Restart, Set, Snapshot, Speed, Step, Stop
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
 
 NODES = [

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from runtime.channels.sender import Sender
+from runtime.time.clock import Tick
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.schedule import Tick
 from runtime.tools.tracing.record import CHUNK, Spool, TraceInstrument
 from tests.runtime.samples import Ping
 

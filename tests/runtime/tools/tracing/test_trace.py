@@ -16,7 +16,7 @@ from runtime import on
 from runtime.errors import ConfigError
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
-from runtime.tools.cli.live import tables
+from runtime.tools.cli.run import tables
 from runtime.tools.tracing import write
 from runtime.tools.tracing.record import Spool
 from runtime.tools.tracing.write import (

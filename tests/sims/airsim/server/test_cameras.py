@@ -13,13 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.testing import spec
-from sims.airsim.server.cameras import (
-    LONGEST,
-    MOST,
-    Capture,
-    ServedCamera,
-    cameras_by_name,
-)
+from sims.airsim.server.cameras import LONGEST, MOST, Capture, ServedCamera, cameras_by_name
 from sims.airsim.server.objects import initial_id
 from sims.airsim.server.rendering import ImageType, palette
 from sims.airsim.settings import default_mount

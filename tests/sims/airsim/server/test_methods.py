@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from runtime.channels.digest import Digest
+from runtime.channels.wire import Digest
 from runtime.testing import NodeResult
 from sims.airsim import wire
 from sims.airsim.server import AirsimServer

@@ -15,10 +15,10 @@ from typing import Any
 
 import pytest
 
-from runtime.channels.digest import Digest
+from runtime.channels.wire import Digest
 from runtime.node import Node
 from runtime.testing import run_nodes, spec
-from runtime.time.schedule import SECOND, Once
+from runtime.time.clock import SECOND, Once
 from sims.airsim import wire
 from sims.airsim.client.connection import RpcCallError, RpcClient
 from sims.airsim.server import AirsimServer

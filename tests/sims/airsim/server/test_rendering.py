@@ -30,9 +30,9 @@ from sims.airsim.server.rendering import (
     surface_normals,
 )
 from sims.cameras import CameraRenderer, CameraSpec, add_camera, model_to_bytes
-from sims.cameras.lens import Lens
+from sims.cameras.optics import Lens
 from sims.cameras.spec import camera_info
-from sims.cameras.view import Drawn
+from sims.cameras.stage import Drawn
 from sims.vehicle import attach_vehicle
 from tests.sims.cameras.scenes import frames_of
 

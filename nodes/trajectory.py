@@ -1,4 +1,4 @@
-"""Poses in time: checked arrays, interpolation, matrices; and rows for nodes to collect."""
+"""Trajectories, poses in time: checked arrays, interpolation, matrices; and rows for nodes."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from scipy.spatial.transform import Rotation
 from events import Quaternion, Vector3
 from events.frames import slerp
 from events.geometry import Pose
+
+__all__ = ["PoseRows", "RecentPoses", "Trajectory", "associate"]
+
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]

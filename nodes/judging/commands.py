@@ -1,0 +1,232 @@
+"""Commands ``judge`` and ``vslamlab``: a run's figures and report for other programs' results.
+
+A program of VSLAM-LAB's contract gets the folder of an exported sequence, and leaves
+``<exp_id>_KeyFrameTrajectory.csv`` in that of the experiment (github.com/VSLAM-LAB/VSLAM-LAB,
+``Baselines/BaselineVSLAMLab.py``).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import typer
+
+from runtime.tools.cli.commands import Json, JUnit, of_verdict, writing
+
+
+def judge(
+    truth: Annotated[str, typer.Option(help="True poses: FILE, BAG:/TOPIC, or a run's folder.")],
+    estimate: Annotated[
+        list[str],
+        typer.Option(metavar="[NAME=]FILE", help="Poses, or BAG:/TOPIC. May be repeated."),
+    ],
+    final: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=FILE", help="The same after loop closures. May be repeated."),
+    ] = None,
+    alignment: Annotated[str, typer.Option(help="auto, none, origin, se3 or sim3.")] = "auto",
+    scale_free: Annotated[
+        bool, typer.Option("--scale-free", help="The estimates' unit of length is their own.")
+    ] = False,
+    times: Annotated[str, typer.Option(help="File of stamps of KITTI's poses.")] = "",
+    frames: Annotated[str, typer.Option(help="File of stamps of the images, for coverage.")] = "",
+    max_difference: Annotated[str, typer.Option(help="To the nearest true pose.")] = "100ms",
+    gap: Annotated[str, typer.Option(help="Silence that counts as lost.")] = "500ms",
+    body_from_camera: Annotated[
+        str, typer.Option(metavar="POSE", help="Where the camera is whose poses these are.")
+    ] = "",
+    axes: Annotated[str, typer.Option(help="Of the files: ned, nwu, enu or optical.")] = "",
+    threshold: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FIGURE=VALUE", help="As ate_percent=1. May be repeated."),
+    ] = None,
+    out: Annotated[str, typer.Option(help="Folder for results; judged/NAME if not given.")] = "",
+    name: Annotated[str, typer.Option(help="Of the folder, and of the page.")] = "trajectories",
+    junit: JUnit = None,
+    json: Json = None,
+) -> None:
+    """Judge trajectories computed elsewhere, as a run judges its estimators.
+
+    Reads TUM, EuRoC, KITTI (with --times: seconds, one a line) and VSLAM-LAB files, and Path,
+    Odometry, PoseStamped and PoseWithCovarianceStamped topics of bags. Figures, report and
+    thresholds are those of a run, but for figures that need more than poses, such as latencies.
+    --frames is a times.txt, rgb.txt, rgb.csv or cam0/data.csv; without it the flight is that of the
+    truth. --final NAME=FILE is the trajectory of the estimate NAME after loop closures, judged
+    beside it.
+    Alignment is sim3 with --scale-free; otherwise none for an estimate in the frame map, origin for
+    one in another named frame, and se3 for all others. World and body are NED and FRD in TUM files;
+    z up, with the body as it is, in EuRoC and VSLAM-LAB files (nwu); those of a camera that looks
+    ahead in KITTI files (optical); enu is ENU and FLU. --axes sets the axes of other files. If
+    estimates are of a camera, --body-from-camera is its optical frame in the truth's body: "tx ty
+    tz qx qy qz qw", a TUM file with one pose, or a camera of the truth's run. Exit codes: 0; 1 if a
+    threshold is missed (by default also: poses for 90 % of the flight); 2 if an input cannot be
+    read.
+    """
+    from rich.console import Console
+
+    from nodes.judging import judgement
+    from runtime.config.model import given
+    from runtime.config.reading import convert
+    from runtime.errors import ConfigError
+    from runtime.tools.cli.brief import print_verdict, verdict_table
+    from runtime.tools.cli.commands import warn
+
+    with writing(name, junit, json) as outcomes:
+        try:
+            said = {
+                "alignment": alignment,
+                "scale_free": scale_free,
+                "axes": axes or None,
+                "max_difference": max_difference,
+                "gap": gap,
+                "thresholds": {
+                    k: given(v) for k, _, v in (t.partition("=") for t in threshold or ())
+                },
+            }
+            config = convert(said, judgement.JudgeConfig, "judge")
+            true = judgement.read_truth(truth, times)
+            camera = judgement.read_mounting(body_from_camera, truth) if body_from_camera else None
+            found = [judgement.read(each, config.axes, times, camera) for each in estimate]
+            stamps = judgement.read_stamps(Path(frames)) if frames else None
+            corrected = [judgement.read(each, config.axes, times, camera) for each in final or ()]
+            finals = {each.name: each.poses for each in corrected}
+            judgements, verdict, notes = judgement.judge_all(true, found, stamps, config, finals)
+            page = judgement.write(Path(out or f"judged/{name}"), true, judgements, verdict, notes)
+            outcomes += of_verdict(name, verdict)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+    for note in notes:
+        warn(note)
+    console = Console()
+    console.print(verdict_table(verdict))
+    print_verdict(verdict)
+    console.print(f"results in [bold]{page.parent}[/bold]: open {page.name}", highlight=False)
+    raise typer.Exit(1 if verdict.passed is False else 0)
+
+
+def arguments(
+    sequence: Path,
+    run: Path,  # folder of the experiment, with the name of the run
+    mode: str,  # ``mono``, ``rgbd``, ``stereo``, ``mono-vi`` or ``stereo-vi``
+    settings: str = "",  # its settings_yaml, if it has one
+    *,
+    dashes: bool = False,  # for programs in Python; those in C++ lack it
+) -> list[str]:
+    """Return a program's arguments: ``key:value``, or ``--key value`` with `dashes`."""
+    values = {
+        "sequence_path": sequence,
+        "calibration_yaml": sequence / "calibration.yaml",
+        "rgb_csv": sequence / "rgb.csv",
+        "exp_folder": run.parent,
+        "exp_it" if dashes else "exp_id": run.name,
+        **({"settings_yaml": settings} if settings else {}),
+        "verbose": 0,
+        "mode": mode,
+    }
+    if dashes:
+        return [word for key, value in values.items() for word in (f"--{key}", str(value))]
+    return [f"{key}:{value}" for key, value in values.items()]
+
+
+def run_once(command: Sequence[str], run: Path, limit: float) -> Path:
+    """Run a program for at most `limit` real seconds; return its trajectory file.
+
+    Args:
+        command: Program and arguments. Its output goes to ``system_output_<exp_id>.txt``.
+        run: As of `arguments`.
+
+    Raises:
+        ValueError: The program left no trajectory, failed (with its last output), or took too long.
+    """
+    from nodes.outside.process.program import Program
+
+    trajectory = run.with_name(f"{run.name}_KeyFrameTrajectory.csv")
+    trajectory.unlink(missing_ok=True)  # of an earlier experiment
+    with run.with_name(f"system_output_{run.name}.txt").open("w", encoding="utf-8") as log:
+        program = Program(
+            command, Path.cwd(), os.environ, grace=5.0, printed=lambda line: print(line, file=log)
+        )
+        ended = program.wait(limit)
+        program.close()
+    if not ended:
+        raise ValueError(f"it took more than {limit:g} s, and was ended")
+    if program.code or not trajectory.is_file():
+        raise ValueError(f"expected {trajectory.name}, found none; it {program.story()}")
+    return trajectory
+
+
+def vslamlab(
+    sequence: Annotated[Path, typer.Argument(help="Folder that export --format vslamlab made.")],
+    command: Annotated[list[str], typer.Argument(help="The program, and its own arguments.")],
+    mode: Annotated[str, typer.Option(help="mono, rgbd, stereo, mono-vi or stereo-vi.")] = "mono",
+    dashes: Annotated[bool, typer.Option(help="Arguments as --key value, for Python.")] = False,
+    settings: Annotated[str, typer.Option(help="The program's settings_yaml.")] = "",
+    repeat: Annotated[int, typer.Option(min=1, help="Runs.")] = 1,
+    limit: Annotated[float, typer.Option(min=0, help="Real seconds of a run.")] = 600.0,
+    body_from_camera: Annotated[
+        str, typer.Option(metavar="POSE", help="As of judge, if its poses are a camera's.")
+    ] = "",
+    out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("judged/vslamlab"),
+) -> None:
+    """Run a program of VSLAM-LAB's contract on an exported sequence, and judge its trajectories.
+
+    Started REPEAT times in a row, with key:value for sequence_path, calibration_yaml, rgb_csv,
+    exp_folder, exp_id, settings_yaml, verbose and mode. A run that leaves no
+    <exp_id>_KeyFrameTrajectory.csv, ends with an error or takes too long has failed. Scale is
+    aligned in the mode mono only. Ends with 0; with 1 if a run failed or a threshold was missed;
+    with 2 if something is missing.
+    """
+    from rich.console import Console
+
+    from nodes.judging import judgement
+    from runtime.config.reading import convert
+    from runtime.errors import ConfigError
+    from runtime.tools.cli.brief import print_verdict, verdict_table
+
+    sequence, runs = sequence.absolute(), out.absolute().with_name(f"{out.name}_runs")
+    found, failed = [], {}
+    try:
+        if shutil.which(command[0]) is None:
+            raise ValueError(f"expected a program that can be executed, found none: {command[0]}")
+        config = convert(
+            {"scale_free": mode == "mono", "gap": "2s"}, judgement.JudgeConfig, "judge"
+        )
+        truth = judgement.read_truth(str(sequence / "groundtruth.csv"), "")
+        images = judgement.read_stamps(sequence / "rgb.csv")
+        camera = judgement.read_mounting(body_from_camera, "") if body_from_camera else None
+        runs.mkdir(parents=True, exist_ok=True)
+        for number in range(repeat):
+            run = runs / f"{number:05d}"
+            given = arguments(sequence, run, mode, settings, dashes=dashes)
+            try:
+                path = run_once([*command, *given], run, limit)
+                source = judgement.read(f"{run.name}={path}", None, "", camera)
+                judgement.judge_all(truth, [source], images, config)  # raises, of another flight
+                found.append(source)
+            except ValueError as error:
+                failed[run.name] = {"passed": False, "failure": str(error)}
+        judgements, verdict, notes = judgement.judge_all(truth, found, images, config)
+        errors = [each.figures.get("ate_rmse_m", np.nan) for each in judgements.values()]
+        if np.isfinite(errors).any():  # of two key frames there is none
+            least, middle, most = np.nanpercentile(errors, [0, 50, 100])
+            spread = f"ate_rmse_m: median {middle:.4g}, {least:.4g} to {most:.4g}"
+            notes.append(f"{len(errors)} of {repeat} runs left a trajectory; {spread}")
+        notes += [f"run {name} failed: {each['failure']}" for name, each in failed.items()]
+        rows = dict(sorted({**verdict.estimators, **failed}.items()))
+        passed = False if failed else verdict.passed
+        verdict = msgspec.structs.replace(verdict, passed=passed, estimators=rows)
+        page = judgement.write(out, truth, judgements, verdict, notes)
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from None
+    console = Console()
+    console.print(verdict_table(verdict))
+    console.print("\n".join(notes), highlight=False)
+    print_verdict(verdict)
+    console.print(f"results in [bold]{page.parent}[/bold]: open {page.name}", highlight=False)
+    raise typer.Exit(1 if verdict.passed is False else 0)
