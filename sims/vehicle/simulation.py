@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -341,7 +342,7 @@ class Mixer:
         ).T  # fmt: skip
         if np.linalg.matrix_rank(effect) < 4:
             raise ValueError("expected motors that can make thrust, roll, pitch and yaw")
-        inverse = np.round(np.linalg.inv(effect), 9)  # the last bits are the processor's
+        inverse = _inverse(effect)
         if not np.allclose(inverse[:, 0], inverse[0, 0], rtol=1e-6):
             raise ValueError("expected motors that do not turn the vehicle at equal thrust")
         self.max_thrust = parameters.max_thrust
@@ -379,3 +380,21 @@ def _room(motor: float, change: float) -> float:
     else:
         return 1.0
     return min(1.0, max(0.0, room))
+
+
+def _inverse(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the inverse by fractions; numpy's last bits are the processor's."""
+    size = len(matrix)
+    rows = [
+        [Fraction(value) for value in row] + [Fraction(int(k == number)) for k in range(size)]
+        for number, row in enumerate(matrix.tolist())
+    ]
+    for k in range(size):
+        pivot = max(range(k, size), key=lambda row: abs(rows[row][k]))
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [value / rows[k][k] for value in rows[k]]
+        for other in range(size):
+            if other != k:
+                factor = rows[other][k]
+                rows[other] = [a - factor * b for a, b in zip(rows[other], rows[k], strict=True)]
+    return np.array([[float(value) for value in row[size:]] for row in rows])

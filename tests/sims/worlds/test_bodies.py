@@ -45,7 +45,7 @@ def test_a_path_passes_its_places_at_its_times(speed: float, turns: int, loop: b
     for place, when in zip(WALK, times, strict=False):
         assert motion.pose(when + turns * period)[0] == pytest.approx(place, abs=1e-6)
     if not loop:
-        assert motion.pose(times[-1] + 100.0)[0] == pytest.approx(WALK[-1])
+        assert motion.pose(times[-1] + 100.0)[0] == pytest.approx(WALK[-1], abs=1e-6)
 
 
 PLACES = st.lists(
