@@ -234,11 +234,11 @@ class Raster(Stage):
             if to["kind"] or of.diffuse.any() or of.specular.any():
                 to["position"], to["direction"] = of.pos, of.dir
                 if of.castshadow and to["kind"] != 1:
-                    self._cast(to, of)
+                    self._cast(to, of, int((found["size"] > 0).sum()))
         return found
 
-    def _cast(self, light: Any, of: Any) -> None:
-        """Have a light throw shadows, by a map of what MuJoCo's map covers."""
+    def _cast(self, light: Any, of: Any, number: int) -> None:
+        """Have a light throw shadows, by a map (of this number) of what MuJoCo's map covers."""
         ahead = of.dir.astype(float)
         if not self._map_size or not (length := float(np.linalg.norm(ahead))):
             return
@@ -249,17 +249,17 @@ class Raster(Stage):
         if light["kind"] == 0:  # rays of a sun are parallel: seen from far away
             reach, back = 1.0 / SUN_AWAY, SUN_AWAY * self._sun_reach
         light["size"], light["step"] = self._map_size, 2.0 * reach / self._map_size
+        if number == len(self._maps):
+            self._maps.append(np.empty((self._map_size, self._map_size), np.float32))
+            self._mapped.append(b"")
+        light["map"] = self._maps[number].ctypes.data
         light["eye"]["position"] = of.pos - back * ahead
         light["eye"]["turn"] = np.stack([aside, np.cross(ahead, aside), ahead], axis=1).ravel()
 
     def _draw_shadows(self, lights: Any, geoms: Any, poses: Any) -> None:
         """Draw what each light that throws shadows sees, unless it has seen just that before."""
-        casting, size = [lights[k] for k in np.flatnonzero(lights["size"])], self._map_size
-        for _ in casting[len(self._maps) :]:
-            self._maps.append(np.empty((size, size), np.float32))
-            self._mapped.append(b"")
-        for light, depth in zip(casting, self._maps, strict=False):
-            light["map"] = depth.ctypes.data
+        size = self._map_size
+        casting = lights[lights["size"] > 0]
         for number, (light, depth) in enumerate(zip(casting, self._maps, strict=False)):
             seen = b"".join(each.tobytes() for each in (light["eye"], geoms["rgba"], poses))
             if seen == self._mapped[number]:

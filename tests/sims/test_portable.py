@@ -39,6 +39,8 @@ imu = {{ vibration = {{ amplitude = 2.0 }}, gyroscope_misalignment = 0.01 }}
 barometer = {{}}
 magnetometer = {{}}
 gnss = {{}}
+lidars = [{{ name = "lidar", rate = 5, channels = 16 }}]
+range_finders = [{{ name = "below" }}]
 cameras = [{{ name = "camera", width = 64, height = 48, rate = 5 }}]
 
 [[nodes]]
