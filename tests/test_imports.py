@@ -173,6 +173,7 @@ def test_no_arrow_points_up(where: str) -> None:
     assert upwards == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", MAY_IMPORT)
 def test_no_string_points_up(where: str) -> None:
     others = MAY_IMPORT.keys() - MAY_IMPORT[where]

@@ -58,6 +58,7 @@ def test_another_package_called_runtime_is_named(tmp_path: Path) -> None:
     assert str(tmp_path / "runtime" / "__init__.py") in line
 
 
+@pytest.mark.slow
 def test_the_console_command_is_the_command_line(tmp_path: Path) -> None:
     done = python("import sys, visnav; sys.argv[1:] = ['--help']; visnav.main()", tmp_path)
     assert done.returncode == 0, done.stderr
@@ -70,6 +71,7 @@ def test_all_examples_are_listed_with_what_they_show() -> None:
     assert all(len(line.split()) > 3 for line in lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_a_copied_example_is_whole(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -24,6 +24,7 @@ def test_our_nodes_exchange_pings(mode: Mode, nodes: int) -> None:
     assert (samples > 0).all()
 
 
+@pytest.mark.slow
 def test_a_measurement_has_a_process_of_its_own() -> None:
     case = Case(samples=20, warm_up=2)
     samples = driver._measure("bench.systems.in_process", "plain calls", case)

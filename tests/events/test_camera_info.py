@@ -59,6 +59,7 @@ def test_projects_as_opencv_does(info: CameraInfo) -> None:
     np.testing.assert_allclose(info.project(points), expected.reshape(-1, 2), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("info", ALL, ids=IDS)
 @given(column=st.floats(0, 639), row=st.floats(0, 479))
 def test_unprojects_to_what_projects_there(info: CameraInfo, column: float, row: float) -> None:

@@ -81,6 +81,7 @@ def wrong_values(type_: Any, name: str) -> Iterator[Any]:
         yield from ((0.0,) * 4, (0.0, 0.0, 0.0, 1.002), (0.998, 0.0, 0.0, 0.0), (1.0,) * 4)
 
 
+@pytest.mark.slow
 def test_no_field_of_any_event_may_be_wrong() -> None:
     for cls in CHECKED:
         right = fields_of(cls)

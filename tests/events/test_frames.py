@@ -62,6 +62,7 @@ def test_vectors_turn_as_the_axes_do(which: Axes, vector: Vector3) -> None:
     np.testing.assert_array_equal(convert_points(which, points), points @ MATRICES[which])
 
 
+@pytest.mark.slow
 @given(axes, axes, rotations())
 def test_rotations_come_back(parent: Axes, child: Axes, rotation: Quaternion) -> None:
     there = convert_rotation(parent, child, rotation)
@@ -69,6 +70,7 @@ def test_rotations_come_back(parent: Axes, child: Axes, rotation: Quaternion) ->
     np.testing.assert_allclose(matrix(again), matrix(rotation), atol=1e-12)
 
 
+@pytest.mark.slow
 @given(axes, axes, rotations(), vectors)
 def test_a_turned_rotation_turns_turned_vectors(
     parent: Axes, child: Axes, rotation: Quaternion, vector: Vector3
@@ -102,6 +104,7 @@ def test_flipping_undoes_itself(vector: Vector3, rotation: Quaternion) -> None:
     assert rotation_to_ned(rotation_to_nwu(rotation)) == rotation
 
 
+@pytest.mark.slow
 @given(vectors, rotations())
 def test_rotating_and_flipping_commute(vector: Vector3, rotation: Quaternion) -> None:
     """Body to world in FLU and NWU, then to NED, is FRD first and then body to world."""

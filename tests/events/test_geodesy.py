@@ -38,6 +38,7 @@ def test_there_and_back_is_a_micrometre_at_most(place: Geodetic) -> None:
     assert from_ecef(to_ecef(place))[2] == pytest.approx(place[2], abs=1e-6)
 
 
+@pytest.mark.slow
 @given(position=st.tuples(metres, metres, metres), origin=places)
 def test_a_position_survives_the_earth(position: Geodetic, origin: Geodetic) -> None:
     again = from_geodetic(to_geodetic(position, origin), origin)

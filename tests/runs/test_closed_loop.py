@@ -100,6 +100,7 @@ def test_a_restarted_estimator_speaks_in_a_frame_that_begins_where_it_is(
     assert [each.stamp for each in flight.of(TrackingRegained)] == [first.stamp]
 
 
+@pytest.mark.slow
 def test_the_vehicle_stays_where_it_was_and_lands(flight: NodeResult) -> None:
     assert flight.reason == "pilot: no estimate in map for 4 s: landed"
     assert len(flight.of(Landed)) == 1

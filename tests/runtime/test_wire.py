@@ -50,6 +50,7 @@ def test_small_events_come_back_equal(
     assert unpack(pack(event).frame()) == event
 
 
+@pytest.mark.slow
 @given(arrays, st.none() | arrays)
 def test_arrays_come_back_to_the_byte_and_read_only(
     one: npt.NDArray[Any], other: npt.NDArray[Any] | None

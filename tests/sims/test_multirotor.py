@@ -253,6 +253,7 @@ def test_each_refused_order_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_collision_is_told_once_while_it_lasts() -> None:
     """Flown against a wall and pressed against it for four seconds."""
     push = [
@@ -341,6 +342,7 @@ def apart(a: Vector3, b: Vector3) -> float:
     return hypot(*(x - y for x, y in zip(a, b, strict=True)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [0.5, 4.0, 5.5], ids=["taking off", "flying", "landing"])
 def test_whoever_is_teleported_in_the_air_holds_the_new_place(before: float) -> None:
     orders = [say(Takeoff, 0.0), say(Land, 5.0)]
@@ -363,6 +365,7 @@ def test_one_that_does_not_fly_falls_from_where_it_is_put() -> None:
     assert -0.2 < last.position[2] < 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampling", ["instant", "mean"])
 def test_an_imu_feels_no_jump(sampling: str) -> None:
     result = fly(
@@ -412,6 +415,7 @@ def test_where_physics_would_break_it_refuses_to_be(caplog: pytest.LogCaptureFix
     assert apart(result.of(Odometry)[-1].position, (0.0, 0.0, -0.1)) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_reset_in_the_air_brings_it_to_the_start_and_it_takes_off_as_before() -> None:
     result = fly(
         say(Takeoff, 0.0),
@@ -436,6 +440,7 @@ def test_a_reset_in_the_air_brings_it_to_the_start_and_it_takes_off_as_before() 
     )
 
 
+@pytest.mark.slow
 def test_a_reset_forgets_the_heading_of_the_last_velocity() -> None:
     turning = VelocitySetpoint(
         stamp=4 * SECOND, source="test", velocity=(2.0, 1.0, 0.0), yaw_rate=2.0

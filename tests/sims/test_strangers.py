@@ -26,6 +26,7 @@ places = st.tuples(st.floats(-85, 85), st.floats(-179, 179), st.floats(-100, 400
 offsets = st.tuples(*[st.floats(-20_000, 20_000)] * 2, st.floats(-3000, 100))
 
 
+@pytest.mark.slow
 @given(places, offsets)
 def test_proj_sees_the_place_where_a_receiver_is(
     origin: tuple[float, float, float], position: tuple[float, float, float]

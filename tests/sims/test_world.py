@@ -243,6 +243,7 @@ def test_a_vehicle_that_is_brought_up_again_is_where_it_was_left(world: str) -> 
     assert places(result, "b")[-1] == pytest.approx((0.0, 4.0, -1.1), abs=0.1)
 
 
+@pytest.mark.slow
 def test_physics_that_diverged_are_made_anew_for_all(world: str) -> None:
     class Wild(Multirotor):
         @every(hz="control_rate")
@@ -322,6 +323,7 @@ def test_wind_is_announced_sent_and_felt_alike_by_all(world: str) -> None:
     assert [e.position for e in again.of(Odometry)] == [e.position for e in result.of(Odometry)]
 
 
+@pytest.mark.slow
 def test_a_world_without_wind_and_bodies_changes_no_bit_of_a_flight(world: str) -> None:
     plain, beside = (
         fly(*nodes, inputs=[takeoff("a")], duration=1.5)

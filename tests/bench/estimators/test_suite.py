@@ -184,6 +184,7 @@ def test_a_crash_that_a_later_try_mended_is_still_told(small: Path, tmp_path: Pa
     assert page.count("- bad: its worker died\n") == 2
 
 
+@pytest.mark.slow
 def test_a_flaw_of_the_flight_is_told_and_is_not_the_estimators(
     small: Path, tmp_path: Path
 ) -> None:
@@ -220,6 +221,7 @@ def test_every_scenario_is_flown_to_its_end_and_meets_nothing(
         assert "Collision" not in run.summary["events"]
 
 
+@pytest.mark.slow
 def test_who_is_not_installed_is_named(small: Path, tmp_path: Path) -> None:
     page = page_of(read_suite(small), tmp_path, lambda row: row)
     assert "- elsewhere: `make elsewhere` installs it." in page

@@ -91,6 +91,7 @@ def test_program_that_hangs_is_ended() -> None:
         compiled.run(["sleep", "30"], 0.2)
 
 
+@pytest.mark.slow
 def test_graph_ends_its_nodes_when_one_fails(roscpp: System) -> None:
     with graph() as ros:
         steady = ros.start(["sleep", "60"])
@@ -100,6 +101,7 @@ def test_graph_ends_its_nodes_when_one_fails(roscpp: System) -> None:
     assert steady.returncode == -signal.SIGKILL
 
 
+@pytest.mark.slow
 def test_nothing_outlives_the_measuring_process(roscpp: System) -> None:
     code = (
         "from bench.systems.ros1 import graph\n"

@@ -42,6 +42,7 @@ def test_names_are_unique() -> None:
     assert len(set(NAMES)) == len(NAMES)
 
 
+@pytest.mark.slow
 def test_importing_a_module_does_not_import_its_system() -> None:
     done = subprocess.run(
         [sys.executable, "-c", IMPORTED, *MODULES],

@@ -69,6 +69,7 @@ def test_every_format_is_written_and_read() -> None:
     assert set(FORMATS) == set(READERS) == set(SAYS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_stereo_pair_projects_the_same_or_is_refused(
@@ -84,6 +85,7 @@ def test_a_stereo_pair_projects_the_same_or_is_refused(
     assert {each.time_offset for each in found} <= {-0.005, None}
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     k=st.tuples(*[st.floats(-0.2, 0.2)] * 2),

@@ -199,6 +199,7 @@ def test_a_good_one_passes(node: type[Good]) -> None:
     assert not faults(run(Case(node), flight()), Case(node))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("node", BAD)
 def test_a_bad_one_is_found_out(node: type[Good]) -> None:
     found = faults(run(Case(node), flight()), Case(node))

@@ -50,6 +50,7 @@ def content(cloud: VoxelCloud) -> set[Any]:
     return set(zip(map(tuple, cloud.points), map(tuple, cloud.colours), strict=True))
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 60)), max_size=6),
     st.sampled_from([0.05, 0.13, 0.3]),

@@ -358,6 +358,7 @@ async def test_streams_are_so_many_are_answered_and_end() -> None:
     links.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -274,6 +274,7 @@ def test_right_estimates_though_late_keep_the_vehicle_on_its_path(world: str) ->
     assert np.linalg.norm(beside_the_plan(result), axis=1).max() < 0.3
 
 
+@pytest.mark.slow
 def test_an_estimate_that_is_off_takes_the_vehicle_off(world: str) -> None:
     error = beside_the_plan(estimate_and_fly(world, shift=(0.0, 0.0, -0.4)))
     assert error[-100:, 2].mean() == pytest.approx(0.4, abs=0.03)

@@ -54,6 +54,7 @@ def held(*keys: str) -> set[tuple[float, float, float, float]]:
     return set(velocities(fly(*keys, config=BRISK, duration=0.2))[:-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "expected"),
     [

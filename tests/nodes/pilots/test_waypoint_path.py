@@ -53,6 +53,7 @@ def planned(points: Any, **changes: Any) -> WaypointPath:
     return plan(np.asarray(points, dtype=np.float64), **(wanted | changes))
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(waypoints(), st.floats(0.3, 3.0), st.floats(0.5, 3.0), st.floats(0.1, 2.0))
 def test_a_path_keeps_its_promises(
@@ -171,6 +172,7 @@ def test_an_excitation_that_no_vehicle_follows_is_refused() -> None:
         Excitation(duration=Duration(1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [{}, {"amplitude": 0.36}, {"amplitude": 0.2, "frequency": 0.52},

@@ -52,6 +52,7 @@ def read_kitti_with_stamps(path: Path, stamps: Any) -> Trajectory:
     return Trajectory.from_matrices(stamps, read_kitti(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("write", "read"),
     [

@@ -76,6 +76,7 @@ def test_length_and_distances_are_evos() -> None:
     assert walk(1).length() == 0.0
 
 
+@pytest.mark.slow
 @given(seed=SEEDS)
 @settings(max_examples=20, deadline=None)
 def test_matrices_and_back(seed: int) -> None:
@@ -185,6 +186,7 @@ def test_many_rows_wait_in_a_file_or_in_memory_if_the_disk_is_full(
         assert path.positions[:, 0].tolist() == [float(k) for k in range(n)]
 
 
+@pytest.mark.slow
 @given(st.integers(0, 900_000_000))
 def test_poses_between_two_are_those_of_a_trajectory(stamp: int) -> None:
     truth = walk(10)

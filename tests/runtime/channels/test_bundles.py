@@ -186,6 +186,7 @@ def test_events_without_partners_do_not_pile_up() -> None:
     assert matcher.missed["b"] > HISTORY
 
 
+@pytest.mark.slow
 @given(st.sets(st.integers(1, 40)), st.sets(st.integers(1, 40)), st.integers(0, 1 << 16))
 def test_each_common_stamp_gives_one_set_however_the_two_are_interleaved(
     a: set[int], b: set[int], seed: int
@@ -285,6 +286,7 @@ def test_a_set_that_is_skipped_leaves_its_tuples_to_the_next() -> None:
     assert result.drops["n.sets"].dropped == 2
 
 
+@pytest.mark.slow
 @given(
     st.sets(st.integers(1, 40)), st.sets(st.integers(1, 40)), st.sets(st.integers(1, 40)), st.data()
 )

@@ -78,6 +78,7 @@ def test_the_order_counts_within_a_speaker_only(pair: tuple[list[Said], list[Sai
     assert (digest(*one) == digest(*other)) == (by_speaker(one) == by_speaker(other))
 
 
+@pytest.mark.slow
 @given(arrays, arrays)
 def test_arrays_are_told_apart_by_type_shape_and_content(
     one: npt.NDArray[Any], other: npt.NDArray[Any]

@@ -50,6 +50,7 @@ def test_numbers_and_arrays_of_numpy_are_written_as_numbers_and_lists(tmp_path: 
     assert found.announcements[0]["values"] == [[1.0, 0.0], [0.0, 1.0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("figures", "passed", "message"),
     [
@@ -77,6 +78,7 @@ class Odd(Announcement):
     thing: Any
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("said", "message"),
     [

@@ -60,6 +60,7 @@ def said(*sources: str, announced: tuple[str, ...] = (), kind: str = "estimate")
     return [each.source for each in found.sent if not isinstance(each, Announcement)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sources", "announced"),
     [
@@ -75,6 +76,7 @@ def test_a_node_speaks_for_itself_and_for_those_that_it_announces(
         assert said(*sources, announced=announced, kind=kind) == list(sources)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "whose"),
     [

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from itertools import pairwise
 
+import pytest
+
 from runtime.channels.streams import TURN, Stream
 from runtime.channels.tasks import DEPTH_LIMIT
 from tests.runtime.loops import Run, turns
@@ -15,6 +17,7 @@ async def relay(source: Stream[int], target: Stream[int]) -> None:
         target.offer(event)
 
 
+@pytest.mark.slow
 def test_a_relay_of_five_hundred_delivers_in_order(run: Run) -> None:
     async def main() -> list[int]:
         streams = [Stream[int](str(i)) for i in range(501)]

@@ -48,6 +48,7 @@ def test_whatever_is_changed_is_noticed(message: bytes, payload: bytes, seed: in
     assert there.open(sealed, payload) == message
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=60))
 def test_what_was_never_sealed_is_not_heard(data: bytes) -> None:
     with pytest.raises(ForgedError):

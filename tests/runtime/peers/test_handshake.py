@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
 
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -141,6 +142,7 @@ ANSWERED: list[tuple[str, Any]] = [
 """An answer to a greeting from before the session is still on its way when there is one."""
 
 
+@pytest.mark.slow
 @given(OPS)
 @example(CROSSED)
 @example(ANSWERED)

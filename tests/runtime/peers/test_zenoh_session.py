@@ -71,6 +71,7 @@ def open_ports() -> set[tuple[str, str, int]]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "[::1]"])
 def test_it_listens_at_the_named_address_only(host: str) -> None:
     """Where it is met, and at a port of the address by which that is reached; no datagrams."""

@@ -68,6 +68,7 @@ DEVICE = os.makedev(1, 7)
 """That of /dev/full, which cannot be written to."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", [write, write_ply_here, trace_here, write_vocabulary_here])
 @pytest.mark.parametrize("kind", ["device", "link to a device", "fifo", "folder"])
 def test_what_is_no_file_is_never_removed_nor_replaced(

@@ -164,6 +164,7 @@ def test_an_earlier_run_in_the_way_is_renamed(tmp_path: Path) -> None:
     assert flights(out) == [4]
 
 
+@pytest.mark.slow
 def test_what_no_run_has_made_is_never_removed(tmp_path: Path) -> None:
     out = tmp_path / "run"
     for number in range(3):

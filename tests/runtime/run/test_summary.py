@@ -197,6 +197,7 @@ def test_the_inputs_are_what_estimators_are_fed_and_not_what_they_answer() -> No
     assert found.digest != other.digest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", [{"noise": 50.0}, {"announced_noise": 0.1}], ids=str)
 def test_a_changed_sensor_changes_the_digest_of_the_inputs(rig: dict[str, Any]) -> None:
     assert rigged(**rig).inputs_digest != rigged().inputs_digest

@@ -19,6 +19,7 @@ def counted(values: list[int]) -> DurationHistogram:
     return lateness
 
 
+@pytest.mark.slow
 @given(values=durations, q=st.sampled_from([0.25, 0.5, 0.75, 0.875, 1.0]))
 def test_quantiles_are_numpys_to_within_a_bucket_and_never_too_low(
     values: list[int], q: float

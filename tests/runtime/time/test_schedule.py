@@ -28,6 +28,7 @@ def run_until(schedule: Schedule, end: int) -> None:
         schedule.run_first(due)
 
 
+@pytest.mark.slow
 @given(
     rate=st.sampled_from([Fraction(30), Fraction(400), Fraction(7), Fraction(30000, 1001)])
     | st.fractions(Fraction(1, 100), 100_000, max_denominator=1000),

@@ -30,6 +30,7 @@ HEAVY = {"cv2", "jinja2", "matplotlib", "mujoco", "nodes", "scipy", "sims", "tex
 """Packages that take long to import; the list of commands needs none of them."""
 
 
+@pytest.mark.slow
 def test_help_imports_no_package_that_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     code = (

@@ -42,6 +42,7 @@ def ate(pairs: Pairs, **options: Any) -> Comparison:
     return compare_values("vo", "ate_percent", pairs, **options)
 
 
+@pytest.mark.slow
 def test_equal_sides_differ_in_at_most_one_of_twenty_comparisons() -> None:
     found = [ate(flights(12, 1.0, seed)).verdict for seed in range(400)]
     wrong = sum(each in {"better", "worse"} for each in found)
@@ -49,6 +50,7 @@ def test_equal_sides_differ_in_at_most_one_of_twenty_comparisons() -> None:
     assert wrong > 0  # as many as asked for: it is not blind either
 
 
+@pytest.mark.slow
 def test_several_figures_together_err_no_more_often() -> None:
     def rows(values: np.ndarray) -> dict[Key, list[Row]]:
         names = ("flight_ate_percent", "rpe_1m_trans_percent", "rot_rmse_deg")
@@ -223,6 +225,7 @@ def test_zeros_are_compared_by_difference() -> None:
 VALUES = st.floats(-100, 100).filter(lambda x: abs(x) > 1e-6)
 
 
+@pytest.mark.slow
 @given(st.lists(VALUES, min_size=6, max_size=25, unique_by=abs))
 def test_the_test_is_scipys_where_that_is_exact(values: list[float]) -> None:
     from scipy.stats import wilcoxon
@@ -232,6 +235,7 @@ def test_the_test_is_scipys_where_that_is_exact(values: list[float]) -> None:
     assert (p <= 0.05) == (low > 0 or high < 0)
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(-3, 3), min_size=1, max_size=12))
 def test_with_ties_it_is_the_share_of_random_signs(values: list[int]) -> None:
     differences = np.array(values, float)

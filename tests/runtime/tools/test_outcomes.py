@@ -99,6 +99,7 @@ def test_a_run_says_who_passed(
     assert done.stdout == (said if code == 1 else "")
 
 
+@pytest.mark.slow
 def test_a_sweep_fails_where_a_run_does(file: Path, tmp_path: Path) -> None:
     words: list[str | Path] = ["sweep", file, "--vary", "judge.error=0.5,7", "--junit", "j.xml"]
     with pytest.MonkeyPatch.context() as patch:
@@ -143,6 +144,7 @@ def test_an_interrupted_run_leaves_what_there_is(tmp_path: Path) -> None:
     assert [case[0] for case in cases(tmp_path / "j.xml")] == ["a"]
 
 
+@pytest.mark.slow
 def test_a_verdict_is_shown_in_a_few_lines(file: Path, tmp_path: Path) -> None:
     done = command_here("run", file, folder=tmp_path)
     lines = done.stdout.splitlines()
@@ -160,6 +162,7 @@ def test_a_verdict_is_shown_in_a_few_lines(file: Path, tmp_path: Path) -> None:
     assert "expected the folder of a run, with summary.json," in nothing.stderr
 
 
+@pytest.mark.slow
 def test_runs_are_listed_with_their_verdicts_the_newest_last(file: Path, tmp_path: Path) -> None:
     changes = ("error=0.5", "error=7", "crash=true", "fails_in_start=true")
     for change in changes:

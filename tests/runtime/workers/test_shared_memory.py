@@ -273,6 +273,7 @@ def test_a_full_file_says_so_and_has_room_again_later() -> None:
     arena.close()
 
 
+@pytest.mark.slow
 async def test_a_view_keeps_the_memory_of_its_array() -> None:
     async with worker() as plant:
         view = (await plant.call(Plant.big, MEGABYTE, 1))[10:20]

@@ -45,6 +45,7 @@ async def worker(*args: Any, **options: Any) -> AsyncIterator[Worker[Plant]]:
         clock.close()
 
 
+@pytest.mark.slow
 async def test_calls_of_one_process_are_answered_in_order() -> None:
     async with worker() as plant:
         assert await plant.call(Plant.echo, 1) == 1
@@ -78,6 +79,7 @@ async def test_a_function_can_make_the_object_too() -> None:
         assert await plant.call(Plant.echo, "here") == "here"
 
 
+@pytest.mark.slow
 async def test_an_exception_of_the_object_comes_back_with_the_workers_traceback() -> None:
     async with worker() as plant:
         with pytest.raises(LookupError, match="not here") as caught:
@@ -125,6 +127,7 @@ async def test_arguments_that_cannot_be_pickled_are_the_callers_mistake() -> Non
         assert await plant.call(Plant.echo, 1) == 1
 
 
+@pytest.mark.slow
 async def test_a_result_that_cannot_be_pickled_fails_only_its_call() -> None:
     async with worker() as plant:
         with pytest.raises(TypeError, match="cannot pickle"):
@@ -150,12 +153,14 @@ def test_a_class_of_main_is_refused() -> None:
     run_in_lockstep(main())
 
 
+@pytest.mark.slow
 async def test_environment_variables_reach_the_process() -> None:
     async with worker(env={"PLANT_COLOUR": "green"}) as plant:
         assert await plant.call(Plant.variable, "PLANT_COLOUR") == "green"
         assert await plant.call(Plant.variable, "HOME") == os.environ.get("HOME")
 
 
+@pytest.mark.slow
 async def test_what_a_process_prints_is_passed_on() -> None:
     lines: list[str] = []
     async with worker(printed=lines.append) as plant:
@@ -191,6 +196,7 @@ async def test_in_real_time_an_answer_comes_no_sooner_than_the_latency() -> None
         assert 200_000_000 <= clock.now() - begin < 400_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fate", "text"),
     [
@@ -214,6 +220,7 @@ async def test_a_death_fails_all_calls_with_code_and_last_output(
     assert deaths == [outcomes[0]]
 
 
+@pytest.mark.slow
 async def test_a_death_while_idle_is_told() -> None:
     deaths: list[WorkerError] = []
     told = threading.Event()
@@ -240,6 +247,7 @@ async def test_a_process_that_hangs_is_killed_within_its_limit() -> None:
     assert not alive(pid)
 
 
+@pytest.mark.slow
 async def test_ctrl_c_does_not_reach_a_worker() -> None:
     async with worker() as plant:
         pid = await plant.call(Plant.pid)

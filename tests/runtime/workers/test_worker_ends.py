@@ -53,6 +53,7 @@ class Undecided(Node):
         await self.worker(Plant)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["real", "lockstep"])
 def test_a_start_that_is_cancelled_leaves_no_process(clock: str, started: list[Started]) -> None:
     assert supervise([spec(Undecided, "u")], clock=clock).reason == "never mind"

@@ -52,6 +52,7 @@ def test_what_import_prints_is_toml_that_says_where_it_is_from(tmp_path: Path) -
     assert json.loads(server["settings"])["Wind"] == {"X": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "settings"), [("import", "\xff"), ("import", ""), ("check", '{"SimMode": "Car"}')]
 )

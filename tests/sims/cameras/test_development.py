@@ -160,6 +160,7 @@ def test_a_response_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         Development(spec(response="missing.txt"))
 
 
+@pytest.mark.slow
 @given(
     st.floats(0.01, 50.0),
     st.integers(0, 255),
@@ -346,6 +347,7 @@ def test_dark_surfaces_are_lost_to_structured_light_and_plain_ones_to_stereo() -
     assert not plain[:, 224:].any()
 
 
+@pytest.mark.slow
 @given(
     arrays.arrays(
         np.float32,

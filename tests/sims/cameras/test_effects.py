@@ -318,6 +318,7 @@ def test_time_comes_before_gain() -> None:
             assert exposure == pytest.approx(AUTO.max_exposure)
 
 
+@pytest.mark.slow
 @given(
     scene=st.floats(0.002, 500.0),
     start=st.floats(1e-5, 0.1),

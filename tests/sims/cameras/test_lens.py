@@ -114,6 +114,7 @@ def balls(info: CameraInfo) -> tuple[Array, Array]:
     return rays * distance[:, None], distance * min(22.0 / max(info.fx, info.fy), 0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", CAMERAS, ids=lambda spec: spec.name)
 def test_known_points_fall_on_their_pixels(spec: CameraSpec, draws: RendererName) -> None:
     """Balls at known places are seen where OpenCV projects their outlines.
@@ -232,6 +233,7 @@ def test_odd_sizes_are_drawn(size: tuple[int, int], fov: float) -> None:
     assert middle == pytest.approx(3.0, abs=1e-4)
 
 
+@pytest.mark.slow
 @given(
     data=st.data(),
     width=st.integers(1, 40),
@@ -279,6 +281,7 @@ def test_every_ray_is_looked_up_in_one_face(
     np.testing.assert_array_equal(found, seen)
 
 
+@pytest.mark.slow
 def test_the_undistorted_twin_agrees_with_opencv() -> None:
     """Its maps are those of OpenCV's rectification."""
     info = camera_info(CAMERAS[1])
@@ -292,6 +295,7 @@ def test_the_undistorted_twin_agrees_with_opencv() -> None:
     np.testing.assert_allclose(rows, expected[1], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_undistorted_twin_shows_the_same_world() -> None:
     """Nearly the image, and the depth, of a pinhole camera in the same place."""
     spec = camera("twin", fov=90.0, lens=CAMERAS[1].lens, undistorted=True)

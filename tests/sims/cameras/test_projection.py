@@ -132,6 +132,7 @@ def residuals(spec: CameraSpec, info: CameraInfo) -> Array:
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", LENSLESS, ids=lambda spec: spec.name)
 def test_known_points_fall_on_their_pixels(spec: CameraSpec) -> None:
     """Balls at known places appear where announced intrinsics and mounting put them."""
@@ -184,6 +185,7 @@ def test_moments_are_a_pixel_apart_at_most(shift: float, count: int) -> None:
     assert found[-1] + 0.02 / count / 2 == pytest.approx(0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instructions", ["", "numpy"])
 def test_the_mean_is_rounded_and_does_not_overflow(instructions: str) -> None:
     """Of as many images as may be, through a table."""
@@ -311,6 +313,7 @@ def test_nothing_hit_is_infinite_and_has_no_number(
     assert nothing.any() == (name == "yard")
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_the_geoms_that_are_hit(
     world: tuple[Scene, CameraRenderer, str],
 ) -> None:

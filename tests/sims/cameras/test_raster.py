@@ -98,6 +98,7 @@ def difference(one: Drawn, other: Drawn) -> tuple[float, float, float]:
 WORLD = [name if name == "hall" else pytest.param(name, marks=SLOW) for name in WORLDS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WORLD)
 @pytest.mark.timeout(300)
 def test_every_world_looks_as_mujoco_draws_it(name: str) -> None:
@@ -197,6 +198,7 @@ def compare(model: Any, levels: float, numbers: float = 0.99) -> None:
     reference.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["box", *(pytest.param(n, marks=SLOW) for n in SHAPES)])
 def test_textures_lie_on_shapes_as_mujoco_lays_them(shape: str) -> None:
     flat, cube = mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtTexture.mjTEXTURE_CUBE
@@ -243,6 +245,7 @@ def test_a_point_light_shines_to_all_sides_and_falls_off() -> None:
     raster.close()
 
 
+@pytest.mark.slow
 def test_what_is_see_through_is_blended_and_has_no_depth() -> None:
     """Its number is the nearest."""
     behind = '<geom type="box" size=".1 9 9" pos="5 0 1" rgba="1 0 0 1"/>'
@@ -303,6 +306,7 @@ def shadowed(spec: CameraSpec, kind: str, casts: bool = True, size: int = 4096) 
     return raster, drawn(raster, spec, (-2.6, 0.4, -2.5), from_rpy(0.1, -0.8, -0.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
 @pytest.mark.parametrize("kind", ["spot", "directional"])
 def test_shadows_lie_where_the_light_does_not_arrive(kind: str, spec: CameraSpec) -> None:
@@ -377,6 +381,7 @@ PLATE = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
 @pytest.mark.parametrize("roll", [0.0, 0.2, 0.7])
 def test_a_plate_gives_the_light_of_its_area(spec: CameraSpec, roll: float) -> None:
@@ -394,6 +399,7 @@ def test_a_plate_gives_the_light_of_its_area(spec: CameraSpec, roll: float) -> N
     raster.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
 def test_outlines_and_textures_are_near_the_mean_of_many_samples(spec: CameraSpec) -> None:
     info, samples = camera_info(spec), 4
@@ -443,6 +449,7 @@ def swarm() -> tuple[Raster, npt.NDArray[Any], npt.NDArray[Any]]:
     return raster, middles @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), radii
 
 
+@pytest.mark.slow
 @given(
     model=st.sampled_from(["plumb_bob", "rational_polynomial", "equidistant"]),
     bend=st.tuples(*[st.floats(-0.08, 0.08)] * 4),

@@ -91,6 +91,7 @@ def test_depth_noise_grows_with_the_square_of_depth() -> None:
     assert far.std() == pytest.approx(0.05, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "found",
     [image_noise(10.0), shot_noise(), depth_noise(0.002)],
@@ -255,6 +256,7 @@ def test_cameras_have_noise_where_nothing_was_compiled(monkeypatch: pytest.Monke
     np.testing.assert_array_equal(image_noise(3.0), compiled)
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(0, 4000), max_size=5), st.booleans(), st.sampled_from([*libraries()]))
 def test_parts_of_an_image_are_those_of_the_whole(
     cuts: list[int], wide: bool, instructions: str

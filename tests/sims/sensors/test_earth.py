@@ -76,6 +76,7 @@ def test_the_drift_tends_to_its_standard_deviation_and_airsims_does_not() -> Non
         assert found.std() / base == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_drift_keeps_its_value_over_its_time_constant() -> None:
     """Autocorrelation e^-1 after one time constant of 0.2 s: ten samples."""
     found = errors(barometer(noise=0.0, drift_time=0.2), 60_000)[500:]

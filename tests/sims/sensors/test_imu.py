@@ -50,6 +50,7 @@ def test_white_noise_has_the_density_asked_for() -> None:
     np.testing.assert_allclose(errors.mean(axis=0), 0.0, atol=4 * expected.max() / 20_000**0.5)
 
 
+@pytest.mark.slow
 def test_white_noise_averages_out_with_the_root_of_time() -> None:
     """The Allan deviation's slope of -1/2: at 1 s it is the density itself."""
     errors = samples(noise_of(gyroscope_random_walk=0.0, accelerometer_random_walk=0.0), 100_000)
@@ -372,6 +373,7 @@ def integrated(rows: list[Row], mean: bool) -> float:
     return math.dist(p, rows[-1][1].position)
 
 
+@pytest.mark.slow
 def test_the_ideal_imu_integrates_to_the_truth_on_an_aggressive_flight() -> None:
     """5 s at 200 Hz, up to 5.4 m/s and 7 rad/s. The mean over each period is good to millimetres;
     instants are not within 1 cm here, since between two they miss what the motors do."""

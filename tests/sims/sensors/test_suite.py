@@ -58,6 +58,7 @@ def test_a_barometer_is_announced_mounted_and_read_at_its_rate() -> None:
     assert result.of(FluidPressure)[0].fluid_pressure == pytest.approx(pressure_at(122.15), abs=15)
 
 
+@pytest.mark.slow
 def test_a_measurement_comes_latency_after_its_stamp_and_first_after_the_start() -> None:
     result = fly(barometer={"rate": 50, "latency": "45ms", "startup_delay": "100ms"}, imu_rate=1000)
     stamps = [e.stamp for e in result.of(FluidPressure)]

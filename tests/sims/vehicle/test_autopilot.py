@@ -73,6 +73,7 @@ def test_taken_off_is_told_near_the_altitude_and_slow() -> None:
     assert hypot(*state.velocity) < 0.2
 
 
+@pytest.mark.slow
 def test_it_flies_again_after_landing() -> None:
     flight = taken_off()
     flight.autopilot.command(LAND)
@@ -82,6 +83,7 @@ def test_it_flies_again_after_landing() -> None:
     assert flight.events == [Armed, TakenOff, Landed, Disarmed, Armed, TakenOff]
 
 
+@pytest.mark.slow
 def test_landing_out_of_fast_flight_stops_first() -> None:
     flight = airborne()
     flight.fly(3.0, lambda stamp: velocity(stamp, 5.0, 0.0))
@@ -115,6 +117,7 @@ def test_disarming_in_the_air_stops_the_motors() -> None:
     assert flight.events[-1] is Disarmed
 
 
+@pytest.mark.slow
 def test_armed_on_the_ground_a_setpoint_starts_the_flight() -> None:
     flight = grounded()
     flight.autopilot.command(ARM)
@@ -169,6 +172,7 @@ def test_what_cannot_be_obeyed_is_refused_with_a_reason(
     assert autopilot.phase is phase
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [TAKEOFF, LAND])
 def test_hover_ends_a_take_off_and_a_landing(order: Event) -> None:
     flight = grounded() if order is TAKEOFF else taken_off()
@@ -182,6 +186,7 @@ def test_hover_ends_a_take_off_and_a_landing(order: Event) -> None:
     assert flight.autopilot.command(place(0.0, 0.0, -1.0)) is None
 
 
+@pytest.mark.slow
 def test_hover_stops_and_stays_where_it_stopped() -> None:
     """It does not fly back to where it was told to."""
     flight = airborne()
@@ -193,6 +198,7 @@ def test_hover_stops_and_stays_where_it_stopped() -> None:
     assert track[-1][1].velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "setpoint",
     [
@@ -221,12 +227,14 @@ def test_a_setpoint_that_is_not_renewed_becomes_a_hover(setpoint: Event) -> None
     assert hypot(*(track[-1][1].position[i] - track[-400][1].position[i] for i in range(3))) < 0.05
 
 
+@pytest.mark.slow
 def test_a_position_setpoint_needs_no_renewal() -> None:
     flight = airborne()
     flight.autopilot.command(place(20.0, 0.0, -UP))
     assert flight.fly(10.0)[-1][1].position[0] == pytest.approx(20.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_same_commands_give_the_same_bits() -> None:
     def run() -> list[object]:
         flight = grounded()

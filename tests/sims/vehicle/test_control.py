@@ -31,12 +31,14 @@ from tests.sims.vehicle.test_autopilot import ARM, DISARM
 from tests.sims.vehicle.test_model import PARAMETERS
 
 
+@pytest.mark.slow
 def test_hover_holds_within_five_centimetres() -> None:
     for _, state in airborne().fly(10.0):
         x, y, z = state.position
         assert hypot(x, y, z + UP) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("axis", "length"), [(0, 2.0), (1, -2.0), (2, -2.0), (2, 2.0)], ids=["x", "y", "up", "down"]
 )
@@ -64,6 +66,7 @@ def test_near_and_far_places_are_not_overshot(length: float, astray: float) -> N
     assert places[-1] == pytest.approx(length, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_fast_leg_keeps_its_height() -> None:
     """5 m/s from standing and back to standing: less than 0.3 m of height lost, none gained."""
     flight = airborne()
@@ -74,6 +77,7 @@ def test_a_fast_leg_keeps_its_height() -> None:
     assert max(abs(s.position[2] + UP) for _, s in track) < 0.3
 
 
+@pytest.mark.slow
 def test_feed_forward_follows_a_circle() -> None:
     """3 m/s on a radius of 3 m, nose along the path: within 15 cm once on it."""
 
@@ -98,6 +102,7 @@ def test_feed_forward_follows_a_circle() -> None:
         assert abs((turned + pi) % (2.0 * pi) - pi) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start", "turn"), [(0.0, 1.5), (3.0, 0.5), (0.0, -2.5)])
 def test_a_yaw_step_takes_the_short_way_and_does_not_move_the_vehicle(
     start: float, turn: float
@@ -119,12 +124,14 @@ def test_velocity_along_the_heading_flies_where_the_nose_points() -> None:
     assert yaw_of(track[-1][1].orientation) == pytest.approx(pi / 2, abs=0.01)
 
 
+@pytest.mark.slow
 def test_yaw_rate_turns_on_through_renewed_setpoints() -> None:
     flight = airborne()
     track = flight.fly(3.0, lambda stamp: velocity(stamp, 0.0, 0.0, yaw_rate=0.8))
     assert yaw_of(track[-1][1].orientation) == pytest.approx(2.4, abs=0.1)
 
 
+@pytest.mark.slow
 def test_limits_hold_whatever_is_asked() -> None:
     """A place half a kilometre away and deep below: tilt, speed and descent stay bounded."""
     flight = airborne()
@@ -164,6 +171,7 @@ def test_body_rates_are_followed_on_all_axes_at_once() -> None:
             assert state.angular_velocity == pytest.approx(goal, abs=0.05)
 
 
+@pytest.mark.slow
 def test_it_recovers_from_being_upside_down() -> None:
     flight = airborne()
     flight.physics.data.qpos[10:14] = (0.0, 1.0, 0.0, 0.0)  # after the ball's seven and a position
@@ -200,6 +208,7 @@ def test_motors_are_front_right_rear_left_front_left_rear_right(
     assert flight.physics.data.ctrl[:4].tolist() == pytest.approx(motors)
 
 
+@pytest.mark.slow
 def test_the_loops_take_over_from_motor_setpoints() -> None:
     flight = airborne()
     flight.fly(0.1)
@@ -220,6 +229,7 @@ orientations = st.builds(rotations.from_rpy, angles, st.floats(-1.5, 1.5), angle
 attitude = AttitudeController(Gains(), Limits())
 
 
+@pytest.mark.slow
 @given(orientations, orientations)
 def test_both_quaternions_of_an_attitude_mean_the_same(a: Quaternion, b: Quaternion) -> None:
     w, x, y, z = b
@@ -227,6 +237,7 @@ def test_both_quaternions_of_an_attitude_mean_the_same(a: Quaternion, b: Quatern
     assert attitude.update(a, (-w, -x, -y, -z), 0.3) == pytest.approx(one, abs=1e-9)
 
 
+@pytest.mark.slow
 @given(orientations, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
 def test_small_errors_are_turned_back_about_their_own_axis(
     target: Quaternion, x: float, y: float, z: float
@@ -281,6 +292,7 @@ def test_integrators_learn_nothing_while_the_tilt_is_at_its_limit() -> None:
     assert controller.update(STILL, 0.0025)[0] == pytest.approx(rotations.IDENTITY, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_integrators_learn_a_steady_wind() -> None:
     """A small error that stays is met with more and more tilt, up to the integral's bound."""
     controller = PositionController(PARAMETERS, Gains(), Limits())
@@ -321,6 +333,7 @@ def test_arming_starts_afresh() -> None:
     assert again == pytest.approx(fresh.update(flight.stamp, state, False), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_renewed_velocity_setpoints_keep_the_heading_against_a_kick() -> None:
     flight = airborne()
     flight.fly(0.5, lambda stamp: velocity(stamp, 1.0, 0.0))

@@ -60,6 +60,7 @@ def test_time_goes_by_whole_milliseconds() -> None:
     assert physics.state() == state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read_every", [1, 2, 5, 10])
 def test_pieces_and_readings_change_nothing(read_every: int) -> None:
     """In one go or in pieces, sensors read or not, in flight or on the floor: the same bits."""
@@ -109,6 +110,7 @@ def test_what_does_not_stand_does_not_settle() -> None:
     assert physics.data.qpos.tolist() == before
 
 
+@pytest.mark.slow
 @given(
     motors=st.tuples(*[st.floats(0.0, 1.0)] * 4),
     height=st.sampled_from([0.12, 0.3, UP]),

@@ -36,6 +36,7 @@ def body(**fields: Any) -> BodyMotion:
     return motion_of(found, "world/b")
 
 
+@pytest.mark.slow
 @given(speed=st.floats(0.2, 8.0), turns=st.integers(0, 3), loop=st.booleans())
 def test_a_path_passes_its_places_at_its_times(speed: float, turns: int, loop: bool) -> None:
     motion = body(waypoints=WALK, speed=speed, loop=loop)
@@ -68,6 +69,7 @@ def test_it_moves_and_turns_without_jumps(
     assert abs(math.remainder(later - yaw, math.tau)) < 0.35
 
 
+@pytest.mark.slow
 @given(st.floats(0.0, 60.0))
 def test_it_looks_where_it_goes(seconds: float) -> None:
     """Round a circle: within 3 degrees of its way, over the loop's end too."""
@@ -183,6 +185,7 @@ def test_flicker_stays_within_its_share(seconds: float) -> None:
 FLICKER = made(lights=[{"name": "lamp", "flicker": 0.3}])
 
 
+@pytest.mark.slow
 def test_every_light_of_the_built_in_worlds_has_a_name() -> None:
     """Else nobody could change it."""
     for name in ("hall", "yard"):

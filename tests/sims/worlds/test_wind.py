@@ -98,6 +98,7 @@ def test_it_is_as_strong_at_any_step_speed_and_height(
     assert np.std(ends, axis=0) == pytest.approx(expected, rel=0.25)
 
 
+@pytest.mark.slow
 def test_ten_small_steps_are_as_one_large_one() -> None:
     """Their correlations in time agree, whatever the step."""
     fine, coarse = series(2000.0, 0.05, speed=20.0)[::10], series(10000.0, 0.5, speed=20.0)

@@ -72,6 +72,7 @@ def probe(request: pytest.FixtureRequest) -> tuple[str, Probe]:
     return request.param, Probe(request.param)
 
 
+@pytest.mark.slow
 def test_the_tour_is_clear(probe: tuple[str, Probe]) -> None:
     """Along each leg, and from the last point to the first, nothing is nearer than promised."""
     name, measure = probe
@@ -141,6 +142,7 @@ def test_everything_has_a_name_and_only_solids_collide(probe: tuple[str, Probe])
             assert name.removesuffix(".look") in names
 
 
+@pytest.mark.slow
 def test_a_ball_comes_to_rest_on_the_floor_and_steps_are_cheap(probe: tuple[str, Probe]) -> None:
     """Solids hold a vehicle; they are few, and none touches another, so that steps cost little."""
     name, _ = probe

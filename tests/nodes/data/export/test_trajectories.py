@@ -68,6 +68,7 @@ def test_every_format_has_its_files(run: Path, tmp_path: Path) -> None:
 NWU = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("epoch", "zero"),
     [
@@ -197,6 +198,7 @@ def test_evos_commands_take_the_files_as_they_are_and_find_our_figures(run: Path
         assert found["rmse"] * 100 == pytest.approx(rpe["rpe_1m_trans_percent"], abs=2e-4)
 
 
+@pytest.mark.slow
 def test_of_several_vehicles_each_estimate_goes_with_its_own(run: Path) -> None:
     truths, estimates = load(run)
     moved = truths["truth"].positions + np.array([1.0, 0.0, 0.0])

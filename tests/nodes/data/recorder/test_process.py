@@ -65,6 +65,7 @@ def test_all_events_come_back_as_they_were(tmp_path: Path, settings: dict[str, A
     assert all(same(*pair) for pair in zip(found, events, strict=True))
 
 
+@pytest.mark.slow
 def test_ros_reads_the_topics_that_the_bridge_has(tmp_path: Path) -> None:
     """All messages can be read; images, poses and transforms are in ROS's names and axes."""
     path = tmp_path / "a.mcap"

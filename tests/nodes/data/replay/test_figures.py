@@ -274,6 +274,7 @@ def test_a_missing_image_is_an_error_when_its_turn_comes(tmp_path: Path) -> None
         of(found, Image)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["euroc", "tum_rgbd"])
 @given(
     start=st.integers(0, 10**13),
@@ -307,6 +308,7 @@ def test_every_stamp_of_a_data_set_comes_back(
         assert [event.stamp for event in of(found, kind)] == stamps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [sets.euroc_as_published, sets.tum_as_published])
 def test_truth_beyond_the_sensors_is_no_part_of_a_flight(build: Any, tmp_path: Path) -> None:
     """An estimator could see nothing then, and is not to be charged for that."""
@@ -332,6 +334,7 @@ def test_truth_beyond_the_sensors_is_no_part_of_a_flight(build: Any, tmp_path: P
     assert min(images[0].stamp, poses[0].stamp) < 60_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [sets.euroc, sets.tum_rgbd])
 @given(data=st.data())
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])

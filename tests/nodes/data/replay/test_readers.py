@@ -35,6 +35,7 @@ def read(path: Path, start: int = 0, end: int | None = None, choice: Choice = AL
         opened.close()
 
 
+@pytest.mark.slow
 def test_events_come_in_order_of_time(path: Path) -> None:
     """Times begin near 0; stamps are of the same clock, and not ahead."""
     found = read(path)
@@ -45,6 +46,7 @@ def test_events_come_in_order_of_time(path: Path) -> None:
     assert not [each for each in found if isinstance(each.event, Announcement)]
 
 
+@pytest.mark.slow
 def test_reading_again_gives_the_same(path: Path) -> None:
     """To the byte, with a reader of its own or the same one."""
     opened = reader(path)
@@ -57,6 +59,7 @@ def test_reading_again_gives_the_same(path: Path) -> None:
     assert twice[0] == [(each.time, pack(each.event).frame()) for each in read(path)]
 
 
+@pytest.mark.slow
 def test_a_range_is_that_part_of_the_whole(path: Path) -> None:
     """From its start to before its end."""
     whole = read(path)
@@ -66,6 +69,7 @@ def test_a_range_is_that_part_of_the_whole(path: Path) -> None:
     assert [pack(e.event).frame() for e in found] == [pack(e.event).frame() for e in expected]
 
 
+@pytest.mark.slow
 def test_only_what_is_wanted_is_read(path: Path) -> None:
     """By type and by source."""
     whole = read(path)
@@ -76,6 +80,7 @@ def test_only_what_is_wanted_is_read(path: Path) -> None:
     assert read(path, choice=Choice(("nobody",))) == []
 
 
+@pytest.mark.slow
 def test_images_are_of_announced_cameras(path: Path) -> None:
     """Of their size, kinds and frame, so that an estimator works unchanged."""
     opened = reader(path)
@@ -95,6 +100,7 @@ def test_images_are_of_announced_cameras(path: Path) -> None:
     assert all(np.isclose(np.linalg.norm(c.orientation), 1.0) for c in cameras.values())
 
 
+@pytest.mark.slow
 def test_truth_and_vehicle_agree(path: Path) -> None:
     """The vehicle stands, at first, where the truth has it about the first image."""
     opened = reader(path)

@@ -137,6 +137,7 @@ def test_a_map_that_contradicts_is_not_believed() -> None:
     assert made.state is before
 
 
+@pytest.mark.slow
 def test_rows_of_a_turning_and_moving_camera_are_made_straight() -> None:
     readout, turn, speed = 0.025, 1.0, 1.0
     times = readout * (np.arange(INFO.height) / (INFO.height - 1) - 0.5)
@@ -212,6 +213,7 @@ def test_a_start_in_motion_with_gravity_20_degrees_off_converges_and_knows_its_e
     assert 1.0 < np.mean(consistent) < 6.0
 
 
+@pytest.mark.slow
 def test_two_landmarks_do_not_carry_the_camera_off() -> None:
     *_, (made, _, _) = flight(0)
     before = made.state

@@ -6,6 +6,7 @@ import itertools
 
 import msgspec
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -52,6 +53,7 @@ def difference(of: Preintegrated, other: Preintegrated) -> Floats:
     return np.concatenate([turn, other.velocity - of.velocity, other.position - of.position])
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(motions)
 def test_samples_at_200_hz_give_the_motion_that_fine_steps_give(motion: Floats) -> None:
@@ -73,6 +75,7 @@ def test_derivatives_by_the_bias_are_those_of_differences(motion: Floats, bias: 
         assert np.abs((ahead - behind) / 2e-5 - found.by_bias[:, axis]).max() < 2e-4
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_noisy_samples() -> None:
     random = np.random.default_rng(1)
     samples = felt(np.linspace(-1, 1, 12), np.linspace(0, 0.2, 41))

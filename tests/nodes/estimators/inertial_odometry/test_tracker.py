@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from events import CameraAnnouncement
 from nodes.estimators import TrackingResult
@@ -46,6 +47,7 @@ def test_images_that_contradict_the_imu_are_lost_and_begin_a_frame_of_their_own(
     assert found[-1].map > 0
 
 
+@pytest.mark.slow
 def test_a_stereo_rig_that_comes_to_see_level_edges_only_is_lost_and_not_wrong() -> None:
     tracker, random = started(BASELINE), np.random.default_rng(1)
     texture, stripes = pair(pose())[:2], np.full((INFO.height, INFO.width), 110.0)

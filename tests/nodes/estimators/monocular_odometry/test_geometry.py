@@ -203,6 +203,7 @@ def test_reprojection_errors_by_hand() -> None:
     np.testing.assert_allclose(errors, [0, 5, np.inf, np.inf])
 
 
+@pytest.mark.slow
 @given(st.tuples(metres, metres, metres, degrees, degrees), st.lists(metres, min_size=3))
 def test_what_two_cameras_see_is_triangulated_where_it_is(
     motion: tuple[float, ...], numbers: list[float]

@@ -110,6 +110,7 @@ def test_the_unit_is_the_median_depth_of_the_first_image() -> None:
     assert unit(last, RIGHT[-1]) == pytest.approx(2.0, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_camera_that_hurries_is_followed() -> None:
     odometry = MonocularTracker(INFO)
     follow(odometry, render(RIGHT, FLAT))
@@ -130,6 +131,7 @@ def test_landmarks_that_leave_are_replaced_by_far_ones_in_time() -> None:
     )
 
 
+@pytest.mark.slow
 def test_what_moves_by_itself_does_not_agree() -> None:
     on: list[Place] = [(1.15 + 0.05 * i,) for i in range(1, 4)]
     thing = render([(9.0, 4.0)], FLAT)[0][40:120, 60:140]
@@ -159,6 +161,7 @@ def test_nothing_is_known_before_there_is_a_map() -> None:
     assert {each.reason for each in said[first:]} == {""}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path", [[(0.0,)] * 12, [(0.0, 0.0, 0.0, 3.0 * i) for i in range(12)]], ids=["rest", "turning"]
 )
@@ -166,12 +169,14 @@ def test_without_a_way_there_is_no_map(path: list[Place]) -> None:
     assert all(each is NO_MAP for each in follow(MonocularTracker(INFO), render(path)))
 
 
+@pytest.mark.slow
 def test_a_camera_that_turned_first_begins_once_it_moves() -> None:
     turn: list[Place] = [(0.0, 0.0, 0.0, 2.0 * i) for i in range(8)]
     away: list[Place] = [(0.05 * i, 0.0, 0.0, 14.0) for i in range(16)]
     assert follow(MonocularTracker(INFO), render(turn + away))[-1] is not NO_MAP
 
 
+@pytest.mark.slow
 def test_equal_images_give_equal_bits() -> None:
     images = [*render(RIGHT), DARK, *render(RIGHT[-3:])]
     one, other = (follow(MonocularTracker(INFO), images) for _ in range(2))
@@ -196,6 +201,7 @@ def test_it_tells_what_it_followed() -> None:
     assert last.inliers.sum() > 60
 
 
+@pytest.mark.slow
 def test_a_dark_moment_is_lost_and_regained_with_the_same_unit() -> None:
     odometry = MonocularTracker(INFO)
     *_, before = follow(odometry, render(RIGHT))

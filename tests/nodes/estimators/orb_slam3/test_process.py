@@ -121,6 +121,7 @@ def test_the_pose_is_the_camera_in_its_first_frame_in_metres(flight: Flight) -> 
     assert degrees[:30].max() < 0.3
 
 
+@pytest.mark.slow
 def test_a_blank_image_is_lost_and_the_last_pose_stays(flight: Flight) -> None:
     before, blank = flight.tracked[29], flight.tracked[30:36]
     assert all(t.lost and t.reason and t.state != "OK" for t in blank)

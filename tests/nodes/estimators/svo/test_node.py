@@ -85,6 +85,7 @@ def test_it_says_where_the_body_went_and_when_it_was_lost() -> None:
     assert [each.stamp // FRAME for each in result.of(TrackingRegained)] == [6]
 
 
+@pytest.mark.slow
 def test_a_library_that_ends_its_process_is_a_clear_error() -> None:
     with pytest.raises(NodeError, match=r"worker .*(ended|died)"):
         run_node(Svo, inputs=[camera(PINHOLE), *images(9, 9, 255)], duration=0.5)
@@ -204,6 +205,7 @@ def test_a_missing_library_is_an_error_with_the_command_that_installs_it(
 numbers = st.floats(-1e3, 1e3)
 
 
+@pytest.mark.slow
 @given(st.tuples(numbers, numbers, numbers), st.tuples(*[st.floats(-3, 3)] * 3))
 def test_a_pose_is_read_from_where_it_lies(
     shift: tuple[float, float, float], turn: tuple[float, float, float]

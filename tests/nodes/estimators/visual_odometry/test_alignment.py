@@ -93,6 +93,7 @@ def test_a_flat_wall_alone_says_too_little() -> None:
     assert all(each.lost for each in follow((WALL,), [pose(x=0.02 * i) for i in range(3)]))
 
 
+@pytest.mark.slow
 def test_the_motion_during_a_loss_is_found_again() -> None:
     tracker = FeatureTracker(INFO)
     dark = np.zeros((240, 320), np.uint8), np.full((240, 320), np.inf, np.float32)

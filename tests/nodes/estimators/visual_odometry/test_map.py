@@ -172,6 +172,7 @@ def test_forgetting_a_key_frame_leaves_the_others_as_they_were() -> None:
     assert patches.warps == pytest.approx(np.stack([np.eye(2)] * 2), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_few_key_frames_remembered_do_for_a_path() -> None:
     tracker = FeatureTracker(INFO, FeatureSettings(keyframes=2, keyframe_shift=8.0))
     for index in range(30):
@@ -190,6 +191,7 @@ def test_images_without_depth_are_followed_on_the_map_there_is() -> None:
     assert np.linalg.norm(said.pose[:3, 3] - there[:3, 3]) < 0.01
 
 
+@pytest.mark.slow
 def test_a_lost_camera_finds_a_key_frame_that_optical_flow_does_not_reach() -> None:
     tracker = FeatureTracker(INFO, FeatureSettings(keyframe_shift=30.0))
     for index in range(28):

@@ -51,6 +51,7 @@ def test_corners_on_a_surface_of_one_colour_have_depth() -> None:
     assert np.allclose(INFO.fx * BASELINE * found.inverse[found.continuous], 11.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_level_edge_in_noise_has_no_depth() -> None:
     random = np.random.default_rng(2)
     images = np.full((2, INFO.height, INFO.width), 40.0)
@@ -80,6 +81,7 @@ def test_images_that_do_not_match_have_no_depth(other: str) -> None:
     assert matcher.surfaces_at(coarse, pixels, matcher.depth_noise).continuous.mean() < 0.03
 
 
+@pytest.mark.slow
 def test_the_trajectory_is_metric_and_the_same_twice() -> None:
     def fly() -> list[np.ndarray]:
         tracker = StereoTracker(INFO, BASELINE, StereoSettings(), FeatureSettings())

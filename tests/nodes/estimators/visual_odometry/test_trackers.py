@@ -129,6 +129,7 @@ def test_features_find_a_place_again_that_they_were_carried_to() -> None:
     assert off(said, elsewhere[0])[0] < 0.03
 
 
+@pytest.mark.slow
 def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
     settings = FeatureSettings(reset_timeout=0.1)
     tracker = FeatureTracker(INFO, settings)

@@ -43,6 +43,7 @@ def repeated(p: Floats, count: int) -> Floats:
     return np.tile(p, (count, 1, 1))
 
 
+@pytest.mark.slow
 @given(seed=SEEDS)
 @settings(max_examples=15, deadline=None)
 def test_a_true_covariance_is_consistent(seed: int) -> None:
@@ -55,6 +56,7 @@ def test_a_true_covariance_is_consistent(seed: int) -> None:
     assert found["nees_pose_inside_percent"] == pytest.approx(95.0, abs=2.5)
 
 
+@pytest.mark.slow
 def test_one_pose_is_the_quadratic_form_and_the_bounds_are_those_of_chi_squared() -> None:
     from scipy.stats import chi2
 

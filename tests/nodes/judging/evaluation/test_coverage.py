@@ -100,6 +100,7 @@ def test_every_image_without_a_pose_for_longer_than_the_gap_is_in_a_lost_interva
     assert 0.0 <= coverage.percent <= 100.0
 
 
+@pytest.mark.slow
 @given(flights(), st.data())
 def test_saying_less_never_looks_better(
     flight: tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]], data: st.DataObject

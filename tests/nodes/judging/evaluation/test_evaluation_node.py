@@ -81,6 +81,7 @@ def test_a_constant_error_is_found_everywhere(tmp_path: Path) -> None:
     assert figures["rate_hz"] == pytest.approx(10.0)
 
 
+@pytest.mark.slow
 def test_an_estimate_in_odom_is_laid_on_the_first_pose(tmp_path: Path) -> None:
     estimates: list[Event] = [estimate(s, error=(7.0, 0.0, 0.0), frame_id="odom") for s in FRAMES]
     scores = run(tmp_path, announced(), truth(10), estimates)
@@ -135,6 +136,7 @@ def test_lost_time_is_by_word_and_by_silence(tmp_path: Path) -> None:
     assert found["lost_seconds"] == pytest.approx(1.0 + 2.0)
 
 
+@pytest.mark.slow
 def test_an_estimator_that_falls_silent_is_lost_until_the_end(tmp_path: Path) -> None:
     estimates: list[Event] = [estimate(s) for s in FRAMES if s <= 4 * SECOND]
     found = judged(tmp_path, announced(), truth(10), estimates)["estimators"]["est"]
@@ -162,6 +164,7 @@ def test_without_a_truth_there_is_no_verdict_but_a_reason(tmp_path: Path) -> Non
     assert "no odometry" in verdict["estimators"]["est"]["failed"][0]
 
 
+@pytest.mark.slow
 def test_the_flight_is_held_against_its_plan(tmp_path: Path) -> None:
     """Half a metre aside, and once two metres; set-points are no plan."""
     estimates: list[Event] = [estimate(s) for s in FRAMES]
@@ -183,6 +186,7 @@ def test_the_flight_is_held_against_its_plan(tmp_path: Path) -> None:
     assert verdict["flights"]["drone"]["failed"] == expected
 
 
+@pytest.mark.slow
 def test_files_hold_what_was_said(tmp_path: Path) -> None:
     estimates: list[Event] = [estimate(s, error=(0.3, 0.0, 0.0)) for s in FRAMES]
     plan: list[Event] = [
@@ -314,6 +318,7 @@ def two_flights() -> list[Event]:
     return events
 
 
+@pytest.mark.slow
 def test_an_estimate_is_held_against_the_vehicle_that_carries_its_camera(tmp_path: Path) -> None:
     scores = run(tmp_path, two_flights())
     assert max(s.value for s in scores if s.metric == "position_error") < 1e-9
@@ -344,6 +349,7 @@ def test_the_file_may_say_which_vehicle_is_meant(tmp_path: Path) -> None:
     assert figures["collisions"] == 2
 
 
+@pytest.mark.slow
 def test_settings_of_single_estimators_hold_for_those_only(tmp_path: Path) -> None:
     verdict = judged(
         tmp_path,
@@ -379,6 +385,7 @@ def test_wrong_settings_of_single_estimators_are_refused(
         judged(tmp_path, two_flights(), estimators=own)
 
 
+@pytest.mark.slow
 def test_settings_of_an_estimator_that_is_not_there_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -423,6 +430,7 @@ class Restarted(Evaluation):
             raise RuntimeError("fails once")
 
 
+@pytest.mark.slow
 def test_an_evaluation_that_was_restarted_fails_and_what_was_written_stays(tmp_path: Path) -> None:
     from runtime.testing import run_nodes, spec
 

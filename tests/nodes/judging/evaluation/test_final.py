@@ -141,6 +141,7 @@ def flown(out: Path, *more: Event, reads: tuple[str, ...] = ()) -> dict[str, Any
     return found
 
 
+@pytest.mark.slow
 def test_the_node_judges_it_and_leaves_it_for_the_report(tmp_path: Path) -> None:
     said = [estimate(k * 100 * MS, error=(0.0, 0.0, 0.5)) for k in range(100)]
     poses = Trajectory(

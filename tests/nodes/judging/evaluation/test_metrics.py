@@ -62,6 +62,7 @@ def test_absolute_errorss_are_evos(seed: int, n: int) -> None:
     assert ours["rot_rmse_deg"] == pytest.approx(turns["rmse"], abs=1e-9)
 
 
+@pytest.mark.slow
 @given(seed=SEEDS, n=st.integers(30, 120), delta=st.sampled_from([0.2, 1.0]))
 @settings(max_examples=10, deadline=None)
 def test_relative_errors_are_evos(seed: int, n: int, delta: float) -> None:

@@ -111,6 +111,7 @@ PAIRS: dict[str, tuple[Say, Say]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_the_worse_one_looks_worse(pair: str) -> None:
     worse, better = (judged(say) for say in PAIRS[pair])
@@ -211,6 +212,7 @@ def test_a_reported_loss_is_charged_only_where_there_is_no_pose() -> None:
 stamps = st.lists(st.integers(0, 200), max_size=30, unique=True)
 
 
+@pytest.mark.slow
 @given(said=stamps, percent=st.floats(0.0, 20.0))
 @settings(deadline=None, max_examples=60)
 def test_to_say_less_never_looks_better(said: list[int], percent: float) -> None:

@@ -73,6 +73,7 @@ def judged(animal: Animal) -> dict[str, Any]:
     return judge(record, truth, cameras={"camera": frames}, end=stop, planned=planned).figures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*GOOD, *BAD])
 def test_which_figure_tells(name: str) -> None:
     animal = (GOOD | BAD)[name]
@@ -155,6 +156,7 @@ def test_one_that_raises_fails_and_the_good_one_beside_it_is_judged_as_if_alone(
     assert both["estimators"]["good"] == alone["estimators"]["good"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "on_error", "figure", "other"),
     [

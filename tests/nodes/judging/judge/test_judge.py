@@ -88,6 +88,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]
     return folder, found
 
 
+@pytest.mark.slow
 def test_a_runs_own_trajectories_get_its_figures(
     run: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -146,6 +147,7 @@ def test_every_exported_format_gives_the_same_figures(
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["se3", "sim3"])
 def test_errors_are_evos(how: str, tmp_path: Path) -> None:
     truth = walk(400)
@@ -171,6 +173,7 @@ def test_errors_are_evos(how: str, tmp_path: Path) -> None:
     assert found["rpe_1m_trans_percent"] == pytest.approx(expected, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("type_", bags.TYPES)
 def test_topics_of_bags_are_read_in_our_frames(type_: str, tmp_path: Path) -> None:
     """In `map` nothing has to be aligned: whatever is wrong with the axes would be an error."""
@@ -211,6 +214,7 @@ def camera_poses(truth: Trajectory) -> tuple[np.ndarray, Trajectory]:
 MOUNTED = "0.1 -0.2 0.3 0.5 0.5 0.5 0.5"
 
 
+@pytest.mark.slow
 def test_a_cameras_poses_are_judged_as_the_bodys(tmp_path: Path) -> None:
     """By numbers, by a file, by the name of an announced camera; of a file and of a bag."""
     truth = walk(300)

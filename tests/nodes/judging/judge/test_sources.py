@@ -63,6 +63,7 @@ def test_each_format_is_recognized_and_read_as_it_was_written(
     assert angle(found.poses, trajectory) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", FORMATS)
 @given(trajectory=trajectories(), data=st.data())
 @settings(max_examples=30, deadline=None)
@@ -117,6 +118,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "message"), WRONG)
 def test_each_bad_input_has_its_sentence(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "t").write_text(text)
@@ -231,6 +233,7 @@ def test_wrong_options_are_named(words: list[str], message: str, tmp_path: Path)
     assert message in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("topic", "change", "message"),
     [

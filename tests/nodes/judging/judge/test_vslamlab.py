@@ -89,6 +89,7 @@ def judged(sequence: Path, behaviour: str, *words: str) -> tuple[Result, dict[st
     return result, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("style", [[], ["--dashes"]])
 def test_runs_that_succeed_are_judged_with_their_spread(sequence: Path, style: list[str]) -> None:
     result, verdict = judged(sequence, "works", "--repeat", "3", *style)
@@ -112,6 +113,7 @@ def test_scale_is_aligned_in_mono_only(sequence: Path) -> None:
     assert result.exit_code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("behaviour", "why"),
     [
@@ -134,6 +136,7 @@ def test_a_run_that_fails_is_a_row_and_fails_the_whole(
     assert ("ate_rmse_m" in rows["00000"]) == works
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("behaviour", ["few", "another flight"])
 def test_what_cannot_be_compared_passes_nothing(sequence: Path, behaviour: str) -> None:
     result, verdict = judged(sequence, behaviour)
@@ -154,6 +157,7 @@ def test_a_run_that_hangs_is_ended_with_all_that_it_started(sequence: Path) -> N
     assert not stat.exists() or " Z " in stat.read_text()
 
 
+@pytest.mark.slow
 def test_what_an_earlier_experiment_left_does_not_count(sequence: Path) -> None:
     judged(sequence, "works")
     result, _ = judged(sequence, "nothing")

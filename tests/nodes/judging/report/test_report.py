@@ -102,6 +102,7 @@ def test_the_figures_are_there_with_thresholds_and_what_was_missed(run: Path, pa
     assert 'missed">' in page.markup
 
 
+@pytest.mark.slow
 def test_every_section_and_fact_is_there(page: Page) -> None:
     for text in (
         "Trajectories", "Errors over time", "Position error along each axis",

@@ -113,6 +113,7 @@ def test_the_run_dies(mirror: list[str], tmp_path: Path) -> None:
     assert "the run is gone" in error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [2, 3])
 def test_the_run_has_another_version(mirror: list[str], tmp_path: Path, kind: int) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
@@ -149,6 +150,7 @@ NOT_OF_A_RUN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("message", NOT_OF_A_RUN.values(), ids=NOT_OF_A_RUN.keys())
 def test_what_no_run_sends_is_an_error(mirror: list[str], tmp_path: Path, message: bytes) -> None:
     with listening(tmp_path / "s") as run:

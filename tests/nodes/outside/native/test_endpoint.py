@@ -193,6 +193,7 @@ def test_nothing_waits_for_a_program_that_is_gone(run: Noted, how: str) -> None:
         assert run.gone.empty()
 
 
+@pytest.mark.slow
 def test_close_does_not_wait_for_a_program_that_reads_nothing(run: Noted) -> None:
     with program(run.path) as raw:
         raw.get_ready()

@@ -144,6 +144,7 @@ def deaf() -> None:
 OTHERS = (spec(Others, "others"), spec(Ear, "ear"))
 
 
+@pytest.mark.slow
 def test_a_filter_gets_all_that_came_and_answers_each_tenth_sample(tmp_path: Path) -> None:
     asks = {"asks": "drone/imu", "every": 10}
     slam = fusion("further", reads=[*SENSORS], outputs=["raw"], **asks)
@@ -174,6 +175,7 @@ def test_a_filter_gets_all_that_came_and_answers_each_tenth_sample(tmp_path: Pat
     assert {"slam", "slam/raw"} <= {each["source"] for each in summary.announcements}
 
 
+@pytest.mark.slow
 def test_each_scan_and_each_estimate_may_ask(tmp_path: Path) -> None:
     for name, stamps in {"lidar": [2, 102], "vio": [0, 100]}.items():
         Ear.heard.clear()
@@ -201,6 +203,7 @@ def test_a_lost_estimator_is_a_row_without_a_pose_and_a_new_map_another_frame() 
     assert inputs.drain() == []
 
 
+@pytest.mark.slow
 def test_what_no_frame_takes_along_is_dropped_and_counted() -> None:
     inputs = Inputs(["lidar"])
     for each in announced():
@@ -235,16 +238,19 @@ def test_a_program_flies(tmp_path: Path) -> None:
     assert isinstance(land, Land)
 
 
+@pytest.mark.slow
 def test_a_program_that_is_not_the_pilot_does_not_fly(tmp_path: Path) -> None:
     with pytest.raises(VisnavError, match="ORDER: expected none, as the program does not fly"):
         fly(fusion("flies", asks="gnss"), tmp_path, 0.1, others=OTHERS)
 
 
+@pytest.mark.slow
 def test_without_images_poses_are_of_the_body(tmp_path: Path) -> None:
     with pytest.raises(VisnavError, match=r"READY\.pose_of: expected 1, the body"):
         fly(fusion("camera", asks="imu"), tmp_path, 0.1, others=OTHERS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [
@@ -267,6 +273,7 @@ def test_somebody_has_to_ask() -> None:
         program(asks="imu")
 
 
+@pytest.mark.slow
 def test_the_calibration_is_written_and_the_processors_are_few(tmp_path: Path) -> None:
     command = [sys.executable, FUSION, "$VISNAV_FOLDER/calibration.json"]
     fly(

@@ -81,6 +81,7 @@ def test_what_it_is_sent_depends_on_nothing_that_it_does(
         assert ("loses" in modes) == (summary.digest != plain.digest)
 
 
+@pytest.mark.slow
 def test_one_that_contradicts_itself_gets_the_same_but_is_not_called_reproducible(
     plain: Summary, tmp_path: Path
 ) -> None:
@@ -115,6 +116,7 @@ class Ear(Node[NodeConfig]):
         self.poses.append(event)
 
 
+@pytest.mark.slow
 def test_covariance_and_velocity_reach_the_estimates_turned_as_the_poses_are(
     tmp_path: Path,
 ) -> None:
@@ -129,6 +131,7 @@ def test_covariance_and_velocity_reach_the_estimates_turned_as_the_poses_are(
         assert np.reshape(pose.covariance, (6, 6)) == pytest.approx(expected, abs=1e-15)
 
 
+@pytest.mark.slow
 def test_a_program_finds_no_truth_before_the_end_and_then_it_is_there(tmp_path: Path) -> None:
     out = tmp_path / "runs" / "one"
     fly(program("spies"), out, 0.2, others=(spec(Evaluation, "evaluation"),), truth=True)
@@ -190,6 +193,7 @@ GOES_WRONG: dict[str, tuple[list[str], dict[str, Any], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", quick(GOES_WRONG, "dies", "nan", "ends at once"))
 def test_what_goes_wrong_is_one_error_that_says_all(what: str, tmp_path: Path) -> None:
     modes, settings, message = GOES_WRONG[what]
@@ -198,6 +202,7 @@ def test_what_goes_wrong_is_one_error_that_says_all(what: str, tmp_path: Path) -
     assert str(caught.value).startswith("slam: ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("policy", "lost", "reproducible", "passed"),
     [("lost", FRAMES - 5, True, False), ("continue", FRAMES - 5, False, False)],
@@ -216,6 +221,7 @@ def test_without_it_a_run_goes_on_if_it_may(
     assert "ended with exit code 7" in (tmp_path / "log.txt").read_text()
 
 
+@pytest.mark.slow
 def test_what_is_on_its_way_at_the_end_is_not_lost(tmp_path: Path) -> None:
     """The program ends when it is told to, with answers to come; and its exit code is looked at."""
     hold = {"on_missing": "lost"}
@@ -241,6 +247,7 @@ class Heard(logging.Handler):
         return next(created for created, text in self.said if what in text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", quick(["error", "lost", "continue", "restart"], "error"))
 def test_a_program_that_is_killed_is_missed_within_a_second(policy: str, tmp_path: Path) -> None:
     heard = Heard()
@@ -276,6 +283,7 @@ def test_no_child_of_it_stays(mode: str, tmp_path: Path) -> None:
     assert gone_soon(int(file.read_text()))
 
 
+@pytest.mark.slow
 def test_several_cameras_come_together_and_what_is_incomplete_is_left_out(tmp_path: Path) -> None:
     eyes: dict[str, Any] = {"cameras": ("left", "right"), "images": ("grey",), "leaves_out": (3, 7)}
     node = program("log", cameras=["left", "right"], images=["grey"])
@@ -284,6 +292,7 @@ def test_several_cameras_come_together_and_what_is_incomplete_is_left_out(tmp_pa
     assert "2 exposures lacked an image" in (tmp_path / "log.txt").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -410,6 +419,7 @@ def test_what_an_earlier_run_has_left_is_not_there_any_more(tmp_path: Path) -> N
     assert [*folder.iterdir()] == []
 
 
+@pytest.mark.slow
 def test_a_path_that_is_too_long_for_a_socket_is_no_hindrance(tmp_path: Path) -> None:
     out = tmp_path / ("x" * 120)
     assert fly(program(), out, 0.1).outside["slam"].answered == 3

@@ -211,6 +211,7 @@ def test_a_flood_is_counted_but_not_logged() -> None:
     assert found == ["x"] * LINES + ["(50 more lines)"] + ["x"] * (20 + LINES) + ["(1 more lines)"]
 
 
+@pytest.mark.slow
 def test_all_of_a_flood_is_read(start: type[Started]) -> None:
     it = start(*python("import os\nfor n in range(200): os.write(1, b'x' * 99 + b'\\n' * 1000)"))
     it.program.wait()

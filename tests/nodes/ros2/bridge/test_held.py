@@ -158,6 +158,7 @@ def test_answers_are_what_they_say_however_they_come(
         assert result.of(PoseEstimate) == reference.of(PoseEstimate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("behaviour", "hold", "message"),
     [
@@ -240,6 +241,7 @@ def test_what_is_missing_at_the_start_is_named(needs: list[str], missing: str) -
             run_node(Ros2Bridge, inputs=[*ANNOUNCED, *flight()], config=config)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

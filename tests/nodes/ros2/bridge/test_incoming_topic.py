@@ -105,6 +105,7 @@ def test_every_reader_reads_what_is_sane_and_refuses_what_is_cut_off(type_: str,
     assert len(ear.said) == 1
 
 
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 @given(st.sampled_from(ALL), st.data())
 def test_garbled_messages_become_events_or_nothing(
@@ -120,6 +121,7 @@ def test_garbled_messages_become_events_or_nothing(
     assert bool(ear.said) != (event is not None) or of[1] == "camera"
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(st.sampled_from(ALL), st.binary(max_size=400))
 def test_noise_becomes_events_or_nothing(of: tuple[str, str], noise: bytes) -> None:

@@ -69,6 +69,7 @@ def listener() -> Iterator[Listener]:
         yield Listener(session, locator)
 
 
+@pytest.mark.slow
 def test_a_bridge_of_zenoh_s_for_dds_gets_its_own_keys_and_no_attachment(
     listener: Listener,
 ) -> None:
@@ -95,6 +96,7 @@ def test_only_what_is_asked_for_is_published_under_the_name_that_is_asked_for(
     assert topics == {"truth", "drone/camera/camera_info", "drone/camera/image_raw/compressed"}
 
 
+@pytest.mark.slow
 def test_further_sensors_paths_and_mappings_of_the_users_own(listener: Listener) -> None:
     """Each event becomes its message, and a path grows but is sent seldom."""
     mapping = "tests.nodes.ros2.bridge.mappings"

@@ -194,6 +194,7 @@ def test_services_have_the_hashes_that_ros_gives_them(
     assert humble.hash(type_) == "TypeHashNotSupported"
 
 
+@pytest.mark.slow
 def test_time_is_paused_stepped_and_resumed_by_services() -> None:
     def drive(client: Client) -> None:
         features = client.call("/get_simulator_features", f"{SIMULATION}/GetSimulatorFeatures")
@@ -248,6 +249,7 @@ def test_a_step_ends_at_exactly_its_time() -> None:
     assert result.seconds == 0.5
 
 
+@pytest.mark.slow
 def test_vehicles_are_armed_take_off_and_land_and_the_reply_says_so() -> None:
     def drive(client: Client) -> None:
         assert client.set_state(1) == 1
@@ -263,6 +265,7 @@ def test_vehicles_are_armed_take_off_and_land_and_the_reply_says_so() -> None:
     assert {(each.vehicle, each.source) for each in commands} == {("drone", "ros2")}
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_does_not_obey_is_told_of() -> None:
     class Deaf(Vehicle):
         async def tell(self, told: type[VehicleEvent]) -> None:

@@ -51,6 +51,7 @@ def test_tokens_and_messages_are_seen_from_outside_and_end_with_the_session() ->
     assert (publisher.sent, publisher.failed) == (2, 1)
 
 
+@pytest.mark.slow
 def test_a_configuration_file_says_where_to_listen(tmp_path: Path) -> None:
     port = free_port()
     file = tmp_path / "zenoh.json5"

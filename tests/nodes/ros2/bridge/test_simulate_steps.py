@@ -108,6 +108,7 @@ def test_parts_of_actions_have_the_hashes_that_ros_gives_them(type_: str, expect
     assert store.hash(type_.replace("X", name)) == f"RIHS01_{expected}"
 
 
+@pytest.mark.slow
 def test_a_goal_steps_time_and_tells_how_far_it_is() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(7, 250)
@@ -154,6 +155,7 @@ def test_feedback_comes_while_steps_go_on_and_cancel_lets_time_stand() -> None:
     acted(drive)
 
 
+@pytest.mark.slow
 def test_all_goals_or_those_of_before_are_canceled() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, 1000)
@@ -169,6 +171,7 @@ def test_all_goals_or_those_of_before_are_canceled() -> None:
     acted(drive)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_done_is_aborted_and_says_why() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, 0)
@@ -193,6 +196,7 @@ def test_what_cannot_be_done_is_aborted_and_says_why() -> None:
     acted(drive)
 
 
+@pytest.mark.slow
 def test_goals_are_forgotten_but_for_the_last() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, FOREVER)
@@ -207,6 +211,7 @@ def test_goals_are_forgotten_but_for_the_last() -> None:
     acted(drive)
 
 
+@pytest.mark.slow
 def test_the_end_of_the_run_aborts_a_goal() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, FOREVER)
@@ -244,6 +249,7 @@ def test_real_time_aborts_and_says_that_it_cannot_be_stepped() -> None:
     assert acted(drive, run=run, paused=False) == "ended by ROS"
 
 
+@pytest.mark.slow
 def test_a_client_that_joins_late_gets_the_last_status() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, 1)

@@ -109,6 +109,7 @@ def test_the_file_may_say_in_which_frame_a_pose_is() -> None:
 numbers = st.floats(-100, 100)
 
 
+@pytest.mark.slow
 @given(
     st.tuples(numbers, numbers, numbers),
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 0.01),

@@ -92,6 +92,7 @@ def test_the_library_listens_where_no_page_can_find_it(server: Server) -> None:
     assert len({hidden_host() for _ in range(50)}) > 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [b"", b"GET / HT", b"\x00\xff" * 20_000, b"HELLO\r\n\r\n"])
 def test_who_says_something_else_is_sent_away_and_others_are_served(
     server: Server, words: bytes, monkeypatch: pytest.MonkeyPatch

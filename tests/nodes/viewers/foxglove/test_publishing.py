@@ -256,6 +256,7 @@ def test_a_camera_with_both_has_a_topic_for_the_grey_ones(
     assert pixels[3, 4] == pytest.approx(90, abs=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{"image_rate": 0}, {"depth": False}])
 def test_what_is_not_to_be_shown_has_no_topic(
     server: Server, viewer: Viewer, settings: dict[str, Any]
@@ -355,6 +356,7 @@ def test_the_run_s_time_is_told(server: Server, viewer: Viewer) -> None:
     assert viewer.times[-1] == STAMP
 
 
+@pytest.mark.slow
 def test_a_viewer_that_vanishes_is_survived(server: Server, viewer: Viewer) -> None:
     stage = Stage(server)
     gone = Viewer(server.address)

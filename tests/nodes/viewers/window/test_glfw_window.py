@@ -35,6 +35,7 @@ def test_an_image_fills_the_window_in_one_direction(
     assert letterbox(*image, *window) == expected
 
 
+@pytest.mark.slow
 def test_importing_the_nodes_imports_neither_glfw_nor_opengl() -> None:
     """A machine without a display, or without the libraries, can import and list the nodes."""
     code = (

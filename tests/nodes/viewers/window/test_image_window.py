@@ -71,6 +71,7 @@ def test_keys_held_together_are_both_down_until_each_comes_up(shared: Run) -> No
     shared.wait_for("KeyReleased", key="left_shift")
 
 
+@pytest.mark.slow
 def test_a_held_key_is_not_repeated(shared: Run) -> None:
     """What the X server repeats while a key is held is told once."""
     shared.heard.clear()

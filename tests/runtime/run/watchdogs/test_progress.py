@@ -160,6 +160,7 @@ class Cancels(Node):
             task.cancel()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 def test_a_node_that_cancels_all_tasks_is_named(clock: str, tmp_path: Path) -> None:
     run = RunConfig(clock=clock, duration=Duration(1.0))  # type: ignore[arg-type]

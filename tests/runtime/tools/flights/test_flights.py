@@ -212,6 +212,7 @@ def test_every_way_to_import_is_known(statement: str, tmp_path: Path) -> None:
     assert ("flying.helper" if "from ." in statement else "helper") in found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["{}", ".{}.lock", ".{}.new", ""])
 @pytest.mark.parametrize("kind", ["fifo", "folder"])
 def test_what_has_a_name_of_the_cache_neither_hangs_nor_fails_a_run(
@@ -294,6 +295,7 @@ def test_calls_that_the_flight_does_not_know_are_an_error(tmp_path: Path) -> Non
         events_of(flown(tmp_path, "captain.end=1.0"), watch=played)
 
 
+@pytest.mark.slow
 def test_a_flight_that_fails_is_not_kept(tmp_path: Path) -> None:
     config = flown(tmp_path, "craft.fail=true", "craft.lens=false")
     assert recorded(config, record=True) is None
@@ -302,6 +304,7 @@ def test_a_flight_that_fails_is_not_kept(tmp_path: Path) -> None:
         events_of(config)
 
 
+@pytest.mark.slow
 def test_a_signal_during_the_flight_ends_what_was_to_follow(tmp_path: Path) -> None:
     config = flown(tmp_path, "craft.signal=true", "craft.lens=false")
     with pytest.raises(KeyboardInterrupt):

@@ -111,6 +111,7 @@ async def test_the_page_comes_with_the_token_and_runs_no_script_but_its_own() ->
     assert "https://" not in content
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("request_", "status"),
     [
@@ -214,6 +215,7 @@ def test_a_page_is_served_until_the_run_is_over(
     assert "the monitor is at http://127.0.0.1:" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_page_needs_no_textual() -> None:
     """In a fresh process, as other tests have imported it."""
     code = "import sys; sys.modules['textual'] = None; import runtime.tools.monitor.web"

@@ -188,6 +188,7 @@ def test_a_terminal_shows_whole_numbers_in_at_most_100_columns(tmp_path: Path, w
     assert "all:" not in summary_text(one, [pretend(job) for job in one.jobs][:0])
 
 
+@pytest.mark.slow
 def test_missed_and_failed_runs_are_two_counts(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.rate=60,5", seeds=4)
     rows = [pretend(job) for job in plan.jobs]

@@ -37,6 +37,7 @@ def test_values_are_split_at_the_commas_between_them(pieces: list[tuple[str, str
     assert split(text, "") == tuple(piece for piece, _ in pieces)
 
 
+@pytest.mark.slow
 @given(values)
 def test_a_value_in_toml_is_read_as_such(original: Any) -> None:
     assert value(written(original)) == original

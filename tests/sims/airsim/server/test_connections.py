@@ -186,6 +186,7 @@ def test_requests_of_one_connection_begin_in_order_and_end_as_they_do() -> None:
     serve(scenario)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after_a_long_one", [False, True])
 def test_a_flood_of_one_client_leaves_turns_of_the_loop_to_others(
     *, after_a_long_one: bool

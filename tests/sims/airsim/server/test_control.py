@@ -158,6 +158,7 @@ def test_reset_resets_every_vehicle_and_its_sensors(tiny_world: str) -> None:
     assert [e.source for e in sent if isinstance(e, Disarmed)] == ["b"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("between", ["armDisarm", "reset"])
 def test_a_script_flies_at_the_instant_at_which_another_one_has_disarmed(
     between: str, tiny_world: str

@@ -234,6 +234,7 @@ def test_a_newer_task_ends_the_older_whose_reply_comes_first(tiny_world: str) ->
     fly(tiny_world, script, time="paused")
 
 
+@pytest.mark.slow
 def test_a_task_goes_on_without_its_client_and_without_api_control(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         other = Caller(caller._socket.getpeername()[1])
@@ -260,6 +261,7 @@ def test_nothing_elapses_while_time_stands(tiny_world: str) -> None:
     fly(tiny_world, script, time="paused")
 
 
+@pytest.mark.slow
 def test_sixty_milliseconds_after_its_last_order_a_vehicle_hovers(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         caller("simContinueForTime", 0.51)
@@ -289,6 +291,7 @@ def test_two_vehicles_fly_at_once(tiny_world: str) -> None:
     fly(tiny_world, script, "a", "b")
 
 
+@pytest.mark.slow
 def test_a_disarmed_vehicle_ends_its_task_and_falls(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         caller("takeoff", 20, "")
@@ -345,6 +348,7 @@ NUMBERS = [
 ]
 
 
+@pytest.mark.slow
 def test_no_number_that_is_none_reaches_a_vehicle(tiny_world: str) -> None:
     """Nor does one in a structure; and the vehicle flies as before."""
 

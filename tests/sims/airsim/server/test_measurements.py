@@ -28,6 +28,7 @@ ALL: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 def test_sensors_are_read_in_airsims_units(tiny_world: str) -> None:
     def script(airsim: Caller) -> None:
         assert airsim("getGpsData", "", "")["is_valid"] is False

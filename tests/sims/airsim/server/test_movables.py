@@ -94,6 +94,7 @@ def test_what_cannot_be_brought_in_is_refused(tiny_world: str) -> None:
     with_script(script, [drone(world=tiny_world)], **CUBES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asset", ["Cube", "person"])
 def test_a_vehicle_collides_with_what_is_brought_in(asset: str, tiny_world: str) -> None:
     def script(airsim: Caller) -> None:
@@ -117,6 +118,7 @@ _steps = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=_steps)
 def test_names_stay_unique_and_poses_exact(steps: list[Any], tiny_world: str) -> None:
@@ -147,6 +149,7 @@ def test_names_stay_unique_and_poses_exact(steps: list[Any], tiny_world: str) ->
     with_script(script, [drone(world=tiny_world)], **CUBES)
 
 
+@pytest.mark.slow
 def test_equal_scripts_with_objects_give_equal_runs(tiny_world: str) -> None:
     def script(airsim: Caller) -> None:
         airsim("simContinueForTime", 0.1)

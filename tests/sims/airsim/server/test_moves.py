@@ -50,6 +50,7 @@ def moved(task: Task, begin: Vector3, *, lag: float, most: int) -> tuple[bool | 
     return None, position
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     path=PATHS,
@@ -79,6 +80,7 @@ def test_each_path_ends_near_its_last_point(
     assert math.dist(end, path[-1]) < 2.0 * CLOSE
 
 
+@pytest.mark.slow
 @given(path=PATHS, positions=st.lists(POINTS, max_size=20), lookahead=st.floats(0.01, 1e6))
 def test_progress_never_goes_back_and_the_follower_is_on_the_path(
     path: Sequence[Vector3], positions: list[Vector3], lookahead: float
@@ -158,6 +160,7 @@ def test_yaw_rates_of_all_modes(
     assert rate == pytest.approx(gain * expected)
 
 
+@pytest.mark.slow
 @given(st.floats(-1e6, 1e6))
 def test_angles_are_wrapped(angle: float) -> None:
     wrapped = moves.wrapped(angle)
@@ -165,6 +168,7 @@ def test_angles_are_wrapped(angle: float) -> None:
     assert math.cos(wrapped - angle) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [3.0, 5.0, 12.0])
 @pytest.mark.parametrize("goal", [(20.0, 20.0, -UP - 5.0), (0.0, 0.0, -UP + 4.0)])
 def test_moves_end_where_they_should_and_stay_there(speed: float, goal: Vector3) -> None:
