@@ -30,7 +30,7 @@ _DORA = (sys.executable, "-c", "import sys, dora_cli; sys.exit(dora_cli.py_main(
 _POOL = 1 << 26
 
 
-def _dataflow(case: system.Case) -> bytes:
+def _dataflow(case: system.Case, directory: str) -> bytes:
     others = range(2, case.nodes + 1)
     pongs = {f"pong{n}": {"source": f"node{n}/pong", "queue_size": 1000} for n in others}
     nodes: list[dict[str, object]] = [
@@ -40,7 +40,7 @@ def _dataflow(case: system.Case) -> bytes:
         {
             "id": f"node{number}",
             "path": sys.executable,
-            "args": f"-m {__name__} {number} {case.case}",
+            "args": f"-m {__name__} {number} {case.case} {directory}",
             "inputs": {"ping": {"source": "node1/ping", "queue_size": 1000}},
             "outputs": ["pong"],
         }
@@ -84,11 +84,10 @@ def _retry(do: Callable[[], None]) -> None:
         time.sleep(0.05)
 
 
-def run(number: int, case: str) -> None:
-    """Be a node, as long as the daemon is there."""
-    daemon = os.getppid()
+def run(number: int, case: str, directory: Path) -> None:
+    """Be a node, as long as the directory of the dataflow is there."""
     node: Any = importlib.import_module("dora").Node()
-    while os.getppid() == daemon:
+    while directory.exists():
         event = node.next(timeout=1.0)
         if event is None or event["type"] != "INPUT":
             continue
@@ -112,7 +111,7 @@ def measure(case: system.Case) -> system.Samples:
     coordinator = ("coordinator", "--port", str(port), "--store", "memory", "--quiet")
     daemon = ("daemon", "--coordinator-port", str(port), "--local-listen-port", str(listening))
     with tempfile.TemporaryDirectory() as directory:
-        Path(directory, "flow.yml").write_bytes(_dataflow(case))
+        Path(directory, "flow.yml").write_bytes(_dataflow(case, directory))
         with _running(directory, port, *coordinator), _running(directory, listening, *daemon):
             _retry(lambda: _start(directory, port))
             return _exchange(case, listening)
@@ -150,4 +149,4 @@ SYSTEMS = (system.in_processes("dora", ("stream",), measure, 400, **_PACKAGES),)
 
 
 if __name__ == "__main__":
-    run(int(sys.argv[1]), sys.argv[2])
+    run(int(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
