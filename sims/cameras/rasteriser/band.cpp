@@ -12,7 +12,7 @@ constexpr std::int32_t clear_part = 1 << 30;
 Band::Band(Scene& scene, int first, int last, const Images& images)
     : scene_(scene), lens_(*scene.lens_), view_(scene.view_), first_(first), last_(last),
       images_(images), end_(images.rgb ? row(last) : nullptr), nearest_(scene.nearest_.data()),
-      visible_(scene.visible_.data()), taps_(lens_.stride),
+      visible_(scene.visible_.data()), taps_(lens_.stride, scene.texels.data()),
       farthest_(lens_.pinhole ? 0 : leaf(0, last + Lens::smallest)) {}
 
 const Triangle& Band::triangle(std::int32_t number) const {
@@ -34,7 +34,7 @@ Corners Band::between_poses(std::int32_t number, int y) const {
 bool Band::seen(Triangle& triangle, std::int32_t number, int y) const {
     const Corners corners = between_poses(number, y);
     if (corners.away >= 0) return false;
-    triangle.see(corners);
+    triangle.planes = Planes(corners);
     return true;
 }
 
@@ -64,7 +64,8 @@ void Band::finish() {
     if (images_.numbers && !images_.rgb)  // else they are known by now
         for (int y = first_; y < last_; ++y)
             runs(y, [&](int left, int right, std::int32_t seen) {
-                number(y, left, right, seen < 0 ? nullptr : &triangle(seen));
+                number(y, left, right,
+                       seen < 0 ? -1 : scene_.placed_[triangle(seen).geom].geom->number);
             });
     blend();
     if (images_.depth) measure();
@@ -77,7 +78,7 @@ inline void Band::over(const Triangle& triangle, std::int32_t number, Found foun
     const Placed& placed = scene_.placed_[triangle.geom];
     if (!lens_.pinhole) {
         Triangle later = triangle;
-        if (view_.poses > 1) later.see(moving(number).to);
+        if (view_.poses > 1) later.planes = Planes(moving(number).to);
         // The squares about the pixels where it may be, if these are less than the geom's.
         int side = 2 * Lens::smallest;
         while (side < std::max(triangle.right - triangle.left, triangle.bottom - triangle.top))
@@ -99,26 +100,26 @@ inline void Band::over(const Triangle& triangle, std::int32_t number, Found foun
 
 template <typename Found>
 inline void Band::scan_frame(const Triangle& triangle, int top, int bottom, Found found) {
-    const float(&e)[3][3] = triangle.edges;
-    const float(&d)[3] = triangle.depth;
+    const Vec3f e[3] = {triangle.planes[0], triangle.planes[1], triangle.planes[2]};
+    const Vec3f d = triangle.planes.depth();
     const fv nearest = fv{} + 1.0f / view_.near;
     const int left = triangle.left & ~(lanes - 1);
     const bool wide = triangle.right - left > 4 * lanes;
     const float start = lens_.x[0], steps = static_cast<float>(1.0 / lens_.step[0]);
     float slope[3];  // of the columns in which the edges are, by row
-    for (int k = 0; k < 3; ++k) slope[k] = e[k][0] != 0 ? -1.0f / e[k][0] : 0;
+    for (int k = 0; k < 3; ++k) slope[k] = e[k].x != 0 ? -1.0f / e[k].x : 0;
     bottom = std::min(bottom, last_);
     for (int y = std::max(top, first_); y < bottom; ++y) {
         const float down = lens_.y[y];
         float in[3];
-        for (int k = 0; k < 3; ++k) in[k] = e[k][1] * down + e[k][2];
-        const float depth = d[1] * down + d[2];
+        for (int k = 0; k < 3; ++k) in[k] = e[k].y * down + e[k].z;
+        const float depth = d.y * down + d.z;
         int from = left, to = triangle.right;
         if (wide) {  // the columns between the edges, and a few more for rounding
             float low = lens_.x[triangle.left], high = lens_.x[triangle.right - 1];
             for (int k = 0; k < 3; ++k) {
-                if (e[k][0] > 0) low = std::max(low, in[k] * slope[k]);
-                if (e[k][0] < 0) high = std::min(high, in[k] * slope[k]);
+                if (e[k].x > 0) low = std::max(low, in[k] * slope[k]);
+                if (e[k].x < 0) high = std::min(high, in[k] * slope[k]);
             }
             const float begin = (low - start) * steps - 3, end = (high - start) * steps + 4;
             if (!(begin < end)) continue;
@@ -126,9 +127,9 @@ inline void Band::scan_frame(const Triangle& triangle, int top, int bottom, Foun
             if (end < to) to = static_cast<int>(end);
         }
         for (int x = from; x < to; x += lanes) {
-            const fv rays = load<fv>(&lens_.x[x]), q = rays * d[0] + depth;
-            const iv inside = (rays * e[0][0] + in[0] >= 0.0f) & (rays * e[1][0] + in[1] >= 0.0f) &
-                              (rays * e[2][0] + in[2] >= 0.0f) & (q > 0.0f) & (q <= nearest);
+            const fv rays = load<fv>(&lens_.x[x]), q = rays * d.x + depth;
+            const iv inside = (rays * e[0].x + in[0] >= 0.0f) & (rays * e[1].x + in[1] >= 0.0f) &
+                              (rays * e[2].x + in[2] >= 0.0f) & (q > 0.0f) & (q <= nearest);
             found(y, x, inside, q);
         }
     }
@@ -144,14 +145,14 @@ void Band::over_square(const Triangle& triangle, const Triangle& later, std::int
     i4 met = (rays.low[2] <= rays.high[2]) & (most(rays, triangle.ahead) >= triangle.least);
     f4 nearest{};
     if (side <= Lens::small) {
-        const auto reach = [&](const float(&now)[3], const float(&then)[3]) {
-            const f4 one = most(rays, {now[0], now[1], now[2]});
+        const auto reach = [&](int plane) {
+            const f4 one = most(rays, triangle.planes[plane]);
             if (view_.poses == 1) return one;
-            const f4 other = most(rays, {then[0], then[1], then[2]});
+            const f4 other = most(rays, later.planes[plane]);
             return one < other ? other : one;
         };
-        for (int k = 0; k < 3; ++k) met &= reach(triangle.edges[k], later.edges[k]) >= 0.0f;
-        nearest = reach(triangle.depth, later.depth);
+        for (int k = 0; k < 3; ++k) met &= reach(k) >= 0.0f;
+        nearest = reach(3);
         met &= nearest >= 0.0f;
     }
     side /= 2;
@@ -199,7 +200,8 @@ inline void Band::over_leaf(const Triangle& triangle, std::int32_t number, int l
 template <typename Found>
 inline bool Band::scan_pixels(const Triangle& triangle, int left, int right, int top, int bottom,
                               Found found) const {
-    const float(&e)[3][3] = triangle.edges;
+    const Vec3f e[3] = {triangle.planes[0], triangle.planes[1], triangle.planes[2]};
+    const Vec3f depth = triangle.planes.depth();
     const fv nearest = fv{} + 1.0f / view_.near;
     bool touched = false;
     for (int y = top; y < bottom; ++y)
@@ -207,8 +209,8 @@ inline bool Band::scan_pixels(const Triangle& triangle, int left, int right, int
             const std::size_t here = std::size_t(y) * lens_.stride + x;
             const fv rx = load<fv>(&lens_.x[here]), ry = load<fv>(&lens_.y[here]);
             const fv rz = load<fv>(&lens_.z[here]);
-            const auto times = [&](const float(&p)[3]) { return rx * p[0] + (ry * p[1] + rz * p[2]); };
-            const fv q = times(triangle.depth);
+            const auto times = [&](Vec3f p) { return rx * p.x + (ry * p.y + rz * p.z); };
+            const fv q = times(depth);
             const iv inside = (times(e[0]) >= 0.0f) & (times(e[1]) >= 0.0f) &
                               (times(e[2]) >= 0.0f) & (q > 0.0f) & (q <= nearest);
             if (!any(inside)) continue;
@@ -231,10 +233,11 @@ void Band::cover(const Triangle& triangle, std::int32_t number) {
 
 // Whether a pixel on an edge is the triangle's, and not that of the one beyond.
 static bool owns(const Triangle& triangle, Vec3f ray) {
-    for (const auto& edge : triangle.edges)
-        if (edge[0] * ray.x + (edge[1] * ray.y + edge[2] * ray.z) == 0.0f &&
-            !(edge[0] > 0 || (edge[0] == 0 && edge[1] > 0)))
-            return false;
+    const f4 at = triangle.planes(ray);
+    for (int k = 0; k < 3; ++k) {
+        const Vec3f edge = triangle.planes[k];
+        if (at[k] == 0.0f && !(edge.x > 0 || (edge.x == 0 && edge.y > 0))) return false;
+    }
     return true;
 }
 
@@ -251,6 +254,7 @@ void Band::blend() {
     for (std::size_t part = scene_.clear_.size(); part-- > 0;) {
         std::int32_t number = clear_part | static_cast<std::int32_t>(part) << parts_from;
         for (const Triangle& triangle : scene_.clear_[part]) {
+            const std::int32_t geom = scene_.placed_[triangle.geom].geom->number;
             if (front.empty()) front.assign(nearest_ + at(first_), nearest_ + at(last_) + widest);
             over(triangle, number, [&](int y, int x, iv inside, fv q) {
                 const std::size_t here = at(y) + x;
@@ -258,7 +262,7 @@ void Band::blend() {
                 for (int k = 0; k < lanes && x + k < lens_.width; ++k) {
                     if (!wins[k] || !owned(triangle, number, x + k, y)) continue;
                     float& most = front[here - at(first_) + k];
-                    if (q[k] > most) most = q[k], this->number(y, x + k, x + k + 1, &triangle);
+                    if (q[k] > most) most = q[k], this->number(y, x + k, x + k + 1, geom);
                     if (images_.rgb) mix(x + k, y, q[k], number);
                 }
             });
@@ -289,10 +293,10 @@ void Band::measure() const {
 }
 
 // Write the number of a geom, -1 for none, into pixels side by side.
-void Band::number(int y, int left, int right, const Triangle* seen) const {
+void Band::number(int y, int left, int right, std::int32_t number) const {
     if (!images_.numbers) return;
     std::int32_t* to = images_.numbers + std::size_t(y - view_.first) * lens_.width;
-    std::fill(to + left, to + right, seen ? scene_.placed_[seen->geom].geom->number : -1);
+    std::fill(to + left, to + right, number);
 }
 
 }  // namespace raster

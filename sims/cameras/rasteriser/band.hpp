@@ -5,26 +5,6 @@
 
 namespace raster {
 
-// What a triangle's planes say of a ray: three edges, positive inside, and the inverse depth.
-struct Planes {
-    f4 x, y, z;
-
-    explicit Planes(const Triangle& of)
-        : x{of.edges[0][0], of.edges[1][0], of.edges[2][0], of.depth[0]},
-          y{of.edges[0][1], of.edges[1][1], of.edges[2][1], of.depth[1]},
-          z{of.edges[0][2], of.edges[1][2], of.edges[2][2], of.depth[2]} {}
-
-    explicit Planes(const Corners& of) {  // seen from the front
-        for (int k = 0; k < 3; ++k) {
-            const Vec3f edge = narrow(of.edges[k] * -1.0);
-            x[k] = edge.x, y[k] = edge.y, z[k] = edge.z;
-        }
-    }
-
-    f4 operator()(Vec3f ray) const { return x * ray.x + (y * ray.y + z * ray.z); }
-    Vec3f operator[](int k) const { return {x[k], y[k], z[k]}; }
-};
-
 class Band {
   public:
     Band(Scene& scene, int first, int last, const Images& images);
@@ -44,14 +24,20 @@ class Band {
     };
 
     static constexpr int most_triangles = 64;  // of a pixel that are walked over
-    static constexpr int run = 16;  // pixels side by side with one level of a mipmap
+    struct Span {  // pixels side by side with one level of a mipmap, in 256ths
+        std::int32_t surface;  // number of theirs; -1 for the sky
+        int x, count, level;
+        float nearest;  // inverse depth in the middle
+    };
+    static constexpr int most_side_by_side = 16;
+
     // A mipmap's level whose texels are as large as a pixel blurs more than the pixel; so many 256ths
     // below it are nearer to the mean of 16 samples. 128 would be nearest, but too far from MuJoCo's.
     static constexpr int sharper = 64;
 
     const Triangle& triangle(std::int32_t number) const;
     std::int32_t& surface_of(std::int32_t number);
-    const Surface& surface(std::int32_t number, int y);
+    std::int32_t surface(std::int32_t number, int y);
     const Moving& moving(std::int32_t number) const;
     Corners between_poses(std::int32_t number, int y) const;
     bool seen(Triangle& triangle, std::int32_t number, int y) const;
@@ -73,22 +59,24 @@ class Band {
     void runs(int y, Found found) const;
     void cover(const Triangle& triangle, std::int32_t number);
     void shade();
-    void place(int y, int left, int right, std::int32_t number);
+    template <bool pinhole>
+    void find_levels(int y);
+    template <bool pinhole>
+    void place(int y);
+    template <bool pinhole>
+    void place(const Span& span, int y, const float* nearest);
     void place_sky(int y, int left, int right);
     void plain(int x);
-    template <bool pinhole>
-    void place(const Surface& surface, int x, int y, const float* nearest, int count);
-    template <bool pinhole>
-    int detail(const Surface& surface, int x, int y, float inverse) const;
     Colours colours(int x);
     void mix(int x, int y, float nearest, std::int32_t number);
     void write(std::uint8_t* to, Colours colours, int count) const;
-    End end(const Triangle& triangle, const Planes& planes, Vec3f from, Vec3f to, int y) const;
+    End end(const Triangle& triangle, Vec3f from, Vec3f to, int y) const;
     void smooth(int x, int y, bool below);
+    void find_below(int y, const std::int32_t* above, const std::int32_t* parts);
     void smooth_outlines() const;
     void blend();
     void measure() const;
-    void number(int y, int left, int right, const Triangle* seen) const;
+    void number(int y, int left, int right, std::int32_t number) const;
 
     std::size_t at(int y) const { return std::size_t(y - view_.first) * lens_.stride; }
     std::size_t leaf(int x, int y) const {
@@ -109,6 +97,8 @@ class Band {
     std::int32_t* const visible_;
     Taps taps_;
     std::vector<Outline> outlines_;
+    std::size_t first_row_ = 0;  // how many are within its first row
+    std::vector<Span> spans_;  // of a row
     std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
     std::vector<Surface> surfaces_;
     std::vector<Shade> shades_;

@@ -21,17 +21,16 @@ inline float power_of_2(float x) {
     return share * scale;
 }
 
-// Logarithm to base 2 of x > 0; absolute error below 1e-4.
-inline float log_2(float x) {
-    std::int32_t bits;
-    std::memcpy(&bits, &x, sizeof bits);
-    const int exponent = (bits >> 23) - 127;
-    bits = (bits & 0x7fffff) | 0x3f800000;
-    float y;
-    std::memcpy(&y, &bits, sizeof y);
-    y -= 1.0f;  // a polynomial in y from 0 to 1, exact at both ends
-    return exponent + y * (1.44252727f + y * (-0.71791348f + y * (0.456540411f + y * (-0.275968957f + y * (0.120100259f + y * -0.025285506f)))));
+// Logarithms to base 2 of x > 0; absolute error below 1e-4.
+inline fv log_2(fv x) {
+    const iv bits = reinterpret_cast<iv>(x);
+    // A polynomial in y from 0 to 1, exact at both ends.
+    const fv y = reinterpret_cast<fv>((bits & 0x7fffff) | 0x3f800000) - 1.0f;
+    return as_float((bits >> 23) - 127) +
+           y * (1.44252727f + y * (-0.71791348f + y * (0.456540411f + y * (-0.275968957f + y * (0.120100259f + y * -0.025285506f)))));
 }
+
+inline float log_2(float x) { return log_2(fv{} + x)[0]; }
 
 inline Vec3 unit(Vec3 a) {
     const double length = root(dot(a, a));

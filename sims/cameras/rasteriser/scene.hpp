@@ -100,19 +100,34 @@ inline f4 most(const Lens::Square& rays, Vec3f plane) {
             (plane.z > 0 ? rays.high : rays.low)[2] * plane.z);
 }
 
+// What the planes of a triangle say of a ray: of three edges, positive inside, and its inverse depth.
+struct Planes {
+    f4 x, y, z;
+
+    Planes() = default;
+    explicit Planes(const Corners& of) {
+        const double share = 1.0 / of.away, side = of.away > 0 ? 1.0 : -1.0;
+        for (int k = 0; k < 3; ++k) set(k, of.edges[k] * side);
+        set(3, (of.edges[0] + of.edges[1] + of.edges[2]) * share);
+    }
+
+    f4 operator()(Vec3f ray) const { return x * ray.x + (y * ray.y + z * ray.z); }
+    Vec3f operator[](int k) const { return {x[k], y[k], z[k]}; }
+    Vec3f depth() const { return (*this)[3]; }
+
+  private:
+    void set(int k, Vec3 plane) {
+        const Vec3f found = narrow(plane);
+        x[k] = found.x, y[k] = found.y, z[k] = found.z;
+    }
+};
+
 struct Triangle {
-    float depth[3];     // inverse depth, times the ray
-    float edges[3][3];  // positive inside
+    Planes planes;
     std::int32_t geom, corner, part;  // its parts count on from geom to geom
     int left, right, top, bottom;  // pixels that it may cover: to right - 1 and bottom - 1
     Vec3f ahead;                   // towards the ball about it, and the least cosine of rays to it
     float least;
-
-    void see(const Corners& corners) {
-        const double share = 1.0 / corners.away, side = corners.away > 0 ? 1.0 : -1.0;
-        put(depth, (corners.edges[0] + corners.edges[1] + corners.edges[2]) * share);
-        for (int k = 0; k < 3; ++k) put(edges[k], corners.edges[k] * side);
-    }
 };
 
 struct Moving {  // a triangle that is seen from one pose in its first row, and another in its last
@@ -131,6 +146,7 @@ struct Surface {  // what is interpolated on a triangle, each times the ray
     float u[3], v[3], w[3];  // w of a cube, in which they are a direction
     float light[3][3];
     std::int32_t shades;  // number of the first
+    std::int32_t part, number;  // of its triangle and its geom
     bool flat;
     std::uint16_t same[3];  // the light of a flat one, in 65536ths
     const Texture* texture;
@@ -144,6 +160,10 @@ struct Placed {  // a geom of the frame
     Vec3 shift;                    // of its mesh's origin from the eye, in the optical frame
     Matrix turn;                   // from the mesh's axes to the optical frame
     std::int32_t parts;            // how many those before it have
+    std::vector<std::int32_t> listed;  // of each of its triangles, unless all moves: the number in
+                                       // `list`, or one of the following
+    static constexpr std::int32_t faces_away = -1, out_of_view = -2;
+    const std::vector<Triangle>* list;
     bool is_seen;                  // whether the following are known
     std::vector<Vec3> seen;        // its vertices in the optical frame
     std::vector<Lens::Pixel> pixels;  // and, by a lens, in the image
@@ -189,7 +209,7 @@ class Scene {
     int beyond(const Placed& placed) const;
     static double ball(Vec3 middle, double reach, Vec3f& ahead, float& least);
     bool in_squares(Placed& placed, const Placed& later) const;
-    void add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) const;
+    void add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving);
     bool bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels,
                  int count) const;
     void light(const Geom& geom, const Pose& pose, Slot& slot) const;

@@ -33,16 +33,15 @@ void Scene::light(const Geom& geom, const Pose& pose, Slot& slot) const {
     slot.geom = geom, slot.pose = pose;
 }
 
-// Planes of all that is interpolated on a triangle, computed when its first pixel is shaded; while
-// it moves, those of a row.
-const Surface& Band::surface(std::int32_t number, int y) {
+// Number of a triangle's surface: the planes of all that is interpolated on it, computed when its
+// first pixel is shaded; while it moves, those of a row.
+std::int32_t Band::surface(std::int32_t number, int y) {
     const bool rolling = view_.poses > 1;
+    const auto index = static_cast<std::int32_t>(surfaces_.size());
     if (!rolling) {
         std::int32_t& known = surface_of(number);
-        if (known >= 0) return surfaces_[known];
-        known = static_cast<std::int32_t>(surfaces_.size());
-    } else {
-        surfaces_.clear(), shades_.clear();
+        if (known >= 0) return known;
+        known = index;
     }
     const Triangle& triangle = this->triangle(number);
     const Placed& placed = scene_.placed_[triangle.geom];
@@ -58,6 +57,7 @@ const Surface& Band::surface(std::int32_t number, int y) {
         put(to, weights[0] * double(a) + weights[1] * double(b) + weights[2] * double(c));
     };
     Surface made{};
+    made.part = triangle.part, made.number = geom.number;
     put(made.depth, weights[0] + weights[1] + weights[2]);
     made.opacity = 1.0f - (1.0f - geom.rgba[3]) * (1.0f - geom.rgba[3]);  // MuJoCo draws it twice
     if (geom.texture >= 0) {
@@ -120,7 +120,7 @@ const Surface& Band::surface(std::int32_t number, int y) {
         shades_.push_back(shade);
     }
     surfaces_.push_back(made);
-    return surfaces_.back();
+    return index;
 }
 
 // How much of a light reaches points, which are seen from it: of four pixels of its map about each,
@@ -151,54 +151,80 @@ static fv reaches(const Light& light, const Shade& shade, fv x, fv y, fv z) {
     return inside ? lit : fv{} + 1.0f;
 }
 
-static float times(const float (&plane)[3], Vec3f ray) {
-    return plane[0] * ray.x + (plane[1] * ray.y + plane[2] * ray.z);
+// Find the levels of mipmaps whose texels are as large as a pixel in the middle of each span.
+template <bool pinhole>
+void Band::find_levels(int y) {
+    static constexpr Surface none{};
+    const int count = static_cast<int>(spans_.size());
+    for (int first = 0; first < count; first += lanes) {
+        float planes[4][3][lanes], sizes[2][lanes], rays[3][3][lanes], nearest[lanes];
+        std::int32_t cubes[lanes], levels[lanes];
+        for (int lane = 0; lane < lanes; ++lane) {
+            const Span& span = spans_[std::min(first + lane, count - 1)];
+            const bool textured = span.surface >= 0 && surfaces_[span.surface].texture;
+            const Surface& surface = textured ? surfaces_[span.surface] : none;
+            for (int k = 0; k < 3; ++k) {
+                planes[0][k][lane] = surface.u[k], planes[1][k][lane] = surface.v[k];
+                planes[2][k][lane] = surface.w[k], planes[3][k][lane] = surface.depth[k];
+            }
+            sizes[0][lane] = surface.width, sizes[1][lane] = surface.height;
+            cubes[lane] = textured && surface.texture->is_cube ? -1 : 0;
+            levels[lane] = textured ? (surface.texture->levels() - 1) << 8 : 0;
+            nearest[lane] = span.nearest;
+            const int x = span.x + span.count / 2;
+            const auto put = [&](int which, Vec3f ray) {
+                rays[which][0][lane] = ray.x, rays[which][1][lane] = ray.y;
+                rays[which][2][lane] = ray.z;
+            };
+            const Vec3f here = lens_.ray(x, y);
+            put(0, here);
+            if constexpr (pinhole) continue;
+            put(1, lens_.ray(std::min(x + 1, lens_.width - 1), y) - here);
+            put(2, lens_.ray(x, std::min(y + 1, lens_.height - 1)) - here);
+        }
+        const auto times = [&](int plane, int ray) {
+            if (pinhole && ray)
+                return load<fv>(planes[plane][ray - 1]) * static_cast<float>(lens_.step[ray - 1]);
+            const auto product = [&](int k) {
+                return load<fv>(planes[plane][k]) * load<fv>(rays[ray][k]);
+            };
+            return product(0) + (product(1) + product(2));
+        };
+        const fv inverse = 1.0f / load<fv>(nearest);
+        const fv u = times(0, 0) * inverse, v = times(1, 0) * inverse, w = times(2, 0) * inverse;
+        const auto size = [](fv value) { return value < 0.0f ? -value : value; };
+        const auto larger = [](fv a, fv b) { return a < b ? b : a; };
+        fv width = inverse * load<fv>(sizes[0]), height = inverse * load<fv>(sizes[1]);
+        const iv cube = load<iv>(cubes);
+        const fv share = 0.5f / larger(larger(size(u), size(v)), larger(size(w), fv{} + 1e-20f));
+        width = cube ? width * share : width, height = cube ? width : height;
+        const auto step = [&](int ray) {  // how far a step moves, squared, texels
+            const fv dq = times(3, ray), across = (times(0, ray) - u * dq) * width;
+            const fv down = (times(1, ray) - v * dq) * height;
+            const fv ahead = cube ? (times(2, ray) - w * dq) * width : fv{};
+            return across * across + (down * down + ahead * ahead);
+        };
+        const fv most = larger(step(1), step(2));
+        const fv within = most < 1e30f ? most : fv{} + 1e30f;
+        iv level = as_whole(128.0f * log_2(within)) - sharper;
+        level = level < 0 ? iv{} : level;
+        level = level < load<iv>(levels) ? level : load<iv>(levels);
+        level = most > 1.0f ? level : iv{};  // also where a ray's neighbour is none
+        store(levels, level);
+        for (int lane = 0; lane < lanes && first + lane < count; ++lane)
+            spans_[first + lane].level = levels[lane];
+    }
 }
 
-// Level of a mipmap, in 256ths, whose texels are as large as a pixel; `inverse` is its depth's.
+// Find out where the colours of pixels side by side come from, whose inverse depths these are.
 template <bool pinhole>
-inline int Band::detail(const Surface& surface, int x, int y, float inverse) const {
-    const Vec3f here = lens_.ray(x, y);
-    const float u = times(surface.u, here) * inverse, v = times(surface.v, here) * inverse;
-    float width = inverse * surface.width, height = inverse * surface.height, w = 0;
-    const bool is_cube = surface.texture->is_cube;
-    if (is_cube) {
-        w = times(surface.w, here) * inverse;
-        const auto size = [](float value) { return value < 0 ? -value : value; };
-        width *= 0.5f / std::max({size(u), size(v), size(w), 1e-20f}), height = width;
-    }
-    const auto step = [&](auto along) {  // how far a step moves, squared, texels
-        const float dq = along(surface.depth);
-        const float across = (along(surface.u) - u * dq) * width;
-        const float down = (along(surface.v) - v * dq) * height;
-        const float ahead = is_cube ? (along(surface.w) - w * dq) * width : 0.0f;
-        return across * across + (down * down + ahead * ahead);
-    };
-    float most;
-    if constexpr (pinhole) {
-        const auto right = static_cast<float>(lens_.step[0]), below = static_cast<float>(lens_.step[1]);
-        most = std::max(step([&](const float(&plane)[3]) { return plane[0] * right; }),
-                        step([&](const float(&plane)[3]) { return plane[1] * below; }));
-    } else {
-        const Vec3f right = lens_.ray(std::min(x + 1, lens_.width - 1), y) - here;
-        const Vec3f below = lens_.ray(x, std::min(y + 1, lens_.height - 1)) - here;
-        most = std::max(step([&](const float(&plane)[3]) { return times(plane, right); }),
-                        step([&](const float(&plane)[3]) { return times(plane, below); }));
-    }
-    if (!(most > 1.0f)) return 0;  // also where a ray's neighbour is none
-    const int level = static_cast<int>(128.0f * log_2(std::min(most, 1e30f))) - sharper;
-    return std::min(std::max(level, 0), (surface.texture->levels() - 1) << 8);
-}
-
-// Find out where the colours of `count` pixels of a triangle in a row come from, from x on.
-template <bool pinhole>
-void Band::place(const Surface& surface, int x, int y, const float* nearest, int count) {
+void Band::place(const Span& span, int y, const float* nearest) {
+    const Surface& surface = surfaces_[span.surface];
     const Texture* texture = surface.texture;
-    const int middle = count / 2;
-    const int level =
-        texture ? detail<pinhole>(surface, x + middle, y, 1.0f / nearest[middle]) : 0;
+    const int level = span.level;
+    int x = span.x;
     const std::size_t row = pinhole ? 0 : std::size_t(y) * lens_.stride;
-    for (const int end = x + count; x < end; x += lanes, nearest += lanes) {
+    for (const int end = x + span.count; x < end; x += lanes, nearest += lanes) {
         const fv inverse = 1.0f / load<fv>(nearest);
         const fv rx = load<fv>(&lens_.x[row + x]);
         const fv ry = pinhole ? fv{} + lens_.y[y] : load<fv>(&lens_.y[row + x]);
@@ -245,11 +271,10 @@ void Band::plain(int x) {
 
 // Colours of pixels from x on, whose taps are set.
 Colours Band::colours(int x) {
-    const std::uint32_t* texels = scene_.texels.data();
-    Colours mine = read(texels, taps_, x, 0);
+    Colours mine = read(taps_, x, 0);
     const iv share = taps_.get(Taps::share, x);
     if (const auto two = reinterpret_cast<wv>(share != 0); any(reinterpret_cast<iv>(two))) {
-        const Colours both = between(mine, read(texels, taps_, x, 1), reinterpret_cast<wv>(share));
+        const Colours both = between(mine, read(taps_, x, 1), reinterpret_cast<wv>(share));
         mine = {(both.red_blue & two) | (mine.red_blue & ~two),
                 (both.green & two) | (mine.green & ~two)};
     }
@@ -278,24 +303,47 @@ void Band::write(std::uint8_t* to, Colours colours, int count) const {
 }
 
 void Band::shade() {
+    std::vector<std::int32_t> rows[2];  // parts that pixels of a row, and of that above, see
+    for (auto& row : rows) row.resize(lens_.stride + widest);
+    std::vector<std::int32_t> numbers(images_.numbers ? lens_.stride + widest : 0);
+    std::vector<int> ends;  // columns of pixels right of which another part is seen
     for (int y = first_; y < last_; ++y) {
+        std::int32_t* parts = rows[y & 1].data();
+        spans_.clear(), ends.clear();
+        if (view_.poses > 1) surfaces_.clear(), shades_.clear();
         runs(y, [&](int left, int right, std::int32_t number) {
-            if (number < 0) place_sky(y, left, right);
-            else place(y, left, right, number);
+            const std::int32_t seen = number < 0 ? -1 : surface(number, y);
+            const std::int32_t part = seen < 0 ? -1 : surfaces_[seen].part;
+            if (left && part != parts[left - 1]) ends.push_back(left - 1);
+            for (int x = left; x < right; x += lanes) store(parts + x, iv{} + part);
+            if (!numbers.empty()) {
+                const iv number_of = iv{} + (seen < 0 ? -1 : surfaces_[seen].number);
+                for (int x = left; x < right; x += lanes) store(&numbers[x], number_of);
+            }
+            for (int count; left < right; left += count) {
+                count = seen < 0 ? right - left : std::min(right - left, most_side_by_side);
+                spans_.push_back({seen, left, count, 0, nearest_[at(y) + left + count / 2]});
+            }
         });
+        if (lens_.pinhole) place<true>(y);
+        else place<false>(y);
         for (int x = 0; x < lens_.width; x += lanes)
             write(row(y) + 3 * x, colours(x), std::min(lens_.width - x, lanes));
+        if (!numbers.empty())
+            std::copy_n(numbers.data(), lens_.width,
+                        images_.numbers + std::size_t(y - view_.first) * lens_.width);
+        for (const int x : ends) smooth(x, y, false);
+        if (y == first_) first_row_ = outlines_.size();
+        else find_below(y, rows[~y & 1].data(), parts);
     }
 }
 
-void Band::place(int y, int left, int right, std::int32_t number) {
-    const Surface& surface = this->surface(number, y);
-    for (; left < right; left += run) {
-        const int count = std::min(right - left, run);
-        const float* nearest = nearest_ + at(y) + left;
-        if (lens_.pinhole) place<true>(surface, left, y, nearest, count);
-        else place<false>(surface, left, y, nearest, count);
-    }
+template <bool pinhole>
+void Band::place(int y) {
+    find_levels<pinhole>(y);
+    for (const Span& span : spans_)
+        if (span.surface < 0) place_sky(y, span.x, span.x + span.count);
+        else place<pinhole>(span, y, nearest_ + at(y) + span.x);
 }
 
 void Band::place_sky(int y, int left, int right) {
@@ -305,8 +353,9 @@ void Band::place_sky(int y, int left, int right) {
         for (int k = 0; k < lanes && left + k < right; ++k) {
             const Vec3f ray = lens_.ray(left + k, y);
             const Vec3 along{ray.x, ray.y, ray.z};
-            const Vec3 from = scene_.eye_.turn * along, to = scene_.next_eye_.turn * along;
-            const Vec3 world = from + (to - from) * share;
+            Vec3 world = scene_.eye_.turn * along;
+            if (view_.poses > 1)
+                world = world + (scene_.next_eye_.turn * along - world) * share;
             rays[0][k] = static_cast<float>(world.x);
             rays[1][k] = static_cast<float>(world.z);
             rays[2][k] = static_cast<float>(-world.y);
@@ -327,11 +376,14 @@ void Band::place_sky(int y, int left, int right) {
 
 // Blend a see-through triangle's colour into a pixel.
 void Band::mix(int x, int y, float nearest, std::int32_t number) {
-    const Surface& surface = this->surface(number, y);
+    if (view_.poses > 1) surfaces_.clear(), shades_.clear();
+    const std::int32_t seen = surface(number, y);
+    spans_.assign(1, {seen, x, 1, 0, nearest});
     float inverse[widest];
     std::fill_n(inverse, widest, nearest);
-    if (lens_.pinhole) place<true>(surface, x, y, inverse, 1);
-    else place<false>(surface, x, y, inverse, 1);
+    if (lens_.pinhole) find_levels<true>(y), place<true>(spans_[0], y, inverse);
+    else find_levels<false>(y), place<false>(spans_[0], y, inverse);
+    const Surface& surface = surfaces_[seen];
     const Colours mine = colours(x);
     std::uint8_t* to = row(y) + 3 * x;
     const int levels[3] = {mine.red_blue[0], mine.green[0], mine.red_blue[1]};

@@ -75,13 +75,12 @@ const Triangle* Band::seen_by(std::int32_t number, int y, Triangle& row) const {
     if (y >= scene_.first_) return seen(row = triangle(number), number, y) ? &row : nullptr;
     const Moving& moving = scene_.before_moving_[number];
     row = scene_.before_[number];  // it is above these rows
-    row.see({moving.from, moving.to, (y - scene_.start_) / scene_.step_ + 1});
+    row.planes = Planes({moving.from, moving.to, (y - scene_.start_) / scene_.step_ + 1});
     return &row;
 }
 
 // Where between two rays a surface without a crease ends, of which the first ray meets a triangle.
-Band::End Band::end(const Triangle& triangle, const Planes& planes, Vec3f from, Vec3f to,
-                    int y) const {
+Band::End Band::end(const Triangle& triangle, Vec3f from, Vec3f to, int y) const {
     const Placed& placed = scene_.placed_[triangle.geom];
     const Mesh& mesh = *placed.mesh;
     const auto point = [&](std::int32_t corner) {
@@ -91,7 +90,7 @@ Band::End Band::end(const Triangle& triangle, const Planes& planes, Vec3f from, 
         return now + (later - now) * ((y - scene_.start_) / scene_.step_);
     };
     std::int32_t corner = triangle.corner;
-    Planes at = planes;
+    Planes at = triangle.planes;
     End found{2, {}};
     for (int count = 0; count < most_triangles; ++count) {  // across the edges between two of them
         const f4 here = at(from), there = at(to);
@@ -106,6 +105,14 @@ Band::End Band::end(const Triangle& triangle, const Planes& planes, Vec3f from, 
         found = {count ? std::max(share, found.share) : share, at[edge]};
         corner = mesh.beyond[corner + edge];
         if (corner < 0) return found;
+        if (view_.poses == 1) {
+            const std::int32_t number = placed.listed[corner / 3];
+            if (number == Placed::faces_away) return found;
+            if (number >= 0) {
+                at = (*placed.list)[number].planes;
+                continue;
+            }
+        }
         const std::int32_t* corners = mesh.corners.data() + corner;
         const Vec3 next[3] = {point(corners[0]), point(corners[1]), point(corners[2])};
         if (!(dot(cross(next[1] - next[0], next[2] - next[0]), next[0]) < 0)) return found;
@@ -126,15 +133,15 @@ void Band::smooth(int x, int y, bool below) {
     if (!first) return;
     const Vec3f near_ray = turned ? lens_.ray(other_x, other_y) : lens_.ray(x, y);
     const Vec3f far_ray = turned ? lens_.ray(x, y) : lens_.ray(other_x, other_y);
-    const Planes nearer(*first);
+    const Planes& nearer = first->planes;
     const f4 mine = nearer(near_ray), beyond = nearer(far_ray);
     // Of the way between the middles that is the nearer one's, and what ends it.
-    auto [share, plane] = end(*first, nearer, near_ray, far_ray, y);
+    auto [share, plane] = end(*first, near_ray, far_ray, y);
     if (share > 1) {
         if (!second) return;
-        const Planes farther(*second);
+        const Planes& farther = second->planes;
         const f4 theirs = farther(far_ray), behind = farther(near_ray);
-        const End start = end(*second, farther, far_ray, near_ray, y);
+        const End start = end(*second, far_ray, near_ray, y);
         share = 1 - start.share, plane = start.plane;
         if (start.share > 1) {  // they meet
             const float inside = mine[3] - behind[3], outside = beyond[3] - theirs[3];
@@ -161,33 +168,36 @@ void Band::smooth(int x, int y, bool below) {
                          std::abs(parts - 128)});
 }
 
-// Find the pixels that outlines cross, once all rows are shaded, and number all of them.
-void Band::find_outlines() {
-    outlines_.clear();
-    std::vector<std::int32_t> rows[2];  // parts that each pixel of a row, and of that above, sees
-    for (auto& row : rows) row.resize(lens_.stride + lanes);
-    const int top = std::max(first_ - 1, view_.first), end = std::min(last_ + 1, scene_.last_);
-    for (int y = top; y < end; ++y) {
-        std::int32_t* parts = rows[y & 1].data();
-        const std::int32_t* above = rows[~y & 1].data();
-        const bool mine = y >= first_ && y < last_;
-        runs(y, [&](int left, int right, std::int32_t number) {
-            Triangle row;
-            const Triangle* triangle = y < scene_.first_ ? seen_by(number, y, row) :
-                                       number < 0 ? nullptr : &this->triangle(number);
-            const std::int32_t part = triangle ? triangle->part : -1;
-            std::fill(parts + left, parts + right, part);
-            if (mine) this->number(y, left, right, triangle);
-            if (mine && left && part != parts[left - 1]) smooth(left - 1, y, false);
-        });
-        if (y == top) continue;
-        for (int x = 0; x < lens_.width; x += lanes) {
-            const iv differs = load<iv>(parts + x) != load<iv>(above + x);
-            for (int found = bits(differs); found; found &= found - 1) {
-                const int column = x + __builtin_ctz(found);
-                if (column < lens_.width) smooth(column, y - 1, true);
-            }
+// Find the pixels that outlines cross between a row and the one above it, which see these parts.
+void Band::find_below(int y, const std::int32_t* above, const std::int32_t* parts) {
+    for (int x = 0; x < lens_.width; x += lanes) {
+        const iv differs = load<iv>(parts + x) != load<iv>(above + x);
+        for (int found = bits(differs); found; found &= found - 1) {
+            const int column = x + __builtin_ctz(found);
+            if (column < lens_.width) smooth(column, y - 1, true);
         }
+    }
+}
+
+// Find the pixels that outlines cross between these rows and those of other bands, once all are
+// shaded.
+void Band::find_outlines() {
+    std::vector<std::int32_t> rows[2];
+    for (auto& row : rows) row.resize(lens_.stride + lanes);
+    for (const int y : {first_, last_}) {
+        if (y == view_.first || y == scene_.last_) continue;
+        for (int k = 0; k < 2; ++k)
+            runs(y - 1 + k, [&](int left, int right, std::int32_t number) {
+                Triangle row;
+                const Triangle* triangle =
+                    number < 0 ? nullptr : y - 1 + k < scene_.first_ ? seen_by(number, y - 1 + k, row)
+                                                                     : &this->triangle(number);
+                std::fill(&rows[k][left], &rows[k][right], triangle ? triangle->part : -1);
+            });
+        const std::ptrdiff_t before = outlines_.size();
+        find_below(y, rows[0].data(), rows[1].data());
+        if (y == first_)  // a pixel's neighbours are blended in the same order in any band
+            std::rotate(outlines_.begin() + first_row_, outlines_.begin() + before, outlines_.end());
     }
 }
 

@@ -14,7 +14,10 @@ namespace raster {
 struct Taps {
     enum { upper, lower = 2, right = 4, low = 6, share = 8, red_blue, green, clear, kinds };
 
-    explicit Taps(int width) : stride_(width + widest), values_(std::size_t(stride_) * kinds) {}
+    const std::uint32_t* const texels;  // of the scene
+
+    Taps(int width, const std::uint32_t* all)
+        : texels(all), stride_(width + widest), values_(std::size_t(stride_) * kinds) {}
 
     std::uint32_t* at(int kind, int x) { return values_.data() + kind * stride_ + x; }
     void set(int kind, int x, iv value) { store(at(kind, x), value); }
@@ -103,6 +106,11 @@ class Texture {
         if (is_cube) at += face * (level.stride() * (level.height + 2));
         taps.set(Taps::upper + size, x, at);
         taps.set(Taps::lower + size, x, at + level.stride());
+        if (size == 0)  // the larger one; they are read when the row is complete
+            for (int k = 0; k < lanes; k += 4) {
+                __builtin_prefetch(taps.texels + at[k]);
+                __builtin_prefetch(taps.texels + at[k] + level.stride());
+            }
         taps.set(Taps::right + size, x, twice(column));
         taps.set(Taps::low + size, x, twice(row));
     }
@@ -189,9 +197,9 @@ inline Pair pair(const std::uint32_t* texels, const std::uint32_t* at) {
 #endif
 }
 
-inline Colours read(const std::uint32_t* texels, Taps& taps, int x, int size) {
-    const Pair above = pair(texels, taps.at(Taps::upper + size, x));
-    const Pair below = pair(texels, taps.at(Taps::lower + size, x));
+inline Colours read(Taps& taps, int x, int size) {
+    const Pair above = pair(taps.texels, taps.at(Taps::upper + size, x));
+    const Pair below = pair(taps.texels, taps.at(Taps::lower + size, x));
     const wv low = taps.weights(Taps::low + size, x);
     return between(between(coloured(above.left), coloured(below.left), low),
                    between(coloured(above.right), coloured(below.right), low),

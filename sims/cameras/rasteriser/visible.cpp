@@ -203,10 +203,12 @@ bool Scene::in_squares(Placed& placed, const Placed& later) const {
 }
 
 // Add a geom's triangles to the frame, unless they are out of view or seen from behind.
-void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) const {
-    const Placed& placed = placed_[index];
+void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) {
+    Placed& placed = placed_[index];
     const bool rolling = view_.poses > 1;
     const std::vector<std::int32_t>& corners = placed.mesh->corners;
+    placed.list = &to;
+    if (!rolling) placed.listed.assign(corners.size() / 3, Placed::faces_away);
     for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
         Vec3 points[6];  // now, and for the next pose
         Lens::Pixel pixels[6] = {};
@@ -225,8 +227,11 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         if (!rolling) {
             const double away = dot(cross(now[1] - now[0], now[2] - now[0]), now[0]);
             if (!(away < 0)) continue;
+            std::int32_t& listed = placed.listed[corner / 3];
+            listed = Placed::out_of_view;
             if (!bounded(triangle, points, pixels, 3)) continue;
-            triangle.see(Corners(now));
+            listed = static_cast<std::int32_t>(to.size());
+            triangle.planes = Planes(Corners(now));
             to.push_back(triangle);
             continue;
         }
@@ -234,7 +239,7 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         if (!bounded(triangle, points, pixels, 6)) continue;
         const Corners from(now), next(*reinterpret_cast<Vec3(*)[3]>(points + 3));
         if (from.away >= 0 && next.away >= 0) continue;
-        triangle.see(from);
+        triangle.planes = Planes(from);
         to.push_back(triangle);
         moving.push_back({from, next});
     }
