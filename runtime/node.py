@@ -259,7 +259,7 @@ class Node(Generic[C]):
 
         Args:
             factory: A class of an importable module.
-            options: `processes`, `latency`, `timeout`, `env`, `niceness`; see `Worker`.
+            options: `more`, `processes`, `latency`, `timeout`, `env`, `niceness`; see `Worker`.
 
         Raises:
             WorkerError: The process died or hung; or whatever making the object raised.

@@ -17,7 +17,7 @@ from runtime import Tick, every, on
 from runtime.paths import InputPath
 from sims.cameras import CameraSpec, add_free_camera, check_cameras, pose_to_qpos, qvel_between
 from sims.vehicle import State
-from sims.world import Rate, Simulator, SimulatorConfig, join_world
+from sims.world import Rate, SharedWorld, Simulator, SimulatorConfig, join_world
 from sims.worlds import Dynamics, Scene
 
 Course = Callable[[int], tuple[Vector3, Quaternion]]  # poses in ``map`` at times (ns)
@@ -77,6 +77,10 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         self._rows = (
             await self.offload(read_tum, Path(config.trajectory)) if (config.trajectory) else None
         )
+        await self.rig.start(self._join)
+        self._world.remember(self.rig.past)
+
+    async def _join(self) -> SharedWorld:
         self._world = await join_world(self)
         joint = self._world.model.joint(self.name)
         pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
@@ -86,8 +90,7 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         self._world.starts.setdefault(
             self.name, State(self._position, self._orientation, still, still)
         )
-        await self.rig.start(self._world)
-        self._world.remember(self.rig.past)
+        return self._world
 
     @classmethod
     def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:

@@ -24,7 +24,7 @@ from sims.vehicle import (
 )
 from sims.vehicle.autopilot import FALL, Clearance, trouble_at_start, trouble_on_path
 from sims.vehicle.physics import Contact
-from sims.world import Rate, Simulator, join_world
+from sims.world import Rate, SharedWorld, Simulator, join_world
 from sims.worlds import Dynamics, Scene
 
 FRAME = "base_link"  # frame of the vehicle's body
@@ -83,6 +83,19 @@ class Multirotor(Simulator[MultirotorConfig]):
         """Build the world and start the renderers."""
         await super().on_startup()
         config = self.config
+        await self.rig.start(self._join)  # what draws is imported meanwhile
+        self._world.remember(self.rig.past)
+        tied = [camera for camera in config.cameras if self._is_tied(camera)]
+        for camera in tied:
+            self.every(camera.rate, functools.partial(self._trigger, camera.name), camera.name)
+        self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
+        for camera in config.cameras:  # an image without latency comes after the IMU's sample
+            if camera not in tied:
+                self.every(camera.rate, functools.partial(self._expose, camera.name), camera.name)
+        await self._suite.start()
+
+    async def _join(self) -> SharedWorld:
+        config = self.config
         self._start = start_of(config)
         self._world = await join_world(self)
         assert self._world.simulation is not None
@@ -103,16 +116,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         self._refused = ""
         self._odometry_stamp = -1
         self._triggered: list[str] = []
-        await self.rig.start(self._world)
-        self._world.remember(self.rig.past)
-        tied = [camera for camera in config.cameras if self._is_tied(camera)]
-        for camera in tied:
-            self.every(camera.rate, functools.partial(self._trigger, camera.name), camera.name)
-        self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
-        for camera in config.cameras:  # an image without latency comes after the IMU's sample
-            if camera not in tied:
-                self.every(camera.rate, functools.partial(self._expose, camera.name), camera.name)
-        await self._suite.start()
+        return self._world
 
     async def run(self) -> None:
         """Send the poses of cameras and sensors on the body, once."""

@@ -286,7 +286,10 @@ class _Played(Worker[Any]):
     content: memoryview
     left: Iterator[tuple[str, int]]
 
-    def _start(self) -> list[concurrent.futures.Future[Any]]:
+    def _begin(self) -> list[Any]:
+        return []
+
+    def _start(self, begun: Any, args: Any) -> list[concurrent.futures.Future[Any]]:  # noqa: ARG002
         return [_DONE] * len(self._make)
 
     def _request(

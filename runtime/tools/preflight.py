@@ -185,7 +185,9 @@ class _DryHost(Host):
     def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
         return Ticker(f"{node.name}.{name}", hz, call, lambda _: None)
 
-    async def worker(self, *_: Any, **__: Any) -> Any:
+    async def worker(self, *_: Any, **options: Any) -> Any:
+        if "more" in options:
+            await options["more"]()
         return _Absent()
 
 

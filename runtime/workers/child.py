@@ -8,6 +8,8 @@ call does not even let go of Python's lock, once its limit is over.
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import os
 import select
 import signal
@@ -39,7 +41,7 @@ def main(socket_fd: int, in_fd: int, out_fd: int, limit: float) -> None:
     made = False
     target: Any = None
     try:
-        sys.path[:] = pipe.receive()  # first, because the next message names what to import
+        _begin(*pipe.receive())  # first, because the next message names what to import
         message = pipe.read()
         made, target = _attempt(limit, _make, pipe, message)
         _answer(pipe, made, None if made else target, 0, 0)
@@ -74,11 +76,18 @@ def _end_group(number: signal.Signals) -> None:
         os.killpg(0, number)
 
 
-def _make(pipe: SharedPipe, message: bytearray) -> Any:
-    factory, args, niceness, cores = pipe.unpack(message)
+def _begin(path: list[str], niceness: int, cores: tuple[int, ...], module: str) -> None:
+    """Import the object's module, while the run prepares what the object is made from."""
+    sys.path[:] = path
     os.nice(niceness)
     if cores:  # before any library starts threads, which inherit it
         os.sched_setaffinity(0, cores)
+    with contextlib.suppress(Exception):  # again when it is made, and told then
+        importlib.import_module(module)
+
+
+def _make(pipe: SharedPipe, message: bytearray) -> Any:
+    factory, args = pipe.unpack(message)
     return factory(*args)
 
 

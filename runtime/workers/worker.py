@@ -25,7 +25,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
@@ -52,6 +52,8 @@ class Worker(Generic[W]):
 
     Args:
         factory: A class (or function) of an importable module; called in the process.
+        more: Called once the processes have begun, and awaited while they import: the last of the
+            factory's arguments.
         processes: How many; each call goes to the one with the fewest calls outstanding.
         latency: Seconds of the run's clock from a call to its result.
         timeout: Real seconds after which a call that has no answer is a `WorkerTimeoutError`.
@@ -70,6 +72,7 @@ class Worker(Generic[W]):
         clock: Clock,
         factory: Callable[..., W],
         *args: Any,
+        more: Callable[[], Awaitable[tuple[Any, ...]]] | None = None,
         processes: int = 1,
         latency: float = 0.0,
         timeout: float = 60.0,
@@ -101,7 +104,8 @@ class Worker(Generic[W]):
             for each in names
         ]
         cores = spare_cores() if clock.kind == "real" else ()
-        self._to_make = factory, args, niceness, cores
+        self._conditions = sys.path, niceness, cores, factory.__module__
+        self._factory, self._args, self._more = factory, args, more
 
     async def ready(self) -> None:
         """Start the processes, and wait until each has made its object.
@@ -109,18 +113,34 @@ class Worker(Generic[W]):
         Raises:
             WorkerError: A process died or hung; or whatever making the object raised.
         """
-        for started in await asyncio.to_thread(self._start):  # which takes milliseconds
-            await self._clock.beside(started)
+        begun = await asyncio.to_thread(self._begin)  # which takes milliseconds
+        more = await self._more() if self._more else ()
+        args = *self._args, *more
+        for made in await asyncio.to_thread(self._start, begun, args):
+            await self._clock.beside(made)
 
-    def _start(self) -> list[concurrent.futures.Future[Any]]:
+    def _begin(self) -> list[_Process]:
+        """Start the processes that are missing."""
+        with self._unless_closed():
+            begun = []
+            for make in self._make[len(self._processes) :]:
+                self._processes.append(make())
+                self._processes[-1].begin(self._conditions)
+                begun.append(self._processes[-1])
+            return begun
+
+    def _start(
+        self, begun: list[_Process], args: tuple[Any, ...]
+    ) -> list[concurrent.futures.Future[Any]]:
+        with self._unless_closed():
+            return [process.request((self._factory, args)) for process in begun]
+
+    @contextlib.contextmanager
+    def _unless_closed(self) -> Iterator[None]:
         with self._changing:
             if self._closed:  # its caller has gone before this thread came to it
                 raise WorkerError(f"worker {self.name}: closed before it was ready")
-            started = []
-            for make in self._make[len(self._processes) :]:
-                self._processes.append(make())
-                started.append(self._processes[-1].start(self._to_make))
-            return started
+            yield
 
     async def call(
         self, method: Callable[Concatenate[W, P], R], *args: P.args, **kwargs: P.kwargs
@@ -258,20 +278,18 @@ class _Process:
         self._output = threading.Thread(target=self._read_output, name=name, daemon=True)
         self._reader = threading.Thread(target=self._read_answers, name=name, daemon=True)
 
-    def start(self, to_make: Any) -> concurrent.futures.Future[Any]:
-        """Start to make the object; the future has the success or the error."""
+    def begin(self, conditions: Any) -> None:
+        """Have the process import what it will need."""
         self._output.start()
-        with contextlib.suppress(OSError):  # if it is gone already, the request below says so
-            self._pipe.send(sys.path)
-        started = self.request(to_make)
+        with contextlib.suppress(OSError):  # if it is gone already, a request says so
+            self._pipe.send(conditions)
         self._reader.start()
-        return started
 
     def outstanding(self) -> int:
         return len(self._calls)
 
     def request(self, message: Any) -> concurrent.futures.Future[Any]:
-        """Send a message and return the future of its answer; from the loop's thread only.
+        """Send a message and return the future of its answer; the first is what makes the object.
 
         It never waits for the process to take it.
         """

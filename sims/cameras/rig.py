@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
@@ -98,22 +98,32 @@ class CameraRig:
         self.skipped = dict.fromkeys(self._specs, 0)
         """Exposures left out because the renderer was behind; never in lockstep."""
 
-    async def start(self, world: DrawnWorld) -> None:
-        """Start the renderers, or raise a `GraphicsError`."""
+    async def start(self, join: Callable[[], Awaitable[DrawnWorld]]) -> None:
+        """Join the world, and start the renderers, or raise a `GraphicsError`."""
         if not self._specs:
+            await join()
             return
-        self._seed = int(self._node.rng.integers(1 << 31))
-        self._node.doing = "starting the renderer of its cameras"
+
+        async def drawn() -> tuple[Any, ...]:
+            world = await join()
+            self._node.doing = "starting the renderer of its cameras"
+            self._seed = int(self._node.rng.integers(1 << 31))
+            return (
+                await self._node.offload(lambda: world.model_bytes),
+                tuple(self._specs.values()),
+                f"{self._node.name}/",
+                self._seed,
+                self._threads,
+                world.dynamics,
+                self._draws,
+            )
+
         self._renderer = await self._node.worker(
             CameraRenderer,
-            await self._node.offload(lambda: world.model_bytes),
-            tuple(self._specs.values()),
-            f"{self._node.name}/",
-            self._seed,
-            self._threads,
-            world.dynamics,
-            self._draws,
+            more=drawn,
             processes=self._processes,
+            # What draws is ours: MuJoCo need not look for a window's library.
+            env={"MUJOCO_GL": "disable"} if self._draws == "raster" else {},
         )
         self._node.doing = ""
         if self._node.checking:

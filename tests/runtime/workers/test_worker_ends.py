@@ -74,6 +74,45 @@ async def test_a_worker_that_was_closed_before_it_was_ready_starts_nothing(
     clock.close()
 
 
+async def test_processes_begin_before_the_last_arguments_are_there(started: list[Started]) -> None:
+    begun: list[int] = []
+
+    async def more() -> tuple[str, ...]:
+        begun.append(len(started))
+        return ("value",)
+
+    with pytest.raises(ValueError, match="no such plant"):
+        async with worker(more=more, processes=2):
+            pass
+    assert begun == [2]
+
+
+async def test_no_process_is_left_if_the_last_arguments_fail(started: list[Started]) -> None:
+    async def more() -> tuple[str, ...]:
+        raise LookupError("no world")
+
+    with pytest.raises(LookupError, match="no world"):
+        async with worker(more=more):
+            pass
+    assert [process.poll() is None for process in started] == [False]
+
+
+async def test_a_worker_that_is_closed_before_the_last_arguments_are_there_makes_nothing(
+    started: list[Started],
+) -> None:
+    clock = RealClock(asyncio.get_running_loop())
+
+    async def more() -> tuple[str, ...]:
+        await asyncio.to_thread(plant.close)
+        return ()
+
+    plant = Worker("plant", clock, Plant, more=more)
+    with pytest.raises(WorkerError, match="worker plant: closed before it was ready"):
+        await plant.ready()
+    assert [process.poll() is None for process in started] == [False]
+    clock.close()
+
+
 async def test_of_several_processes_the_first_ends_if_the_second_cannot_start(
     started: list[Started], monkeypatch: pytest.MonkeyPatch
 ) -> None:
