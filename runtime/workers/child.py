@@ -80,6 +80,9 @@ def _begin(path: list[str], niceness: int, cores: tuple[int, ...], module: str) 
     """Import the object's module, while the run prepares what the object is made from."""
     sys.path[:] = path
     os.nice(niceness)
+    if hasattr(os, "SCHED_BATCH"):  # which, when it wakes, does not push the loop off its core
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     if cores:  # before any library starts threads, which inherit it
         os.sched_setaffinity(0, cores)
     with contextlib.suppress(Exception):  # again when it is made, and told then

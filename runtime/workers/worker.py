@@ -58,8 +58,9 @@ class Worker(Generic[W]):
         latency: Seconds of the run's clock from a call to its result.
         timeout: Real seconds after which a call that has no answer is a `WorkerTimeoutError`.
         env: Environment variables for the processes, added to ours.
-        niceness: How much the processes stand back for others, 0 to 19. In real time they also keep
-            off one core, so that a tick need not wait for a core to come free.
+        niceness: How much the processes stand back for others, 0 to 19. None pushes another off its
+            core when it wakes, and in real time they keep off one core, so that a tick need not
+            wait for a core to come free.
         printed: Called with each line that a process prints.
 
     Raises:
