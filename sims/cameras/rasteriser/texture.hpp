@@ -128,7 +128,7 @@ class Texture {
             }
     }
 
-    // Smaller, rounded down: each texel the mean of those that it covers.
+    // Smaller, rounded down: each texel the mean of what it covers.
     static std::vector<std::uint32_t> halved(const std::vector<std::uint32_t>& from, int width,
                                              int height, int across, int down) {
         std::vector<std::uint32_t> to;
@@ -146,17 +146,25 @@ class Texture {
                 }
             return to;
         }
+        // Of an odd size, texels that two cover count for each by their share: all stays in place.
         for (int y = 0; y < down; ++y)
             for (int x = 0; x < across; ++x) {
-                const int top = y * height / down, bottom = (y + 1) * height / down;
-                const int left = x * width / across, right = (x + 1) * width / across;
-                std::uint32_t sums[3] = {0, 0, 0}, count = 0;
-                for (int row = top; row < bottom; ++row)
-                    for (int column = left; column < right; ++column, ++count)
+                std::uint64_t sums[3] = {0, 0, 0};
+                const auto shares = [](int at, int size, int smaller, auto found) {
+                    const int begin = at * size, end = begin + size;
+                    for (int k = begin / smaller; k * smaller < end; ++k)
+                        found(k, std::min((k + 1) * smaller, end) - std::max(k * smaller, begin));
+                };
+                shares(y, height, down, [&](int row, int rows) {
+                    shares(x, width, across, [&](int column, int columns) {
+                        const std::uint32_t texel = from[std::size_t(row) * width + column];
                         for (int k = 0; k < 3; ++k)
-                            sums[k] += from[std::size_t(row) * width + column] >> 8 * k & 255;
-                for (std::uint32_t& sum : sums) sum = (sum + count / 2) / count;
-                to.push_back(sums[0] | sums[1] << 8 | sums[2] << 16);
+                            sums[k] += std::uint64_t(rows) * columns * (texel >> 8 * k & 255);
+                    });
+                });
+                const std::uint64_t count = std::uint64_t(width) * height;
+                for (std::uint64_t& sum : sums) sum = (sum + count / 2) / count;
+                to.push_back(static_cast<std::uint32_t>(sums[0] | sums[1] << 8 | sums[2] << 16));
             }
         return to;
     }

@@ -170,7 +170,7 @@ def shaped(body: str, ambient: str = "1 1 1", shine: str = "0 0 0", **material: 
     """Return a model of some geoms, textured if `kind` says how."""
     world = mujoco.MjSpec.from_string(SCENE.format(body=body, ambient=ambient, shine=shine))
     if (kind := material.pop("kind", None)) is not None:
-        image = ramps(kind == mujoco.mjtTexture.mjTEXTURE_CUBE)
+        image = material.pop("image", ramps(kind == mujoco.mjtTexture.mjTEXTURE_CUBE))
         texture = world.add_texture(
             name="ramps", type=kind, width=image.shape[1], height=len(image), nchannel=3
         )
@@ -306,24 +306,45 @@ def test_a_plate_gives_the_light_of_its_area(spec: CameraSpec, roll: float) -> N
     raster.close()
 
 
+def finer(info: CameraInfo, samples: int) -> View:
+    """Return a view with squares of so many pixels a side in place of each."""
+    size = {name: getattr(info, name) * samples for name in ("width", "height", "fx", "fy")}
+    centre = {name: (getattr(info, name) + 0.5) * samples - 0.5 for name in ("cx", "cy")}
+    return View(msgspec.structs.replace(info, **size, **centre))
+
+
+@pytest.mark.slow
+@settings(max_examples=15, deadline=None)
+@given(width=st.integers(40, 500), ratio=st.floats(0.6, 1.6), far=st.floats(2.0, 12.0))
+@example(width=333, ratio=1.04, far=6.0)
+def test_textures_of_any_size_stay_in_place_in_the_distance(
+    width: int, ratio: float, far: float
+) -> None:
+    """Where texels are smaller than pixels, they are where sixty-four smaller pixels see them."""
+    size = width, round(width * ratio)
+    spots = np.random.default_rng(1).uniform(0, 255, (9, 9, 3)).astype(np.uint8)
+    image: Any = cv2.resize(spots, size, interpolation=cv2.INTER_CUBIC)
+    plate = f'<geom type="box" size=".01 1.2 1" pos="{far} 0 0"/>'
+    raster = Raster(shaped(plate, kind=mujoco.mjtTexture.mjTEXTURE_2D, image=image))
+    seen, _, numbers = drawn(raster, PINHOLE, (0.0, 0.0, 0.0), from_rpy(0.0, 0.0, 0.0))
+    many: Any = raster.draw(finer(camera_info(PINHOLE), 8), True, False, False).colours
+    raster.close()
+    squares = many.reshape(PINHOLE.height, 8, PINHOLE.width, 8, 3).mean(axis=(1, 3))
+    inside = cv2.erode(np.uint8(np.asarray(numbers) >= 0), np.ones((7, 7))) > 0
+    slopes = [np.gradient(squares, axis=axis)[inside].ravel() for axis in (0, 1)]
+    shift = np.linalg.lstsq(np.stack(slopes, 1), (squares - seen)[inside].ravel(), rcond=None)[0]
+    assert np.abs(shift).max() < 0.03
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
 def test_outlines_and_textures_are_near_the_mean_of_many_samples(spec: CameraSpec) -> None:
     info, samples = camera_info(spec), 4
-    finer = msgspec.structs.replace(
-        info,
-        width=info.width * samples,
-        height=info.height * samples,
-        fx=info.fx * samples,
-        fy=info.fy * samples,
-        cx=(info.cx + 0.5) * samples - 0.5,
-        cy=(info.cy + 0.5) * samples - 0.5,
-    )
     raster = Raster(model_of("hall"))
     at_edges, elsewhere = [], []
     for place, turn in itertools.islice(places("hall"), None, None, 3):
         image, _, numbers = drawn(raster, spec, place, turn)
-        many = raster.draw(View(finer), True, False, False).colours
+        many = raster.draw(finer(info, samples), True, False, False).colours
         assert image is not None
         assert many is not None
         assert numbers is not None
