@@ -490,5 +490,12 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
                 self.publish(image, result, origin=first if first >= 0 else None)
 
     async def on_end(self) -> None:
-        """Send the trajectory after loop closures and other corrections."""
-        self.publish_trajectory(*await self._slam.call_for(0.0, OrbSlam3Process.trajectory))
+        """Send the trajectory after loop closures and other corrections, if it can be saved."""
+        try:
+            found = await self._slam.call_for(0.0, OrbSlam3Process.trajectory)
+        except (
+            RuntimeError
+        ) as error:  # its library's; what it said in flight is judged all the same
+            self.log.warning("ORB-SLAM3 failed to save its final trajectory: %s", error)
+        else:
+            self.publish_trajectory(*found)

@@ -330,7 +330,7 @@ def test_textures_of_any_size_stay_in_place_in_the_distance(
     many: Any = raster.draw(finer(camera_info(PINHOLE), 8), True, False, False).colours
     raster.close()
     squares = many.reshape(PINHOLE.height, 8, PINHOLE.width, 8, 3).mean(axis=(1, 3))
-    inside = cv2.erode(np.uint8(np.asarray(numbers) >= 0), np.ones((7, 7))) > 0
+    inside = cv2.erode((np.asarray(numbers) >= 0).astype(np.uint8), np.ones((7, 7))) > 0
     slopes = [np.gradient(squares, axis=axis)[inside].ravel() for axis in (0, 1)]
     shift = np.linalg.lstsq(np.stack(slopes, 1), (squares - seen)[inside].ravel(), rcond=None)[0]
     assert np.abs(shift).max() < 0.03

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
+from typing_extensions import override
 
 from events import CameraAnnouncement, CameraInfo, Image, ImuAnnouncement
 from nodes.estimators.orb_slam3.node import OrbSlam3Result, check_arrays
@@ -166,3 +167,11 @@ class StubProcess:
 
     def close(self) -> None:
         pass
+
+
+class UnsavedProcess(StubProcess):
+    """Fails to save its trajectory, as ORB-SLAM3 sometimes does."""
+
+    @override
+    def trajectory(self) -> tuple[Any, Any]:
+        raise RuntimeError("Invalid argument")

@@ -23,7 +23,7 @@ from nodes.estimators.orb_slam3 import OrbSlam3
 from runtime.errors import NodeError, RefusedError
 from runtime.node import make_node
 from runtime.testing import run_nodes, spec
-from tests.nodes.estimators.orb_slam3.scene import StubProcess
+from tests.nodes.estimators.orb_slam3.scene import StubProcess, UnsavedProcess
 from tests.nodes.estimators.test_estimator import MS, camera, imu, rgbd, sample, vehicle
 from tests.runtime.small_events import NoHost
 
@@ -158,6 +158,20 @@ def test_each_mode_gets_its_sensors_and_says_its_trajectory_twice(
     causal = np.array([e.position for e in sent.of(PoseEstimate)])
     assert np.linalg.norm(causal[-1] - causal[0]) == pytest.approx(4.0)
     assert np.linalg.norm(final.positions[-1] - causal[0]) == pytest.approx(2.0)
+
+
+@pytest.mark.slow
+def test_what_it_said_counts_though_its_final_trajectory_cannot_be_saved(
+    stub: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("nodes.estimators.orb_slam3.node.OrbSlam3Process", UnsavedProcess)
+    cameras = [vehicle(), camera("drone/front", "rgb", "depth")]
+    flown = [event for k in (10, 20) for event in rgbd(k * MS, "drone/front")]
+    node = spec(OrbSlam3, "slam", {"latency": "1ms"}, inputs={"frames": "drone/front"})
+    sent = run_nodes([node], inputs=[*cameras, *flown], duration=1.0)
+    assert [e.stamp for e in sent.of(PoseEstimate)] == [10 * MS, 20 * MS]
+    assert not sent.of(TrajectoryEstimate)
+    assert "failed to save its final trajectory: Invalid argument" in caplog.text
 
 
 def test_its_runs_do_not_promise_their_digest() -> None:
