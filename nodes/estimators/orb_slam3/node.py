@@ -492,10 +492,6 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
     async def on_end(self) -> None:
         """Send the trajectory after loop closures and other corrections, if it can be saved."""
         try:
-            found = await self._slam.call_for(0.0, OrbSlam3Process.trajectory)
-        except (
-            RuntimeError
-        ) as error:  # its library's; what it said in flight is judged all the same
+            self.publish_trajectory(*await self._slam.call_for(0.0, OrbSlam3Process.trajectory))
+        except RuntimeError as error:  # of its library: what it said in flight is judged
             self.log.warning("ORB-SLAM3 failed to save its final trajectory: %s", error)
-        else:
-            self.publish_trajectory(*found)

@@ -321,11 +321,10 @@ def test_textures_of_any_size_stay_in_place_in_the_distance(
     width: int, ratio: float, far: float
 ) -> None:
     """Where texels are smaller than pixels, they are where sixty-four smaller pixels see them."""
-    size = width, round(width * ratio)
     spots = np.random.default_rng(1).uniform(0, 255, (9, 9, 3)).astype(np.uint8)
-    image: Any = cv2.resize(spots, size, interpolation=cv2.INTER_CUBIC)
-    plate = f'<geom type="box" size=".01 1.2 1" pos="{far} 0 0"/>'
-    raster = Raster(shaped(plate, kind=mujoco.mjtTexture.mjTEXTURE_2D, image=image))
+    image: Any = cv2.resize(spots, (width, round(width * ratio)), interpolation=cv2.INTER_CUBIC)
+    body = f'<geom type="box" size=".01 1.2 1" pos="{far} 0 0"/>'
+    raster = Raster(shaped(body, kind=mujoco.mjtTexture.mjTEXTURE_2D, image=image))
     seen, _, numbers = drawn(raster, PINHOLE, (0.0, 0.0, 0.0), from_rpy(0.0, 0.0, 0.0))
     many: Any = raster.draw(finer(camera_info(PINHOLE), 8), True, False, False).colours
     raster.close()
