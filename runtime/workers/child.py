@@ -41,9 +41,10 @@ def main(socket_fd: int, in_fd: int, out_fd: int, limit: float) -> None:
     made = False
     target: Any = None
     try:
-        _begin(*pipe.receive())  # first, because the next message names what to import
+        # First, because the next message names what to import.
+        begun, error = _attempt(limit, _begin, *pipe.receive())
         message = pipe.read()
-        made, target = _attempt(limit, _make, pipe, message)
+        made, target = _attempt(limit, _make, pipe, message) if begun else (False, error)
         _answer(pipe, made, None if made else target, 0, 0)
         cpu = time.process_time_ns()
         while made:
@@ -85,8 +86,7 @@ def _begin(path: list[str], niceness: int, cores: tuple[int, ...], module: str) 
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     if cores:  # before any library starts threads, which inherit it
         os.sched_setaffinity(0, cores)
-    with contextlib.suppress(Exception):  # again when it is made, and told then
-        importlib.import_module(module)
+    importlib.import_module(module)
 
 
 def _make(pipe: SharedPipe, message: bytearray) -> Any:

@@ -87,6 +87,21 @@ async def test_processes_begin_before_the_last_arguments_are_there(started: list
     assert begun == [2]
 
 
+async def test_what_a_process_may_not_begin_with_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runtime.workers.worker.spare_cores", lambda: (4095,))
+    with pytest.raises(OSError, match="Invalid argument") as caught:
+        async with worker():
+            pass
+    assert "sched_setaffinity" in caught.value.__notes__[0]
+
+
+async def test_a_process_that_wakes_does_not_push_others_off_their_core(
+    started: list[Started],
+) -> None:
+    async with worker():
+        assert os.sched_getscheduler(started[0].pid) == os.SCHED_BATCH
+
+
 async def test_no_process_is_left_if_the_last_arguments_fail(started: list[Started]) -> None:
     async def more() -> tuple[str, ...]:
         raise LookupError("no world")
