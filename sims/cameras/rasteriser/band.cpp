@@ -27,15 +27,14 @@ const Moving& Band::moving(std::int32_t number) const {
 
 Corners Band::between_poses(std::int32_t number, int y) const {
     const Moving& moving = this->moving(number);
-    return {moving.from, moving.to, (y - scene_.start_) / scene_.step_};
+    return {moving.from, moving.to, share(y)};
 }
 
-// A triangle as a row sees it; false if it does not.
-bool Band::seen(Triangle& triangle, std::int32_t number, int y) const {
+// A triangle's planes as a row sees it; false if it does not.
+bool Band::seen(Planes& planes, std::int32_t number, int y) const {
     const Corners corners = between_poses(number, y);
-    if (corners.away >= 0) return false;
-    triangle.planes = Planes(corners);
-    return true;
+    planes = Planes(corners);
+    return !(corners.away() >= 0);
 }
 
 std::int32_t& Band::surface_of(std::int32_t number) {
@@ -94,8 +93,20 @@ inline void Band::over(const Triangle& triangle, std::int32_t number, Found foun
     }
     if (view_.poses == 1) return scan_frame(triangle, triangle.top, triangle.bottom, found);
     Triangle row = triangle;
-    for (int y = std::max(triangle.top, first_); y < std::min(triangle.bottom, last_); ++y)
-        if (seen(row, number, y)) scan_frame(row, y, y + 1, found);
+    const Moving& moving = this->moving(number);
+    constexpr int most = 32;  // rows whose planes are found together: that is quicker
+    Planes planes[most];
+    bool met[most];
+    const int end = std::min(triangle.bottom, last_);
+    for (int y = std::max(triangle.top, first_); y < end; y += most) {
+        const int count = std::min(end - y, most);
+        for (int k = 0; k < count; ++k) {
+            const Corners corners(moving.from, moving.to, share(y + k));
+            planes[k] = Planes(corners), met[k] = !(corners.away() >= 0);
+        }
+        for (int k = 0; k < count; ++k)
+            if (row.planes = planes[k]; met[k]) scan_frame(row, y + k, y + k + 1, found);
+    }
 }
 
 template <typename Found>
@@ -107,7 +118,7 @@ inline void Band::scan_frame(const Triangle& triangle, int top, int bottom, Foun
     const bool wide = triangle.right - left > 4 * lanes;
     const float start = lens_.x[0], steps = static_cast<float>(1.0 / lens_.step[0]);
     float slope[3];  // of the columns in which the edges are, by row
-    for (int k = 0; k < 3; ++k) slope[k] = e[k].x != 0 ? -1.0f / e[k].x : 0;
+    for (int k = 0; k < 3; ++k) slope[k] = wide && e[k].x != 0 ? -1.0f / e[k].x : 0;
     bottom = std::min(bottom, last_);
     for (int y = std::max(top, first_); y < bottom; ++y) {
         const float down = lens_.y[y];
@@ -143,6 +154,7 @@ void Band::over_square(const Triangle& triangle, const Triangle& later, std::int
                        int square, int column, int row, int side, Found found) {
     const Lens::Square& rays = lens_.squares[square];
     i4 met = (rays.low[2] <= rays.high[2]) & (most(rays, triangle.ahead) >= triangle.least);
+    i4 whole{};
     f4 nearest{};
     if (side <= Lens::small) {
         const auto reach = [&](int plane) {
@@ -154,6 +166,11 @@ void Band::over_square(const Triangle& triangle, const Triangle& later, std::int
         for (int k = 0; k < 3; ++k) met &= reach(k) >= 0.0f;
         nearest = reach(3);
         met &= nearest >= 0.0f;
+        if (side == 2 * Lens::smallest && view_.poses == 1) {
+            whole = met;
+            for (int k = 0; k < 3; ++k)
+                whole &= most(rays, triangle.planes[k] * -1.0f) <= 0.0f;
+        }
     }
     side /= 2;
     for (int left_over = bits(met); left_over; left_over &= left_over - 1) {
@@ -165,24 +182,24 @@ void Band::over_square(const Triangle& triangle, const Triangle& later, std::int
         if (rays.parts[part] >= 0)
             over_square(triangle, later, number, rays.parts[part], left, top, side, found);
         else if (!(nearest[part] * 1.00001f <= farthest_[leaf(left, top)]))
-            over_leaf(triangle, number, left, top, found);
+            over_leaf(triangle, number, whole[part], left, top, found);
     }
 }
 
 // In the smallest square of a lens.
 template <typename Found>
-inline void Band::over_leaf(const Triangle& triangle, std::int32_t number, int left, int top,
-                            Found found) {
+inline void Band::over_leaf(const Triangle& triangle, std::int32_t number, bool whole, int left,
+                            int top, Found found) {
     const int from = std::max({top, first_, triangle.top});
     const int to = std::min({top + Lens::smallest, last_, triangle.bottom});
     const int right = std::min(left + Lens::smallest, lens_.stride);
     bool touched = false;
     if (view_.poses == 1) {
-        touched = scan_pixels(triangle, left, right, from, to, found);
+        touched = scan_pixels(triangle, whole, left, right, from, to, found);
     } else {
         Triangle row = triangle;
         for (int y = from; y < to; ++y)
-            if (seen(row, number, y)) touched |= scan_pixels(row, left, right, y, y + 1, found);
+            if (seen(row.planes, number, y)) touched |= scan_pixels(row, false, left, right, y, y + 1, found);
     }
     if (!touched) return;
     fv least = fv{} + 1e30f;
@@ -196,23 +213,25 @@ inline void Band::over_leaf(const Triangle& triangle, std::int32_t number, int l
     farthest_[leaf(left, top)] = all;
 }
 
-// In some pixels; false if the triangle is in none of them.
+// In some pixels, all of them within its edges if so said; false if the triangle is in none.
 template <typename Found>
-inline bool Band::scan_pixels(const Triangle& triangle, int left, int right, int top, int bottom,
-                              Found found) const {
+inline bool Band::scan_pixels(const Triangle& triangle, bool whole, int left, int right, int top,
+                              int bottom, Found found) const {
     const Vec3f e[3] = {triangle.planes[0], triangle.planes[1], triangle.planes[2]};
     const Vec3f depth = triangle.planes.depth();
     const fv nearest = fv{} + 1.0f / view_.near;
+    const float *xs = lens_.x.data(), *ys = lens_.y.data(), *zs = lens_.z.data();
+    const std::size_t stride = lens_.stride;
     bool touched = false;
     for (int y = top; y < bottom; ++y)
         for (int x = left; x < right; x += lanes) {
-            const std::size_t here = std::size_t(y) * lens_.stride + x;
-            const fv rx = load<fv>(&lens_.x[here]), ry = load<fv>(&lens_.y[here]);
-            const fv rz = load<fv>(&lens_.z[here]);
+            const std::size_t here = y * stride + x;
+            const fv rx = load<fv>(xs + here), ry = load<fv>(ys + here), rz = load<fv>(zs + here);
             const auto times = [&](Vec3f p) { return rx * p.x + (ry * p.y + rz * p.z); };
             const fv q = times(depth);
-            const iv inside = (times(e[0]) >= 0.0f) & (times(e[1]) >= 0.0f) &
-                              (times(e[2]) >= 0.0f) & (q > 0.0f) & (q <= nearest);
+            iv inside = (q > 0.0f) & (q <= nearest);
+            if (!whole)
+                inside &= (times(e[0]) >= 0.0f) & (times(e[1]) >= 0.0f) & (times(e[2]) >= 0.0f);
             if (!any(inside)) continue;
             found(y, x, inside, q);
             touched = true;
@@ -222,13 +241,16 @@ inline bool Band::scan_pixels(const Triangle& triangle, int left, int right, int
 
 void Band::cover(const Triangle& triangle, std::int32_t number) {
     const iv mine = iv{} + number;
-    over(triangle, number, [&](int y, int x, iv inside, fv q) __attribute__((always_inline)) {
-        const std::size_t here = at(y) + x;
-        const fv before = load<fv>(nearest_ + here);
+    const auto found = [mine, nearest = nearest_, visible = visible_, first = view_.first,
+                        stride = std::size_t(lens_.stride)](int y, int x, iv inside, fv q)
+        __attribute__((always_inline)) {
+        const std::size_t here = (y - first) * stride + x;
+        const fv before = load<fv>(nearest + here);
         const iv wins = inside & (q > before);
-        store(nearest_ + here, wins ? q : before);
-        store(visible_ + here, wins ? mine : load<iv>(visible_ + here));
-    });
+        store(nearest + here, wins ? q : before);
+        store(visible + here, wins ? mine : load<iv>(visible + here));
+    };
+    over(triangle, number, found);
 }
 
 // Whether a pixel on an edge is the triangle's, and not that of the one beyond.
@@ -244,7 +266,7 @@ static bool owns(const Triangle& triangle, Vec3f ray) {
 bool Band::owned(const Triangle& triangle, std::int32_t number, int x, int y) const {
     if (view_.poses == 1) return owns(triangle, lens_.ray(x, y));
     Triangle row = triangle;
-    return seen(row, number, y) && owns(row, lens_.ray(x, y));
+    return seen(row.planes, number, y) && owns(row, lens_.ray(x, y));
 }
 
 // Draw what is see-through over what is behind it, from the back to the front. It has a number, but

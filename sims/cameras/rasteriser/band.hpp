@@ -40,7 +40,7 @@ class Band {
     std::int32_t surface(std::int32_t number, int y);
     const Moving& moving(std::int32_t number) const;
     Corners between_poses(std::int32_t number, int y) const;
-    bool seen(Triangle& triangle, std::int32_t number, int y) const;
+    bool seen(Planes& planes, std::int32_t number, int y) const;
     const Triangle* seen_by(std::int32_t number, int y, Triangle& row) const;
     bool owned(const Triangle& triangle, std::int32_t number, int x, int y) const;
     template <typename Found>
@@ -51,10 +51,11 @@ class Band {
     template <typename Found>
     void scan_frame(const Triangle& triangle, int top, int bottom, Found found);
     template <typename Found>
-    void over_leaf(const Triangle& triangle, std::int32_t number, int left, int top, Found found);
+    void over_leaf(const Triangle& triangle, std::int32_t number, bool whole, int left, int top,
+                   Found found);
     template <typename Found>
-    bool scan_pixels(const Triangle& triangle, int left, int right, int top, int bottom,
-                     Found found) const;
+    bool scan_pixels(const Triangle& triangle, bool whole, int left, int right, int top,
+                     int bottom, Found found) const;
     template <typename Found>
     void runs(int y, Found found) const;
     void cover(const Triangle& triangle, std::int32_t number);
@@ -78,6 +79,7 @@ class Band {
     void measure() const;
     void number(int y, int left, int right, std::int32_t number) const;
 
+    double share(int y) const { return (y - scene_.start_) / scene_.step_; }  // of the way
     std::size_t at(int y) const { return std::size_t(y - view_.first) * lens_.stride; }
     std::size_t leaf(int x, int y) const {
         return std::size_t(y / Lens::smallest - first_ / Lens::smallest) *

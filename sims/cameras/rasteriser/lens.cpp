@@ -103,7 +103,7 @@ void Lens::find_spots() {
 }
 
 // From a pixel near it by Newton's method, one step.
-Lens::Pixel Lens::pixel(Vec3 towards) const {
+Lens::Pixel Lens::near_pixel(Vec3 towards) const {
     const Vec3f ahead = narrow(towards * (1.0 / root(dot(towards, towards))));
     if (!(ahead.x == ahead.x)) return {-1, -1};
     const Spot near = spots_[spot(ahead)];

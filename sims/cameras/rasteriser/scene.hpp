@@ -27,7 +27,7 @@ struct Mesh {
 struct Lens {
     const bool pinhole;
     const int width, height, stride;
-    double step[2];  // of a pinhole: a pixel's width and height at z = 1
+    double step[2]{};  // of a pinhole: a pixel's width and height at z = 1
     std::vector<float> x, y, z;
 
     // Squares of pixels, and of each the four smaller ones in it, with boxes about their rays.
@@ -45,11 +45,16 @@ struct Lens {
         return by_level_[level][std::size_t(row / side) * (largest / side) + column / side];
     }
 
-    // Where the ray in a direction is, pixels, nearly; column -1 if that is not known.
+    // Where the ray in a direction is, pixels, nearly, column -1 if that is not known; of a pinhole
+    // x and y at z = 1, not a number behind it.
     struct Pixel {
-        float column, row;
+        double column, row;
     };
-    Pixel pixel(Vec3 towards) const;
+    Pixel pixel(Vec3 towards) const {
+        if (!pinhole) return near_pixel(towards);
+        const double share = towards.z > 0 ? 1.0 / towards.z : std::nan("");
+        return {towards.x * share, towards.y * share};
+    }
 
     float bend = 0;  // how far an edge may bulge, pixels, by the square of its triangle's sine
 
@@ -67,6 +72,7 @@ struct Lens {
     };
     static constexpr int spots_across = 256;
 
+    Pixel near_pixel(Vec3 towards) const;
     int cut(int column, int row, int side);
     void find_spots();
     static std::size_t spot(Vec3f direction);
@@ -75,22 +81,24 @@ struct Lens {
     std::vector<Spot> spots_;
 };
 
-// The planes through the eye and the edges of a triangle, and how far it faces away.
+// The planes through the eye and the edges of a triangle, a lane each, and how far it faces away.
 struct Corners {
-    Vec3 edges[3];
-    double away;
+    d4 x, y, z;  // the last lane of x is how far
 
-    explicit Corners(const Vec3 (&points)[3])
-        : edges{cross(points[0], points[1]), cross(points[1], points[2]),
-                cross(points[2], points[0])},
-          away(dot(cross(points[1] - points[0], points[2] - points[0]), points[0])) {}
+    explicit Corners(const Vec3 (&points)[3]) {
+        const Vec3 a = cross(points[0], points[1]), b = cross(points[1], points[2]);
+        const Vec3 c = cross(points[2], points[0]);
+        const double away = dot(cross(points[1] - points[0], points[2] - points[0]), points[0]);
+        x = d4{a.x, b.x, c.x, away}, y = d4{a.y, b.y, c.y, 0}, z = d4{a.z, b.z, c.z, 0};
+    }
 
     // Between two poses: all of these are linear in the eye's place.
     Corners(const Corners& from, const Corners& to, double share)
-        : away(from.away + (to.away - from.away) * share) {
-        for (int k = 0; k < 3; ++k)
-            edges[k] = from.edges[k] + (to.edges[k] - from.edges[k]) * share;
-    }
+        : x(from.x + (to.x - from.x) * share), y(from.y + (to.y - from.y) * share),
+          z(from.z + (to.z - from.z) * share) {}
+
+    double away() const { return x[3]; }
+    d4 edge(int k) const { return d4{x[k], y[k], z[k], 0}; }
 };
 
 // The most that a plane may say of the rays in each part of a square.
@@ -106,20 +114,18 @@ struct Planes {
 
     Planes() = default;
     explicit Planes(const Corners& of) {
-        const double share = 1.0 / of.away, side = of.away > 0 ? 1.0 : -1.0;
-        for (int k = 0; k < 3; ++k) set(k, of.edges[k] * side);
-        set(3, (of.edges[0] + of.edges[1] + of.edges[2]) * share);
+        const double share = 1.0 / of.away(), side = of.away() > 0 ? 1.0 : -1.0;
+        const auto planes = [=](d4 edges) {
+            d4 found = edges * side;
+            found[3] = (edges[0] + edges[1] + edges[2]) * share;
+            return __builtin_convertvector(found, f4);
+        };
+        x = planes(of.x), y = planes(of.y), z = planes(of.z);
     }
 
     f4 operator()(Vec3f ray) const { return x * ray.x + (y * ray.y + z * ray.z); }
     Vec3f operator[](int k) const { return {x[k], y[k], z[k]}; }
     Vec3f depth() const { return (*this)[3]; }
-
-  private:
-    void set(int k, Vec3 plane) {
-        const Vec3f found = narrow(plane);
-        x[k] = found.x, y[k] = found.y, z[k] = found.z;
-    }
 };
 
 struct Triangle {
@@ -166,7 +172,7 @@ struct Placed {  // a geom of the frame
     const std::vector<Triangle>* list;
     bool is_seen;                  // whether the following are known
     std::vector<Vec3> seen;        // its vertices in the optical frame
-    std::vector<Lens::Pixel> pixels;  // and, by a lens, in the image
+    std::vector<Lens::Pixel> pixels;  // and in the image
     int square, column, row, side;  // the smallest of the lens's squares about it, if it has any
 };
 

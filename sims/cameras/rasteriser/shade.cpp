@@ -51,12 +51,12 @@ std::int32_t Band::surface(std::int32_t number, int y) {
     const Corners seen =
         rolling ? between_poses(number, y)
                 : Corners({placed.seen[corners[0]], placed.seen[corners[1]], placed.seen[corners[2]]});
-    const double share = 1.0 / seen.away;
-    const Vec3 weights[3] = {seen.edges[1] * share, seen.edges[2] * share, seen.edges[0] * share};
+    const double share = 1.0 / seen.away();
+    const d4 weights[3] = {seen.edge(1) * share, seen.edge(2) * share, seen.edge(0) * share};
     const auto plane = [&](float (&to)[3], float a, float b, float c) {
         put(to, weights[0] * double(a) + weights[1] * double(b) + weights[2] * double(c));
     };
-    Surface made{};
+    Surface& made = surfaces_.emplace_back();
     made.part = triangle.part, made.number = geom.number;
     put(made.depth, weights[0] + weights[1] + weights[2]);
     made.opacity = 1.0f - (1.0f - geom.rgba[3]) * (1.0f - geom.rgba[3]);  // MuJoCo draws it twice
@@ -116,10 +116,9 @@ std::int32_t Band::surface(std::int32_t number, int y) {
         plane(shade.place[0], at[0].x, at[1].x, at[2].x);
         plane(shade.place[1], at[0].y, at[1].y, at[2].y);
         plane(shade.place[2], at[0].z, at[1].z, at[2].z);
-        put(shade.depth, (from.edges[0] + from.edges[1] + from.edges[2]) * (1.0 / from.away));
+        put(shade.depth, (from.edge(0) + from.edge(1) + from.edge(2)) * (1.0 / from.away()));
         shades_.push_back(shade);
     }
-    surfaces_.push_back(made);
     return index;
 }
 
@@ -347,7 +346,7 @@ void Band::place(int y) {
 }
 
 void Band::place_sky(int y, int left, int right) {
-    const double share = (y - scene_.start_) / scene_.step_;
+    const double share = this->share(y);
     for (; left < right; left += lanes) {
         float rays[3][lanes] = {};
         for (int k = 0; k < lanes && left + k < right; ++k) {

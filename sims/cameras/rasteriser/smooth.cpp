@@ -72,10 +72,10 @@ void Mesh::find_parts() {
 const Triangle* Band::seen_by(std::int32_t number, int y, Triangle& row) const {
     if (number < 0) return nullptr;
     if (view_.poses == 1) return &triangle(number);
-    if (y >= scene_.first_) return seen(row = triangle(number), number, y) ? &row : nullptr;
+    if (y >= scene_.first_) return seen((row = triangle(number)).planes, number, y) ? &row : nullptr;
     const Moving& moving = scene_.before_moving_[number];
     row = scene_.before_[number];  // it is above these rows
-    row.planes = Planes({moving.from, moving.to, (y - scene_.start_) / scene_.step_ + 1});
+    row.planes = Planes({moving.from, moving.to, share(y) + 1});
     return &row;
 }
 
@@ -87,7 +87,7 @@ Band::End Band::end(const Triangle& triangle, Vec3f from, Vec3f to, int y) const
         const Vec3 now = placed.seen[corner];
         if (view_.poses == 1) return now;
         const Vec3 later = scene_.later_[triangle.geom].seen[corner];
-        return now + (later - now) * ((y - scene_.start_) / scene_.step_);
+        return now + (later - now) * share(y);
     };
     std::int32_t corner = triangle.corner;
     Planes at = triangle.planes;

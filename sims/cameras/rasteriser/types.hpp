@@ -27,6 +27,7 @@ using fv = float __attribute__((vector_size(width_of_vectors)));
 using iv = std::int32_t __attribute__((vector_size(width_of_vectors)));
 using wv = std::uint16_t __attribute__((vector_size(width_of_vectors)));  // two in each lane
 using f4 = float __attribute__((vector_size(16)));
+using d4 = double __attribute__((vector_size(32)));
 using i4 = std::int32_t __attribute__((vector_size(16)));
 using qv = std::uint64_t __attribute__((vector_size(width_of_vectors)));
 
@@ -116,9 +117,9 @@ inline Vec<T> cross(Vec<T> a, Vec<T> b) {
 inline Vec3f narrow(Vec3 a) {
     return {static_cast<float>(a.x), static_cast<float>(a.y), static_cast<float>(a.z)};
 }
-inline void put(float (&to)[3], Vec3 from) {
-    const Vec3f found = narrow(from);
-    to[0] = found.x, to[1] = found.y, to[2] = found.z;
+inline void put(float (&to)[3], d4 from) {
+    const f4 found = __builtin_convertvector(from, f4);
+    std::memcpy(to, &found, sizeof to);
 }
 
 inline double root(double x) { return std::sqrt(x); }  // IEEE 754 requires it to be exact

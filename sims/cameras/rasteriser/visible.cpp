@@ -141,7 +141,6 @@ void Scene::see(Placed& placed) const {
         const Vec3f p = placed.mesh->points[at];
         placed.seen[at] = placed.turn * Vec3{p.x, p.y, p.z} + placed.shift;
     }
-    if (lens_->pinhole) return;
     placed.pixels.clear();
     for (const Vec3& point : placed.seen) placed.pixels.push_back(lens_->pixel(point));
 }
@@ -209,15 +208,27 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
     const std::vector<std::int32_t>& corners = placed.mesh->corners;
     placed.list = &to;
     if (!rolling) placed.listed.assign(corners.size() / 3, Placed::faces_away);
+    const double start = lens_->pinhole ? lens_->y[0] : 0;  // of rows, and some more for rounding
+    const double above = start + (first_ - 4) * lens_->step[1];
+    const double below = start + (last_ + 3) * lens_->step[1];
     for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
         Vec3 points[6];  // now, and for the next pose
-        Lens::Pixel pixels[6] = {};
+        Lens::Pixel pixels[6];
         const auto put = [&](const Placed& of, int first) {
             for (int k = 0; k < 3; ++k) {
                 points[first + k] = of.seen[corners[corner + k]];
-                if (!lens_->pinhole) pixels[first + k] = of.pixels[corners[corner + k]];
+                pixels[first + k] = of.pixels[corners[corner + k]];
             }
         };
+        const auto beyond = [&](const Placed& of) {  // bits: above these rows, below them
+            int found = 3;
+            for (int k = 0; k < 3; ++k) {
+                const double row = of.pixels[corners[corner + k]].row;
+                found &= (row < above) | (row > below) << 1;
+            }
+            return found;
+        };
+        if (rolling && lens_->pinhole && (beyond(placed) & beyond(later_[index]))) continue;
         put(placed, 0);
         const Vec3(&now)[3] = *reinterpret_cast<Vec3(*)[3]>(points);
         Triangle triangle;
@@ -238,7 +249,7 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         put(later_[index], 3);
         if (!bounded(triangle, points, pixels, 6)) continue;
         const Corners from(now), next(*reinterpret_cast<Vec3(*)[3]>(points + 3));
-        if (from.away >= 0 && next.away >= 0) continue;
+        if (from.away() >= 0 && next.away() >= 0) continue;
         triangle.planes = Planes(from);
         to.push_back(triangle);
         moving.push_back({from, next});
@@ -250,6 +261,11 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
                     int count) const {
     triangle.left = 0, triangle.right = lens_->width;
     triangle.top = first_, triangle.bottom = last_;
+    double low[2] = {1e30, 1e30}, high[2] = {-1e30, -1e30};
+    const auto see = [&](Lens::Pixel at) {
+        low[0] = std::min(low[0], at.column), high[0] = std::max(high[0], at.column);
+        low[1] = std::min(low[1], at.row), high[1] = std::max(high[1], at.row);
+    };
     if (!lens_->pinhole) {
         Vec3 middle{};
         double reach = 0;
@@ -259,12 +275,10 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
         // What is small is in the box about its corners and the bulges of its edges.
         const double share = ball(middle, reach, triangle.ahead, triangle.least);
         if (!(share < 0.03)) return true;
-        float low[2] = {1e9f, 1e9f}, high[2] = {-1e9f, -1e9f};
         for (int k = 0; k < count; ++k) {
             const auto [column, row] = pixels[k];
             if (!(column >= 0 && column < 1e6f && row > -1e6f && row < 1e6f)) return true;
-            low[0] = std::min(low[0], column), high[0] = std::max(high[0], column);
-            low[1] = std::min(low[1], row), high[1] = std::max(high[1], row);
+            see(pixels[k]);
         }
         // 0.0005: of `pixel`. Of a lens that sees right behind itself, more than there are pixels.
         const double more = std::min(1.5 + lens_->bend * (share + 0.0005), 1e6);
@@ -274,20 +288,14 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
         triangle.bottom = std::min(triangle.bottom, static_cast<int>(high[1] + more) + 1);
         return triangle.left < triangle.right && triangle.top < triangle.bottom;
     }
-    double low[2] = {1e30, 1e30}, high[2] = {-1e30, -1e30};
     const double near = view_.near;
-    const auto see = [&](Vec3 p) {
-        const double share = 1.0 / p.z, x = p.x * share, y = p.y * share;
-        low[0] = std::min(low[0], x), high[0] = std::max(high[0], x);
-        low[1] = std::min(low[1], y), high[1] = std::max(high[1], y);
-    };
     for (int k = 0; k < count; ++k) {
         const Vec3 from = points[k], to = points[k % 3 == 2 ? k - 2 : k + 1];
-        if (from.z >= near) see(from);
+        if (from.z >= near) see(pixels[k]);
         if ((from.z >= near) != (to.z >= near)) {
             Vec3 at = from + (to - from) * ((near - from.z) / (to.z - from.z));
             at.z = near;
-            see(at);
+            see(lens_->pixel(at));
         }
     }
     // Columns are at equal steps of x, rows of y; a pixel more on each side for rounding, and one
@@ -300,8 +308,8 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
         last = to < last ? static_cast<int>(to) : last;
         return first < last;
     };
-    return span(low[0], high[0], lens_->x[0], lens_->step[0], triangle.left, triangle.right) &&
-           span(low[1], high[1], lens_->y[0], lens_->step[1], triangle.top, triangle.bottom);
+    return span(low[1], high[1], lens_->y[0], lens_->step[1], triangle.top, triangle.bottom) &&
+           span(low[0], high[0], lens_->x[0], lens_->step[0], triangle.left, triangle.right);
 }
 
 }  // namespace raster
