@@ -17,7 +17,6 @@ from bench.estimators.plan import FOLDER, Suite
 from runtime.channels.wire import combined
 from runtime.errors import ConfigError
 from runtime.run.results import write
-from runtime.run.summarise import commit, environment
 from runtime.tools.cli.commands import Json, JUnit, of_rows, writing
 from runtime.tools.sweep.plan import Job, Plan
 from runtime.tools.sweep.plots import template
@@ -217,7 +216,9 @@ def draw(suite: Suite, cells: Mapping[str, Mapping[str, Combination]], path: Pat
     axes.set_xticks(
         range(len(suite.scenarios)), [f"{s.name}\n({s.level})" for s in suite.scenarios]
     )
-    axes.set(yscale="log", ylabel="error over the whole flight, % of the path (cross: failed)")
+    if np.isfinite(axes.dataLim.minposy):  # someone said something, and erred
+        axes.set_yscale("log")
+    axes.set_ylabel("error over the whole flight, % of the path (cross: failed)")
     axes.grid(axis="y", alpha=0.3)
     figure.legend(loc="outside right upper", fontsize=8)
     figure.savefig(path, dpi=120)
@@ -277,12 +278,16 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
         thresholds=", ".join(f"{name} {value:g}" for name, value in suite.thresholds.items()),
         pictures=pictures(plan, folder),
         folder=folder.name,
-        where={**environment(), "commit": commit(), **_graphics(plan)},
+        where=_where(plan),
     )
     write(path, (text.rstrip() + "\n").encode())
 
 
-def _graphics(plan: Plan) -> dict[str, str]:
-    """Return the ``graphics`` entry of the first summary to contain any."""
-    places = (summary.get("environment", {}) for _, summary in summaries(plan))
-    return next(({"graphics": each["graphics"]} for each in places if "graphics" in each), {})
+def _where(plan: Plan) -> dict[str, str]:
+    """Return where the runs were made; what differs among them, all of it."""
+    found: dict[str, dict[str, None]] = {}
+    for _, summary in summaries(plan):
+        for name, value in summary.get("environment", {}).items():
+            if value and name != "command":  # without git there is no commit
+                found.setdefault(name, {})[value] = None
+    return {name: ", ".join(values) for name, values in found.items()}

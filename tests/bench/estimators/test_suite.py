@@ -264,6 +264,22 @@ def test_flights_that_differ_are_refused(small: Path, tmp_path: Path) -> None:
         flights(suite, plan)
 
 
+@pytest.mark.slow
+def test_the_page_says_where_the_runs_were_made(small: Path, tmp_path: Path) -> None:
+    """All places and commits, if there are several, and not those of who writes the page."""
+    suite = read_suite(small)
+    plan = make_plan(suite, out=tmp_path / "out", repeats=1)
+    for job, commit in zip(plan.jobs, ("abc", "def", "abc", "def"), strict=True):
+        where = {"system": "an island", "commit": commit, "command": "its own"}
+        Path(job.out).mkdir(parents=True)
+        summary = json.dumps({"digests": {}, "environment": where})
+        (Path(job.out) / "summary.json").write_text(summary)
+    rows = [crashed(job, "") for job in plan.jobs]
+    write_page(suite, plan, rows, tmp_path / "SUITE.md", "runtime suite")
+    page = (tmp_path / "SUITE.md").read_text(encoding="utf-8")
+    assert page.endswith("- system: an island\n- commit: abc, def\n")
+
+
 def test_an_estimator_without_rows_has_no_cell(small: Path) -> None:
     assert cells(make_plan(read_suite(small), out=Path("out")), []) == {}
 
