@@ -41,6 +41,13 @@ def big(stamp: int) -> Image:
     return Image(stamp=stamp, source="drone/front", frame_id="f", data=data)
 
 
+def wait_for_an_event(path: Path) -> None:
+    """Wait until another process has written one whole; a part of it may be there before."""
+    unfinished: list[str] = []
+    while not [*read(path, damaged=unfinished.append)]:
+        time.sleep(0.01)
+
+
 @pytest.mark.slow
 def test_a_run_is_recorded_to_its_end(tmp_path: Path) -> None:
     """All that was said is there, when it was said; so is the time at which the run ended."""
@@ -184,8 +191,7 @@ def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> 
     process = WriterProcess(request, backlog, failures.append, lambda _: None)
     process.start()
     backlog.put(1, big(1))
-    while path.stat().st_size < 200_000:
-        time.sleep(0.01)  # for another process
+    wait_for_an_event(path)
     os.kill(process._child.pid, signal.SIGKILL)
     process._child.wait()
     for stamp in range(2, 9):
@@ -256,8 +262,7 @@ def test_a_process_that_cannot_be_woken_is_ended_and_what_it_had_written_is_kept
     process = WriterProcess(request, Backlog(1 << 30, "wait"), failures.append, lambda _: None)
     process.start()
     process.backlog.put(1, big(1))
-    while path.stat().st_size < 200_000:
-        time.sleep(0.01)  # for another process
+    wait_for_an_event(path)
     os.kill(process._child.pid, signal.SIGSTOP)
     send = process._child.send_signal
     deaf = {signal.SIGCONT}
