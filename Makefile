@@ -12,6 +12,9 @@ export PYTHONDONTWRITEBYTECODE :=
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-slow test-pythons test-all check fix size docs wheel peers bench bench-quick orbslam3 svo suite images clean
 
+# That folders here may hide packages of the same name, setuptools says at length of every such install.
+INSTALL = PYTHONWARNINGS='ignore:Editable installation' $(BIN)/python -m pip install --quiet
+
 help:  ## List the targets.
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -22,12 +25,12 @@ $(CORE): pyproject.toml setup.py $(wildcard sims/cameras/rasteriser/*)
 		{ echo "expected Python 3.11 or later, found $$($(PYTHON) --version): set PYTHON="; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet -e .
+	$(INSTALL) -e .
 	@touch $@
 
 # The tests compare with MuJoCo's renderer, through EGL; what it lacks is installed if we may.
 $(READY): $(CORE)
-	$(BIN)/python -m pip install --quiet -e '.[dev,docs]'
+	$(INSTALL) -e '.[dev,docs]'
 	@sh tools/system_packages.sh gl $(BIN)/python
 	@touch $@
 
@@ -69,7 +72,7 @@ wheel: $(READY)  ## Build the wheel into dist.
 	$(BIN)/python -m build --outdir dist .
 
 orbslam3: $(READY)  ## Install ORB-SLAM3 (GPL) and train its vocabulary from rendered images.
-	$(BIN)/python -m pip install --quiet -e '.[orbslam3]'
+	$(INSTALL) -e '.[orbslam3]'
 	@sh tools/system_packages.sh orbslam3 $(BIN)/python
 	$(BIN)/python -m runtime vocabulary config.toml
 
@@ -82,7 +85,7 @@ suite: $(READY)  ## Judge all estimators that are installed in all scenarios; wr
 	$(BIN)/python -m runtime suite --page bench/SUITE.md
 
 peers: $(READY)  ## Install what the benchmarks compare with (PyPI, and Debian's ROS 1 and C++).
-	$(BIN)/python -m pip install --quiet -e '.[peers]'
+	$(INSTALL) -e '.[peers]'
 	@sh tools/system_packages.sh peers
 
 bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (about 20 minutes).
