@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE :=
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-slow test-pythons test-all check fix size docs wheel peers bench bench-quick orbslam3 svo suite images clean
 
-# That folders here may hide packages of the same name, setuptools says at length of every such install.
+# Setuptools warns at length of every editable install that folders here may hide packages.
 INSTALL = PYTHONWARNINGS='ignore:Editable installation' $(BIN)/python -m pip install --quiet
 
 help:  ## List the targets.
