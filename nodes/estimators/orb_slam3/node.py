@@ -161,14 +161,15 @@ class OrbSlam3Process:
         settings: Mode, settings file, size of images.
         vocabulary: In DBoW2's text format, its name ending with ``.txt``.
         mapping_time: Processor seconds that `track` leaves to the other threads, at most, after
-            each image. Without any, images faster than real time make the map poorer.
+            each image. Without any, images faster than real time make the map poorer, and how poor
+            depends on the machine.
 
     Raises:
         MissingDependencyError: `pyorbslam3` cannot be imported.
         ValueError: The vocabulary is none.
     """
 
-    def __init__(self, settings: Settings, vocabulary: Path, mapping_time: float = 0.02) -> None:
+    def __init__(self, settings: Settings, vocabulary: Path, mapping_time: float = 1.0) -> None:
         try:
             import pyorbslam3
         except ImportError as error:  # also where one of the system's libraries is missing
@@ -214,8 +215,8 @@ class OrbSlam3Process:
         self._stamps.append(stamp)
         # The second image of a map is compared with the first key frame by its words, which another
         # thread must have found by now: if not, it is lost at once.
-        share = _FIRST if self._new else self._mapping_time
-        _wait_for_other_threads(self._left_alone + share)
+        share = max(_FIRST if self._new else 0.0, self._mapping_time)
+        wait_for_other_threads(self._left_alone + share)
         chunk = None if imu is None else imu * (1e-9, 1, 1, 1, 1, 1, 1)
         if depth is not None:
             # 0 is how ORB-SLAM3 knows that there is no depth.
@@ -236,7 +237,7 @@ class OrbSlam3Process:
             Stamps as given to `track`, strictly rising, shape (n,), the optical camera in the frame
             of `track`'s poses, shape (n, 4, 4), and the number of that map.
         """
-        _wait_for_other_threads(self._left_alone + _LAST)
+        wait_for_other_threads(self._left_alone + _LAST)
         self._slam.shutdown()
         folder = Path(self._folder.name)
         files = str(folder / "frames.txt"), str(folder / "key_frames.txt")
@@ -346,7 +347,7 @@ def check_arrays(
             )
 
 
-def _wait_for_other_threads(until: float) -> None:
+def wait_for_other_threads(until: float) -> None:
     """Return when the other threads, polling every 3 and 5 ms, rest, or at a `process_time`."""
     quiet, naps = 0, _naps()
     while quiet < 3 and time.process_time() < until:
@@ -420,13 +421,14 @@ class OrbSlam3Config(EstimatorConfig):
         vocabulary: File in DBoW2's text format; if empty, that of ``python -m runtime vocabulary
             CONFIG``.
         orb: ORB-SLAM3's own settings.
-        mapping_timeout: Processor time of its other threads after each image, at most.
+        mapping_timeout: Processor time of its other threads after each image, at most, in lockstep:
+            the next one waits until they rest. On the real clock none waits.
     """
 
     mode: Mode = "rgbd"
     vocabulary: InputPath = ""
     orb: OrbSettings = OrbSettings()
-    mapping_timeout: Duration = Duration(0.02)  # immutable
+    mapping_timeout: Duration = Duration(1.0)  # immutable
 
 
 class OrbSlam3(Estimator[OrbSlam3Config]):
@@ -467,7 +469,8 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
 
     async def on_ready(self) -> None:
         """Start ORB-SLAM3, in a process of its own."""
-        told = self._settings, self._vocabulary, float(self.config.mapping_timeout)
+        mapping = float(self.config.mapping_timeout) if self.clock.kind == "lockstep" else 0.0
+        told = self._settings, self._vocabulary, mapping
         self._slam = await self.worker(OrbSlam3Process, *told, latency=self.config.latency)
 
     async def run(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -176,3 +177,21 @@ def test_what_it_said_counts_though_its_final_trajectory_cannot_be_saved(
 
 def test_its_runs_do_not_promise_their_digest() -> None:
     assert OrbSlam3.deterministic is False
+
+
+@pytest.mark.parametrize(("clock", "seconds"), [("lockstep", 0.7), ("real", 0.0)])
+async def test_images_wait_for_its_mapping_in_lockstep_alone(
+    monkeypatch: pytest.MonkeyPatch, clock: str, seconds: float
+) -> None:
+    told: list[Any] = []
+
+    async def worker(node: OrbSlam3, of: type, *given: Any, **_: Any) -> None:
+        told.append(given[-1])
+
+    monkeypatch.setattr(OrbSlam3, "worker", worker)
+    settings = spec(OrbSlam3, "slam", {"mapping_timeout": "700ms"}).config
+    node = make_node(OrbSlam3, "slam", settings, NoHost())
+    node.clock = SimpleNamespace(kind=clock)  # type: ignore[assignment]
+    node._settings, node._vocabulary = None, None  # type: ignore[assignment]
+    await node.on_ready()
+    assert told == pytest.approx([seconds])

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from nodes.estimators.orb_slam3.node import (
     OrbSlam3Result,
     check_arrays,
     first_key_frame,
+    wait_for_other_threads,
 )
 from nodes.estimators.orb_slam3.settings import (
     Mode,
@@ -333,3 +337,26 @@ def test_the_first_key_frame_of_a_trajectory(tmp_path: Path) -> None:
     )
     file.write_text("")
     assert first_key_frame(file) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit", "in_time"), [(60.0, True), (0.05, False)])
+def test_other_threads_are_waited_for_until_they_rest_or_have_had_their_time(
+    limit: float, in_time: bool
+) -> None:
+    computed, ended = threading.Event(), threading.Event()
+
+    def compute() -> None:
+        block = bytes(1 << 20)
+        for _ in range(600):  # some tenths of a second, without the interpreter's lock
+            hashlib.sha256(block).digest()
+        computed.set()
+        while not ended.wait(0.005):  # looks for more to do, as ORB-SLAM3's threads
+            pass
+
+    thread = threading.Thread(target=compute)
+    thread.start()
+    wait_for_other_threads(time.process_time() + limit)
+    assert computed.is_set() == in_time
+    ended.set()
+    thread.join()
