@@ -25,7 +25,7 @@ duration = "{seconds}s"
 [[nodes]]
 name = "world"
 type = "World"
-world = "hall"
+world = "{world}"
 wind = {{ velocity = [2.0, 0.5, 0.0], turbulence = "light" }}
 bodies = [
     {{ name = "walker", kind = "person", waypoints = [[0.6, -1.4, 0.0], [1.0, 1.4, 0.0]] }},
@@ -49,9 +49,9 @@ type = "WaypointFollower"
 {path}
 """
 PATHS = {
-    "waypoints": "waypoints = [[-2.5, 0.0, -1.4], [2.0, 1.0, -1.5], [1.0, 2.0, -1.2]]",
-    "excitation": "waypoints = [[-2.5, 0.0, -1.4]]\nexcitation = { duration = '5s' }",
-    "eight": "figure_eight = { centre = [0.0, 0.0, -1.5] }",
+    "waypoints": ("hall", "waypoints = [[-2.5, 0.0, -1.4], [2.0, 1.0, -1.5], [1.0, 2.0, -1.2]]"),
+    "excitation": ("yard", "waypoints = [[-2.5, 0.0, -1.4]]\nexcitation = { duration = '5s' }"),
+    "eight": ("hall", "figure_eight = { centre = [0.0, 0.0, -1.5] }"),
 }
 
 
@@ -71,7 +71,8 @@ def inputs(file: Path, **environment: str) -> dict[str, Any]:
 @pytest.mark.parametrize("path", PATHS)
 def test_inputs_depend_on_no_width_of_vectors_and_no_kernels(path: str, tmp_path: Path) -> None:
     file = tmp_path / "flight.toml"
-    file.write_text(FLIGHT.format(seconds=12, path=PATHS[path]), encoding="utf-8")
+    world, words = PATHS[path]
+    file.write_text(FLIGHT.format(seconds=12, world=world, path=words), encoding="utf-8")
     simd = np.show_config(mode="dicts")["SIMD Extensions"]
     here = simd.get("found", [])
     plain = inputs(file, NPY_DISABLE_CPU_FEATURES=" ".join(here), OPENBLAS_CORETYPE="Prescott")

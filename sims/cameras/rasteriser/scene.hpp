@@ -227,6 +227,7 @@ class Scene {
     int first_ = 0, last_ = 0;  // rows that are being drawn: first to last - 1
     double start_ = 0, step_ = 0;  // row of the first pose, and how many there are to the next one
     Pose eye_{}, next_eye_{}, middle_eye_{};
+    const Pose* middle_poses_ = nullptr;  // of geoms; their light is that of all rows
     std::vector<Light> lights_;
     std::vector<Light> casters_;  // those that throw shadows
     std::vector<Placed> placed_, later_;  // for the first pose, and the next one

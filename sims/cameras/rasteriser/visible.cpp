@@ -38,9 +38,7 @@ void Scene::draw(const Lens& lens, const View& view, const Pose* eyes, const Geo
     nearest_.resize(std::size_t(view.last - view.first) * lens.stride + widest);
     visible_.resize(std::size_t(view.last - view.first) * lens.stride + widest);
     const int steps = view.poses - 1, middle = view.poses / 2;
-    middle_eye_ = eyes[middle];
-    if (images.rgb)  // the light of the middle is that of all rows
-        for (int k = 0; k < count; ++k) slots_[k].pose = poses[std::size_t(middle) * count + k];
+    middle_eye_ = eyes[middle], middle_poses_ = poses + std::size_t(middle) * count;
     bool fresh = true;
     for (int k = 0; k < std::max(steps, 1); ++k) {
         step_ = steps ? (view.height - 1.0) / steps : 1.0, start_ = k * step_;
@@ -92,7 +90,7 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
             const int index = order[k].second;
             see(placed_[index]);
             if (rolling) see(later_[index]);
-            if (images.rgb) light(geoms[index], slots_[index].pose, slots_[index]);
+            if (images.rgb) light(geoms[index], middle_poses_[index], slots_[index]);
             if (geoms[index].rgba[3] >= 1.0f) add(index, solid_[part], solid_moving_[part]);
         }
         for (std::size_t k = end; k-- > begin;)  // from back to front

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from events.frames import from_rpy
 from sims.cameras import add_free_camera, model_from_bytes, model_to_bytes, pose_to_qpos
 from sims.cameras.opengl import OpenGL
+from sims.cameras.raster import Raster
 from sims.cameras.spec import camera_info
-from sims.cameras.stage import Floats
+from sims.cameras.stage import Drawn, Floats, View
 from sims.worlds import TOURS
 from tests.sims.cameras.scenes import WIDE, scene
+from tests.sims.cameras.test_raster import PINHOLE, shaped
 
 SIZE = (90, 160)
 
@@ -96,3 +101,33 @@ def test_what_is_out_of_view_is_not_missed(
         for a, b in zip(found, whole, strict=True):
             np.testing.assert_array_equal(a, b)
     assert left_out > 0
+
+
+def turning() -> Any:
+    """Return a model of a box that turns in the light of a sun."""
+    sun = '<light type="directional" dir="1 -.3 -1" diffuse=".8 .6 .4" specular="0 0 0"/>'
+    box = '<body><joint axis=".2 .3 1"/><geom type="box" size=".6 .5 .4" mass="1"/></body>'
+    return shaped(sun + box)
+
+
+@settings(max_examples=20, deadline=None)
+@given(angles=st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=4), rolling=st.booleans())
+@example(angles=[0.0, 1.5], rolling=False)
+def test_an_image_does_not_depend_on_those_drawn_before(angles: list[float], rolling: bool) -> None:
+    """Of what moves the light is that of where it is, too."""
+    model = turning()
+
+    def seen(stage: Raster, angle: float) -> Drawn:
+        camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "free/pinhole")
+        qpos = np.array([angle, *pose_to_qpos((-2.2, 0.3, -0.2), from_rpy(0.0, 0.0, 0.0))])
+        for late in (-0.2, 0.2) if rolling else ():
+            stage.keep(camera, qpos + np.eye(len(qpos))[0] * late, 0.0)
+        stage.look(camera, qpos)
+        return stage.draw(View(camera_info(PINHOLE)), True, True, True)
+
+    raster, other = Raster(model), Raster(model)
+    *_, last = (seen(raster, angle) for angle in angles)
+    for image, alone in zip(last, seen(other, angles[-1]), strict=True):
+        np.testing.assert_array_equal(image, alone)
+    raster.close()
+    other.close()
