@@ -219,6 +219,8 @@ class Evaluation(Node[EvaluationConfig]):
     @on(PlannedPose, PositionSetpoint)
     def plans(self, event: PlannedPose | PositionSetpoint) -> None:
         """Note where a pilot means its vehicle to be."""
+        if self._closed:
+            return
         vehicle = self._vehicles.of(event.vehicle or event.source)
         self._flights.setdefault(vehicle, Flight()).add_plan(event)
 
@@ -248,18 +250,23 @@ class Evaluation(Node[EvaluationConfig]):
     @on(TrackingEvent)
     def tracking_events(self, event: TrackingEvent) -> None:
         """Record loss or recovery of an estimator's tracking."""
+        if self._closed:
+            return
         record = self._records.setdefault(event.source, EstimatorRecord())
         record.note(event, self.clock.now())
 
     @on(TrajectoryEstimate)
     def trajectories(self, event: TrajectoryEstimate) -> None:
         """Record an estimator's trajectory after loop closures; the last counts."""
-        if not self._closed:
-            self._records.setdefault(event.source, EstimatorRecord()).add_final(event)
+        if self._closed:
+            return
+        self._records.setdefault(event.source, EstimatorRecord()).add_final(event)
 
     @on(LidarScan)
     def scans(self, event: LidarScan) -> None:
         """Record a scan's end time; a pose may be for any of its rays."""
+        if self._closed:
+            return
         stamps = self._scans.setdefault(event.source, array("q"))
         if not stamps or event.end > stamps[-1]:
             stamps.append(event.end)
@@ -267,6 +274,8 @@ class Evaluation(Node[EvaluationConfig]):
     @on(Image)
     def images(self, event: Image) -> None:
         """Record an image's stamp; keep the image for a while, for features to follow."""
+        if self._closed:
+            return
         stamps = self._frames.setdefault(event.source, array("q"))
         exposed = event.stamp - self._late.get(event.source.removesuffix("/grey"), 0)
         if not stamps or exposed > stamps[-1]:
@@ -276,11 +285,15 @@ class Evaluation(Node[EvaluationConfig]):
     @on(Collision)
     def collisions(self, event: Collision) -> None:
         """Note a vehicle's collision."""
+        if self._closed:
+            return
         self._flights.setdefault(event.source, Flight()).collisions.append(event)
 
     @on(TrackedFeatures)
     def features(self, event: TrackedFeatures) -> None:
         """Record an estimator's camera; keep an image with its features at intervals."""
+        if self._closed:
+            return
         self._vehicles.tracked(event)
         self._album.add_features(event)
 
