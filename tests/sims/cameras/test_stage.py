@@ -20,7 +20,7 @@ from sims.cameras.spec import camera_info
 from sims.cameras.stage import Drawn, Floats, View
 from sims.worlds import TOURS
 from tests.sims.cameras.scenes import WIDE, scene
-from tests.sims.cameras.test_raster import PINHOLE, shaped
+from tests.sims.cameras.test_raster import PINHOLE, SPECS, shaped
 
 SIZE = (90, 160)
 
@@ -103,31 +103,56 @@ def test_what_is_out_of_view_is_not_missed(
     assert left_out > 0
 
 
-def turning() -> Any:
-    """Return a model of a box that turns in the light of a sun."""
-    sun = '<light type="directional" dir="1 -.3 -1" diffuse=".8 .6 .4" specular="0 0 0"/>'
-    box = '<body><joint axis=".2 .3 1"/><geom type="box" size=".6 .5 .4" mass="1"/></body>'
-    return shaped(sun + box)
+CHANGING = """
+<light type="directional" dir="1 -.3 -1" diffuse=".8 .6 .4" specular="0 0 0"/>
+<light type="spot" pos="-1 1 3" dir=".3 -.3 -1" castshadow="false" specular="0 0 0"/>
+<geom type="plane" size="4 4 .1" pos="0 0 -1"/>
+<body><joint axis=".2 .3 1"/><geom type="box" size=".6 .5 .4" mass="1"/></body>
+<geom type="sphere" size=".3" pos="-.8 .6 .2" rgba=".2 .4 .9 .5"/>
+"""
 
 
-@settings(max_examples=20, deadline=None)
-@given(angles=st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=4), rolling=st.booleans())
-@example(angles=[0.0, 1.5], rolling=False)
-def test_an_image_does_not_depend_on_those_drawn_before(angles: list[float], rolling: bool) -> None:
-    """Of what moves the light is that of where it is, too."""
-    model = turning()
+class Changes:
+    """A lamp that dims, a ball that becomes see-through and a box that changes its colour."""
 
-    def seen(stage: Raster, angle: float) -> Drawn:
-        camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "free/pinhole")
+    fog = False
+
+    def apply(self, model: Any, data: Any, seconds: float) -> None:
+        model.light_diffuse[1] = 0.5 + 0.4 * math.sin(seconds)
+        box, ball = model.geom_rgba[-2:]
+        box[0], ball[3] = 0.5 + 0.4 * math.cos(seconds), min(1.0, 0.6 + 0.5 * math.sin(seconds))
+
+
+SHOTS = st.tuples(
+    st.sampled_from((0.0, 0.3, 1.5, -2.0)),  # the box's angle, radians
+    st.sampled_from((0.0, 1.0, 2.5)),  # seconds
+    st.sampled_from(SPECS),
+    st.booleans(),  # by a rolling shutter
+    st.sampled_from(((True, True, True), (True, False, False), (False, True, False))),
+)
+
+
+@settings(max_examples=30, deadline=None)
+@given(shots=st.lists(SHOTS, min_size=2, max_size=5))
+@example(shots=[(angle, 0.0, PINHOLE, False, (True, True, True)) for angle in (0.0, 1.5)])
+def test_an_image_does_not_depend_on_those_drawn_before(shots: list[Any]) -> None:
+    """The light of what moves is that of where it is now, too."""
+    model = shaped(CHANGING)
+
+    def seen(stage: Raster, shot: Any) -> Drawn:
+        angle, seconds, lens, rolling, wanted = shot
+        camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, f"free/{lens.name}")
         qpos = np.array([angle, *pose_to_qpos((-2.2, 0.3, -0.2), from_rpy(0.0, 0.0, 0.0))])
         for late in (-0.2, 0.2) if rolling else ():
-            stage.keep(camera, qpos + np.eye(len(qpos))[0] * late, 0.0)
-        stage.look(camera, qpos)
-        return stage.draw(View(camera_info(PINHOLE)), True, True, True)
+            stage.keep(camera, qpos + np.eye(len(qpos))[0] * late, seconds + late)
+        stage.look(camera, qpos, seconds)
+        return stage.draw(View(camera_info(lens)), *wanted)
 
-    raster, other = Raster(model), Raster(model)
-    *_, last = (seen(raster, angle) for angle in angles)
-    for image, alone in zip(last, seen(other, angles[-1]), strict=True):
-        np.testing.assert_array_equal(image, alone)
+    raster, other = Raster(model, Changes()), Raster(model, Changes())
+    *_, last = (seen(raster, shot) for shot in shots)
+    for image, alone in zip(last, seen(other, shots[-1]), strict=True):
+        assert (image is None) == (alone is None)
+        if image is not None and alone is not None:
+            np.testing.assert_array_equal(image, alone)
     raster.close()
     other.close()
