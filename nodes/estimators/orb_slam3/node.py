@@ -349,13 +349,20 @@ def check_arrays(
 
 def wait_for_other_threads(until: float) -> None:
     """Return when the other threads, polling every 3 and 5 ms, rest, or at a `process_time`."""
-    quiet, naps = 0, _naps()
+    quiet, naps, worked = 0, _naps(), _worked()
     while quiet < 3 and time.process_time() < until:
         time.sleep(_QUIET)
-        before, naps = naps, _naps()
-        # Who runs (or waits for a processor) and has not napped meanwhile has something to do.
-        busy = any(runs and before.get(task) == (runs, n) for task, (runs, n) in naps.items())
+        before, naps, begin, worked = naps, _naps(), worked, _worked()
+        # Who has computed for long, or runs (or waits for a processor) and has not napped
+        # meanwhile, has something to do.
+        busy = worked - begin > _QUIET / 5
+        busy |= any(runs and before.get(task) == (runs, n) for task, (runs, n) in naps.items())
         quiet = 0 if busy else quiet + 1
+
+
+def _worked() -> float:
+    """Return the seconds that all other threads have computed so far."""
+    return time.process_time() - time.thread_time()
 
 
 def _naps() -> dict[str, tuple[bool, str]]:
