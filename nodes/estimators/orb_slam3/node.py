@@ -161,8 +161,7 @@ class OrbSlam3Process:
         settings: Mode, settings file, size of images.
         vocabulary: In DBoW2's text format, its name ending with ``.txt``.
         mapping_time: Processor seconds that `track` leaves to the other threads, at most, after
-            each image. Without any, images faster than real time make the map poorer, and how poor
-            depends on the machine.
+            each image. Without any, images faster than real time make the map poorer.
 
     Raises:
         MissingDependencyError: `pyorbslam3` cannot be imported.
@@ -205,8 +204,7 @@ class OrbSlam3Process:
             depth: Metres along the optical axis, shape (h, w); ``inf`` for none. For modes with
                 depth only.
             imu: For inertial modes: measurements since the last call, shape (n, 7): stamp (ns),
-                angular velocity (rad/s), specific force (m/s²). Those after the image wait for the
-                next.
+                angular velocity (rad/s), specific force (m/s²). Those after it wait for the next.
 
         Raises:
             ValueError: An array is missing, superfluous, or of the wrong shape.
@@ -349,20 +347,15 @@ def check_arrays(
 
 def wait_for_other_threads(until: float) -> None:
     """Return when the other threads, polling every 3 and 5 ms, rest, or at a `process_time`."""
-    quiet, naps, worked = 0, _naps(), _worked()
+    quiet, naps = 0, _naps()
     while quiet < 3 and time.process_time() < until:
+        begin = time.process_time() - time.thread_time()  # of the others
         time.sleep(_QUIET)
-        before, naps, begin, worked = naps, _naps(), worked, _worked()
-        # Who has computed for long, or runs (or waits for a processor) and has not napped
-        # meanwhile, has something to do.
-        busy = worked - begin > _QUIET / 5
+        before, naps = naps, _naps()
+        # Who computes, or runs (or waits for a processor) without a nap, has something to do.
+        busy = time.process_time() - time.thread_time() - begin > _QUIET / 5
         busy |= any(runs and before.get(task) == (runs, n) for task, (runs, n) in naps.items())
         quiet = 0 if busy else quiet + 1
-
-
-def _worked() -> float:
-    """Return the seconds that all other threads have computed so far."""
-    return time.process_time() - time.thread_time()
 
 
 def _naps() -> dict[str, tuple[bool, str]]:
