@@ -422,7 +422,7 @@ class OrbSlam3Config(EstimatorConfig):
             CONFIG``.
         orb: ORB-SLAM3's own settings.
         mapping_timeout: Processor time of its other threads after each image, at most, in lockstep:
-            the next one waits until they rest. On the real clock none waits.
+            the next one waits until they rest. On the real clock only a map's second one does.
     """
 
     mode: Mode = "rgbd"
