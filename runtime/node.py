@@ -201,7 +201,11 @@ class Node(Generic[C]):
         """
 
     async def on_shutdown(self) -> None:
-        """Flush and close. Events sent here still reach nodes before this in the file."""
+        """Flush and close. Events sent here still reach nodes before this in the file.
+
+        The node receives nothing any more, also in what it does beside the loop; its streams still
+        have what came before.
+        """
 
     # What a node can ask for.
 

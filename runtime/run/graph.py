@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dis
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from events import Announcement, CameraAnnouncement, Odometry, PoseStamped, VehicleAnnouncement
@@ -76,6 +76,7 @@ def connect(
     elsewhere: Callable[[str], Iterable[Listener]] = lambda _: (),
     wrap: Wrap = unwrapped,
     voices: Voices | None = None,
+    deaf: Collection[str] = (),
 ) -> list[Listener]:
     """Freeze the listeners of every output, and return all listeners of this process.
 
@@ -86,10 +87,12 @@ def connect(
         fault: Called with listeners that raise; without it, `send` raises what they do.
         elsewhere: Given ``node.port``, returns its listeners in other processes.
         wrap: Puts something round the nodes' handlers.
+        deaf: Names of nodes that may send, and receive nothing any more.
     """
     connected = [
         listener
         for node in nodes
+        if node.name not in deaf
         for listener in listeners(node, (links or {}).get(node.name, {}), fault, wrap)
     ]
     connected += last

@@ -159,10 +159,18 @@ class NodeRunner:
         async with self.shutdown_lock:
             return await self._last_step(limit, "on_end", node.on_end())
 
-    async def shut_down(self, limit: float) -> list[NodeError]:
-        """End ticks, tasks, node and workers, within a limit (real s) each; return the errors."""
-        node, wrong = self.node, []
+    def hang_up(self) -> None:
+        """Take nothing more in: what the node knows stays as it is while it shuts down."""
         self.shutting_down = True
+        for link in self.links.values():
+            link.close()
+
+    async def shut_down(self, limit: float) -> list[NodeError]:
+        """End ticks, tasks, node and workers, within a limit (real s) each; return the errors.
+
+        For a node that has hung up.
+        """
+        node, wrong = self.node, []
         for ticker in self.tickers:
             ticker.stopped = True
         self.tickers.clear()
@@ -177,8 +185,6 @@ class NodeRunner:
         wrong += await self._end_by(limit, "its workers", workers)
         self.workers.clear()
         self.started = False
-        for link in self.links.values():
-            link.close()
         if node is not None:
             for stream in streams(node).values():
                 stream.close()

@@ -218,6 +218,7 @@ class Supervisor:
             elsewhere=self.others.listeners,
             wrap=self.instruments.listener,
             voices=self._voices,
+            deaf={runner.spec.name for runner in runners if runner.shutting_down},
         )
         self.state.truth_readers |= graph.truth_readers(nodes, listeners, self.state.announcements)
         self.others.connect(listeners, self._listener_failed)
@@ -380,12 +381,13 @@ class Supervisor:
             self.state.note_error(error)
 
     async def _shut_down(self, runner: NodeRunner) -> None:
-        """Shut a node down, once; afterwards the node receives nothing."""
+        """Shut a node down, once; from the first step on the node receives nothing."""
         async with runner.shutdown_lock:
+            runner.hang_up()
+            self.connect()
             runner.first_error = self.state.error is None
             for error in await runner.shut_down(self.state.shutdown_limit()):
                 self.state.note_error(error)
-            self.connect()
 
 
 def _give_up(_phase: Phase, _runner: NodeRunner, error: NodeError) -> None:

@@ -168,7 +168,6 @@ class Evaluation(Node[EvaluationConfig]):
         self._late: dict[str, int] = {}  # offsets of the cameras' clocks
         self._album = Album(self.config.image_count)
         self._files: dict[str, GrowingFile] = {}
-        self._closed = False
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Note vehicles and their cameras; expect estimators."""
@@ -207,7 +206,7 @@ class Evaluation(Node[EvaluationConfig]):
     def odometry(self, event: Odometry) -> None:
         """Note the truth."""
         known = self._vehicles.names
-        if self._closed or (known and event.source not in known and "odometry" not in self.sources):
+        if known and event.source not in known and "odometry" not in self.sources:
             return
         flight = self._flights.get(event.source)
         if flight is None:
@@ -219,16 +218,12 @@ class Evaluation(Node[EvaluationConfig]):
     @on(PlannedPose, PositionSetpoint)
     def plans(self, event: PlannedPose | PositionSetpoint) -> None:
         """Note where a pilot means its vehicle to be."""
-        if self._closed:
-            return
         vehicle = self._vehicles.of(event.vehicle or event.source)
         self._flights.setdefault(vehicle, Flight()).add_plan(event)
 
     @on(PoseEstimate)
     def estimates(self, event: PoseEstimate) -> None:
         """Note an estimate, and send its errors as scores."""
-        if self._closed:
-            return
         name, now = event.source, self.clock.now()
         record = self._records.setdefault(name, EstimatorRecord())
         if not record.add(event, now):
@@ -250,23 +245,17 @@ class Evaluation(Node[EvaluationConfig]):
     @on(TrackingEvent)
     def tracking_events(self, event: TrackingEvent) -> None:
         """Record loss or recovery of an estimator's tracking."""
-        if self._closed:
-            return
         record = self._records.setdefault(event.source, EstimatorRecord())
         record.note(event, self.clock.now())
 
     @on(TrajectoryEstimate)
     def trajectories(self, event: TrajectoryEstimate) -> None:
         """Record an estimator's trajectory after loop closures; the last counts."""
-        if self._closed:
-            return
         self._records.setdefault(event.source, EstimatorRecord()).add_final(event)
 
     @on(LidarScan)
     def scans(self, event: LidarScan) -> None:
         """Record a scan's end time; a pose may be for any of its rays."""
-        if self._closed:
-            return
         stamps = self._scans.setdefault(event.source, array("q"))
         if not stamps or event.end > stamps[-1]:
             stamps.append(event.end)
@@ -274,8 +263,6 @@ class Evaluation(Node[EvaluationConfig]):
     @on(Image)
     def images(self, event: Image) -> None:
         """Record an image's stamp; keep the image for a while, for features to follow."""
-        if self._closed:
-            return
         stamps = self._frames.setdefault(event.source, array("q"))
         exposed = event.stamp - self._late.get(event.source.removesuffix("/grey"), 0)
         if not stamps or exposed > stamps[-1]:
@@ -285,21 +272,16 @@ class Evaluation(Node[EvaluationConfig]):
     @on(Collision)
     def collisions(self, event: Collision) -> None:
         """Note a vehicle's collision."""
-        if self._closed:
-            return
         self._flights.setdefault(event.source, Flight()).collisions.append(event)
 
     @on(TrackedFeatures)
     def features(self, event: TrackedFeatures) -> None:
         """Record an estimator's camera; keep an image with its features at intervals."""
-        if self._closed:
-            return
         self._vehicles.tracked(event)
         self._album.add_features(event)
 
     async def on_shutdown(self) -> None:
         """Judge all estimators and write the results."""
-        self._closed = True  # while it judges, beside the loop, nothing may change
         for file in self._files.values():
             file.close()
         if not self._records and self.clock.now() > 0:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -16,11 +16,12 @@ from events import (
     VehicleAnnouncement,
     WindowClosed,
 )
-from runtime import Input, Node, Output, on
+from runtime import Bundle, Input, Node, Output, on
 from runtime.config.model import NodeSpec
 from runtime.host import RunEnd
 from runtime.node import NodeConfig
 from runtime.testing import spec
+from tests.runtime.samples import Ping
 from tests.runtime.samples_runs import supervise
 
 
@@ -125,6 +126,64 @@ def test_a_run_counts_how_often_a_node_was_brought_up_anew() -> None:
     end = ended(spec(Ends, "x", {"how": "raise"}, on_error="restart"), duration=1.5)
     assert end.restarts == {"reader": 0, "x": 1}
     assert (end.by, end.planned) == ("", True)
+
+
+class Chatterbox(Node):
+    """Lets others make it speak."""
+
+    pings = Output(Ping)
+
+    async def on_startup(self) -> None:
+        self.share("speak", lambda: self._speak)
+
+    def _speak(self, count: int) -> None:
+        self.pings.send(Ping(stamp=self.clock.now(), source=self.name, count=count))
+
+
+class Pair(NamedTuple):
+    ping: Ping
+
+
+class Busy(Node):
+    """Works beside the loop as it ends, while others go on speaking."""
+
+    read = Input(Ping)
+    paired = Bundle(Pair)
+    found: list[Any]
+
+    async def run(self) -> None:
+        Busy.found = []
+        self._let_speak(1)
+        self.stop("enough")
+
+    @on(Ping)
+    def hear(self, event: Ping) -> None:
+        Busy.found.append(event.count)
+
+    @on(Ping)
+    def hear_late(self, event: Ping) -> None:
+        Busy.found.append(f"late {event.count}")
+
+    async def on_shutdown(self) -> None:
+        self._let_speak(2)
+        if self.clock.kind == "real":
+            await self.clock.sleep(0.03)  # what was under way would have come by then
+        Busy.found += [self.read.receive_nowait().count, self.paired.receive_nowait().ping.count]
+        Busy.found += [self.read.statistics().buffered, self.paired.statistics().buffered]
+
+    def _let_speak(self, count: int) -> None:
+        speak: Callable[[int], None] = self.share("speak", lambda: lambda _: None)
+        speak(count)
+
+
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
+def test_a_node_receives_nothing_while_it_shuts_down(clock: str) -> None:
+    """What it writes beside the loop stays as it is; what came before can still be read."""
+    busy = spec(Busy, "busy", links={"hear_late": {"delay": "10ms"}})
+    outcome = supervise([spec(Chatterbox, "box"), busy], clock=clock)
+    assert outcome.error is None
+    assert [each.count for each in outcome.sent if isinstance(each, Ping)] == [1, 2]
+    assert Busy.found == [1, 1, 1, 0, 0]  # by the handler, the stream and the bundle; no more
 
 
 class Vehicle(Node):

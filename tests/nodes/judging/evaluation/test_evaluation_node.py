@@ -469,30 +469,3 @@ def test_images_count_at_the_time_of_their_exposure(tmp_path: Path, told: bool) 
     figures = verdict["estimators"]["est"]
     assert figures["ate_rmse_m"] < 1e-3
     assert (figures["frame_coverage_percent"] > 95.0) == told
-
-
-class Disturbed(Evaluation):
-    """Hears of everything while it judges, as on the real clock it may."""
-
-    def _finish(self, end: int) -> Any:
-        seen: Any = {"stamp": end, "source": "new/eye", "frame_id": "new/eye_optical"}
-        self.images(Image(encoding="mono8", data=np.zeros((60, 80), np.uint8), **seen))
-        self.plans(PositionSetpoint(stamp=end, source="pilot", vehicle="new", position=(1, 2, 3)))
-        where: Any = {"position": (1.0, 2.0, -1.5), "normal": (1.0, 0.0, 0.0), "speed": 0.5}
-        self.collisions(Collision(stamp=end, source="drone", other="wall", **where))
-        self.tracking_events(lost(end))
-        self.estimates(estimate(end))
-        return super()._finish(end)
-
-
-def test_what_comes_while_it_judges_changes_nothing(tmp_path: Path) -> None:
-    script = [*announced(), *truth(10.0), *(estimate(s) for s in FRAMES)]
-    script.sort(key=lambda event: event.stamp)
-    for name, judge in (("quiet", Evaluation), ("disturbed", Disturbed)):
-        (tmp_path / name).mkdir()
-        node = spec(judge, "evaluation", {})
-        run_nodes([node], inputs=script, duration=11.0, out=tmp_path / name)
-    quiet, other = (
-        (tmp_path / name / "evaluation/verdict.json").read_text() for name in ("quiet", "disturbed")
-    )
-    assert quiet == other
