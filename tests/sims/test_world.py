@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from events import (
     BodyAnnouncement,
     Collision,
     Event,
+    Image,
     Imu,
     Odometry,
     PathAnnouncement,
@@ -376,6 +378,33 @@ def test_a_mask_is_where_its_body_is(world: str) -> None:
         assert columns.mean() == pytest.approx(79.5 + 80 * east / 4.0, abs=4.0)
         seen += 1
     assert seen == 10
+
+
+@pytest.mark.slow
+def test_a_turning_body_is_lit_the_same_by_any_number_of_processes(tmp_path: Path) -> None:
+    """Each draws other images, so what it drew before must not matter: two begin with two poses."""
+    sun = '<light type="directional" dir="1 0.5 -1" specular="0 0 0"/>'
+    matt = f'<visual><headlight specular="0 0 0"/></visual><worldbody>{sun}'  # nothing shines
+    (tmp_path / "sunny.xml").write_text(WORLD.replace("<worldbody>", matt))
+    sunny = str(tmp_path / "sunny.xml")
+    turning = {"times": [0, 0.9, 2.2], "angles": [20, 90, 20]}
+    door = {"name": "d", "kind": "door", "waypoints": [(3, -0.4, 0)]} | turning
+    camera = {"name": "c", "images": ["rgb"], "width": 160, "height": 120, "latency": "900ms"}
+    one, two = (
+        fly(
+            surroundings(sunny, bodies=[door]),
+            spec(
+                FreeCamera,
+                "eye",
+                {"cameras": [camera], "rate": 3, "position": [0, 0, -1], "camera_processes": count},
+            ),
+            duration=3.0,
+        ).of(Image)
+        for count in (1, 2)
+    )
+    assert len({image.data.tobytes() for image in one}) == len(one) > 5
+    for alone, shared in zip(one, two, strict=True):
+        np.testing.assert_array_equal(alone.data, shared.data)
 
 
 def test_there_is_one_world_and_it_is_that_of_the_vehicles(world: str) -> None:
