@@ -143,10 +143,19 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         """Return rows by mask (n,), rising numbers or slice; a `ValueError` if none are left."""
         return Trajectory(self.stamps[rows], self.positions[rows], self.orientations[rows])
 
-    def covers(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
-        """Return a mask of the stamps (ns) from the first pose to the last, shape as given."""
+    def covers(self, stamps: Stamps, hole: int | None = None) -> npt.NDArray[np.bool_]:
+        """Return a mask of the stamps (ns) from the first pose to the last, shape as given.
+
+        Args:
+            hole: Nanoseconds: between poses farther apart nothing is covered.
+        """
         stamps = np.asarray(stamps)
-        return np.asarray((stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]))
+        inside = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1])
+        if hole is not None:
+            after = np.searchsorted(self.stamps, stamps).clip(max=len(self) - 1)
+            step = self.stamps[after] - self.stamps[after - (after > 0)]
+            inside &= (step <= hole) | (self.stamps[after] == stamps)
+        return np.asarray(inside)
 
     def at(self, stamps: Stamps) -> Trajectory:
         """Return the poses at other times: positions linear, orientations by slerp.
@@ -258,21 +267,31 @@ def _slerp(first: Floats, second: Floats, share: Floats) -> Floats:
     return np.asarray(a * first + b * second)
 
 
+HOLE = 200_000_000  # nanoseconds from a true pose to the next over which none is made up
+
+
 def associate(
-    truth: Trajectory, estimate: Trajectory, *, name: str = ""
+    truth: Trajectory, estimate: Trajectory, hole: int = HOLE, *, name: str = ""
 ) -> tuple[Trajectory, Trajectory]:
     """Return the truth at the estimate's stamps, and the estimate where there is a truth.
 
     Args:
-        truth: Dense, as it is interpolated; estimates before its start or after its end are left
-            out.
+        truth: Dense, as it is interpolated; estimates before its start, after its end or in a hole
+            are left out.
+        hole: As of `Trajectory.covers`.
         name: Beginning of errors' messages, such as the estimate's file.
 
     Raises:
         ValueError: They have no time in common; the message says if their units or clocks differ.
     """
-    known = truth.covers(estimate.stamps)
+    known = truth.covers(estimate.stamps, hole)
     if not known.any():
+        if truth.covers(estimate.stamps).any():
+            usual = np.median(np.diff(truth.stamps)) / 1e9
+            raise ValueError(
+                f"{name}{name and ': '}expected estimates between true poses at most "
+                f"{hole / 1e9:g} s apart, found none: the truth's are {usual:.3g} s apart (median)"
+            )
         first, second = int(truth.stamps[-1]), int(estimate.stamps[-1])
         why = ""
         if 0.5e9 < max(first, second) / max(min(first, second), 1) < 2e9:
@@ -345,15 +364,15 @@ class RecentPoses:
         old = bisect_left(stamps, stamps[-1] - HISTORY)
         del stamps[:old], poses[:old]
 
-    def at(self, stamp: int) -> Pose | None:
-        """Return the pose at a time (ns), by slerp; `None` outside of the kept stamps."""
+    def at(self, stamp: int, hole: int = HISTORY) -> Pose | None:
+        """Return the pose at a time (ns), by slerp; `None` outside of those kept or in a hole."""
         stamps, poses = self._stamps, self._poses
         after = bisect_left(stamps, stamp)
         if after == len(stamps):
             return None
         if stamps[after] == stamp:
             return poses[after]
-        if after == 0:
+        if after == 0 or stamps[after] - stamps[after - 1] > hole:
             return None
         (p, q), (r, s) = poses[after - 1 : after + 1]
         share = (stamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])

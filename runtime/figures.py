@@ -121,7 +121,7 @@ _TABLE = (
     Figure("alignment", "how it was laid on the truth", report="head"),
     _detail("scale", "by what Sim(3) multiplies its lengths; 1 is right if they are in metres"),
     _detail("estimates", "poses that count"),
-    _detail("compared", "poses within the truth's time"),
+    _detail("compared", "poses for whose time a true pose is known"),
     _detail("path_m", "length of the true path in the flight"),
     _error("ate_rmse_m", "absolute trajectory error (ATE), RMS", report="head", sweep=1),
     _error(

@@ -36,7 +36,7 @@ def judge(
     ] = False,
     times: Annotated[str, typer.Option(help="File of stamps of KITTI's poses.")] = "",
     frames: Annotated[str, typer.Option(help="File of stamps of the images, for coverage.")] = "",
-    max_difference: Annotated[str, typer.Option(help="To the nearest true pose.")] = "100ms",
+    max_difference: Annotated[str, typer.Option(help="Half of a hole of the truth.")] = "100ms",
     gap: Annotated[str, typer.Option(help="Silence that counts as lost.")] = "500ms",
     body_from_camera: Annotated[
         str, typer.Option(metavar="POSE", help="Where the camera is whose poses these are.")

@@ -47,7 +47,6 @@ from nodes.trajectory_files import (
     read_vslamlab,
     write_tum,
 )
-from runtime import Duration
 from runtime.errors import ResultsError
 from runtime.paths import source_file
 from runtime.run import results
@@ -62,12 +61,10 @@ class JudgeConfig(EvaluationConfig):
     Attributes:
         scale_free: Whether the estimates' unit of length is their own.
         axes: Those of the estimates' files; see `nodes.judging.judgement.AXES`.
-        max_difference: From an estimate to the nearest true pose; farther ones are not compared.
     """
 
     scale_free: bool = False
     axes: Axes | None = None
-    max_difference: Duration = Duration(0.1)
 
 
 def judge_all(
@@ -101,8 +98,7 @@ def judge_all(
             raise ValueError(f"{source.file}: expected a name of its own, NAME={source.file}")
         by_frame: dict[str, How] = {"": "se3", "map": "none"}
         usual = "sim3" if config.scale_free else by_frame.get(source.frame_id, "origin")
-        poses, note = _compared(truth.poses, source, config.max_difference)
-        record = EstimatorRecord.of(poses)
+        record = EstimatorRecord.of(source.poses)
         record.final = finals.get(source.name)
         judgement = judge(
             record,
@@ -110,13 +106,15 @@ def judge_all(
             cameras=None if frames is None else {"": frames},
             alignment=usual if config.alignment == "auto" else config.alignment,
             gap=config.gap,
+            hole=config.hole,
         )
+        if not judgement.figures["compared"] and truth.poses.covers(source.poses.stamps).any():
+            raise ValueError(f"{source.file}: {judgement.figures['why']}")
         unknown = {"restarts", "repeated_stamps", "future_stamps", "other_bodies"}
         figures = {k: v for k, v in judgement.figures.items() if k not in unknown} | source.counts
         figures["method"] = source.file
-        figures["compared"] = int(truth.poses.covers(poses.stamps).sum())
         judgements[source.name] = msgspec.structs.replace(judgement, figures=figures)
-        notes += [f"{source.name}: {note}"] if note else []
+        notes += [f"{source.name}: {judgement.note}"] if judgement.note else []
     verdict = conclude({k: j.figures for k, j in judgements.items()}, config.thresholds)
     return judgements, msgspec.convert(verdict, Verdict), notes
 
@@ -199,21 +197,6 @@ def _write(
     text = msgspec.json.format(msgspec.json.encode(facts), indent=2)
     results.write(out / "summary.json", text + b"\n")
     return write_report(out)
-
-
-def _compared(truth: Trajectory, source: Source, most: float) -> tuple[Trajectory, str]:
-    """Return the poses except those far in time from true ones, and a note on exclusions."""
-    poses = source.poses
-    after = np.searchsorted(truth.stamps, poses.stamps)
-    ends = truth.stamps[np.clip([after - 1, after], 0, len(truth) - 1)]
-    inside = truth.covers(poses.stamps)
-    far = inside & (abs(ends - poses.stamps).min(axis=0) > most * SECOND)
-    if far.all():
-        raise ValueError(f"{source.file}: expected true poses within {most:g} s of its, found none")
-    said = [f"{(~inside).sum()} outside the truth's time"] if not inside.all() else []
-    said += [f"{far.sum()} more than {most:g} s from any true pose"] if far.any() else []
-    note = f"not compared, of {len(poses)} poses: {', '.join(said)}" if said else ""
-    return poses.take(~far), note
 
 
 _PATH, _POSE = "nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped"

@@ -44,7 +44,7 @@ from nodes.judging.evaluation.record import (
     cover,
     seconds,
 )
-from nodes.trajectory import PoseRows, RecentPoses, Trajectory, associate
+from nodes.trajectory import HOLE, PoseRows, RecentPoses, Trajectory, associate
 from runtime.time.clock import SECOND
 
 
@@ -124,6 +124,7 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
 
     figures: dict[str, Any]  # by name, which ends with the unit
     estimate: Trajectory | None  # as sent
+    note: str = ""  # of poses that are not compared
     # The same in the truth's frame, where there is a truth; `None` if there are none.
     aligned: Trajectory | None = None
     of_images: Errors | None = None  # errors of each pose at the time of its image
@@ -144,6 +145,7 @@ def judge(
     alignment: How | Literal["auto"] = "auto",  # see `choose_alignment`
     rate: float = 400.0,  # control ticks a second
     gap: float = 0.5,  # seconds of silence that count as lost
+    hole: int = HOLE,  # time between true poses (ns) over which none is made up
 ) -> Judgement:
     """Judge an estimator against the truth of the same body.
 
@@ -165,13 +167,14 @@ def judge(
     due = truth.stamps if frames is None else frames
     due = due[: max(int(np.searchsorted(due, end - waits, side="right")), 1)]
     coverage = cover(due, poses, round(gap * SECOND), record.reported_lost(end), planned)
-    due = due[truth.covers(due)]
+    due = due[truth.covers(due, hole)]
     start, stop = coverage.flight
     inside = (truth.stamps >= start) & (truth.stamps <= stop)
     path = float(np.ptp(truth.distances()[inside] if inside.any() else truth.distances()))
     figures: dict[str, Any] = {
         "method": record.method,
         "estimates": len(record),
+        "compared": int(truth.covers(poses, hole).sum()),
         "coverage_percent": coverage.percent,
         "frame_coverage_percent": None if frames is None else coverage.frames_percent,
         "lost_seconds": seconds(coverage.lost),
@@ -196,8 +199,9 @@ def judge(
         return _held(held_errors(truth, due, poses[:0], np.empty(0), coverage.lost), path)
 
     how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
-    final = _judge_final(record, truth, due, path, alignment, figures)
-    judgement = Judgement(figures, estimate, lost=coverage.lost, final=final)
+    final = _judge_final(record, truth, hole, due, path, alignment, figures)
+    note = _not_compared(truth, poses, hole)
+    judgement = Judgement(figures, estimate, note, lost=coverage.lost, final=final)
     if estimate is None:
         figures |= without()
         return judgement
@@ -214,7 +218,7 @@ def judge(
         period = max((np.median(np.diff(s)) for s in (poses, due) if len(s) > 1), default=0.0)
         figures["not_causal"] = int((arrivals - poses > _LATE * period).sum()) if period else 0
     try:
-        there, kept = associate(truth, estimate)
+        there, kept = associate(truth, estimate, hole)
         aligned = align(kept, there, how)
     except ValueError as error:  # too little to align, or no time in common
         figures |= {**without(), "why": str(error)}
@@ -228,7 +232,7 @@ def judge(
         figures |= path_errors(there, moved)
     except ValueError as error:  # it did not get that far
         figures["why"] = str(error)
-    inside = truth.covers(poses)
+    inside = truth.covers(poses, hole)
     of_images = Errors(
         stamps=there.stamps,
         since=arrivals[inside] if len(arrivals) else arrivals,
@@ -240,9 +244,23 @@ def judge(
     whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
     of_ticks = None
     if len(arrivals):
-        of_ticks, available = errors_at_ticks(truth, whole, arrivals, rate)
+        of_ticks, available = errors_at_ticks(truth, whole, arrivals, rate, hole)
         figures |= available
-    return Judgement(figures, estimate, moved, of_images, of_ticks, coverage.lost, final)
+    return Judgement(figures, estimate, note, moved, of_images, of_ticks, coverage.lost, final)
+
+
+def _not_compared(truth: Trajectory, stamps: Stamps, hole: int) -> str:
+    """Return how many poses of these stamps (ns) no truth is known for, and why; empty if none."""
+    inside = truth.covers(stamps)
+    outside, between = (~inside).sum(), (inside & ~truth.covers(stamps, hole)).sum()
+    said = [f"{outside} outside the truth's time"] if outside else []
+    if between:
+        longest = int(np.diff(truth.stamps).max()) / SECOND
+        said += [
+            f"{between} between true poses more than {hole / SECOND:g} s apart (as max_difference "
+            f"says; the longest hole is {longest:.3g} s)"
+        ]
+    return f"not compared, of {len(stamps)} poses: {', '.join(said)}" if said else ""
 
 
 def _aligned_as_a_whole(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
@@ -268,6 +286,7 @@ def _held(errors: Floats, path: float, prefix: str = "") -> dict[str, float | No
 def _judge_final(
     record: EstimatorRecord,
     truth: Trajectory,
+    hole: int,
     frames: Stamps,
     path: float,
     alignment: How | Literal["auto"],
@@ -280,7 +299,7 @@ def _judge_final(
     if alignment == "auto":
         alignment = choose_alignment(record.scale_free, record.final_frame_id)
     try:
-        there, kept = associate(truth, record.final)
+        there, kept = associate(truth, record.final, hole)
         moved = align(kept, there, alignment).trajectory
     except ValueError as error:
         figures["why_not_final"] = str(error)
@@ -338,6 +357,7 @@ def errors_at_ticks(
     estimate: Trajectory,
     arrivals: npt.NDArray[np.int64],  # of the estimates (ns), shape (n,)
     rate: float,  # ticks a second, from the first arrival to the end of the truth
+    hole: int = HOLE,  # as of `Trajectory.covers`
 ) -> tuple[Errors | None, dict[str, float]]:
     """Return the errors of the newest pose at each control tick, and their figures.
 
@@ -345,6 +365,7 @@ def errors_at_ticks(
     """
     first, last = max(int(arrivals.min()), int(truth.stamps[0])), int(truth.stamps[-1])
     ticks = np.arange(first, last + 1, SECOND / rate).astype(np.int64)
+    ticks = ticks[truth.covers(ticks, hole)]
     if not len(ticks):
         return None, {}
     order = np.argsort(arrivals, kind="stable")

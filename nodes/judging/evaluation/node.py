@@ -47,6 +47,7 @@ from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
 from runtime.figures import FIGURES
 from runtime.paths import source_file
+from runtime.time.clock import SECOND
 
 
 class LiveErrors:
@@ -106,6 +107,8 @@ class EvaluationConfig(NodeConfig):
             estimator's source, or of its camera, else the first.
         control_rate: Hertz of the controller for which newest poses are judged.
         gap: Silence of an estimator that counts as lost.
+        max_difference: From a time to the nearest true pose in a hole of the truth; in longer holes
+            poses are not compared.
         thresholds: Limits of figures; a missed one makes the run's exit code 1. Always asked: poses
             for nine tenths of the flight, one frame, rising stamps, no collision, the run's planned
             end. With thresholds, there must be an estimator. ``collisions`` and ``plan_*`` are
@@ -118,6 +121,7 @@ class EvaluationConfig(NodeConfig):
     vehicle: str = ""
     control_rate: Positive = 400
     gap: Duration = Duration(0.5)  # immutable
+    max_difference: Duration = Duration(0.1)
     thresholds: Thresholds = Thresholds()
     estimators: dict[str, OwnConfig] = msgspec.field(default_factory=dict)
     image_count: Annotated[int, msgspec.Meta(ge=0, le=100)] = 12
@@ -131,6 +135,11 @@ class EvaluationConfig(NodeConfig):
                         f"estimators.{name}.thresholds: expected the name of a figure of an "
                         f"estimator, found {each}{suggest(each, known)}"
                     )
+
+    @property
+    def hole(self) -> int:
+        """Nanoseconds between true poses over which none is made up."""
+        return 2 * round(self.max_difference * SECOND)
 
     def alignment_of(self, estimator: str) -> Laid:
         """Return how an estimator's poses are laid on the truth."""
@@ -231,7 +240,7 @@ class Evaluation(Node[EvaluationConfig]):
         self._append(source_file(name), event)
         self._score(event, "latency", (now - event.stamp) / 1e9, "s")
         flight = self._flight_of(name)
-        truth = flight.recent.at(event.stamp)
+        truth = flight.recent.at(event.stamp, self.config.hole)
         if truth is None or record.scale_free:
             return
         live = self._live.setdefault(name, LiveErrors())
@@ -292,6 +301,8 @@ class Evaluation(Node[EvaluationConfig]):
             self.conclude(name, rest, passed=figures["passed"])
             if figures.get("why"):
                 self.log.warning("%s: %s", name, figures["why"])
+            if judgements[name].note:
+                self.log.warning("%s: %s", name, judgements[name].note)
         for name in self.config.estimators.keys() - judgements.keys():
             self.log.warning("estimators.%s: expected poses from it, found none", name)
         for vehicle, figures in verdict["flights"].items():
@@ -368,6 +379,7 @@ class Evaluation(Node[EvaluationConfig]):
                 alignment=config.alignment_of(name),
                 rate=config.control_rate,
                 gap=config.gap,
+                hole=config.hole,
             )
         except Exception as error:
             self.log.exception("it cannot be judged")

@@ -214,6 +214,8 @@ def _flow(name: str, figures: Mapping[str, Any], summary: Summary) -> Iterator[s
     shown = [f"{figures.get('estimates', 0)} poses"]
     if figures.get("frame_coverage_percent") is not None:
         shown[0] += f", for {figures['frame_coverage_percent']:.4g} % of the images"
+    if figures.get("compared", figures.get("estimates")) != figures.get("estimates"):
+        shown.append(f"compared {figures['compared']} of them")
     lost = figures.get("lost_count")
     if lost is not None:
         times = "never lost" if not lost else f"lost {lost} × ({figures['lost_seconds']:.3g} s)"

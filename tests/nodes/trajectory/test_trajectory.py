@@ -146,6 +146,14 @@ def test_times_outside_are_an_error_and_can_be_known_before() -> None:
         path.at(stamps)
 
 
+def test_between_poses_far_apart_nothing_is_covered() -> None:
+    path = walk(5, start=100)  # every 50 ms
+    stamps = np.array([100, 101, 50_000_100])
+    assert path.covers(stamps, 50_000_000).tolist() == [True, True, True]
+    assert path.covers(stamps, 49_999_999).tolist() == [True, False, True]
+    assert path.take(slice(1)).covers(stamps, 1).tolist() == [True, False, False]
+
+
 def test_rows_come_in_any_order_and_the_last_word_on_a_stamp_holds() -> None:
     rows = PoseRows()
     for stamp, x in ((10, 1.0), (0, 0.0), (20, 9.0), (20, 2.0)):

@@ -342,6 +342,20 @@ def test_an_estimate_is_held_against_the_vehicle_that_carries_its_camera(tmp_pat
     ]
 
 
+def test_a_hole_of_the_truth_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """And no score is made up in it."""
+    known = [e for e in truth(6) if not 2 * SECOND < e.stamp < 4 * SECOND]
+    poses = [estimate(stamp * 100 * MS) for stamp in range(60)]
+    scores = run(tmp_path, [*announced(), *sorted([*known, *poses], key=lambda e: e.stamp)])
+    figures = json.loads((tmp_path / "evaluation" / "verdict.json").read_text())["estimators"][
+        "est"
+    ]
+    assert (figures["estimates"], figures["compared"]) == (60, 41)
+    assert figures["ate_rmse_m"] < 1e-9
+    assert max(s.value for s in scores if s.metric == "position_error") < 1e-9
+    assert "est: not compared, of 60 poses: 19 between true poses more than 0.2 s" in caplog.text
+
+
 def test_the_file_may_say_which_vehicle_is_meant(tmp_path: Path) -> None:
     figures = judged(tmp_path, two_flights(), vehicle="drone")["estimators"]["est"]
     assert figures["vehicle"] == "drone"

@@ -186,7 +186,7 @@ def test_of_many_ticks_the_figures_are_those_of_all_and_a_few_rows_are_kept() ->
     """A pose that is never replaced, of a body that moves along x at 1 m/s for 800 s."""
     ends = np.array([0, 800 * SECOND])
     there = Trajectory(ends, np.array([[0.0, 0, 0], [800.0, 0, 0]]), np.eye(4)[[0, 0]])
-    rows, found = errors_at_ticks(there, there.take(slice(1)), np.array([0]), 400.0)
+    rows, found = errors_at_ticks(there, there.take(slice(1)), np.array([0]), 400.0, 801 * SECOND)
     assert rows is not None
     assert len(rows.stamps) == 80_001  # every fourth
     assert found["newest_pose_rmse_m"] == pytest.approx(800 / np.sqrt(3), rel=1e-4)

@@ -246,3 +246,35 @@ def test_images_after_the_truths_time_have_no_error() -> None:
     figures = judge(record, TRUTH, cameras={"c": FRAMES + 2 * END}).figures
     assert figures["flight_ate_rmse_m"] is None
     assert figures["ate_rmse_m"] > 0.0
+
+
+@pytest.mark.slow
+@settings(max_examples=30, deadline=None)
+@given(
+    start=st.integers(1, SECONDS * 10 - 40),
+    length=st.integers(4, 39),
+    hole=st.integers(20, 30),
+)
+def test_where_no_truth_is_known_nothing_is_held_against_anybody(
+    start: int, length: int, hole: int
+) -> None:
+    """Tenths of a second without a truth, in which the circle is no straight line."""
+    record = EstimatorRecord()
+    for stamp in FRAMES.tolist():
+        drifts(2)(record, stamp, stamp / END)
+    known = (TRUTH.stamps <= start * 100 * MS) | (TRUTH.stamps >= (start + length) * 100 * MS)
+    rest, most = TRUTH.take(known), hole * 10 * MS
+    found = judge(record, rest, cameras={"c": FRAMES}, hole=most)
+    compared = rest.covers(FRAMES, most)
+    assert found.figures["compared"] == compared.sum() == len(FRAMES) - (2 * length - 1)
+    errors = 0.02 * PATH * FRAMES[compared] / END
+    assert found.figures["ate_rmse_m"] == pytest.approx(np.sqrt((errors**2).mean()))
+    assert found.figures["flight_ate_rmse_m"] == pytest.approx(
+        found.figures["ate_rmse_m"], rel=0.01
+    )
+    assert found.figures["newest_pose_rmse_m"] < 0.05 * PATH
+    assert (found.figures["lost_seconds"], found.figures["coverage_percent"]) == (0.0, 100.0)
+    assert f"{2 * length - 1} between true poses more than {hole / 100:g} s apart" in found.note
+    made_up = judge(record, rest, cameras={"c": FRAMES}, hole=END)
+    assert (made_up.figures["compared"], made_up.note) == (len(FRAMES), "")
+    assert made_up.figures["ate_rmse_m"] != found.figures["ate_rmse_m"]

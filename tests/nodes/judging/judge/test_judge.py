@@ -288,7 +288,10 @@ def test_what_is_not_compared_is_said(tmp_path: Path) -> None:
     write_tum(tmp_path / "truth.tum", truth.take(gap).take(slice(10, None)))
     write_tum(tmp_path / "vo.tum", truth)
     done = said(tmp_path, "--truth", "truth.tum", "--estimate", "vo.tum")
-    note = "vo: not compared, of 400 poses: 10 outside the truth's time, 17 more than 0.1 s from"
+    note = (
+        "vo: not compared, of 400 poses: 10 outside the truth's time, 21 between true poses more "
+        "than 0.2 s apart (as max_difference says; the longest hole is 1.1 s)"
+    )
     assert note in done.stderr
     (shown,) = read_run(tmp_path / "judged" / "trajectories").missing
     assert shown.startswith(note)

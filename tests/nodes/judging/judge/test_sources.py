@@ -202,7 +202,7 @@ def test_no_time_in_common_fails_and_says_why(tmp_path: Path) -> None:
 def test_a_truth_too_sparse_to_judge_by_is_an_error(tmp_path: Path) -> None:
     truth = walk(100)
     ends = truth.take(np.array([0, 99]))
-    with pytest.raises(ValueError, match=r"vo: expected true poses within 0\.1 s of its"):
+    with pytest.raises(ValueError, match=r"vo: .* true poses at most 0\.2 s apart, .*\(med"):
         judged(tmp_path, ends, truth.take(slice(10, 90)))
 
 
