@@ -141,7 +141,8 @@ class NavSatFix(Event, category=Category.SENSOR):
         longitude: Degrees east.
         altitude: Metres above the WGS 84 ellipsoid.
         position_covariance: Of (north, east, down), m²: 9 numbers, row by row; empty if unknown.
-        velocity: Metres per second in ``map``, as receivers measure it by Doppler shift.
+        velocity: Of the antenna, metres per second in ``map``, as receivers measure it by Doppler
+            shift.
         status: As ROS's ``sensor_msgs/NavSatStatus``: 0 is a fix, -1 none yet.
     """
 

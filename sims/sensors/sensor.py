@@ -13,7 +13,7 @@ import numpy as np
 
 import events as ev
 from events import Announcement, Event, Quaternion, Vector3
-from events.frames import from_rpy, multiply, rotate, rotate_inverse, to_geodetic
+from events.frames import cross, from_rpy, multiply, rotate, rotate_inverse, to_geodetic
 from runtime.units import Duration, Latency
 
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -61,6 +61,7 @@ class Truth(NamedTuple):
     position: Vector3  # metres NED
     orientation: Quaternion  # rotation FRD → NED
     velocity: Vector3  # metres per second NED
+    angular_velocity: Vector3  # radians per second FRD
     qpos: Any  # the world's generalised positions, shape (nq,), for sensors of the surroundings
 
 
@@ -355,7 +356,10 @@ class Gnss(Sensor[GnssSpec]):
         lever = rotate(truth.orientation, spec.position)
         north, east, down = (np.add(truth.position, lever) + error).tolist()
         latitude, longitude, altitude = to_geodetic((north, east, down), self.place.origin)
-        vx, vy, vz = (np.array(truth.velocity) + spec.velocity_noise * numbers[1]).tolist()
+        velocity = np.array(truth.velocity)
+        if any(spec.position):  # to add zeros would change the sign of -0.0
+            velocity += rotate(truth.orientation, cross(truth.angular_velocity, spec.position))
+        vx, vy, vz = (velocity + spec.velocity_noise * numbers[1]).tolist()
         shown = self._uncertainty(truth.stamp / 1e9)
         covariance = np.diag(shown**2 + self._noises**2 + self._drifts**2)
         return ev.NavSatFix(

@@ -210,7 +210,7 @@ class SensorSuite:
         if tick.stamp >= sensor.spec.startup_delay * 1e9:
             stamp = self._advance(tick)
             state, qpos, _ = self._physics.state_at(stamp)
-            truth = Truth(stamp, state.position, state.orientation, state.velocity, qpos)
+            truth = Truth(stamp=stamp, qpos=qpos, **msgspec.structs.asdict(state))
             self._send_later(sensor, sensor.measure(truth))
 
     def _send_later(self, sensor: Sensor[Any], event: Event) -> None:

@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
-from events.frames import from_geodetic, from_rpy
+from events import Vector3
+from events.frames import from_geodetic, from_rpy, multiply
 from sims.sensors.sensor import (
     Barometer,
     BarometerSpec,
@@ -27,6 +30,8 @@ from sims.sensors.sensor import (
     world_field,
 )
 from tests.sims.sensors.truths import ORIGIN, PLACE, random, truth
+
+VECTORS = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 
 
 def barometer(seed: int = 0, **settings: Any) -> Barometer:
@@ -155,6 +160,36 @@ def test_by_default_it_tells_the_truth_of_its_antenna() -> None:
     found = from_geodetic((fix.latitude, fix.longitude, fix.altitude), ORIGIN)
     assert found == pytest.approx((5.0, -6.0, -7.1), abs=1e-6)
     assert fix.velocity == (1.0, 2.0, 3.0)
+
+
+@given(VECTORS, VECTORS, VECTORS, VECTORS)
+def test_its_velocity_is_the_rate_of_change_of_its_position(
+    angles: Vector3, velocity: Vector3, rates: Vector3, antenna: Vector3
+) -> None:
+    """On a body that moves and turns evenly, whatever its attitude."""
+    sensor, turning = gnss(position=antenna), np.hypot.reduce(rates)
+
+    def fix(seconds: float) -> tuple[Vector3, Vector3]:
+        half = 0.5 * turning * seconds
+        axis = np.multiply(rates, np.sin(half) / (turning or 1.0)).tolist()
+        turn = multiply(from_rpy(*angles), (float(np.cos(half)), *axis))
+        place = tuple(np.multiply(velocity, seconds).tolist())
+        found = sensor.measure(truth(place, turn, velocity, rates))
+        where = (found.latitude, found.longitude, found.altitude)
+        return from_geodetic(where, ORIGIN), found.velocity
+
+    (before, _), (_, said), (after, _) = fix(-1e-3), fix(0.0), fix(1e-3)
+    np.testing.assert_allclose(said, np.subtract(after, before) / 2e-3, atol=1e-3)
+
+
+@given(VECTORS, VECTORS)
+@example((-0.0, -0.0, -0.0), (1.0, 2.0, 3.0))
+def test_at_the_centre_of_mass_turning_changes_no_bit_of_its_velocity(
+    velocity: Vector3, rates: Vector3
+) -> None:
+    found = gnss().measure(truth(velocity=velocity, angular_velocity=rates)).velocity
+    no_noise = 0.0 * random().standard_normal((2, 3))[1]  # zeros of either sign
+    assert np.array(found).tobytes() == (np.array(velocity) + no_noise).tobytes()
 
 
 @pytest.mark.parametrize(

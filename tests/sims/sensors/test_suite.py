@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 from events import (
     BarometerAnnouncement,
+    Event,
     FluidPressure,
     Imu,
     LidarAnnouncement,
@@ -17,10 +19,13 @@ from events import (
     MagnetometerAnnouncement,
     NavSatAnnouncement,
     NavSatFix,
+    Odometry,
     Range,
     RangeAnnouncement,
+    Teleport,
     TransformStamped,
 )
+from events.frames import cross, rotate
 from runtime.errors import ConfigError
 from runtime.testing import NodeResult, run_node, spec
 from sims.multirotor import Multirotor
@@ -40,8 +45,9 @@ def _world(tmp_path_factory: pytest.TempPathFactory) -> None:
     world = str(path)
 
 
-def fly(duration: float = 0.5, **config: Any) -> NodeResult:
-    return run_node(Multirotor, config={"world": world} | config, duration=duration, name="drone")
+def fly(*orders: Event, **config: Any) -> NodeResult:
+    config |= {"world": world}
+    return run_node(Multirotor, inputs=orders, config=config, duration=0.5, name="drone")
 
 
 def test_a_barometer_is_announced_mounted_and_read_at_its_rate() -> None:
@@ -68,6 +74,27 @@ def test_a_measurement_comes_latency_after_its_stamp_and_first_after_the_start()
         if isinstance(event, FluidPressure):
             now = max(e.stamp for e in result.sent[:index] if isinstance(e, Imu))
             assert event.stamp + 0.044 * SECOND <= now <= event.stamp + 0.046 * SECOND
+
+
+def test_the_velocity_of_a_fix_is_that_of_the_antenna() -> None:
+    """On a vehicle that tumbles as it falls."""
+    antenna = (1.0, 0.5, -0.3)
+    thrown = Teleport(
+        stamp=SECOND // 20,
+        source="test",
+        position=(0.0, 0.0, -9.0),
+        orientation=(1.0, 0.0, 0.0, 0.0),
+        linear_velocity=(2.0, 0.0, 0.0),
+        angular_velocity=(1.0, -2.0, 3.0),
+    )
+    result = fly(thrown, gnss={"position": antenna, "startup_delay": 0, "latency": 0})
+    truths = {e.stamp: e for e in result.of(Odometry)}
+    for fix in result.of(NavSatFix)[5:]:
+        true = truths[fix.stamp]
+        body = np.add(true.linear_velocity, cross(true.angular_velocity, antenna))
+        expected = rotate(true.orientation, tuple(body.tolist()))
+        assert fix.velocity == pytest.approx(expected, abs=1e-9)
+        assert math.dist(fix.velocity, rotate(true.orientation, true.linear_velocity)) > 1.0
 
 
 def test_a_sensor_changes_nothing_of_the_others() -> None:

@@ -15,10 +15,11 @@ def truth(
     position: Vector3 = (0.0, 0.0, 0.0),
     orientation: Quaternion = (1.0, 0.0, 0.0, 0.0),
     velocity: Vector3 = (0.0, 0.0, 0.0),
+    angular_velocity: Vector3 = (0.0, 0.0, 0.0),
     seconds: float = 0.0,
     qpos: object = None,
 ) -> Truth:
-    return Truth(round(seconds * 1e9), position, orientation, velocity, qpos)
+    return Truth(round(seconds * 1e9), position, orientation, velocity, angular_velocity, qpos)
 
 
 def random(seed: int = 0) -> np.random.Generator:
