@@ -158,6 +158,11 @@ def generator_of(parent: np.random.Generator, name: str) -> np.random.Generator:
     return np.random.default_rng([*entropy, zlib.crc32(name.encode())])
 
 
+def _check_drift(drift: float, seconds: float) -> None:
+    if drift and not seconds:
+        raise ValueError("drift_time: expected more than 0 s with a drift, found 0 s")
+
+
 _SEA_LEVEL = 101325.0
 _RADIUS = 6378.137  # radius of the earth in AirSim, kilometres
 
@@ -169,7 +174,8 @@ class BarometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields
         noise: Standard deviation of the white noise, pascal (AirSim: ``UncorrelatedNoiseSigma``).
             At sea level 12 Pa are a metre.
         drift: Standard deviation of the drifting relative error (AirSim: ``PressureFactorSigma``).
-        drift_time: Time constant of the drift (AirSim: ``PressureFactorTau``).
+        drift_time: Time constant of the drift, above 0 if there is one (AirSim:
+            ``PressureFactorTau``).
         model: ``gauss_markov``: the drift tends to its standard deviation, of 185 Pa with these
             defaults. ``airsim``: AirSim's recursion, which at 50 Hz tends to 0.3 Pa.
     """
@@ -178,6 +184,9 @@ class BarometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields
     drift: NonNegative = 0.001825
     drift_time: Duration = Duration(3600)  # immutable
     model: Literal["gauss_markov", "airsim"] = "gauss_markov"
+
+    def __post_init__(self) -> None:
+        _check_drift(self.drift, self.drift_time)
 
 
 def pressure_at(altitude: float) -> float:
@@ -313,7 +322,8 @@ class GnssSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True
         vertical_noise: Standard deviation of the white noise, down, metres.
         horizontal_drift: Standard deviation of the slow error, north and east, metres.
         vertical_drift: Standard deviation of the slow error, down, metres.
-        drift_time: Time constant of the slow error, a first-order Gauss-Markov process.
+        drift_time: Time constant of the slow error, a first-order Gauss-Markov process; above 0 if
+            there is one.
         velocity_noise: Standard deviation of the velocity's white noise, metres per second.
         eph_initial: Reported uncertainty (`position_covariance` only) at the start, metres (AirSim:
             ``EphInitial`` and ``EpvInitial``).
@@ -334,6 +344,9 @@ class GnssSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True
     eph_final: NonNegative = 0.1
     eph_time_constant: Duration = Duration(0.9)
     eph_min_3d: Positive = 3.0
+
+    def __post_init__(self) -> None:
+        _check_drift(self.horizontal_drift or self.vertical_drift, self.drift_time)
 
 
 class Gnss(Sensor[GnssSpec]):

@@ -145,6 +145,15 @@ def test_all_sensors_are_announced_mounted_and_sent() -> None:
         ({"origin": [91.0, 0.0, 0.0]}, "origin"),
         ({"barometer": {"nois": 1.0}}, "nois"),
         ({"magnetometer": {"year": 2035.0}}, "year"),
+        ({"barometer": {"drift_time": 0}}, "barometer.*: drift_time: expected more than 0 s"),
+        (
+            {"gnss": {"horizontal_drift": 1.0, "drift_time": "0s"}},
+            "gnss.*: drift_time: expected more than 0 s",
+        ),
+        (
+            {"gnss": {"vertical_drift": 1.0, "drift_time": "0s"}},
+            "gnss.*: drift_time: expected more than 0 s",
+        ),
     ],
 )
 def test_settings_that_cannot_be_are_refused_with_the_file(
@@ -152,6 +161,12 @@ def test_settings_that_cannot_be_are_refused_with_the_file(
 ) -> None:
     with pytest.raises(ConfigError, match=said):
         spec(Multirotor, "drone", config)
+
+
+def test_without_a_drift_its_time_constant_may_be_zero() -> None:
+    spec(
+        Multirotor, "drone", {"barometer": {"drift": 0, "drift_time": 0}, "gnss": {"drift_time": 0}}
+    )
 
 
 @pytest.mark.slow
