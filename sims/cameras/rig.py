@@ -151,7 +151,10 @@ class CameraRig:
                 )
                 if spec.stereo and eye is not left:
                     said = msgspec.structs.replace(
-                        said, baseline=spec.stereo.baseline, stereo=f"{name}/{left.name}"
+                        said,
+                        latency=said.latency - spec.offset,  # both are delivered together
+                        baseline=spec.stereo.baseline,
+                        stereo=f"{name}/{left.name}",
                     )
                 yield said
                 if spec.undistorted:

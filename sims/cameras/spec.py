@@ -102,7 +102,8 @@ class Stereo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     Attributes:
         baseline: Distance of the right camera from the left one along the image's rows, metres.
-        offset: Time by which the right camera is exposed later; its stamps say so.
+        offset: Time by which the right camera is exposed later; its stamps say so. It is delivered
+            with the left one, so its latency is shorter by this.
     """
 
     baseline: Annotated[float, msgspec.Meta(gt=0.0)]

@@ -322,6 +322,22 @@ def test_the_right_eye_may_be_triggered_later(world: str) -> None:
         assert math.dist(here, there) == pytest.approx(0.215, abs=2e-3)
 
 
+@pytest.mark.parametrize("offset", ["0ms", "5ms", "39ms"])
+def test_images_of_both_eyes_come_after_the_latency_announced_of_each(
+    world: str, offset: str
+) -> None:
+    """So do those without distortion."""
+    lens = {"model": "plumb_bob", "coefficients": [-0.2, 0.05, 0.0, 0.0]}
+    rig = {"baseline": 0.2, "offset": offset}
+    result = watch(world, stereo=rig, lens=lens, undistorted=True)
+    announced, came = result.of(CameraAnnouncement), arrivals(result)
+    assert len(announced) == 4
+    for said in announced:
+        stamps = [image.stamp for image in result.of(Image) if image.source == said.source]
+        assert len(stamps) >= 40
+        assert {came[stamp] - stamp for stamp in stamps} == {round(said.latency * 1e9)}
+
+
 def test_stamps_are_late_as_the_clock_of_the_camera_is(world: str) -> None:
     """All that is sent of an exposure has the same stamp; it comes when it would anyway."""
     true = sent(world)
