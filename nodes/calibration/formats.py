@@ -5,10 +5,12 @@ IMU's frame and of optical frames (x right, y down, z forward); pixel centres ha
 in all of them. Without an IMU, the body's frame takes its place. The IMU's axes are ROS's (forward,
 left, up) in files that name topics, else ours, as in exported data (forward, right, down). Noise is
 that of ``ImuAnnouncement``, continuous densities as Kalibr's, or what a template says beside it.
-What a format cannot express is refused if the projection depends on it, else noted in a comment.
+What a format cannot express is refused if the projection depends on it, else noted in a comment,
+for which JSON has no place. Scale and axes of the IMU are words of OpenVINS and Basalt only.
 Sources: github.com/ethz-asl/kalibr/wiki/yaml-formats; docs.openvins.com/gs-calibration.html and
 open_vins/config; VINS-Fusion/config and camodocal; basalt-headers' ``calibration.hpp``; ORB-SLAM3's
-"Calibration_Tutorial.pdf", section 5; github.com/VSLAM-LAB/VSLAM-LAB,
+"Calibration_Tutorial.pdf", section 5; open_vins' ``Propagator.cpp`` and basalt-headers'
+``calib_bias.hpp``; github.com/VSLAM-LAB/VSLAM-LAB,
 ``Datasets/DatasetVSLAMLAB.py`` and its data sets.
 """
 
@@ -34,6 +36,7 @@ from events import (
     ImuAnnouncement,
     Odometry,
 )
+from events.announcements import IDENTITY
 from events.frames import axes_of, flip_yz, rotation_to_nwu
 from events.geometry import inverse, pose_matrix, pose_tuples
 from nodes.data.dataset.recording import (
@@ -66,6 +69,7 @@ class Format(msgspec.Struct, frozen=True):
     needs_imu: bool = False
     camera_file: str = ""  # a file of each camera, with ``{}`` for its number; empty for none
     topics: bool = False  # whether its files name the topics of ROS
+    imu_errors: bool = False  # whether it has words for an IMU's scale and axes
 
 
 FORMATS = {
@@ -75,9 +79,10 @@ FORMATS = {
         4,
         needs_imu=True,
         topics=True,
+        imu_errors=True,
     ),
     "vins": Format(("vins.yaml",), 4, pair_only=True, camera_file="cam{}.yaml", topics=True),
-    "basalt": Format(("calibration.json",), 8),
+    "basalt": Format(("calibration.json",), 8, imu_errors=True),
     "orbslam3": Format(("orbslam3.yaml",), 5, pair_only=True),
     "vslamlab": Format(("calibration.yaml",), 5),
 }  # calibration formats by their names in ``export``
@@ -103,6 +108,7 @@ def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
         if len({camera[what] for camera in cameras}) > 1:
             raise ValueError(f"{name} has one {what} for all cameras, found several")
     common = variables(rig, cameras) | {
+        "imu_errors": _imu_errors(rig, name, ros=ros) if form.imu_errors else None,
         "axes": "x forward, y left, z up, as on ROS's topics"
         if ros
         else "x forward, y right, z down, as in exported data; on ROS's topics y left, z up",
@@ -114,6 +120,8 @@ def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
         for file in form.files
         if rig.imu is not None or file != "imu.yaml"
     }
+    if rig.imu is not None and not form.imu_errors:
+        found[form.files[-1]] += "".join(f"# {remark}\n" for remark in _imu_remarks(rig.imu))
     for number, camera in enumerate(cameras if form.camera_file else []):
         template = environment.get_template(f"{name}.{form.camera_file.format('')}.jinja")
         found[form.camera_file.format(number)] = template.render(camera=camera)
@@ -138,6 +146,49 @@ def variables(
         "gravity": GRAVITY,
         "depth_factor": DEPTH_FACTOR,
     }
+
+
+def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
+    """Return scale and axes of the IMU in the words of OpenVINS and of Basalt.
+
+    The first has L · Q, with a rotation Q; the second the inverse less the identity, column by
+    column, of the accelerometer without the numbers above its diagonal.
+    """
+    found: dict[str, Any] = {}
+    turn = imu_axes(rig, ros=ros)[:3, :3]
+    feigned = rig.imu.g_sensitivity if rig.imu else 0.0
+    for sensor, of in (("gyroscope", "GYRO"), ("accelerometer", "ACC")):
+        given = getattr(rig.imu, f"{sensor}_matrix") if rig.imu else IDENTITY
+        matrix = turn @ np.reshape(given, (3, 3)) @ turn
+        if abs(np.linalg.det(matrix)) < 1e-9:
+            raise ValueError(
+                f"{name}: expected an IMU of three axes, found {sensor}_matrix {given}"
+            )
+        q, r = np.linalg.qr(matrix.T)
+        signs = np.sign(np.diag(r))
+        found |= {f"T{sensor[0]}": signs * r.T, f"R_IMUto{of}": (q * signs).T}
+        error = np.linalg.inv(matrix) - np.eye(3)
+        if sensor == "accelerometer":
+            lower = np.tril(np.ones((3, 3), np.bool_))
+            if name == "basalt" and (feigned or error[~lower].any()):
+                raise ValueError(
+                    "basalt has no word for all of the IMU's errors: expected no g_sensitivity and "
+                    "an accelerometer_matrix without numbers above its diagonal, found "
+                    f"{feigned:g} and {given}"
+                )
+            error = error.T[lower.T]
+        found[f"{sensor}_error"] = np.ravel(error, "F")
+    found = {"Tw" if key == "Tg" else key: value + 0.0 for key, value in found.items()}  # no -0.0
+    return found | {"Tg": feigned * np.eye(3)}
+
+
+def _imu_remarks(imu: ImuAnnouncement) -> list[str]:
+    """Return what formats without a word for them say of the errors of scale and axes."""
+    return [
+        f"{name}, which readers of this file know nothing of: {getattr(imu, name)}"
+        for name in ("gyroscope_matrix", "accelerometer_matrix", "g_sensitivity")
+        if getattr(imu, name) not in {IDENTITY, 0.0}
+    ]
 
 
 def _camera(rig: Rig, camera: CameraAnnouncement, name: str, *, ros: bool) -> dict[str, Any]:
@@ -300,14 +351,16 @@ def announcements(run: Path) -> list[Announcement]:
 
 
 class VslamLab(Recording):
-    """Images of the rig's cameras, the IMU, and the body's poses in a world with z up.
+    """Images of the rig's cameras, the IMU, and its poses in a world with z up.
+
+    The body of the calibration is the IMU, as in VSLAM-LAB's own sequences of EuRoC.
 
     ::
 
         rgb_0/<ns>.png, depth_0/<ns>.png      one folder for each camera; depth in 16 bits
         rgb.csv                               images that belong together, row by row
         imu_0.csv                             in the IMU's frame
-        groundtruth.csv                       the body (FRD) in north, west, up
+        groundtruth.csv                       the IMU, else the body (FRD), in north, west, up
     """
 
     def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
@@ -318,7 +371,9 @@ class VslamLab(Recording):
             for kind in ("rgb", *(("depth",) if "depth" in camera.images else ())):
                 self._stamps[f"{kind}_{number}"] = []
                 (folder / f"{kind}_{number}").mkdir()
+        self._imu_in_body = np.eye(4)
         if rig.imu is not None:
+            self._imu_in_body = pose_matrix(rig.imu.position, rig.imu.orientation)
             axes = ("wx (rad s^-1)", "wy (rad s^-1)", "wz (rad s^-1)")
             force = ("ax (m s^-2)", "ay (m s^-2)", "az (m s^-2)")
             self._imu = self.rows("imu_0.csv", ",".join(("ts (ns)", *axes, *force)) + "\n")
@@ -339,9 +394,12 @@ class VslamLab(Recording):
     depth = image
 
     def odometry(self, event: Odometry) -> None:
-        """Note where the body is."""
+        """Note where the body is, and with it the IMU."""
         if event.source == self.rig.body:
-            (x, y, z), (w, i, j, k) = flip_yz(event.position), rotation_to_nwu(event.orientation)
+            place, turn = event.position, event.orientation
+            if (self._imu_in_body != np.eye(4)).any():
+                place, turn = pose_tuples(pose_matrix(place, turn) @ self._imu_in_body)
+            (x, y, z), (w, i, j, k) = flip_yz(place), rotation_to_nwu(turn)
             row = f"{x:.9f},{y:.9f},{z:.9f},{i:.12f},{j:.12f},{k:.12f},{w:.12f}"
             self._truth.add(event.stamp, f"{self.epoch + event.stamp},{row}\n")
 

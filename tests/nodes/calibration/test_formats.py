@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import importlib
 import json
@@ -13,6 +14,7 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -200,6 +202,72 @@ def test_an_imu_that_is_turned_and_moved_is_what_transforms_speak_of(tmp_path: P
         np.testing.assert_allclose(found, rig.cameras[0].info.project(points), atol=1e-6)
 
 
+@given(
+    gyroscope=st.lists(st.floats(-0.2, 0.2), min_size=9, max_size=9),
+    accelerometer=st.lists(st.floats(-0.2, 0.2), min_size=9, max_size=9),
+    feigned=st.sampled_from([0.0, 2e-3]),
+    ros=st.booleans(),
+)
+def test_what_a_calibration_says_of_an_imu_undoes_its_errors(
+    gyroscope: list[float], accelerometer: list[float], feigned: float, ros: bool
+) -> None:
+    """By the equations of OpenVINS (``Propagator.cpp``) and Basalt (``calib_bias.hpp``)."""
+    yaml: Any = importlib.import_module("yaml")  # without types
+    m_g, m_a = (np.eye(3) + np.reshape(each, (3, 3)) for each in (gyroscope, accelerometer))
+    rates, force = np.array([0.3, -0.2, 0.7]), np.array([1.0, 2.0, -9.0])
+    seen_rates, seen_force = m_g @ rates + feigned * force, m_a @ force
+
+    def rig_with(accelerometer: npt.NDArray[np.float64]) -> Rig:
+        matrices = (tuple(m.ravel().tolist()) for m in (m_g, accelerometer))
+        names = ("gyroscope_matrix", "accelerometer_matrix")
+        errors: dict[str, Any] = dict(zip(names, matrices, strict=True))
+        return msgspec.structs.replace(
+            stereo(), imu=msgspec.structs.replace(IMU, g_sensitivity=feigned, **errors)
+        )
+
+    flip = np.diag([1.0, -1.0, -1.0]) if ros else np.eye(3)
+    files = write_files(rig_with(m_a), "openvins", topics=ros)
+    says = yaml.safe_load(files["kalibr_imu_chain.yaml"].partition("---")[2])["imu0"]
+    says = {name: np.array(value) for name, value in says.items() if isinstance(value, list)}
+    for name in ("Tw", "Ta"):
+        np.testing.assert_allclose(says[name], np.tril(says[name]))
+    back = says["R_IMUtoACC"].T @ np.linalg.inv(says["Ta"]) @ flip @ seen_force
+    np.testing.assert_allclose(back, flip @ force, atol=1e-9)
+    left = np.linalg.inv(says["Tw"]) @ (flip @ seen_rates - says["Tg"] @ back)
+    np.testing.assert_allclose(says["R_IMUtoGYRO"].T @ left, flip @ rates, atol=1e-9)
+
+    lower = np.tril(m_a)
+    if feigned:
+        with pytest.raises(ValueError, match="basalt has no word for all of the IMU's errors"):
+            write_files(rig_with(lower), "basalt")
+        return
+    bias = json.loads(write_files(rig_with(lower), "basalt")["calibration.json"])["value0"]
+    s = bias["calib_gyro_bias"]
+    assert s[:3] == bias["calib_accel_bias"][:3] == [0.0, 0.0, 0.0]
+    undone = (np.eye(3) + np.reshape(s[3:], (3, 3)).T) @ m_g
+    np.testing.assert_allclose(undone, np.eye(3), atol=1e-9)
+    s1, s2, s3, s4, s5, s6 = bias["calib_accel_bias"][3:]
+    undone = (np.eye(3) + np.array([[s1, 0, 0], [s2, s4, 0], [s3, s5, s6]])) @ lower
+    np.testing.assert_allclose(undone, np.eye(3), atol=1e-9)
+
+
+def test_errors_of_an_imu_without_a_word_are_a_comment_or_refused() -> None:
+    errors: dict[str, Any] = {"accelerometer_matrix": (1.0, 0.1, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)}
+    rig = msgspec.structs.replace(stereo(), imu=msgspec.structs.replace(IMU, **errors))
+    for form in ("kalibr", "vins", "orbslam3", "vslamlab"):
+        text = "".join(write_files(rig, form).values())
+        assert (
+            "# accelerometer_matrix, which readers of this file know nothing of: (1.0, 0.1" in text
+        )
+        assert "gyroscope_matrix" not in text
+    with pytest.raises(ValueError, match=r"without numbers above its diagonal, found 0 and \(1"):
+        write_files(rig, "basalt")
+    dead: dict[str, Any] = {"gyroscope_matrix": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)}
+    rig = msgspec.structs.replace(stereo(), imu=msgspec.structs.replace(IMU, **dead))
+    with pytest.raises(ValueError, match="openvins: expected an IMU of three axes"):
+        write_files(rig, "openvins")
+
+
 def test_a_library_that_gets_our_measurements_gets_files_for_them() -> None:
     ours = write_files(stereo(), "openvins", topics=False)
     assert 'rostopic: ""' in ours["kalibr_imu_chain.yaml"]
@@ -275,7 +343,9 @@ def test_a_run_without_a_summary_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_recorded_run_gives_vslam_lab_its_data(tmp_path: Path) -> None:
-    execute(parse(RECORDED, "test"), tmp_path)
+    recorded: Any = copy.deepcopy(RECORDED)
+    recorded["nodes"][1]["imu"] = {"position": [0.3, 0.0, -0.1], "orientation": [0, 0, 90]}
+    execute(parse(recorded, "test"), tmp_path)
     names = [path.name for path in export_calibration(tmp_path, "vslamlab", epoch=10**18)]
     assert names == ["calibration.yaml", "imu_0.csv", "groundtruth.csv", "rgb.csv"]
     folder = tmp_path / "export" / "vslamlab"
@@ -295,4 +365,8 @@ def test_a_recorded_run_gives_vslam_lab_its_data(tmp_path: Path) -> None:
     truth = list(csv.reader((folder / "groundtruth.csv").read_text().splitlines()))
     assert len(truth) > 150
     assert float(truth[-1][3]) > 0.0  # up
+    # The body is the IMU, before the vehicle and turned to its right (north, west, up).
+    assert [float(value) for value in truth[1][1:3]] == pytest.approx([0.3, 0.0], abs=0.01)
+    turned = [abs(float(value)) for value in truth[1][4:8]]
+    assert turned == pytest.approx([0.5**0.5, 0.5**0.5, 0.0, 0.0], abs=0.01)
     export_calibration(tmp_path, "vslamlab")  # again, over what is there
