@@ -30,6 +30,7 @@ from events import (
     PoseStamped,
     Vector3,
 )
+from events.announcements import IDENTITY
 from events.camera_info import response_light, vignette_map
 from events.frames import flip_yz, rotate, rotation_to_nwu
 from events.geometry import pose_matrix
@@ -41,6 +42,7 @@ from nodes.data.dataset.recording import (
     RowFile,
     in_colour,
     in_grey,
+    real,
 )
 from nodes.ros2.messages.images import depth_in_steps
 from nodes.trajectory_files import EUROC_HEADER, euroc_row, seconds_text, tum_row
@@ -93,7 +95,10 @@ class Euroc(Recording):
                 )
         if rig.imu is not None:
             self._imu = self.rows("mav0/imu0/data.csv", _IMU_HEADER)
-            self._sensor("imu0", "imu", f"{rig.imu.source}; {_BODY}", rig.imu, imu=rig.imu)
+            matrices = {rig.imu.gyroscope_matrix, rig.imu.accelerometer_matrix}
+            errors = matrices != {IDENTITY} or rig.imu.g_sensitivity
+            comment = f"{rig.imu.source}; {_BODY}"
+            self._sensor("imu0", "imu", comment, rig.imu, imu=rig.imu, errors=errors)
         self._truth = self.rows(f"mav0/{_TRUTH}/data.csv", f"{EUROC_HEADER}\n")
         self._velocity_known = False
         self._places: set[Vector3] = set()  # no more than two
@@ -249,6 +254,14 @@ class TumMono(Recording):
             self._truth.add(event.stamp, tum_row(stamp, *place))
         self._poses = {s: pose for s, pose in self._poses.items() if s > event.stamp}
         return ImageFile(self.folder / "images" / f"{number:05d}.png", event.data, in_grey)
+
+    def warnings(self) -> list[str]:
+        """Return a warning of what the layout has no place for."""
+        return [
+            f"{self._camera.source}: no file of this layout says its {name}, {real(value)} s"
+            for name in ("time_offset", "readout")
+            if (value := getattr(self._camera, name))
+        ]
 
     def pose(self, event: PoseStamped) -> None:
         """Note where the camera is, until its image comes."""

@@ -115,16 +115,24 @@ def in_grey(data: Pixels) -> Pixels:
     return cv2.cvtColor(data, cv2.COLOR_RGB2GRAY) if data.ndim == 3 else data
 
 
+_KEPT = 100_000_000  # nanoseconds between rows that the system is given
+
+
 class RowFile:
-    """A text file of rows with rising stamps, after the lines of a header; may raise `OSError`."""
+    """A text file of rows with rising stamps, after the lines of a header; may raise `OSError`.
+
+    A run that is killed leaves all rows but those of the last tenth of a second.
+    """
 
     def __init__(self, path: Path, header: str) -> None:
         self.path = path
         self.count = 0  # rows so far
         self.left_out = 0  # rows left out because their stamp did not rise, as readers expect
         self._last: int | None = None
+        self._written = -_KEPT  # stamp of the last row that the system was given
         self._file = path.open("w", encoding="utf-8", newline="\n")
         self._file.write(header)
+        self._file.flush()
 
     def add(self, stamp: int, row: str) -> bool:
         """Add a row with its line end; return whether its stamp was in order."""
@@ -134,6 +142,9 @@ class RowFile:
         self._last = stamp
         self.count += 1
         self._file.write(row)
+        if stamp - self._written >= _KEPT:
+            self._file.flush()
+            self._written = stamp
         return True
 
     def close(self) -> None:

@@ -11,6 +11,7 @@ import bisect
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from events import (
@@ -23,6 +24,7 @@ from events import (
     Quaternion,
     Vector3,
 )
+from events.announcements import IDENTITY
 from events.base import UNIT_TOLERANCE
 from events.frames import (
     OPTICAL_TO_FRD,
@@ -37,6 +39,7 @@ from nodes.data.replay.folders import (
     Files,
     FolderReader,
     Rows,
+    Sensor,
     as_pair,
     camera_at,
     first_image,
@@ -53,8 +56,8 @@ class Euroc(FolderReader):
     """Reader of a data set's cameras, first IMU and ground truth; the folder has cam0 in it (mav0).
 
     M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The body keeps the data
-    set's axes: in EuRoC's own those of the IMU, not FRD. The second of two cameras side by side is
-    announced as the right one of a stereo rig.
+    set's axes: in EuRoC's own those of the IMU, not FRD. Of cameras whose numbers follow each other
+    and that stand side by side the second is announced as the right one of a stereo rig.
     """
 
     layout = "EuRoC's (mav0)"
@@ -69,8 +72,9 @@ class Euroc(FolderReader):
     def _read(self) -> None:
         folder = self._folder
         cameras = [self._camera(camera) for camera in sorted(folder.glob("cam[0-9]*"))]
-        if len(cameras) == 2:
-            cameras[1] = as_pair(*cameras)
+        for number in range(1, len(cameras)):
+            left, right = cameras[number - 1 : number + 1]
+            cameras[number] = right if left.stereo else as_pair(left, right)
         self._announcements += cameras
         self._imu_source, self._imu_frame = f"{self._vehicle}/imu0", "base_link"
         self._imu = self._measurements(folder / "imu0" / "data.csv")
@@ -130,7 +134,8 @@ class Euroc(FolderReader):
             CameraInfo,
         )
         rate = sensor.number("rate_hz")
-        return camera_at(source, tuple(images), info, rate, position, orientation)
+        camera = camera_at(source, tuple(images), info, rate, position, orientation)
+        return _with_times(camera, sensor)
 
     def _imu_announcement(self) -> ImuAnnouncement:
         sensor = read_sensor(self._folder / "imu0" / "sensor.yaml")
@@ -149,6 +154,9 @@ class Euroc(FolderReader):
             gyroscope_random_walk=sensor.number("gyroscope_random_walk", 0.0),
             accelerometer_noise_density=sensor.number("accelerometer_noise_density", 0.0),
             accelerometer_random_walk=sensor.number("accelerometer_random_walk", 0.0),
+            gyroscope_matrix=_matrix(sensor, "gyroscope_matrix"),
+            accelerometer_matrix=_matrix(sensor, "accelerometer_matrix"),
+            g_sensitivity=sensor.number("g_sensitivity", 0.0),
         )
 
     def _index(self, folder: Path) -> Files:
@@ -160,6 +168,16 @@ class Euroc(FolderReader):
             return []
         rows = read_rows(path, ",", (7,), "timestamp, w x 3, a x 3")
         return sorted((row.nanoseconds(), row.numbers(1, 7)) for row in rows)
+
+
+def _with_times(camera: CameraAnnouncement, sensor: Sensor) -> CameraAnnouncement:
+    """Return a camera with the times that only our own data sets note."""
+    times = {name: sensor.number(name, 0.0) for name in ("time_offset", "readout")}
+    return msgspec.structs.replace(camera, **times)
+
+
+def _matrix(sensor: Sensor, name: str) -> tuple[float, ...]:
+    return tuple(sensor.list(name, 9)) if name in sensor.lists else IDENTITY
 
 
 FARTHEST = 20_000_000  # nanoseconds between a depth image and its colour image
@@ -209,7 +227,10 @@ class TumRgbd(FolderReader):
         self._depths[self._source] = depth, factor
         kind, *size = first_image(rgb[0][1])
         kinds = (kind, "depth") if depth else (kind,)
-        self._announcements.append(camera_at(self._source, kinds, camera.info(*size), rate))
+        announced = camera_at(self._source, kinds, camera.info(*size), rate)
+        if calibration.is_file():
+            announced = _with_times(announced, sensor)
+        self._announcements.append(announced)
         self._begin(noted=calibration)
 
     def _rows(self) -> Iterator[Rows]:

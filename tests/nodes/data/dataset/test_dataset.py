@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from events import Announcement, CameraAnnouncement, Event, ImuAnnouncement, Odometry, Shutdown
 from events.frames import from_rpy, rotate
 from nodes.data.dataset import DatasetWriter
-from nodes.data.dataset.recording import ImageFile
+from nodes.data.dataset.recording import ImageFile, RowFile
 from nodes.data.replay.node import open_reader
 from nodes.data.replay.reader import ReplayConfig
 from nodes.trajectory_files import read_euroc, read_tum
@@ -233,10 +233,17 @@ def test_a_replay_announces_the_lens_and_the_mounting_that_were_recorded(
     tmp_path: Path, form: str, lens: dict[str, Any]
 ) -> None:
     info = msgspec.structs.replace(camera().info, **lens)
+    errors: dict[str, Any] = {
+        "gyroscope_matrix": (1.1, 0.01, 0.0, 0.0, 0.9, 0.0, 0.0, 0.02, 1.0),
+        "g_sensitivity": 1e-3,
+    }
     sensors: list[Event] = [
-        msgspec.structs.replace(camera(), info=info),
+        msgspec.structs.replace(camera(), info=info, time_offset=0.06, readout=0.02),
         msgspec.structs.replace(
-            imu_announcement(frame="drone/imu"), position=(0.1, 0.0, -0.02), orientation=TURNED
+            imu_announcement(frame="drone/imu"),
+            position=(0.1, 0.0, -0.02),
+            orientation=TURNED,
+            **errors,
         ),
     ]
     twin = msgspec.structs.replace(
@@ -253,11 +260,13 @@ def test_a_replay_announces_the_lens_and_the_mounting_that_were_recorded(
     seen = found[CameraAnnouncement]
     assert isinstance(seen, CameraAnnouncement)
     assert seen.info == info
+    assert (seen.time_offset, seen.readout) == (0.06, 0.02)
     if form == "euroc":
         inertial = found[ImuAnnouncement]
         assert isinstance(inertial, ImuAnnouncement)
         assert inertial.position == pytest.approx((0.1, 0.0, -0.02))
         assert inertial.orientation == pytest.approx(TURNED)
+        assert {name: getattr(inertial, name) for name in errors} == errors
         assert not (data / "mav0" / "cam1").exists()  # the twin is no camera of its own
     else:
         force = (data / "accelerometer.txt").read_text().splitlines()[3].split()[1:]
@@ -302,6 +311,30 @@ def test_what_is_not_written_when_the_run_ends_is_written_then(tmp_path: Path) -
         assert len(listed) == 40
         assert {p.name for p in (data / "data").iterdir()} == {*listed}
         assert all(png(data / "data" / each).shape == (3, 4) for each in listed)
+
+
+def test_of_a_killed_run_the_rows_are_there_but_those_of_the_last_moment(tmp_path: Path) -> None:
+    rows = RowFile(tmp_path / "rows.txt", "# header\n")
+    for stamp in range(0, 1_000 * 10**6, 7 * 10**6):
+        rows.add(stamp, f"{stamp}\n")
+        seen = (tmp_path / "rows.txt").read_text().splitlines()[1:]
+        assert seen == [str(each) for each in range(0, int(seen[-1]) + 1, 7 * 10**6)]
+        assert stamp - int(seen[-1]) < 100 * 10**6
+    rows.close()
+
+
+@pytest.mark.parametrize("front", [False, True])
+def test_a_stereo_rig_is_found_among_other_cameras(tmp_path: Path, front: bool) -> None:
+    pair = [
+        msgspec.structs.replace(camera(name, images=("grey",)), position=(0.15, y, 0.05))
+        for name, y in (("left", 0.0), ("right", 0.1), ("more", 0.2))
+    ]
+    others = [camera(images=("rgb",))] if front else []
+    seen = [image(0, each.source, grey="grey" in each.images) for each in (*others, *pair)]
+    data = record(tmp_path, [*others, *pair, *seen, odometry(0)], "euroc")
+    announced = open_reader(ReplayConfig(file=str(data)), "drone").announcements()
+    stereo = [each.stereo for each in announced if isinstance(each, CameraAnnouncement)]
+    assert stereo == (["", "", "drone/cam1", ""] if front else ["", "drone/cam0", ""])
 
 
 def test_a_few_images_are_written_at_once_and_none_is_lost(tmp_path: Path) -> None:

@@ -130,6 +130,14 @@ def test_the_calibration_names_dso_s_models(
     assert (data / "camera.txt").read_text("utf-8").splitlines() == expected
 
 
+def test_times_without_a_place_in_the_files_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rolling = msgspec.structs.replace(camera(), readout=0.02)
+    record(tmp_path, [rolling, image(0)])
+    assert "drone/front: no file of this layout says its readout, 0.02 s" in caplog.text
+
+
 def test_a_lens_without_a_place_in_the_file_is_refused(tmp_path: Path) -> None:
     info = msgspec.structs.replace(INFO, distortion=(-0.2, 0.03, 0.0, 0.0, 0.01))
     with pytest.raises(NodeError, match="drone/front: expected distortion with four coefficients"):
