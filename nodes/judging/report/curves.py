@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
 from nodes.judging.evaluation.metrics import path_pairs, relative_errors
-from nodes.judging.report.folder import Floats, broken
+from nodes.judging.report.folder import Floats, broken, holes
 from nodes.judging.report.tables import (
     Estimator,
     Plot,
@@ -45,7 +45,7 @@ def draw_errors(run: Run) -> Plot | None:
         for axis, values in zip(axes, (errors.position, np.degrees(errors.rotation)), strict=True):
             some = thin(len(values))
             stamps = errors.stamps[some]
-            line = broken(values[some], stamps, each.lost)
+            line = broken(values[some], stamps, [*each.lost, *holes(run.truth_of(each))])
             seconds = (stamps - run.start) / SECOND
             axis.plot(seconds, line, color=each.color, lw=1.2, label=label(each.name))
     lost = any(each.lost for each in run.estimators)
@@ -99,7 +99,7 @@ def draw_axes(run: Run) -> Plot | None:
         errors = inside.positions - truth.positions
         some = thin(len(inside))
         stamps = inside.stamps[some]
-        lines = broken(errors[some], stamps, each.lost).T
+        lines = broken(errors[some], stamps, [*each.lost, *holes(run.truth_of(each))]).T
         for axis, line in zip(axes, lines, strict=True):
             seconds = (stamps - run.start) / SECOND
             axis.plot(seconds, line, color=each.color, lw=1.2, label=label(each.name))

@@ -15,7 +15,7 @@ from nodes.judging.evaluation.judging import Errors, judge
 from nodes.judging.evaluation.record import EstimatorRecord, Interval, cover, seconds
 from nodes.judging.evaluation.verdict import read_errors
 from nodes.judging.report.tables import COLORS, Estimator, Facts, Run, Verdict
-from nodes.trajectory import Trajectory
+from nodes.trajectory import HOLE, Trajectory
 from nodes.trajectory_files import read_tum
 from runtime.paths import source_file, source_of
 from runtime.run.results import run_folder
@@ -43,8 +43,18 @@ def gaps(estimate: Trajectory | None, truth: Trajectory | None) -> list[Interval
     return cover(frames, estimate.stamps, GAP).lost
 
 
+def holes(truth: Trajectory | None) -> list[Interval]:
+    """Return where a truth is not known: between poses much farther apart than they usually are."""
+    if truth is None or len(truth) < 2:
+        return []
+    steps = np.diff(truth.stamps)
+    before = np.flatnonzero(steps > max(HOLE, 10 * np.median(steps)))
+    ends = zip(truth.stamps[before].tolist(), truth.stamps[before + 1].tolist(), strict=True)
+    return [Interval(*each) for each in ends]
+
+
 def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interval]) -> Floats:
-    """Return a copy of rows, shape (n,) or (n, k), with NaN in each lost interval (ns)."""
+    """Return a copy of rows, shape (n,) or (n, k), with NaN in each interval (ns)."""
     values = values.copy()
     for start, end in lost:
         inside = (stamps > start) & (stamps < end)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from nodes.judging.evaluation.record import Interval
-from nodes.judging.report.folder import Floats, broken
+from nodes.judging.report.folder import Floats, broken, holes
 from nodes.judging.report.tables import (
     DPI,
     HIT,
@@ -102,7 +102,7 @@ def _caption(run: Run, *, astray: bool) -> str:
     if any(e.aligned is not None for e in run.estimators):
         text += (
             f" Estimates as laid on the truth for the evaluation{laid}; "
-            "their lines are broken where they were lost."
+            "their lines are broken where they were lost or no truth is known."
         )
     if astray:
         text += " What goes farther astray than this is cut off."
@@ -115,14 +115,17 @@ def _lines(run: Run) -> list[_Line]:
     for k, (vehicle, truth) in enumerate(run.truths.items()):
         style = {"color": TRUTHS[k % len(TRUTHS)], "lw": 3.2, "alpha": 0.45}
         style["solid_capstyle"] = "round"
-        found.append(_line(f"truth of {label(vehicle)}" if several else "truth", truth, style))
+        found.append(
+            _line(f"truth of {label(vehicle)}" if several else "truth", truth, style, holes(truth))
+        )
     for vehicle, plan in run.plans.items():
         style = {"color": PLAN, "lw": 0.9, "ls": (0, (5, 3))}
         found.append(_line(f"plan of {label(vehicle)}" if several else "plan", plan, style))
     for each in run.estimators:
         if each.aligned is not None:
             style = {"color": each.color, "lw": 1.3}
-            found.append(_line(label(each.name), each.aligned, style, each.lost))
+            unknown = [*each.lost, *holes(run.truth_of(each))]
+            found.append(_line(label(each.name), each.aligned, style, unknown))
         if each.final is not None:
             style = {"color": each.color, "lw": 1.3, "ls": (0, (2, 1.5))}
             found.append(_line(f"{label(each.name)} after loop closures", each.final, style))
@@ -148,7 +151,7 @@ def _bounds(lines: list[_Line]) -> tuple[Floats, Floats]:
     true = [line.points for line in lines if line.style["color"] in TRUTHS]
     if true:
         first = np.concatenate(true)
-        low, high = first.min(axis=0), first.max(axis=0)
+        low, high = np.nanmin(first, axis=0), np.nanmax(first, axis=0)
         beyond = max(float((high - low).max()), 0.5)
         points = np.clip(points, low - beyond, high + beyond)
     # A vehicle that hovers, or one that goes straight ahead, still has a figure of some shape.

@@ -11,7 +11,7 @@ from nodes.judging.evaluation.record import Interval
 from nodes.judging.evaluation.verdict import Thresholds
 from nodes.judging.report.clouds import Shown, View, paint
 from nodes.judging.report.curves import draw_latency
-from nodes.judging.report.folder import broken, gaps, read_poses, read_run
+from nodes.judging.report.folder import broken, gaps, holes, read_poses, read_run
 from nodes.judging.report.tables import drawing, label, number
 from nodes.judging.report.trajectories import draw_trajectories
 from nodes.mapping import read_ply
@@ -58,6 +58,22 @@ def test_gaps_are_where_no_pose_is_and_lines_break_there() -> None:
     inside = broken(said.positions, said.stamps, [Interval(SECOND, 2 * SECOND)])
     within = (said.stamps > SECOND) & (said.stamps < 2 * SECOND)
     assert (np.isnan(inside[:, 0]) == within).all()
+
+
+def test_lines_break_where_no_truth_is_known(tmp_path: Path) -> None:
+    whole = walk(10)
+    known = (whole.stamps <= 3 * SECOND) | (whole.stamps >= 6 * SECOND)
+    truth = whole.take(known)
+    (hole,) = holes(truth)
+    assert (hole.start / SECOND, hole.end / SECOND) == (3.0, 6.0)
+    sparse = whole.take(whole.stamps % SECOND == 0)
+    assert not any(map(holes, (whole, sparse, truth.take(slice(1)), None)))
+    evaluated(tmp_path, truth, {"vo": recorded(whole)}, Thresholds())
+    with drawing():
+        plot = draw_trajectories(read_run(tmp_path))
+    assert plot is not None
+    lines = {line.get_label(): np.asarray(line.get_ydata()) for line in plot.figure.axes[0].lines}
+    assert all(np.isnan(lines[name]).any() for name in ("truth", "vo"))
 
 
 def test_an_end_in_silence_is_a_gap() -> None:
