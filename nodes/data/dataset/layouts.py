@@ -257,10 +257,11 @@ class TumMono(Recording):
 
     def warnings(self) -> list[str]:
         """Return a warning of what the layout has no place for."""
+        camera = self._camera
+        if not camera.readout:
+            return []
         return [
-            f"{self._camera.source}: no file of this layout says its {name}, {real(value)} s"
-            for name in ("time_offset", "readout")
-            if (value := getattr(self._camera, name))
+            f"{camera.source}: no file of this layout says its readout, {real(camera.readout)} s"
         ]
 
     def pose(self, event: PoseStamped) -> None:

@@ -135,7 +135,8 @@ class Euroc(FolderReader):
         )
         rate = sensor.number("rate_hz")
         camera = camera_at(source, tuple(images), info, rate, position, orientation)
-        return _with_times(camera, sensor)
+        times = {name: sensor.number(name, 0.0) for name in ("time_offset", "readout")}
+        return msgspec.structs.replace(camera, **times)  # which only our own data sets note
 
     def _imu_announcement(self) -> ImuAnnouncement:
         sensor = read_sensor(self._folder / "imu0" / "sensor.yaml")
@@ -170,12 +171,6 @@ class Euroc(FolderReader):
         return sorted((row.nanoseconds(), row.numbers(1, 7)) for row in rows)
 
 
-def _with_times(camera: CameraAnnouncement, sensor: Sensor) -> CameraAnnouncement:
-    """Return a camera with the times that only our own data sets note."""
-    times = {name: sensor.number(name, 0.0) for name in ("time_offset", "readout")}
-    return msgspec.structs.replace(camera, **times)
-
-
 def _matrix(sensor: Sensor, name: str) -> tuple[float, ...]:
     return tuple(sensor.list(name, 9)) if name in sensor.lists else IDENTITY
 
@@ -205,14 +200,14 @@ class TumRgbd(FolderReader):
         depth = self._index("depth.txt") if (folder / "depth.txt").is_file() else []
         self._truth = self._poses()
         depth = self._paired(depth, [stamp for stamp, _ in rgb])
-        factor = self._config.depth_factor
+        factor, readout = self._config.depth_factor, 0.0
         span = rgb[-1][0] - rgb[0][0]
         rate = (len(rgb) - 1) * 1e9 / span if span else 30.0
         calibration = folder / "camera.yaml"
         if calibration.is_file():
             sensor = read_sensor(calibration)
             factor = sensor.number("depth_factor", factor)
-            rate = sensor.number("rate_hz", rate)
+            rate, readout = sensor.number("rate_hz", rate), sensor.number("readout", 0.0)
             if camera is None:
                 model = sensor.texts.get("distortion_model", "plumb_bob")
                 lens = {"distortion_model": model, "distortion": sensor.lists.get("distortion")}
@@ -228,9 +223,7 @@ class TumRgbd(FolderReader):
         kind, *size = first_image(rgb[0][1])
         kinds = (kind, "depth") if depth else (kind,)
         announced = camera_at(self._source, kinds, camera.info(*size), rate)
-        if calibration.is_file():
-            announced = _with_times(announced, sensor)
-        self._announcements.append(announced)
+        self._announcements.append(msgspec.structs.replace(announced, readout=readout))
         self._begin(noted=calibration)
 
     def _rows(self) -> Iterator[Rows]:
