@@ -30,7 +30,6 @@ from events import (
     PoseStamped,
     Vector3,
 )
-from events.announcements import IDENTITY
 from events.camera_info import response_light, vignette_map
 from events.frames import flip_yz, rotate, rotation_to_nwu
 from events.geometry import pose_matrix
@@ -42,6 +41,7 @@ from nodes.data.dataset.recording import (
     RowFile,
     in_colour,
     in_grey,
+    noted,
     real,
 )
 from nodes.ros2.messages.images import depth_in_steps
@@ -95,10 +95,7 @@ class Euroc(Recording):
                 )
         if rig.imu is not None:
             self._imu = self.rows("mav0/imu0/data.csv", _IMU_HEADER)
-            matrices = {rig.imu.gyroscope_matrix, rig.imu.accelerometer_matrix}
-            errors = matrices != {IDENTITY} or rig.imu.g_sensitivity
-            comment = f"{rig.imu.source}; {_BODY}"
-            self._sensor("imu0", "imu", comment, rig.imu, imu=rig.imu, errors=errors)
+            self._sensor("imu0", "imu", f"{rig.imu.source}; {_BODY}", rig.imu, imu=rig.imu)
         self._truth = self.rows(f"mav0/{_TRUTH}/data.csv", f"{EUROC_HEADER}\n")
         self._velocity_known = False
         self._places: set[Vector3] = set()  # no more than two
@@ -163,10 +160,10 @@ class Euroc(Recording):
         **more: Any,
     ) -> None:
         """Write a sensor.yaml: kind, pose on the body, and further fields by kind."""
-        pose = np.eye(4)
+        pose, said = np.eye(4), {}
         if mounted is not None:
-            pose = pose_matrix(mounted.position, mounted.orientation)
-        what = {"kind": kind, "comment": comment, "pose": pose.tolist()} | more
+            pose, said = pose_matrix(mounted.position, mounted.orientation), noted(mounted)
+        what = {"kind": kind, "comment": comment, "pose": pose.tolist(), "noted": said} | more
         self.describe(f"mav0/{name}/sensor.yaml", "euroc.sensor.yaml", **what)
 
     def _note(
@@ -322,7 +319,11 @@ class TumRgbd(Recording):
                 "timestamp ax ay az",
             )  # fmt: skip
         self._unpaired: dict[int, str] = {}  # by stamp: rgb or depth, whichever came
-        self.describe("camera.yaml", "tum_rgbd.camera.yaml", camera=camera, factor=depth_factor)
+        said = noted(camera)
+        said.pop("time_offset", None)  # the true poses are those of the images' own stamps
+        self.describe(
+            "camera.yaml", "tum_rgbd.camera.yaml", camera=camera, factor=depth_factor, noted=said
+        )
 
     def image(self, event: Image) -> ImageFile | None:
         """Add an image of the camera, in colour if available."""

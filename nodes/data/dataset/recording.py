@@ -221,6 +221,29 @@ class Recording(ABC):
         return sum(file.left_out for file in self.files)
 
 
+_SAID = {"position", "orientation", "parent_frame_id", "baseline", "stereo", "undistorted"}
+
+
+def notable(kind: Any) -> list[msgspec.structs.FieldInfo]:
+    """Return the fields of an announcement for which no layout has a word, all with defaults.
+
+    Our own data sets note them all the same.
+    """
+    fields = msgspec.structs.fields(kind)
+    return [f for f in fields if f.default is not msgspec.NODEFAULT and f.name not in _SAID]
+
+
+def noted(announcement: CameraAnnouncement | ImuAnnouncement) -> dict[str, str]:
+    """Return the `notable` fields that are not their defaults, as YAML."""
+    found = {}
+    for field in notable(announcement):
+        value = getattr(announcement, field.name)
+        if value != field.default:
+            text = _row(value) if isinstance(value, tuple) else str(value).lower()
+            found[field.name] = text if isinstance(value, bool | tuple) else real(value)
+    return found
+
+
 def real(value: float) -> str:
     """Return a number in YAML 1.1: ``2.0e-05``, since ``2e-05`` would be text."""
     digits, e, exponent = repr(value).partition("e")

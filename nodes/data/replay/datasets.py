@@ -10,9 +10,11 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
+from typing_extensions import TypeVar
 
 from events import (
     CameraAnnouncement,
@@ -24,7 +26,6 @@ from events import (
     Quaternion,
     Vector3,
 )
-from events.announcements import IDENTITY
 from events.base import UNIT_TOLERANCE
 from events.frames import (
     OPTICAL_TO_FRD,
@@ -35,6 +36,7 @@ from events.frames import (
     rotation_to_ned,
 )
 from events.geometry import pose_matrix, pose_tuples
+from nodes.data.dataset.recording import notable
 from nodes.data.replay.folders import (
     Files,
     FolderReader,
@@ -135,8 +137,7 @@ class Euroc(FolderReader):
         )
         rate = sensor.number("rate_hz")
         camera = camera_at(source, tuple(images), info, rate, position, orientation)
-        times = {name: sensor.number(name, 0.0) for name in ("time_offset", "readout")}
-        return msgspec.structs.replace(camera, **times)  # which only our own data sets note
+        return _with_noted(camera, sensor)
 
     def _imu_announcement(self) -> ImuAnnouncement:
         sensor = read_sensor(self._folder / "imu0" / "sensor.yaml")
@@ -144,7 +145,7 @@ class Euroc(FolderReader):
         position, orientation = pose_tuples(np.reshape(given, (4, 4)))
         if (position, orientation) != ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)):
             self._imu_frame = self._imu_source
-        return ImuAnnouncement(
+        announced = ImuAnnouncement(
             stamp=0,
             source=self._imu_source,
             rate=sensor.number("rate_hz"),
@@ -155,10 +156,8 @@ class Euroc(FolderReader):
             gyroscope_random_walk=sensor.number("gyroscope_random_walk", 0.0),
             accelerometer_noise_density=sensor.number("accelerometer_noise_density", 0.0),
             accelerometer_random_walk=sensor.number("accelerometer_random_walk", 0.0),
-            gyroscope_matrix=_matrix(sensor, "gyroscope_matrix"),
-            accelerometer_matrix=_matrix(sensor, "accelerometer_matrix"),
-            g_sensitivity=sensor.number("g_sensitivity", 0.0),
         )
+        return _with_noted(announced, sensor)
 
     def _index(self, folder: Path) -> Files:
         rows = read_rows(folder / "data.csv", ",", (2,), "timestamp, filename")
@@ -171,8 +170,21 @@ class Euroc(FolderReader):
         return sorted((row.nanoseconds(), row.numbers(1, 7)) for row in rows)
 
 
-def _matrix(sensor: Sensor, name: str) -> tuple[float, ...]:
-    return tuple(sensor.list(name, 9)) if name in sensor.lists else IDENTITY
+A = TypeVar("A", CameraAnnouncement, ImuAnnouncement)
+
+
+def _with_noted(announcement: A, sensor: Sensor) -> A:
+    """Return an announcement with what our own data sets note beside the layout's words."""
+    found: dict[str, Any] = {}
+    for field in notable(announcement):
+        name = field.name
+        if name in sensor.lists:
+            found[name] = tuple(sensor.lists[name])
+        elif isinstance(field.default, bool):
+            found[name] = sensor.texts.get(name) == "true"
+        elif name in sensor.texts:
+            found[name] = sensor.number(name)
+    return msgspec.structs.replace(announcement, **found)
 
 
 FARTHEST = 20_000_000  # nanoseconds between a depth image and its colour image
@@ -200,14 +212,14 @@ class TumRgbd(FolderReader):
         depth = self._index("depth.txt") if (folder / "depth.txt").is_file() else []
         self._truth = self._poses()
         depth = self._paired(depth, [stamp for stamp, _ in rgb])
-        factor, readout = self._config.depth_factor, 0.0
+        factor = self._config.depth_factor
         span = rgb[-1][0] - rgb[0][0]
         rate = (len(rgb) - 1) * 1e9 / span if span else 30.0
         calibration = folder / "camera.yaml"
         if calibration.is_file():
             sensor = read_sensor(calibration)
             factor = sensor.number("depth_factor", factor)
-            rate, readout = sensor.number("rate_hz", rate), sensor.number("readout", 0.0)
+            rate = sensor.number("rate_hz", rate)
             if camera is None:
                 model = sensor.texts.get("distortion_model", "plumb_bob")
                 lens = {"distortion_model": model, "distortion": sensor.lists.get("distortion")}
@@ -223,7 +235,9 @@ class TumRgbd(FolderReader):
         kind, *size = first_image(rgb[0][1])
         kinds = (kind, "depth") if depth else (kind,)
         announced = camera_at(self._source, kinds, camera.info(*size), rate)
-        self._announcements.append(msgspec.structs.replace(announced, readout=readout))
+        if calibration.is_file():
+            announced = _with_noted(announced, sensor)
+        self._announcements.append(announced)
         self._begin(noted=calibration)
 
     def _rows(self) -> Iterator[Rows]:

@@ -236,9 +236,13 @@ def test_a_replay_announces_the_lens_and_the_mounting_that_were_recorded(
     errors: dict[str, Any] = {
         "gyroscope_matrix": (1.1, 0.01, 0.0, 0.0, 0.9, 0.0, 0.0, 0.02, 1.0),
         "g_sensitivity": 1e-3,
+        "vibration": 1.5,
+        "averaged": True,
     }
     sensors: list[Event] = [
-        msgspec.structs.replace(camera(), info=info, time_offset=0.06, readout=0.02),
+        msgspec.structs.replace(
+            camera(), info=info, time_offset=0.06, readout=0.02, noise=2.0, vignette=(-0.5, 0.1)
+        ),
         msgspec.structs.replace(
             imu_announcement(frame="drone/imu"),
             position=(0.1, 0.0, -0.02),
@@ -262,6 +266,7 @@ def test_a_replay_announces_the_lens_and_the_mounting_that_were_recorded(
     assert seen.info == info
     # The true poses of TUM's are those of the images' stamps.
     assert (seen.time_offset, seen.readout) == (0.06 if form == "euroc" else 0.0, 0.02)
+    assert (seen.noise, seen.vignette, seen.exposure) == (2.0, (-0.5, 0.1), 0.0)
     if form == "euroc":
         inertial = found[ImuAnnouncement]
         assert isinstance(inertial, ImuAnnouncement)
