@@ -84,10 +84,15 @@ def read_euroc(path: Path) -> Trajectory:
 
 
 def euroc_rows(
-    path: Path, columns: tuple[int, ...] = (17,), tolerance: float = UNIT_LENGTH
+    path: Path,
+    columns: tuple[int, ...] = (17,),
+    tolerance: float = UNIT_LENGTH,
+    *,
+    whole: bool = True,  # whether a last line without its end counts
 ) -> Iterator[tuple[Row, int, list[float]]]:
     """Yield a EuRoC ground truth's rows, stamps (ns), values; a `ValueError` names a wrong line."""
-    for row in read_rows(path, ",", columns, "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3"):
+    meaning = "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3"
+    for row in read_rows(path, ",", columns, meaning, whole=whole):
         values = row.numbers(1, 17)
         _check_quaternion(row, values[3:7], tolerance)
         yield row, row.nanoseconds(), values

@@ -101,7 +101,9 @@ class ImageFile:
                 image = self._convert(self._data)
                 flags = _DEPTH if image.dtype == np.uint16 else ()
                 _, code = cv2.imencode(".png", image, flags)
-                self._path.write_bytes(code.tobytes())
+                part = self._path.with_name(f"{self._path.name}.part")
+                part.write_bytes(code.tobytes())
+                part.replace(self._path)  # a killed run leaves no half of an image
                 self._data = None
 
 
@@ -121,7 +123,8 @@ _KEPT = 100_000_000  # nanoseconds between rows that the system is given
 class RowFile:
     """A text file of rows with rising stamps, after the lines of a header; may raise `OSError`.
 
-    A run that is killed leaves all rows but those of the last tenth of a second.
+    A run that is killed leaves all rows but those of the last tenth of a second; the last one may
+    be cut off.
     """
 
     def __init__(self, path: Path, header: str) -> None:

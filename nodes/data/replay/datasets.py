@@ -63,6 +63,7 @@ class Euroc(FolderReader):
     """
 
     layout = "EuRoC's (mav0)"
+    noted = "body.yaml"
 
     @classmethod
     def find(cls, path: Path) -> Path | None:
@@ -83,9 +84,10 @@ class Euroc(FolderReader):
         if self._imu:
             self._announcements.append(self._imu_announcement())
         truth = folder / "state_groundtruth_estimate0" / "data.csv"
-        rows = euroc_rows(truth, tolerance=UNIT_TOLERANCE) if truth.is_file() else ()
-        self._truth = sorted((stamp, values) for _, stamp, values in rows)
-        self._begin([row[0] for row in self._imu], folder / "body.yaml")
+        if truth.is_file():
+            rows = euroc_rows(truth, tolerance=UNIT_TOLERANCE, whole=self._whole(truth))
+            self._truth = sorted((stamp, values) for _, stamp, values in rows)
+        self._begin([row[0] for row in self._imu])
 
     def _rows(self) -> Iterator[Rows]:
         yield Rows(Imu, self._imu_source, self._imu, self._measurement)
@@ -160,13 +162,15 @@ class Euroc(FolderReader):
         return _with_noted(announced, sensor)
 
     def _index(self, folder: Path) -> Files:
-        rows = read_rows(folder / "data.csv", ",", (2,), "timestamp, filename")
-        return sorted((row.nanoseconds(), folder / "data" / row.fields[1]) for row in rows)
+        path = folder / "data.csv"
+        rows = read_rows(path, ",", (2,), "timestamp, filename", whole=self._whole(path))
+        files = sorted((row.nanoseconds(), folder / "data" / row.fields[1]) for row in rows)
+        return self._written(files)
 
     def _measurements(self, path: Path) -> list[tuple[int, list[float]]]:
         if not path.is_file():
             return []
-        rows = read_rows(path, ",", (7,), "timestamp, w x 3, a x 3")
+        rows = read_rows(path, ",", (7,), "timestamp, w x 3, a x 3", whole=self._whole(path))
         return sorted((row.nanoseconds(), row.numbers(1, 7)) for row in rows)
 
 
@@ -199,6 +203,7 @@ class TumRgbd(FolderReader):
     """
 
     layout = "TUM's (rgb.txt)"
+    noted = "camera.yaml"
 
     @classmethod
     def find(cls, path: Path) -> Path | None:
@@ -215,7 +220,7 @@ class TumRgbd(FolderReader):
         factor = self._config.depth_factor
         span = rgb[-1][0] - rgb[0][0]
         rate = (len(rgb) - 1) * 1e9 / span if span else 30.0
-        calibration = folder / "camera.yaml"
+        calibration = folder / self.noted
         if calibration.is_file():
             sensor = read_sensor(calibration)
             factor = sensor.number("depth_factor", factor)
@@ -238,7 +243,7 @@ class TumRgbd(FolderReader):
         if calibration.is_file():
             announced = _with_noted(announced, sensor)
         self._announcements.append(announced)
-        self._begin(noted=calibration)
+        self._begin()
 
     def _rows(self) -> Iterator[Rows]:
         truth, *images = super()._rows()
@@ -268,14 +273,15 @@ class TumRgbd(FolderReader):
         return sorted((stamp, path) for stamp, (_, path) in taken.items())
 
     def _index(self, name: str) -> Files:
-        rows = read_rows(self._folder / name, None, (2,), "timestamp filename")
-        return sorted((row.seconds(), self._folder / row.fields[1]) for row in rows)
+        path = self._folder / name
+        rows = read_rows(path, None, (2,), "timestamp filename", whole=self._whole(path))
+        return self._written(sorted((row.seconds(), self._folder / row.fields[1]) for row in rows))
 
     def _poses(self) -> list[tuple[int, Vector3, Quaternion]]:
         path = self._folder / "groundtruth.txt"
         if not path.is_file():
             return []
-        truth = read_tum(path, in_order=False)
+        truth = read_tum(path, whole=self._whole(path), in_order=False)
         return [
             (stamp, flip_yz(place), rotation_to_ned(turn)) for stamp, place, turn in truth.poses()
         ]

@@ -109,6 +109,7 @@ class FolderReader(Reader):
     """
 
     layout: ClassVar[str]  # name and marks of the layout, for an error
+    noted: ClassVar[str] = ""  # file in which our own data sets note the epoch
 
     def __init__(self, folder: Path, config: ReplayConfig, vehicle: str) -> None:
         super().__init__()
@@ -119,6 +120,7 @@ class FolderReader(Reader):
         self._truth: list[Any] = []  # tuples: the stamp (ns), then the arguments of `_odometry`
         self._announcements: list[Announcement] = []
         try:
+            self._epoch = noted_epoch(folder / self.noted) if self.noted else []
             self._read()
         except ValueError as error:
             raise ReplayError(str(error)) from None
@@ -161,12 +163,32 @@ class FolderReader(Reader):
         for source, files in self._images.items():
             yield Rows(Image, source, files, partial(self._image, source))
 
-    def _begin(self, others: Sequence[int] = (), noted: Path | None = None) -> None:
+    def _whole(self, path: Path) -> bool:
+        """Return whether a file's last line counts: a killed run of ours may have cut it off."""
+        try:
+            with path.open("rb") as file:
+                file.seek(-1, 2)
+                torn = bool(self._epoch) and file.read() != b"\n"
+        except OSError:  # it is empty or unreadable, which whoever reads it says
+            return True
+        if torn:
+            self.complain(f"{path}: the last line is cut off, and left out")
+        return not torn
+
+    def _written(self, files: Files) -> Files:
+        """Return a camera's images without those that a killed run of ours listed, not wrote."""
+        found = [each for each in files if not self._epoch or each[1].is_file()]
+        if found and (missing := len(files) - len(found)):
+            self.complain(
+                f"{files[0][1].parent}: {missing} listed images are missing, and left out"
+            )
+        return found or files
+
+    def _begin(self, others: Sequence[int] = ()) -> None:
         """Choose time 0, cut the truth to the sensors' time, and announce the vehicle.
 
         Args:
             others: Stamps of sensors besides cameras, ns.
-            noted: File in which our own data sets note the epoch.
         """
         firsts = [files[0][0] for files in self._images.values() if files]
         lasts = [files[-1][0] for files in self._images.values() if files]
@@ -177,9 +199,7 @@ class FolderReader(Reader):
         begin = bisect.bisect_right(self._truth, first, key=lambda row: row[0]) - 1
         end = bisect.bisect_left(self._truth, last, key=lambda row: row[0]) + 1
         self._truth = self._truth[max(begin, 0) : end]
-        self._origin = min([first, *(row[0] for row in self._truth[:1])])
-        if noted is not None:
-            self._origin = min([self._origin, *noted_epoch(noted)])
+        self._origin = min([first, *(row[0] for row in self._truth[:1]), *self._epoch])
         if self._truth:
             seen = min(firsts, default=self._truth[0][0])
             row = next((row for row in self._truth if row[0] >= seen), self._truth[0])
@@ -281,7 +301,7 @@ class Sensor(msgspec.Struct, frozen=True):
         try:
             return float(self.texts[key])
         except (KeyError, ValueError):
-            if default is not None:
+            if default is not None and key not in self.texts:
                 return default
             found = self.texts.get(key, "nothing")
             raise ReplayError(f"{self.path}: {key}: expected a number, found {found}") from None

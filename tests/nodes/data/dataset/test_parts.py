@@ -50,6 +50,17 @@ def test_an_image_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         file()
 
 
+def test_an_image_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(self: Path, target: Path) -> None:
+        assert not target.exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        ImageFile(tmp_path / "a.png", image(1).data, in_colour)()
+    assert not (tmp_path / "a.png").exists()
+
+
 def test_rows_keep_to_the_order_of_time(tmp_path: Path) -> None:
     rows = RowFile(tmp_path / "rows.txt", "# head\n")
     assert [rows.add(stamp, f"{stamp}\n") for stamp in (5, 7, 7, 6, 8)] == [

@@ -274,6 +274,47 @@ def test_a_missing_image_is_an_error_when_its_turn_comes(tmp_path: Path) -> None
         of(found, Image)
 
 
+def cut(path: Path, count: int) -> None:
+    """Take the last bytes of a file away."""
+    path.write_bytes(path.read_bytes()[:-count])
+
+
+@pytest.mark.parametrize("count", [1, 8])
+@pytest.mark.parametrize(
+    ("build", "index", "truth", "images"),
+    [
+        (sets.euroc, "cam0/data.csv", "state_groundtruth_estimate0/data.csv", "cam0/data"),
+        (sets.tum_rgbd, "rgb.txt", "groundtruth.txt", "rgb"),
+    ],
+)
+def test_rows_that_a_killed_run_cut_off_are_left_out_and_told(
+    build: Any, index: str, truth: str, images: str, count: int, tmp_path: Path
+) -> None:
+    """A row without its end may lack digits; an image that is listed may lack its file."""
+    folder = build(tmp_path)
+    root = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    cut(root / index, count)
+    cut(root / truth, count)
+    sorted((root / images).iterdir())[1].unlink()
+    found = sets.reader(folder)
+    assert [each.stamp for each in of(found, Image)] == [0]
+    assert max(each.stamp for each in of(found, Odometry)) < 2 * sets.STEP
+    assert {*found.trouble} >= {
+        f"{root / index}: the last line is cut off, and left out",
+        f"{root / images}: 1 listed images are missing, and left out",
+        f"{root / truth}: the last line is cut off, and left out",
+    }
+
+
+def test_a_last_line_of_others_needs_no_end(tmp_path: Path) -> None:
+    folder = sets.euroc_as_published(tmp_path)
+    path = folder / "mav0" / "imu0" / "data.csv"
+    path.write_text(path.read_text().rstrip())
+    found = sets.reader(folder)
+    assert len(of(found, Imu)) == 2
+    assert not found.trouble
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["euroc", "tum_rgbd"])
 @given(
