@@ -128,6 +128,15 @@ def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
     return found
 
 
+def left_out(rig: Rig, name: str) -> list[str]:
+    """Return what a format's files do not even say in a comment, a sentence each."""
+    return [
+        f"{camera.source}: {name} has no word for a rolling shutter ({real(camera.readout)} s)"
+        for camera in rig.cameras
+        if name == "basalt" and camera.readout
+    ]
+
+
 def variables(
     rig: Rig, cameras: list[dict[str, Any]] | None = None, *, topics: bool = False
 ) -> dict[str, Any]:

@@ -283,8 +283,10 @@ def export(
     transforms; vslamlab adds images, IMU data and ground truth if the run has a recording. A lens
     that a format cannot express is refused.
     """
-    from nodes.calibration.formats import export_calibration
+    from nodes.calibration.formats import announcements, export_calibration, left_out
+    from nodes.data.dataset.recording import choose
     from runtime.errors import ConfigError
+    from runtime.tools.cli.commands import warn
 
     run = run_folder(run)
     try:
@@ -294,6 +296,8 @@ def export(
             written = export_measurements(run, out, epoch)
         else:
             written = export_calibration(run, form.value, out, epoch, camera)
+            for each in left_out(choose(announcements(run), camera), form.value):
+                warn(each)
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None
     for path in written:

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Image, Imu
 from events.geometry import inverse
-from nodes.calibration.formats import camera_in_imu, write_files
+from nodes.calibration.formats import camera_in_imu, left_out, write_files
 from nodes.data.dataset.recording import Rig
 from nodes.estimators import (
     Estimator,
@@ -410,6 +410,8 @@ class Vit(Estimator[VitConfig]):
                 files = write_files(rig, config.calibration, topics=False)
             except ValueError as error:
                 self.log.fatal("calibration: %s", error)
+            for each in left_out(rig, config.calibration):
+                self.log.warning("calibration: %s", each)
         self._hold = self.hold(self.name, config.hold, config.latency)
         told = config.library, config.config, files, rig
         limit = config.hold.max_wait + 60.0

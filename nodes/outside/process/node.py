@@ -39,7 +39,7 @@ from events import (
     VehicleAnnouncement,
     VelocitySetpoint,
 )
-from nodes.calibration.formats import variables
+from nodes.calibration.formats import left_out, variables
 from nodes.data.dataset.recording import Rig
 from nodes.estimators import Estimator, Mount, TrackingResult
 from nodes.outside.native import LinkAnswer, LinkError, LinkOrder, describe
@@ -208,7 +208,10 @@ class Process(Estimator[ProcessConfig]):
         config, launch = self.config, self._launch
         self._loop = asyncio.get_running_loop()
         self._end: asyncio.Future[str] = self._loop.create_future()
-        for path, text in launch.texts(self._known(), self._rig()).items():
+        rig = self._rig()
+        for each in left_out(rig, config.calibration) if rig is not None else ():
+            self.log.warning("calibration: %s", each)
+        for path, text in launch.texts(self._known(), rig).items():
             path.parent.mkdir(parents=True, exist_ok=True)
             await self.offload(path.write_text, text, "utf-8")
         if config.feed == "link":

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from events import Announcement, CameraInfo
 from events.frames import convert_vector, from_rpy
 from events.geometry import pose_matrix
-from nodes.calibration.formats import FORMATS, export_calibration, write_files
+from nodes.calibration.formats import FORMATS, export_calibration, left_out, write_files
 from nodes.calibration.room import READERS, ReadCamera, read
 from nodes.data.dataset.recording import Rig
 from runtime.config.reading import parse
@@ -181,6 +181,9 @@ def test_what_has_no_word_is_a_comment_or_refused() -> None:
         assert any(
             "rolling shutter: 0.02 s" in text for text in write_files(rolling, form).values()
         )
+        assert not left_out(rolling, form)
+    (said,) = left_out(rolling, "basalt")
+    assert "drone/left: basalt has no word for a rolling shutter (0.02 s)" in said
     assert "rolling_shutter_tr: 0.02" in write_files(rolling, "vins")["vins.yaml"]
     assert "0.01 s late" in write_files(rolling, "orbslam3")["orbslam3.yaml"]
     two = Rig("drone", (camera(time_offset=0.01), camera("other")), IMU)

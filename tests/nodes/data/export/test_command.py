@@ -8,9 +8,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from nodes.data.export import export
+from nodes.data.export import Format, export
 from nodes.trajectory_files import write_tum
 from runtime.errors import ConfigError, ResultsError
+from tests.nodes.calibration.samples import IMU, camera
+from tests.nodes.calibration.test_formats import summary
 from tests.nodes.trajectory.samples import walk
 
 app = typer.Typer()
@@ -54,6 +56,18 @@ def test_a_place_that_cannot_be_written_is_one_of_our_errors(run: Path) -> None:
     (run / "file").touch()
     with pytest.raises(ConfigError, match=r"file"):
         call(str(run), "--format", "tum", "--out", str(run / "file"))
+
+
+def test_what_a_calibration_does_not_say_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = summary(tmp_path / "run", (camera(readout=0.02), IMU))
+    export(run, Format("kalibr"))
+    assert capsys.readouterr().err == ""
+    export(run, Format("basalt"))
+    assert (
+        "warning: drone/left: basalt has no word for a rolling shutter" in capsys.readouterr().err
+    )
 
 
 def test_an_unknown_format_is_refused_with_those_there_are(run: Path) -> None:
