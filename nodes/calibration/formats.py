@@ -166,7 +166,8 @@ def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
     found: dict[str, Any] = {}
     turn = imu_axes(rig, ros=ros)[:3, :3]
     feigned = rig.imu.g_sensitivity if rig.imu else 0.0
-    for sensor, of in (("gyroscope", "GYRO"), ("accelerometer", "ACC")):
+    names = ("gyroscope", "Tw", "R_IMUtoGYRO"), ("accelerometer", "Ta", "R_IMUtoACC")
+    for sensor, lower, rotation in names:
         given = getattr(rig.imu, f"{sensor}_matrix") if rig.imu else IDENTITY
         matrix = turn @ np.reshape(given, (3, 3)) @ turn
         if abs(np.linalg.det(matrix)) < 1e-9:
@@ -175,20 +176,20 @@ def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
             )
         q, r = np.linalg.qr(matrix.T)
         signs = np.sign(np.diag(r))
-        found |= {f"T{sensor[0]}": signs * r.T, f"R_IMUto{of}": (q * signs).T}
+        found |= {lower: signs * r.T, rotation: (q * signs).T}
         error = np.linalg.inv(matrix) - np.eye(3)
         if sensor == "accelerometer":
-            lower = np.tril(np.ones((3, 3), np.bool_))
-            if name == "basalt" and (feigned or np.abs(error[~lower]).max() > 1e-12):
+            above = np.triu(np.ones((3, 3), np.bool_), 1)
+            if name == "basalt" and (feigned or np.abs(error[above]).max() > 1e-12):
                 raise ValueError(
                     "basalt has no word for all of the IMU's errors: expected no g_sensitivity and "
                     "an accelerometer_matrix without numbers above its diagonal, found "
                     f"{feigned:g} and {given}"
                 )
-            error = error.T[lower.T]
+            error = error.T[~above.T]
         found[f"{sensor}_error"] = np.ravel(error, "F")
-    found = {"Tw" if key == "Tg" else key: value + 0.0 for key, value in found.items()}  # no -0.0
-    return found | {"Tg": feigned * np.eye(3)}
+    found["Tg"] = feigned * np.eye(3)
+    return {key: value + 0.0 for key, value in found.items()}  # without -0.0
 
 
 def _imu_remarks(imu: ImuAnnouncement) -> list[str]:
