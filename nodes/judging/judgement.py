@@ -27,8 +27,8 @@ from events.frames import axes_of
 from nodes.data.export import mounting
 from nodes.data.replay.bags import chosen, open_bag, readable
 from nodes.data.replay.reader import BagTopic
+from nodes.judging.evaluation.alignment import AlignmentMethod
 from nodes.judging.evaluation.judging import Judgement, judge
-from nodes.judging.evaluation.metrics import How
 from nodes.judging.evaluation.node import EvaluationConfig
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.judging.evaluation.verdict import FRAMES, conclude, write_results
@@ -96,7 +96,7 @@ def judge_all(
     for source in estimates:
         if source.name in {*judgements, "truth", "plan"}:
             raise ValueError(f"{source.file}: expected a name of its own, NAME={source.file}")
-        by_frame: dict[str, How] = {"": "se3", "map": "none"}
+        by_frame: dict[str, AlignmentMethod] = {"": "se3", "map": "none"}
         usual = "sim3" if config.scale_free else by_frame.get(source.frame_id, "origin")
         record = EstimatorRecord.of(source.poses)
         record.final = finals.get(source.name)
@@ -105,6 +105,7 @@ def judge_all(
             truth.poses,
             cameras=None if frames is None else {"": frames},
             alignment=usual if config.alignment == "auto" else config.alignment,
+            align_first=config.alignment_span(),
             gap=config.gap,
             hole=config.hole,
         )
