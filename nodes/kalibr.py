@@ -22,7 +22,6 @@ import yaml
 from events import CameraInfo
 from events.camera_info import COEFFICIENTS
 from events.geometry import inverse
-from nodes.trajectory import not_rotations
 
 Floats = npt.NDArray[np.float64]
 
@@ -160,12 +159,18 @@ def transform(given: Any, where: str) -> Floats:
             f"{where}: expected a transform of 4 × 4 numbers, found {given!r:.80}"
         ) from None
     rigid = np.isfinite(matrix).all() and (matrix[3] == (0.0, 0.0, 0.0, 1.0)).all()
-    if not rigid or not_rotations(matrix[None, :3, :3]):
+    if not rigid or not is_rotation(matrix[:3, :3]):
         raise ValueError(
             f"{where}: expected a rotation, a translation and a last row 0 0 0 1, "
             f"found {matrix.round(6).tolist()}"
         )
     return matrix
+
+
+def is_rotation(matrix: Floats) -> bool:
+    """Return whether a matrix, (3, 3), is a rotation to 1e-4, as of files with few decimals."""
+    odd = abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(odd <= 1e-4 and np.linalg.det(matrix) > 0.0)
 
 
 class _Keys:
@@ -184,7 +189,7 @@ class _Keys:
         given = self._table.get(key, default)
         try:
             # YAML 1.1 takes 1e-5, which has no point, for a text.
-            value = float(given)  # type: ignore[arg-type]
+            value = float(given)
         except (TypeError, ValueError):
             self.wrong(key, "a number", given)
         if not np.isfinite(value):

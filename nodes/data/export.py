@@ -283,9 +283,7 @@ def export(
     form: Annotated[Format, typer.Option("--format", "-f", help="Format of the files.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for the files; if not given RUN/export/FORMAT."
-        ),
+        typer.Option(help="Folder for the files; if not given RUN/export/FORMAT."),
     ] = None,
     epoch: Annotated[
         str, typer.Option(help="The run's time 0: a date, or nanoseconds of Unix time.")

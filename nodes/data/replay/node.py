@@ -16,6 +16,7 @@ import numpy.typing as npt
 from events import Announcement, Event, Odometry, TrajectoryEstimate, VehicleAnnouncement
 from nodes.data.replay.bags import Recorded, RosBag, is_ours
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError, Timed
+from nodes.kalibr import Chain, read_chain
 from runtime import Node, Output
 from runtime.run.results import newest
 from runtime.time.clock import SECOND
@@ -115,17 +116,55 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
         path /= "recording.mcap"
     # Readers are imported when needed: scipy and rosbags take tenths of a second.
     if path.is_dir() and not (path / "metadata.yaml").is_file():
-        from nodes.data.replay.datasets import open_folder
+        if (bag := _only_bag(path)) is not None:
+            path = bag
+        else:
+            from nodes.data.replay.datasets import open_folder
 
-        return open_folder(path, config, vehicle)
+            return open_folder(path, config, vehicle)
     if not path.is_dir() and not path.is_file():
         raise ReplayError(
             f"{path}: expected a recording or the folder of a data set, found nothing there; "
             "docs/how-to/datasets.md says where to download those of EuRoC, TUM and KITTI"
         )
     if path.is_file() and path.suffix not in {".db3", ".bag"} and is_ours(path):
+        if config.calibration:
+            raise ReplayError(
+                f"calibration: expected a bag of ROS or a data set in EuRoC's layout beside it, "
+                f"found a recording, whose cameras are announced in it: {path}"
+            )
         return Recorded(path)
-    return RosBag(path, config.topics, vehicle)
+    return RosBag(path, config.topics, vehicle, chain_of(config))
+
+
+def _only_bag(folder: Path) -> Path | None:
+    """Return the only bag of a folder without metadata.yaml; `None` if there is none.
+
+    Raises:
+        ReplayError: There are several.
+    """
+    bags = sorted(path for path in folder.iterdir() if path.suffix in _BAGS and path.is_file())
+    if len(bags) > 1:
+        raise ReplayError(
+            f"{folder}: expected one bag, or a bag of ROS 2 of several files with its "
+            f"metadata.yaml (`ros2 bag reindex` writes it), found {len(bags)} bags: "
+            f"{', '.join(path.name for path in bags[:5])}{', …' * (len(bags) > 5)}; "
+            "name one in file"
+        )
+    return bags[0] if bags else None
+
+
+_BAGS = {".bag", ".db3", ".mcap"}
+
+
+def chain_of(config: ReplayConfig) -> Chain | None:
+    """Return the calibration that the settings name; a `ReplayError` if it cannot be read."""
+    if not config.calibration:
+        return None
+    try:
+        return read_chain([Path(path) for path in config.calibration])
+    except ValueError as error:
+        raise ReplayError(f"calibration: {error}") from None
 
 
 class Timeline:
@@ -337,6 +376,8 @@ class Replay(Node[ReplayConfig]):
     def _open(self) -> None:
         config = self.config
         self._reader = reader = open_reader(config, self.name)
+        for note in reader.notes:
+            self.log.info("%s: %s", config.file, note)
         announced = reader.announcements()
         self._choice = Choice(config.only, config.skip, announced)
         self._announcements = [each for each in announced if self._choice.announced(each)]
