@@ -7,6 +7,7 @@ in it. Events of an IMU in ROS's axes have turned ones here, by half a turn abou
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -15,10 +16,20 @@ from events import CameraAnnouncement, ImuAnnouncement
 from events.frames import OPTICAL_TO_FRD, axes_of
 from events.geometry import Floats, Pose, pose_matrix, pose_tuples
 from nodes.data.replay.folders import as_pair
-from nodes.data.replay.reader import ReplayError
-from nodes.kalibr import Chain, KalibrCamera
+from nodes.data.replay.reader import ReplayConfig, ReplayError
+from nodes.kalibr import Chain, KalibrCamera, read_chain
 
 _HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def chain_of(config: ReplayConfig) -> Chain | None:
+    """Return the calibration that the settings name; a `ReplayError` if it cannot be read."""
+    if not config.calibration:
+        return None
+    try:
+        return read_chain([Path(path) for path in config.calibration])
+    except ValueError as error:
+        raise ReplayError(f"calibration: {error}") from None
 
 
 def imu_in_body(imu: ImuAnnouncement | None) -> Floats:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from events import Announcement, Event, Odometry, TrajectoryEstimate, VehicleAnnouncement
 from nodes.data.replay.bags import Recorded, RosBag, is_ours
+from nodes.data.replay.chains import chain_of
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError, Timed
-from nodes.kalibr import Chain, read_chain
 from runtime import Node, Output
 from runtime.run.results import newest
 from runtime.time.clock import SECOND
@@ -130,7 +130,7 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
     if path.is_file() and path.suffix not in {".db3", ".bag"} and is_ours(path):
         if config.calibration:
             raise ReplayError(
-                f"calibration: expected a bag of ROS or a data set in EuRoC's layout beside it, "
+                "calibration: expected a bag of ROS or a data set in EuRoC's layout beside it, "
                 f"found a recording, whose cameras are announced in it: {path}"
             )
         return Recorded(path)
@@ -155,16 +155,6 @@ def _only_bag(folder: Path) -> Path | None:
 
 
 _BAGS = {".bag", ".db3", ".mcap"}
-
-
-def chain_of(config: ReplayConfig) -> Chain | None:
-    """Return the calibration that the settings name; a `ReplayError` if it cannot be read."""
-    if not config.calibration:
-        return None
-    try:
-        return read_chain([Path(path) for path in config.calibration])
-    except ValueError as error:
-        raise ReplayError(f"calibration: {error}") from None
 
 
 class Timeline:
