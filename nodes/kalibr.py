@@ -42,7 +42,7 @@ class KalibrCamera(msgspec.Struct, frozen=True, eq=False):
     name: str  # ``cam0``
     topic: str  # ``rostopic``; empty if not noted
     info: CameraInfo
-    in_imu: Floats | None  # transform to the IMU, (4, 4); None of a chain that names no IMU
+    in_imu: Floats | None  # transform to the IMU, (4, 4); None if no camera's place on it is known
     in_first: Floats  # transform to the optical frame of the chain's first camera, (4, 4)
     # Seconds by which images' stamps are late on the IMU's clock: less ``timeshift_cam_imu``.
     time_offset: float
@@ -90,6 +90,13 @@ def parse_chain(text: str, where: str) -> Chain:
     cameras: list[KalibrCamera] = []
     for name, given in _numbered(table, _PER_CAMERA, where):
         cameras.append(_camera(_Keys(f"{where}: {name}", given), name, cameras))
+    if (known := next((c for c in cameras if c.in_imu is not None), None)) is not None:
+        assert known.in_imu is not None
+        first = known.in_imu @ inverse(known.in_first)
+        cameras = [
+            msgspec.structs.replace(c, in_imu=first @ c.in_first) if c.in_imu is None else c
+            for c in cameras
+        ]
     imus = [
         _imu(_Keys(f"{where}: {name}", given), name)
         for name, given in _numbered(table, _PER_IMU, where)

@@ -91,6 +91,11 @@ def test_a_chain_without_all_transforms_is_closed_from_camera_to_camera(
     np.testing.assert_allclose(third.in_first, step @ step, atol=1e-9)
     assert third.in_imu is not None
     np.testing.assert_allclose(third.in_imu, on_imu @ step @ step, atol=1e-9)
+    back = on_imu @ inverse(step)
+    last = f"cam1: {{{common}, {rows}, T_cam_imu: {inverse(on_imu).tolist()}}}"
+    found = parse_chain(f"cam0: {{{common}}}\n{last}", "chain").cameras[0].in_imu
+    assert found is not None
+    np.testing.assert_allclose(found, back, atol=1e-9)
     third = parse_chain(f"cam0: {{{common}}}\n{rest}", "chain").cameras[2]
     assert third.in_imu is None
     np.testing.assert_allclose(third.in_first, step @ step, atol=1e-9)
@@ -157,8 +162,9 @@ def test_the_mounting_is_from_the_optical_frame_to_the_imu(tmp_path: Path) -> No
     with pytest.raises(ValueError, match="expected a camera cam7, found cam0, cam1"):
         mounting_of_kalibr(f"{path}:cam7")
     start, end = CHAIN.index("  T_cam_imu"), CHAIN.index("  cam_overlaps")
+    alone = CHAIN[:start] + CHAIN[end : CHAIN.index("cam1:")]
     with pytest.raises(ValueError, match="cam0: expected T_cam_imu, which says where it is"):
-        mounting_of_kalibr(str(write(tmp_path, CHAIN[:start] + CHAIN[end:])))
+        mounting_of_kalibr(str(write(tmp_path, alone)))
 
 
 @pytest.mark.parametrize(

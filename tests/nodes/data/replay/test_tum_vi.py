@@ -156,9 +156,7 @@ def test_what_a_calibration_lacks_is_said(tmp_path: Path) -> None:
     reader = sets.reader(root)
     assert any("imu0: expected the IMU's noise in a sensor.yaml" in t for t in reader.trouble)
     (root / "dso" / "camchain.yaml").write_text(CHAIN[: CHAIN.index("cam1:")])
-    with pytest.raises(
-        ReplayError, match=r"cam1: expected a sensor\.yaml in it, Kalibr's"
-    ):
+    with pytest.raises(ReplayError, match=r"cam1: expected a sensor\.yaml in it, Kalibr's"):
         sets.reader(root)
     (root / "dso" / "camchain.yaml").write_text(CHAIN.replace("[512, 512]", "[1024, 1024]"))
     with pytest.raises(ReplayError, match=r"png: expected images of 1024 x 1024 pixels"):
