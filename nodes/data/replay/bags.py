@@ -352,7 +352,10 @@ class RosBag(Reader):
         if self._named:
             return chosen(self._found, topics, self._vehicle)
         messages = {name: message for name, (_, _, message) in self._firsts.items()}
-        streams = guess(self._found, messages, self._vehicle, self._mountings.same)
+        given = self._chain.cameras if self._chain else ()
+        calibrated = {topic_in(self._found, each.topic): each.info for each in given}
+        same_frame = self._mountings.same
+        streams = guess(self._found, messages, self._vehicle, same_frame, calibrated)
         self.notes += streams.notes
         for each in streams.left_out:
             self.complain(each)
@@ -442,6 +445,13 @@ class RosBag(Reader):
             assert isinstance(event, Image | DepthImage)
             images.setdefault(topic.source, []).append((name, kind))
             sizes[name] = event.data.shape[1::-1]
+        for source, streams in images.items():
+            several = [name for name, kind in streams if kind != "depth"]
+            if len(several) > 1:
+                self.complain(
+                    f"{source}: expected one stream of images, found {', '.join(several)}: each "
+                    "stamp may come twice; give each a source of its own"
+                )
         if self._chain is not None:
             yield from self._by_chain(self._chain, images, sizes, imus)
         for name, topic in self._topics.items():

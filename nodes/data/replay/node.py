@@ -255,6 +255,10 @@ class Replay(Node[ReplayConfig]):
             await self.offload(self._open)
         except ReplayError as error:
             self.log.fatal("%s", error)
+        assert self._reader is not None
+        for note in self._reader.notes:
+            self.log.info("%s: %s", self.config.file, note)
+        self._log_trouble()
 
     def announce(self) -> Iterable[Announcement]:
         """Announce the recorded announcements, and this node as source of the events."""
@@ -366,8 +370,6 @@ class Replay(Node[ReplayConfig]):
     def _open(self) -> None:
         config = self.config
         self._reader = reader = open_reader(config, self.name)
-        for note in reader.notes:
-            self.log.info("%s: %s", config.file, note)
         announced = reader.announcements()
         self._choice = Choice(config.only, config.skip, announced)
         self._announcements = [each for each in announced if self._choice.announced(each)]

@@ -201,9 +201,10 @@ class ReplayConfig(NodeConfig):
     """Settings of a replay.
 
     Attributes:
-        file: A recording of `nodes.data.recorder` (torn ones too), a ROS 2 bag (a folder, or an
-            MCAP or SQLite file), or the folder of a data set in the layout of EuRoC, of TUM RGB-D,
-            or of KITTI's odometry (``sequences/00``).
+        file: A recording of `nodes.data.recorder` (torn ones too), a ROS bag (of ROS 2 a folder, or
+            an MCAP or SQLite file; of ROS 1 a file; or a folder with one of these in it), or the
+            folder of a data set in the layout of EuRoC, of TUM VI, of TUM RGB-D, or of KITTI's
+            odometry (``sequences/00``).
         start: Where to begin; the run's clock and stamps count from there.
         end: Where to end, on the recording's own time; 0 for its end.
         linger: How long the run goes on after the last event, so that others can react; 0 if the

@@ -119,6 +119,7 @@ def guess(
     firsts: Mapping[str, Any],  # first message of each topic of `GUESSED`
     vehicle: str,
     same_frame: SameFrame,
+    calibrated: Mapping[str, CameraInfo],  # by topic, in the place of their camera_info
 ) -> Streams:
     """Choose topics by types, names, encodings and calibrations."""
     result = Streams([], [], [])
@@ -128,7 +129,7 @@ def guess(
         if name not in firsts or name.startswith("/visnav/") or "segmentation" in name:
             continue
         if type_ in {_IMAGE, _COMPRESSED}:
-            images += _images(name, type_, found, firsts, result.left_out)
+            images += _images(name, type_, found, firsts, calibrated, result.left_out)
         elif type_ == _IMU:
             topic = BagTopic(topic=name, use="imu", source=source_of(name, "imu", vehicle))
             result.topics.append(topic)
@@ -150,6 +151,7 @@ def _images(
     type_: str,
     found: Mapping[str, tuple[str, int]],
     firsts: Mapping[str, Any],
+    calibrated: Mapping[str, CameraInfo],
     left_out: list[str],
 ) -> list[_Images]:
     """Return an image topic, or nothing if its encoding is none that can be read."""
@@ -176,8 +178,8 @@ def _images(
     every = {base_of(other) for other, (t, n) in found.items() if t in {_IMAGE, _COMPRESSED} and n}
     alone = pipeline or sum(other.rpartition("/")[0] == space for other in every) == 1
     info_topic = own if own in firsts else beside if beside in firsts and alone else ""
-    info = None
-    if info_topic:
+    info = calibrated.get(base)
+    if info is None and info_topic:
         try:
             info = calibration(firsts[info_topic], name)
         except ValueError as error:
@@ -193,7 +195,7 @@ def _images(
             camera=space if pipeline else base,
             said=said,
             message=message,
-            info_topic=info_topic if info else "",
+            info_topic=info_topic if info and base not in calibrated else "",
             info=info,
             frame=frame.lstrip("/"),
         )
@@ -246,6 +248,8 @@ def _add_cameras(
             result.notes.append(f"{each.topic}: depth of {source}, as {paired.topic}{why}")
             continue
         told = f"calibration {each.info_topic}" if each.info_topic else "without a calibration"
+        if each.info and not each.info_topic:
+            told = "calibration of the settings"
         if each.info_topic and is_rectified(each.topic):
             told += " (P, rectified)"
         result.notes.append(f"{each.topic}: {use} of {source} ({each.said}), {told}{why}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,9 @@ from events import (
 )
 from events.frames import OPTICAL_TO_FLU, OPTICAL_TO_FRD
 from events.geometry import inverse, pose_matrix
+from nodes.data.replay import Replay
 from nodes.data.replay.reader import Reader, ReplayError
+from runtime.testing import run_node
 from tests.nodes.calibration.kalibr_files import CHAIN, IMU
 from tests.nodes.data.replay import bags, sets
 from tests.nodes.data.replay.bags import COLOUR_K, DEPTH_K, fixed, images, imus, infos, poses
@@ -96,6 +99,21 @@ def test_each_stream_is_told_in_a_line(tmp_path: Path) -> None:
     own = told["/camera/depth/image_rect_raw"]
     assert f"/camera/color/image_raw is of the frame '{COLOUR}', not '{DEPTH}'" in own
     reader.close()
+
+
+def test_a_run_logs_what_it_took_and_warns_of_what_it_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """At the start, before anything is sent."""
+    topics = {"/usb/image_raw": images("usb", "yuv422"), "/imu": imus("imu", 2)}
+    path = bags.write(tmp_path, topics)
+    with caplog.at_level(logging.INFO):
+        result = run_node(Replay, config={"file": str(path)}, name="drone", duration=2.0)
+    assert len(result.of(Imu)) == 2
+    levels = {record.getMessage(): record.levelname for record in caplog.records}
+    assert levels[f"{path}: /imu: IMU drone/imu"] == "INFO"
+    (warning,) = (text for text, level in levels.items() if level == "WARNING")
+    assert warning.startswith(f"{path}: /usb/image_raw: left out: its encoding 'yuv422'")
 
 
 @pytest.mark.parametrize(
@@ -179,6 +197,14 @@ def test_rectified_images_are_those_of_a_pinhole(tmp_path: Path, named: bool) ->
     np.testing.assert_allclose(
         turned @ Rotation.from_euler("y", 0.05).as_matrix(), ahead, atol=1e-9
     )
+    reader.close()
+
+
+def test_two_named_topics_of_one_source_are_said(tmp_path: Path) -> None:
+    """Who names both raw and rectified images gets both."""
+    wanted = [{"topic": f"/cam/{name}", "as": "image"} for name in ("image_raw", "image_rect")]
+    reader = sets.reader(bags.write(tmp_path, pipeline("image_raw", "image_rect")), topics=wanted)
+    assert "expected one stream of images, found /cam/image_raw, /cam/ima" in reader.trouble[0]
     reader.close()
 
 
@@ -370,6 +396,8 @@ def test_kalibrs_calibration_takes_the_place_of_what_a_bag_says(tmp_path: Path, 
     Path(files[0]).write_text(text)
     reader = sets.reader(bags.write(tmp_path, topics), calibration=files)
     left, right = cameras(reader).values()
+    assert reader.trouble == []
+    assert any(note.endswith("calibration of the settings") for note in reader.notes)
     assert (left.source, right.source) == ("drone/cam0", "drone/cam1")
     assert left.info.distortion_model == "equidistant"
     assert (left.time_offset, right.time_offset) == (-0.004, 0.0)

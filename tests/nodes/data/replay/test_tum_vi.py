@@ -14,7 +14,7 @@ from events.geometry import inverse, pose_matrix
 from nodes.data.replay.reader import Reader, ReplayError
 from nodes.kalibr import parse_chain
 from tests.nodes.calibration.kalibr_files import CHAIN, IMU, IN_IMU
-from tests.nodes.data.replay import sets
+from tests.nodes.data.replay import downloads, sets
 
 FIRST = 1_520_530_308_199_447_626
 STEP = 50_000_000
@@ -82,6 +82,34 @@ def test_a_sequence_as_published_is_read(tmp_path: Path) -> None:
     assert any("dso/camchain.yaml" in note for note in reader.notes)
     assert any(note.endswith("mav0/mocap0/data.csv") for note in reader.notes)
     assert reader.trouble == []
+
+
+@pytest.mark.slow
+def test_a_sequence_is_the_same_in_both_layouts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In EuRoC's, with sensor.yaml, 8 bits and 17 columns, and in TUM VI's."""
+    monkeypatch.setattr(downloads, "IMAGES", 3)
+    one = sets.reader(downloads.euroc(tmp_path / "euroc"))
+    other = sets.reader(downloads.tum_vi(tmp_path / "tum_vi"))
+    for announced, found in zip(cameras(one), cameras(other), strict=True):
+        assert (found.info, found.stereo) == (announced.info, announced.stereo)
+        assert found.position == pytest.approx(announced.position, abs=1e-12)
+        assert found.orientation == pytest.approx(announced.orientation, abs=1e-12)
+        assert found.rate == pytest.approx(announced.rate, rel=1e-3)
+    for pose, same in zip(truth(one), truth(other), strict=True):
+        assert (same.stamp, same.position) == (pose.stamp, pose.position)
+        assert same.orientation == pose.orientation
+    both = [
+        [each.event for each in reader.events(0, None, lambda kind, _: kind is Image)]
+        for reader in (one, other)
+    ]
+    assert len(both[0]) == 6
+    for image, copy in zip(*both, strict=True):
+        assert isinstance(image, Image)
+        assert isinstance(copy, Image)
+        assert (copy.stamp, copy.source) == (image.stamp, image.source)
+        assert (copy.data == image.data).all()
 
 
 def test_its_truth_is_that_of_the_imu_in_a_world_with_z_down(tmp_path: Path) -> None:
