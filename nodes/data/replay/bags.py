@@ -10,8 +10,9 @@ origin, where cameras look ahead; or where Kalibr's calibration has them.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
+from math import isfinite
 from pathlib import Path
 from typing import Any, get_args
 
@@ -187,18 +188,26 @@ _HERE: Pose = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 class Mountings:
-    """A tree of fixed transforms, in ROS's axes, from messages of tf2_msgs/TFMessage."""
+    """A tree of fixed transforms, in ROS's axes, from messages of tf2_msgs/TFMessage.
 
-    def __init__(self, messages: Iterable[Any]) -> None:
+    Args:
+        complain: Called with a sentence on a transform that is none, and is left out.
+    """
+
+    def __init__(self, messages: Iterable[Any], complain: Callable[[str], None]) -> None:
         self._parents: dict[str, tuple[str, Pose]] = {}
         for message in messages:
             for each in message.transforms:
                 t, r = each.transform.translation, each.transform.rotation
-                pose = (
-                    (float(t.x), float(t.y), float(t.z)),
-                    normalize((float(r.w), float(r.x), float(r.y), float(r.z))),
-                )
-                self._parents[each.child_frame_id] = each.header.frame_id, pose
+                position = (float(t.x), float(t.y), float(t.z))
+                try:
+                    turn = normalize((float(r.w), float(r.x), float(r.y), float(r.z)))
+                    if not all(map(isfinite, position)):
+                        raise ValueError(f"expected a finite place, found {position}")
+                except ValueError as error:
+                    complain(f"/tf_static: {each.child_frame_id} is left out: {error}")
+                    continue
+                self._parents[each.child_frame_id] = each.header.frame_id, (position, turn)
 
     def of(self, frame: str, axes: Axes = "optical", body: str = "base_link") -> Pose | None:
         """Return the pose of a frame, with such axes here, in the body, FRD; `None` if unknown."""
@@ -321,14 +330,15 @@ class RosBag(Reader):
 
     def _read_mountings(self) -> Mountings:
         try:
-            return Mountings(
+            messages = (
                 message
-                for _, type_, _, message in self._bag.messages(["/tf_static"])
+                for _, type_, _, message in self._bag.messages(["/tf_static", "tf_static"])
                 if type_ == "tf2_msgs/msg/TFMessage"
             )
+            return Mountings(messages, self.complain)
         except MessageError as error:
             self.complain(f"/tf_static: left out: {error}")
-            return Mountings(())
+            return Mountings((), self.complain)
 
     def _first_messages(self, topics: tuple[BagTopic, ...]) -> dict[str, tuple[str, int, Any]]:
         """Return type, time of receipt and content of the first message of each topic to read."""

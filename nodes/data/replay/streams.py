@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from events import CameraInfo
-from nodes.data.replay.reader import BagTopic
+from nodes.data.replay.reader import BagTopic, Use
 from nodes.ros2.messages.images import COLOUR_ENCODINGS, DEPTH_ENCODINGS
 from nodes.ros2.messages.incoming import camera_info
 
@@ -157,8 +157,7 @@ def _images(
     """Return an image topic, or nothing if its encoding is none that can be read."""
     message, base = firsts[name], base_of(name)
     if type_ == _COMPRESSED:
-        raw_type, raw_count = found.get(base, ("", 0))
-        if raw_type == _IMAGE and raw_count and base in firsts:
+        if getattr(firsts.get(base), "encoding", "") in (*COLOUR_ENCODINGS, *DEPTH_ENCODINGS):
             return []  # the same images
         said = str(message.format)
         depth = "compressedDepth" in said or said.startswith(DEPTH_ENCODINGS)
@@ -242,8 +241,8 @@ def _add_cameras(
                 if source in sources.values():  # another camera's
                     source = source_of(longer, "imu", vehicle)
             sources[each.topic] = source
-        use = "depth" if each.depth else "image"
-        result.topics.append(BagTopic(topic=each.topic, use=use, source=source))  # type: ignore[arg-type]
+        use: Use = "depth" if each.depth else "image"
+        result.topics.append(BagTopic(topic=each.topic, use=use, source=source))
         if paired is not None:
             result.notes.append(f"{each.topic}: depth of {source}, as {paired.topic}{why}")
             continue

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -255,6 +256,42 @@ def test_one_camera_that_cannot_be_read_leaves_the_others(tmp_path: Path) -> Non
     sources = {event.source for event in events(reader)}
     assert {"drone/camera", "drone/raw"} <= sources
     assert "drone/usb" not in sources
+    reader.close()
+
+
+def test_a_transform_that_is_none_is_left_out_by_name(tmp_path: Path) -> None:
+    ahead = tuple(Rotation.from_euler("z", 90, degrees=True).as_quat())
+    topics = {
+        "/imu": imus("imu_link"),
+        "/tf_static": fixed(
+            ("base_link", "cam", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)),
+            ("base_link", "imu_link", (0.1, 0.0, 0.0), ahead),
+        ),
+    }
+    reader = sets.reader(bags.write(tmp_path, topics))
+    (told,) = reader.trouble
+    assert told.startswith("/tf_static: cam is left out: expected a quaternion of length one")
+    (imu,) = reader.announcements()
+    assert isinstance(imu, ImuAnnouncement)
+    assert imu.position == pytest.approx((0.1, 0.0, 0.0))
+    reader.close()
+
+
+def test_of_raw_images_that_cannot_be_read_the_compressed_ones_are(tmp_path: Path) -> None:
+    code = np.asarray(cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1], np.uint8).ravel()
+    compressed = [
+        bags.ROS_2.types["sensor_msgs/msg/CompressedImage"](bags.header("cam", n), "png", code)
+        for n in range(bags.FRAMES)
+    ]
+    topics = {
+        "/cam/image_raw": images("cam", "yuv422"),
+        "/cam/image_raw/compressed": compressed,
+        "/cam/camera_info": infos("cam"),
+    }
+    reader = sets.reader(bags.write(tmp_path, topics))
+    assert cameras(reader)["drone/cam"].images == ("grey",)
+    assert len(events(reader)) == bags.FRAMES
+    assert any(each.startswith("/cam/image_raw: left out") for each in reader.trouble)
     reader.close()
 
 
