@@ -161,7 +161,7 @@ def transform(given: Any, where: str) -> Floats:
         given = given.get("data")
     try:
         matrix = np.array(given, np.float64).reshape(4, 4)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(
             f"{where}: expected a transform of 4 × 4 numbers, found {given!r:.80}"
         ) from None
@@ -197,7 +197,7 @@ class _Keys:
         try:
             # YAML 1.1 takes 1e-5, which has no point, for a text.
             value = float(given)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             self.wrong(key, "a number", given)
         if not np.isfinite(value):
             self.wrong(key, "a finite number", given)
@@ -208,7 +208,7 @@ class _Keys:
         expected = f"{' or '.join(map(str, counts))} numbers"
         try:
             values = [float(each) for each in given]  # type: ignore[union-attr]
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             self.wrong(key, expected, given)
         if len(values) not in counts or not np.isfinite(values).all():
             self.wrong(key, expected, given)
@@ -227,7 +227,7 @@ def _parse(text: str, where: str) -> Mapping[str, Any]:
     lines = (line for line in text.splitlines() if not re.match(r"%YAML|---\s*$", line))
     try:
         table = yaml.safe_load("\n".join(lines))
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         what = " ".join(str(error).split())
         raise ValueError(f"{where}: expected YAML, found: {what:.200}") from None
     if not isinstance(table, Mapping):

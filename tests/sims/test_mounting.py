@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -38,6 +38,7 @@ def in_body(spec: CameraSpec) -> Any:
     return pose_matrix(*optical_in_body(spec))
 
 
+@settings(max_examples=50, deadline=None)
 @given(rotation=st.tuples(*[st.floats(-4, 4)] * 3), place=st.tuples(*[st.floats(-2, 2)] * 3))
 def test_a_camera_is_where_its_matrix_has_it(
     rotation: tuple[float, float, float], place: tuple[float, float, float]

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from events.frames import from_rpy
@@ -76,6 +76,7 @@ def test_openvins_files_are_read(tmp_path: Path) -> None:
     assert chain.imu.accelerometer_noise_density == ANNOUNCED.accelerometer_noise_density
 
 
+@settings(max_examples=10, deadline=None)
 @given(angles=st.tuples(*[st.floats(-3, 3)] * 3), place=st.tuples(*[st.floats(-2, 2)] * 3))
 def test_a_chain_without_all_transforms_is_closed_from_camera_to_camera(
     angles: tuple[float, float, float], place: tuple[float, float, float]
@@ -128,6 +129,32 @@ def test_a_damaged_chain_is_an_error_of_one_line(old: str, new: str, wrong: str)
     with pytest.raises(ValueError, match=rf"camchain\.yaml.*{wrong}") as raised:
         parse_chain(CHAIN.replace(old, new, 1), "camchain.yaml")
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.slow
+@settings(deadline=None)
+@given(
+    place=st.floats(0, 1),
+    length=st.integers(0, 12),
+    text=st.one_of(
+        st.text(max_size=8),
+        st.sampled_from(
+            ["1" * 400, "2001-99-99", "[" * 2000, "&a [*a]", "{}", "null", "? []", "-"]
+        ),
+    ),
+)
+def test_a_chain_with_anything_in_it_is_read_or_an_error_of_one_line(
+    place: float, length: int, text: str
+) -> None:
+    whole = CHAIN + IMU
+    at = int(place * len(whole))
+    wrong = "chain"
+    try:
+        parse_chain(whole[:at] + text + whole[at + length :], "chain")
+    except ValueError as error:
+        wrong = str(error)
+    assert wrong.startswith("chain")
+    assert "\n" not in wrong
 
 
 def test_what_is_no_calibration_is_refused(tmp_path: Path) -> None:
