@@ -76,7 +76,7 @@ def test_openvins_files_are_read(tmp_path: Path) -> None:
     assert chain.imu.accelerometer_noise_density == ANNOUNCED.accelerometer_noise_density
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(angles=st.tuples(*[st.floats(-3, 3)] * 3), place=st.tuples(*[st.floats(-2, 2)] * 3))
 def test_a_chain_without_all_transforms_is_closed_from_camera_to_camera(
     angles: tuple[float, float, float], place: tuple[float, float, float]
@@ -132,7 +132,6 @@ def test_a_damaged_chain_is_an_error_of_one_line(old: str, new: str, wrong: str)
 
 
 @pytest.mark.slow
-@settings(deadline=None)
 @given(
     place=st.floats(0, 1),
     length=st.integers(0, 12),

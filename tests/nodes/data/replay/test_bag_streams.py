@@ -23,6 +23,8 @@ from events import (
 )
 from events.frames import OPTICAL_TO_FLU, OPTICAL_TO_FRD
 from events.geometry import inverse, pose_matrix
+from nodes.calibration.formats import write_files
+from nodes.data.dataset.recording import choose
 from nodes.data.replay import Replay
 from nodes.data.replay.reader import Reader, ReplayError
 from runtime.testing import run_node
@@ -455,6 +457,33 @@ def test_kalibrs_calibration_takes_the_place_of_what_a_bag_says(tmp_path: Path, 
     )
     assert in_camera == pytest.approx(rotation @ (1.0, 2.0, 3.0))
     reader.close()
+
+
+@pytest.mark.parametrize("form", ["kalibr", "openvins"])
+def test_our_own_calibration_says_of_our_own_bag_what_it_says_itself(
+    tmp_path: Path, form: str
+) -> None:
+    """Exported for the topics of a recording: places, lens and noise come back."""
+    path = sets.bag(tmp_path)
+    itself = sets.reader(path)
+    flown = sets.reader(sets.recording(tmp_path))
+    rig = choose(flown.announcements(), None)
+    assert rig.imu is not None
+    calibrations = []
+    for name, text in write_files(rig, form).items():
+        if "estimator" not in name:
+            calibrations.append(str(tmp_path / name))
+            (tmp_path / name).write_text(text)
+    reader = sets.reader(path, calibration=calibrations)
+    (one,), (other,) = cameras(itself).values(), cameras(reader).values()
+    assert other.info == one.info == rig.cameras[0].info
+    assert other.position == pytest.approx(one.position, abs=1e-9)
+    assert abs(np.dot(other.orientation, one.orientation)) == pytest.approx(1.0, abs=1e-9)
+    assert (other.source, other.images) == (one.source, one.images)
+    (imu,) = (a for a in reader.announcements() if isinstance(a, ImuAnnouncement))
+    assert imu.gyroscope_random_walk == rig.imu.gyroscope_random_walk
+    for opened in (itself, flown, reader):
+        opened.close()
 
 
 def test_a_chain_without_an_imu_begins_where_the_first_camera_is(tmp_path: Path) -> None:
