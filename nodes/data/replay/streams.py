@@ -130,6 +130,11 @@ def guess(
             continue
         if type_ in {_IMAGE, _COMPRESSED}:
             images += _images(name, type_, found, firsts, calibrated, result.left_out)
+        elif type_ == _IMU and (half := _other_half(name, found)):
+            result.left_out.append(
+                f"{name}: left out: with {half} it is half an IMU each, as of realsense2_camera "
+                "without unite_imu_method; record it united to have it"
+            )
         elif type_ == _IMU:
             topic = BagTopic(topic=name, use="imu", source=source_of(name, "imu", vehicle))
             result.topics.append(topic)
@@ -144,6 +149,19 @@ def guess(
             )
     _add_cameras(_one_a_camera(images, result.notes), vehicle, same_frame, result)
     return result
+
+
+def _other_half(name: str, found: Mapping[str, tuple[str, int]]) -> str:
+    """Return the topic of the gyroscope beside an accelerometer's, or the reverse, else ''.
+
+    Both have the type of a whole IMU, with zeros for what they do not measure.
+    """
+    parts = name.split("/")
+    for one, other in (("accel", "gyro"), ("gyro", "accel")):
+        twin = "/".join(other if part == one else part for part in parts)
+        if one in parts and found.get(twin, ("", 0))[0] == _IMU:
+            return twin
+    return ""
 
 
 def _images(

@@ -363,6 +363,17 @@ def test_an_invalid_first_message_is_counted_and_no_end(tmp_path: Path) -> None:
     reader.close()
 
 
+def test_halves_of_an_imu_are_left_out_by_name(tmp_path: Path) -> None:
+    """RealSense's gyroscope sends no acceleration: as an IMU's it would be a free fall."""
+    halves = ("/camera/gyro/sample", "/camera/accel/sample")
+    topics = {name: imus("camera_imu_optical_frame") for name in (*halves, "/camera/imu")}
+    reader = sets.reader(bags.write(tmp_path, topics))
+    assert {event.source for event in events(reader)} == {"drone/camera/imu"}
+    for name, text in zip(sorted(halves), sorted(reader.trouble), strict=True):
+        assert text.startswith(f"{name}: left out: with /camera/")
+    reader.close()
+
+
 def test_a_second_odometry_is_named(tmp_path: Path) -> None:
     topics = {"/odom": poses(UNIT), "/vins/odom": poses(UNIT)}
     reader = sets.reader(bags.write(tmp_path, topics))
