@@ -277,7 +277,8 @@ class RosBag(Reader):
                 self._firsts = {k: v for k, v in self._firsts.items() if k in self._topics}
                 self._times, self._stamps = self._origins()
                 self._announcements = list(self._announced())
-                if not any(name in self._topics for name in self._firsts):
+                left = (name for name in self._firsts if name in self._topics)
+                if all(self._topics[name].use == "camera" for name in left):
                     raise ReplayError(f"{path}: expected a topic to replay; {self._reasons()}")
         except ReplayError:
             self._bag.close()

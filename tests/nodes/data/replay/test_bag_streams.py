@@ -330,6 +330,17 @@ def test_a_bag_of_which_nothing_can_be_read_is_an_error_with_the_reasons(tmp_pat
         sets.reader(path)
 
 
+def test_messages_that_lie_of_their_size_leave_nothing(tmp_path: Path) -> None:
+    """The calibration that is left is nothing to replay."""
+    broken = images("cam", "mono8")
+    for message in broken:
+        message.data = message.data[:-1]
+    path = bags.write(tmp_path, {"/cam/image_raw": broken, "/cam/camera_info": infos("cam")})
+    wrong = r"expected a topic to replay; /cam/image_raw: left out: expected height \* step bytes"
+    with pytest.raises(ReplayError, match=wrong):
+        sets.reader(path)
+
+
 def test_bayer_and_grey_of_sixteen_bits_are_images(tmp_path: Path) -> None:
     mosaic = np.tile(np.array([[200, 100], [100, 50]], np.uint8), (24, 32))
     grey = np.full((48, 64), 0x4080, np.uint16)
