@@ -9,7 +9,8 @@ A package names its entry points in its ``pyproject.toml``; this project does th
     MyNode = "my_package.nodes:MyNode"
 
     [project.entry-points."visnav.configurations"]
-    json = "my_package.settings:read"     # read(text, path, warn): the table of a TOML file of ours
+    json = "my_package.settings:read"     # read(text, path, warn): the table of a TOML file of
+                                          # ours; `import`, which prints it, may add world="yard"
 
 A file names a node that is listed here by its name, ``type = "MyNode"``, and any other as
 ``module:Class``.

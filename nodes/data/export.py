@@ -52,11 +52,12 @@ def export_trajectories(
 
     Args:
         form: One of `FORMATS`.
-        out: Folder for the files, made if need be; ``export`` in the run's folder if None.
+        out: Folder for the files, made if need be; ``export/<form>`` in the run's folder if None.
         epoch: The run's time 0: a date (ISO 8601), or nanoseconds of Unix time.
 
     Raises:
-        ValueError: A trajectory or the epoch is missing or malformed.
+        ValueError: A trajectory or the epoch is missing or malformed, or a file of that name is
+            there with something else.
         OSError: A file cannot be written.
     """
     zero = epoch_of(epoch)
@@ -77,7 +78,7 @@ def export_trajectories(
         )
         for name, estimate in (estimates.items() if form == "kitti" else ())
     }
-    folder = out or run / "export"
+    folder = out or run / "export" / form
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     mounted = mounting(run) if pairs else np.eye(4)
@@ -93,17 +94,40 @@ def export_trajectories(
     if form == "kitti":
         return written
     world = np.diag([1.0, -1.0, -1.0, 1.0]) if form == "euroc" else np.eye(4)
-    for name, trajectory in (truths | estimates).items():
-        comment = _COMMENT[form, TRUTH if name in truths else ""]
-        comment = f"{comment}\nthe run's time 0 is {zero} ns"
+    comments = {
+        name: _COMMENT[form, TRUTH if name in truths else ""] for name in truths | estimates
+    }
+    files = [
+        (name, folder / f"{name}.{suffix}")
+        for name in comments
+        for suffix in ("csv", "tum")
+        if (form == "euroc" if suffix == "csv" else form == "tum" or name in estimates)
+    ]
+    for name, path in files:
+        _check_replaced(path, comments[name])
+    for name, path in files:
+        trajectory = (truths | estimates)[name]
+        comment = f"{comments[name]}\nthe run's time 0 is {zero} ns"
         placed = Trajectory.from_matrices(trajectory.stamps + zero, world @ trajectory.matrices())
-        if form == "euroc":
-            written.append(folder / f"{name}.csv")
-            write_euroc(written[-1], placed, comment + _VELOCITIES)
-        if form == "tum" or name in estimates:
-            written.append(folder / f"{name}.tum")
-            write_tum(written[-1], placed, comment)
-    return written
+        if path.suffix == ".csv":
+            write_euroc(path, placed, comment + _VELOCITIES)
+        else:
+            write_tum(path, placed, comment)
+    return [path for _, path in files]
+
+
+def _check_replaced(path: Path, comment: str) -> None:
+    """Raise a `ValueError` if a file is there that an export with this comment did not write."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            first = file.readline().strip()
+    except FileNotFoundError:
+        return
+    if first != f"# {comment}":
+        raise ValueError(
+            f"{path}: expected no file, or one that an earlier export in this format wrote "
+            f"(# {comment}), found {first!r:.80}: choose another folder (--out)"
+        )
 
 
 def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
@@ -189,7 +213,7 @@ def export_measurements(run: Path, out: Path | None = None, epoch: int | str = E
     Rows are in order of arrival; a column is named by field and unit.
 
     Args:
-        out: Folder for the files, made if need be; ``export`` in the run's folder if None.
+        out: Folder for the files, made if need be; ``export/csv`` in the run's folder if None.
         epoch: The run's time 0: a date (ISO 8601), or nanoseconds of Unix time.
 
     Raises:
@@ -203,7 +227,7 @@ def export_measurements(run: Path, out: Path | None = None, epoch: int | str = E
             f"{run}: expected a recording (*.mcap), found none: a run leaves one if a node of type "
             "McapRecorder is in it"
         )
-    folder = out or run / "export"
+    folder = out or run / "export" / "csv"
     folder.mkdir(parents=True, exist_ok=True)
     files: dict[Path, IO[str]] = {}
     with ExitStack() as stack:
@@ -259,10 +283,7 @@ def export(
     form: Annotated[Format, typer.Option("--format", "-f", help="Format of the files.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for the files; if not given RUN/export, of a calibration "
-            "RUN/export/FORMAT."
-        ),
+        typer.Option(help="Folder for the files; if not given RUN/export/FORMAT."),
     ] = None,
     epoch: Annotated[
         str, typer.Option(help="The run's time 0: a date, or nanoseconds of Unix time.")

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path, PurePath
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from events import Vector3
 from sims.airsim.keys import Keys, parse
@@ -85,27 +82,6 @@ def read(text: str, path: str, warn: Callable[[str], None], world: str = "hall")
     for line in dict.fromkeys(notes):
         warn(line)
     return table
-
-
-def import_(
-    settings: Annotated[Path, typer.Argument(help="AirSim's settings.json.")],
-    world: Annotated[str, typer.Option(help="World to fly in: a name, or an MJCF file.")] = "hall",
-) -> None:
-    """Print AirSim's settings.json as an equivalent TOML file.
-
-    Settings not honoured are warnings on standard error, and comments at the top of the file.
-    """
-    import tomli_w
-
-    from runtime.config.reading import text_of
-
-    warnings: list[str] = []
-    table = read(text_of(settings), settings.name, warnings.append, world)
-    for line in warnings:
-        print(f"warning: {line}", file=sys.stderr)
-    print(f"# Made from AirSim's {settings.name} by `python -m runtime import`.")
-    print("".join(f"# {line}\n" for line in warnings))
-    print(tomli_w.dumps(table, multiline_strings=True), end="")
 
 
 def _configuration(keys: Keys, text: str, world: str) -> Table:

@@ -31,6 +31,7 @@ from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
 from sims.cameras.optics import AutoExposure, Intrinsics, Lens, intrinsics, noise_at, read_response
+from sims.mounting import Matrix, apply_matrix
 from sims.presets import CAMERAS, DEPTH_SENSORS
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
@@ -129,6 +130,9 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         position: Position on the body, metres forward, right, down (FRD).
         orientation: Roll, pitch, yaw of the camera in the body's frame, degrees, applied yaw first
             (Z-Y-X). Positive pitch is upwards: -90 looks straight down.
+        T_BS: In place of both, the transform from the **optical** frame (x right, y down, z
+            forward) to the body: four rows of four numbers, or ``{ rows, cols, data }`` as in a
+            sensor.yaml of EuRoC's, whose body is its IMU, though. Of a rig, the left camera's.
         light: Factor on all lights of the scene, but the sky and surfaces that shine.
         exposure: Seconds that the shutter is open, half of them before the stamp: motion blurs the
             image. Depth, segmentation and pose are those of the stamp.
@@ -172,6 +176,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     rate: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 30.0
     position: Vector3 = (0.15, 0.0, 0.0)
     orientation: Vector3 = (0.0, 0.0, 0.0)
+    T_BS: Matrix | None = None
     light: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
     exposure: Latency = Latency(0)  # immutable
     readout: Latency = Latency(0)
@@ -194,6 +199,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     render_time: Latency = Latency(0)
 
     def __post_init__(self) -> None:
+        apply_matrix(self, OPTICAL_TO_FRD)
         if not self.images or len(set(self.images)) != len(self.images):
             found = ", ".join(self.images) or "none"
             raise ValueError(f"images: expected one or more kinds, each once, found {found}")

@@ -97,6 +97,7 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
     sampling: Literal["instant", "mean"] = "instant"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for field in ("gyroscope_matrix", "accelerometer_matrix"):
             if len(getattr(self, field)) not in (0, 9):
                 found = len(getattr(self, field))

@@ -73,6 +73,7 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     full_range: Positive = 20.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         first, last = self.azimuths
         low, high = self.elevations
         if not 0.0 < last - first <= 360.0:

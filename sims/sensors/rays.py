@@ -95,6 +95,7 @@ class RangeFinderSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fiel
     field_of_view: Annotated[float, msgspec.Meta(ge=0.0, le=90.0)] = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.max_range <= self.min_range:
             raise ValueError(
                 f"{self.name}: max_range: expected more than the {self.min_range:g} m of "

@@ -13,8 +13,9 @@ import numpy as np
 
 import events as ev
 from events import Announcement, Event, Quaternion, Vector3
-from events.frames import cross, from_rpy, multiply, rotate, rotate_inverse, to_geodetic
+from events.frames import IDENTITY, cross, from_rpy, multiply, rotate, rotate_inverse, to_geodetic
 from runtime.units import Duration, Latency
+from sims.mounting import Matrix, apply_matrix
 
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -28,10 +29,17 @@ class Mount(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         position: Position on the body, metres forward, right, down (FRD) of its centre of mass.
         orientation: Roll, pitch, yaw of the sensor in the body's frame, degrees, applied yaw first
             (Z-Y-X). Positive pitch is upwards: -90 looks straight down.
+        T_BS: In place of both, the transform from the sensor's own axes (forward, right, down if
+            `orientation` is 0) to the body: four rows of four numbers, or ``{ rows, cols, data }``
+            as in a sensor.yaml of EuRoC's.
     """
 
     position: Vector3 = (0.0, 0.0, 0.0)
     orientation: Vector3 = (0.0, 0.0, 0.0)
+    T_BS: Matrix | None = None
+
+    def __post_init__(self) -> None:
+        apply_matrix(self, IDENTITY)
 
     @property
     def rotation(self) -> Quaternion:
@@ -186,6 +194,7 @@ class BarometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields
     model: Literal["gauss_markov", "airsim"] = "gauss_markov"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_drift(self.drift, self.drift_time)
 
 
@@ -346,6 +355,7 @@ class GnssSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True
     eph_min_3d: Positive = 3.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_drift(self.horizontal_drift or self.vertical_drift, self.drift_time)
 
 

@@ -313,14 +313,16 @@ def test_data_sets_in_the_layouts_that_people_download(tmp_path: Path) -> None:
     camera = {name: getattr(lens, name) for name in ("fx", "fy", "cx", "cy")}
     camera["distortion"] = list(lens.distortion)
     table = ", ".join(f"{name} = {value}" for name, value in camera.items())
-    changes = {
-        "euroc": (downloads.euroc(tmp_path / "MH_01"), ()),
-        "tum": (downloads.tum(tmp_path / "fr1"), (f"replay.camera={{ {table} }}",)),
-        "kitti": (downloads.kitti(tmp_path / "kitti"), ()),
-    }
-    for name, (folder, more) in changes.items():
+    tum = (f"replay.camera={{ {table} }}",)
+    for name, folder, more in (
+        ("euroc", downloads.euroc(tmp_path / "MH_01"), ()),
+        ("euroc", downloads.tum_vi(tmp_path / "room1"), ()),
+        ("tum", downloads.tum(tmp_path / "fr1"), tum),
+        ("kitti", downloads.kitti(tmp_path / "kitti"), ()),
+    ):
         file = f"replay.file={folder}"
-        summary = run(name, tmp_path / f"{name}_out", file, *more, "report.figures=[]")
+        out = tmp_path / f"{folder.name}_out"
+        summary = run(name, out, file, *more, "report.figures=[]")
         figures = summary["verdict"]["estimators"]
         judged = figures["odometry" if name == "tum" else "stereo"]
         assert judged["estimates"] == downloads.IMAGES

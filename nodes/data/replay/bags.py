@@ -2,42 +2,71 @@
 
 Foreign messages become events in our frames (`nodes.ros2.messages`). They keep a header's stamp,
 unless zero, and are sent at their time of receipt; two different clocks each count from their own
-first. Topics that settings do not name are known by type and name.
-Cameras sit where ``/tf_static`` puts their optical frames in ``base_link``, else look ahead from
-the body's origin.
+first. Topics that settings do not name are chosen by `nodes.data.replay.streams`.
+Cameras and IMUs sit where ``/tf_static`` puts their frames in ``base_link``, else in the body's
+origin, where cameras look ahead; or where Kalibr's calibration has them.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
+from math import isfinite
 from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
+import numpy as np
 
 from events import (
     Announcement,
     CameraAnnouncement,
+    DepthImage,
     EstimatorAnnouncement,
     Event,
     Image,
+    Imu,
     ImuAnnouncement,
     Odometry,
 )
-from events.frames import convert_rotation, convert_vector, multiply, normalize, rotate
-from events.geometry import Pose
+from events.frames import (
+    Axes,
+    angle_between,
+    axes_of,
+    convert_rotation,
+    convert_vector,
+    multiply,
+    normalize,
+    rotate,
+)
+from events.geometry import Pose, pose_tuples
 from nodes.data.mcap import layout, native
 from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import Record, contents, read
 from nodes.data.mcap.native import HOLDERS, arrays
-from nodes.data.replay.folders import vehicle_at
+from nodes.data.replay.chains import (
+    as_pairs,
+    check_size,
+    imu_in_body,
+    mountings,
+    with_noise,
+)
+from nodes.data.replay.folders import camera_at, vehicle_at
 from nodes.data.replay.reader import BagTopic, Reader, ReplayError, Timed, Use, Wants
+from nodes.data.replay.streams import (
+    GUESSED,
+    base_of,
+    calibration,
+    guess,
+    source_of,
+    topic_in,
+)
+from nodes.kalibr import Chain, is_rotation
 from nodes.ros2.messages.incoming import MessageContext, camera_announcement
 from nodes.ros2.messages.mappings import READERS
 from nodes.ros2.messages.topics import FrameNames
-from nodes.ros2.messages.typestore import Bag, Stamps, TypeStore
+from nodes.ros2.messages.typestore import Bag, MessageError, Stamps, TypeStore
 from runtime.channels.wire import event_type
 from runtime.errors import VisnavError, WireError, suggest
 from runtime.time.clock import SECOND
@@ -127,79 +156,31 @@ def is_ours(path: Path) -> bool:
 TYPES = {use: tuple(t for t, to in READERS if to == use) for use in get_args(Use)}
 """Readable message types of each use."""
 
-_PARTS = {
-    "image", "image_raw", "image_rect", "image_color", "image_rect_color", "image_mono",
-    "camera_info", "compressed", "compressedDepth", "depth", "color", "rgb", "depth_registered",
-}  # fmt: skip
-"""Parts of topic names for the kind of data, not its source."""
-
 
 def chosen(
     found: Mapping[str, tuple[str, int]],  # type and number of messages, by topic
-    wanted: tuple[BagTopic, ...],  # from the file; if empty, topics are taken by type and name
+    wanted: tuple[BagTopic, ...],
     vehicle: str,
 ) -> dict[str, BagTopic]:
     """Return the topics to read, by name, with all sources; a `ReplayError` if one is missing."""
-    there = ", ".join(f"{name} ({type_})" for name, (type_, _) in sorted(found.items()))
+    taken: dict[str, BagTopic] = {}
     for topic in wanted:
-        if topic.topic not in found:
+        name = topic_in(found, topic.topic)
+        if name not in found:
             fit = [f"{k} ({v})" for k, (v, _) in sorted(found.items()) if v in TYPES[topic.use]]
             raise ReplayError(
                 f"topics: expected one of the bag's, found {topic.topic!r}"
                 f"{suggest(topic.topic, found)}; {topic.use} can be: {', '.join(fit) or 'none'}"
             )
-        type_ = found[topic.topic][0]
+        type_ = found[name][0]
         if type_ not in TYPES[topic.use]:
             raise ReplayError(
-                f"topics: {topic.topic}: expected {' or '.join(TYPES[topic.use])} "
+                f"topics: {name}: expected {' or '.join(TYPES[topic.use])} "
                 f"for {topic.use}, found {type_}"
             )
-    taken = wanted or _guessed(found)
-    if not taken:
-        raise ReplayError(f"expected topics of cameras, IMUs or poses, found: {there or 'none'}")
-    return {
-        topic.topic: msgspec.structs.replace(topic, source=topic.source or _source(topic, vehicle))
-        for topic in taken
-    }
-
-
-def _guessed(found: Mapping[str, tuple[str, int]]) -> list[BagTopic]:
-    taken: list[BagTopic] = []
-    truth = False
-    for name, (type_, count) in sorted(found.items()):
-        use: Use | None = None
-        if not count or name.startswith("/visnav/"):
-            continue
-        if type_ == "sensor_msgs/msg/Image":
-            use = "depth" if "depth" in name else "image"
-        elif type_ == "sensor_msgs/msg/CompressedImage":
-            raw_type, raw_count = found.get(name.rpartition("/")[0], ("", 0))
-            if not (raw_type == "sensor_msgs/msg/Image" and raw_count):
-                use = "depth" if "depth" in name.lower() else "image"
-        elif type_ == "sensor_msgs/msg/CameraInfo":
-            use = None if "depth" in name else "camera"
-        elif type_ == "sensor_msgs/msg/Imu":
-            use = "imu"
-        elif type_ == "nav_msgs/msg/Odometry" and not truth:
-            use, truth = "odometry", True
-        if use is not None and "segmentation" not in name:
-            taken.append(BagTopic(topic=name, use=use))
+        source = topic.source or source_of(name, topic.use, vehicle)
+        taken[name] = msgspec.structs.replace(topic, topic=name, source=source)
     return taken
-
-
-def _source(topic: BagTopic, vehicle: str) -> str:
-    """Return the source of a topic's events: of a camera, its namespace, below the vehicle."""
-    if topic.use in {"odometry", "truth"}:
-        return vehicle
-    if topic.use == "estimate":
-        return topic.topic.strip("/")
-    parts = [part for part in topic.topic.split("/") if part]
-    if parts and parts[0] == vehicle:
-        parts = parts[1:]
-    if topic.use != "imu":
-        cut = next((n for n, part in enumerate(parts) if part in _PARTS), len(parts))
-        parts = parts[:cut]
-    return "/".join((vehicle, *(parts or ["camera"])))
 
 
 LONGEST = 16  # transforms between a camera and the body, at most: more would go in circles
@@ -207,38 +188,57 @@ _HERE: Pose = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 class Mountings:
-    """A tree of fixed transforms, in ROS's axes, from messages of tf2_msgs/TFMessage."""
+    """A tree of fixed transforms, in ROS's axes, from messages of tf2_msgs/TFMessage.
 
-    def __init__(self, messages: Iterable[Any]) -> None:
+    Args:
+        complain: Called with a sentence on a transform that is none, and is left out.
+    """
+
+    def __init__(self, messages: Iterable[Any], complain: Callable[[str], None]) -> None:
         self._parents: dict[str, tuple[str, Pose]] = {}
         for message in messages:
             for each in message.transforms:
                 t, r = each.transform.translation, each.transform.rotation
-                pose = (
-                    (float(t.x), float(t.y), float(t.z)),
-                    normalize((float(r.w), float(r.x), float(r.y), float(r.z))),
-                )
-                self._parents[each.child_frame_id] = each.header.frame_id, pose
+                position = (float(t.x), float(t.y), float(t.z))
+                try:
+                    turn = normalize((float(r.w), float(r.x), float(r.y), float(r.z)))
+                    if not all(map(isfinite, position)):
+                        raise ValueError(f"expected a finite place, found {position}")
+                except ValueError as error:
+                    complain(f"/tf_static: {each.child_frame_id} is left out: {error}")
+                    continue
+                self._parents[each.child_frame_id] = each.header.frame_id, (position, turn)
 
-    def of(self, optical: str, body: str = "base_link") -> Pose | None:
-        """Return the pose of an optical frame in the body, FRD; `None` if unknown."""
-        frame, (position, rotation) = optical, _HERE
+    def of(self, frame: str, axes: Axes = "optical", body: str = "base_link") -> Pose | None:
+        """Return the pose of a frame, with such axes here, in the body, FRD; `None` if unknown."""
+        root, (position, rotation) = self._up(frame, body)
+        if root != body:
+            return None
+        return convert_vector("body", position), convert_rotation("body", axes, rotation)
+
+    def same(self, one: str, other: str) -> bool:
+        """Return whether two frames are known to be one, to 0.1 mm and 0.1 mrad."""
+        (root, a), (other_root, b) = self._up(one), self._up(other)
+        apart = max(abs(x - y) for x, y in zip(a[0], b[0], strict=True))
+        return root == other_root and apart < 1e-4 and angle_between(a[1], b[1]) < 1e-4
+
+    def _up(self, frame: str, end: str = "") -> tuple[str, Pose]:
+        """Return the last known parent of a frame, or `end`, and the frame's pose in it."""
+        position, rotation = _HERE
         for _ in range(LONGEST):
-            if frame == body:
-                return convert_vector("body", position), convert_rotation(
-                    "body", "optical", rotation
-                )
-            if frame not in self._parents:
-                return None
+            if frame == end or frame not in self._parents:
+                break
             frame, (offset, turn) = self._parents[frame]
             x, y, z = rotate(turn, position)
             position = (x + offset[0], y + offset[1], z + offset[2])
             rotation = multiply(turn, rotation)
-        return None
+        return frame, (position, rotation)
 
 
 _SAME_CLOCK = 60 * SECOND  # largest difference of stamp and receipt on a common clock, nanoseconds
 _EVENTS = {use: row.becomes or row.events[0] for (_, use), row in READERS.items() if use in TYPES}
+_INVALID = (ValueError, TypeError, ArithmeticError, AttributeError)  # of a message's content
+_TRIED = 100  # first messages of a topic among which there has to be a valid one
 _LATER = 1 << 62  # placeholder for the stamp of a message without a stamp
 
 
@@ -247,24 +247,39 @@ class RosBag(Reader):
 
     Args:
         path: A folder, or an MCAP or SQLite file.
-        topics: Topics to read; if empty, by types and names.
+        topics: Topics to read; if empty, by types, names and calibrations, and topics that cannot
+            be read are left out, each with a complaint.
+        calibration: Of its cameras, found by their topics, in the place of their camera_info.
 
     Raises:
-        ReplayError: It cannot be read, or a topic is not there.
+        ReplayError: It cannot be read, a named topic is not there or cannot be read, or nothing is
+            left.
     """
 
-    def __init__(self, path: Path, topics: tuple[BagTopic, ...], vehicle: str) -> None:
+    def __init__(
+        self,
+        path: Path,
+        topics: tuple[BagTopic, ...],
+        vehicle: str,
+        calibration: Chain | None = None,
+    ) -> None:
         super().__init__()
-        self._path, self._vehicle = path, vehicle
+        self._path, self._vehicle, self._chain = path, vehicle, calibration
+        self._named = bool(topics)
         with readable(path):
             self._bag = open_bag(path)
         try:
             with readable(path):
-                found = self._bag.topics()
-                self._topics = chosen(found, topics, vehicle)
-                self._firsts = self._first_messages()
+                self._found = self._bag.topics()
+                self._mountings = self._read_mountings()
+                self._firsts = self._first_messages(topics)
+                self._topics = self._choose(topics)
+                self._firsts = {k: v for k, v in self._firsts.items() if k in self._topics}
                 self._times, self._stamps = self._origins()
-                self._announcements = list(self._announced(found))
+                self._announcements = list(self._announced())
+                left = (name for name in self._firsts if name in self._topics)
+                if all(self._topics[name].use == "camera" for name in left):
+                    raise ReplayError(f"{path}: expected a topic to replay; {self._reasons()}")
         except ReplayError:
             self._bag.close()
             raise
@@ -286,7 +301,7 @@ class RosBag(Reader):
             for name, type_, time, message in self._bag.messages(names, start + self._times, stop):
                 try:
                     event = self._event(self._topics[name], type_, message)
-                except (ValueError, TypeError, ArithmeticError, AttributeError) as error:
+                except _INVALID as error:
                     self.left_out += 1
                     if name not in wrong:  # one example of each topic is enough
                         wrong.add(name)
@@ -314,16 +329,64 @@ class RosBag(Reader):
         assert event is not None
         return event
 
-    def _first_messages(self) -> dict[str, tuple[str, int, Any]]:
-        """Return type, time of receipt and content of each topic's first message."""
+    def _read_mountings(self) -> Mountings:
+        try:
+            messages = (
+                message
+                for _, type_, _, message in self._bag.messages(["/tf_static", "tf_static"])
+                if type_ == "tf2_msgs/msg/TFMessage"
+            )
+            return Mountings(messages, self.complain)
+        except MessageError as error:
+            self.complain(f"/tf_static: left out: {error}")
+            return Mountings((), self.complain)
+
+    def _first_messages(self, topics: tuple[BagTopic, ...]) -> dict[str, tuple[str, int, Any]]:
+        """Return type, time of receipt and content of the first message of each topic to read."""
+        names = list(chosen(self._found, topics, self._vehicle))
+        if not self._named:
+            there = self._found.items()
+            names = [name for name, (type_, count) in there if count and type_ in GUESSED]
         found: dict[str, tuple[str, int, Any]] = {}
-        for name in self._topics:
-            for _, type_, time, message in self._bag.messages([name]):
-                found[name] = type_, time, message
-                break
-        if not found:
-            raise ReplayError(f"expected messages on {', '.join(self._topics)}, found none")
+        for name in sorted(names):
+            try:
+                for _, type_, time, message in self._bag.messages([name]):
+                    found[name] = type_, time, message
+                    break
+            except MessageError as error:
+                self._refuse(name, error)
+        if self._named and not found:
+            raise ReplayError(f"expected messages on {', '.join(names)}, found none")
         return found
+
+    def _choose(self, topics: tuple[BagTopic, ...]) -> dict[str, BagTopic]:
+        if self._named:
+            return chosen(self._found, topics, self._vehicle)
+        messages = {name: message for name, (_, _, message) in self._firsts.items()}
+        given = self._chain.cameras if self._chain else ()
+        calibrated = {topic_in(self._found, each.topic): each.info for each in given}
+        same_frame = self._mountings.same
+        streams = guess(self._found, messages, self._vehicle, same_frame, calibrated)
+        self.notes += streams.notes
+        for each in streams.left_out:
+            self.complain(each)
+        if not streams.topics:
+            types = sorted((name, type_) for name, (type_, _) in self._found.items())
+            there = ", ".join(f"{name} ({type_})" for name, type_ in types)
+            reasons = f"; {self._reasons()}" if self.trouble else ""
+            raise ReplayError(
+                f"expected topics of cameras, IMUs or poses, found: {there or 'none'}{reasons}"
+            )
+        return {topic.topic: topic for topic in streams.topics}
+
+    def _reasons(self) -> str:
+        return "; ".join(self.trouble) or "none has a message"
+
+    def _refuse(self, name: str, error: object) -> None:
+        """Leave a topic out, by name; raise a `ReplayError` if the settings name it."""
+        if self._named:
+            raise ReplayError(f"topics: {name}: {error}") from None
+        self.complain(f"{name}: left out: {error}")
 
     def _origins(self) -> tuple[int, Stamps]:
         """Return the time of receipt counted as 0, and the conversion of stamps."""
@@ -336,67 +399,183 @@ class RosBag(Reader):
             return origin, Stamps(origin)
         return min(times), Stamps(min(stamps))
 
-    def _announced(self, found: dict[str, tuple[str, int]]) -> Iterator[Announcement]:
-        for name, topic in self._topics.items():
-            if topic.use in {"odometry", "truth"} and name in self._firsts:
-                type_, _, message = self._firsts[name]
-                event = self._event(topic, type_, message)
-                assert isinstance(event, Odometry)
-                yield vehicle_at(event)
-        yield from self._cameras(found)
-        for name, topic in self._topics.items():
-            if topic.use == "imu" and name in self._firsts:
-                header = self._firsts[name][2].header
-                yield ImuAnnouncement(
-                    stamp=0,
-                    source=topic.source,
-                    rate=self._rate(found[name][1]),
-                    frame_id=topic.frame_id or header.frame_id or "base_link",
-                    gyroscope_noise_density=0.0,  # messages do not say
-                    gyroscope_random_walk=0.0,
-                    accelerometer_noise_density=0.0,
-                    accelerometer_random_walk=0.0,
-                )
-            elif topic.use == "estimate":
+    def _first_events(self, *uses: Use) -> Iterator[tuple[str, BagTopic, Event]]:
+        """Yield the first valid event of each topic; a topic without any is left out."""
+        for name, topic in list(self._topics.items()):
+            if topic.use not in uses or name not in self._firsts:
+                continue
+            wrong: Exception | None = None
+            for _, type_, _, message in islice(self._bag.messages([name]), _TRIED):
+                try:
+                    yield name, topic, self._event(topic, type_, message)
+                    break
+                except _INVALID as error:
+                    wrong = wrong or error
+            else:
+                self._refuse(name, wrong)
+                del self._topics[name]
+
+    def _announced(self) -> Iterator[Announcement]:
+        for _, _, event in self._first_events("odometry", "truth"):
+            assert isinstance(event, Odometry)
+            yield vehicle_at(event)
+        imus = [self._imu(*each) for each in self._first_events("imu")]
+        yield from self._cameras(imus)
+        yield from imus
+        for topic in self._topics.values():
+            if topic.use == "estimate":
                 yield EstimatorAnnouncement(
                     stamp=0, source=topic.source, method=f"ROS: {topic.topic}"
                 )
 
-    def _cameras(self, found: dict[str, tuple[str, int]]) -> Iterator[CameraAnnouncement]:
-        mountings = Mountings(
-            message
-            for _, type_, _, message in self._bag.messages(["/tf_static"])
-            if type_ == "tf2_msgs/msg/TFMessage"
+    def _imu(self, name: str, topic: BagTopic, event: Event) -> ImuAnnouncement:
+        assert isinstance(event, Imu)
+        frame = topic.frame_id or self._firsts[name][2].header.frame_id
+        position, orientation = self._mountings.of(frame, axes_of(event.frame_id)) or _HERE
+        return ImuAnnouncement(
+            stamp=0,
+            source=topic.source,
+            rate=self._rate(name),
+            frame_id=event.frame_id,
+            position=position,
+            orientation=orientation,
+            gyroscope_noise_density=0.0,  # messages do not say
+            gyroscope_random_walk=0.0,
+            accelerometer_noise_density=0.0,
+            accelerometer_random_walk=0.0,
         )
-        images: dict[str, list[str]] = {}
-        rates: dict[str, float] = {}
-        for name, topic in self._topics.items():
-            if topic.use in {"image", "depth"} and name in self._firsts:
-                type_, _, message = self._firsts[name]
-                kind = "depth"
-                if topic.use == "image":
-                    event = self._event(topic, type_, message)
-                    assert isinstance(event, Image)
-                    kind = "rgb" if event.encoding == "rgb8" else "grey"
-                images.setdefault(topic.source, []).append(kind)
-                rates[topic.source] = self._rate(found[name][1])
+
+    def _cameras(self, imus: list[ImuAnnouncement]) -> Iterator[CameraAnnouncement]:
+        images: dict[str, list[tuple[str, str]]] = {}  # topics and kinds, by source
+        sizes: dict[str, tuple[int, ...]] = {}
+        for name, topic, event in self._first_events("image", "depth"):
+            kind = "depth"
+            if isinstance(event, Image):
+                kind = "rgb" if event.encoding == "rgb8" else "grey"
+                self._check_bits(name)
+            assert isinstance(event, Image | DepthImage)
+            images.setdefault(topic.source, []).append((name, kind))
+            sizes[name] = event.data.shape[1::-1]
+        for source, streams in images.items():
+            several = [name for name, kind in streams if kind != "depth"]
+            if len(several) > 1:
+                self.complain(
+                    f"{source}: expected one stream of images, found {', '.join(several)}: each "
+                    "stamp may come twice; give each a source of its own"
+                )
+        if self._chain is not None:
+            yield from self._by_chain(self._chain, images, sizes, imus)
         for name, topic in self._topics.items():
             if topic.use == "camera" and name in self._firsts and topic.source in images:
-                kinds = tuple(images.pop(topic.source))
-                message = self._firsts[name][2]
-                camera = camera_announcement(message, topic.source, kinds, topic.frame_id)
-                camera = msgspec.structs.replace(camera, rate=rates[topic.source])
-                mounting = mountings.of(message.header.frame_id)
-                if mounting is not None:
-                    place, turn = mounting
-                    camera = msgspec.structs.replace(camera, position=place, orientation=turn)
-                yield camera
+                try:
+                    yield self._camera(name, topic, images[topic.source])
+                except ValueError as error:
+                    self._refuse(name, error)
+                    continue
+                del images[topic.source]
         for source in images:
-            self.complain(f"{source}: expected a camera_info, found none: it is not announced")
+            self.complain(
+                f"{source}: expected a camera_info, found none: it is not announced; give a "
+                "calibration by the setting calibration"
+            )
 
-    def _rate(self, count: int) -> float:
+    def _camera(
+        self, name: str, topic: BagTopic, images: list[tuple[str, str]]
+    ) -> CameraAnnouncement:
+        """Return a camera by its CameraInfo; a `ValueError` if that is no calibration."""
+        message, first = self._firsts[name][2], images[0][0]
+        kinds = tuple(kind for _, kind in images)
+        camera = camera_announcement(message, topic.source, kinds, topic.frame_id)
+        info = calibration(message, first)
+        place, turn = self._mountings.of(message.header.frame_id) or (
+            camera.position,
+            camera.orientation,
+        )
+        if info != camera.info:  # rectified images are turned, too
+            rectification = np.reshape(message.r, (3, 3)).astype(np.float64)
+            if is_rotation(rectification):
+                moved = np.eye(4)
+                moved[:3, :3] = rectification.T
+                turn = multiply(turn, pose_tuples(moved)[1])
+        return msgspec.structs.replace(
+            camera,
+            rate=self._rate(first),
+            info=info,
+            baseline=abs(float(message.p[3])) / info.fx,
+            position=place,
+            orientation=turn,
+        )
+
+    def _by_chain(
+        self,
+        chain: Chain,
+        images: dict[str, list[tuple[str, str]]],
+        sizes: dict[str, tuple[int, ...]],
+        imus: list[ImuAnnouncement],
+    ) -> Iterator[CameraAnnouncement]:
+        """Yield the cameras of a calibration, whose images are taken away; note the IMU's."""
+        topics = {
+            base_of(name): (source, name) for source, each in images.items() for name, _ in each
+        }
+        own = next((n for n, i in enumerate(imus) if _is_of(chain, self._topics, i)), None)
+        body = imu_in_body(imus[own] if own is not None else None)
+        if own is not None:
+            imus[own] = with_noise(imus[own], chain)
+        first = chain.cameras[0].topic if chain.cameras else ""
+        _, name = topics.get(topic_in(topics, first), ("", ""))
+        ahead = self._mountings.of(self._firsts[name][2].header.frame_id) if name else None
+        places = mountings(chain, body, ahead)
+        cameras: list[CameraAnnouncement] = []
+        for camera, (position, orientation) in zip(chain.cameras, places, strict=True):
+            topic = topic_in(topics, camera.topic)
+            if topic not in topics:
+                self.complain(
+                    f"calibration: {camera.name} is of the topic {camera.topic or '(none)'}, which "
+                    f"is not read; those that are: {', '.join(sorted(topics)) or 'none'}"
+                )
+                continue
+            source, name = topics[topic]
+            check_size(camera, sizes[name], name)
+            announced = camera_at(
+                source,
+                tuple(kind for _, kind in images.pop(source)),
+                camera.info,
+                self._rate(name),
+                position,
+                orientation,
+            )
+            cameras.append(
+                msgspec.structs.replace(
+                    announced,
+                    frame_id=self._topics[name].frame_id or self._firsts[name][2].header.frame_id,
+                    time_offset=camera.time_offset,
+                )
+            )
+        if chain.cameras and not cameras:
+            raise ReplayError(
+                f"{chain.where}: expected the calibration of a camera that is read, found "
+                f"{', '.join(c.topic or c.name for c in chain.cameras)}; set rostopic to one of "
+                f"{', '.join(sorted(topics)) or 'none'}"
+            )
+        yield from as_pairs(cameras)
+
+    def _check_bits(self, name: str) -> None:
+        message = self._firsts[name][2]
+        if getattr(message, "encoding", "").endswith("16"):
+            order = ">" if message.is_bigendian else "<"
+            self.check_bits(name, np.frombuffer(message.data.tobytes(), f"{order}u2"))
+
+    def _rate(self, name: str) -> float:
+        count = self._found[name][1]
         seconds = (self._bag.end - self._bag.start) / 1e9
         return max(count - 1, 1) / seconds if seconds > 0 else 1.0
+
+
+def _is_of(chain: Chain, topics: Mapping[str, BagTopic], imu: ImuAnnouncement) -> bool:
+    """Return whether a calibration's transforms are of an IMU: by its topic, or as the only one."""
+    names = {name: topic.source for name, topic in topics.items() if topic.use == "imu"}
+    named = topic_in(names, chain.imu.topic) if chain.imu and chain.imu.topic else ""
+    return names[named] == imu.source if named in names else len(names) == 1
 
 
 def open_bag(path: Path) -> Bag:

@@ -1,14 +1,14 @@
-"""Data sets in folders, as published: EuRoC MAV, TUM RGB-D, KITTI odometry.
+"""Data sets in folders, as published: EuRoC MAV, TUM VI, TUM RGB-D, KITTI odometry.
 
-The first two also as `nodes.data.dataset` writes them. Their worlds, z up, are turned to NED by
-half a turn about x. Times count from the first stamp, or from the epoch that ``body.yaml`` or
-``camera.yaml`` notes (``epoch_ns``).
+EuRoC's and TUM RGB-D also as `nodes.data.dataset` writes them. Their worlds, z up, are turned to
+NED by half a turn about x. Times count from the first stamp, or from the epoch that ``body.yaml``
+or ``camera.yaml`` notes (``epoch_ns``).
 """
 
 from __future__ import annotations
 
 import bisect
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from events import (
     Quaternion,
     Vector3,
 )
-from events.base import UNIT_TOLERANCE
 from events.frames import (
     OPTICAL_TO_FRD,
     flip_yz,
@@ -35,8 +34,9 @@ from events.frames import (
     rotate_inverse,
     rotation_to_ned,
 )
-from events.geometry import pose_matrix, pose_tuples
+from events.geometry import Pose, pose_matrix, pose_tuples
 from nodes.data.dataset.recording import notable
+from nodes.data.replay.chains import as_pairs, chain_of, check_size, mountings, with_noise
 from nodes.data.replay.folders import (
     Files,
     FolderReader,
@@ -48,7 +48,9 @@ from nodes.data.replay.folders import (
     read_sensor,
 )
 from nodes.data.replay.reader import Pinhole, ReplayConfig, ReplayError
-from nodes.trajectory_files import Row, euroc_rows, read_kitti, read_rows, read_tum
+from nodes.data.replay.truth import read_truth
+from nodes.kalibr import Chain, KalibrCamera, read_chain
+from nodes.trajectory_files import Row, read_kitti, read_rows
 
 _MODELS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 """Kalibr's names of distortion models, and ours."""
@@ -60,6 +62,10 @@ class Euroc(FolderReader):
     M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The body keeps the data
     set's axes: in EuRoC's own those of the IMU, not FRD. Of cameras whose numbers follow each other
     and that stand side by side the second is announced as the right one of a stereo rig.
+
+    D. Schubert et al., "The TUM VI benchmark for evaluating visual-inertial odometry", IROS 2018,
+    has the same layout with images of 16 bits, truth in ``mocap0``, and Kalibr's calibration beside
+    it in place of a sensor.yaml; the settings can name another.
     """
 
     layout = "EuRoC's (mav0)"
@@ -74,20 +80,56 @@ class Euroc(FolderReader):
 
     def _read(self) -> None:
         folder = self._folder
-        cameras = [self._camera(camera) for camera in sorted(folder.glob("cam[0-9]*"))]
-        for number in range(1, len(cameras)):
-            left, right = cameras[number - 1 : number + 1]
-            cameras[number] = right if left.stereo else as_pair(left, right)
-        self._announcements += cameras
+        chain = self._chain()
         self._imu_source, self._imu_frame = f"{self._vehicle}/imu0", "base_link"
         self._imu = self._measurements(folder / "imu0" / "data.csv")
-        if self._imu:
-            self._announcements.append(self._imu_announcement())
-        truth = folder / "state_groundtruth_estimate0" / "data.csv"
-        if truth.is_file():
-            rows = euroc_rows(truth, tolerance=UNIT_TOLERANCE, whole=self._whole(truth))
-            self._truth = sorted((stamp, values) for _, stamp, values in rows)
+        imu = self._imu_announcement(chain) if self._imu else None
+        mounted: dict[str, tuple[KalibrCamera, Pose]] = {}
+        if chain is not None:
+            in_body = pose_matrix(imu.position, imu.orientation) if imu else np.eye(4)
+            places = mountings(chain, in_body)
+            mounted = {
+                camera.name: (camera, place)
+                for camera, place in zip(chain.cameras, places, strict=True)
+            }
+        folders = sorted(folder.glob("cam[0-9]*"))
+        if self._config.calibration and mounted and not any(f.name in mounted for f in folders):
+            raise ReplayError(
+                f"calibration: expected one of {', '.join(f.name for f in folders) or 'a camera'}, "
+                f"found {', '.join(mounted)}"
+            )
+        self._announcements += as_pairs([self._camera(each, mounted) for each in folders])
+        if imu is not None:
+            self._announcements.append(imu)
+        self._truth = self._poses()
         self._begin([row[0] for row in self._imu])
+
+    def _chain(self) -> Chain | None:
+        """Return the calibration that the settings name, or one beside cameras without their own.
+
+        TUM VI has its in ``dso``.
+        """
+        given = chain_of(self._config)
+        sensors = [*self._folder.glob("cam[0-9]*"), *self._folder.glob("imu0")]
+        if given or all((each / "sensor.yaml").is_file() for each in sensors):
+            return given
+        paths = []
+        for names in _CHAINS, _NOISES:
+            places = (self._folder, self._folder.parent, self._folder.parent / "dso")
+            there = (place / name for place in places for name in names)
+            paths += [path for path in there if path.is_file()][:1]
+        if not paths:
+            return None
+        self.notes.append(f"calibration: {', '.join(map(str, paths))}")
+        return read_chain(paths)
+
+    def _poses(self) -> list[tuple[int, list[float]]]:
+        for name in _TRUTHS:
+            truth = self._folder / name / "data.csv"
+            if truth.is_file():
+                self.notes.append(f"true poses: {truth}")
+                return read_truth(truth, self.complain, euroc=True, whole=self._whole(truth))
+        return []
 
     def _rows(self) -> Iterator[Rows]:
         yield Rows(Imu, self._imu_source, self._imu, self._measurement)
@@ -104,14 +146,31 @@ class Euroc(FolderReader):
 
     def _odometry(self, stamp: int, values: list[float]) -> Odometry:
         """Return the true odometry; the data set has no angular velocity, so 0."""
-        x, y, z, qw, qx, qy, qz, u, v, w = values[:10]
+        x, y, z, qw, qx, qy, qz, u, v, w = [*values, 0.0, 0.0, 0.0][:10]
         turn = qw, qx, qy, qz
         velocity = rotate_inverse(turn, (u, v, w))
         return self._pose(stamp, flip_yz((x, y, z)), rotation_to_ned(turn), velocity)
 
-    def _camera(self, folder: Path) -> CameraAnnouncement:
-        sensor = read_sensor(folder / "sensor.yaml")
+    def _camera(
+        self, folder: Path, mounted: Mapping[str, tuple[KalibrCamera, Pose]]
+    ) -> CameraAnnouncement:
         source = f"{self._vehicle}/{folder.name}"
+        self._images[source] = files = self._index(folder)
+        images = [first_image(files[0][1])[0] if files else "grey"]
+        if files:
+            self._check_bits(files[0][1])
+        if (given := mounted.get(folder.name)) is not None:
+            calibrated, place = given
+            if files:
+                check_size(calibrated, first_image(files[0][1])[1:], str(files[0][1]))
+            announced = camera_at(source, (*images,), calibrated.info, _rate_of(files), *place)
+            return msgspec.structs.replace(announced, time_offset=calibrated.time_offset)
+        if not (folder / "sensor.yaml").is_file():
+            raise ReplayError(
+                f"{folder}: expected a sensor.yaml in it, Kalibr's {_CHAINS[0]} beside the data "
+                "set or the setting calibration, found none"
+            )
+        sensor = read_sensor(folder / "sensor.yaml")
         width, height = sensor.list("resolution", 2)
         fx, fy, cx, cy = sensor.list("intrinsics", 4)
         lens = sensor.list("distortion_coefficients", 4, 5)
@@ -125,8 +184,6 @@ class Euroc(FolderReader):
         if model == "plumb_bob":
             lens = [*lens, 0.0][:5]  # of four, k3 is none
         position, orientation = pose_tuples(np.reshape(sensor.list("data", 16), (4, 4)))
-        self._images[source] = files = self._index(folder)
-        images = [first_image(files[0][1])[0] if files else "grey"]
         depth = self._folder / folder.name.replace("cam", "depth")
         if depth.is_dir():
             factor = read_sensor(depth / "sensor.yaml").number("depth_factor")
@@ -141,8 +198,26 @@ class Euroc(FolderReader):
         camera = camera_at(source, tuple(images), info, rate, position, orientation)
         return _with_noted(camera, sensor)
 
-    def _imu_announcement(self) -> ImuAnnouncement:
-        sensor = read_sensor(self._folder / "imu0" / "sensor.yaml")
+    def _imu_announcement(self, chain: Chain | None) -> ImuAnnouncement:
+        path = self._folder / "imu0" / "sensor.yaml"
+        if not path.is_file():
+            if chain is None or chain.imu is None:
+                self.complain(
+                    f"{path.parent}: expected the IMU's noise in a sensor.yaml or in Kalibr's "
+                    f"{_NOISES[0]}, found neither: it is announced without noise"
+                )
+            announced = ImuAnnouncement(
+                stamp=0,
+                source=self._imu_source,
+                rate=_rate_of(self._imu),
+                frame_id=self._imu_frame,
+                gyroscope_noise_density=0.0,
+                gyroscope_random_walk=0.0,
+                accelerometer_noise_density=0.0,
+                accelerometer_random_walk=0.0,
+            )
+            return announced if chain is None else with_noise(announced, chain)
+        sensor = read_sensor(path)
         given = sensor.list("data", 16) if "data" in sensor.lists else np.eye(4)
         position, orientation = pose_tuples(np.reshape(given, (4, 4)))
         if (position, orientation) != ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)):
@@ -159,7 +234,8 @@ class Euroc(FolderReader):
             accelerometer_noise_density=sensor.number("accelerometer_noise_density", 0.0),
             accelerometer_random_walk=sensor.number("accelerometer_random_walk", 0.0),
         )
-        return _with_noted(announced, sensor)
+        announced = _with_noted(announced, sensor)
+        return announced if chain is None else with_noise(announced, chain)
 
     def _index(self, folder: Path) -> Files:
         path = folder / "data.csv"
@@ -172,6 +248,18 @@ class Euroc(FolderReader):
             return []
         rows = read_rows(path, ",", (7,), "timestamp, w x 3, a x 3", whole=self._whole(path))
         return sorted((row.nanoseconds(), row.numbers(1, 7)) for row in rows)
+
+
+_CHAINS = ("camchain-imucam.yaml", "camchain.yaml", "kalibr_imucam_chain.yaml")
+_NOISES = ("imu.yaml", "imu_config.yaml", "kalibr_imu_chain.yaml")
+_TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt", "leica0")
+"""Folders of true poses, the first that is there counts: EuRoC's, TUM VI's, Basalt's, positions."""
+
+
+def _rate_of(rows: Sequence[tuple[int, Any]]) -> float:
+    """Return the rate of rows with their stamps (ns): 1 over the median interval; 1 of one row."""
+    steps = np.diff([row[0] for row in rows])
+    return float(1e9 / max(np.median(steps), 1.0)) if len(steps) else 1.0
 
 
 A = TypeVar("A", CameraAnnouncement, ImuAnnouncement)
@@ -281,9 +369,10 @@ class TumRgbd(FolderReader):
         path = self._folder / "groundtruth.txt"
         if not path.is_file():
             return []
-        truth = read_tum(path, whole=self._whole(path), in_order=False)
+        rows = read_truth(path, self.complain, euroc=False, whole=self._whole(path))
         return [
-            (stamp, flip_yz(place), rotation_to_ned(turn)) for stamp, place, turn in truth.poses()
+            (stamp, flip_yz((x, y, z)), rotation_to_ned((w, i, j, k)))
+            for stamp, (x, y, z, w, i, j, k) in rows
         ]
 
 
@@ -376,6 +465,11 @@ def open_folder(path: Path, config: ReplayConfig, vehicle: str) -> FolderReader:
     """Return the reader of a data set's folder; a `ReplayError` if its layout is unknown."""
     for reader in _READERS:
         if (folder := reader.find(path)) is not None:
+            if config.calibration and reader is not Euroc:
+                raise ReplayError(
+                    f"calibration: expected a bag of ROS or a data set in {Euroc.layout} layout "
+                    f"beside it, found one in {reader.layout} layout: {path}"
+                )
             return reader(folder, config, vehicle)
     *others, last = (reader.layout for reader in _READERS)
     raise ReplayError(

@@ -31,6 +31,7 @@ from events import (
 from events.frames import OPTICAL_TO_FRD
 from events.geometry import pose_matrix
 from nodes.data.replay.reader import Reader, ReplayConfig, ReplayError, Timed, Wants
+from nodes.ros2.messages.images import high_byte
 
 Files = list[tuple[int, Path]]  # images of a camera, by stamp (ns)
 T = TypeVar("T")
@@ -163,6 +164,12 @@ class FolderReader(Reader):
         for source, files in self._images.items():
             yield Rows(Image, source, files, partial(self._image, source))
 
+    def _check_bits(self, path: Path) -> None:
+        """Complain of an image of 16 bits that will be dark."""
+        pixels = _pixels(path)
+        if pixels.dtype == np.uint16:
+            self.check_bits(str(path), pixels)
+
     def _whole(self, path: Path) -> bool:
         """Return whether a file's last line counts: a killed run of ours may have cut it off."""
         try:
@@ -252,14 +259,12 @@ def first_image(path: Path) -> tuple[str, int, int]:
 
 
 def read_image(path: Path) -> npt.NDArray[np.uint8]:
-    """Read a colour (RGB) or grey image; a `ReplayError` if it is none."""
-    pixels = _pixels(path)
-    if pixels.dtype == np.uint16:
-        raise ReplayError(f"{path}: expected an image of 8 bits, found one of 16")
+    """Read a colour (RGB) or grey image, of 16 bits the high byte; may raise `ReplayError`."""
+    pixels: Any = high_byte(_pixels(path))
     if pixels.ndim == 3:
         code = cv2.COLOR_BGRA2RGB if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
         pixels = cv2.cvtColor(pixels, code)
-    return pixels
+    return np.asarray(pixels, np.uint8)
 
 
 def read_depth(path: Path, factor: float) -> npt.NDArray[np.float32]:

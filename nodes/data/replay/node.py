@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from events import Announcement, Event, Odometry, TrajectoryEstimate, VehicleAnnouncement
 from nodes.data.replay.bags import Recorded, RosBag, is_ours
+from nodes.data.replay.chains import chain_of
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError, Timed
 from runtime import Node, Output
 from runtime.run.results import newest
@@ -115,17 +116,45 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
         path /= "recording.mcap"
     # Readers are imported when needed: scipy and rosbags take tenths of a second.
     if path.is_dir() and not (path / "metadata.yaml").is_file():
-        from nodes.data.replay.datasets import open_folder
+        if (bag := _only_bag(path)) is not None:
+            path = bag
+        else:
+            from nodes.data.replay.datasets import open_folder
 
-        return open_folder(path, config, vehicle)
+            return open_folder(path, config, vehicle)
     if not path.is_dir() and not path.is_file():
         raise ReplayError(
             f"{path}: expected a recording or the folder of a data set, found nothing there; "
             "docs/how-to/datasets.md says where to download those of EuRoC, TUM and KITTI"
         )
     if path.is_file() and path.suffix not in {".db3", ".bag"} and is_ours(path):
+        if config.calibration:
+            raise ReplayError(
+                "calibration: expected a bag of ROS or a data set in EuRoC's layout beside it, "
+                f"found a recording, whose cameras are announced in it: {path}"
+            )
         return Recorded(path)
-    return RosBag(path, config.topics, vehicle)
+    return RosBag(path, config.topics, vehicle, chain_of(config))
+
+
+def _only_bag(folder: Path) -> Path | None:
+    """Return the only bag of a folder without metadata.yaml; `None` if there is none.
+
+    Raises:
+        ReplayError: There are several.
+    """
+    bags = sorted(path for path in folder.iterdir() if path.suffix in _BAGS and path.is_file())
+    if len(bags) > 1:
+        raise ReplayError(
+            f"{folder}: expected one bag, or a bag of ROS 2 of several files with its "
+            f"metadata.yaml (`ros2 bag reindex` writes it), found {len(bags)} bags: "
+            f"{', '.join(path.name for path in bags[:5])}{', …' * (len(bags) > 5)}; "
+            "name one in file"
+        )
+    return bags[0] if bags else None
+
+
+_BAGS = {".bag", ".db3", ".mcap"}
 
 
 class Timeline:
@@ -226,6 +255,10 @@ class Replay(Node[ReplayConfig]):
             await self.offload(self._open)
         except ReplayError as error:
             self.log.fatal("%s", error)
+        assert self._reader is not None
+        for note in self._reader.notes:
+            self.log.info("%s: %s", self.config.file, note)
+        self._log_trouble()
 
     def announce(self) -> Iterable[Announcement]:
         """Announce the recorded announcements, and this node as source of the events."""

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Literal, NamedTuple, Protocol
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from events import Announcement, CameraInfo, Category, EstimatorAnnouncement, Event, PoseEstimate
 from events.camera_info import DistortionModel
@@ -40,6 +42,7 @@ class Reader(ABC):
     def __init__(self) -> None:
         self.trouble: list[str] = []  # parts unread so far, in words
         self.left_out = 0  # number of events unread so far
+        self.notes: list[str] = []  # a sentence on each stream that was chosen, or was not
 
     @abstractmethod
     def announcements(self) -> Sequence[Announcement]:
@@ -64,6 +67,15 @@ class Reader(ABC):
         if what in self.trouble or len(self.trouble) > MOST_TROUBLE:
             return
         self.trouble.append(what if len(self.trouble) < MOST_TROUBLE else "and more of that kind")
+
+    def check_bits(self, what: str, pixels: npt.NDArray[np.uint16]) -> None:
+        """Complain of an image of 16 bits of which lower ones are used: its high byte is dark."""
+        most = int(pixels.max(initial=0))
+        if 0 < most < 1 << 13:
+            self.complain(
+                f"{what}: the first image uses {most.bit_length()} of its 16 bits; of 16 the high "
+                "byte is taken, so it is dark"
+            )
 
     def close(self) -> None:  # noqa: B027  # most hold nothing
         """Release all resources."""
@@ -189,9 +201,10 @@ class ReplayConfig(NodeConfig):
     """Settings of a replay.
 
     Attributes:
-        file: A recording of `nodes.data.recorder` (torn ones too), a ROS 2 bag (a folder, or an
-            MCAP or SQLite file), or the folder of a data set in the layout of EuRoC, of TUM RGB-D,
-            or of KITTI's odometry (``sequences/00``).
+        file: A recording of `nodes.data.recorder` (torn ones too), a ROS bag (of ROS 2 a folder, or
+            an MCAP or SQLite file; of ROS 1 a file; or a folder with one of these in it), or the
+            folder of a data set in the layout of EuRoC, of TUM VI, of TUM RGB-D, or of KITTI's
+            odometry (``sequences/00``).
         start: Where to begin; the run's clock and stamps count from there.
         end: Where to end, on the recording's own time; 0 for its end.
         linger: How long the run goes on after the last event, so that others can react; 0 if the
@@ -205,7 +218,11 @@ class ReplayConfig(NodeConfig):
             evaluations.
         skip: Types and sources left out.
         memory: Bytes that may be read ahead.
-        topics: Topics read from a ROS bag, and their use.
+        topics: Topics read from a ROS bag, and their use; if empty, one stream a camera, IMUs and
+            the first odometry, as the log says.
+        calibration: Files of Kalibr's (``["camchain-imucam.yaml", "imu.yaml"]``) in the place of
+            what a bag or a data set in EuRoC's layout says of cameras and IMU. A bag's cameras are
+            found by ``rostopic``, a data set's by their names.
         vehicle: Source of a data set's true poses; its cameras are below it. If empty, the node's
             name.
         camera: Intrinsics of a data set in TUM's layout, if it has no camera.yaml.
@@ -223,6 +240,7 @@ class ReplayConfig(NodeConfig):
     skip: tuple[str, ...] = ()
     memory: Annotated[int, msgspec.Meta(ge=1 << 20)] = 128 << 20
     topics: tuple[BagTopic, ...] = ()
+    calibration: tuple[InputPath, ...] = ()
     vehicle: str = ""
     camera: Pinhole | None = None
     depth_factor: Annotated[float, msgspec.Meta(gt=0)] = 5000.0

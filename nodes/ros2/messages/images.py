@@ -14,6 +14,7 @@ for no depth.
 from __future__ import annotations
 
 import struct
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import cv2
@@ -61,6 +62,16 @@ _TURNS = {
     "rgba8": cv2.COLOR_RGBA2RGB,
     "bgra8": cv2.COLOR_BGRA2RGB,
 }
+_MOSAICS = {
+    "rggb": cv2.COLOR_BayerRGGB2RGB,
+    "bggr": cv2.COLOR_BayerBGGR2RGB,
+    "gbrg": cv2.COLOR_BayerGBRG2RGB,
+    "grbg": cv2.COLOR_BayerGRBG2RGB,
+}
+"""Conversions of Bayer's patterns, by the colours of the first two rows' first two pixels."""
+_SIXTEEN_BITS = {"mono16", "rgb16", "bgr16", *(f"bayer_{pattern}16" for pattern in _MOSAICS)}
+DEPTH_ENCODINGS = ("32FC1", "16UC1")
+COLOUR_ENCODINGS = (*_PIXEL_BYTES, *(f"bayer_{pattern}8" for pattern in _MOSAICS), *_SIXTEEN_BITS)
 
 
 class ImageWriter:
@@ -136,16 +147,42 @@ def cloud(
 
 
 def image_pixels(message: Any) -> npt.NDArray[np.uint8]:
-    """Return an Image's pixels, RGB (height, width, 3) or grey; may raise `ValueError`."""
-    channels = _PIXEL_BYTES.get(message.encoding)
-    if channels is None:
+    """Return an Image's pixels, RGB (height, width, 3) or grey; may raise `ValueError`.
+
+    Bayer's patterns are demosaiced (bilinearly, by OpenCV). Of 16 bits the high byte is taken.
+    """
+    encoding = str(message.encoding)
+    if encoding not in COLOUR_ENCODINGS:
         raise ValueError(
-            f"encoding: expected one of {', '.join(_PIXEL_BYTES)}, found {message.encoding!r:.80}"
+            f"encoding: expected one of {', '.join(sorted(COLOUR_ENCODINGS))}, "
+            f"found {encoding!r:.80}"
         )
+    if encoding in _SIXTEEN_BITS:
+        message = _high_bytes(message)
+        encoding = f"{encoding[:-2]}8"
+    if encoding.startswith("bayer_"):
+        mosaic = np.ascontiguousarray(_rows(message, 1))
+        return np.asarray(cv2.cvtColor(mosaic, _MOSAICS[encoding[6:10]]), np.uint8)
+    channels = _PIXEL_BYTES[encoding]
     pixels = _rows(message, channels).reshape(message.height, message.width, channels)
-    turn = _TURNS.get(message.encoding)
+    turn = _TURNS.get(encoding)
     found: npt.NDArray[Any] = pixels[:, :, 0] if channels == 1 else np.ascontiguousarray(pixels)
     return found if turn is None else np.asarray(cv2.cvtColor(pixels, turn), np.uint8)
+
+
+def high_byte(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    """Return the high byte of an image of 16 bits; one of 8 bits as it is."""
+    return (pixels >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels
+
+
+def _high_bytes(message: Any) -> Any:
+    """Return an Image of 16 bits a channel as one of 8."""
+    channels = 3 if message.encoding in {"rgb16", "bgr16"} else 1
+    rows = _rows(message, 2 * channels)
+    data = np.ascontiguousarray(rows[:, 0 if message.is_bigendian else 1 :: 2])
+    return SimpleNamespace(
+        height=message.height, width=message.width, step=data.shape[1], data=data.ravel()
+    )
 
 
 def depth_pixels(message: Any) -> npt.NDArray[np.float32]:
@@ -156,14 +193,19 @@ def depth_pixels(message: Any) -> npt.NDArray[np.float32]:
     Raises:
         ValueError: The encoding is another, or sizes do not fit each other.
     """
-    size = {"32FC1": 4, "16UC1": 2}.get(message.encoding)
-    if size is None:
+    if message.encoding not in DEPTH_ENCODINGS:
         raise ValueError(f"encoding: expected 32FC1 or 16UC1, found {message.encoding!r:.80}")
+    size = 4 if message.encoding == "32FC1" else 2
     order = ">" if message.is_bigendian else "<"
     rows = np.ascontiguousarray(_rows(message, size)).view(
         f"{order}{'f' if size == 4 else 'u'}{size}"
     )
-    metres = rows.astype(np.float32) * np.float32(1.0 if size == 4 else 0.001)
+    return known_depth(rows, 1.0 if size == 4 else 0.001)
+
+
+def known_depth(steps: npt.NDArray[Any], metres_per_step: float) -> npt.NDArray[np.float32]:
+    """Return depth in metres; ``inf`` where it is not above 0."""
+    metres = steps.astype(np.float32) * np.float32(metres_per_step)
     metres[~(metres > 0.0)] = np.inf
     return metres
 

@@ -43,7 +43,13 @@ from events.frames import (
     normalize,
     yaw_of,
 )
-from nodes.ros2.messages.images import decode_compressed, depth_pixels, image_pixels
+from nodes.ros2.messages.images import (
+    decode_compressed,
+    depth_pixels,
+    high_byte,
+    image_pixels,
+    known_depth,
+)
 from nodes.ros2.messages.typestore import Stamps
 
 E = TypeVar("E", bound=Event)
@@ -201,7 +207,7 @@ def fix(message: Any, context: MessageContext) -> Event:
 def image(message: Any, context: MessageContext) -> Event:
     """Read an Image or a CompressedImage as a colour or grey image."""
     raw = hasattr(message, "encoding")
-    pixels = image_pixels(message) if raw else decode_compressed(message)
+    pixels = image_pixels(message) if raw else high_byte(decode_compressed(message))
     encoding, frame_id = "rgb8" if pixels.ndim == 3 else "mono8", context.frame(message.header, "")
     return context.event(Image, message.header, frame_id=frame_id, encoding=encoding, data=pixels)
 
@@ -210,6 +216,12 @@ def depth(message: Any, context: MessageContext) -> Event:
     """Read an Image or a CompressedImage as depth."""
     raw = hasattr(message, "encoding")
     metres = depth_pixels(message) if raw else decode_compressed(message)
+    if metres.dtype == np.uint16:  # millimetres as an ordinary PNG
+        metres = known_depth(metres, 0.001)
+    if metres.dtype != np.float32 or metres.ndim != 2:
+        raise ValueError(
+            f"expected depth in 16 bits or metres, found {metres.dtype} {metres.shape}"
+        )
     frame_id = context.frame(message.header, "")
     return context.event(DepthImage, message.header, frame_id=frame_id, data=metres)
 

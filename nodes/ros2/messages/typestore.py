@@ -219,10 +219,20 @@ class Bag:
         try:
             found = self._reader.messages(chosen, start, stop)
             for connection, time, data in deque(found, maxlen=1) if newest else found:
-                message = self._reader.deserialize(data, connection.msgtype)
-                yield connection.topic, connection.msgtype, time, message
+                yield connection.topic, connection.msgtype, time, self._message(connection, data)
+        except MessageError:
+            raise
         except self._errors as error:
             raise ValueError(f"{self._path}: expected a readable bag, found: {error}") from error
+
+    def _message(self, connection: Any, data: bytes) -> Any:
+        try:
+            return self._reader.deserialize(data, connection.msgtype)
+        except self._errors as error:
+            raise MessageError(
+                f"{self._path}: {connection.topic}: expected a readable {connection.msgtype}, "
+                f"found: {error}"
+            ) from error
 
     def close(self) -> None:
         """Close the bag."""

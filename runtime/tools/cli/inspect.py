@@ -267,6 +267,45 @@ def settings() -> None:
         console.print(tree, highlight=False)
 
 
+def import_(
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="AirSim's settings.json, or Kalibr's camchain.yaml and imu.yaml."),
+    ],
+    world: Annotated[
+        str | None, typer.Option(help="World to fly in: a name, or an MJCF file.")
+    ] = None,
+) -> None:
+    """Print another program's settings or calibration as an equivalent TOML file.
+
+    AirSim's settings.json becomes its vehicles with their sensors; Kalibr's chain of cameras, with
+    the file of its IMU after it, a vehicle that carries the rig. What is not honoured is a warning
+    on standard error, and a comment at the top of the file.
+    """
+    import tomli_w
+
+    from runtime.config.reading import text_of
+    from runtime.errors import ConfigError
+    from runtime.extras import CONFIGURATIONS, offers
+
+    kinds = {offer.name: offer for offer in reversed(offers(CONFIGURATIONS))}
+    suffixes = {path.suffix.lower().lstrip(".") for path in files}
+    names = " and ".join(path.name for path in files)
+    if len(suffixes) > 1 or not suffixes <= kinds.keys():
+        known = ", ".join(f".{kind}" for kind in kinds)
+        raise ConfigError(f"import: expected files of one kind ({known}), found {names}")
+    read = kinds[suffixes.pop()].load()
+    warnings: list[str] = []
+    given = {} if world is None else {"world": world}
+    text = "\n".join(text_of(path) for path in files)
+    table = read(text, names, warnings.append, **given)
+    for line in warnings:
+        warn(line)
+    print(f"# Made from {names} by `python -m runtime import`.")
+    print("".join(f"# {line}\n" for line in warnings))
+    print(tomli_w.dumps(table, multiline_strings=True), end="")
+
+
 def schema(
     out: Annotated[
         Path | None, typer.Option(help="File to write; it is printed if not given.")

@@ -41,9 +41,7 @@ def test_what_import_prints_is_toml_that_says_where_it_is_from(tmp_path: Path) -
     assert done.returncode == 0, done.stderr
     assert "warning: settings.json: line 1, column 21: AirSim itself refuses" in done.stderr
     assert "warning: settings.json: ViewMode: ignored: it changes only" in done.stderr
-    assert done.stdout.startswith(
-        "# Made from AirSim's settings.json by `python -m runtime import`"
-    )
+    assert done.stdout.startswith("# Made from settings.json by `python -m runtime import`")
     assert (
         "\n# settings.json: ViewMode: ignored: it changes only what Unreal shows\n" in done.stdout
     )

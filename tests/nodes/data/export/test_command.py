@@ -36,7 +36,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_it_prints_what_it_wrote(run: Path) -> None:
-    out = run / "export"
+    out = run / "export" / "tum"
     assert call(str(run), "--format", "tum") == [str(out / "truth.tum"), str(out / "vo.tum")]
     other = run / "other" / "place"
     names = ["vo.truth.kitti.txt", "vo.kitti.txt"]

@@ -76,4 +76,4 @@ def test_a_recording_without_measurements_gives_no_files(tmp_path: Path) -> None
     record(tmp_path / "recording.mcap", [])
     with pytest.raises(ValueError, match="expected measurements of small sensors, found none"):
         export_measurements(tmp_path)
-    assert not list((tmp_path / "export").iterdir())
+    assert not list((tmp_path / "export" / "csv").iterdir())

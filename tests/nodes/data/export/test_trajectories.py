@@ -63,7 +63,39 @@ def test_every_format_has_its_files(run: Path, tmp_path: Path) -> None:
         ],
     }
     assert all(path.is_file() for paths in written.values() for path in paths)
-    assert all(p.parent == run / "export" for p in export_trajectories(run, "tum"))
+    for form in written:
+        paths = export_trajectories(run, form)
+        assert {path.parent for path in paths} == {run / "export" / form}
+
+
+def rmse(truth: Trajectory, estimate: Trajectory) -> float:
+    true, said = associate(truth, estimate)
+    return absolute_errors(true, align(said, true, "se3").trajectory)["ate_rmse_m"]
+
+
+def test_one_formats_estimate_is_not_replaced_by_anothers(run: Path) -> None:
+    """Both turn the world another way, so that an estimate is only right beside its own truth."""
+    truths, estimates = load(run)
+    expected = rmse(truths["truth"], estimates["vo"])
+    for form in ("tum", "euroc"):
+        export_trajectories(run, form)
+    tum, euroc = run / "export" / "tum", run / "export" / "euroc"
+    true, said = read_tum(tum / "truth.tum"), read_tum(tum / "vo.tum")
+    assert rmse(true, said) == pytest.approx(expected, abs=1e-8)
+    true, said = read_euroc(euroc / "truth.csv"), read_tum(euroc / "vo.tum")
+    assert rmse(true, said) == pytest.approx(expected, abs=1e-8)
+
+
+def test_a_file_of_another_format_is_never_overwritten(run: Path, tmp_path: Path) -> None:
+    """An export in the same format is."""
+    out = tmp_path / "mine"
+    for _ in range(2):
+        export_trajectories(run, "tum", out)
+    before = (out / "vo.tum").read_bytes()
+    with pytest.raises(ValueError, match=r"slam\.tum: expected no file, .*\(--out\)"):
+        export_trajectories(run, "euroc", out)
+    assert (out / "vo.tum").read_bytes() == before
+    assert not list(out.glob("*.csv"))
 
 
 NWU = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -92,10 +124,10 @@ def test_poses_stay_where_they_were_and_stamps_are_of_the_epoch(
             if form == "tum" or name != "truth":
                 files[f"{name}.tum"] = read_tum
             for file, read in files.items():
-                found = read(out / file)
+                found = read(out / form / file)
                 assert (found.stamps == expected.stamps + zero).all()
                 assert abs(found.matrices() - world @ expected.matrices()).max() < 1e-9
-                assert f"time 0 is {zero} ns" in (out / file).read_text()
+                assert f"time 0 is {zero} ns" in (out / form / file).read_text()
 
 
 @pytest.mark.parametrize("epoch", ["yesterday", "1969-12-31", "2263-01-01", -1, 1 << 63, "１２x"])
@@ -116,8 +148,8 @@ def test_kittis_poses_are_the_left_cameras_from_identity_line_by_line(run: Path)
     ):
         (run / "summary.json").write_text(json.dumps({"announcements": announced}))
         export_trajectories(run, "kitti")
-        true = read_kitti(run / "export" / "slam.truth.kitti.txt")
-        said = read_kitti(run / "export" / "slam.kitti.txt")
+        true = read_kitti(run / "export" / "kitti" / "slam.truth.kitti.txt")
+        said = read_kitti(run / "export" / "kitti" / "slam.kitti.txt")
         for found, body in ((true, truth.at(estimates["slam"].stamps)), (said, estimates["slam"])):
             poses = body.matrices() @ mounted
             assert abs(found[0] - np.eye(4)).max() < 1e-9
@@ -192,10 +224,10 @@ def test_evos_commands_take_the_files_as_they_are_and_find_our_figures(run: Path
     }
     pairs = ["--delta", "1", "--delta_unit", "m", "--all_pairs", "--pairs_from_reference"]
     for form, names in files.items():
-        found = evo(run / "export", "ape", form, *names, "--align")
+        found = evo(run / "export" / form, "ape", form, *names, "--align")
         assert found["rmse"] == pytest.approx(ape["ate_rmse_m"], abs=2e-6)  # it prints six decimals
         assert found["max"] == pytest.approx(ape["ate_max_m"], abs=2e-6)
-        found = evo(run / "export", "rpe", form, *names, *pairs)
+        found = evo(run / "export" / form, "rpe", form, *names, *pairs)
         assert found["rmse"] * 100 == pytest.approx(rpe["rpe_1m_trans_percent"], abs=2e-4)
 
 
@@ -215,7 +247,7 @@ def test_of_several_vehicles_each_estimate_goes_with_its_own(run: Path) -> None:
     export_trajectories(run, "kitti")
     for name, true in (("vo", second), ("slam", truths["truth"])):
         there = true.at(estimates[name].stamps).matrices() @ OPTICAL
-        found = read_kitti(run / "export" / f"{name}.truth.kitti.txt")
+        found = read_kitti(run / "export" / "kitti" / f"{name}.truth.kitti.txt")
         assert abs(there[0] @ found - there).max() < 1e-9
 
 
@@ -225,6 +257,7 @@ def test_evo_reads_an_estimate_in_a_frame_of_its_own(run: Path) -> None:
     truths, estimates = load(run)
     truth = truths["truth"]
     true, said = associate(truth, estimates["slam"])
-    found = evo(run / "export", "ape", "kitti", "slam.truth.kitti.txt", "slam.kitti.txt", "--align")
+    files = ["slam.truth.kitti.txt", "slam.kitti.txt"]
+    found = evo(run / "export" / "kitti", "ape", "kitti", *files, "--align")
     ours = absolute_errors(true, align(said, true, "se3").trajectory)
     assert found["rmse"] == pytest.approx(ours["ate_rmse_m"], abs=2e-6)

@@ -6,6 +6,7 @@ would have taken them, with their lenses, at less resolution.
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,37 @@ def euroc(folder: Path) -> Path:
     (folder / "mav0" / "state_groundtruth_estimate0").mkdir()
     truth = Trajectory.from_matrices(np.array(stamps()), bodies)
     write_euroc(folder / "mav0" / "state_groundtruth_estimate0" / "data.csv", truth)
+    return folder
+
+
+def tum_vi(folder: Path) -> Path:
+    """Write the sequence of `euroc` in TUM VI's layout: 16 bits, mocap0, and Kalibr's chain."""
+    root = euroc(folder) / "mav0"
+    chain = ""
+    for number, (lens, turn, place) in enumerate(MOUNTS):
+        camera = root / f"cam{number}"
+        (camera / "sensor.yaml").unlink()
+        for path in (camera / "data").iterdir():
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            assert image is not None
+            cv2.imwrite(str(path), image.astype(np.uint16) << 8)
+        from_imu = np.eye(4)
+        from_imu[:3, :3] = turn.as_matrix().T
+        from_imu[:3, 3] = -from_imu[:3, :3] @ place
+        rows = "".join(f"  - {row}\n" for row in from_imu.tolist())
+        chain += (
+            f"cam{number}:\n  T_cam_imu:\n{rows}  camera_model: pinhole\n"
+            f"  distortion_coeffs: {list(lens.distortion[:4])}\n  distortion_model: radtan\n"
+            f"  intrinsics: {[lens.fx, lens.fy, lens.cx, lens.cy]}\n"
+            f"  resolution: {[lens.width, lens.height]}\n  rostopic: /cam{number}/image_raw\n"
+        )
+    (folder / "dso").mkdir()
+    (folder / "dso" / "camchain.yaml").write_text(chain)
+    truth = (root / "state_groundtruth_estimate0" / "data.csv").read_text().splitlines()
+    rows = "\n".join(",".join(row.split(",")[:8]) for row in truth)
+    (root / "mocap0").mkdir()
+    (root / "mocap0" / "data.csv").write_text(f"{rows}\n")
+    shutil.rmtree(root / "state_groundtruth_estimate0")
     return folder
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from events import Image, LidarScan, PointCloud
+from events import DepthImage, Image, LidarScan, PointCloud
 from nodes.ros2.messages import incoming, outgoing
 from nodes.ros2.messages.images import ImageWriter, depth_pixels, image_pixels
 from nodes.ros2.messages.incoming import MessageContext
@@ -183,6 +184,55 @@ def test_rows_may_be_filled_up() -> None:
     np.testing.assert_array_equal(
         image_pixels(message), np.arange(36).reshape(3, 4, 3)[:, :3, ::-1]
     )
+
+
+@pytest.mark.parametrize(
+    ("pattern", "colours"),
+    [("rggb", "RGGB"), ("bggr", "BGGR"), ("gbrg", "GBRG"), ("grbg", "GRBG")],
+)
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_bayer_pattern_becomes_the_colour_that_it_is_of(
+    pattern: str, colours: str, bits: int
+) -> None:
+    """The name says the first two rows' first pixels (sensor_msgs/image_encodings.hpp)."""
+    levels = {"R": 200, "G": 100, "B": 50}
+    cell = np.reshape([levels[each] for each in colours], (2, 2))
+    kind = np.uint16 if bits == 16 else np.uint8
+    mosaic = (np.tile(cell, (4, 5)) * (257 if bits == 16 else 1)).astype(kind)
+    found = image_pixels(parsed(f"bayer_{pattern}{bits}", mosaic))
+    assert found.shape == (8, 10, 3)
+    assert (found[2:-2, 2:-2] == (200, 100, 50)).all()
+
+
+@pytest.mark.parametrize("big", [0, 1])
+def test_of_sixteen_bits_the_high_byte_is_the_image(big: int) -> None:
+    steps = np.array([[0, 255, 256], [0x1234, 0xFF00, 0xFFFF]], ">u2" if big else "<u2")
+    expected = [[0, 0, 1], [0x12, 0xFF, 0xFF]]
+    message = parsed("mono16", steps.view(np.uint8))
+    message.width, message.is_bigendian = 3, big
+    np.testing.assert_array_equal(image_pixels(message), expected)
+    colours = np.repeat(steps[..., None], 3, axis=2) & np.array([0xFFFF, 0, 0], steps.dtype)
+    message = parsed("bgr16", colours.astype(steps.dtype).view(np.uint8).reshape(2, -1))
+    message.width, message.is_bigendian = 3, big
+    blue = image_pixels(message)
+    np.testing.assert_array_equal(blue[..., 2], expected)
+    assert not blue[..., :2].any()
+
+
+def test_a_compressed_image_of_sixteen_bits_is_grey_or_millimetres() -> None:
+    steps = np.array([[0, 1500], [0x1234, 0xFFFF]], np.uint16)
+    code = cv2.imencode(".png", steps)[1].ravel()
+    header = SimpleNamespace(frame_id="c", stamp=SimpleNamespace(sec=1, nanosec=0))
+    message = SimpleNamespace(header=header, format="16UC1; png compressed", data=code)
+    grey = incoming.image(message, CONTEXT)
+    assert isinstance(grey, Image)
+    np.testing.assert_array_equal(grey.data, [[0, 5], [0x12, 0xFF]])
+    depth = incoming.depth(message, CONTEXT)
+    assert isinstance(depth, DepthImage)
+    np.testing.assert_allclose(depth.data, [[np.inf, 1.5], [4.66, 65.535]])
+    message.data = cv2.imencode(".png", np.zeros((2, 2, 3), np.uint8))[1].ravel()
+    with pytest.raises(ValueError, match=r"expected depth in 16 bits or metres, found uint8"):
+        incoming.depth(message, CONTEXT)
 
 
 def test_depth_comes_in_metres_and_what_is_unknown_is_infinite() -> None:
