@@ -203,6 +203,7 @@ class Replay(Node[ReplayConfig]):
     """
 
     ends_run = "plan"
+    relays_estimates = True
 
     events = Output(Event)
 
