@@ -60,7 +60,9 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
             whose `reads_truth` says what for; an estimator in any case.
         truth_relays: Those that received true poses and passed on estimates of programs outside.
         owners: Nodes by the sources that they announced.
-        read: Cameras and lidars whose images and scans each node of this process received.
+        estimators: Nodes that announced an estimator or sent estimates; see
+            `Node.relays_estimates`.
+        read: Cameras and lidars whose images and scans each of those in this process received.
     """
 
     stamp: int
@@ -73,6 +75,7 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
     truth_readers: frozenset[str] = frozenset()
     truth_relays: frozenset[str] = frozenset()
     owners: dict[str, str] = {}
+    estimators: frozenset[str] = frozenset()
     read: dict[str, frozenset[str]] = {}
 
 

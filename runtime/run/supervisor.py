@@ -134,6 +134,7 @@ class Supervisor:
         state.reason = reason
         state.error = error
         state.stopped, state.stopped_at = time.monotonic(), state.clock.now()
+        estimators = state.estimators()
         state.run_end = RunEnd(
             stamp=state.stopped_at,
             reason=reason,
@@ -145,7 +146,8 @@ class Supervisor:
             truth_readers=frozenset(state.truth_readers()),
             truth_relays=frozenset(self._truth_relays()),
             owners=dict(state.owners),
-            read={node: frozenset(sources) for node, sources in state.sensors_read.items()},
+            estimators=frozenset(estimators),
+            read={n: frozenset(s) for n, s in state.sensors_read.items() if n in estimators},
         )
         if error is not None or state.stop_requested:
             state.clock.hurry()
