@@ -135,6 +135,22 @@ def test_every_image_without_a_pose_for_longer_than_the_gap_is_in_a_lost_interva
     assert 0.0 <= coverage.percent <= 100.0
 
 
+@given(flights(), st.lists(st.integers(0, 40 * 900 * MS), max_size=60, unique=True))
+def test_each_pose_answers_the_nearest_image_and_no_other(
+    flight: tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]], said: list[int]
+) -> None:
+    frames, poses = flight[0], np.array(sorted(said), np.int64)
+    has_pose = answered(frames, poses)
+    period = int(np.median(np.diff(frames))) if len(frames) > 1 else 0
+    expected = set()
+    for pose in poses.tolist():
+        nearest = int(np.argmin(abs(frames - pose)))  # the first of two
+        if 2 * abs(int(frames[nearest]) - pose) <= period:
+            expected.add(nearest)
+    assert {*np.flatnonzero(has_pose).tolist()} == expected
+    assert has_pose.sum() <= len(poses)
+
+
 @pytest.mark.slow
 @given(flights(), st.data())
 def test_saying_less_never_looks_better(
