@@ -373,6 +373,8 @@ class EstimatorAnnouncement(Announcement):
         rectifies: Whether images of other lenses are first rectified to a pinhole camera.
         vehicle: Name of the estimated vehicle, where neither `source` nor the camera followed
             says so.
+        cameras: Sources of the cameras or lidars that it reads, as far as they are known when it is
+            announced: those named in the file.
     """
 
     method: str
@@ -382,6 +384,7 @@ class EstimatorAnnouncement(Announcement):
     lenses: tuple[str, ...] = ()
     rectifies: bool = False
     vehicle: str = ""
+    cameras: tuple[str, ...] = ()
 
 
 class Vehicles:

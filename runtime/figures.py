@@ -6,6 +6,7 @@ figure that is not in it is shown all the same, by its name, among all others.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import msgspec
@@ -20,6 +21,8 @@ class Figure(msgspec.Struct, frozen=True):
         default: The threshold where the file gives none.
         optional: Whether a threshold is not missed where there is no figure: not everybody sends
             velocities, and nobody who never restarts counts how often.
+        if_known: Whether the same holds as long as the threshold is the default: a flight of less
+            than a metre has no error over one.
         all_or_none: Percentage required as soon as there is any: of values sent with some of the
             poses only, somebody may have chosen with which.
         report: ``head`` and ``main`` stand at the top of a report, in this order.
@@ -35,6 +38,7 @@ class Figure(msgspec.Struct, frozen=True):
     default: float | None = None
     counts: bool = False
     optional: bool = False
+    if_known: bool = False
     all_or_none: float | None = None
     report: Literal["head", "main", ""] = "main"
     sweep: int = 0
@@ -65,15 +69,26 @@ class Figure(msgspec.Struct, frozen=True):
         return f"{self.meaning[0].upper()}{self.meaning[1:]}{unit}, at {self.limit}."
 
     def missed(self, limit: float | None, value: Any) -> str:
-        """Return a sentence if a value does not meet a threshold, or else nothing."""
+        """Return a sentence if a value does not meet a threshold, or else nothing.
+
+        Args:
+            limit: `None` or an infinite one for none.
+        """
         if limit is None and value is not None:
             limit = self.all_or_none
-        if limit is None or (value is None and self.optional):
+        if limit is None or is_off(limit):
+            return ""
+        if value is None and (self.optional or (self.if_known and limit == self.default)):
             return ""
         found = "none" if value is None else f"{value:.4g}"
         if value is not None and (value >= limit if self.limit == "least" else value <= limit):
             return ""
         return f"{self.name}: expected at {self.limit} {limit:g}, found {found}"
+
+
+def is_off(limit: float | None) -> bool:
+    """Return whether a threshold is infinite, which switches a default off."""
+    return limit is not None and math.isinf(limit)
 
 
 _OF_ORIENTATION = (
@@ -160,8 +175,11 @@ _TABLE = (
     Figure("final_flight_ate_percent", "the same over the whole flight", report="head"),
     _detail("why_not_final", "why the trajectory after loop closures was not judged"),
     _error("ate_max_m", "greatest position error"),
-    _error("rot_rmse_deg", "rotation error, RMS"),
-    _error("rpe_1m_trans_percent", "relative pose error (RPE) over 1 m, position, RMS", sweep=4),
+    _error("rot_rmse_deg", "rotation error, RMS", default=15.0, if_known=True),
+    _error(
+        "rpe_1m_trans_percent", "relative pose error (RPE) over 1 m, position, RMS", default=75.0,
+        if_known=True, sweep=4,
+    ),
     _error("rpe_1m_rot_deg_per_m", "relative pose error (RPE) over 1 m, rotation, RMS", sweep=5),
     *_segments(),
     _detail("rpe_frame_trans_m", "RPE from each pose to the next, position, RMS"),
@@ -182,8 +200,14 @@ _TABLE = (
     Figure("newest_pose_rot_rmse_deg", "rotation error of the same, RMS"),
     _error("newest_pose_age_ms", "age of the newest pose at control ticks, mean", report=""),
     _error("velocity_rmse_m_per_s", "velocity error, RMS", optional=True),
+    _error(
+        "velocity_error_percent", "velocity error in percent of the true speed", default=75.0,
+        optional=True,
+    ),
     Figure("heading_rmse_deg", "heading error, RMS"),
-    _error("nees_position", "NEES of the position, 3 if consistent", optional=True),
+    _error(
+        "nees_position", "NEES of the position, 3 if consistent", default=1000.0, optional=True
+    ),
     Figure("nees_pose", "NEES of the pose, 6 if consistent"),
     _detail("nees_position_inside_percent", "share of the positions within 95 % bounds of NEES"),
     _detail("nees_pose_inside_percent", "share of the poses within 95 % bounds of NEES"),
@@ -203,19 +227,31 @@ _TABLE = (
     _share("velocities_percent", "share of the poses with a velocity", all_or_none=95.0),
     _share("covariances_percent", "share of the poses with a covariance", all_or_none=95.0),
     _count("covariance_invalid", "covariances that are not symmetric and positive definite"),
+    _error(
+        "covariance_too_large_percent", "share of the covariances too large to say anything",
+        default=5.0, optional=True,
+    ),
     _count("restarts", "times that it began anew, in a frame of its own or as a node", sweep=8),
     _count("repeated_stamps", "poses whose stamp was not later than the one before"),
     _count("future_stamps", "poses and losses of a time that had not come"),
     _count("not_causal", "poses so late that later images may be in them", None),
+    _error("not_causal_percent", "share of such poses", default=5.0, optional=True),
+    _detail("camera", "camera or lidar whose images or scans were to be answered"),
+    _share(
+        "stamped_at_images_percent", "share of the answered images with a pose at their stamp",
+        default=90.0, optional=True,
+    ),
     _count("other_bodies", "poses of another body than the truth's"),
     _error(
         "early_end_seconds", "time that the run ended before its plan", default=0.0, optional=True
     ),
     Figure("ended_by", "who ended the run"),
+    Figure("commands", "what it has ordered a vehicle to do"),
     Figure("reads_truth", "whether it reads the truth"),
     _count("collisions", "collisions of the vehicle", of_flight=True),
     Figure("rate_hz", "estimates a second"),
     _detail("time_offset_ms", "what added to its stamps would make it fit best"),
+    _detail("orientations", "whether they are the same body's, as far as positions tell"),
     _detail("body_rotation_deg", "constant turn of its body against the truth's"),
     _detail("body_rotation_spread_deg", "rotations beside that turn, RMS"),
     _detail("why_no_rotations", "why figures of rotations and relative errors are left out"),

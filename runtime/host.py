@@ -57,7 +57,12 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
         duration: Seconds that the run was to take; `None` if the file does not say.
         restarts: How often each node of this process was brought up anew.
         truth_readers: Nodes of this process that received true poses, but those that fly, and those
-            whose `reads_truth` says what for.
+            whose `reads_truth` says what for; an estimator in any case.
+        truth_relays: Those that received true poses and passed on estimates of programs outside.
+        owners: Nodes by the sources that they announced.
+        estimators: Nodes that announced an estimator or sent estimates; see
+            `Node.relays_estimates`.
+        read: Cameras and lidars whose images and scans each of those in this process received.
     """
 
     stamp: int
@@ -68,6 +73,10 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
     duration: float | None = None
     restarts: dict[str, int]
     truth_readers: frozenset[str] = frozenset()
+    truth_relays: frozenset[str] = frozenset()
+    owners: dict[str, str] = {}
+    estimators: frozenset[str] = frozenset()
+    read: dict[str, frozenset[str]] = {}
 
 
 class Host:

@@ -102,7 +102,12 @@ class Node(Generic[C]):
     """
     reads_truth: ClassVar[str] = ""
     """Purpose of receiving true poses, if not flying or estimating: ``judging``, ``recording``,
-    ``showing``. All others that do are named in the summary.
+    ``showing``. All others that do are named in the summary, and every estimator.
+    """
+    relays_estimates: ClassVar[bool] = False
+    """Whether the estimates that it sends are made by others: by programs behind a bridge, or in a
+    recording. Any other node that announces an estimator, or sends estimates, is one, whatever its
+    `flies`, `ends_run` and `reads_truth` say. Of nodes outside of this project it is ignored.
     """
     doing: str = ""
     """Slow work of the moment, in words, such as "building the world hall". A node that sets it

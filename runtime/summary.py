@@ -276,7 +276,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
             announcements (`runtime.run.summarise.inputs`). `None` if digests are off.
         inputs: Fingerprint of each output and announcement that counts to the inputs.
         not_deterministic: Nodes because of which equal runs may have unequal digests.
-        truth_readers: Nodes that received true poses, but those that fly, judge, record or show.
+        truth_readers: Nodes that received true poses: estimators, and all others but those that
+            fly, judge, record or show.
         environment: Machine and versions; the command line, and the commit of the current folder.
         processes: Where which nodes ran, if not all in one process.
         workers: Costs of workers, by ``node.Factory``, and of programs, by their nodes.

@@ -213,6 +213,7 @@ class Estimator(Node[C], ABC):
             eyes=self.eyes,
             lenses=tuple(sorted(self.lenses)),
             rectifies=self.config.rectify and "lidar" not in self.needs,
+            cameras=self._choice.named_cameras(),
         )
 
     def on_announcement(self, announcement: Announcement) -> None:

@@ -63,6 +63,10 @@ class SensorChoice:
         self._imus: list[ImuAnnouncement] = []
         self._refusals: dict[str, str] = {}
 
+    def named_cameras(self) -> tuple[str, ...]:
+        """Return the cameras or the lidar named in the file, the left one first."""
+        return tuple(filter(None, (self._first, self._second)))
+
     def announced(self, announcement: Announcement) -> None:
         """Add a camera, an IMU or a lidar; choose if now possible."""
         if isinstance(announcement, ImuAnnouncement):

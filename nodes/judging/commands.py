@@ -65,8 +65,8 @@ def judge(
     ahead in KITTI files (optical); enu is ENU and FLU. --axes sets the axes of other files. If
     estimates are of a camera, --body-from-camera is its optical frame in the truth's body: "tx ty
     tz qx qy qz qw", a TUM file with one pose, or a camera of the truth's run. Exit codes: 0; 1 if a
-    threshold is missed (by default also: poses for 90 % of the flight); 2 if an input cannot be
-    read.
+    threshold is missed (by default also: poses for 90 % of the flight, orientations within 15°,
+    motions over a metre within 75 %; NAME=inf is none); 2 if an input cannot be read.
     """
     from rich.console import Console
 

@@ -99,6 +99,7 @@ class Mavlink(VehicleController[MavlinkConfig]):
     deterministic = False
     flies = True
     ends_run = "hand"
+    relays_estimates = True
     setpoints = Output(Setpoint)
     estimates = Output(PoseEstimate, when="vision")
 

@@ -11,7 +11,20 @@ import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from events import Announcement, CameraAnnouncement, Odometry, PoseStamped, VehicleAnnouncement
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    Event,
+    Image,
+    LidarAnnouncement,
+    LidarScan,
+    Odometry,
+    PoseEstimate,
+    PoseStamped,
+    TrajectoryEstimate,
+    VehicleAnnouncement,
+)
 from runtime.channels.sender import Deliver, Link, Listener, Tap, Voices
 from runtime.channels.tasks import Fault
 from runtime.config.model import NodeSpec
@@ -103,21 +116,55 @@ def connect(
     return connected
 
 
-def truth_readers(
-    nodes: Iterable[Node[Any]], listeners: Iterable[Listener], announcements: Iterable[Announcement]
+def truth_receivers(
+    listeners: Iterable[Listener], announcements: Iterable[Announcement]
 ) -> set[str]:
-    """Return the nodes receiving true poses of vehicles or cameras for no declared use."""
+    """Return the nodes that receive true poses of announced vehicles or cameras."""
     truths = [
         (Odometry if isinstance(each, VehicleAnnouncement) else PoseStamped, each.source)
         for each in announcements
         if isinstance(each, VehicleAnnouncement | CameraAnnouncement)
     ]
-    said = {node.name for node in nodes if node.flies or node.reads_truth}
     return {
-        each.node
-        for each in listeners
-        if each.node not in said and any(each.receives(*truth) for truth in truths)
+        listener.node
+        for listener in listeners
+        if any(listener.receives(*truth) for truth in truths)
     } - {"run"}
+
+
+def sensors_read(
+    listeners: Iterable[Listener], announcements: Iterable[Announcement]
+) -> dict[str, set[str]]:
+    """Return the announced cameras and lidars whose images and scans each node receives."""
+    events: dict[type[Announcement], tuple[type[Event], ...]] = {
+        CameraAnnouncement: (Image, DepthImage),
+        LidarAnnouncement: (LidarScan,),
+    }
+    sources = [(kind, a.source) for a in announcements for kind in events.get(type(a), ())]
+    read: dict[str, set[str]] = {}
+    for listener in listeners:
+        for kind, source in sources:
+            # Grey images beside coloured ones have a source of their own, below the camera's.
+            if listener.receives(kind, source) or listener.receives(kind, f"{source}/grey"):
+                read.setdefault(listener.node, set()).add(source)
+    return read
+
+
+_OURS = frozenset({"nodes", "sims"})  # rooms whose bridges and replays are known to make nothing up
+
+
+def relays(cls: type[Node[Any]]) -> bool:
+    """Return whether a node's estimates are those of others; see `Node.relays_estimates`."""
+    return cls.relays_estimates and cls.__module__.partition(".")[0] in _OURS
+
+
+def sends_estimates(node: Node[Any]) -> bool:
+    """Return whether a node has sent an estimated pose or trajectory."""
+    return any(
+        issubclass(event, PoseEstimate | TrajectoryEstimate)
+        for sender in senders(node).values()
+        for event in sender.sent()
+    )
 
 
 def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str, str, str]]:

@@ -25,7 +25,7 @@ from typing import Any
 import msgspec
 from typing_extensions import TypeVar, override
 
-from events import Announcement, ParameterChanged
+from events import Announcement, EstimatorAnnouncement, ParameterChanged
 from runtime.channels.answers import Answers
 from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.sender import Deliver, Link, Sender, Tap
@@ -36,6 +36,7 @@ from runtime.config.parameters import change
 from runtime.errors import ConfigError
 from runtime.host import Host, Sibling
 from runtime.node import Node
+from runtime.run import graph
 from runtime.run.node_runner import Create, NodeRunner
 from runtime.time.clock import SECOND, Clock, Tick, Ticker
 from runtime.workers.process import Costs
@@ -58,6 +59,9 @@ class RunState(Host):
         first_update: When that was, on `time.monotonic`; `None` before.
         stop_requested: Why the end of the run was requested, such as by a signal; the loop may not
             know of it yet.
+        truth_receivers: Nodes that have received true poses, whatever for.
+        sensors_read: Cameras and lidars read by each node; see `graph.sensors_read`.
+        owners: Nodes by the sources that they announced.
         stopped: When the end of the run was asked for, on `time.monotonic`; `None` before.
         interruption: An exception that is to be raised in a node that blocks the loop.
         all_nodes: All nodes there have been, those restarted or dropped included.
@@ -93,7 +97,9 @@ class RunState(Host):
         self.error: Exception | None = None
         self.interruption: Exception | None = None
         self.announcements: list[Announcement] = []
-        self.truth_readers: set[str] = set()
+        self.truth_receivers: set[str] = set()
+        self.sensors_read: dict[str, set[str]] = {}
+        self.owners: dict[str, str] = {}
         self.all_nodes: list[Node[Any]] = []
         self.tickers: dict[str, Ticker] = {}
         self.links: dict[str, Link] = {}
@@ -118,6 +124,21 @@ class RunState(Host):
     def several_processes(self) -> bool:
         """Whether other nodes of the file run in other processes."""
         return len(self.runners) < len(self.config.nodes)
+
+    def estimators(self) -> set[str]:
+        """Return the nodes that have announced an estimator or sent estimates of their own."""
+        estimating = {
+            self.owners.get(announcement.source, "")
+            for announcement in self.announcements
+            if isinstance(announcement, EstimatorAnnouncement)
+        } | {node.name for node in self.all_nodes if graph.sends_estimates(node)}
+        classes = {spec.name: spec.node for spec in self.config.nodes}
+        return {name for name in estimating & classes.keys() if not graph.relays(classes[name])}
+
+    def truth_readers(self) -> set[str]:
+        """Return the nodes that received true poses for no declared use, and all estimators."""
+        declared = {s.name for s in self.config.nodes if s.node.flies or s.node.reads_truth}
+        return self.truth_receivers - (declared - self.estimators())
 
     def note_error(self, error: Exception) -> None:
         """Record an error; the first becomes the error of the run."""

@@ -198,7 +198,7 @@ def summarise(
         ticks=tick_summaries(state),
         stalls=dict(stalls),
         longest_stalls=longest_stalls,
-        truth_readers=sorted(state.truth_readers),
+        truth_readers=sorted(state.truth_readers()),
         announcements=[
             {"type": type(a).__name__, **plain(a, a.source)} for a in state.announcements
         ],

@@ -134,6 +134,7 @@ class Supervisor:
         state.reason = reason
         state.error = error
         state.stopped, state.stopped_at = time.monotonic(), state.clock.now()
+        estimators = state.estimators()
         state.run_end = RunEnd(
             stamp=state.stopped_at,
             reason=reason,
@@ -142,7 +143,11 @@ class Supervisor:
             planned=error is None and self._is_planned(by),
             duration=state.config.run.duration or None,
             restarts={name: max(each.starts - 1, 0) for name, each in state.runners.items()},
-            truth_readers=frozenset(state.truth_readers),
+            truth_readers=frozenset(state.truth_readers()),
+            truth_relays=frozenset(self._truth_relays()),
+            owners=dict(state.owners),
+            estimators=frozenset(estimators),
+            read={n: frozenset(s) for n, s in state.sensors_read.items() if n in estimators},
         )
         if error is not None or state.stop_requested:
             state.clock.hurry()
@@ -160,9 +165,19 @@ class Supervisor:
     def _ends_run(self, name: str) -> str:
         """Return the purpose fulfilled if a node ends the run; see `Node.ends_run`."""
         nodes = {spec.name: spec.node for spec in self.state.config.nodes}
-        if name not in nodes:
+        if name not in nodes or name in self.state.estimators():
             return ""
         return nodes[name].ends_run or ("plan" if nodes[name].flies else "")
+
+    def _truth_relays(self) -> set[str]:
+        """Return the nodes that received the truth and pass on estimates of others."""
+        state = self.state
+        speaking = {node.name for node in state.all_nodes if graph.sends_estimates(node)}
+        for each in state.announcements:
+            if isinstance(each, EstimatorAnnouncement):
+                speaking.add(state.owners.get(each.source, ""))
+        relays = {spec.name for spec in state.config.nodes if graph.relays(spec.node)}
+        return state.truth_receivers & speaking & relays
 
     def escaped(self, error: BaseException) -> None:
         """Handle an exception raised out of the loop by a task or callback."""
@@ -220,9 +235,19 @@ class Supervisor:
             voices=self._voices,
             deaf={runner.spec.name for runner in runners if runner.shutting_down},
         )
-        self.state.truth_readers |= graph.truth_readers(nodes, listeners, self.state.announcements)
+        self._note_inputs(listeners)
         self.others.connect(listeners, self._listener_failed)
         self.state.changes.connect(listeners, taps, self._listener_failed)
+
+    def _note_inputs(self, listeners: list[Listener]) -> None:
+        """Note who receives true poses, and whose images and scans; of restarted nodes, too."""
+        state = self.state
+        for each in state.announcements:
+            if owner := self._voices.owner(each.source):
+                state.owners[each.source] = owner
+        state.truth_receivers |= graph.truth_receivers(listeners, state.announcements)
+        for node, sources in graph.sensors_read(listeners, state.announcements).items():
+            state.sensors_read.setdefault(node, set()).update(sources)
 
     def _reconnect(self) -> None:
         if self.state.running:  # before, nodes must not be able to send
@@ -259,10 +284,11 @@ class Supervisor:
             for tap in self._taps:
                 tap(None, announcement)
         self.connect()
+        readers = state.truth_readers()
         for each in state.announcements:
             node = self._voices.owner(each.source)
             undeclared = isinstance(each, EstimatorAnnouncement) and "truth" not in each.reads
-            if undeclared and node in state.truth_readers:
+            if undeclared and node in readers:
                 log.warning("%s: receives true poses, and does not announce so", node)
         state.running = True
         state.first_update = time.monotonic()

@@ -6,10 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 
-from events import PoseEstimate
-from runtime import Node, Output
+from events import Command, Event, Land, Odometry, PoseEstimate
+from nodes.estimators import TrackingResult
+from nodes.estimators.visual_odometry import VisualOdometry
+from runtime import Node, Output, on
 from tests.runtime.tools.samples_cli import ROOT, command
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -83,3 +87,102 @@ def test_thresholds_that_nobody_meets_are_exit_code_1(tmp_path: Path) -> None:
     verdict = fly(tmp_path, config, code=1)["verdict"]
     assert verdict["passed"] is False
     assert "found none that announced itself" in verdict["estimators"]["evaluation"]["failed"][0]
+
+
+class NeverTurns(VisualOdometry):
+    """Has the orientation of the start in all poses."""
+
+    def publish(self, image: Event, result: TrackingResult, origin: int | None = None) -> None:
+        pose = np.eye(4)
+        pose[:3, 3] = result.pose[:3, 3]
+        super().publish(image, msgspec.structs.replace(result, pose=pose), origin)
+
+
+class StampsItsArrival(VisualOdometry):
+    """Stamps poses when it sends them."""
+
+    def exposed_at(self, image: Event) -> int:
+        return self.clock.now()
+
+
+class SaysToFly(VisualOdometry):
+    """Listens to the truth as a part of the flight."""
+
+    flies = True
+
+    @on(Odometry)
+    def odometry(self, event: Odometry) -> None: ...
+
+
+class Lands(VisualOdometry):
+    """Lands once it has flown for a second, before it gets difficult."""
+
+    flies = True
+    commands = Output(Command)
+
+    async def on_ready(self) -> None:
+        await super().on_ready()
+        self.start(self.land())
+
+    async def land(self) -> None:
+        await self.clock.sleep(3.5)
+        self.commands.send(Land(stamp=self.clock.now(), source=self.name))
+
+
+RIG = """
+[run]
+clock = "lockstep"
+duration = "16s"
+[[nodes]]
+name = "drone"
+type = "Multirotor"
+world = "hall"
+[[nodes.cameras]]
+name = "camera"
+images = ["rgb", "depth"]
+width = 256
+height = 256
+fov = 90
+rate = 20
+latency = "40ms"
+[[nodes]]
+name = "pilot"
+type = "WaypointFollower"
+speed = 1.0
+waypoints = [[0.0, 0.0, -1.5], [4.4, 0.2, -1.5], [6.0, -2.0, -1.7]]
+[[nodes]]
+name = "evaluation"
+type = "Evaluation"
+thresholds = { ate_percent = 2.0, lost_seconds = 0.5 }
+"""
+
+
+def flown(folder: Path, *kinds: type[Node[Any]]) -> dict[str, Any]:
+    """Fly with estimators of these classes beside a good one; return their figures."""
+    file = folder / "zoo.toml"
+    nodes = [("good", "VisualOdometry")] + [(k.__name__, f"{__name__}:{k.__name__}") for k in kinds]
+    file.write_text(RIG + "".join(f'[[nodes]]\nname = "{n}"\ntype = "{t}"\n' for n, t in nodes))
+    estimators: dict[str, Any] = fly(folder, file, code=1)["verdict"]["estimators"]
+    return estimators
+
+
+def test_bad_estimators_fail_beside_a_good_one(tmp_path: Path) -> None:
+    found = flown(tmp_path, NeverTurns, StampsItsArrival, SaysToFly)
+    assert found["good"]["passed"], found["good"]["failed"]
+    assert found["good"]["camera"] == "drone/camera"
+    expected = {
+        "NeverTurns": "rot_rmse_deg: expected at most 15, found",
+        "StampsItsArrival": "stamped_at_images_percent: expected at least 90, found",
+        "SaysToFly": "reads_truth: expected it to announce that it reads the truth",
+    }
+    for name, reason in expected.items():
+        assert found[name]["ate_percent"] < 2.0
+        assert any(text.startswith(reason) for text in found[name]["failed"]), found[name]
+
+
+def test_who_lands_the_vehicle_before_its_pilot_does_fails(tmp_path: Path) -> None:
+    found = flown(tmp_path, Lands)
+    assert found["Lands"]["commands"] == "land at 3.5 s"
+    reason = "commands: expected it not to end the flight, found land at 3.5 s"
+    assert reason in found["Lands"]["failed"]
+    assert "commands" not in found["good"]

@@ -232,6 +232,7 @@ class Replay(Node[ReplayConfig]):
     """
 
     ends_run = "plan"
+    relays_estimates = True
 
     events = Output(Event)
 

@@ -33,6 +33,7 @@ from nodes.judging.evaluation.metrics import (
     segment_errors,
 )
 from nodes.judging.evaluation.orientations import Orientations, examine
+from nodes.judging.evaluation.plausibility import too_large_percent, velocity_error_percent
 from nodes.judging.evaluation.record import (
     EstimatorRecord,
     Interval,
@@ -40,6 +41,7 @@ from nodes.judging.evaluation.record import (
     answered,
     choose_frames,
     cover,
+    nearest,
     seconds,
 )
 from nodes.judging.evaluation.time_offset import best_time_offset
@@ -214,10 +216,11 @@ def judge(
     }
 
     def without() -> dict[str, float | None]:
-        return _held(held_errors(truth, due, poses[:0], np.empty(0), coverage.lost), path)
+        errors = held_errors(truth, due, poses[:0], np.empty(0), coverage.lost)
+        return _held(errors, path, due, planned)
 
     how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
-    final = _judge_final(record, truth, hole, due, path, alignment, align_first, figures)
+    final = _judge_final(record, truth, hole, due, path, alignment, align_first, figures, planned)
     if estimate is None or weighed is None:
         figures |= without()
         return Judgement(figures, estimate, lost=coverage.lost, final=final)
@@ -249,6 +252,7 @@ def judge(
         notes.append(offset.text())
     orientations = examine(there, kept)
     if orientations is not None:
+        figures["orientations"] = orientations.kind
         figures["body_rotation_deg"] = orientations.degrees
         figures["body_rotation_spread_deg"] = orientations.spread
         notes.append(orientations.text())
@@ -265,7 +269,8 @@ def judge(
         rotation=rotation_errors(there.orientations, moved.orientations),
     )
     held = held_errors(truth, due, there.stamps, of_images.position, coverage.lost)
-    figures |= _held(held, path) | _said_with_poses(record, truth, there, moved, aligned)
+    figures |= _held(held, path, due, planned)
+    figures |= _said_with_poses(record, truth, there, moved, aligned)
     of_ticks = None
     if len(arrivals):
         of_ticks, available = errors_at_ticks(truth, whole, arrivals, rate, hole)
@@ -291,10 +296,12 @@ def _weighed(estimate: Trajectory, frames: Stamps | None) -> Trajectory:
 def _latencies(poses: Stamps, arrivals: Stamps, due: Stamps) -> dict[str, float]:
     late = arrivals - poses
     period = max((np.median(np.diff(s)) for s in (poses, due) if len(s) > 1), default=0.0)
+    too_late = int((late > _LATE * period).sum()) if period else 0
     return {
         "latency_p50_ms": float(np.percentile(late / MILLISECOND, 50)),
         "latency_p99_ms": float(np.percentile(late / MILLISECOND, 99)),
-        "not_causal": int((late > _LATE * period).sum()) if period else 0,
+        "not_causal": too_late,
+        "not_causal_percent": 100.0 * too_late / len(poses),
     }
 
 
@@ -331,10 +338,7 @@ def one_an_image(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
         frames: Stamps of the images (ns), strictly rising, shape (n,), n ≥ 1.
         poses: Stamps of the poses (ns), strictly rising, shape (m,), m ≥ 1.
     """
-    after = np.clip(np.searchsorted(frames, poses), 1, max(len(frames) - 1, 1))
-    nearer = abs(frames[after - 1] - poses) <= abs(frames[after % len(frames)] - poses)
-    image = np.where(nearer, after - 1, after % len(frames))  # of each pose
-    distance = abs(frames[image] - poses)
+    image, distance = nearest(frames, poses)
     order = np.lexsort((distance, image))
     first = np.append(True, np.diff(image[order]) > 0)
     mask = np.zeros(len(poses), np.bool_)
@@ -407,11 +411,42 @@ def _aligned_as_a_whole(truth: Trajectory, estimate: Trajectory) -> dict[str, fl
     return found
 
 
-def _held(errors: Floats, path: float, prefix: str = "") -> dict[str, float | None]:
-    known = len(errors) > 0
+def to_planned_end(
+    errors: Floats, path: float, frames: Stamps, planned: int | None
+) -> tuple[float, float]:
+    """Return the RMS of the errors at the images of a flight, and its path, to its planned end, m.
+
+    What would have been flown after an early end is not known: images go on at their usual rate and
+    the vehicle at its mean speed so far. An estimator is lost meanwhile: the path since is added to
+    the error of the last image.
+
+    Args:
+        errors: At each image, metres, shape (n,), n ≥ 1.
+        path: Length of the flight's true path (m).
+        frames: Stamps of the images (ns), strictly rising, shape (n,).
+        planned: Planned end (ns); `None` if the flight came to its end.
+    """
+    if planned is None or len(frames) < 2 or planned <= frames[-1]:
+        return rms(errors), path
+    missing = (planned - int(frames[-1])) / int(frames[-1] - frames[0])  # in flights so far
+    count = round(missing * (len(frames) - 1))
+    last, since = float(errors[-1]), path * missing
+    total = float(np.sum(errors**2))
+    if count:  # the sum of (last + since · k / count)² for k from 1 to count
+        total += count * last**2 + last * since * (count + 1)
+        total += since**2 * (count + 1) * (2 * count + 1) / (6 * count)
+    return math.sqrt(total / (len(errors) + count)), path + since
+
+
+def _held(
+    errors: Floats, path: float, frames: Stamps, planned: int | None, prefix: str = ""
+) -> dict[str, float | None]:
+    if not len(errors):
+        return {f"{prefix}flight_ate_rmse_m": None, f"{prefix}flight_ate_percent": None}
+    error, length = to_planned_end(errors, path, frames, planned)
     return {
-        f"{prefix}flight_ate_rmse_m": rms(errors) if known else None,
-        f"{prefix}flight_ate_percent": 100.0 * rms(errors) / path if known and path > 0 else None,
+        f"{prefix}flight_ate_rmse_m": error,
+        f"{prefix}flight_ate_percent": 100.0 * error / length if path > 0 else None,
     }
 
 
@@ -424,6 +459,7 @@ def _judge_final(
     alignment: AlignmentMethod | Literal["auto"],
     align_first: float | None,
     figures: dict[str, Any],
+    planned: int | None,
 ) -> Trajectory | None:
     """Judge the trajectory after loop closures: add figures, return aligned poses."""
     if record.final is None:
@@ -441,7 +477,8 @@ def _judge_final(
     errors = absolute_errors(there, moved)
     figures |= {f"final_{name}": errors[name] for name in ("ate_rmse_m", "rot_rmse_deg")}
     figures["final_ate_percent"] = 100.0 * errors["ate_rmse_m"] / path if path > 0 else None
-    figures |= _held(interpolated_errors(truth, frames, moved), path, "final_")
+    held = interpolated_errors(truth, frames, moved)
+    figures |= _held(held, path, frames, planned, "final_")
     return moved
 
 
@@ -465,10 +502,12 @@ def _said_with_poses(
         true = interpolated(near.stamps, near.velocities(), there.stamps[rows])
         wrong = position_errors(true, scale * said @ rotation.T)
         figures["velocity_rmse_m_per_s"] = rms(wrong)
+        figures["velocity_error_percent"] = velocity_error_percent(wrong, true)
     rows, said = record.covariances.at(there.stamps)
     if rows.any():
         turn = np.kron(np.diag([scale, 1.0]), rotation)
         turned = turn @ said.reshape(-1, 6, 6) @ turn.T
+        figures["covariance_too_large_percent"] = too_large_percent(turned, there.length())
         figures |= consistency(there.take(rows), moved.take(rows), turned)
     return figures
 

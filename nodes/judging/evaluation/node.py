@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -15,6 +15,8 @@ from events import (
     Announcement,
     CameraAnnouncement,
     Collision,
+    Command,
+    DepthImage,
     EstimatorAnnouncement,
     Image,
     LidarScan,
@@ -26,18 +28,21 @@ from events import (
     TrackedFeatures,
     TrackingEvent,
     TrajectoryEstimate,
+    VehicleEvent,
 )
 from events.announcements import Vehicles
 from events.frames import angle_between
 from events.geometry import Pose, pose_matrix, pose_tuples
 from nodes.judging.evaluation.judging import Flight, Judgement, collision_rows, judge
-from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.plausibility import CommandLog, at_images
+from nodes.judging.evaluation.record import EstimatorRecord, Stamps, choose_camera
 from nodes.judging.evaluation.verdict import (
     FRAMES,
     Album,
     Thresholds,
     conclude,
     node_of,
+    owner_of,
     planned_end,
     write_results,
 )
@@ -46,6 +51,7 @@ from nodes.trajectory_files import GrowingFile, tum_row
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
 from runtime.figures import FIGURES
+from runtime.host import RunEnd
 from runtime.paths import source_file
 from runtime.time.clock import SECOND
 
@@ -111,10 +117,12 @@ class EvaluationConfig(NodeConfig):
         gap: Silence of an estimator that counts as lost.
         max_difference: From a time to the nearest true pose in a hole of the truth; in longer holes
             poses are not compared.
-        thresholds: Limits of figures; a missed one makes the run's exit code 1. Always asked: poses
-            for nine tenths of the flight, one frame, rising stamps, no collision, the run's planned
-            end. With thresholds, there must be an estimator. ``collisions`` and ``plan_*`` are
-            thresholds of the flight, and fail no estimator.
+        thresholds: Limits of figures; a missed one makes the run's exit code 1. Always asked, but
+            for an ``inf``: poses for nine tenths of the flight, one frame, rising stamps, no
+            collision, the run's planned end, and what anybody can mean: orientations, motions over
+            a metre, velocities, covariances, stamps of images, no later images. With thresholds,
+            there must be an estimator. ``collisions`` and ``plan_*`` are thresholds of the flight,
+            and fail no estimator.
         estimators: Settings of single estimators, by source.
         image_count: Sample images with features of each estimator; 0 for none.
     """
@@ -190,6 +198,9 @@ class Evaluation(Node[EvaluationConfig]):
         self._frames: dict[str, array[int]] = {}  # times of exposure by camera
         self._scans: dict[str, array[int]] = {}  # by lidar
         self._late: dict[str, int] = {}  # offsets of the cameras' clocks
+        self._latencies: dict[str, int] = {}  # of their images (ns)
+        self._read: dict[str, tuple[str, ...]] = {}  # cameras by estimator, as it announced
+        self._commands = CommandLog()
         self._album = Album(self.config.image_count)
         self._files: dict[str, GrowingFile] = {}
 
@@ -198,11 +209,13 @@ class Evaluation(Node[EvaluationConfig]):
         self._vehicles.announced(announcement)
         if isinstance(announcement, CameraAnnouncement):
             self._late[announcement.source] = round(announcement.time_offset * 1e9)
+            self._latencies[announcement.source] = round(announcement.latency * 1e9)
         if isinstance(announcement, EstimatorAnnouncement):
             record = EstimatorRecord(
                 announcement.scale_free, announcement.method, announcement.reads
             )
             self._records[announcement.source] = record
+            self._read[announcement.source] = announcement.cameras
 
     def check(self) -> Iterable[str]:
         """Say if there is no such vehicle as the file names, or nobody to judge."""
@@ -293,6 +306,19 @@ class Evaluation(Node[EvaluationConfig]):
             stamps.append(exposed)
         self._album.add_image(event)
 
+    @on(DepthImage)
+    def depth_images(self, event: DepthImage) -> None:
+        """Record the stamp of a depth image, which may be all that a camera gives."""
+        stamps = self._frames.setdefault(event.source, array("q"))
+        exposed = event.stamp - self._late.get(event.source, 0)
+        if not stamps or exposed > stamps[-1]:
+            stamps.append(exposed)
+
+    @on(Command, VehicleEvent)
+    def commands(self, event: Command | VehicleEvent) -> None:
+        """Note who commands a vehicle, and what comes of it."""
+        self._commands.add(event)
+
     @on(Collision)
     def collisions(self, event: Collision) -> None:
         """Note a vehicle's collision."""
@@ -331,22 +357,39 @@ class Evaluation(Node[EvaluationConfig]):
         truths = {v: f.truth.trajectory() for v, f in self._flights.items() if len(f.truth)}
         flown = {v: flight.figures(truths.get(v)) for v, flight in self._flights.items()}
         judgements = {}
+        ended: dict[str, str] = {}
         how = self.run_end
         for name, record in self._records.items():
             vehicle = self._vehicle_of(name)
             sensors = self._scans if "lidar" in record.reads else self._frames
             seen = self._seen(vehicle, sensors)
+            poses = record.stamps()
+            read = self._read_by(name, how)
+            camera = choose_camera(seen, poses, read)
             body = self._flights.get(vehicle, Flight()).body
             judgement = self._judge(
                 name,
                 record,
                 truths.get(vehicle),
-                cameras=seen,
+                cameras={} if camera is None else {camera: seen[camera]},
                 end=end,
                 planned=planned_end(how),
                 body=body,
             )
             judgement.figures.update(flown.get(vehicle, {}))
+            if camera is not None:
+                judgement.figures["camera"] = camera
+            eye = "" if camera is None else camera.removesuffix("/grey")
+            if camera is not None and eye in self._late and {camera, eye} & {*read}:
+                judgement.figures["stamped_at_images_percent"] = at_images(
+                    seen[camera],
+                    poses,
+                    self._late[eye],
+                    record.arrivals() - poses,
+                    self._latencies[eye],
+                )
+            if how is not None:
+                self._add_commands(name, vehicle, how, judgement.figures, ended)
             if "latency_p50_ms" in judgement.figures:
                 declared_here = self.clock.kind == "lockstep"
                 judgement.figures["latency"] = "declared" if declared_here else "measured"
@@ -368,6 +411,7 @@ class Evaluation(Node[EvaluationConfig]):
             declared,
             flights={vehicle: each for vehicle, each in flown.items() if vehicle},
             own=config.own_thresholds(),
+            ended_flights=ended,
         )
         if self.out is not None:
             plans = {self._named("plan", v): f.plan() for v, f in self._flights.items()}
@@ -377,6 +421,30 @@ class Evaluation(Node[EvaluationConfig]):
             file.write_text(collision_rows(collisions), encoding="utf-8")
             self._album.write(self.out / "frames")
         return judgements, verdict
+
+    def _read_by(self, estimator: str, end: RunEnd | None) -> Collection[str]:
+        """Return the cameras and lidars that an estimator reads, as far as that is known."""
+        read = None if end is None else end.read.get(owner_of(estimator, end))
+        return read or self._read.get(estimator, ())
+
+    def _add_commands(
+        self,
+        estimator: str,
+        vehicle: str,
+        end: RunEnd,
+        figures: dict[str, Any],
+        ended: dict[str, str],  # by estimator, added to
+    ) -> None:
+        """Add the commands of an estimator's node, and whether one of them ended the flight."""
+        owner = owner_of(estimator, end)
+
+        def sent_by(source: str) -> bool:
+            return owner_of(source, end) == owner
+
+        if text := self._commands.text(sent_by):
+            figures["commands"] = text
+        if owner in end.estimators and (text := self._commands.ended(sent_by, vehicle)):
+            ended[estimator] = text
 
     def _judge(
         self, name: str, record: EstimatorRecord, truth: Trajectory | None, **seen: Any
@@ -410,9 +478,7 @@ class Evaluation(Node[EvaluationConfig]):
     def _flight_of(self, estimator: str) -> Flight:
         return self._flights.get(self._vehicle_of(estimator)) or Flight()
 
-    def _seen(
-        self, vehicle: str, sensors: dict[str, array[int]]
-    ) -> dict[str, npt.NDArray[np.int64]]:
+    def _seen(self, vehicle: str, sensors: dict[str, array[int]]) -> dict[str, Stamps]:
         several = len(self._vehicles.names) > 1
         return {
             sensor: np.array(stamps, np.int64)

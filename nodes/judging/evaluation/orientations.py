@@ -36,6 +36,10 @@ _LOOSE = 30.0  # degrees of spread from which orientations are none of this body
 _BETTER = 0.25  # share of the spread that a guess has to leave to be right
 
 
+AT_FAULT: frozenset[Kind] = frozenset({"estimate without", "inverse", "order", "other"})
+"""Findings for which the estimate is to blame."""
+
+
 class Orientations(msgspec.Struct, frozen=True, kw_only=True):
     """Finding about an estimate's orientations."""
 

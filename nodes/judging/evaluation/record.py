@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -37,7 +37,7 @@ class Coverage(msgspec.Struct, frozen=True):
 
     flight: Interval  # from the first image to the last
     frames: int  # number of images, missing ones of an early end included
-    answered: int  # images with a pose within half an image's period
+    answered: int  # images with a pose of their own, within half an image's period
     lost: list[Interval]  # disjoint intervals without a pose, in order
 
     @property
@@ -92,20 +92,59 @@ def cover(
 
 
 def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
-    """Return a mask, shape (n,), of images with a pose within half the image period."""
-    if not len(poses):
-        return np.zeros(len(frames), np.bool_)
+    """Return a mask, shape (n,), of images with a pose of their own within half the image period.
+
+    A pose answers at most one image, the nearest (the earlier of two equally near).
+    """
+    has_pose = np.zeros(len(frames), np.bool_)
+    own, distance = nearest(frames, poses)
     period = int(np.median(np.diff(frames))) if len(frames) > 1 else 0
-    after = np.clip(np.searchsorted(poses, frames), 0, len(poses) - 1)
+    has_pose[own[2 * distance <= period]] = True
+    return has_pose
+
+
+def nearest(frames: Stamps, poses: Stamps) -> tuple[Stamps, Stamps]:
+    """Return the row of the image nearest to each pose, and their distance (ns): shapes (m,)."""
+    after = np.clip(np.searchsorted(frames, poses), 0, len(frames) - 1)
     before = np.clip(after - 1, 0, None)
-    distance = np.minimum(abs(poses[after] - frames), abs(poses[before] - frames))
-    return np.asarray(2 * distance <= period)
+    rows = np.where(poses - frames[before] <= frames[after] - poses, before, after)
+    return rows, abs(poses - frames[rows])
+
+
+SAME = 1_000_000  # difference of stamps that are the same, ns: those of files are rounded
+
+
+def choose_camera(
+    cameras: Mapping[str, Stamps], poses: Stamps, read: Collection[str] = ()
+) -> str | None:
+    """Return the camera that an estimator reads, of those with images.
+
+    It is one of those in `read`, if that is known, or else of all: that with images at the stamps
+    of most poses; of several the one of which the greatest share of the images is answered, such as
+    the slower one of two that are triggered together; then the quickest.
+
+    Args:
+        cameras: Stamps of the images (ns), strictly rising, by source.
+        read: Sources that it is known to read.
+
+    Returns:
+        `None` without images.
+    """
+    seen = [source for source, stamps in cameras.items() if len(stamps)]
+    known = [source for source in seen if source in read or source.removesuffix("/grey") in read]
+
+    def fit(source: str) -> tuple[int, float, int]:
+        stamps = cameras[source]
+        shared = nearest(stamps, poses)[1] <= SAME
+        return int(shared.sum()), float(answered(stamps, poses).mean()), len(stamps)
+
+    return max(known or seen, key=fit, default=None)
 
 
 def choose_frames(cameras: Mapping[str, Stamps], poses: Stamps) -> Stamps | None:
-    """Return the stamps of the first camera that shares most poses; `None` without images."""
-    there = (stamps for stamps in cameras.values() if len(stamps))
-    return max(there, key=lambda stamps: int(np.isin(poses, stamps).sum()), default=None)
+    """Return the stamps of the images of an estimator's camera; see `choose_camera`."""
+    camera = choose_camera(cameras, poses)
+    return None if camera is None else cameras[camera]
 
 
 def union(intervals: Sequence[Interval]) -> list[Interval]:
@@ -223,6 +262,10 @@ class EstimatorRecord:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def stamps(self) -> Stamps:
+        """Return the stamps of the trajectory's poses (ns), strictly rising, shape (n,)."""
+        return self.rows.trajectory().stamps if len(self) else np.empty(0, np.int64)
 
     def arrivals(self) -> npt.NDArray[np.int64]:
         """Return when each pose of the trajectory came (ns), shape (n,); (0,) if not known."""

@@ -29,9 +29,10 @@ import numpy as np
 
 from events import Image, TrackedFeatures
 from nodes.judging.evaluation.judging import Errors, Judgement
+from nodes.judging.evaluation.orientations import AT_FAULT
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_tum
-from runtime.figures import FIGURES, Figure
+from runtime.figures import FIGURES, Figure, is_off
 from runtime.host import RunEnd
 from runtime.paths import source_file
 from runtime.summary import overall
@@ -40,8 +41,12 @@ from runtime.time.clock import SECOND
 
 class _Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def given(self, *, of_flight: bool = False) -> bool:
-        """Return whether any threshold of an estimator, or else of a flight, is not its default."""
-        return any(getattr(self, each.name) != each.default for each in _asked(of_flight))
+        """Return whether any threshold of an estimator, or else of a flight, is not its default.
+
+        One that switches a default off asks for nothing.
+        """
+        limits = ((each.default, getattr(self, each.name)) for each in _asked(of_flight))
+        return any(limit != usual and not is_off(limit) for usual, limit in limits)
 
     def missed(self, figures: Mapping[str, Any], *, of_flight: bool = False) -> list[str]:
         """Return a sentence for each missed threshold of an estimator, or else of the flight."""
@@ -96,10 +101,12 @@ def conclude(
     declared: Collection[str] = (),  # estimators that announced that they read the truth
     flights: Mapping[str, dict[str, Any]] = MappingProxyType({}),
     own: Mapping[str, Thresholds] = MappingProxyType({}),  # thresholds of single estimators
+    ended_flights: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the verdict on figures by estimator, for ``evaluation/verdict.json``.
 
     Args:
+        ended_flights: Commands by which estimators ended the flight of their vehicle.
         flights: Figures of the flights themselves, by vehicle.
 
     Returns:
@@ -127,9 +134,14 @@ def conclude(
             if of_run["early_end_seconds"] is None:
                 unknown = f"ended early (by {by}: {end.reason}); the planned end is not known"
                 failed.append(f"early_end_seconds: {unknown}")
-            if end.error and node_of(name, [end.by]):
+            if end.error and node_of(owner_of(name, end), [end.by]):
                 failed.append(f"ended_by: expected no error of its own, found: {end.error}")
+            missed += _no_rotations(figures, asked, missed)
         failed += missed
+        if name in ended_flights:
+            failed.append(
+                f"commands: expected it not to end the flight, found {ended_flights[name]}"
+            )
         if of_run.get("reads_truth") == "undeclared":
             failed.append(UNDECLARED)
         failed += faults
@@ -159,6 +171,22 @@ def conclude(
     return verdict
 
 
+def _no_rotations(
+    figures: Mapping[str, Any], thresholds: Thresholds, missed: Sequence[str]
+) -> list[str]:
+    """Return a sentence if an estimator's orientations in a run are none of its vehicle's.
+
+    Their figures are left out then. (Of files that is said, and nothing else: many have positions
+    only.)
+    """
+    why, limit = figures.get("why_no_rotations", ""), getattr(thresholds, "rot_rmse_deg", None)
+    known = any(text.startswith("rot_rmse_deg") for text in missed)
+    blamed = figures.get("orientations") in AT_FAULT
+    if not blamed or known or limit is None or is_off(limit):
+        return []
+    return [f"rot_rmse_deg: expected at most {limit:g}, found none: {why}"]
+
+
 def planned_end(end: RunEnd | None) -> int | None:
     """Return the planned end (ns) of a run cut short by anyone but the user, if known."""
     if end is None or end.planned or end.by == "user" or end.duration is None:
@@ -173,12 +201,21 @@ def _of_run(name: str, figures: Mapping[str, Any], end: RunEnd, declared: bool) 
         planned = end.duration
         missing = None if planned is None else max(planned - end.stamp / SECOND, 0.0)
     found: dict[str, Any] = {"early_end_seconds": missing, "ended_by": end.by or "duration"}
-    again = end.restarts.get(node_of(name, end.restarts), 0)
+    owner = owner_of(name, end)
+    again = end.restarts.get(node_of(owner, end.restarts), 0)
     if again or "restarts" in figures:  # who restarts in a new frame has it in both
         found["restarts"] = max(figures.get("restarts", 0), again)
-    if declared or node_of(name, end.truth_readers):
+    if declared or node_of(owner, end.truth_readers):
         found["reads_truth"] = "declared" if declared else "undeclared"
+    elif node_of(owner, end.truth_relays):
+        found["reads_truth"] = "offered"
     return found
+
+
+def owner_of(source: str, end: RunEnd) -> str:
+    """Return the node that sends in the name of a source; the source itself if that is unknown."""
+    owners = {**{node: node for node in end.restarts}, **end.owners}
+    return owners.get(node_of(source, owners), source)
 
 
 def node_of(source: str, nodes: Iterable[str]) -> str:

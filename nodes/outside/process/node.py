@@ -158,6 +158,7 @@ class Process(Estimator[ProcessConfig]):
         if isinstance(announcement, ImuAnnouncement):
             self._imus.append(announcement)
         if not self.config.images:
+            self.narrow("frames", self.name)  # it has none: it reads no camera
             if isinstance(announcement, VehicleAnnouncement):
                 self._vehicles += (announcement,)
             return

@@ -68,8 +68,13 @@ class IncomingTopic:
             yield PilotAnnouncement(stamp=0, source=self.source, vehicle=given.vehicle)
         if given.use == "estimate":
             method, scale_free = f"ROS 2: {self.topic.name}", given.scale_free
+            cameras = (given.answers_to,) if given.answers_to else ()
             yield EstimatorAnnouncement(
-                stamp=0, source=self.source, method=method, scale_free=scale_free
+                stamp=0,
+                source=self.source,
+                method=method,
+                scale_free=scale_free,
+                cameras=cameras,
             )
 
     def find_camera(

@@ -67,6 +67,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     reads_truth = "showing"
     ends_run = "hand"
+    relays_estimates = True
     estimates = Output(PoseEstimate)
     setpoints = Output(Setpoint)
     images = Output(Image)

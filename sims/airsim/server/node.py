@@ -112,6 +112,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
     It speaks msgpack-rpc on TCP with AirSim's methods; see docs/reference/airsim.md.
     """
 
+    relays_estimates = True
     commands = Output(Command)
     setpoints = Output(Setpoint)
     estimates = Output(PoseEstimate)

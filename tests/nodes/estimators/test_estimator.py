@@ -17,6 +17,7 @@ from events import (
     CameraAnnouncement,
     CameraInfo,
     DepthImage,
+    EstimatorAnnouncement,
     Event,
     Image,
     Imu,
@@ -169,6 +170,13 @@ def test_a_vehicle_that_takes_commands_stands_where_it_said_until_it_is_armed() 
     assert begin(armed(late - 1), *rgbd(late)) == ["odom"]
     assert begin(TakenOff(stamp=late - 1, source="drone"), *rgbd(late)) == ["odom"]
     assert begin(armed(late - 1, "another"), *rgbd(late)) == ["map"]
+
+
+def test_the_cameras_that_a_file_names_are_announced() -> None:
+    seen = camera("drone/front", "rgb", "depth")
+    for inputs, cameras in ((None, ()), ({"frames": "drone/front"}, ("drone/front",))):
+        (announced,) = track(seen, inputs=inputs).of(EstimatorAnnouncement)
+        assert announced.cameras == cameras
 
 
 def test_an_image_that_shows_too_little_is_no_beginning() -> None:

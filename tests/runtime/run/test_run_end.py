@@ -9,8 +9,14 @@ import pytest
 
 from events import (
     Announcement,
+    CameraAnnouncement,
+    CameraInfo,
+    DepthImage,
     EstimatorAnnouncement,
+    Image,
+    LidarScan,
     Odometry,
+    PoseEstimate,
     PoseStamped,
     Shutdown,
     VehicleAnnouncement,
@@ -64,6 +70,29 @@ class Window(Ends):
     ends_run = "hand"
 
 
+class Announces(Ends):
+    """Ends the run as an estimator."""
+
+    def announce(self) -> Iterable[Announcement]:
+        yield EstimatorAnnouncement(stamp=0, source="in another name", method="none")
+
+
+class Estimates(Ends):
+    """Ends the run as an estimator that has announced nothing."""
+
+    estimates = Output(PoseEstimate)
+
+    async def run(self) -> None:
+        place: dict[str, Any] = {"position": (0.0, 0.0, 0.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
+        self.estimates.send(PoseEstimate(stamp=0, source=self.name, **place))
+        await super().run()
+
+
+def claiming(node: type[Ends], **claims: Any) -> type[Ends]:
+    """Return an estimator that says to be a part of the flight."""
+    return type(f"{node.__name__}{claims}", (node,), claims)
+
+
 class Reader(Node):
     """Keeps how the run ended."""
 
@@ -113,6 +142,29 @@ def test_a_run_says_who_ended_it_and_whether_that_was_the_plan(
     assert (end.by, end.reason, end.error, end.planned) == expected
     assert end.stamp == (1_000_000_000 if not end.by else 200_000_000)
     assert end.duration == 1.0
+
+
+@pytest.mark.parametrize("node", [Announces, Estimates])
+@pytest.mark.parametrize(
+    "claims",
+    [{"flies": True}, {"ends_run": "plan"}, {"ends_run": "hand"}, {"relays_estimates": True}],
+)
+def test_an_estimator_is_no_pilot_whatever_its_class_says(
+    node: type[Ends], claims: dict[str, Any]
+) -> None:
+    for how in ("stop", "shutdown"):
+        end = ended(spec(claiming(node, **claims), "x", {"how": how}))
+        assert (end.by, end.planned) == ("x", False)
+
+
+def test_a_relay_of_this_project_may_end_the_run_as_planned() -> None:
+    class Relay(Estimates):
+        relays_estimates = True
+        ends_run = "plan"
+
+    Relay.__module__ = "nodes.data.replay"
+    end = ended(spec(Relay, "x", {"how": "stop"}))
+    assert (end.by, end.planned) == ("x", True)
 
 
 @pytest.mark.parametrize(("others", "planned"), [([], True), ([Replayer], False)])
@@ -219,6 +271,20 @@ class Shows(Peeps):
     reads_truth = "showing"
 
 
+class Flies(Peeps):
+    flies = True
+
+
+class Relays(Shows):
+    relays_estimates = True
+
+
+class RelaysOurs(Relays): ...
+
+
+RelaysOurs.__module__ = "nodes.bridge"
+
+
 class FromElsewhere(Estimator):
     @on(Odometry, source="other")
     def peep(self, _: Odometry) -> None: ...
@@ -231,7 +297,10 @@ class FromElsewhere(Estimator):
         (Peeps, ["rgb"], {"x"}, True),
         (Peeps, ["truth"], {"x"}, False),
         (PeepsAtCameras, ["rgb"], set(), False),  # there is no camera
-        (Shows, ["rgb"], set(), False),
+        (Shows, ["rgb"], {"x"}, True),
+        (Flies, ["rgb"], {"x"}, True),
+        (Relays, ["rgb"], {"x"}, True),
+        (RelaysOurs, ["rgb"], set(), False),
         (FromElsewhere, ["rgb"], set(), False),
     ],
 )
@@ -244,5 +313,69 @@ def test_a_run_says_who_received_the_truth(
 ) -> None:
     end = ended(spec(Vehicle, "drone"), spec(node, "x", {"reads": reads}))
     assert end.truth_readers == truth_readers
+    assert end.truth_relays == ({"x"} if node is RelaysOurs else set())
     told = [record.getMessage() for record in caplog.records]
     assert told == (["x: receives true poses, and does not announce so"] if warned else [])
+
+
+class Rig(Vehicle):
+    def announce(self) -> Iterable[Announcement]:
+        yield from super().announce()
+        info = CameraInfo(width=4, height=4, fx=2.0, fy=2.0, cx=1.5, cy=1.5)
+        for name in ("left", "right"):
+            yield CameraAnnouncement(
+                stamp=0,
+                source=f"{self.name}/{name}",
+                frame_id=name,
+                parent_frame_id="base_link",
+                info=info,
+                rate=30.0,
+                latency=0.0,
+                images=("rgb", "grey"),
+                position=(0.0, 0.0, 0.0),
+                orientation=(1.0, 0.0, 0.0, 0.0),
+            )
+
+
+class ReadsAll(Estimator):
+    images = Input(Image)
+
+
+class ReadsGrey(Estimator):
+    images = Input(Image, source="drone/left/grey")
+
+
+class ReadsDepth(Estimator):
+    images = Input(DepthImage, source="drone/right")
+
+
+class ReadsScans(Estimator):
+    images = Input(LidarScan)
+
+
+class Announced(Estimator):
+    """Chooses its camera once it is announced."""
+
+    images = Input(Image)
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        if announcement.source == "drone/right":
+            self.narrow("images", announcement.source)
+
+
+@pytest.mark.parametrize(
+    ("node", "read"),
+    [
+        (ReadsAll, {"drone/left", "drone/right"}),
+        (ReadsGrey, {"drone/left"}),
+        (ReadsDepth, {"drone/right"}),
+        (Announced, {"drone/right"}),
+        (ReadsScans, None),
+    ],
+)
+def test_a_run_knows_which_cameras_a_node_reads(
+    node: type[Estimator], read: set[str] | None
+) -> None:
+    end = ended(spec(Rig, "drone"), spec(node, "x"))
+    assert end.read.get("x") == read
+    assert end.owners["drone/left"] == "drone"

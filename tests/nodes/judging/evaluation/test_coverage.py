@@ -14,6 +14,7 @@ from nodes.judging.evaluation.record import (
     EstimatorRecord,
     Interval,
     answered,
+    choose_camera,
     choose_frames,
     cover,
     seconds,
@@ -64,12 +65,46 @@ def test_images_are_answered_by_poses_of_their_time() -> None:
     assert not answered(FRAMES, FRAMES + 10**12).any()
 
 
+def test_a_pose_answers_one_image() -> None:
+    midway = FRAMES[:-1] + 25 * MS
+    assert answered(FRAMES, midway[::2]).mean() == pytest.approx(0.5)
+    assert answered(FRAMES, midway[:1]).tolist()[:3] == [True, False, False]
+    assert answered(FRAMES, FRAMES[:1] + 26 * MS).tolist()[:3] == [False, True, False]
+    twice = np.sort(np.append(FRAMES[::2], FRAMES[::2] + MS))
+    assert answered(FRAMES, twice).mean() == pytest.approx(0.5)
+
+
+SLOW, QUICK = np.arange(0, 10 * SECOND, 100 * MS), np.arange(0, 10 * SECOND, 10 * MS)
+CAMERAS = {"quick": QUICK, "slow": SLOW}
+
+
 def test_the_camera_is_the_one_whose_stamps_the_poses_have() -> None:
-    slow, quick = np.arange(0, SECOND, 100 * MS), np.arange(0, SECOND, 10 * MS)
-    cameras = {"slow": slow, "quick": quick}
-    assert choose_frames(cameras, quick[1::2]) is quick
-    assert choose_frames(cameras, slow) is slow
-    assert choose_frames({}, slow) is None
+    for cameras in (CAMERAS, dict(reversed(CAMERAS.items()))):
+        assert choose_camera(cameras, QUICK[1::2]) == "quick"
+        assert choose_camera(cameras, SLOW) == "slow"
+        assert choose_camera(cameras, np.delete(SLOW, [3, 7])) == "slow"
+        assert choose_camera(cameras, np.delete(QUICK, range(0, 900, 20))) == "quick"
+        assert choose_camera(cameras, QUICK + 1000) == "quick"  # stamps through a double
+        assert choose_camera(cameras, QUICK[:0]) == "quick"
+        assert choose_camera(cameras, SLOW, {"quick"}) == "quick"
+        assert choose_camera(cameras, QUICK, {"slow"}) == "slow"
+        assert choose_camera(cameras, SLOW, {"of depth only"}) == "slow"
+    assert choose_camera({"c/grey": SLOW, "d": QUICK}, QUICK, {"c"}) == "c/grey"
+    assert choose_camera({"c": SLOW[:0]}, SLOW) is choose_camera({}, SLOW) is None
+    assert choose_frames(CAMERAS, SLOW) is SLOW
+    assert choose_frames({}, SLOW) is None
+
+
+@pytest.mark.parametrize("rates", [(30, 20), (30, 10), (60, 30), (30, 29)])
+def test_of_cameras_that_are_triggered_together_the_estimators_own_is_covered(
+    rates: tuple[int, int],
+) -> None:
+    cameras = {str(r): np.array([round(k * SECOND / r) for k in range(10 * r)]) for r in rates}
+    for rate, stamps in cameras.items():
+        assert choose_camera(cameras, stamps) == rate
+        own = choose_frames(cameras, stamps)
+        assert own is not None
+        assert cover(own, stamps, GAP).frames_percent == 100.0
 
 
 @st.composite
@@ -98,6 +133,22 @@ def test_every_image_without_a_pose_for_longer_than_the_gap_is_in_a_lost_interva
         assert end - start > GAP
         assert (~has_pose[(frames >= start) & (frames <= end)]).any()
     assert 0.0 <= coverage.percent <= 100.0
+
+
+@given(flights(), st.lists(st.integers(0, 40 * 900 * MS), max_size=60, unique=True))
+def test_each_pose_answers_the_nearest_image_and_no_other(
+    flight: tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]], said: list[int]
+) -> None:
+    frames, poses = flight[0], np.array(sorted(said), np.int64)
+    has_pose = answered(frames, poses)
+    period = int(np.median(np.diff(frames))) if len(frames) > 1 else 0
+    expected = set()
+    for pose in poses.tolist():
+        nearest = int(np.argmin(abs(frames - pose)))  # the first of two
+        if 2 * abs(int(frames[nearest]) - pose) <= period:
+            expected.add(nearest)
+    assert {*np.flatnonzero(has_pose).tolist()} == expected
+    assert has_pose.sum() <= len(poses)
 
 
 @pytest.mark.slow

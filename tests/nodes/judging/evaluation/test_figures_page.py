@@ -20,7 +20,8 @@ def test_every_figure_is_in_the_table_and_on_the_page() -> None:
     record = recorded(truth, silent=(5.0, 6.0), velocity=(1.0, 0.0, 0.0), covariance=(0.1,) * 36)
     record.final, record.final_frame_id = truth, "map"
     figures = {*judge(record, truth).figures} | {"plan_rmse_m", "plan_max_m", "collisions"}
-    figures |= {"early_end_seconds", "ended_by", "reads_truth"}
+    figures |= {"early_end_seconds", "ended_by", "reads_truth", "commands"}
+    figures |= {"camera", "stamped_at_images_percent"}
     assert {"relocalization_p50_seconds", "nees_pose", "final_ate_percent"} <= figures
     assert figures <= {*FIGURES}
     assert "<!-- all figures" in PAGE  # `tools.docs_pages` puts the table there
@@ -35,6 +36,10 @@ def test_thresholds_are_those_of_the_table_with_the_defaults_that_the_page_names
     (sentence,) = re.findall(r"at least 90;(.*?)at most 0;", PAGE, re.DOTALL)
     assert {*re.findall(r"`(\w+)`", sentence)} == counts
     assert FIGURES["velocities_percent"].all_or_none == 95.0
+    table = PAGE.partition("### Defaults")[2].partition("## How the run ended")[0]
+    for each in asked:
+        if each.default and each.name not in {"coverage_percent", "compared_percent"}:
+            assert f"| `{each.name}` | at {each.limit} {each.default:g} |" in table
 
 
 def test_units_are_the_ends_of_names_and_an_unknown_figure_has_words() -> None:

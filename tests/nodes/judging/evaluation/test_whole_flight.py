@@ -11,7 +11,12 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 
-from nodes.judging.evaluation.judging import held_errors, interpolated_errors, judge
+from nodes.judging.evaluation.judging import (
+    held_errors,
+    interpolated_errors,
+    judge,
+    to_planned_end,
+)
 from nodes.judging.evaluation.record import EstimatorRecord, cover
 from nodes.trajectory import Trajectory
 from tests.nodes.judging.evaluation.flights import (
@@ -207,6 +212,52 @@ def test_a_reported_loss_is_charged_only_where_there_is_no_pose() -> None:
     assert honest["lost_seconds"] == quiet["lost_seconds"] == pytest.approx(2.0)
     assert honest["flight_ate_percent"] < 1e-9
     assert quiet["flight_ate_percent"] > 1.0
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+@pytest.mark.parametrize("percent", [0, 2])
+def test_an_early_end_costs_as_much_as_giving_up(share: float, percent: float) -> None:
+    """The path that is not flown is as long as it would be at the speed so far."""
+    given_up = judged(until(share, drifts(percent)))
+    stop = round(share * END)
+    record = EstimatorRecord()
+    for stamp in FRAMES[stop > FRAMES].tolist():
+        drifts(percent)(record, stamp, stamp / END)
+    flown = TRUTH.take(TRUTH.stamps <= stop)
+    frames = FRAMES[stop >= FRAMES]
+    cut = judge(record, flown, cameras={"c": frames}, end=stop, planned=END).figures
+    assert cut["path_m"] == pytest.approx(share * PATH, rel=0.01)
+    for name in ("flight_ate_rmse_m", "flight_ate_percent"):
+        assert cut[name] == pytest.approx(given_up[name], rel=0.05)  # an image more of 40
+    assert cut["lost_seconds"] == pytest.approx((1.0 - share) * SECONDS, abs=0.2)
+
+
+def test_the_error_to_the_planned_end_is_that_of_the_images_one_by_one() -> None:
+    random = np.random.default_rng(2)
+    frames = np.arange(20) * 50 * MS
+    errors = random.uniform(0.0, 1.0, 20)
+    planned = int(frames[-1]) + 10 * 50 * MS
+    lengths = errors[-1] + 19.0 * np.arange(1, 11) / 19  # 19 m in 19 periods so far
+    every = np.concatenate([errors, lengths])
+    found = to_planned_end(errors, 19.0, frames, planned)
+    assert found == pytest.approx((np.sqrt(np.mean(every**2)), 29.0))
+    usual = pytest.approx((np.sqrt(np.mean(errors**2)), 19.0))
+    for end in (None, int(frames[-1]), int(frames[3])):
+        assert to_planned_end(errors, 19.0, frames, end) == usual
+    assert to_planned_end(errors[:1], 19.0, frames[:1], planned) == (errors[0], 19.0)
+    far = to_planned_end(errors, 19.0, frames, 10**18)  # in no time, in no memory
+    assert far[0] / far[1] == pytest.approx(1 / np.sqrt(3), rel=1e-3)
+
+
+def test_a_trajectory_after_loop_closures_ends_early_with_its_flight() -> None:
+    stop = END // 2
+    flown = TRUTH.take(TRUTH.stamps <= stop)
+    record = EstimatorRecord.of(flown)
+    record.final, record.final_frame_id = flown, "map"
+    figures = judge(
+        record, flown, cameras={"c": FRAMES[stop >= FRAMES]}, end=stop, planned=END
+    ).figures
+    assert figures["final_flight_ate_percent"] == pytest.approx(20.4, rel=0.02)
 
 
 stamps = st.lists(st.integers(0, 200), max_size=30, unique=True)

@@ -28,6 +28,7 @@ from events import (
 )
 from nodes.judging.evaluation import Evaluation
 from nodes.judging.evaluation.judging import judge
+from nodes.judging.evaluation.plausibility import at_images
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.judging.evaluation.verdict import Thresholds, conclude, planned_end
 from nodes.trajectory import Trajectory
@@ -35,7 +36,16 @@ from runtime import Input, Node, NodeConfig, Output
 from runtime.errors import NodeError
 from runtime.testing import run_nodes, spec
 from tests.nodes.judging.evaluation.flights import MS, SECOND, announced, heading, place, truth
-from tests.nodes.judging.evaluation.zoo import BAD, FRAMES, GOOD, SECONDS, STRICT, Animal, ended
+from tests.nodes.judging.evaluation.zoo import (
+    BAD,
+    EARLY,
+    FRAMES,
+    GOOD,
+    SECONDS,
+    STRICT,
+    Animal,
+    ended,
+)
 
 ROOT = Path(__file__).parents[4]
 
@@ -70,7 +80,8 @@ def judged(animal: Animal) -> dict[str, Any]:
     frames = np.array([t for t in FRAMES[:: 30 // animal.rate] if t + 40 * MS <= stop])
     truth = TRUTH.take(TRUTH.stamps <= stop)
     planned = planned_end(animal.end)
-    return judge(record, truth, cameras={"camera": frames}, end=stop, planned=planned).figures
+    figures = judge(record, truth, cameras={"camera": frames}, end=stop, planned=planned).figures
+    return figures | {"stamped_at_images_percent": at_images(frames, record.stamps())}
 
 
 @pytest.mark.slow
@@ -204,6 +215,24 @@ def test_nobody_invents_by_how_much_an_end_was_early() -> None:
     assert figures["early_end_seconds"] is None
     unknown = "early_end_seconds: ended early (by est: dark); the planned end is not known"
     assert figures["failed"] == [unknown]
+
+
+def test_an_estimator_is_its_node_by_whatever_name_it_speaks() -> None:
+    figures = {"est": judged(GOOD["exact"])}
+
+    def found(**how: Any) -> dict[str, Any]:
+        end = ended(owners={"est": "node", "est/further": "other"}, **how)
+        verdict = conclude(figures, Thresholds(), (), end)["estimators"]["est"]
+        return dict(verdict)
+
+    assert found()["failed"] == []
+    reads = found(truth_readers=frozenset({"node"}))
+    assert (reads["reads_truth"], len(reads["failed"])) == ("undeclared", 1)
+    offered = found(truth_relays=frozenset({"node"}))
+    assert (offered["reads_truth"], offered["failed"]) == ("offered", [])
+    assert found(restarts={"node": 2})["restarts"] == 2
+    assert "ended_by" in str(found(by="node", error="SVD did not converge", **EARLY)["failed"])
+    assert "reads_truth" not in found(truth_readers=frozenset({"other"}))
 
 
 def test_what_the_user_ended_is_not_judged() -> None:

@@ -231,8 +231,9 @@ def test_a_cameras_poses_are_judged_as_the_bodys(tmp_path: Path) -> None:
     bags.bag(tmp_path / "bag", bags.POSE, seen, child="cam_optical")
     bags.bag(tmp_path / "optical", bags.ODOMETRY, seen, child="cam_optical")
     words = ["--truth", "run", "--estimate", "vo.tum", "--alignment", "se3"]
-    plain = only(judge(tmp_path, *words))
+    plain = only(judge(tmp_path, *words, code=1))
     assert plain["rot_rmse_deg"] > 100.0
+    assert plain["failed"][0].startswith("rot_rmse_deg: expected at most 15, found 1")
     for given in (MOUNTED, "mounting.tum", "drone/front"):
         found = only(judge(tmp_path, *words, "--body-from-camera", given))
         assert (found["ate_max_m"], found["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)

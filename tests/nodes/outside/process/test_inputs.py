@@ -38,6 +38,7 @@ from nodes.outside.process.program import MOST_BYTES, Inputs
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from runtime.config.model import NodeSpec
 from runtime.errors import ConfigError, VisnavError
+from runtime.host import RunEnd
 from runtime.testing import spec
 from tests.nodes.outside.process.rig import fly, program
 
@@ -142,6 +143,24 @@ def deaf() -> None:
 
 
 OTHERS = (spec(Others, "others"), spec(Ear, "ear"))
+
+
+class Last(Node[NodeConfig]):
+    """Keeps how the run ended."""
+
+    end: ClassVar[RunEnd | None] = None
+
+    async def on_end(self) -> None:
+        Last.end = self.run_end
+
+
+@pytest.mark.slow
+def test_a_filter_reads_no_camera(tmp_path: Path) -> None:
+    fly(fusion(asks="drone/imu"), tmp_path, 0.1, others=(*OTHERS, spec(Last, "last")))
+    assert Last.end is not None
+    assert "drone/camera" in Last.end.owners
+    assert "drone/camera" not in Last.end.read.get("slam", ())
+    assert "slam" in Last.end.estimators
 
 
 @pytest.mark.slow

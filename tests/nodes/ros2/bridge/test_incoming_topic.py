@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from events import Event, FluidPressure, Imu, MagneticField, NavSatFix, Range
+from events import EstimatorAnnouncement, Event, FluidPressure, Imu, MagneticField, NavSatFix, Range
 from nodes.ros2.bridge.incoming_topic import IncomingTopic
 from nodes.ros2.bridge.keys import Complaints
 from nodes.ros2.bridge.settings import Ros2BridgeConfig, Subscription
@@ -181,3 +181,20 @@ def test_types_may_be_defined_by_files(tmp_path: Path) -> None:
     assert len(store.hash("weather_msgs/msg/Wind")) == 71
     with pytest.raises(ValueError, match=r"weather_msgs/msg/Rain: expected a readable"):
         TypeStore("jazzy", {"weather_msgs/msg/Rain": str(tmp_path / "none.msg")})
+
+
+@pytest.mark.parametrize(("answers_to", "cameras"), [("drone/camera", ("drone/camera",)), ("", ())])
+def test_an_estimator_that_answers_images_announces_whose(
+    answers_to: str, cameras: tuple[str, ...]
+) -> None:
+    table = Subscription(
+        topic="/pose",
+        type="geometry_msgs/msg/PoseStamped",
+        use="estimate",
+        answers_to=answers_to,
+    )
+    complaints = Complaints(lambda _: None)
+    topic = IncomingTopic(table, Ros2BridgeConfig(), samples.store(), "ros2", complaints)
+    (announced,) = topic.announce()
+    assert isinstance(announced, EstimatorAnnouncement)
+    assert announced.cameras == cameras
