@@ -213,7 +213,7 @@ def test_orientations_of_no_body_fail_in_a_run_and_are_told_of_files() -> None:
     why = "its orientations are inverted, from the world to the body"
     figures: dict[str, Any] = {"ate_rmse_m": 0.0}
     figures |= {"coverage_percent": 100.0, "compared_percent": 100.0}
-    left_out = figures | {"why_no_rotations": why}
+    left_out = figures | {"why_no_rotations": why, "orientations": "inverse"}
 
     def failed(figures: dict[str, Any], **limits: float) -> list[str]:
         found = conclude({"est": figures}, Thresholds(**limits), (), ended())
@@ -224,7 +224,7 @@ def test_orientations_of_no_body_fail_in_a_run_and_are_told_of_files() -> None:
     assert failed(left_out) == [f"rot_rmse_deg: expected at most 15, found none: {why}"]
     assert failed(left_out, rot_rmse_deg=1.0) == ["rot_rmse_deg: expected at most 1, found none"]
     assert failed(left_out, rot_rmse_deg=math.inf) == []
-    assert failed(figures | {"why_no_rotations": "the truth has no orientations"}) == []
+    assert failed(left_out | {"orientations": "truth without"}) == []
     assert conclude({"est": left_out}, Thresholds())["estimators"]["est"]["failed"] == []
 
 
