@@ -230,13 +230,14 @@ class RunState(Host):
         def died(error: Exception) -> None:
             loop.call_soon_threadsafe(self._fault, node.name, error)
 
-        name = f"{node.name}.{getattr(factory, '__name__', 'worker')}"
+        kind = getattr(factory, "__name__", "worker")
+        name = f"{node.name}.{kind}"
         worker: Worker[W] = self.make_worker(
             name,
             self.clock,
             factory,
             *args,
-            printed=lambda line: node.log.debug("%s printed: %s", name, line),
+            printed=lambda line: node.log.info("%s: %s", kind, line),
             died=died,
             costs=self.costs.setdefault(name, Costs()),
             **options,

@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
 from runtime.errors import UnsupportedInterpreterError
-from runtime.time.clock import SECOND, Clock, Once, Schedule
+from runtime.time.clock import SECOND, Clock, Once, Schedule, settle
 
 LIMIT = 20.0  # real seconds until an unfinished test has failed; busy machines take their time
 
@@ -249,7 +249,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
                     return wait(None)
                 self.now = due
                 _, _, work, future = heapq.heappop(held_work)
-                _settle(future, work)
+                settle(future, work)
             else:
                 self.now = due
                 schedule.run_first(due)
@@ -341,17 +341,6 @@ class LockstepClock(Clock):
 
 def _is_over(held: _Held) -> bool:
     return held[2].done() or held[3].cancelled()
-
-
-def _settle(future: asyncio.Future[Any], work: _Work) -> None:
-    if future.cancelled():
-        return
-    if work.cancelled():
-        future.cancel()
-    elif (error := work.exception()) is not None:
-        future.set_exception(error)
-    else:
-        future.set_result(work.result())
 
 
 def _nothing() -> None:
