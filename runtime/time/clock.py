@@ -85,9 +85,9 @@ async def result_of(work: concurrent.futures.Future[R]) -> R:
     loop = asyncio.get_running_loop()
     future: asyncio.Future[R] = loop.create_future()
 
-    def done(_: concurrent.futures.Future[R]) -> None:
+    def done(finished: concurrent.futures.Future[R]) -> None:  # no circle: results may be large
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
-            loop.call_soon_threadsafe(settle, future, work)
+            loop.call_soon_threadsafe(settle, future, finished)
 
     work.add_done_callback(done)
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import ctypes
 import os
 import re
 import signal
@@ -81,6 +82,9 @@ class Plant:
         if trouble == "exit":
             print("seed not found", flush=True)
             sys.exit(3)
+        if trouble == "end":
+            print("seed not found", flush=True)
+            os._exit(3)
         if trouble == "hang":
             time.sleep(1000)
         self._kept: list[Any] = []
@@ -140,6 +144,10 @@ class Plant:
 
     def say(self, text: str) -> None:
         print(text, flush=True)
+
+    def say_in_c(self, text: str) -> None:
+        """Print as a library does: into C's buffer."""
+        ctypes.CDLL(None).printf(text.encode())
 
     def fill(self, size: int) -> int:
         """Have so many bytes for a moment."""
