@@ -35,6 +35,7 @@ from runtime.config.model import Config
 from runtime.config.parameters import change
 from runtime.errors import ConfigError
 from runtime.host import Host, Sibling
+from runtime.logs import executor
 from runtime.node import Node
 from runtime.run.node_runner import Create, NodeRunner
 from runtime.time.clock import SECOND, Clock, Tick, Ticker
@@ -110,9 +111,7 @@ class RunState(Host):
         self._create = create
         self._stop = stop
         self._fault = fault
-        self._executor = concurrent.futures.ThreadPoolExecutor(
-            max_workers=8, thread_name_prefix="offload"
-        )
+        self._executor = executor("offload", 8)
 
     @property
     def several_processes(self) -> bool:

@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
 from runtime.errors import UnsupportedInterpreterError
+from runtime.logs import executor
 from runtime.time.clock import SECOND, Clock, Once, Schedule, settle
 
 LIMIT = 20.0  # real seconds until an unfinished test has failed; busy machines take their time
@@ -133,7 +134,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         self._jumping = selector
         super().__init__(selector)
         self._clock_resolution = 1e-9
-        self.set_default_executor(concurrent.futures.ThreadPoolExecutor(thread_name_prefix="node"))
+        self.set_default_executor(executor("node"))
 
     def time(self) -> float:
         """Return simulated seconds."""
