@@ -96,7 +96,7 @@ class Run:
         return page if page is not None and page.is_file() else None
 
     def show(self) -> list[Figure]:
-        """Draw trajectories and errors; a notebook displays the figures."""
+        """Draw trajectories and errors; in a notebook, display them as images and return none."""
         from nodes.judging.report.curves import draw_errors
         from nodes.judging.report.tables import drawing
         from nodes.judging.report.trajectories import draw_trajectories
@@ -106,10 +106,11 @@ class Run:
         figures = [plot.figure for plot in plots if plot is not None]
         with contextlib.suppress(ImportError):
             from IPython import get_ipython
-            from IPython.display import display
+            from IPython.display import Image, display
 
-            if get_ipython() is not None:
-                display(*figures)
+            if get_ipython() is not None:  # which draws no figures itself until asked to
+                with drawing():
+                    display(*(Image(data=_png(figure), format="png") for figure in figures))
                 return []
         return figures
 
@@ -394,6 +395,14 @@ def judge(
         judgement.write(Path(out), true, judgements, verdict, notes)
         return load(out)
     return Run(judgement.in_memory(true, judgements, verdict, notes), None)
+
+
+def _png(figure: Figure) -> bytes:
+    import io
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
 
 
 def _settings(config: str | Path | Mapping[str, Any], changes: Mapping[str, Any]) -> Config:

@@ -138,6 +138,8 @@ def main() -> None:
         if not {"tf", "info"} <= latest.keys():
             continue
         if odometry is None:  # where the camera is on the body, by the tree of frames
+            if any(latest["info"].d) or latest["info"].distortion_model == "equidistant":
+                sys.exit("expected images without distortion, found a lens: rectify them first")
             odometry = Odometry(latest["info"].k.reshape(3, 3))
             links = {each.child_frame_id: each for each in latest["tf"].transforms}
             frame = latest["info"].header.frame_id

@@ -70,7 +70,10 @@ class OwnConfig(EstimatorConfig):
 
 
 class OwnEstimator(Estimator[OwnConfig]):
-    """Tracks a camera with depth; base class and evaluation do the rest."""
+    """Tracks a camera with depth; base class and evaluation do the rest.
+
+    It reads pinhole images: as `lenses` names no model, those of a lens are rectified first.
+    """
 
     needs = frozenset({"grey", "depth"})
     method = "optical flow and PnP"

@@ -22,6 +22,7 @@
     ├── PeerError              another process of the run is missing, gone, or of another mind
     ├── WireError              bytes from elsewhere that are no event, or an event that cannot leave
     ├── MissingAnswerError     a system outside the process did not answer, or is gone
+    ├── UnraisableError        a call in a thread or worker raised what no coroutine may
     └── WorkerError
         ├── WorkerDiedError    the process ended: name, exit code and last output
         └── WorkerTimeoutError the process did not answer in time
@@ -31,6 +32,7 @@ The command line prints any of these as one line and ends with exit code 2.
 
 from __future__ import annotations
 
+import concurrent.futures
 import difflib
 from collections.abc import Iterable
 
@@ -84,6 +86,27 @@ class RefusedError(NodeError):
 
 class NodeTimeoutError(NodeError):
     """A node's start-up or shutdown took longer than its limit."""
+
+
+class UnraisableError(VisnavError, RuntimeError):
+    """A call in a thread or worker raised what a coroutine takes for an order, not for an error.
+
+    Such are `StopIteration`, `CancelledError`, `SystemExit`; it is this error's cause.
+    """
+
+
+def raisable(error: BaseException) -> Exception:
+    """Return an error of a call beside the loop, or an `UnraisableError` of it, for a coroutine."""
+    ends_loops = StopIteration, StopAsyncIteration, concurrent.futures.CancelledError
+    if isinstance(error, Exception) and not isinstance(error, ends_loops):
+        return error
+    try:
+        text = str(error)
+    except Exception:  # its own fault, too
+        text = "a message that cannot be made"
+    made = UnraisableError(f"{type(error).__name__}: {text}")
+    made.__cause__ = error
+    return made
 
 
 class ChannelError(VisnavError):

@@ -5,16 +5,22 @@ a logger, ``visnav.<node>``; lines carry the time of the run's clock.
 
 Whatever is logged, a run ends: messages are cut, the queue is bounded, and a slow terminal is
 given up soon after the end. Omissions are counted and logged.
+
+Of runs in several threads of a process each logs its own lines only. A line is that of the run
+whose node logs it, or in whose thread it is logged: its own, one of `executor`, or a `RunThread`.
+Lines of other threads, such as a library's, are in the logs of all runs.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import copy
 import logging
 import logging.handlers
 import queue
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, MutableMapping
 from pathlib import Path
@@ -61,15 +67,59 @@ def harmless(text: str) -> str:
     return text.translate(_HARMFUL).replace("\n", "\n    | ")
 
 
+class _OfThread(threading.local):
+    run: object | None = None
+
+
+_of_thread = _OfThread()
+
+
+@contextlib.contextmanager
+def lines_of(run: object | None) -> Iterator[None]:
+    """Count the lines logged in this thread as those of a run while the block runs."""
+    before, _of_thread.run = _of_thread.run, run
+    try:
+        yield
+    finally:
+        _of_thread.run = before
+
+
+class RunThread(threading.Thread):
+    """Thread of the run whose thread makes it: its lines are in that run's log."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._of_run = _of_thread.run
+
+    def run(self) -> None:
+        """Call the target; called by the thread."""
+        with lines_of(self._of_run):
+            super().run()
+
+
+def executor(name: str, threads: int | None = None) -> concurrent.futures.ThreadPoolExecutor:
+    """Return an executor for nodes' slow work, with threads of the run whose thread makes it."""
+    run = _of_thread.run
+
+    def adopt() -> None:
+        _of_thread.run = run
+
+    return concurrent.futures.ThreadPoolExecutor(
+        threads, thread_name_prefix=name, initializer=adopt
+    )
+
+
 class NodeLogger(logging.LoggerAdapter[logging.Logger]):
-    """A node's logger."""
+    """A node's logger, of the run whose thread makes it."""
 
     def __init__(self, node: str) -> None:
         super().__init__(logging.getLogger(f"visnav.{node}"))
         self.node = node
+        self._of_run = _of_thread.run
 
     def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, Any]:
-        """Add nothing to the message; the logger's name is the sender's."""
+        """Add the run to the record; the logger's name is the sender's."""
+        kwargs["extra"] = {**(kwargs.get("extra") or {}), "of_run": self._of_run}
         return msg, kwargs
 
     def trace(self, msg: str, *args: object) -> None:
@@ -185,23 +235,27 @@ def logging_to(
         now: The run's clock (ns), read when a record is made.
     """
     logging.addLevelName(TRACE, "TRACE")
+    run = _of_thread.run or object()
     records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
     handler = _Queued(records)
 
     def stamp(record: logging.LogRecord) -> bool:
+        if (getattr(record, "of_run", None) or _of_thread.run or run) is not run:
+            return False
+        if record.name.partition(".")[0] == "visnav" and record.levelno < LEVELS[level]:
+            return False
         record.seconds = now() / 1e9
         record.logger_name = record.name.removeprefix("visnav.")
         return True
 
     handler.addFilter(stamp)
     listener = _Listener(handler, records, handlers)
-    root, ours = logging.getLogger(), logging.getLogger("visnav")
-    before = ours.level
+    root = logging.getLogger()
     root.addHandler(handler)
-    ours.setLevel(LEVELS[level])
     listener.start()
     try:
-        yield
+        with lines_of(run), _level(LEVELS[level]):
+            yield
     finally:
         listener.ends = time.monotonic() + PATIENCE
         listener.stop()
@@ -209,10 +263,32 @@ def logging_to(
             listener.say(f"{handler.dropped} log lines were dropped: they came too fast")
         if listener.unshown:
             listener.say(f"{listener.unshown} log lines are not shown here: they came too fast")
-        ours.setLevel(before)
         root.removeHandler(handler)
         for each in handlers:
             each.close()
+
+
+_levels: list[int] = []
+_usual_level = logging.NOTSET  # while no run goes on
+_changing_levels = threading.Lock()
+
+
+@contextlib.contextmanager
+def _level(level: int) -> Iterator[None]:
+    """Have nodes and runtime log lines of a level; of several at a time, the lowest counts."""
+    global _usual_level
+    ours = logging.getLogger("visnav")
+    with _changing_levels:
+        if not _levels:
+            _usual_level = ours.level
+        _levels.append(level)
+        ours.setLevel(min(_levels))
+    try:
+        yield
+    finally:
+        with _changing_levels:
+            _levels.remove(level)
+            ours.setLevel(min(_levels, default=_usual_level))
 
 
 def terminal_handler(console: Console | None = None) -> logging.Handler:

@@ -255,7 +255,7 @@ class Node(Generic[C]):
         In lockstep it comes exactly then, however long this machine takes; in real time not
         before then.
         """
-        call = _Call(fn, *args, **kwargs)
+        call = functools.partial(fn, *args, **kwargs)
         self._outside.add(call)
         for sender in senders(self).values():
             sender.watch()  # lest `call` sends something
@@ -379,16 +379,6 @@ def make_node(
         setattr(node, port, Sender(f"{name}.{port}", output.event, node._outside))
     node.__init__()  # type: ignore[misc]  # now that what it may use is there
     return node
-
-
-class _Call(functools.partial[R]):
-    """A call whose `StopIteration`, which no future takes, becomes a `RuntimeError`."""
-
-    def __call__(self, /, *args: Any, **kwargs: Any) -> R:
-        try:
-            return super().__call__(*args, **kwargs)
-        except StopIteration as error:
-            raise RuntimeError("the function raised StopIteration") from error
 
 
 def streams(node: Node[Any]) -> dict[str, Stream[Any]]:

@@ -45,6 +45,16 @@ OutputPath = Annotated[str, msgspec.Meta(extra={_MARK: "output"})]
 """Path in the run's folder; empty for none, or for a name derived from the node's."""
 
 
+def not_utf8(path: str | Path) -> str:
+    """Return why a path is of no use: libraries, JSON and TOML take UTF-8 only; empty if it is."""
+    name = os.fsencode(path)
+    try:
+        name.decode("utf-8")
+    except UnicodeDecodeError:
+        return f"expected a path in UTF-8, found '{name.decode(errors='backslashreplace')}'"
+    return ""
+
+
 class GivenHere(str):
     """Text from the command line; as a path, relative to the working directory."""
 

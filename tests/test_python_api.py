@@ -11,10 +11,12 @@ import signal
 import subprocess
 import sys
 import threading
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -231,6 +233,39 @@ def test_it_shows_itself_with_figures_and_curves() -> None:
     figures[0].canvas.draw()
     assert judged.truth is not None
     assert judged.estimates["<mine>"].positions.shape == judged.truth.positions.shape
+
+
+def test_in_a_fresh_notebook_its_figures_are_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody has asked IPython to draw figures of matplotlib, whose text it would show."""
+    shown: list[dict[str, Any]] = []
+    ipython, display = types.ModuleType("IPython"), types.ModuleType("IPython.display")
+    vars(ipython).update(get_ipython=lambda: object(), version_info=(9, 0, 0))
+    vars(display)["Image"] = dict
+    vars(display)["display"] = lambda *images: shown.extend(images)
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    judged = visnav.judge(curve(), {"mine": curve(wrong=0.02)}, alignment="se3")
+    assert judged.show() == []
+    assert len(shown) == 2
+    for image in shown:
+        assert image["format"] == "png"
+        pixels: Any = cv2.imdecode(np.frombuffer(image["data"], np.uint8), cv2.IMREAD_COLOR)
+        assert min(pixels.shape[:2]) > 100
+
+
+def test_ipython_shows_its_images() -> None:
+    pytest.importorskip("IPython")
+    code = (
+        "import visnav; from IPython.core.interactiveshell import InteractiveShell as Shell\n"
+        "from IPython.utils.capture import capture_output\n"
+        "shell = Shell.instance()\n"
+        "with capture_output() as captured:\n"
+        "    shell.run_cell('from tests.test_python_api import curve')\n"
+        "    shell.run_cell('import visnav; visnav.judge(curve(), curve(wrong=0.02)).show()')\n"
+        "assert [sorted(each.data) for each in captured.outputs] == [['image/png', 'text/plain']] "
+        "* 2, captured.outputs\n"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
 def test_a_judgement_of_nonsense_is_a_sentence(tmp_path: Path) -> None:

@@ -104,6 +104,15 @@ def test_an_example_that_is_not_there_is_guessed() -> None:
     assert "did you mean 'monocular'?" in done.stderr
 
 
+def test_an_example_may_be_named_as_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inspect, "schema", lambda _: None)
+    done = command_here("example", "monocular.toml", "--out", str(tmp_path), folder=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "monocular.toml").is_file()
+
+
 @pytest.mark.parametrize("language", ["python", "cpp", "ros2"])
 def test_a_new_estimator_is_whole(language: str, tmp_path: Path) -> None:
     """The examples are what it begins with, and these fly in the tests."""

@@ -140,7 +140,8 @@ def _write(name: str, images: dict[str, Any], columns: int) -> None:
         tiles.append(tile)
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
     rows = [np.concatenate(tiles[k : k + columns], 1) for k in range(0, len(tiles), columns)]
-    cv2.imwrite(str(DOCS / name), np.concatenate(rows), [cv2.IMWRITE_JPEG_QUALITY, 82])
+    jpeg = cv2.imencode(".jpg", np.concatenate(rows), [cv2.IMWRITE_JPEG_QUALITY, 82])[1]
+    (DOCS / name).write_bytes(jpeg.tobytes())
 
 
 if __name__ == "__main__":

@@ -39,10 +39,12 @@ Points = npt.NDArray[np.float64]
 
 def main() -> None:
     """Write both images."""
-    features = cv2.imread(str(TOUR / "frames_odometry.png"))
-    if features is None:
-        raise SystemExit(f"expected {TOUR / 'frames_odometry.png'}: run `make demo` first")
-    cv2.imwrite(str(DOCS / "features.jpg"), features, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    png = TOUR / "frames_odometry.png"
+    if not png.is_file():
+        raise SystemExit(f"expected {png}: run `make demo` first")
+    features: Any = cv2.imdecode(np.frombuffer(png.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    jpeg = cv2.imencode(".jpg", features, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    (DOCS / "features.jpg").write_bytes(jpeg.tobytes())
     quality = {"quality": 90, "optimize": True}
     _overview().savefig(DOCS / "overview.jpg", facecolor=GROUND, pil_kwargs=quality)
 

@@ -237,7 +237,8 @@ def pictures(plan: Plan, folder: Path) -> dict[str, str]:
             continue
         frames = sorted((Path(job.out) / "frames").glob("*.jpg"))
         newest = {frame.stem.rpartition("_")[0]: frame for frame in frames}
-        images = [cv2.imread(str(frame)) for frame in newest.values()]
+        files = (np.frombuffer(frame.read_bytes(), np.uint8) for frame in newest.values())
+        images = [cv2.imdecode(file, cv2.IMREAD_COLOR) for file in files]
         small = [
             cv2.resize(image, (round(image.shape[1] * HEIGHT / image.shape[0]), HEIGHT))
             for image in images
@@ -245,7 +246,8 @@ def pictures(plan: Plan, folder: Path) -> dict[str, str]:
         ]
         if small:
             found[name] = f"{name}.jpg"
-            cv2.imwrite(str(folder / found[name]), np.hstack(small))
+            jpeg = cv2.imencode(".jpg", np.hstack(small))[1]
+            (folder / found[name]).write_bytes(jpeg.tobytes())
     return found
 
 

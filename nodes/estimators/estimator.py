@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -35,13 +35,15 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
-from events.camera_info import COEFFICIENTS
+from nodes.estimators.latency import ResultQueue
 from nodes.estimators.rectification import ALIGNED, Rectification, misalignment
 from nodes.estimators.rig import Mount, SensorChoice, TrackingResult, check_result, check_trajectory
 from runtime import Bundle, Node, NodeConfig, Output, Worker, on
+from runtime.channels.streams import Stream
 from runtime.errors import DeclarationError, NodeError, suggest
 from runtime.extras import why_missing
 from runtime.node import matchers
+from runtime.time.clock import SECOND
 from runtime.units import Latency
 
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -58,7 +60,8 @@ class EstimatorConfig(NodeConfig):
         rectify: Whether images unusable because of their lens or unaligned rows of a stereo pair
             are turned into those of pinhole cameras, else refused. Cameras that need it come after
             others.
-        latency: Time on the run's clock from the arrival of an image to its estimate.
+        latency: Time on the run's clock from the arrival of an image to its estimate; see
+            `Estimator.publish`.
         not_finite: Meaning of a pose that is not finite (NaN): an ``error`` that ends the run, or
             ``lost``.
     """
@@ -69,8 +72,9 @@ class EstimatorConfig(NodeConfig):
     not_finite: Literal["error", "lost"] = "error"
 
 
+_FRAMES = Image | DepthImage | LidarScan
 _KINDS = ("rgb", "grey", "depth", "segmentation", "lidar")  # kinds of data an estimator may need
-F = TypeVar("F", bound=tuple[Any, ...])
+F = TypeVar("F", bound=tuple[Any, ...] | Event)
 W = TypeVar("W")
 C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
 
@@ -88,8 +92,7 @@ class Estimator(Node[C], ABC):
             frames = Bundle(RgbdFrame, keep="latest")
 
             async def on_ready(self) -> None:
-                info, latency = self.the_camera().info, self.config.latency
-                self.tracker = await self.worker(MyTracker, info, latency=latency)
+                self.tracker = await self.start_tracker(MyTracker, self.the_camera().info)
 
             async def run(self) -> None:
                 async for image, depth in self.frames:
@@ -104,11 +107,17 @@ class Estimator(Node[C], ABC):
     gives poses of the lidar (x forward, y right, z down) in the lidar at its first scan, that of a
     scan at its last ray, unless `exposed_at` is overridden; no features are sent.
 
-    **Lenses.** Images that `refusal` rejects, and stereo pairs that are not `aligned`, are
-    rectified beside the loop (`nodes.estimators.rectification`) before `frames` gives it, unless
-    the setting ``rectify`` is false. `the_camera` is the pinhole camera then, and features are sent
-    where they are in the announced camera's own image. Rows keep the read-out time of a rolling
-    shutter only nearly.
+    **Lenses.** Images that `refusal` rejects, by default those of any lens that distorts, and
+    stereo pairs that are not `aligned`, are rectified beside the loop
+    (`nodes.estimators.rectification`) before `frames` gives it, unless the setting ``rectify`` is
+    false; the log says so. `the_camera` is the pinhole camera then, and features are sent where
+    they are in the announced camera's own image. Rows keep the read-out time of a rolling shutter
+    only nearly.
+
+    **Latency.** An image arrives when `frames` gives it; its estimate goes out when the setting
+    ``latency`` is over, wherever the tracker runs: in a process by `start_tracker`, in a thread by
+    `offload`, or in `run` itself. Until then `frames` gives no further image: with
+    ``keep="latest"`` images arriving meanwhile are skipped.
 
     **Frame and alignment.** The `frame_id` of the estimates, chosen with the first pose of each
     map, says how `nodes.judging.evaluation` aligns them with the ground truth:
@@ -142,8 +151,9 @@ class Estimator(Node[C], ABC):
     """Number of cameras read together; 2 for a stereo rig, with the left camera's pose."""
     inertial: bool = False
     """Whether an IMU is needed on the camera's vehicle."""
-    lenses: frozenset[str] = frozenset(COEFFICIENTS)
-    """Supported distortion models, besides an ideal camera; see also `refusal`."""
+    lenses: frozenset[str] = frozenset()
+    """Distortion models that the tracker knows, as ``frozenset({"plumb_bob"})``; images of all
+    others are rectified first. See also `refusal`."""
     aligned: bool = True
     """Whether the images of a stereo rig must be those of equal pinhole cameras, row by row."""
     method: str = ""
@@ -167,6 +177,7 @@ class Estimator(Node[C], ABC):
     _mounts: Mapping[int, Mount] = MappingProxyType({})
     _frame = ""
     _lost = False
+    _told_unknown = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -196,6 +207,10 @@ class Estimator(Node[C], ABC):
     def _choice(self) -> SensorChoice:
         named = dict(self.sources)
         return SensorChoice(self.needs, self.eyes, self.inertial, named, self._refusals)
+
+    @cached_property
+    def _result_queue(self) -> ResultQueue:
+        return ResultQueue(self.clock, round(self.config.latency * SECOND), self.start)
 
     @property
     def camera(self) -> CameraAnnouncement | None:
@@ -227,6 +242,8 @@ class Estimator(Node[C], ABC):
         choice = self._choice
         before, lidar = choice.cameras, choice.lidar
         choice.announced(announcement)
+        if choice.cameras is not before or choice.lidar is not lidar:
+            self._look_at_frames()
         if choice.cameras is not before:
             self._take(choice.cameras)
             self.imu_announcement = None
@@ -241,19 +258,31 @@ class Estimator(Node[C], ABC):
         if self._choice.rectified:
             self._rectification = Rectification(cameras)
             self.cameras = self._rectification.cameras
-        for matcher in matchers(self).values():
-            matcher.prepare = self._rectify if self._rectification else None
         ports = ("frames",) if self.eyes == 1 else ("frames.left", "frames.right")
         for port, camera in zip(ports, cameras, strict=True):
             self._narrow_to(port, camera.source)
 
+    def _frame_streams(self) -> list[Stream[Any]]:
+        """Return the streams of images or scans."""
+        inputs = self.declared.inputs.items()
+        ports = [port for port, each in inputs if issubclass(each.event, _FRAMES)]
+        matched = [matcher.stream for matcher in matchers(self).values()]
+        return [*matched, *(getattr(self, port) for port in ports)]
+
+    def _look_at_frames(self) -> None:
+        """Have images rectified, and their arrival noted, as they are read."""
+        for stream in self._frame_streams():
+            stream.before, stream.prepare = self._result_queue.wait, self._prepare_frame
+
+    async def _prepare_frame(self, frame: F) -> F:
+        if self._rectification is not None:
+            frame = await self.offload(self._rectification.frame, frame)
+        self._result_queue.arrived(frame)
+        return frame
+
     def _narrow_to(self, port: str, source: str) -> None:
         if port not in self._choice.named:
             self.sources[port] = source
-
-    async def _rectify(self, frame: F) -> F:
-        assert self._rectification is not None
-        return await self.offload(self._rectification.frame, frame)
 
     def _refusals(self, cameras: Sequence[CameraAnnouncement], rectified: bool) -> dict[str, str]:
         if rectified:
@@ -294,7 +323,13 @@ class Estimator(Node[C], ABC):
         if missing := self._missing():
             yield missing
         if self._rectification is not None:
-            self.log.info("%s is rectified: %s", self.the_camera().source, self._rectification)
+            if not self._frame_streams():
+                yield (
+                    "expected images read from a Bundle or an Input, which are rectified, or the "
+                    f"model of the lens in lenses, found neither: {self._rectification.eyes[0]}"
+                )
+            for camera, eye in zip(self.cameras, self._rectification.eyes, strict=True):
+                self.log.info("%s is rectified: %s", camera.source, eye)
 
     @abstractmethod
     async def run(self) -> None:
@@ -335,7 +370,11 @@ class Estimator(Node[C], ABC):
         return self._choice.missing()
 
     def publish(self, image: Event, result: TrackingResult, origin: int | None = None) -> None:
-        """Send a tracker's result for an image: features, pose, loss of tracking.
+        """Send a tracker's result for an image, once its latency is over: features, pose, loss.
+
+        It goes out when the setting ``latency`` has passed on the clock since `frames` gave the
+        image; at once, if that was before now, as after the call of a worker with this latency.
+        Results keep their order. One that is due after the end of the run is not sent.
 
         Args:
             origin: Exposure of the image at which the tracker's poses start (ns); if `None`, of the
@@ -346,6 +385,34 @@ class Estimator(Node[C], ABC):
         """
         stamp = self.exposed_at(image)
         result = self._checked(stamp, result)
+        if not self._result_queue.knows(image) and not self._told_unknown:
+            self._told_unknown = True
+            self.log.warning(
+                "publish: expected an image read from frames, found one of %s at %.3f s that was "
+                "not: its latency is not kept",
+                image.source,
+                image.stamp / SECOND,
+            )
+        if self._result_queue.is_due(image):
+            self._send_result(image, stamp, result, origin)
+        else:
+            send = partial(self._send_result, image, stamp, result.copy(), origin)
+            self._result_queue.put(image, send)
+
+    def send_result(self, image: Event, result: TrackingResult, origin: int | None = None) -> None:
+        """Send a tracker's result now, whatever the setting ``latency`` says; see `publish`.
+
+        For systems whose answers a `Hold` delays.
+
+        Raises:
+            NodeError: It is no such result.
+        """
+        stamp = self.exposed_at(image)
+        self._send_result(image, stamp, self._checked(stamp, result), origin)
+
+    def _send_result(
+        self, image: Event, stamp: int, result: TrackingResult, origin: int | None
+    ) -> None:
         if self.restarts and not self._mounts:
             self._lose(stamp, f"restarted: poses are in {self._odom()} from here on")
         self._send_features(image, result)
@@ -371,6 +438,8 @@ class Estimator(Node[C], ABC):
             wrong = check_result(result)
         except ValueError as error:
             raise NodeError(self.name, f"{which}: {error}") from None
+        if len(result.points) and not len(result.inliers):
+            result = msgspec.structs.replace(result, inliers=np.ones(len(result.points), np.bool_))
         if not wrong:
             return result
         if self.config.not_finite == "error":

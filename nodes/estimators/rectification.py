@@ -20,11 +20,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import CameraAnnouncement, CameraInfo, DepthImage, Image
+from events import CameraAnnouncement, CameraInfo, DepthImage, Event, Image
 from events.geometry import pose_matrix, pose_tuples
 
 Floats = npt.NDArray[np.float64]
-F = TypeVar("F", bound=tuple[Any, ...])
+F = TypeVar("F", bound=tuple[Any, ...] | Event)
 WIDEST = math.radians(110.0)  # greatest field of view of a new image, along its longer side
 ALIGNED = 0.1  # largest violation of the rule above by a point's images in a rectified pair, pixels
 _NO_MAP: Any = None  # both coordinates stand in one
@@ -81,6 +81,17 @@ class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
             data = cv2.remap(event.data, places, shares, cv2.INTER_LINEAR)
         return msgspec.structs.replace(event, data=data)
 
+    def __str__(self) -> str:
+        info, lens = self.pinhole, self.lens
+        found = "pinhole"
+        if not lens.is_pinhole:
+            coefficients = ", ".join(f"{value:.3g}" for value in lens.distortion)
+            found = f"{lens.distortion_model} with {coefficients}"
+        across, down = (
+            math.degrees(2 * math.atan(n / 2 / info.fx)) for n in (info.width, info.height)
+        )
+        return f"{found} to pinhole, focal length {info.fx:.1f} px, {across:.0f}° × {down:.0f}°"
+
 
 class Rectification:
     """The pinhole cameras in the place of a camera, or of both eyes of a stereo rig.
@@ -117,26 +128,24 @@ class Rectification:
         )  # the same with the pinhole cameras' intrinsics and orientations
 
     def frame(self, frame: F) -> F:
-        """Return the fields of a frame with rectified images; those of a right eye are `right`."""
-        names: tuple[str, ...] = frame._fields  # type: ignore[attr-defined]
-        fields = [
-            self.eyes[name == "right"].rectify(each)
-            if isinstance(each, Image | DepthImage)
-            else each
-            for name, each in zip(names, frame, strict=True)
-        ]
-        made: F = type(frame)._make(fields)  # type: ignore[attr-defined]
-        return made
+        """Return a frame, or a single image, with rectified images.
 
-    def __str__(self) -> str:
-        info = self.eyes[0].pinhole
-        across, down = (
-            math.degrees(2 * math.atan(n / 2 / info.fx)) for n in (info.width, info.height)
-        )
-        return (
-            f"{self.eyes[0].lens.distortion_model} to pinhole, focal length {info.fx:.1f} px, "
-            f"{across:.0f}° × {down:.0f}°"
-        )
+        Of a stereo rig the right eye's are those of the field `right`.
+        """
+        given: Any = frame
+        made: Any
+        if isinstance(given, Event):
+            right = len(self.cameras) > 1 and given.source.startswith(self.cameras[1].source)
+            made = self.eyes[right].rectify(given)  # type: ignore[arg-type]
+        else:
+            made = type(given)._make(
+                self.eyes[name == "right"].rectify(each)
+                if isinstance(each, Image | DepthImage)
+                else each
+                for name, each in zip(given._fields, given, strict=True)
+            )
+        result: F = made
+        return result
 
 
 def misalignment(left: CameraAnnouncement, right: CameraAnnouncement) -> float:

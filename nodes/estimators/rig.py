@@ -219,7 +219,7 @@ class TrackingResult(msgspec.Struct, frozen=True, eq=False):
         lost: Whether `pose` is just the last known one.
         reason: Why tracking was lost, or how it was regained.
         points: Tracked features: column and row, float32 pixels, shape (n, 2).
-        inliers: Mask of those that agree with the pose: bool, shape (n,).
+        inliers: Mask of those that agree with the pose: bool, shape (n,); all, if empty.
         velocity: Of the optical camera, in that at the first image, m/s, shape (3,); `None` if
             unknown.
         covariance: Of the pose's error (x, y, z, roll, pitch, yaw) in the optical camera at the
@@ -238,6 +238,12 @@ class TrackingResult(msgspec.Struct, frozen=True, eq=False):
     covariance: npt.NDArray[np.float64] | None = None
     map: int = 0
 
+    def copy(self) -> TrackingResult:
+        """Return a copy that no change of these arrays reaches."""
+        fields = ((name, getattr(self, name)) for name in self.__struct_fields__)
+        arrays = {name: value.copy() for name, value in fields if isinstance(value, np.ndarray)}
+        return msgspec.structs.replace(self, **arrays)
+
 
 _NOT_RIGID = 1e-2  # by how much a rotation's columns may miss length 1 and right angles
 
@@ -246,6 +252,12 @@ def check_result(result: Any) -> str:
     """Return a complaint on the first non-finite number, or nothing; or raise a `ValueError`."""
     if not isinstance(result, TrackingResult):
         raise ValueError(f"expected a TrackingResult, found {_kind(result)}")
+    _check_shape("points", result.points, (len(result.points), 2))
+    if len(result.inliers) not in {0, len(result.points)}:
+        raise ValueError(
+            f"inliers: expected as many as points, {len(result.points)}, or none, "
+            f"found {len(result.inliers)}"
+        )
     if result.lost:
         return ""
     given: dict[str, tuple[Any, tuple[int, ...]]] = {"pose": (result.pose, (4, 4))}

@@ -25,6 +25,7 @@ from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Image, Imu
+from events.camera_info import COEFFICIENTS
 from events.geometry import inverse
 from nodes.calibration.formats import camera_in_imu, left_out, write_files
 from nodes.data.dataset.recording import Rig
@@ -369,6 +370,7 @@ class Vit(Estimator[VitConfig]):
 
     deterministic: ClassVar[bool] = False
     needs = frozenset({"grey"})
+    lenses = frozenset(COEFFICIENTS)  # the library is told the model
     inertial = True
     aligned = False
 
@@ -443,6 +445,6 @@ class Vit(Estimator[VitConfig]):
         result = await owed
         if result is not None:
             self._pose = result.pose
-            self.publish(image, result)
+            self.send_result(image, result)
         elif self._said:
-            self.publish(image, TrackingResult(self._pose, True, "the library gave no pose"))
+            self.send_result(image, TrackingResult(self._pose, True, "the library gave no pose"))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import inspect
 import types
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from typing import (
     Any,
     Generic,
@@ -127,7 +127,6 @@ class Matcher(Generic[B]):
     Attributes:
         missed: Number of sets not completed, by field: its event was missing, or (of the first
             field) not later than that of the set before.
-        prepare: Awaited with a set that is read; the reader gets its result. `None` for nothing.
     """
 
     def __init__(
@@ -138,7 +137,6 @@ class Matcher(Generic[B]):
         self.deliver: Callable[[B], Any] = stream.offer
         self.slots = {name: Slot(self, name, field.kind) for name, field in fields.items()}
         self.missed = dict.fromkeys(fields, 0)
-        self.prepare: Callable[[B], Awaitable[B]] | None = None
         self._set_type = set_type
         self._tolerance = tolerance
         self._newest: int | None = None
@@ -148,16 +146,14 @@ class Matcher(Generic[B]):
             stream.merge = self._with_tuples_of
 
     def __aiter__(self) -> AsyncIterator[B]:
-        return self.stream if self.prepare is None else self
+        return aiter(self.stream)
 
     async def __anext__(self) -> B:
-        found = await self.stream.__anext__()
-        return found if self.prepare is None else await self.prepare(found)
+        return await anext(aiter(self.stream))
 
     async def receive(self) -> B:
         """Return the next set, waiting if necessary; see `Stream.receive`."""
-        found = await self.stream.receive()
-        return found if self.prepare is None else await self.prepare(found)
+        return await self.stream.receive()
 
     def receive_nowait(self) -> B:
         """Return the next set, neither waiting nor preparing; see `Stream.receive_nowait`."""

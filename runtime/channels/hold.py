@@ -20,7 +20,6 @@ answer to a later frame says that those before it were skipped.
 
 from __future__ import annotations
 
-import asyncio
 import concurrent.futures
 import threading
 import time
@@ -35,7 +34,7 @@ from runtime.channels.answers import Answers, Outcome, Settled, Wrong, read_late
 from runtime.channels.wire import fingerprint
 from runtime.errors import MissingAnswerError
 from runtime.paths import InputPath
-from runtime.time.clock import SECOND, Clock
+from runtime.time.clock import SECOND, Clock, result_of
 from runtime.units import Duration
 
 T = TypeVar("T")
@@ -68,7 +67,7 @@ class Owed(Generic[T]):
         latency = max(self.due - self._clock.now(), 0)
         result = await self._clock.beside(self.work, latency)
         if self.later is not None and result is LET_GO:
-            result = await asyncio.wrap_future(self.later)
+            result = await result_of(self.later)
         found: T | None = result
         return found
 

@@ -12,7 +12,7 @@ import asyncio
 import contextvars
 import types
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import msgspec
@@ -56,11 +56,16 @@ class Stream(Generic[T]):
             discards the oldest and counts it, ``wait`` is for senders that await `Sender.send_wait`
             (a plain `send` raises).
         soon: Resume the reader when the loop next turns instead of inside `offer`.
+
+    Attributes:
+        before: Awaited before an event is taken, so that those arriving meanwhile may replace it.
+        prepare: Awaited with an event that was taken; the reader gets its result. Both, `None` for
+            nothing, hold for ``async for`` and `receive`.
     """
 
     __slots__ = (
-        "_buffer", "_closed", "_room", "_seen", "_taken", "bound", "dropped", "merge", "name",
-        "offer", "overflow", "peak", "soon", "waiter",
+        "_buffer", "_closed", "_room", "_seen", "_taken", "before", "bound", "dropped", "merge",
+        "name", "offer", "overflow", "peak", "prepare", "soon", "waiter",
     )  # fmt: skip
 
     def __init__(
@@ -76,6 +81,8 @@ class Stream(Generic[T]):
         self._buffer: deque[T] = deque()
         self.merge: Callable[[T, T], T] | None = None
         """Merges a dropped item into its successor; the result replaces both."""
+        self.before: Callable[[], Awaitable[object]] | None = None
+        self.prepare: Callable[[T], Awaitable[T]] | None = None
         self.waiter: Waiter | None = None  # set by the task that a reader yielded this stream to
         self._taken = 0
         self._seen: T | None = None
@@ -84,8 +91,8 @@ class Stream(Generic[T]):
 
     # Reading.
 
-    def __aiter__(self) -> Stream[T]:
-        return self
+    def __aiter__(self) -> AsyncIterator[T]:
+        return self if self.before is None and self.prepare is None else _Preparing(self)
 
     @types.coroutine
     def __anext__(self) -> Generator[Any, Any, T]:
@@ -138,7 +145,8 @@ class Stream(Generic[T]):
     async def receive(self) -> T:
         """Return the next event, waiting if necessary.
 
-        ``await anext(stream)`` does the same, a little quicker, and ends as an iterator does.
+        ``await anext(stream)`` does the same, a little quicker and without `before` and `prepare`,
+        and ends as an iterator does.
         Cancelling loses nothing: an event that comes afterwards is kept for the next call.
 
         Raises:
@@ -146,12 +154,12 @@ class Stream(Generic[T]):
             ChannelBusyError: Another coroutine waits here already.
         """
         try:
-            return await self.__anext__()
+            return await anext(aiter(self))
         except StopAsyncIteration:
             raise ChannelClosedError(f"{self.name} is closed") from None
 
     def receive_nowait(self) -> T:
-        """Return the next event without waiting.
+        """Return the next event, neither waiting nor preparing.
 
         Raises:
             LookupError: Nothing waits.
@@ -276,6 +284,25 @@ class Stream(Generic[T]):
         self.waiter = None
         waiter.cancel(msg)
         return True
+
+
+class _Preparing(Generic[T]):
+    """Iterator over a stream with something to await before and after an event is taken."""
+
+    __slots__ = ("_stream",)
+
+    def __init__(self, stream: Stream[T]) -> None:
+        self._stream = stream
+
+    def __aiter__(self) -> _Preparing[T]:
+        return self
+
+    async def __anext__(self) -> T:
+        stream = self._stream
+        if stream.before is not None:
+            await stream.before()
+        event = await stream.__anext__()
+        return event if stream.prepare is None else await stream.prepare(event)
 
 
 class _ForeignTask:

@@ -65,7 +65,7 @@ from runtime.config.model import (
 from runtime.errors import ConfigError, DeclarationError, VisnavError, expect_known, suggest
 from runtime.extras import CONFIGURATIONS, NODES, offers
 from runtime.node import Node
-from runtime.paths import resolve, unmarked
+from runtime.paths import not_utf8, resolve, unmarked
 from runtime.units import Duration
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -114,6 +114,8 @@ def load(
     """
     table = (read or _read_toml)(text_of(path), str(path))
     folder = path.resolve().parent
+    if why := not_utf8(folder):
+        raise ConfigError(f"{path.name}: {why}")
     find_modules_in(folder)
     for change in overrides:
         override(table, change)

@@ -30,7 +30,7 @@ from typing import Any, TypeVar
 from runtime.channels import tasks
 from runtime.channels.streams import Stream
 from runtime.channels.tasks import Nesting, ResumableCoroutine
-from runtime.errors import NodeError
+from runtime.errors import NodeError, UnraisableError
 from runtime.node import Node
 from runtime.time.lockstep import PYTHON, call_after, passes
 
@@ -278,10 +278,17 @@ def of_error(error: BaseException) -> tuple[str, str]:
 
 
 def leaf(error: BaseException) -> BaseException:
-    """Return the only exception of a group, however nested; any other as given."""
-    while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
-        error = error.exceptions[0]
-    return error
+    """Return the only exception of a group, however nested, and the cause of an `UnraisableError`.
+
+    Any other is returned as given.
+    """
+    while True:
+        if isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
+            error = error.exceptions[0]
+        elif isinstance(error, UnraisableError) and error.__cause__ is not None:
+            error = error.__cause__
+        else:
+            return error
 
 
 def waits_for(task: asyncio.Task[Any], future: asyncio.Future[Any]) -> bool:

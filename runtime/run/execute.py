@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import contextlib
 import functools
 import gc
@@ -23,7 +22,7 @@ from runtime.channels.sender import Sender, Tap
 from runtime.channels.wire import Digest
 from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError, VisnavError
-from runtime.logs import file_handler, logging_to
+from runtime.logs import executor, file_handler, lines_of, logging_to
 from runtime.node import Node
 from runtime.run import event_loop, results
 from runtime.run.node_runner import log_error, with_place, wrap
@@ -68,6 +67,7 @@ def execute(
     handlers = list(handlers or [])
     programs = any(spec.node.starts_programs for spec in config.nodes)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(lines_of(object()))
         folder = Folder(out) if isinstance(out, Path) else out
         if folder is not None:
             stack.enter_context(folder)
@@ -100,7 +100,7 @@ def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
     else:
         loop = uvloop.new_event_loop()
     # Named, so that the command line knows whose threads may be left behind.
-    loop.set_default_executor(concurrent.futures.ThreadPoolExecutor(thread_name_prefix="node"))
+    loop.set_default_executor(executor("node"))
     return loop
 
 

@@ -39,6 +39,8 @@ from runtime.workers.worker import Worker
 
 log = logging.getLogger("visnav.runtime")
 
+MOST_GIVEN = 10_000  # announcements of a node, or unmet needs
+
 GRACE = 0.5  # real seconds for a step to end after its cancellation, such as over its limit
 
 Create = Callable[[Coroutine[Any, Any, Any], str], asyncio.Task[Any]]
@@ -103,13 +105,14 @@ class NodeRunner:
             self.started = self._succeeded
             self.starts += self._succeeded
 
-    def announcements(self) -> list[Announcement]:
-        """Return the node's announcements, or raise `NodeError`."""
+    def announcements(self, limit: float) -> list[Announcement]:
+        """Return the node's announcements, within a limit (real s), or raise `NodeError`."""
         assert self.node is not None
         name = self.spec.name
         try:
             given: Any = self.node.announce()
-            found: list[Any] = list(given) if isinstance(given, Iterable) else [given]
+            given = given if isinstance(given, Iterable) else [given]
+            found = self._items("announce", given, limit)
             for each in found:
                 if not isinstance(each, Announcement):
                     raise NodeError(
@@ -122,8 +125,23 @@ class NodeRunner:
         except BaseException as error:
             raise wrap(name, error) from error
 
-    def receive_announcements(self, announcements: Iterable[Announcement]) -> None:
-        """Hand the node all announcements, then call its `check`.
+    def _items(self, phase: str, given: Iterable[Any], limit: float) -> list[Any]:
+        """Return what a phase gives, which may be endless; or raise `NodeError`."""
+        found: list[Any] = []
+        until = time.monotonic() + limit
+        for each in given:
+            if len(found) == MOST_GIVEN:
+                raise NodeError(
+                    self.spec.name,
+                    f"{phase}(): expected an end after at most {MOST_GIVEN:,} values, found more",
+                )
+            if time.monotonic() > until:
+                raise self._too_late(phase, limit, "")
+            found.append(each)
+        return found
+
+    def receive_announcements(self, announcements: Iterable[Announcement], limit: float) -> None:
+        """Hand the node all announcements, then call its `check`, within a limit (real s).
 
         Raises:
             NodeError: The node failed; a `RefusedError` if it cannot work with one, or lacks
@@ -140,7 +158,7 @@ class NodeRunner:
             except BaseException as error:
                 raise wrap(name, error) from error
         try:
-            lacks = list(self.node.check())
+            lacks = self._items("check", self.node.check(), limit)
         except BaseException as error:
             raise wrap(name, error) from error
         if lacks:
@@ -252,7 +270,8 @@ class NodeRunner:
         return wrong
 
     def _too_late(self, what: str, limit: float, place: str) -> NodeTimeoutError:
-        setting = "startup_limit" if what in {"on_startup", "on_ready"} else "shutdown_limit"
+        starting = {"on_startup", "announce", "check", "on_ready"}
+        setting = "startup_limit" if what in starting else "shutdown_limit"
         late = NodeTimeoutError(
             self.spec.name,
             f"expected {what} to end within {limit:.3g} s (run.{setting}), found it still running",
@@ -332,6 +351,7 @@ async def start_up(
     ready: Step | None = None,
     failed: Callable[[Phase, NodeRunner, NodeError], None],
     voices: Voices,
+    limit: float,
     give_up: Callable[[], bool] = lambda: False,
 ) -> None:
     """Take nodes through their phases up to the first update.
@@ -341,6 +361,7 @@ async def start_up(
         exchange: Given what the nodes here announce, returns what all nodes of the run announce.
         ready: Runs a node's `on_ready`; without it, that phase is left out.
         failed: Called when a node fails; if it returns, the next node follows.
+        limit: For what a node announces and checks, real seconds.
         give_up: Asked, once all nodes had their `on_startup`, whether to leave out what follows.
     """
     announced: Announced = {}
@@ -353,7 +374,7 @@ async def start_up(
         return
     for runner in runners:
         try:
-            announced[runner.spec.name] = found = runner.announcements()
+            announced[runner.spec.name] = found = runner.announcements(limit)
             for announcement in found:
                 try:
                     voices.announce(runner.spec.name, announcement)
@@ -364,7 +385,7 @@ async def start_up(
     everything = await exchange(announced)
     for runner in runners:
         try:
-            runner.receive_announcements(everything)
+            runner.receive_announcements(everything, limit)
         except NodeError as error:
             failed("check", runner, error)
     if ready is None:

@@ -22,6 +22,7 @@ import logging
 import os
 import re
 import shutil
+import stat
 import tempfile
 import time
 from collections.abc import Iterator
@@ -33,6 +34,7 @@ import tomli_w
 
 from runtime.config.model import Config, to_builtins
 from runtime.errors import ResultsError
+from runtime.paths import not_utf8
 from runtime.summary import Summary
 
 log = logging.getLogger("visnav.runtime")
@@ -69,6 +71,8 @@ class Folder:
 
     def __enter__(self) -> Folder:
         path = self.path
+        if why := not_utf8(path.absolute()):
+            raise ResultsError(f"folder of results: {why}")
         with _readable(path):
             if path.is_symlink() or path.name in {"", ".."}:
                 path = Path(os.path.realpath(path))
@@ -144,10 +148,14 @@ def clear(out: Path) -> None:
 
 def claim(out: Path) -> None:
     """Make a folder, or take an empty one or a run's, and mark it; else raise `ResultsError`."""
+    if why := not_utf8(out.absolute()):
+        raise ResultsError(f"folder of results: {why}")
     out.mkdir(parents=True, exist_ok=True)
     marker = out / MARKER
     if marker.is_file():
         return
+    if os.path.lexists(marker):
+        raise ResultsError(f"{marker}: expected a file, which a run has made, found none")
     if found := sorted(each.name for each in out.iterdir()):
         raise ResultsError(
             f"{out}: expected a new or empty folder, or one that a run has made (with a "
@@ -157,13 +165,22 @@ def claim(out: Path) -> None:
 
 
 def _marked(folder: Path) -> str:
-    with contextlib.suppress(OSError):
-        return (folder / MARKER).read_text(encoding="utf-8", errors="replace")
+    with contextlib.suppress(OSError), os.fdopen(_open(folder, os.O_RDONLY), "rb") as marker:
+        return marker.read().decode(errors="replace")
     return ""
 
 
+def _open(folder: Path, flags: int) -> int:
+    """Open a folder's marker without waiting, or raise `OSError` if it is no file (a fifo, say)."""
+    marker = os.open(folder / MARKER, flags | os.O_NONBLOCK, 0o666)
+    if not stat.S_ISREG(os.fstat(marker).st_mode):
+        os.close(marker)
+        raise FileExistsError(errno.EEXIST, "expected a file, found none", str(folder / MARKER))
+    return marker
+
+
 def _lock(folder: Path) -> int:
-    marker = os.open(folder / MARKER, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    marker = _open(folder, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW)
     try:
         fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

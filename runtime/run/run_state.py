@@ -35,6 +35,7 @@ from runtime.config.model import Config
 from runtime.config.parameters import change
 from runtime.errors import ConfigError
 from runtime.host import Host, Sibling
+from runtime.logs import executor
 from runtime.node import Node
 from runtime.run import graph
 from runtime.run.node_runner import Create, NodeRunner
@@ -116,9 +117,7 @@ class RunState(Host):
         self._create = create
         self._stop = stop
         self._fault = fault
-        self._executor = concurrent.futures.ThreadPoolExecutor(
-            max_workers=8, thread_name_prefix="offload"
-        )
+        self._executor = executor("offload", 8)
 
     @property
     def several_processes(self) -> bool:
@@ -251,13 +250,14 @@ class RunState(Host):
         def died(error: Exception) -> None:
             loop.call_soon_threadsafe(self._fault, node.name, error)
 
-        name = f"{node.name}.{getattr(factory, '__name__', 'worker')}"
+        kind = getattr(factory, "__name__", "worker")
+        name = f"{node.name}.{kind}"
         worker: Worker[W] = self.make_worker(
             name,
             self.clock,
             factory,
             *args,
-            printed=lambda line: node.log.debug("%s printed: %s", name, line),
+            printed=lambda line: node.log.info("%s: %s", kind, line),
             died=died,
             costs=self.costs.setdefault(name, Costs()),
             **options,

@@ -331,6 +331,7 @@ class Supervisor:
             ready=ready,
             failed=_give_up,
             voices=self._voices,
+            limit=self.state.config.run.startup_limit,
         )
         await self.others.begin()
         return mine
@@ -363,8 +364,9 @@ class Supervisor:
             await self.state.clock.sleep(pause)
             try:
                 await self._start_node(runner)
-                runner.receive_announcements(self.state.announcements)
-                await runner.get_ready(self.state.config.run.startup_limit)
+                limit = self.state.config.run.startup_limit
+                runner.receive_announcements(self.state.announcements, limit)
+                await runner.get_ready(limit)
             except NodeError as error:
                 if isinstance(event_loop.leaf(error.__cause__ or error), FatalError):
                     log_error(error, last=True)

@@ -27,6 +27,7 @@ from typing import Any
 
 from runtime.errors import NodeTimeoutError
 from runtime.host import Stepping
+from runtime.logs import RunThread
 from runtime.run import event_loop
 from runtime.run.event_loop import frame_of
 from runtime.run.node_runner import NodeRunner
@@ -64,7 +65,7 @@ class LoopWatchdog:
         self._thread_id = threading.get_ident()
         self._signed = threading.Event()
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self._thread = RunThread(target=self._watch, name="watchdog", daemon=True)
         self.stalls: Counter[str] = Counter()
         self.longest: dict[str, Stall] = {}
 
@@ -143,7 +144,7 @@ class ProgressWatchdog:
         self._thread_id = threading.get_ident()
         self._main = threading.current_thread() is threading.main_thread()
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="progress", daemon=True)
+        self._thread = RunThread(target=self._watch, name="progress", daemon=True)
 
     def __enter__(self) -> None:
         if self._limit > 0:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
 import ctypes
 import heapq
 import math
@@ -24,6 +25,8 @@ from fractions import Fraction
 from typing import Any, Literal, Protocol, TypeVar
 
 import msgspec
+
+from runtime.errors import raisable
 
 R = TypeVar("R")
 
@@ -43,7 +46,8 @@ class Clock(ABC):
         """Await work done elsewhere, taking `latency` nanoseconds of this clock.
 
         Its result is available at the time of the call plus `latency`. In lockstep exactly then:
-        time runs on up to there and waits for slower work. In real time not before then.
+        time runs on up to there and waits for slower work. In real time not before then. Its error
+        is raised as `raisable` says.
         """
 
     async def sleep(self, seconds: float) -> None:
@@ -71,6 +75,38 @@ class Clock(ABC):
 
     def close(self) -> None:  # noqa: B027  # most clocks hold nothing
         """Release the clock's resources."""
+
+
+async def result_of(work: concurrent.futures.Future[R]) -> R:
+    """Await work done elsewhere, on a loop in real time; its error is raised as `raisable` says.
+
+    Cancelling the wait cancels work that has not begun.
+    """
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[R] = loop.create_future()
+
+    def done(finished: concurrent.futures.Future[R]) -> None:  # no circle: results may be large
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+            loop.call_soon_threadsafe(settle, future, finished)
+
+    work.add_done_callback(done)
+    try:
+        return await future
+    except asyncio.CancelledError:
+        work.cancel()
+        raise
+
+
+def settle(future: asyncio.Future[Any], work: concurrent.futures.Future[Any]) -> None:
+    """Give a future the outcome of finished work, unless nobody waits for it any more."""
+    if future.cancelled():
+        return
+    if work.cancelled():
+        future.cancel()
+    elif (error := work.exception()) is not None:
+        future.set_exception(raisable(error))
+    else:
+        future.set_result(work.result())
 
 
 class Alarm(Protocol):
@@ -121,7 +157,7 @@ class RealClock(Clock):
     async def beside(self, work: concurrent.futures.Future[R], latency: int = 0) -> R:
         """Await work done elsewhere; its result comes no earlier than `latency` ns from now."""
         due = self.now() + latency
-        result = await asyncio.wrap_future(work)
+        result = await result_of(work)
         if latency and due > self.now():
             await self.sleep_until(due)
         return result

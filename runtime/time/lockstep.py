@@ -35,7 +35,8 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
 from runtime.errors import UnsupportedInterpreterError
-from runtime.time.clock import SECOND, Clock, Once, Schedule
+from runtime.logs import executor
+from runtime.time.clock import SECOND, Clock, Once, Schedule, settle
 
 LIMIT = 20.0  # real seconds until an unfinished test has failed; busy machines take their time
 
@@ -133,7 +134,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         self._jumping = selector
         super().__init__(selector)
         self._clock_resolution = 1e-9
-        self.set_default_executor(concurrent.futures.ThreadPoolExecutor(thread_name_prefix="node"))
+        self.set_default_executor(executor("node"))
 
     def time(self) -> float:
         """Return simulated seconds."""
@@ -249,7 +250,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
                     return wait(None)
                 self.now = due
                 _, _, work, future = heapq.heappop(held_work)
-                _settle(future, work)
+                settle(future, work)
             else:
                 self.now = due
                 schedule.run_first(due)
@@ -341,17 +342,6 @@ class LockstepClock(Clock):
 
 def _is_over(held: _Held) -> bool:
     return held[2].done() or held[3].cancelled()
-
-
-def _settle(future: asyncio.Future[Any], work: _Work) -> None:
-    if future.cancelled():
-        return
-    if work.cancelled():
-        future.cancel()
-    elif (error := work.exception()) is not None:
-        future.set_exception(error)
-    else:
-        future.set_result(work.result())
 
 
 def _nothing() -> None:

@@ -136,6 +136,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
             exchange=exchange,
             failed=failed,
             voices=Voices(spec.name for spec in config.nodes),
+            limit=config.run.startup_limit,
             give_up=lambda: bool(errors),  # what others then miss is of no interest
         )
     finally:

@@ -9,6 +9,7 @@ call does not even let go of Python's lock, once its limit is over.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib
 import os
 import select
@@ -18,10 +19,11 @@ import sys
 import sysconfig
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
-from runtime.workers.process import SharedPipe
+from runtime.workers.process import PortableError, SharedPipe
 
 _LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
 """Folders of libraries: code not of the worker's own."""
@@ -81,12 +83,23 @@ def _begin(path: list[str], niceness: int, cores: tuple[int, ...], module: str) 
     """Import the object's module, while the run prepares what the object is made from."""
     sys.path[:] = path
     os.nice(niceness)
+    _print_lines()
     if hasattr(os, "SCHED_BATCH"):  # which, when it wakes, does not push the loop off its core
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     if cores:  # before any library starts threads, which inherit it
         os.sched_setaffinity(0, cores)
     importlib.import_module(module)
+
+
+def _print_lines() -> None:
+    """Have C and C++ libraries print each line as it ends: into a pipe they print 4 KB at a time.
+
+    Python itself is told so by its environment. By setvbuf(3); `_IOLBF` is 1 in glibc and musl.
+    """
+    library = ctypes.CDLL(None)
+    with contextlib.suppress(ValueError, AttributeError):  # a C library with other names
+        library.setvbuf(ctypes.c_void_p.in_dll(library, "stdout"), None, 1, ctypes.c_size_t(0))
 
 
 def _make(pipe: SharedPipe, message: bytearray) -> Any:
@@ -107,7 +120,7 @@ def _attempt(limit: float, do: Callable[..., Any], *args: Any) -> tuple[bool, An
     _limit(limit)
     try:
         return True, do(*args)
-    except Exception as error:
+    except BaseException as error:  # also SystemExit: it is the call that fails
         return False, _portable(error)
     finally:
         _limit(0)
@@ -126,30 +139,16 @@ def _limit(seconds: float) -> None:
 def _answer(pipe: SharedPipe, succeeded: bool, result: Any, wall: int, cpu: int) -> None:
     try:
         packed = pipe.pack((succeeded, result, wall, cpu))
-    except Exception as error:  # the result cannot be pickled
+    except BaseException as error:  # the result cannot be pickled
         packed = pipe.pack((False, _portable(error), wall, cpu))
     pipe.write(packed)
 
 
-def _portable(error: Exception) -> Exception:
-    """Return the error with its traceback as text, since tracebacks cannot be pickled."""
-    import pickle
-    import traceback
-
-    note = "in the worker:\n" + "".join(traceback.format_exception(error))
-    error.add_note(note)
+def _portable(error: BaseException) -> PortableError:
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
     own = [f for f in frames if not f.filename.startswith(_LIBRARIES)] or frames
     place = f"{own[-1].filename}:{own[-1].lineno} in {own[-1].name}" if own else ""
-    vars(error)["place_in_worker"] = place
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301  # made a line above
-    except Exception:
-        found = RuntimeError(f"{type(error).__name__}: {error}")
-        found.add_note(note)
-        vars(found)["place_in_worker"] = place
-        return found
-    return error
+    return PortableError.of(error, place)
 
 
 if __name__ == "__main__":

@@ -30,10 +30,11 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 import weakref
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from runtime.time.clock import DurationHistogram
 
@@ -147,6 +148,43 @@ def how_it_ended(code: int) -> str:
     if code >= 0:
         return f"ended with exit code {code}"
     return f"killed by signal {-code} ({signal.strsignal(-code) or 'unknown'})"
+
+
+class PortableError(NamedTuple):
+    """An exception on its way to another process, which may be unable to make it again."""
+
+    pickled: bytes  # empty if it cannot be pickled
+    text: str  # type and message
+    note: str  # its traceback, since tracebacks cannot be pickled
+    place: str  # line of the worker's own code
+
+    @classmethod
+    def of(cls, error: BaseException, place: str) -> PortableError:
+        """Return an exception raised in this process, whatever its methods do."""
+        pickled, text = b"", f"{type(error).__name__}: a message that cannot be made"
+        with contextlib.suppress(Exception):
+            text = f"{type(error).__name__}: {error}"
+        try:
+            pickled = pickle.dumps(error)
+        except BaseException:
+            pickled = b""
+        note = "in the worker:\n" + "".join(traceback.format_exception(error))
+        return cls(pickled, text, note, place)
+
+    def restored(self) -> BaseException:
+        """Return the exception; a `RuntimeError` with its text if it cannot be made again."""
+        error: Any = None
+        try:
+            error = pickle.loads(self.pickled) if self.pickled else None  # noqa: S301  # of our child
+        except BaseException:
+            error = None
+        if not isinstance(error, BaseException):
+            error = RuntimeError(self.text)
+        with contextlib.suppress(Exception):  # of an odd class
+            error.add_note(self.note)
+            vars(error)["place_in_worker"] = self.place
+        restored: BaseException = error
+        return restored
 
 
 class Costs:

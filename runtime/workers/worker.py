@@ -29,9 +29,16 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
-from runtime.time.clock import SECOND, Clock
+from runtime.time.clock import SECOND, Clock, result_of
 from runtime.time.lockstep import Starvation
-from runtime.workers.process import Costs, Output, SharedPipe, anonymous_file, how_it_ended
+from runtime.workers.process import (
+    Costs,
+    Output,
+    SharedPipe,
+    Throttle,
+    anonymous_file,
+    how_it_ended,
+)
 
 W = TypeVar("W")
 R = TypeVar("R")
@@ -61,7 +68,8 @@ class Worker(Generic[W]):
         niceness: How much the processes stand back for others, 0 to 19. None pushes another off its
             core when it wakes, and in real time they keep off one core, so that a tick need not
             wait for a core to come free.
-        printed: Called with each line that a process prints.
+        printed: Called with lines that the processes print, at most so many a second as a
+            `Throttle` lets pass.
 
     Raises:
         WorkerError: The factory is of no module that a process could import.
@@ -98,10 +106,11 @@ class Worker(Generic[W]):
         self._processes: list[_Process] = []
         self._changing = threading.Lock()
         self._closed = False
+        self._printed = Throttle(printed)
         environment = {**os.environ, **(env or {})}
         names = [f"{name}[{n}]" for n in range(processes)] if processes > 1 else [name]
         self._make = [
-            functools.partial(_Process, each, timeout, environment, printed, died, self.costs)
+            functools.partial(_Process, each, timeout, environment, self._printed, died, self.costs)
             for each in names
         ]
         cores = spare_cores() if clock.kind == "real" else ()
@@ -180,8 +189,7 @@ class Worker(Generic[W]):
         result comes is not the same in every run, unless time stands meanwhile.
         """
         self.costs.latency = None
-        result: R = await asyncio.wrap_future(self._request(method, args, kwargs))
-        return result
+        return await result_of(self._request(method, args, kwargs))
 
     def _request(
         self, method: Callable[..., R], args: Any, kwargs: Any
@@ -208,6 +216,7 @@ class Worker(Generic[W]):
             until = time.monotonic() + _GRACE
             for process in processes:
                 process.join(until)
+        self._printed.end()
 
 
 def spare_cores() -> tuple[int, ...]:
@@ -334,7 +343,8 @@ class _Process:
         message = self._pipe.read()
         try:
             succeeded, result, wall, cpu = self._pipe.unpack(message)
-        except Exception as error:  # this call fails, the next may not
+            result = result if succeeded else result.restored()
+        except BaseException as error:  # this call fails, the next may not
             succeeded, result, wall, cpu = False, error, 0, 0
         now = time.monotonic()
         if now >= self._looked + 1:

@@ -70,7 +70,7 @@ class Ideal(Estimator):
                 encoding="mono8",
                 data=np.zeros((6, 8), np.uint8),
             )
-            self.publish(image, TrackingResult(first @ body))
+            self.send_result(image, TrackingResult(first @ body))
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
+import ctypes
 import os
 import re
 import signal
@@ -9,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,6 +23,52 @@ class UnpicklableError(Exception):
 
     def __init__(self, first: int, second: int) -> None:
         super().__init__(f"{first} and {second}")
+
+
+class UnloadableError(Exception):
+    """An error that can be made again in its own process only."""
+
+    def __reduce__(self) -> Any:
+        return load_in, (os.getpid(),)
+
+
+def load_in(pid: int) -> UnloadableError:
+    """Make the error, in a process of this number."""
+    if os.getpid() != pid:
+        raise SystemExit("expected the process of the error")
+    return UnloadableError("of another process")
+
+
+class SpeechlessError(Exception):
+    """An error whose message cannot be made."""
+
+    def __str__(self) -> str:
+        raise KeyError("no words")
+
+
+ODD: dict[str, tuple[Callable[[], BaseException], str]] = {
+    "StopIteration": (lambda: StopIteration("seeds"), "StopIteration: seeds"),
+    "StopAsyncIteration": (lambda: StopAsyncIteration("seeds"), "StopAsyncIteration: seeds"),
+    "asyncio's CancelledError": (lambda: asyncio.CancelledError("off"), "CancelledError: off"),
+    "a thread's CancelledError": (
+        lambda: concurrent.futures.CancelledError("off"),
+        "CancelledError: off",
+    ),
+    "GeneratorExit": (lambda: GeneratorExit("gone"), "GeneratorExit: gone"),
+    "KeyboardInterrupt": (lambda: KeyboardInterrupt("^C"), "KeyboardInterrupt: ^C (expected self."),
+    "SystemExit": (lambda: SystemExit("enough"), "SystemExit: enough (expected self.stop(reason)"),
+    "BaseException": (lambda: BaseException("of the very base"), "BaseException: of the very base"),
+    "unpicklable": (lambda: UnpicklableError(1, 2), "UnpicklableError: 1 and 2"),
+    "unloadable": (lambda: UnloadableError("of a process"), "UnloadableError: of a process"),
+    "speechless": (SpeechlessError, "SpeechlessError: a message that cannot be made"),
+}
+"""Errors that a coroutine, a pickle or a message could stumble over, and how they are reported."""
+
+
+def raise_odd(way: str) -> None:
+    """Raise one of `ODD`."""
+    error = ODD[way][0]()
+    raise error
 
 
 class Plant:
@@ -32,6 +82,9 @@ class Plant:
         if trouble == "exit":
             print("seed not found", flush=True)
             sys.exit(3)
+        if trouble == "end":
+            print("seed not found", flush=True)
+            os._exit(3)
         if trouble == "hang":
             time.sleep(1000)
         self._kept: list[Any] = []
@@ -81,6 +134,9 @@ class Plant:
     def fail_oddly(self) -> None:
         raise UnpicklableError(1, 2)
 
+    def fail_as(self, way: str) -> None:
+        raise_odd(way)
+
     def lock(self) -> Any:
         import threading
 
@@ -88,6 +144,10 @@ class Plant:
 
     def say(self, text: str) -> None:
         print(text, flush=True)
+
+    def say_in_c(self, text: str) -> None:
+        """Print as a library does: into C's buffer."""
+        ctypes.CDLL(None).printf(text.encode())
 
     def fill(self, size: int) -> int:
         """Have so many bytes for a moment."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import logging
 import threading
 import time
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
 from rich.console import Console
@@ -182,3 +184,78 @@ def test_a_terminal_does_not_keep_a_run_from_ending(monkeypatch: pytest.MonkeyPa
     assert len(keeper.records) == 11
     said = [record.getMessage() for record in terminal.records]
     assert said[-1] == f"{11 - len(said)} log lines are not shown here: they came too fast"
+
+
+class TalkerConfig(NodeConfig):
+    """What it says, and how often."""
+
+    word: str = ""
+    worker: bool = False
+
+
+class Prints:
+    """Object of a worker, that prints."""
+
+    def say(self, word: str) -> None:
+        print(word, flush=True)
+
+
+class Talker(Node[TalkerConfig]):
+    """Logs from everywhere, once the other runs are there too."""
+
+    meeting: ClassVar[threading.Barrier]
+
+    def say(self, where: str) -> None:
+        self.log.info("%s in %s", self.config.word, where)
+        logging.getLogger("visnav.runtime").info(
+            "%s for the runtime in %s", self.config.word, where
+        )
+        logging.getLogger("somebody").warning("%s by a library in %s", self.config.word, where)
+
+    async def run(self) -> None:
+        worker = await self.worker(Prints) if self.config.worker else None
+        await self.offload(self.meeting.wait)
+        for _ in range(20):
+            self.say("run")
+            await self.offload(self.say, "offload")
+            await asyncio.to_thread(self.say, "a thread of asyncio")
+            await asyncio.get_running_loop().run_in_executor(None, self.say, "an executor")
+            thread = threading.Thread(
+                target=self.log.info, args=("%s in its own thread", self.config.word)
+            )
+            thread.start()
+            await self.offload(thread.join)
+        if worker is not None:
+            await worker.call(Prints.say, f"{self.config.word} in a worker")
+        await self.offload(self.meeting.wait)
+        self.stop("all is said")
+
+
+@pytest.mark.parametrize("worker", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_runs_of_one_process_have_logs_of_their_own(worker: bool, tmp_path: Path) -> None:
+    """The levels, too, are each run's own; afterwards it is as before."""
+    words: dict[str, Any] = {"alpha": "info", "beta": "debug", "gamma": "warning"}
+    Talker.meeting = threading.Barrier(len(words))
+    usual = logging.getLogger("visnav").level
+
+    def fly(word: str) -> None:
+        run = RunConfig(log=words[word], clock="real" if word == "beta" else "lockstep")
+        nodes = (spec(Talker, word, {"word": word, "worker": worker}),)
+        execute(Config(run=run, nodes=nodes), tmp_path / word)
+
+    threads = [threading.Thread(target=fly, args=(word,)) for word in words]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for word, level in words.items():
+        text = (tmp_path / word / "log.txt").read_text()
+        others = words.keys() - {word}
+        assert not [line for line in text.splitlines() if any(each in line for each in others)]
+        # In three threads and the loop; in all of them by node, runtime and library.
+        assert text.count(f"{word} by a library in") == 4 * 20
+        told = level != "warning"
+        assert text.count(f" {word}: {word} in ") == (4 * 20 + 20) * told
+        assert text.count(f"{word} for the runtime in") == 4 * 20 * told
+        assert text.count(f"Prints: {word} in a worker") == (told and worker)
+    assert logging.getLogger("visnav").level == usual

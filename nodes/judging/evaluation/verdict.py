@@ -332,7 +332,8 @@ class Album:
                 folder.mkdir(exist_ok=True)
                 drawn = draw_features(image, features)
                 path = folder / f"{source_file(name)}_{image.stamp:015d}.jpg"
-                cv2.imwrite(str(path), drawn, [cv2.IMWRITE_JPEG_QUALITY, 88])
+                jpeg = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
+                path.write_bytes(jpeg.tobytes())
 
 
 def draw_features(image: Image, features: TrackedFeatures | None) -> np.ndarray:

@@ -39,6 +39,7 @@ from events import (
     VehicleAnnouncement,
     VelocitySetpoint,
 )
+from events.camera_info import COEFFICIENTS
 from nodes.calibration.formats import left_out, variables
 from nodes.data.dataset.recording import Rig
 from nodes.estimators import Estimator, Mount, TrackingResult
@@ -83,6 +84,7 @@ class Process(Estimator[ProcessConfig]):
     """
 
     starts_programs = True
+    lenses = frozenset(COEFFICIENTS)  # the program is told the model
 
     setpoints = Output(Setpoint, when="pilot")
     commands = Output(Command, when="pilot")
@@ -332,7 +334,7 @@ class Process(Estimator[ProcessConfig]):
         self._pose = self._pose if answer.pose is None else answer.pose
         reason = "the program says so" if lost else ""
         found = answer.points, answer.inliers, answer.velocity, answer.covariance
-        self.publish(event, TrackingResult(self._pose, lost, reason, *found))
+        self.send_result(event, TrackingResult(self._pose, lost, reason, *found))
 
     def _publish_further(
         self, event: Event, answer: LinkAnswer, pose: npt.NDArray[np.float64]

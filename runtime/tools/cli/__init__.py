@@ -17,7 +17,8 @@ from typing import NoReturn
 
 import typer
 
-from runtime.errors import VisnavError
+from runtime.errors import CommandError, VisnavError
+from runtime.paths import not_utf8
 from runtime.tools.cli.commands import Commands
 
 app = typer.Typer(
@@ -39,6 +40,9 @@ def main() -> None:
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="replace")  # a terminal may lack an arrow
+        for argument in sys.argv[1:]:
+            if why := not_utf8(argument):  # before any library sees it
+                raise CommandError(f"command line: {why}")
         app()
     except KeyboardInterrupt:
         interrupted()

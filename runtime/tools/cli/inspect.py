@@ -349,7 +349,10 @@ def demo(
 
 def example(
     name: Annotated[
-        str | None, typer.Argument(help="Which one to copy; all are listed if not given.")
+        str | None,
+        typer.Argument(
+            help="Which one to copy, with or without .toml; all are listed if not given."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to copy it to.")] = Path(),
 ) -> None:
@@ -364,6 +367,7 @@ def example(
         for each, path in examples.items():
             print(f"{each:18} {_about(path)}")
         return
+    name = name.removesuffix(".toml")
     expect_known(name, examples, f"expected the name of an example, found {name!r}")
     _copy(examples[name], out, {})
 

@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from events import TrackedFeatures
 from runtime.errors import CommandError, VisnavError
+from runtime.logs import RunThread
 from runtime.tools.monitor import protocol
 from runtime.tools.monitor.observer import Observer, describe
 
@@ -82,7 +83,7 @@ class Server:
         new.chmod(0o600)
         self._listener.listen(100)
         new.rename(path)
-        threading.Thread(target=self._listen, name="monitor", daemon=True).start()
+        RunThread(target=self._listen, name="monitor", daemon=True).start()
 
     def stop(self) -> None:
         """Send the last snapshot to all who watch, and stop listening; called on the run's loop."""
@@ -114,7 +115,7 @@ class Server:
                 except OSError:  # the end, or too many open files
                     self._end.wait(0.1)
                     continue
-                thread = threading.Thread(target=self._serve, args=(client,), daemon=True)
+                thread = RunThread(target=self._serve, args=(client,), daemon=True)
                 self._clients[thread] = client
                 thread.start()
 

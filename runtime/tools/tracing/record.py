@@ -30,6 +30,7 @@ import msgspec
 
 from events import Category, Event, Image, Setpoint
 from runtime.channels.sender import Sender, Tap
+from runtime.logs import RunThread
 from runtime.run.run_state import Call, Instrument
 from runtime.time.clock import Clock, RealClock
 
@@ -115,7 +116,7 @@ class Spool:
         self._file = path.open("wb", buffering=0)
         self._lists: queue.SimpleQueue[list[tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._encode = msgspec.msgpack.Encoder().encode
-        self._thread = threading.Thread(target=self._write, name="trace", daemon=True)
+        self._thread = RunThread(target=self._write, name="trace", daemon=True)
         self._thread.start()
 
     def put(self, notes: list[tuple[Any, ...]]) -> None:

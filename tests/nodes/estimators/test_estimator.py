@@ -265,7 +265,7 @@ def test_a_frame_of_before_a_restart_is_no_frame_of_another_map() -> None:
 
     frames = [e for at, grey in [(1, 9), (2, 11), (900 * MS, 9)] for e in rgbd(at, grey=grey)]
     result = run_nodes(
-        [spec(Crashes, "est", on_error="restart")],
+        [spec(Crashes, "est", {"latency": 0}, on_error="restart")],
         inputs=[vehicle(), camera("drone/front", "rgb", "depth"), *frames],
         duration=1.0,
     )

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+from typing import Any
+
+import msgspec
 import numpy as np
 import pytest
 
@@ -10,16 +14,29 @@ from events import (
     CameraInfo,
     EstimatorAnnouncement,
     Event,
+    Image,
     PoseEstimate,
     TrackedFeatures,
     TrajectoryEstimate,
 )
+from events.camera_info import COEFFICIENTS
 from nodes.estimators import Estimator, StereoInertialFrame, TrackingResult
+from nodes.estimators.evalio import Evalio
+from nodes.estimators.inertial_odometry import RgbdInertialOdometry, StereoInertialOdometry
+from nodes.estimators.monocular_odometry import MonocularOdometry
+from nodes.estimators.orb_slam3 import OrbSlam3
 from nodes.estimators.rig import SensorChoice
-from runtime import Bundle
+from nodes.estimators.svo import Svo
+from nodes.estimators.visual_odometry import VisualOdometry
+from nodes.estimators.visual_odometry.node import StereoOdometry
+from nodes.outside.process import Process
+from nodes.outside.vit import Vit
+from runtime import Bundle, Input, on
 from runtime.errors import NodeError, RefusedError
+from runtime.node import make_node
 from runtime.testing import run_nodes, spec
 from tests.nodes.estimators.test_estimator import (
+    INFO,
     MS,
     Scripted,
     camera,
@@ -29,6 +46,7 @@ from tests.nodes.estimators.test_estimator import (
     track,
     vehicle,
 )
+from tests.runtime.small_events import NoHost
 
 
 def test_the_first_camera_that_gives_what_is_needed_is_read() -> None:
@@ -187,3 +205,89 @@ def test_the_file_may_name_both_cameras() -> None:
     nodes = [spec(StereoInertial, "est", inputs=named)]
     result = run_nodes(nodes, inputs=[*announced, *flown], duration=1.0)
     assert len(result.of(PoseEstimate)) == 1
+
+
+def test_a_class_that_says_nothing_of_lenses_reads_a_pinhole_and_the_log_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    given: list[CameraInfo] = []
+
+    class Asks(Scripted):
+        async def run(self) -> None:
+            async for image, _ in self.frames:
+                given.append(self.the_camera().info)
+                self.publish(image, TrackingResult(np.eye(4)))
+
+    caplog.set_level(logging.INFO, "visnav")
+    seen = camera("drone/front", "rgb", "depth", info=BARREL)
+    result = run_nodes([spec(Asks, "est")], inputs=[seen, *rgbd(1)], duration=1.0)
+    (said,) = result.of(EstimatorAnnouncement)
+    assert (said.lenses, said.rectifies) == ((), True)
+    assert [info.is_pinhole for info in given] == [True]
+    focal = f"{given[0].fx:.1f}"
+    (line,) = (r.getMessage() for r in caplog.records if "rectified" in r.getMessage())
+    assert line.startswith(
+        "drone/front is rectified: plumb_bob with -0.2, 0.05, 0, 0, 0 to pinhole, focal length "
+        f"{focal} px, "
+    )
+
+
+def test_images_read_in_a_handler_are_not_taken_for_rectified_ones() -> None:
+    class Handles(Estimator):
+        needs = frozenset({"grey"})
+
+        @on(Image)
+        def images(self, image: Image) -> None: ...
+
+        async def run(self) -> None: ...
+
+    seen = [camera("drone/front", "grey", info=info) for info in (BARREL, INFO)]
+    with pytest.raises(RefusedError, match=r"expected images read from a Bundle .* plumb_bob with"):
+        run_nodes([spec(Handles, "est")], inputs=seen[:1], duration=0.1)
+    run_nodes([spec(Handles, "est")], inputs=seen[1:], duration=0.1)
+
+
+def test_a_stream_of_single_images_is_rectified_too() -> None:
+    corners: list[int] = []
+
+    class Single(Estimator):
+        needs = frozenset({"grey"})
+        images = Input(Image)
+
+        async def run(self) -> None:
+            image = await self.images.receive()
+            corners.append(int(image.data[0, 0]))
+
+    seen = camera("drone/front", "grey", info=BARREL)
+    data = np.full((6, 8), 9, np.uint8)
+    data[0, 0] = 200  # the corner is cut off
+    image = msgspec.structs.replace(rgbd(1)[0], data=data)
+    run_nodes([spec(Single, "est")], inputs=[seen, image], duration=0.1)
+    assert len(corners) == 1
+    assert corners[0] < 200
+
+
+@pytest.mark.parametrize(
+    ("node", "settings", "lenses"),
+    [
+        (VisualOdometry, {}, set()),
+        (StereoOdometry, {}, set()),
+        (RgbdInertialOdometry, {}, set()),
+        (StereoInertialOdometry, {}, set()),
+        (MonocularOdometry, {}, set()),
+        (Svo, {}, set()),
+        (Evalio, {}, set()),
+        (OrbSlam3, {"mode": "rgbd"}, {"plumb_bob"}),
+        (OrbSlam3, {"mode": "monocular"}, {"plumb_bob", "equidistant"}),
+        (OrbSlam3, {"mode": "stereo"}, set()),
+        (Vit, {"library": "libvit.so"}, set(COEFFICIENTS)),
+        (Process, {"command": ["slam"]}, set(COEFFICIENTS)),
+    ],
+)
+def test_each_of_ours_says_which_lenses_it_knows(
+    node: type[Estimator[Any]], settings: dict[str, Any], lenses: set[str]
+) -> None:
+    made = make_node(node, "est", spec(node, "est", settings).config, NoHost())
+    (said,) = made.announce()
+    assert isinstance(said, EstimatorAnnouncement)
+    assert set(said.lenses) == lenses

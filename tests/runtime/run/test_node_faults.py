@@ -85,9 +85,7 @@ def wrong_with(here: Path, place: str, way: str, rule: str) -> list[str]:
     if (place, way) == ("task_group", "CancelledError"):
         fails = False  # asyncio's own rule: a cancelled child is no error of its group
     text = SAID[way]
-    if way == "StopIteration" and place == "offload":
-        text = "RuntimeError: the function raised StopIteration"
-    elif way == "StopIteration" and place in COROUTINES:
+    if way == "StopIteration" and place in COROUTINES:
         text = "RuntimeError: coroutine raised StopIteration"
     reason = "duration"
     if place in EARLY:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -15,7 +17,7 @@ import pytest
 
 import visnav
 from runtime.config.model import Config, RunConfig
-from runtime.errors import NodeError, ResultsError
+from runtime.errors import ConfigError, NodeError, ResultsError
 from runtime.node import Node
 from runtime.run import execute as execution
 from runtime.run.execute import execute
@@ -209,6 +211,50 @@ def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path: Path) 
         fly(tmp_path)
     assert [file.read_text(encoding="utf-8") for file in mine] == ["mine", "mine"]
     assert sorted(each.name for each in tmp_path.iterdir()) == ["config.toml", "plots"]
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_marker_that_is_no_file_is_refused_at_once(
+    make: Callable[[Path], None], inside: bool, tmp_path: Path
+) -> None:
+    """Nobody waits for somebody else to open a fifo."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    make(folder / MARKER)
+    if inside:
+        (folder / "summary.json").write_text("{}")
+    with pytest.raises(ResultsError, match=rf"out/{MARKER}: expected a file"), Folder(folder):
+        pass
+    with pytest.raises(ResultsError, match=rf"out/{MARKER}: expected a file"):
+        clear(folder)
+
+
+def path_of(name: bytes) -> str:
+    return os.fsdecode(name)
+
+
+def test_a_folder_that_is_no_utf8_is_refused_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Libraries, JSON and TOML know no other names; OpenCV crashes at the end of the run."""
+    says = r"expected a path in UTF-8, found '.*o\\xff\\xfe"
+    odd = tmp_path / path_of(b"o\xff\xfe")
+    with pytest.raises(ResultsError, match=says), Folder(odd):
+        pass
+    assert not odd.exists()
+    odd.mkdir()
+    config_file(odd, "Speaker")
+    with pytest.raises(ConfigError, match=f"sample.toml: {says}"):
+        visnav.run(odd / "sample.toml")
+    monkeypatch.chdir(odd)
+    with pytest.raises(ResultsError, match=says), Folder(Path("runs")):
+        pass
+    monkeypatch.chdir(tmp_path)
+    config_file(tmp_path, "Speaker", run="duration = 0.2")
+    done = command_here("run", "sample.toml", "--out", path_of(b"o\xff\xfe"), folder=tmp_path)
+    assert done.returncode == 2
+    assert re.fullmatch(f"error: command line: {says}'\n", done.stderr), done.stderr
 
 
 def test_a_folder_of_a_run_of_an_earlier_version_is_one(tmp_path: Path) -> None:

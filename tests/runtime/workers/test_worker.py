@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 
 from runtime import Worker
-from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
+from runtime.errors import UnraisableError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.run import event_loop as task_factory
 from runtime.run.node_runner import with_place, wrap
 from runtime.testing import run_in_lockstep
 from runtime.time.clock import RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.workers.process import LINES
 from tests.runtime.samples_workers import Plant, plain
 
 pytestmark = pytest.mark.timeout(30)
@@ -101,7 +102,8 @@ async def test_an_exception_of_the_object_comes_back_with_the_workers_traceback(
     [
         ("value", ValueError, "no such plant"),
         ("file", FileNotFoundError, "plant.xml"),
-        ("exit", WorkerDiedError, "worker plant: ended with exit code 3; .*\nseed not found"),
+        ("exit", UnraisableError, "SystemExit: 3"),
+        ("end", WorkerDiedError, "worker plant: ended with exit code 3; .*\nseed not found"),
     ],
 )
 async def test_an_error_of_the_constructor_comes_back(
@@ -166,7 +168,20 @@ async def test_what_a_process_prints_is_passed_on() -> None:
     async with worker(printed=lines.append) as plant:
         await plant.call(Plant.say, "hello\nworld")
         await plant.call(Plant.echo, 1)
-    assert lines == ["hello", "world"]
+        await plant.call(Plant.say_in_c, "from a library\n")
+        await poll(lambda: len(lines) == 3)  # before the process ends
+        await plant.call(Plant.say, "more\n" * 1000)
+    assert lines[:3] == ["hello", "world", "from a library"]
+    assert lines.count("more") <= 2 * LINES, "of two seconds, at most"
+    assert sum(map(int, re.findall(r"\((\d+) more lines\)", "\n".join(lines)))) >= 1000 - 2 * LINES
+
+
+async def poll(reached: Callable[[], bool]) -> None:
+    """Wait, in real time, for what another process does."""
+    until = time.monotonic() + 10.0
+    while not reached() and time.monotonic() < until:  # noqa: ASYNC110  # a thread tells it
+        await asyncio.sleep(0.01)
+    assert reached()
 
 
 @pytest.mark.slow

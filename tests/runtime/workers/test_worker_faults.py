@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from typing import ClassVar
@@ -91,7 +92,8 @@ def test_a_restarted_node_has_a_new_worker(fate: str, clock: str) -> None:
     ("trouble", "text"),
     [
         ("value", "g: ValueError: no such plant"),
-        ("exit", "g: worker g.Plant: ended with exit code 3"),
+        ("exit", "g: SystemExit: 3"),
+        ("end", "g: worker g.Plant: ended with exit code 3"),
     ],
 )
 def test_a_worker_that_cannot_be_made_ends_the_start(trouble: str, text: str) -> None:
@@ -110,3 +112,19 @@ def test_the_end_of_a_run_ends_its_workers() -> None:
     outcome = supervise([spec(Gardener, "g")], duration=0.5)
     assert outcome.error is None
     assert not alive(Gardener.pids[1])
+
+
+def test_what_a_worker_prints_stands_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    class Hears(Node):
+        async def run(self) -> None:
+            plant = await self.worker(Plant)
+            await plant.call(Plant.say, "a leaf\nanother")
+            self.stop("said")
+
+    caplog.set_level(logging.INFO)
+    supervise([spec(Hears, "g")])
+    told = [(r.name, r.levelname, r.getMessage()) for r in caplog.records if "Plant" in r.message]
+    assert told == [
+        ("visnav.g", "INFO", "Plant: a leaf"),
+        ("visnav.g", "INFO", "Plant: another"),
+    ]
