@@ -18,6 +18,7 @@ from pathlib import Path
 import msgspec
 
 from runtime.channels.wire import combined
+from runtime.run.made_from import during, made_from
 from runtime.run.results import clear
 from runtime.summary import Verdict
 from runtime.tools.sweep.plan import Job
@@ -67,7 +68,15 @@ class Children:
         return len(self._running)
 
     def run(self, job: Job) -> Row:
-        """Run a job and wait for its end."""
+        """Run a job and wait for its end; note what it was made from, and what of it changed."""
+        before = made_from(job.roots)
+        row = self._run(job)
+        row["parts"], edited = during(before, made_from(job.roots))
+        if edited:
+            row["edited"] = edited
+        return row
+
+    def _run(self, job: Job) -> Row:
         out = Path(job.out)
         clear(out)
         settings = out / "config.toml"
