@@ -298,7 +298,8 @@ def compare(
 
     Returns:
         `rows`, one a figure of an estimator, with `change`, `low`, `high`, `p` and the verdict in
-        `words`; `worse`, with which the command ends with 1; and the `page`.
+        `words`; `worse`, with which the command ends with 1; the `page`; and `notes`, which are
+        warned of, on flights that are not the same for A and B.
 
     Raises:
         ConfigError: A file, a folder, a setting or a figure is wrong, or nothing is in common.
@@ -310,7 +311,7 @@ def compare(
     from runtime.tools import comparison
     from runtime.tools import sweep as sweeping
 
-    return comparison.compare(
+    compared = comparison.compare(
         [Path(each) for each in what],
         _changes(a or {}),
         _changes(b or {}),
@@ -322,6 +323,9 @@ def compare(
         out=Path(out),
         fly=functools.partial(sweeping.run_here, jobs=jobs),
     )
+    for note in compared.notes:
+        warnings.warn(note, stacklevel=2)
+    return compared
 
 
 def judge(

@@ -6,6 +6,7 @@ figure that is not in it is shown all the same, by its name, among all others.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import msgspec
@@ -60,7 +61,12 @@ class Figure(msgspec.Struct, frozen=True):
         return f"{self.meaning[0].upper()}{self.meaning[1:]}{unit}, at {self.limit}."
 
     def missed(self, limit: float | None, value: Any) -> str:
-        """Return a sentence if a value does not meet a threshold, or else nothing."""
+        """Return a sentence if a value does not meet a threshold, or else nothing.
+
+        An infinite threshold is none.
+        """
+        if limit is not None and math.isinf(limit):
+            return ""
         if limit is None and value is not None:
             limit = self.all_or_none
         if limit is None or (value is None and self.optional):

@@ -109,10 +109,10 @@ class EvaluationConfig(NodeConfig):
         gap: Silence of an estimator that counts as lost.
         max_difference: From a time to the nearest true pose in a hole of the truth; in longer holes
             poses are not compared.
-        thresholds: Limits of figures; a missed one makes the run's exit code 1. Always asked: poses
-            for nine tenths of the flight, one frame, rising stamps, no collision, the run's planned
-            end. With thresholds, there must be an estimator. ``collisions`` and ``plan_*`` are
-            thresholds of the flight, and fail no estimator.
+        thresholds: Limits of figures, ``inf`` for none; a missed one makes the run's exit code 1.
+            Always asked: poses for nine tenths of the flight, one frame, rising stamps, no
+            collision, the run's planned end. With thresholds, there must be an estimator.
+            ``collisions`` and ``plan_*`` are thresholds of the flight, and fail no estimator.
         estimators: Settings of single estimators, by source.
         image_count: Sample images with features of each estimator; 0 for none.
     """

@@ -18,6 +18,7 @@ Sample images, with the features of estimators in them, spread evenly over a run
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -41,7 +42,8 @@ from runtime.time.clock import SECOND
 class _Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def given(self, *, of_flight: bool = False) -> bool:
         """Return whether any threshold of an estimator, or else of a flight, is not its default."""
-        return any(getattr(self, each.name) != each.default for each in _asked(of_flight))
+        values = ((getattr(self, each.name), each.default) for each in _asked(of_flight))
+        return any(v != default and v not in {math.inf, -math.inf} for v, default in values)
 
     def missed(self, figures: Mapping[str, Any], *, of_flight: bool = False) -> list[str]:
         """Return a sentence for each missed threshold of an estimator, or else of the flight."""
@@ -71,7 +73,7 @@ else:
             if each.default is not None
             else (each.name, kind | None, None)
             for each in _ASKED
-            for kind in [int if each.counts else float]
+            for kind in [int | float if each.counts else float]  # ``inf`` for none
         ],
         bases=(_Limits,),
         module=__name__,

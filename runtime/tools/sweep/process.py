@@ -43,6 +43,8 @@ class Ended(msgspec.Struct, frozen=True):
     error: str | None = None
     digest: str | None = None
     digests: dict[str, str] = {}
+    name: str = ""
+    inputs: dict[str, str] = {}
     not_deterministic: list[str] = []
     verdict: Verdict | None = None
     workers: dict[str, dict[str, float | None]] = {}
@@ -217,7 +219,7 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
         row["error"] = unread
     if ended is not None:
         row["sim_seconds"], row["run_seconds"] = ended.sim_seconds, ended.wall_seconds
-        row["workers"] = ended.workers
+        row["workers"], row["name"], row["inputs"] = ended.workers, ended.name, ended.inputs
         row["digest"] = None if ended.not_deterministic else ended.digest
         if ended.reason in _STOPPED:
             row["error"] = f"interrupted by {ended.reason}"

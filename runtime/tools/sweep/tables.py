@@ -41,6 +41,8 @@ class Row(TypedDict):
         run_seconds: Real seconds from the first update to the end.
         wall_seconds: Real seconds of the whole process.
         estimators: Name to figures, as the run's verdict has them.
+        name: Of the run.
+        inputs: Fingerprints of what estimators are fed, by output and announcement; empty if off.
         made_from: Key of what the run was made from.
         parts: What it was made from; in the files it stands once, under that key.
         edited: What of it changed while the run was under way, in words.
@@ -62,6 +64,8 @@ class Row(TypedDict):
     crashes: NotRequired[list[str]]
     flights: NotRequired[dict[str, dict[str, Any]]]
     workers: NotRequired[dict[str, dict[str, float | None]]]
+    name: NotRequired[str]
+    inputs: NotRequired[dict[str, str]]
     made_from: NotRequired[str]
     parts: NotRequired[Parts]
     edited: NotRequired[list[str]]
