@@ -47,11 +47,12 @@ from nodes.trajectory_files import (
     read_vslamlab,
     write_tum,
 )
+from runtime.commit import commit
 from runtime.errors import ResultsError
 from runtime.paths import source_file
 from runtime.run import results
 from runtime.run.results import newest, run_folder
-from runtime.run.summarise import command_line, commit, environment
+from runtime.run.summarise import command_line, environment
 from runtime.time.clock import SECOND
 
 
