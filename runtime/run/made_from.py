@@ -97,8 +97,17 @@ def roots_of(config: Config, folder: Path | None = None, modules: Iterable[str] 
         own = msgspec.to_builtins(spec.config, enc_hook=plain)
         texts |= dict.fromkeys(text for text in _texts(own) if text not in apart)
         programs += lines
+    named = (spec.type_name.partition(":") for spec in config.nodes)
     return Roots(
-        modules=tuple(sorted({*modules, *(spec.node.__module__ for spec in config.nodes)})),
+        modules=tuple(
+            sorted(
+                {
+                    *modules,
+                    *(spec.node.__module__ for spec in config.nodes),
+                    *(module for module, colon, _ in named if colon),
+                }
+            )
+        ),
         folder=str(folder or ""),
         inputs=tuple(files),
         texts=tuple(texts),
@@ -288,6 +297,8 @@ class _Collector:
         for name, paths in found.files.items():
             for path in paths:
                 self._note(name, path, certain=name not in found.named)
+                if path.endswith(".so") and name.partition("/")[0] not in OURS and libraries:
+                    self._add_libraries(Path(path), None)
         if libraries:
             self._others |= distributions(found.installed, finder.sites)
 
@@ -486,7 +497,7 @@ def _is_file(path: Path) -> bool:
 
 def _is_data(path: Path) -> bool:
     """Tell whether a path is a folder of data, and none that everything lies in."""
-    path, home = Path(os.path.normpath(path)), Path.home()
+    path, home = Path(os.path.normpath(path)), Path(os.environ.get("HOME") or "/")
     around = {Path("/"), home, *home.parents}
     return path.is_dir() and path not in around and not f"{path}/".startswith(_SYSTEM)
 

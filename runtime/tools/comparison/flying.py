@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from runtime.tools.comparison.statistics import (
     compare_until_sure,
 )
 from runtime.tools.sweep import Job, Plan, Row, make_plan, plan_of, run_here
+from runtime.tools.sweep.console import listed
 from runtime.tools.sweep.plots import decades, template
 from runtime.tools.sweep.process import Ended
 from runtime.tools.sweep.tables import decode_rows
@@ -96,6 +97,7 @@ def compare(
             raise ConfigError("compare: expected two folders, without --a and --b")
         sides = [read_folder(path) for path in what]
         notes += check_flights(*sides)
+        notes += [*_edited(zip("AB", sides, strict=True))]
         found = compare_rows(*sides, **options)
     else:
         if not (a or b):
@@ -194,6 +196,15 @@ def check_flights(a: Mapping[Key, Sequence[Row]], b: Mapping[Key, Sequence[Row]]
             "there are no fingerprints of their inputs"
         )
     return notes
+
+
+def _edited(sides: Iterable[tuple[str, Mapping[Key, Sequence[Row]]]]) -> Iterator[str]:
+    """Yield a sentence for a side of which files were edited while its runs were under way."""
+    for side, runs in sides:
+        edited = [row["edited"] for rows in runs.values() for row in rows if row.get("edited")]
+        if edited:
+            what = listed(dict.fromkeys(each for own in edited for each in own))
+            yield f"{len(edited)} runs of {side} are of a mixture: {what} while they ran"
 
 
 def _inputs(rows: Sequence[Row]) -> tuple[str, dict[str, str]]:

@@ -250,7 +250,8 @@ class Display(Watch):
 def words(changed: Mapping[Job, Sequence[str]]) -> str:
     """Return which finished runs are run again, and why: ``2 are run again: x.py changed``."""
     reasons = [each for why in changed.values() for each in why]
-    return f"{len(changed)} are run again: {listed(dict.fromkeys(reasons))}"
+    are = "is" if len(changed) == 1 else "are"
+    return f"{len(changed)} {are} run again: {listed(dict.fromkeys(reasons))}"
 
 
 def listed(reasons: Iterable[str]) -> str:

@@ -356,6 +356,22 @@ def test_different_flights_are_not_taken_for_equal_ones() -> None:
     assert note.startswith("whether 1 of 3 flights are the same for A and B is not known")
 
 
+def test_runs_during_which_files_were_edited_are_told(tmp_path: Path) -> None:
+    for side in "ab":
+        rows = [fed(("run", n), odometry="1") for n in range(2)]
+        if side == "b":
+            rows[0]["edited"] = ["vo.py changed"]
+        (tmp_path / side).mkdir()
+        lines = b"\n".join(msgspec.json.encode(each) for each in rows)
+        (tmp_path / side / "rows.jsonl").write_bytes(lines)
+    with pytest.warns(UserWarning, match="1 runs of B are of a mixture: vo.py changed while they"):
+        compared = visnav.compare(
+            tmp_path / "a", tmp_path / "b", figures=["ate_percent"], out=tmp_path / "out"
+        )
+    assert compared.notes[0] in (tmp_path / "out" / "compare.html").read_text(encoding="utf-8")
+    assert compared.notes[0] in repr(compared)
+
+
 def test_a_row_cut_short_by_a_full_disk_is_left_out(tmp_path: Path) -> None:
     line = msgspec.json.encode(row(3, ate_percent=1.0))
     (tmp_path / "rows.jsonl").write_bytes(line + b"\n" + line[:40])

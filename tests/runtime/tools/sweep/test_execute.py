@@ -290,7 +290,7 @@ def test_a_run_during_which_a_file_was_edited_is_run_again(tmp_path: Path) -> No
     diary, shown = swept(plan)
     why = "judge_meanwhile.py changed while it ran"
     assert diary.changed == {"judge.rate=2 seed=3": [why]}
-    assert shown == f"1 runs are finished already, 1 are run again: {why}\n"
+    assert shown == f"1 runs are finished already, 1 is run again: {why}\n"
     assert swept(plan, refuse)[0].finished == 2
 
 
