@@ -227,7 +227,8 @@ def sweep(
 ) -> Any:
     """Run a file with every combination of some settings, each run in a process of its own.
 
-    What is finished already is not run again; see the command ``sweep``.
+    What is finished already is not run again, unless code, programs or files that it was made from
+    have changed, which is logged; see the command ``sweep``.
 
     Args:
         vary: Values by setting: ``{"camera.rate": [10, 30]}``.
@@ -283,6 +284,8 @@ def compare(
     jobs: int | None = None,
 ) -> Compared:
     """Compare two versions over equal flights: is B better than A? See the command ``compare``.
+
+    What is flown already is kept as in `sweep`.
 
     Args:
         what: Files, one a scenario; or two folders of finished sweeps or runs, A and B.

@@ -28,6 +28,8 @@ from typing import Any, TypeGuard, TypeVar
 import msgspec
 import xxhash
 
+from runtime.commit import NOTE
+
 T = TypeVar("T")
 
 
@@ -444,7 +446,8 @@ def find_sources(
         found.add(f"{base}/{Path(file).name}".lstrip("/"), file)
         if is_package:
             for beside in os.scandir(folders[0]):
-                if not beside.name.endswith((".py", ".pyc", ".pyi")) and beside.is_file():
+                skipped = beside.name.endswith((".py", ".pyc", ".pyi")) or beside.path == str(NOTE)
+                if not skipped and beside.is_file():
                     found.add(f"{base}/{beside.name}", beside.path)
         read_file(file, name, name if is_package else ".".join(parts[:-1]))
     return found

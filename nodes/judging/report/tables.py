@@ -59,6 +59,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     announcements: list[dict[str, Any]] = []
     environment: dict[str, str] = {}
     judged: dict[str, str] = {}
+    judged_hashes: dict[str, str] = {}
     notes: list[str] = []
 
 

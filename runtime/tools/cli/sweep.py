@@ -86,9 +86,10 @@ def sweep(
     what comes after the sensors fly once: that flight is recorded, and kept for later sweeps (see
     the command flights). Results go to sweeps/<name>: index.html shows all of them; table.csv,
     summary.csv, plots/, each run's folder in runs/, and, since they depend on the machine,
-    timing.csv and what workers cost in costs.csv. Called again, only what is missing or has crashed
-    is run. Ends with 0 if every run came to its end and met its thresholds; with 1 if a threshold
-    was missed; with 2 if a run crashed; with 130 after Ctrl-C.
+    timing.csv and what workers cost in costs.csv. Called again, only what is missing, has crashed,
+    or was made from something that has changed (code, programs, files) is run. Ends with 0 if every
+    run came to its end and met its thresholds; with 1 if a threshold was missed; with 2 if a run
+    crashed; with 130 after Ctrl-C.
     """
     from rich.console import Console
 
