@@ -98,16 +98,10 @@ def roots_of(config: Config, folder: Path | None = None, modules: Iterable[str] 
         texts |= dict.fromkeys(text for text in _texts(own) if text not in apart)
         programs += lines
     named = (spec.type_name.partition(":") for spec in config.nodes)
+    own_modules = {spec.node.__module__ for spec in config.nodes}
+    own_modules |= {module for module, colon, _ in named if colon}
     return Roots(
-        modules=tuple(
-            sorted(
-                {
-                    *modules,
-                    *(spec.node.__module__ for spec in config.nodes),
-                    *(module for module, colon, _ in named if colon),
-                }
-            )
-        ),
+        modules=tuple(sorted({*modules, *own_modules})),
         folder=str(folder or ""),
         inputs=tuple(files),
         texts=tuple(texts),
@@ -219,17 +213,8 @@ _BUILD_FILES = frozenset({"CMakeLists.txt", "Makefile", "makefile", "Cargo.lock"
 _BUILT = frozenset({"build", "install", "log", "target", "devel", "CMakeFiles", "node_modules"})
 _RESULTS = frozenset({"runs", "sweeps", "compared", "judged", "__pycache__"})
 _SYSTEM = (
-    "/bin/",
-    "/dev/",
-    "/etc/",
-    "/lib/",
-    "/lib32/",
-    "/lib64/",
-    "/proc/",
-    "/sbin/",
-    "/sys/",
-    "/usr/",
-)
+    "/bin/", "/dev/", "/etc/", "/lib/", "/lib32/", "/lib64/", "/proc/", "/sbin/", "/sys/", "/usr/",
+)  # fmt: skip
 _TOKEN = re.compile(r"""[^\s"'`=;:,|&()<>{}\[\]$#]+""")
 _FILES = re.compile(r"""\bfile\w*\s*=\s*["']([^"']+)["']""")
 _FOLDERS = re.compile(r"""(?:mesh|texture|asset)dir\s*=\s*["']([^"']+)["']""")

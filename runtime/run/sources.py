@@ -425,7 +425,9 @@ def find_sources(
         if name.endswith("*"):
             package = name.removesuffix("*").removesuffix(".")
             inside = finder.find(package)[1] if package else finder.first
-            if not any(map(is_installed, inside)):
+            if root not in roots and any(map(is_installed, inside)):
+                found.installed.add(root)
+            else:
                 prefix = f"{package}." if package else ""
                 todo += [prefix + each for each in finder.modules(inside)]
             continue

@@ -201,6 +201,7 @@ class Display(Watch):
             self._print(f"{finished} runs are finished already, {to_do}{words(self._again)}")
         elif finished:
             self._print(f"{finished} runs are finished already, {new} to do")
+        self._again = {}  # for another sweep
         self._bar.update(self._task, total=len(missing))
 
     def again(self, changed: Mapping[Job, Sequence[str]]) -> None:

@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runtime import Node
 from runtime.config.model import Config
 from runtime.config.reading import load
 from runtime.node import CommandLine
@@ -32,6 +33,7 @@ from runtime.run.made_from import (
 )
 from runtime.run.results import MARKER
 from runtime.run.sources import content_hash, distributions, read_code
+from runtime.testing import spec
 from tests.runtime.tools.samples_cli import ROOT
 
 NODE = "from runtime import Node\n\n\nclass Own(Node):\n    pass\n"
@@ -454,20 +456,36 @@ def test_the_code_of_an_estimator_is_its_class_with_local_imports_and_its_progra
     (tmp_path / "helper_of_own.py").write_text("")
     config, roots = of_file(tmp_path, "own_with_code")
     assert (roots.folder, roots.modules) == (str(tmp_path), ("own_with_code",))
-    (spec,) = config.nodes
-    found = [code_of(spec, tmp_path)]
+    (own_spec,) = config.nodes
+    found = [code_of(own_spec, tmp_path)]
     edit(tmp_path / "helper_of_own.py")
-    found.append(code_of(spec, tmp_path))
+    found.append(code_of(own_spec, tmp_path))
     assert len({*found}) == 2
     (tmp_path / "slam.py").write_text("")
     text = (
         '[[nodes]]\nname = "slam"\ntype = "Process"\ncommand = ["python", "slam.py"]\nfolder = "."'
     )
     (tmp_path / "p.toml").write_text(text)
-    (spec,) = load(tmp_path / "p.toml").nodes
-    found = [code_of(spec)]
+    (slam,) = load(tmp_path / "p.toml").nodes
+    found = [code_of(slam)]
     edit(tmp_path / "slam.py")
-    assert code_of(spec) not in found
+    assert code_of(slam) not in found
+
+
+def test_a_class_of_a_notebook_has_the_hash_of_its_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    class One(Node):
+        """One."""
+
+    class Other(Node):
+        """Another."""
+
+    monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
+    keys = []
+    for cls in (One, Other, One):
+        monkeypatch.setattr(cls, "__module__", "__main__")
+        monkeypatch.setattr("inspect.getsource", lambda cls: cls.__doc__)
+        keys.append(code_of(spec(cls, "own")))
+    assert keys[0] == keys[2] != keys[1]
 
 
 def test_files_that_a_run_writes_into_its_arguments_are_no_part_of_it(tmp_path: Path) -> None:

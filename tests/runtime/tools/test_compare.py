@@ -511,7 +511,10 @@ type = "Evaluation"
 def test_two_builds_of_a_program_are_compared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One of them is lost in a quarter of the images; both lie beside the file."""
+    """One of them is lost in a quarter of the images; both lie beside the file.
+
+    A new one behind the same command is flown again, and the other is kept.
+    """
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     file = tmp_path / "rig.toml"
     client = str(ROOT / "nodes" / "outside" / "native")
@@ -533,6 +536,11 @@ def test_two_builds_of_a_program_are_compared(
     (found,) = json.loads((tmp_path / "c.json").read_bytes())
     assert (found["failures"], found["b"]) == ([0, 0], 100)
     assert found["a"] == pytest.approx(75, abs=5)
+    shutil.copy(tmp_path / "builds" / "old", tmp_path / "builds" / "new")
+    done = command_here("compare", file, *words, *options, folder=tmp_path)
+    assert "1 runs are finished already, 1 is run again: new changed\n" in done.stderr
+    (found,) = json.loads((tmp_path / "c.json").read_bytes())
+    assert found["b"] == found["a"]
 
 
 @pytest.mark.slow
