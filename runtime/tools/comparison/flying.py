@@ -31,7 +31,7 @@ from runtime.tools.comparison.statistics import (
 from runtime.tools.sweep import Job, Plan, Row, make_plan, plan_of, run_here
 from runtime.tools.sweep.console import listed
 from runtime.tools.sweep.plots import decades, template
-from runtime.tools.sweep.process import Ended
+from runtime.tools.sweep.process import Ended, note_inputs
 from runtime.tools.sweep.tables import decode_rows
 
 Fly = Callable[[Plan], Sequence[Row]]  # carries out a plan: returns a row for each of its jobs
@@ -96,7 +96,7 @@ def compare(
         if len(what) != 2 or a or b:
             raise ConfigError("compare: expected two folders, without --a and --b")
         sides = [read_folder(path) for path in what]
-        notes += check_flights(*sides)
+        notes += check_flights(*sides, whole=False)
         notes += [*_edited(zip("AB", sides, strict=True))]
         found = compare_rows(*sides, **options)
     else:
@@ -161,10 +161,16 @@ def _unchanged(side: Mapping[Key, list[Row]], changed: set[Key]) -> dict[Key, li
     return {key: rows for key, rows in side.items() if key not in changed}
 
 
-def check_flights(a: Mapping[Key, Sequence[Row]], b: Mapping[Key, Sequence[Row]]) -> list[str]:
+def check_flights(
+    a: Mapping[Key, Sequence[Row]], b: Mapping[Key, Sequence[Row]], *, whole: bool = True
+) -> list[str]:
     """Return sentences on pairs of runs whose estimators were fed something else.
 
     Equal seeds and settings are not enough: code, worlds and pilots may have changed.
+
+    Args:
+        whole: Whether both sides are of the same files and code, so that those without fingerprints
+            are no reason to doubt.
 
     Raises:
         ConfigError: The runs have other names, too: they are of different scenarios.
@@ -173,7 +179,7 @@ def check_flights(a: Mapping[Key, Sequence[Row]], b: Mapping[Key, Sequence[Row]]
     unknown = []
     for key in [key for key in a if key in b]:
         (name, ours), (other, theirs) = _inputs(a[key]), _inputs(b[key])
-        if not ours or not theirs:
+        if ours is None or theirs is None:
             unknown += [key] * all(not row["error"] for row in (*a[key], *b[key]))
         elif names := sorted(n for n in {*ours, *theirs} if ours.get(n) != theirs.get(n)):
             differing[key] = names
@@ -190,7 +196,7 @@ def check_flights(a: Mapping[Key, Sequence[Row]], b: Mapping[Key, Sequence[Row]]
             f"{len(differing)} of {common} flights are not the same for A and B: {_some(names)} "
             "differ; what is compared is of different flights"
         )
-    if unknown:
+    if unknown and not whole:
         notes.append(
             f"whether {len(unknown)} of {common} flights are the same for A and B is not known: "
             "there are no fingerprints of their inputs"
@@ -207,10 +213,10 @@ def _edited(sides: Iterable[tuple[str, Mapping[Key, Sequence[Row]]]]) -> Iterato
             yield f"{len(edited)} runs of {side} are of a mixture: {what} while they ran"
 
 
-def _inputs(rows: Sequence[Row]) -> tuple[str, dict[str, str]]:
+def _inputs(rows: Sequence[Row]) -> tuple[str, dict[str, str] | None]:
     """Return name and fingerprints of the inputs of the first run that has some."""
-    known = [(row.get("name", ""), row.get("inputs", {})) for row in rows]
-    return next((each for each in known if each[1]), ("", {}))
+    known = [(row.get("name", ""), row.get("inputs")) for row in rows if not row["error"]]
+    return next((each for each in known if each[1] is not None), ("", None))
 
 
 def _some(names: Sequence[str]) -> str:
@@ -226,8 +232,7 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
             settings = " ".join(f"{path}={text}" for path, text in row["parameters"].items())
             if "inputs" not in row:  # of an earlier version
                 with contextlib.suppress(OSError, msgspec.MsgspecError):
-                    ended = _ended(folder / "runs" / row["id"])
-                    row["name"], row["inputs"] = ended.name, ended.inputs
+                    note_inputs(row, _ended(folder / "runs" / row["id"]))
             found.setdefault((settings or "run", row["seed"]), []).append(row)
         return found
     try:
@@ -241,8 +246,8 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
         id="", parameters={}, seed=ended.seed, exit_code=0, error=ended.error or "",
         passed=verdict.passed if verdict else None, digest=None, sim_seconds=ended.sim_seconds,
         run_seconds=None, wall_seconds=None, estimators=verdict.estimators if verdict else {},
-        name=ended.name, inputs=ended.inputs,
     )  # fmt: skip
+    note_inputs(row, ended)
     return {("run", ended.seed): [row]}
 
 

@@ -45,6 +45,7 @@ class Ended(msgspec.Struct, frozen=True):
     digests: dict[str, str] = {}
     name: str = ""
     inputs: dict[str, str] = {}
+    inputs_digest: str | None = None
     not_deterministic: list[str] = []
     verdict: Verdict | None = None
     workers: dict[str, dict[str, float | None]] = {}
@@ -219,7 +220,8 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
         row["error"] = unread
     if ended is not None:
         row["sim_seconds"], row["run_seconds"] = ended.sim_seconds, ended.wall_seconds
-        row["workers"], row["name"], row["inputs"] = ended.workers, ended.name, ended.inputs
+        row["workers"] = ended.workers
+        note_inputs(row, ended)
         row["digest"] = None if ended.not_deterministic else ended.digest
         if ended.reason in _STOPPED:
             row["error"] = f"interrupted by {ended.reason}"
@@ -233,6 +235,13 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
             if (own := _outputs_of(name.partition("/")[0], ended.digests))
         }
     return row
+
+
+def note_inputs(row: Row, ended: Ended) -> None:
+    """Note in a row what estimators were fed, if that is known."""
+    row["name"] = ended.name
+    if ended.inputs_digest is not None:
+        row["inputs"] = ended.inputs
 
 
 def _outputs_of(node: str, digests: dict[str, str]) -> dict[str, str]:

@@ -42,7 +42,8 @@ class Row(TypedDict):
         wall_seconds: Real seconds of the whole process.
         estimators: Name to figures, as the run's verdict has them.
         name: Of the run.
-        inputs: Fingerprints of what estimators are fed, by output and announcement; empty if off.
+        inputs: Fingerprints of what estimators are fed, by output and announcement; missing if
+            there are no digests.
         made_from: Key of what the run was made from.
         parts: What it was made from; in the files it stands once, under that key.
         edited: What of it changed while the run was under way, in words.
