@@ -228,7 +228,8 @@ def sweep(
 ) -> Any:
     """Run a file with every combination of some settings, each run in a process of its own.
 
-    What is finished already is not run again; see the command ``sweep``.
+    What is finished already is not run again, unless code, programs or files that it was made from
+    have changed, which is logged; see the command ``sweep``.
 
     Args:
         vary: Values by setting: ``{"camera.rate": [10, 30]}``.
@@ -285,6 +286,8 @@ def compare(
 ) -> Compared:
     """Compare two versions over equal flights: is B better than A? See the command ``compare``.
 
+    What is flown already is kept as in `sweep`.
+
     Args:
         what: Files, one a scenario; or two folders of finished sweeps or runs, A and B.
         a: Settings of A: ``{"odometry.corners": 300}``; the files as they are, if not given.
@@ -299,7 +302,8 @@ def compare(
 
     Returns:
         `rows`, one a figure of an estimator, with `change`, `low`, `high`, `p` and the verdict in
-        `words`; `worse`, with which the command ends with 1; and the `page`.
+        `words`; `worse`, with which the command ends with 1; the `page`; and `notes`, which are
+        warned of, on flights that are not the same for A and B.
 
     Raises:
         ConfigError: A file, a folder, a setting or a figure is wrong, or nothing is in common.
@@ -311,7 +315,7 @@ def compare(
     from runtime.tools import comparison
     from runtime.tools import sweep as sweeping
 
-    return comparison.compare(
+    compared = comparison.compare(
         [Path(each) for each in what],
         _changes(a or {}),
         _changes(b or {}),
@@ -323,6 +327,9 @@ def compare(
         out=Path(out),
         fly=functools.partial(sweeping.run_here, jobs=jobs),
     )
+    for note in compared.notes:
+        warnings.warn(note, stacklevel=2)
+    return compared
 
 
 def judge(

@@ -15,8 +15,8 @@ from bench.benchmarks import BENCHMARKS, ROUND_TRIPS, Progress, Row
 from bench.driver import measure_all
 from bench.harness import silent
 from bench.system import large_array
+from runtime.commit import commit
 from runtime.errors import ConfigError
-from runtime.run.summarise import commit
 from runtime.run.summarise import environment as versions
 
 QUICK_SYSTEMS = ("visnav", "plain", "asyncio.queue", "pyee", "thesis")
@@ -61,7 +61,7 @@ def measure_everything(*, quick: bool, progress: Progress = silent) -> dict[str,
 def environment() -> dict[str, str]:
     """Return machine, how quick that was at the end, versions and commit."""
     speed = f"{_copy() * 1e6:.0f} µs for a copy of 4.67 MB"
-    found = commit(Path(__file__).parent) or "unknown"
+    found = commit() or "unknown"
     return {**versions(), "cpu": _cpu(), "memory": speed, "commit": found}
 
 

@@ -55,6 +55,26 @@ class NodeConfig(msgspec.Struct, metaclass=_ConfigMeta, frozen=True, kw_only=Tru
 C = TypeVar("C", bound=NodeConfig, default=NodeConfig)
 
 
+class CommandLine(msgspec.Struct, frozen=True, kw_only=True):
+    """Command line of a program that a node starts, as its settings give it.
+
+    Attributes:
+        words: Program and arguments; variables such as ``$VISNAV_FOLDER`` are not replaced yet.
+        folder: Working folder; if empty, that of the run.
+        environment: Names and values of variables beside those of the run.
+        build: Command that makes the program from sources.
+    """
+
+    words: tuple[str, ...]
+    folder: str = ""
+    environment: tuple[tuple[str, str], ...] = ()
+    build: tuple[str, ...] = ()
+
+    def texts(self) -> Iterable[str]:
+        """Return all texts in it."""
+        return (*self.words, self.folder, *(value for _, value in self.environment), *self.build)
+
+
 class Node(Generic[C]):
     """Base of all nodes: declare ports, handlers and ticks on the class.
 
@@ -140,6 +160,15 @@ class Node(Generic[C]):
                 if isinstance(argument, type) and issubclass(argument, NodeConfig):
                     cls.config_type = argument
         cls.declared = read_declarations(cls, Node)
+
+    @classmethod
+    def made_from(cls, config: C) -> Iterable[Path | CommandLine]:  # noqa: ARG003
+        """Return files that the node reads, and programs that it starts, beside code and settings.
+
+        A finished run of a sweep is run again when one of them has changed. The node's code, with
+        what it imports, and files and folders that its settings name count without a word here.
+        """
+        return ()
 
     # Phases, in order. Override those you need.
 

@@ -17,7 +17,7 @@ import os
 import stat
 import tempfile
 import urllib.parse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -97,10 +97,19 @@ def file_names(table: Any, type_: Any) -> Any:
 
 def written(config: msgspec.Struct) -> Iterator[str]:
     """Yield the files and folders in the run's folder named by a node's settings."""
+    yield from _of_kinds(config, {"output"})
+
+
+def inputs(config: msgspec.Struct) -> Iterator[str]:
+    """Yield the input files and folders named by a node's settings."""
+    yield from _of_kinds(config, {"input", "name", "json"})
+
+
+def _of_kinds(config: msgspec.Struct, kinds: Container[Kind]) -> Iterator[str]:
     found: list[str] = []
 
     def note(kind: Kind, text: str) -> str:
-        if kind == "output" and text:
+        if kind in kinds and text:
             found.append(text)
         return text
 

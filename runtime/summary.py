@@ -278,7 +278,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         not_deterministic: Nodes because of which equal runs may have unequal digests.
         truth_readers: Nodes that received true poses: estimators, and all others but those that
             fly, judge, record or show.
-        environment: Machine and versions; the command line, and the commit of the current folder.
+        environment: Machine and versions; the command line, and the commit of this project.
+        code: Hash of each estimator's own files, by its node: its class with local imports, and the
+            program of a `Process`; as they were when the run began.
         processes: Where which nodes ran, if not all in one process.
         workers: Costs of workers, by ``node.Factory``, and of programs, by their nodes.
         outside: Answers of systems outside the process, by name.
@@ -310,6 +312,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     truth_readers: list[str]
     announcements: list[dict[str, Any]]
     environment: dict[str, str]
+    code: dict[str, str] = {}
     processes: list[ProcessSummary] = []
     workers: dict[str, WorkerSummary] = {}
     outside: dict[str, OutsideSummary] = {}
@@ -376,7 +379,16 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
         processes=processes,
         **{
             field: of_all(field)
-            for field in ("outputs", "drops", "streams", "links", "ticks", "workers", "outside")
+            for field in (
+                "outputs",
+                "drops",
+                "streams",
+                "links",
+                "ticks",
+                "code",
+                "workers",
+                "outside",
+            )
         },
     )
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from runtime.commit import commit
 from runtime.config.reading import load
 from runtime.tools.cli import inspect
 from tests.runtime.tools.samples_cli import command_here
@@ -163,6 +164,8 @@ def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
         return finished.stdout
 
     with zipfile.ZipFile(wheel) as content:
+        noted = content.read("runtime/commit.txt").decode().strip()
+        assert noted == commit()
         assert [name for name in content.namelist() if name.startswith("bench/systems")] == []
     done(bin_ / "pip", "install", "--quiet", wheel)
     visnav = bin_ / "visnav"
@@ -187,5 +190,8 @@ def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
     )
     assert judged.returncode in {0, 1}, judged.stderr  # three seconds need not pass
     folder = tmp_path / "work" / "tour"
-    assert json.loads((folder / "summary.json").read_text())["events"]["Image"] > 60
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["events"]["Image"] > 60
+    assert summary["environment"]["commit"] == noted
+    assert summary["code"].keys() == {"odometry"}
     assert (folder / "report.html").stat().st_size > 10_000

@@ -1,26 +1,50 @@
-"""Additions to the wheel: `config.toml` and the examples, for `visnav demo`, and its name."""
+"""Additions to the wheel: its commit, its name, and for `visnav demo` the examples."""
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
 from pathlib import Path
+from typing import Any
 
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
+from setuptools.command.sdist import sdist
 
 ROOT = Path(__file__).parents[1]
 INSIDE = "runtime/tools/example_files"
 """Where the commands `demo` and `example` look for them once they are installed."""
 
 
+def write_commit(tree: Path) -> None:
+    """Note the commit in a tree of packages; ours need not be importable."""
+    path = ROOT / "runtime" / "commit.py"
+    spec = importlib.util.spec_from_file_location("commit", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module: Any = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.write_note(tree / "runtime")
+
+
+class ArchiveWithCommit(sdist):
+    """Source archive with a note of its commit, since there is no repository in it."""
+
+    def make_release_tree(self, base_dir: str, files: list[str]) -> None:
+        """Copy the files, then add the note."""
+        super().make_release_tree(base_dir, files)
+        write_commit(Path(base_dir))
+
+
 class BuildWithExamples(build_py):
-    """Build step with the examples copied into the package, except in a checkout."""
+    """Build step with examples and commit written into the packages, except in a checkout."""
 
     def run(self) -> None:
-        """Build the packages, then add the examples."""
+        """Build the packages, then add the rest."""
         super().run()
         if self.editable_mode:
             return
+        write_commit(Path(self.build_lib))
         target = Path(self.build_lib) / INSIDE
         target.mkdir(parents=True, exist_ok=True)
         examples = ROOT / "examples"

@@ -47,11 +47,13 @@ from nodes.trajectory_files import (
     read_vslamlab,
     write_tum,
 )
+from runtime.commit import commit
 from runtime.errors import ResultsError
 from runtime.paths import source_file
 from runtime.run import results
 from runtime.run.results import newest, run_folder
-from runtime.run.summarise import command_line, commit, environment
+from runtime.run.sources import content_hash
+from runtime.run.summarise import command_line, environment
 from runtime.time.clock import SECOND
 
 
@@ -188,16 +190,24 @@ def _write(
         assert judgement.estimate is not None
         path = out / "trajectories" / f"{source_file(name)}.tum"
         write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
+    files = {"truth": truth.file, **{k: j.figures["method"] for k, j in judgements.items()}}
     facts = Facts(
         name=out.name,
         verdict=verdict,
         environment={**environment(), "command": command_line(), "commit": commit()},
-        judged={"truth": truth.file, **{k: j.figures["method"] for k, j in judgements.items()}},
+        judged=files,
+        judged_hashes={name: _hash(file) for name, file in files.items()},
         notes=list(notes),
     )
     text = msgspec.json.format(msgspec.json.encode(facts), indent=2)
     results.write(out / "summary.json", text + b"\n")
     return write_report(out)
+
+
+def _hash(file: str) -> str:
+    """Return the hash of a file, of a bag for one of its topics; empty for an array or a folder."""
+    path = Path(file) if Path(file).exists() else Path(file.rpartition(":/")[0])
+    return content_hash(path) if path.is_file() else ""
 
 
 _PATH, _POSE = "nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped"

@@ -313,11 +313,11 @@ def convert(value: Any, type_: type[S], where: str) -> S:
 
     Raises:
         ConfigError: A key or a preset is unknown, a key is missing, or a value is of the wrong type
-            or size, or not finite. (A run's `speed` may be infinite.)
+            or size, or not finite. (A run's `speed` may be infinite, and so may thresholds.)
     """
     value = expanded(value, type_, where)
     for path, number in _not_finite(value):
-        if type_ is not RunConfig or math.isnan(number):
+        if math.isnan(number) or not (type_ is RunConfig or ".thresholds." in path):
             text = f"expected a finite number, found {number} - at `${path}`"
             raise ConfigError(explain(text, value, type_, where))
     try:

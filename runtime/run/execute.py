@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from events import Event
+from events import Event, PoseEstimate, TrajectoryEstimate
 from runtime.channels.sender import Sender, Tap
 from runtime.channels.wire import Digest
 from runtime.config.model import Config, RunConfig
@@ -25,6 +25,7 @@ from runtime.errors import NodeError, VisnavError
 from runtime.logs import executor, file_handler, lines_of, logging_to
 from runtime.node import Node
 from runtime.run import event_loop, results
+from runtime.run.made_from import code_of
 from runtime.run.node_runner import log_error, with_place, wrap
 from runtime.run.results import Folder, private_results
 from runtime.run.summarise import summarise
@@ -73,7 +74,8 @@ def execute(
             stack.enter_context(folder)
             results.write_config(folder.path, config)
             handlers.append(file_handler(folder.path / "log.txt"))
-        run = _Run(config, folder, log_events, watch, only, digest)
+        code = {} if folder is None else code_of_estimators(config, only)
+        run = _Run(config, folder, log_events, watch, only, digest, code)
         stack.enter_context(logging_to(handlers, config.run.log, run.now))
         if folder is not None and folder.earlier is not None:
             log.info("the folder of the earlier run is now %s", folder.earlier)
@@ -86,6 +88,17 @@ def execute(
     if run.supervisor.state.error is not None:
         raise run.supervisor.state.error
     return summary
+
+
+def code_of_estimators(config: Config, only: Collection[str] = ()) -> dict[str, str]:
+    """Return the hash of the files of each node that may send estimates, by its name."""
+    estimates = (PoseEstimate, TrajectoryEstimate)
+    return {
+        spec.name: code_of(spec)
+        for spec in config.nodes
+        if (not only or spec.name in only)
+        and any(issubclass(each.event, estimates) for each in spec.node.declared.outputs.values())
+    }
 
 
 def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
@@ -119,6 +132,7 @@ class _Run:
     watch: Watch | None
     only: Collection[str]
     digest: Digest | None
+    code: dict[str, str]
     supervisor: Supervisor = field(init=False)
     clock: Clock | None = None
     private: Path | None = None
@@ -146,6 +160,7 @@ class _Run:
         self.supervisor = supervisor = Supervisor(
             self.config, clock, taps, self.private or out, self.only, out
         )
+        supervisor.state.code = self.code
         if self.folder is not None:
             supervisor.state.before_first_update = self.folder.flown
         # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.

@@ -68,6 +68,7 @@ class RunState(Host):
         all_nodes: All nodes there have been, those restarted or dropped included.
         links: All links of the nodes that there are, by ``node.port``.
         environment: What nodes found of the machine on which figures depend.
+        code: Hash of the files of each node that may estimate.
         afterwards: Functions to call once the summary is written.
         make_worker: The class of workers, or a function that makes one as that does.
         changes: Output for changes of settings; its listeners include the changed node.
@@ -107,6 +108,7 @@ class RunState(Host):
         self.conclusions: dict[str, dict[str, Any]] = {}
         self.flights: dict[str, dict[str, Any]] = {}
         self.environment: dict[str, str] = {}
+        self.code: dict[str, str] = {}
         self.costs: dict[str, Costs] = {}
         self.outside: dict[str, Answers] = {}
         self.make_worker: Callable[..., Worker[Any]] = Worker

@@ -7,7 +7,6 @@ import os
 import platform
 import re
 import shlex
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -25,6 +24,7 @@ from events import (
 )
 from runtime.channels.answers import Answers
 from runtime.channels.wire import Digest, combined, fingerprint
+from runtime.commit import commit
 from runtime.node import matchers, senders, streams
 from runtime.run.run_state import RunState
 from runtime.summary import (
@@ -73,18 +73,6 @@ def command_line() -> str:
     program, *arguments = sys.orig_argv
     shown = [_SECRET.sub(r"\1…", each) for each in arguments]
     return shlex.join([Path(program).name, *shown])
-
-
-def commit(folder: Path | None = None) -> str:
-    """Return the commit of a folder's files, with ``-dirty`` if they differ; empty without git."""
-    command = ["git", "describe", "--always", "--dirty"]
-    try:
-        done = subprocess.run(  # noqa: S603
-            command, cwd=folder, capture_output=True, text=True, check=True, timeout=5.0
-        )
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return done.stdout.strip()
 
 
 def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
@@ -207,6 +195,14 @@ def summarise(
             **state.environment,
             "command": command_line(),
             "commit": commit(),
+        },
+        code={
+            name: key
+            for name, key in state.code.items()
+            if any(
+                isinstance(each, EstimatorAnnouncement) and f"{each.source}/".startswith(f"{name}/")
+                for each in state.announcements
+            )
         },
         workers={
             name: WorkerSummary.of(each)

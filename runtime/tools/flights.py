@@ -8,7 +8,7 @@ same events come at the same times in the same order, to the byte.
 Flights are kept by their content, in ``~/.cache/visnav-runtime/flights``. ``VISNAV_FLIGHTS_GB``
 says how much they may take (20 if it does not); of more, those that were not used for longest are
 removed. A flight is written by one process at a time, and as a whole. Its name is made of all that
-it depends on: settings, sources, files, machine. Its file:
+it depends on: settings, what it is made from (`runtime.run.made_from`), machine. Its file:
 
     answers      each pickled: the result, or else the error
     calls        by worker, names of methods and places of the answers, in the order of the calls
@@ -18,13 +18,11 @@ it depends on: settings, sources, files, machine. Its file:
 
 from __future__ import annotations
 
-import ast
 import concurrent.futures
 import contextlib
 import errno
 import fcntl
 import functools
-import importlib.util
 import json
 import logging
 import mmap
@@ -32,9 +30,8 @@ import os
 import pickle
 import re
 import struct
-import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -47,7 +44,9 @@ from runtime.node import Node, NodeConfig
 from runtime.paths import written
 from runtime.run.execute import Watch, execute
 from runtime.run.graph import edges_of
+from runtime.run.made_from import RUN, key_of, made_from, roots_of
 from runtime.run.run_state import Instrument
+from runtime.run.sources import hashed
 from runtime.run.summarise import environment
 from runtime.run.supervisor import Supervisor
 from runtime.workers.worker import Worker
@@ -320,10 +319,6 @@ _DRIVERS = (
     "/proc/driver/nvidia/version",
 )
 _VARIABLES = re.compile("MUJOCO_|E?GL|_?_?E?GL[VX]?_|LIBGL_|GALLIUM_|MESA_|LP_")
-_PARSING = threading.Lock()
-"""Lock for Python 3.11's parser: all threads share a depth counter (cpython#106905)."""
-_NAMED = re.compile(r'\bfile\w*\s*=\s*"([^"]+)"')
-_FOLDERS = re.compile(r'(?:mesh|texture|asset)dir\s*=\s*"([^"]+)"')
 
 
 def flight_of(config: Config) -> Config | None:
@@ -359,106 +354,16 @@ def settings_key(flight: Config) -> str:
     """Return a key, equal for flights with equal settings."""
     run = flight.run
     nodes = to_builtins(flight)["nodes"]
-    return _hashed([json.dumps([run.seed, run.duration, nodes], default=str, sort_keys=True)])
+    return hashed([json.dumps([run.seed, run.duration, nodes], default=str, sort_keys=True)])
 
 
 def content_key(flight: Config) -> str:
-    """Return the key of a flight: its settings, sources, files, libraries, drivers."""
+    """Return the key of a flight: its settings, what it is made from, libraries, drivers."""
     texts = [settings_key(flight), json.dumps(environment())]
     texts += [f"{k}={v}" for k, v in sorted(os.environ.items()) if _VARIABLES.match(k)]
     for pattern in _DRIVERS:
         for path in sorted(Path("/").glob(pattern[1:])):
             found = path.stat()
             texts.append(f"{path} {found.st_size} {found.st_mtime_ns}")
-    files = {*_sources([*(spec.node.__module__ for spec in flight.nodes), __name__])}
-    for path in _paths(to_builtins(flight)["nodes"]):
-        files |= _read_by(path)
-    texts += [f"{path} {_hashed([path.read_bytes()])}" for path in sorted(files)]
-    return _hashed(texts)
-
-
-def _hashed(parts: Iterable[str | bytes]) -> str:
-    digest = xxhash.xxh3_128()
-    for part in parts:
-        digest.update(part.encode() if isinstance(part, str) else part)
-        digest.update(b"\0")
-    return digest.hexdigest()
-
-
-def _sources(modules: Iterable[str]) -> Iterator[Path]:
-    """Yield the files of modules and their imports, without other installed packages."""
-    todo = [*modules, "events"]
-    roots = {name.partition(".")[0] for name in todo}
-    seen = {""}
-    while todo:
-        name = todo.pop()
-        root = name.partition(".")[0]
-        if name in seen or not (root in roots or _is_here(root)):
-            continue
-        seen.add(name)
-        path = _origin(name)
-        if path is None:
-            continue
-        package = path.name == "__init__.py"
-        yield from (p for p in path.parent.iterdir() if p.is_file()) if package else [path]
-        parent = name.rpartition(".")[0]
-        todo.append(parent)
-        todo += _imported(path, name if package else parent)
-
-
-def _imported(path: Path, package: str) -> Iterator[str]:
-    """Yield the modules imported anywhere in a package's file, and possible modules."""
-    if path.suffix not in {".py", ".pyi"}:
-        return
-    with contextlib.suppress(SyntaxError, ValueError):
-        with _PARSING:
-            todo: list[Any] = [ast.parse(path.read_bytes())]
-        while todo:  # statements only, which takes a third of the time of `ast.walk`
-            node = todo.pop()
-            for field in ("body", "orelse", "finalbody", "handlers", "cases"):
-                todo += getattr(node, field, ())
-            if isinstance(node, ast.Import):
-                yield from (alias.name for alias in node.names)
-            elif isinstance(node, ast.ImportFrom):
-                with contextlib.suppress(ImportError):  # beyond the topmost package
-                    one = "." * node.level + (node.module or "")
-                    whole = importlib.util.resolve_name(one, package)
-                    yield from (whole, *(f"{whole}.{alias.name}" for alias in node.names))
-
-
-def _origin(name: str) -> Path | None:
-    try:
-        spec = importlib.util.find_spec(name)
-    except Exception:  # a package is imported for what is in it, and may raise anything
-        return None
-    return Path(spec.origin) if spec and spec.has_location and spec.origin else None
-
-
-@functools.cache
-def _is_here(root: str) -> bool:
-    path = None if not root or root in sys.stdlib_module_names else _origin(root)
-    return path is not None and not {"site-packages", "dist-packages"} & {*path.parts}
-
-
-def _paths(value: Any) -> Iterator[Path]:
-    """Yield the files named by settings; paths are absolute since the file was read."""
-    if isinstance(value, str) and value.startswith("/") and Path(value).exists():
-        yield Path(value)
-    elif isinstance(value, dict | list):
-        for each in value.values() if isinstance(value, dict) else value:
-            yield from _paths(each)
-
-
-def _read_by(path: Path) -> set[Path]:
-    """Return a file and all files included by a MuJoCo model, or the files in a folder."""
-    if path.is_dir():
-        return {each for each in path.rglob("*") if each.is_file()}
-    found, todo, folders = {path}, [path], {path.parent}
-    while todo:
-        if (file := todo.pop()).suffix == ".xml":
-            text = file.read_text(encoding="utf-8", errors="replace")
-            folders |= {path.parent / name for name in _FOLDERS.findall(text)}
-            named = {folder / name for folder in folders for name in _NAMED.findall(text)}
-            todo += (new := sorted({each for each in named if each.is_file()} - found))
-            found.update(new)
-    return found
+    parts = made_from(roots_of(flight, modules=(*RUN, __name__)))
+    return hashed([*texts, key_of(parts)])

@@ -44,6 +44,8 @@ from nodes.estimators.orb_slam3.settings import (
     Mode,
     OrbSettings,
     Settings,
+    TreeShape,
+    cached_vocabulary,
     check_vocabulary,
     find_vocabulary,
     make_settings,
@@ -51,6 +53,7 @@ from nodes.estimators.orb_slam3.settings import (
 from runtime import Bundle, Duration
 from runtime.errors import MissingDependencyError
 from runtime.extras import install_command
+from runtime.node import CommandLine
 from runtime.paths import InputPath
 
 Floats = npt.NDArray[np.float64]
@@ -441,6 +444,12 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
     library = "pyorbslam3", INSTALL
 
     frames = Bundle(Frame, keep="latest")
+
+    @classmethod
+    def made_from(cls, config: OrbSlam3Config) -> Iterable[Path | CommandLine]:
+        """Return the vocabulary that the settings leave out."""
+        if not config.vocabulary:
+            yield cached_vocabulary(TreeShape())
 
     def __init__(self) -> None:
         mode = self.config.mode

@@ -76,7 +76,7 @@ else:
             if each.default is not None
             else (each.name, kind | None, None)
             for each in _ASKED
-            for kind in [int if each.counts else float]
+            for kind in [int | float if each.counts else float]  # ``inf`` for none
         ],
         bases=(_Limits,),
         module=__name__,

@@ -59,6 +59,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     announcements: list[dict[str, Any]] = []
     environment: dict[str, str] = {}
     judged: dict[str, str] = {}
+    judged_hashes: dict[str, str] = {}
     notes: list[str] = []
 
 
@@ -134,7 +135,8 @@ class Row(msgspec.Struct, frozen=True):
 def figures(run: Run, *, main: bool) -> list[Row]:
     """Return the main figures, or all others, with the thresholds there are."""
     thresholds = run.verdict.thresholds if run.verdict is not None else {}
-    asked = {name: limit for name, limit in thresholds.items() if limit is not None}
+    limits = {name: limit for name, limit in thresholds.items() if limit is not None}
+    asked = {name: limit for name, limit in limits.items() if math.isfinite(limit)}
     rows = [each for each in FIGURES.values() if each.report]
     top = sorted(rows, key=lambda each: each.report != "head")
     names = dict.fromkeys([*(each.name for each in top), *asked])

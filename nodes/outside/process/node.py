@@ -52,6 +52,7 @@ from runtime import Node, Output, on
 from runtime.channels.bundles import Field, Matcher, Slot
 from runtime.channels.hold import Hold, Owed
 from runtime.channels.streams import Stream
+from runtime.node import CommandLine
 from runtime.workers.process import Throttle
 
 _BEYOND = 64  # waiting frames beyond the slots, in lockstep with `on_missing = "continue"`
@@ -88,6 +89,17 @@ class Process(Estimator[ProcessConfig]):
 
     setpoints = Output(Setpoint, when="pilot")
     commands = Output(Command, when="pilot")
+
+    @classmethod
+    def made_from(cls, config: ProcessConfig) -> Iterable[Path | CommandLine]:
+        """Return the program, with what builds it."""
+        environment = tuple((name, str(value)) for name, value in config.environment.items())
+        yield CommandLine(
+            words=config.command,
+            folder=config.folder,
+            environment=environment,
+            build=config.build,
+        )
 
     def __init__(self) -> None:
         config = self.config

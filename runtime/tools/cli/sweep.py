@@ -26,6 +26,7 @@ from runtime.tools.cli.commands import (
     Overrides,
     State,
     of_rows,
+    warn,
     writing,
 )
 
@@ -85,9 +86,10 @@ def sweep(
     what comes after the sensors fly once: that flight is recorded, and kept for later sweeps (see
     the command flights). Results go to sweeps/<name>: index.html shows all of them; table.csv,
     summary.csv, plots/, each run's folder in runs/, and, since they depend on the machine,
-    timing.csv and what workers cost in costs.csv. Called again, only what is missing or has crashed
-    is run. Ends with 0 if every run came to its end and met its thresholds; with 1 if a threshold
-    was missed; with 2 if a run crashed; with 130 after Ctrl-C.
+    timing.csv and what workers cost in costs.csv. Called again, only what is missing, has crashed,
+    or was made from something that has changed (code, programs, files) is run. Ends with 0 if every
+    run came to its end and met its thresholds; with 1 if a threshold was missed; with 2 if a run
+    crashed; with 130 after Ctrl-C.
     """
     from rich.console import Console
 
@@ -249,10 +251,11 @@ def compare(
     two builds of a program: `--a 'slam.command=["./old"]' --b 'slam.command=["./new"]'`. Each
     flight is recorded once, and both get it. Half of the flights are looked at first; if all
     figures are decided then, the others are not flown. Or A and B are two folders of finished
-    sweeps. Each figure is *better*, *worse*, *no difference* larger than the margin, *not enough
-    runs*, or *not comparable*, an error after different alignments. Crashes and lost estimators
-    count as worst. Ends with 0; with 1 if a figure is worse, or with --margin also if it may be
-    worse by more than that; with 130 after Ctrl-C.
+    sweeps or runs, and it is said if their flights differ. Each figure is *better*, *worse*, *no
+    difference* larger than the margin, *identical*, *not enough runs*, or *not comparable*, an
+    error after different alignments. Crashes and lost estimators count as worst. Ends with 0; with
+    1 if a figure is worse, or with --margin also if it may be worse by more than that; with 130
+    after Ctrl-C.
     """
     from runtime.tools.comparison import compare as compare_all
 
@@ -272,6 +275,8 @@ def compare(
         for each in compared.rows:
             outcomes += of_comparison(each, margin)
     print_table(compared)
+    for note in compared.notes:
+        warn(note)
     if json is not None:
         text = msgspec.json.encode(compared.rows)
         write(json, msgspec.json.format(text, indent=2) + b"\n")
@@ -292,7 +297,7 @@ def of_comparison(each: Comparison, margin: float) -> list[Outcome]:
         state: State = "passed"
         if each.fails(margin):
             state = "failed" if name in guilty or not guilty else "passed"
-        elif each.verdict in {"not enough runs", "not comparable"}:
+        elif each.verdict in {"not enough runs", "not comparable"} or each.more:
             state = "not judged"
         reason = f"{each.words}: {each.interval} in all; worse in {worse} of {flights} flights here"
         reasons = [] if state == "passed" else [reason]

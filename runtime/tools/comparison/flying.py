@@ -6,15 +6,17 @@ Its page has a table, and each flight as a line from A to B.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from runtime.config.model import show
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
 from runtime.figures import FIGURES, figure
@@ -27,8 +29,9 @@ from runtime.tools.comparison.statistics import (
     compare_until_sure,
 )
 from runtime.tools.sweep import Job, Plan, Row, make_plan, plan_of, run_here
+from runtime.tools.sweep.console import listed
 from runtime.tools.sweep.plots import decades, template
-from runtime.tools.sweep.process import Ended
+from runtime.tools.sweep.process import Ended, note_inputs
 from runtime.tools.sweep.tables import decode_rows
 
 Fly = Callable[[Plan], Sequence[Row]]  # carries out a plan: returns a row for each of its jobs
@@ -43,11 +46,13 @@ class Compared(msgspec.Struct, frozen=True):
     Attributes:
         margin: Largest change that does not matter, as `Comparison.change`.
         page: ``compare.html``, with a line from A to B for each flight.
+        notes: Sentences on pairs that are not the same flight.
     """
 
     rows: list[Comparison]
     margin: float
     page: Path
+    notes: tuple[str, ...] = ()
 
     @property
     def worse(self) -> bool:
@@ -56,7 +61,7 @@ class Compared(msgspec.Struct, frozen=True):
 
     def __repr__(self) -> str:
         told = [f"{e.estimator} {e.figure}: {e.interval}, {e.words}" for e in self.rows]
-        return "\n".join([*told, f"page: {self.page}"])
+        return "\n".join([*told, *self.notes, f"page: {self.page}"])
 
 
 def compare(
@@ -79,22 +84,28 @@ def compare(
         figures: `USUAL` if none.
 
     Raises:
-        ConfigError: A file, a folder, a setting or a figure is wrong.
+        ConfigError: A file, a folder, a setting or a figure is wrong, or two folders are of other
+            flights.
     """
     for each in figures:
         if each not in FIGURES:
             raise ConfigError(f"--figure {each}: expected one of {', '.join(FIGURES)}")
     options: dict[str, Any] = {"figures": figures or USUAL, "margin": margin}
+    notes: list[str] = []
     if all(path.is_dir() for path in what):
         if len(what) != 2 or a or b:
             raise ConfigError("compare: expected two folders, without --a and --b")
-        found = compare_rows(*map(read_folder, what), **options)
+        sides = [read_folder(path) for path in what]
+        notes += check_flights(*sides, whole=False)
+        notes += [*_edited(zip("AB", sides, strict=True))]
+        found = compare_rows(*sides, **options)
     else:
         if not (a or b):
             raise ConfigError("compare: expected --a or --b: in what the two sides differ")
-        found = _fly(what, (a, b), seeds, repeats, overrides, out.absolute(), fly, options)
-    page = write_page(found, out, list(a) or [str(what[0])], list(b) or [str(what[-1])])
-    return Compared(found, margin, page)
+        found = _fly(what, (a, b), seeds, repeats, overrides, out.absolute(), fly, options, notes)
+    names = list(a) or [str(what[0])], list(b) or [str(what[-1])]
+    page = write_page(found, out, *names, notes)
+    return Compared(found, margin, page, tuple(notes))
 
 
 def _fly(
@@ -106,6 +117,7 @@ def _fly(
     out: Path,
     fly: Fly,
     options: Mapping[str, Any],
+    notes: list[str],
 ) -> list[Comparison]:
     begin: dict[str, int] = {}  # first seed by scenario
     planned: list[Job] = []
@@ -120,6 +132,11 @@ def _fly(
         raise ConfigError(f"compare: expected files of different names, found {[*map(str, files)]}")
     whole = plan_of(planned, out)
 
+    of_flights: dict[Key, set[str]] = {}
+    for job in planned:
+        of_flights.setdefault((dict(job.settings)["scenario"], job.seed), set()).add(job.flight)
+    changed = {key for key, settings in of_flights.items() if len(settings) > 1}
+
     def compare_first(flights: int, error: float) -> list[Comparison]:
         now = [j for j in whole.jobs if j.seed < begin[dict(j.settings)["scenario"]] + flights]
         rows = fly(msgspec.structs.replace(whole, jobs=tuple(now)))
@@ -127,6 +144,7 @@ def _fly(
         for job, row in zip(now, rows, strict=True):
             (_, side), (_, scenario) = job.settings
             sides[side].setdefault((scenario, job.seed), []).append(row)
+        notes[:] = check_flights(*(_unchanged(each, changed) for each in sides.values()))
         return compare_rows(sides["A"], sides["B"], error=error, **options)
 
     same = sorted(j.id for j in planned if j.seed == begin[dict(j.settings)["scenario"]])
@@ -138,16 +156,87 @@ def _fly(
     return found
 
 
+def _unchanged(side: Mapping[Key, list[Row]], changed: set[Key]) -> dict[Key, list[Row]]:
+    """Return the runs of flights that the settings of A and B do not change themselves."""
+    return {key: rows for key, rows in side.items() if key not in changed}
+
+
+def check_flights(
+    a: Mapping[Key, Sequence[Row]], b: Mapping[Key, Sequence[Row]], *, whole: bool = True
+) -> list[str]:
+    """Return sentences on pairs of runs whose estimators were fed something else.
+
+    Equal seeds and settings are not enough: code, worlds and pilots may have changed.
+
+    Args:
+        whole: Whether both sides are of the same files and code, so that those without fingerprints
+            are no reason to doubt.
+
+    Raises:
+        ConfigError: The runs have other names, too: they are of different scenarios.
+    """
+    differing: dict[Key, list[str]] = {}
+    unknown = []
+    for key in [key for key in a if key in b]:
+        (name, ours), (other, theirs) = _inputs(a[key]), _inputs(b[key])
+        if ours is None or theirs is None:
+            unknown += [key] * all(not row["error"] for row in (*a[key], *b[key]))
+        elif names := sorted(n for n in {*ours, *theirs} if ours.get(n) != theirs.get(n)):
+            differing[key] = names
+            if name != other:
+                raise ConfigError(
+                    f"compare: expected two sides of the same flights, found {show(name)} and "
+                    f"{show(other)} with seed {key[1]}, in which {_some(names)} differ"
+                )
+    common = sum(key in b for key in a)
+    notes = []
+    if differing:
+        names = list(dict.fromkeys(name for each in differing.values() for name in each))
+        notes.append(
+            f"{len(differing)} of {common} flights are not the same for A and B: {_some(names)} "
+            "differ; what is compared is of different flights"
+        )
+    if unknown and not whole:
+        notes.append(
+            f"whether {len(unknown)} of {common} flights are the same for A and B is not known: "
+            "there are no fingerprints of their inputs"
+        )
+    return notes
+
+
+def _edited(sides: Iterable[tuple[str, Mapping[Key, Sequence[Row]]]]) -> Iterator[str]:
+    """Yield a sentence for a side of which files were edited while its runs were under way."""
+    for side, runs in sides:
+        edited = [row["edited"] for rows in runs.values() for row in rows if row.get("edited")]
+        if edited:
+            what = listed(dict.fromkeys(each for own in edited for each in own))
+            yield f"{len(edited)} runs of {side} are of a mixture: {what} while they ran"
+
+
+def _inputs(rows: Sequence[Row]) -> tuple[str, dict[str, str] | None]:
+    """Return name and fingerprints of the inputs of the first run that has some."""
+    known = [(row.get("name", ""), row.get("inputs")) for row in rows if not row["error"]]
+    return next((each for each in known if each[1] is not None), ("", None))
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - 3
+    return ", ".join(names[:3]) + f" and {more} more" * (more > 0)
+
+
 def read_folder(folder: Path) -> dict[Key, list[Row]]:
     """Read the rows of a finished sweep or run by flight; or raise `ConfigError`."""
     found: dict[Key, list[Row]] = {}
     if (folder / "rows.jsonl").is_file():
         for row in decode_rows((folder / "rows.jsonl").read_bytes()).values():
             settings = " ".join(f"{path}={text}" for path, text in row["parameters"].items())
+            if "inputs" not in row:  # of an earlier version
+                with contextlib.suppress(OSError, msgspec.MsgspecError):
+                    note_inputs(row, _ended(folder / "runs" / row["id"]))
             found.setdefault((settings or "run", row["seed"]), []).append(row)
         return found
     try:
-        ended = msgspec.json.decode((newest(folder) / "summary.json").read_bytes(), type=Ended)
+        ended = _ended(newest(folder))
     except (OSError, msgspec.MsgspecError) as error:
         raise ConfigError(
             f"{folder}: expected the folder of a sweep (rows.jsonl) or of a run, found: {error}"
@@ -158,24 +247,37 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
         passed=verdict.passed if verdict else None, digest=None, sim_seconds=ended.sim_seconds,
         run_seconds=None, wall_seconds=None, estimators=verdict.estimators if verdict else {},
     )  # fmt: skip
+    note_inputs(row, ended)
     return {("run", ended.seed): [row]}
+
+
+def _ended(folder: Path) -> Ended:
+    return msgspec.json.decode((folder / "summary.json").read_bytes(), type=Ended)
 
 
 COLOURS = {
     "better": "#1a7f37",
     "worse": "#b3261e",
+    "identical": "#5c646c",
     "no difference": "#5c646c",
     "not enough runs": "#9a6700",
     "not comparable": "#9a6700",
 }
 
 
-def write_page(found: Sequence[Comparison], out: Path, a: Sequence[str], b: Sequence[str]) -> Path:
+def write_page(
+    found: Sequence[Comparison],
+    out: Path,
+    a: Sequence[str],
+    b: Sequence[str],
+    notes: Sequence[str] = (),
+) -> Path:
     """Write ``compare.html`` into a folder, made if missing; return its path."""
     out.mkdir(parents=True, exist_ok=True)
     page = template(Path(__file__).with_name("page.html.jinja")).render(
         sides=[(side, " ".join(said)) for side, said in (("A", a), ("B", b)) if said],
         found=found,
+        notes=notes,
         figure=figure,
         image=base64.b64encode(_slopes(found)).decode(),
     )

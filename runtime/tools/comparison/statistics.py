@@ -38,7 +38,7 @@ USUAL = ("flight_ate_percent", "rpe_1m_trans_percent", "rot_rmse_deg", "frame_co
 ERROR = 0.05
 """Share of comparisons without a difference in which one may be found, of all figures together."""
 
-Word = Literal["better", "worse", "no difference", "not enough runs", "not comparable"]
+Word = Literal["better", "worse", "identical", "no difference", "not enough runs", "not comparable"]
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,8 +51,10 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
         low: Lower end of the interval for it.
         p: Share of random signs with a result as extreme.
         failures: Flights without the figure, in A and in B.
-        verdict: "not comparable" for an error after different alignments in A and B.
-        more: Flights that would probably tell, for a verdict of "not enough runs".
+        verdict: "not comparable" for an error after different alignments in A and B; "identical" if
+            no flight has different values, and no margin says whether that is enough.
+        more: Flights that would probably tell, for a verdict of "not enough runs" or "identical".
+        missing: Side without the estimator in any run, ``A`` or ``B``; what is missing is worse.
         alignments: The different alignments of a pair, if "not comparable".
         flights: Values of A and B by scenario and seed; `None` where there is none.
     """
@@ -71,6 +73,7 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     verdict: Word
     more: int = 0
     alignments: tuple[str, ...] = ()
+    missing: Literal["", "A", "B"] = ""
     flights: dict[str, tuple[float | None, float | None]] = {}
 
     @property
@@ -81,6 +84,12 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def words(self) -> str:
         """Verdict as a reader wants it: "not enough runs: 5 more may tell"."""
+        if self.missing:
+            return f"{self.verdict}: not there in {self.missing}"
+        if self.verdict == "identical" and self.more:
+            return f"identical so far: {self.more} more may tell"
+        if self.verdict == "no difference" and all(a == b for a, b in self.flights.values()):
+            return "no difference: identical"
         if self.verdict == "not enough runs":
             return f"not enough runs: {self.more} more may tell"
         if self.verdict == "not comparable":
@@ -115,8 +124,8 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 
     def inferior(self, margin: float) -> bool:
         """Return whether B may be worse than A by more than a margin."""
-        if self.verdict == "not comparable":
-            return True
+        if self.verdict == "not comparable" or self.missing:
+            return self.missing != "A"
         if figure(self.figure).limit == "least":
             return bool(self.low < -margin)
         return bool(self.high > margin)
@@ -160,6 +169,8 @@ def compare_values(
     more = 0
     if margin > 0 and -margin <= low and high <= margin:
         verdict = "no difference"
+    elif known and not lost and all(a == b for a, b in known):
+        verdict, more = "identical", max(_least(error) - len(known), 0)
     elif p <= error and (low > 0 or high < 0):
         verdict = "worse" if (low > 0) == (sign > 0) else "better"
     else:
@@ -248,7 +259,8 @@ def compare_until_sure(
         found = compare(look, error)
         if look not in looked and max(each.pairs for each in found) >= _least(error / len(found)):
             looked.append(look)
-        if all(each.verdict != "not enough runs" for each in found):
+        # What is identical in half of the flights may still differ in the others.
+        if all(each.verdict not in {"not enough runs", "identical"} for each in found):
             break
     return found
 
@@ -263,6 +275,8 @@ def compare_rows(
 ) -> list[Comparison]:
     """Compare runs, paired by flight; repeats of a flight are averaged.
 
+    An estimator that only one side has is a row of its own: whoever lacks it is worse.
+
     Raises:
         ConfigError: They have no flight, no estimator or no figure in common.
     """
@@ -276,7 +290,7 @@ def compare_rows(
     names = [(each, each) for each in ours if each in theirs]
     if not names and len(ours) == len(theirs) == 1:  # two systems of different names
         names = [(ours[0], theirs[0])]
-    if not names:
+    if not names and bool(ours) == bool(theirs):
         raise ConfigError(f"compare: expected an estimator in both, found {ours} and {theirs}")
     wanted = [
         (name, other, each)
@@ -285,7 +299,12 @@ def compare_rows(
         if any(_value(a[k], name, each) is not None for k in common)
         or any(_value(b[k], other, each) is not None for k in common)
     ]
-    if not wanted:
+    paired = {name for pair in names for name in pair}
+    alone = [
+        *(_alone(name, "B", a, common, figures) for name in ours if name not in paired),
+        *(_alone(name, "A", b, common, figures) for name in theirs if name not in paired),
+    ]
+    if not wanted and not alone:
         raise ConfigError(f"compare: expected {', '.join(figures)}, found none of them in any run")
     found = []
     for name, other, each in wanted:
@@ -299,7 +318,35 @@ def compare_rows(
                 one, verdict="not comparable", more=0, alignments=tuple(differing)
             )
         found.append(one)
-    return found
+    return found + alone
+
+
+def _alone(
+    name: str,
+    missing: Literal["A", "B"],
+    runs: Mapping[Key, Sequence[Row]],
+    common: Sequence[Key],
+    figures: Sequence[str],
+) -> Comparison:
+    """Return the row of an estimator that one side does not have, with a figure of the other."""
+    by_figure = {f: [_value(runs[key], name, f) for key in common] for f in figures}
+    each = next((f for f, v in by_figure.items() if any(x is not None for x in v)), figures[0])
+    values = by_figure[each]
+    known = [value for value in values if value is not None]
+    there = float(np.median(known)) if known else None
+    sign = -1.0 if figure(each).limit == "least" else 1.0
+    change = sign * (math.inf if missing == "B" else -math.inf)
+    lost, all_ = len(values) - len(known), len(values)
+    return Comparison(
+        estimator=name, figure=each, change=change, low=change, high=change, relative=False, p=1.0,
+        pairs=all_, missing=missing, verdict="worse" if missing == "B" else "better",
+        a=None if missing == "A" else there, b=None if missing == "B" else there,
+        failures=(all_, lost) if missing == "A" else (lost, all_),
+        flights={
+            f"{scenario}, seed {seed}": (None, value) if missing == "A" else (value, None)
+            for (scenario, seed), value in zip(common, values, strict=True)
+        },
+    )  # fmt: skip
 
 
 def _alignments(rows: Sequence[Row], estimator: str) -> set[str]:

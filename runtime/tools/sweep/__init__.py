@@ -19,8 +19,9 @@ which the project is installed. With Dask (``pip install distributed``)::
 Runs that differ only in what comes after the sensors use one flight, which each machine records
 once (`runtime.tools.flights`). ``pure=False`` lets a failed run be tried again. A job carries its
 settings as text; what it reads besides (modules beside the file, trajectories, worlds) must be
-found at the same paths on every machine, and a run's folder of results stays on the machine that
-ran it unless the sweep's folder is shared. The rows come back in any case.
+found at the same paths on every machine, with the same content, or the next call runs the job again
+(`runtime.run.made_from`). A run's folder of results stays on the machine that ran it unless the
+sweep's folder is shared. The rows come back in any case.
 """
 
 from runtime.tools.sweep.console import Watch, run_here, sweep

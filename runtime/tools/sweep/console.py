@@ -1,14 +1,16 @@
 """All runs of a plan, on any executor, with their progress and summary in the terminal.
 
-Runs that are finished already are not run again.
+Runs that are finished already are not run again, unless something that they were made from has
+changed since: code, programs, files (`runtime.run.made_from`).
 """
 
 from __future__ import annotations
 
 import concurrent.futures
+import logging
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -19,9 +21,12 @@ from rich.table import Table
 from rich.text import Text
 
 from runtime.figures import figure
+from runtime.run.made_from import Parts, Roots, made_from
 from runtime.tools.sweep.plan import Job, Plan
 from runtime.tools.sweep.process import Children, run_job
 from runtime.tools.sweep.tables import MAIN, Combination, Row, Rows, crashed
+
+_LOG = logging.getLogger("visnav.sweep")
 
 
 class Watch:
@@ -29,6 +34,9 @@ class Watch:
 
     def begin(self, missing: Sequence[Job], finished: int) -> None:
         """Note the jobs to run, and the number of runs finished earlier."""
+
+    def again(self, changed: Mapping[Job, Sequence[str]]) -> None:
+        """Note the finished jobs to run again, with what has changed; called before `begin`."""
 
     def done(self, job: Job, row: Row) -> None:
         """Note the end of a run, successful or not."""
@@ -47,8 +55,9 @@ def sweep(
 ) -> list[Row]:
     """Run the missing jobs, and those crashed before; called in a single thread.
 
-    Each row is in ``rows.jsonl`` before the next one is looked at, so whatever ends a sweep, the
-    next call takes up where it ended. A run that fails is a row with an error.
+    So are those made from something else than what is there now. Each row is in ``rows.jsonl``
+    before the next one is looked at, so whatever ends a sweep, the next call takes up where it
+    ended. A run that fails is a row with an error.
 
     Args:
         run: Runs one job; must be picklable if the executor needs that.
@@ -63,24 +72,48 @@ def sweep(
             ended; those that ended well are kept. A second one is not waited for.
     """
     watch = watch or Watch()
+    now = parts_of(plan)
     with Rows(plan.out / "rows.jsonl", fresh=fresh) as rows:
-        missing = [job for job in plan.jobs if (row := rows.get(job)) is None or row["error"]]
+        missing, changed = [], {}
+        for job in plan.jobs:
+            row = rows.get(job)
+            if row is None or row["error"]:
+                missing.append(job)
+            elif why := rows.changes(row, now[job.roots]):
+                missing.append(job)
+                changed[job] = why
+        if changed:
+            watch.again(changed)
         watch.begin(missing, len(plan.jobs) - len(missing))
         futures: dict[concurrent.futures.Future[Row], Job] = {}  # those without a row
         try:
             for job in missing:
                 futures[_submit(executor, run, job)] = job
             for future in concurrent.futures.as_completed([*futures]):
-                row = rows.add(_row(future, futures[future]))
+                job = futures[future]
+                row = rows.add(_with_parts(_row(future, job), now[job.roots]))
                 watch.done(futures.pop(future), row)
         except BaseException:
             left = [future for future in futures if not future.cancel()]
             watch.interrupted()
             for row in [_row(future, futures[future]) for future in left]:  # waits
                 if not row["error"]:
-                    rows.add(row)
+                    job = next(each for each in plan.jobs if each.id == row["id"])
+                    rows.add(_with_parts(row, now[job.roots]))
             raise
         return [row for job in plan.jobs if (row := rows.get(job)) is not None]
+
+
+def parts_of(plan: Plan) -> dict[Roots, Parts]:
+    """Return what a plan's jobs are made from now, by their roots."""
+    return {roots: made_from(roots) for roots in {job.roots: None for job in plan.jobs}}
+
+
+def _with_parts(row: Row, now: Parts) -> Row:
+    """Return a row that says what it was made from, which `run_job` notes itself."""
+    if "parts" not in row and not row["error"]:
+        row["parts"] = now
+    return row
 
 
 def run_here(
@@ -95,6 +128,7 @@ def run_here(
     children, watch = (display.children, display) if display else (Children(), Watch())
     if display is None:
         watch.interrupted = children.interrupt  # type: ignore[method-assign]
+        watch.again = lambda changed: _LOG.warning("%s", words(changed))  # type: ignore[method-assign]
     with concurrent.futures.ThreadPoolExecutor(jobs or at_once(plan), "run") as executor:
         return sweep(plan, executor, run=children.run, watch=watch, fresh=fresh)
 
@@ -136,6 +170,7 @@ class Display(Watch):
         self.finished = 0
         self._console = console
         self._missing = 0
+        self._again: Mapping[Job, Sequence[str]] = {}
         self._usage, self._looked = (0, 0.0), 0.0
         self._begin = self._last = time.monotonic()
         self._bar = Progress(
@@ -160,9 +195,18 @@ class Display(Watch):
         """Show how many runs there are."""
         self._missing = len(missing)
         self._begin = self._last = time.monotonic()
-        if finished:
-            self._print(f"{finished} runs are finished already, {len(missing)} to do")
+        new = len(missing) - len(self._again)
+        if self._again:
+            to_do = f"{new} to do, " * (new > 0)
+            self._print(f"{finished} runs are finished already, {to_do}{words(self._again)}")
+        elif finished:
+            self._print(f"{finished} runs are finished already, {new} to do")
+        self._again = {}  # for another sweep
         self._bar.update(self._task, total=len(missing))
+
+    def again(self, changed: Mapping[Job, Sequence[str]]) -> None:
+        """Remember which finished runs are run again, and why; `begin` prints it."""
+        self._again = changed
 
     def done(self, job: Job, row: Row) -> None:
         """Count a run; print failures, and without a bar every run."""
@@ -176,6 +220,9 @@ class Display(Watch):
             seconds = f"{row['wall_seconds']:.1f} s" if row["wall_seconds"] else "done"
             failed = ", failed" if row["passed"] is False else ""
             self._print(f"{self._count()} {job}: {seconds}{failed}, {self.state()}")
+        if edited := row.get("edited"):
+            what = listed([f"{each} while it ran" for each in edited])
+            self._print(f"warning: {job}: {what}: the next call runs it again")
 
     def interrupted(self) -> None:
         """Print a notice: running jobs are awaited, Ctrl-C ends them at once."""
@@ -199,6 +246,23 @@ class Display(Watch):
 
     def _print(self, line: str) -> None:
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def words(changed: Mapping[Job, Sequence[str]]) -> str:
+    """Return which finished runs are run again, and why: ``2 are run again: x.py changed``."""
+    reasons = [each for why in changed.values() for each in why]
+    are = "is" if len(changed) == 1 else "are"
+    return f"{len(changed)} {are} run again: {listed(dict.fromkeys(reasons))}"
+
+
+def listed(reasons: Iterable[str]) -> str:
+    """Return some reasons, and how many more there are."""
+    reasons = [*reasons]
+    more = len(reasons) - MOST_REASONS
+    return ", ".join(reasons[:MOST_REASONS]) + f" and {more} more" * (more > 0)
+
+
+MOST_REASONS = 4  # in one line
 
 
 class _State(ProgressColumn):

@@ -19,6 +19,8 @@ import tomli_w
 from runtime.config.model import Config, given, to_builtins
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
+from runtime.run.made_from import RUN, Roots, roots_of
+from runtime.tools import flights
 from runtime.tools.flights import flight_of, settings_key
 from runtime.units import Duration
 
@@ -145,6 +147,8 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
         repeat: The how manieth run with these settings and this seed; they differ if something
             in it does not depend on these alone.
         out: Absolute path of the folder for the run's results.
+        roots: Where the parts begin that it is made from; a finished run is valid as long as these
+            do not change.
     """
 
     id: str
@@ -157,6 +161,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     record: bool = False
     limit: float = LEAST_LIMIT
     repeat: int = 1
+    roots: Roots = Roots()
 
     def __str__(self) -> str:
         """Return settings, seed and repeat as a text, unique in the sweep."""
@@ -292,4 +297,5 @@ def make_job(
         id=key, text=text, folder=str(folder), settings=settings, seed=seed,
         out=str(out / "runs" / key), flight=settings_key(part) if part is not None else "",
         limit=LEAST_LIMIT + SLOWEST * (config.run.duration or USUAL), repeat=repeat,
+        roots=roots_of(config, folder, (*RUN, flights.__name__)),
     )  # fmt: skip

@@ -18,6 +18,7 @@ from pathlib import Path
 import msgspec
 
 from runtime.channels.wire import combined
+from runtime.run.made_from import during, made_from
 from runtime.run.results import clear
 from runtime.summary import Verdict
 from runtime.tools.sweep.plan import Job
@@ -42,6 +43,9 @@ class Ended(msgspec.Struct, frozen=True):
     error: str | None = None
     digest: str | None = None
     digests: dict[str, str] = {}
+    name: str = ""
+    inputs: dict[str, str] = {}
+    inputs_digest: str | None = None
     not_deterministic: list[str] = []
     verdict: Verdict | None = None
     workers: dict[str, dict[str, float | None]] = {}
@@ -67,7 +71,15 @@ class Children:
         return len(self._running)
 
     def run(self, job: Job) -> Row:
-        """Run a job and wait for its end."""
+        """Run a job and wait for its end; note what it was made from, and what of it changed."""
+        before = made_from(job.roots)
+        row = self._run(job)
+        row["parts"], edited = during(before, made_from(job.roots))
+        if edited:
+            row["edited"] = edited
+        return row
+
+    def _run(self, job: Job) -> Row:
         out = Path(job.out)
         clear(out)
         settings = out / "config.toml"
@@ -209,6 +221,7 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
     if ended is not None:
         row["sim_seconds"], row["run_seconds"] = ended.sim_seconds, ended.wall_seconds
         row["workers"] = ended.workers
+        note_inputs(row, ended)
         row["digest"] = None if ended.not_deterministic else ended.digest
         if ended.reason in _STOPPED:
             row["error"] = f"interrupted by {ended.reason}"
@@ -222,6 +235,13 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
             if (own := _outputs_of(name.partition("/")[0], ended.digests))
         }
     return row
+
+
+def note_inputs(row: Row, ended: Ended) -> None:
+    """Note in a row what estimators were fed, if that is known."""
+    row["name"] = ended.name
+    if ended.inputs_digest is not None:
+        row["inputs"] = ended.inputs
 
 
 def _outputs_of(node: str, digests: dict[str, str]) -> dict[str, str]:

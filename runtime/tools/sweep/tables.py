@@ -3,7 +3,8 @@
 ``table.csv`` and ``summary.csv`` hold nothing that differs between two equal sweeps in lockstep;
 whatever depends on the machine is in ``timing.csv`` (runs) and ``costs.csv`` (their workers).
 
-What is remembered of each run: ``rows.jsonl``, one line a run, added when the run ends.
+What is remembered of each run: ``rows.jsonl``, one line a run, added when the run ends. What runs
+were made from is in ``made_from.jsonl``, a line for each set of parts, to which the rows refer.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import msgspec
 
 from runtime.errors import ConfigError
 from runtime.figures import IN_SWEEPS, figure
+from runtime.run.made_from import Parts, changes, key_of
 from runtime.tools.sweep.plan import Job, Plan, value
 
 
@@ -39,6 +41,12 @@ class Row(TypedDict):
         run_seconds: Real seconds from the first update to the end.
         wall_seconds: Real seconds of the whole process.
         estimators: Name to figures, as the run's verdict has them.
+        name: Of the run.
+        inputs: Fingerprints of what estimators are fed, by output and announcement; missing if
+            there are no digests.
+        made_from: Key of what the run was made from.
+        parts: What it was made from; in the files it stands once, under that key.
+        edited: What of it changed while the run was under way, in words.
     """
 
     id: str
@@ -57,6 +65,11 @@ class Row(TypedDict):
     crashes: NotRequired[list[str]]
     flights: NotRequired[dict[str, dict[str, Any]]]
     workers: NotRequired[dict[str, dict[str, float | None]]]
+    name: NotRequired[str]
+    inputs: NotRequired[dict[str, str]]
+    made_from: NotRequired[str]
+    parts: NotRequired[Parts]
+    edited: NotRequired[list[str]]
 
 
 def crashed(job: Job, error: str) -> Row:
@@ -97,6 +110,8 @@ class Rows:
         ConfigError: Another sweep has it open.
     """
 
+    MADE_FROM = "made_from.jsonl"
+
     def __init__(self, path: Path, *, fresh: bool = False) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file: IO[bytes] = path.open("a+b")
@@ -112,6 +127,8 @@ class Rows:
         self._rows = decode_rows(text)
         if text and not text.endswith(b"\n"):
             self._file.write(b"\n")
+        self._made_from = path.with_name(self.MADE_FROM)
+        self._parts = _decode_parts(self._made_from)
 
     def __enter__(self) -> Rows:
         return self
@@ -123,12 +140,46 @@ class Rows:
         """Return a job's row, finished or crashed, or `None`."""
         return self._rows.get(job.id)
 
+    def changes(self, row: Row, now: Parts) -> list[str]:
+        """Return what a run was made from that is different now, in words; nothing if it is valid.
+
+        Of a run that nothing is known of, such as one of an earlier version, that is said.
+        """
+        if edited := row.get("edited"):
+            return [f"{each} while it ran" for each in edited]
+        parts = self._parts.get(row.get("made_from", ""))
+        if parts is None:
+            return ["nothing says what they were made from"]
+        return changes(parts, now)
+
     def add(self, row: Row) -> Row:
         """Write a row, and return the row as read back."""
+        if (parts := row.pop("parts", None)) is not None:
+            key = row["made_from"] = key_of(parts)
+            if key not in self._parts:  # before the row that refers to it
+                self._parts[key] = parts
+                with self._made_from.open("ab") as file:
+                    file.write(b"\n" + msgspec.json.encode(_Set(key, parts)) + b"\n")
         line = msgspec.json.encode(row)
         self._file.write(line + b"\n")
         self._file.flush()
         return _enter(self._rows, msgspec.json.decode(line, type=Row))
+
+
+class _Set(msgspec.Struct):
+    """Line of ``made_from.jsonl``: parts of some runs."""
+
+    key: str
+    parts: Parts
+
+
+def _decode_parts(path: Path) -> dict[str, Parts]:
+    found: dict[str, Parts] = {}
+    for line in path.read_bytes().splitlines() if path.is_file() else ():
+        with contextlib.suppress(msgspec.MsgspecError):  # cut short, or empty
+            one = msgspec.json.decode(line, type=_Set)
+            found[one.key] = one.parts
+    return found
 
 
 class Spread(msgspec.Struct, frozen=True):

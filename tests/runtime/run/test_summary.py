@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,9 +22,11 @@ from events import (
     PoseEstimate,
 )
 from runtime import Duration, Input, Node, NodeConfig, Output, every, on
+from runtime.commit import commit
 from runtime.config.model import Config, RunConfig
 from runtime.run.execute import execute
-from runtime.run.summarise import command_line, commit
+from runtime.run.made_from import code_of
+from runtime.run.summarise import command_line
 from runtime.summary import Summary, merged
 from runtime.testing import run_nodes, spec
 from runtime.time.clock import Tick
@@ -232,11 +232,12 @@ def test_the_command_line_is_kept_without_secrets(monkeypatch: pytest.MonkeyPatc
     assert "network.secret=file:key" in shown
 
 
-def test_the_commit_is_that_of_the_folder_if_there_is_one(tmp_path: Path) -> None:
-    assert commit(tmp_path) == ""
-    for command in (
-        ["init", "-q"],
-        ["-c", "user.name=a", "-c", "user.email=a", "commit", "-q", "--allow-empty", "-m", "a"],
-    ):
-        subprocess.run(["git", *command], cwd=tmp_path, check=True)
-    assert re.fullmatch("[0-9a-f]{7,40}", commit(tmp_path))
+def test_the_code_of_estimators_is_told_as_it_was_when_the_run_began(tmp_path: Path) -> None:
+    nodes = (spec(Rig, "rig"), spec(Tracker, "tracker"))
+    settings = RunConfig(duration=Duration(0.1), clock="lockstep")
+    found = execute(Config(run=settings, nodes=nodes), tmp_path / "run")
+    assert found.code == {"tracker": code_of(nodes[1])}
+    assert found.environment["commit"] == commit()
+    assert merged([found, replace(found, code={"other": "1"})], []).code.keys() == {
+        *("tracker", "other")
+    }

@@ -22,6 +22,7 @@ from runtime.errors import ConfigError
 from runtime.node import Node, NodeConfig
 from runtime.tools.cli.sweep import of_comparison
 from runtime.tools.comparison import Comparison, Key, compare_rows, compare_values, read_folder
+from runtime.tools.comparison.flying import check_flights
 from runtime.tools.comparison.statistics import compare_until_sure, signed_rank
 from runtime.tools.sweep import Row
 from tests.nodes.outside.process.rig import STUB
@@ -282,8 +283,95 @@ def test_crashed_runs_repeats_and_other_names() -> None:
         compare_rows({("t", 0): [row(0)]}, {("u", 0): [row(0)]})
     with pytest.raises(ConfigError, match="expected ate_max_m, found none of them in any run"):
         compare_rows(a, b, figures=["ate_max_m"])
-    with pytest.raises(ConfigError, match=r"an estimator in both, found \['vo'\] and \[\]"):
-        compare_rows({("t", 0): [row(0, x=1)]}, {("t", 0): [row(0, "crashed")]})
+    with pytest.raises(ConfigError, match=r"an estimator in both, found \[\] and \[\]"):
+        compare_rows({("t", 0): [row(0, "crashed")]}, {("t", 0): [row(0, "crashed")]})
+
+
+def test_an_estimator_that_one_side_lacks_is_a_row_and_worse_there() -> None:
+    def both(n: int) -> Row:
+        found = row(n, ate_percent=1.0 + n)
+        found["estimators"]["slam"] = {"ate_percent": 2.0 + n}
+        return found
+
+    a = {("t", n): [both(n)] for n in range(3)}
+    b = {("t", n): [row(n, ate_percent=1.0)] for n in range(3)}
+    vo, slam = compare_rows(a, b, figures=["rot_rmse_deg", "ate_percent"])
+    assert (vo.estimator, vo.missing, slam.estimator, slam.figure) == (
+        "vo", "", "slam", "ate_percent"
+    )  # fmt: skip
+    assert (slam.verdict, slam.words, slam.missing) == ("worse", "worse: not there in B", "B")
+    assert (slam.medians, slam.failures) == (["3 %", "– (3 failed)"], (0, 3))
+    assert (slam.fails(0), slam.fails(5)) == (True, True)
+    assert [each.state for each in of_comparison(slam, 0)] == ["failed"]
+    _, slam = compare_rows(b, a, figures=["ate_percent"])
+    assert (slam.words, slam.fails(0), slam.fails(5)) == ("better: not there in A", False, False)
+    (vo,) = compare_rows(b, {key: [row(0, "crashed")] for key in b}, figures=["ate_percent"])
+    assert vo.words == "worse: not there in B"
+
+
+def test_identical_values_are_said_to_be_identical() -> None:
+    same = {("t", n): (1.0 + n, 1.0 + n) for n in range(12)}
+    for margin, words in ((0.0, "identical"), (5.0, "no difference: identical")):
+        found = ate(same, margin=margin)
+        assert (found.words, found.fails(margin)) == (words, False)
+        assert [each.state for each in of_comparison(found, margin)] == ["passed"]
+    few = ate({key: pair for key, pair in same.items() if key[1] < 2}, margin=5)
+    assert few.words == "identical so far: 4 more may tell"
+    assert (few.fails(0), few.fails(5)) == (False, True)  # with a margin it has to be shown
+    assert ate(same | {("t", 0): (1.0, 1.0 + 1e-12)}).verdict == "not enough runs"
+    assert ate(same | {("t", 0): (None, None)}).verdict == "not enough runs"
+
+
+def test_what_is_identical_in_half_of_the_flights_is_looked_at_in_all() -> None:
+    """A change that has an effect in few flights is not overlooked."""
+    asked: list[int] = []
+
+    def compare(count: int, error: float) -> list[Comparison]:
+        asked.append(count)
+        return [ate({("t", n): (1.0, 1.0) for n in range(count)}, error=error)]
+
+    (found,) = compare_until_sure(compare, 24, [])
+    assert (asked, found.words) == ([12, 24], "identical")
+
+
+def fed(key: Key, name: str = "tour", **inputs: str) -> Row:
+    return row(key[1], ate_percent=1.0) | {"name": name, "inputs": inputs}
+
+
+def test_different_flights_are_not_taken_for_equal_ones() -> None:
+    keys: list[Key] = [("run", n) for n in range(3)]
+    a = {key: [fed(key, odometry="1", images="2")] for key in keys}
+    assert check_flights(a, {key: [fed(key, odometry="1", images="2")] for key in keys}) == []
+    same = {key: [fed(key, "other", odometry="1", images="2")] for key in keys}
+    assert check_flights(a, same) == []  # of another name: the same flight
+    b = a | {keys[1]: [fed(keys[1], odometry="1", images="3", lidar="4")]}
+    (note,) = check_flights(a, b)
+    assert note == (
+        "1 of 3 flights are not the same for A and B: images, lidar differ; what is compared is of "
+        "different flights"
+    )
+    with pytest.raises(ConfigError, match='same flights, found "tour" and "yard" with seed 1, in'):
+        check_flights(a, b | {keys[1]: [fed(keys[1], "yard", odometry="9")]})
+    without = a | {keys[0]: [row(0)], keys[2]: [row(2, "crashed")]}
+    assert check_flights(a, without) == []
+    (note,) = check_flights(a, without, whole=False)
+    assert note.startswith("whether 1 of 3 flights are the same for A and B is not known")
+
+
+def test_runs_during_which_files_were_edited_are_told(tmp_path: Path) -> None:
+    for side in "ab":
+        rows = [fed(("run", n), odometry="1") for n in range(2)]
+        if side == "b":
+            rows[0]["edited"] = ["vo.py changed"]
+        (tmp_path / side).mkdir()
+        lines = b"\n".join(msgspec.json.encode(each) for each in rows)
+        (tmp_path / side / "rows.jsonl").write_bytes(lines)
+    with pytest.warns(UserWarning, match="1 runs of B are of a mixture: vo.py changed while they"):
+        compared = visnav.compare(
+            tmp_path / "a", tmp_path / "b", figures=["ate_percent"], out=tmp_path / "out"
+        )
+    assert compared.notes[0] in (tmp_path / "out" / "compare.html").read_text(encoding="utf-8")
+    assert compared.notes[0] in repr(compared)
 
 
 def test_a_row_cut_short_by_a_full_disk_is_left_out(tmp_path: Path) -> None:
@@ -361,6 +449,44 @@ def test_settings_are_flown_and_compared(
         visnav.compare(file, b={"judge.eror": 2})
 
 
+OWN = f"""
+from {__name__} import Judge, JudgeConfig
+import own_tracker
+
+
+class OwnJudge(Judge):
+    async def on_shutdown(self) -> None:
+        error = own_tracker.FACTOR * self.config.error
+        self.conclude("vo", {{"ate_percent": error, "frame_coverage_percent": 100.0}})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+def test_after_an_edit_of_an_estimator_its_figures_are_new(file: Path, tmp_path: Path) -> None:
+    """The loop of everybody: compare, edit a file, compare again."""
+    (tmp_path / "own_judge.py").write_text(OWN, encoding="utf-8")
+    (tmp_path / "own_tracker.py").write_text("FACTOR = 1.0\n", encoding="utf-8")
+    file.write_text(file.read_text().replace(f"{__name__}:Judge", "own_judge:OwnJudge"))
+    options = ["--b", "judge.error=2", "--seeds", "2", "--figure", "ate_percent"]
+
+    def compared() -> tuple[dict[str, Any], str]:
+        done = command_here("compare", file, *options, "--json", "c.json", folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        (found,) = json.loads((tmp_path / "c.json").read_bytes())
+        return found, done.stderr
+
+    found, _ = compared()
+    assert (found["a"], found["b"]) == (1.0, 2.0)
+    _, said = compared()
+    assert said == "2 runs are finished already, 0 to do\n4 runs are finished already, 0 to do\n"
+    (tmp_path / "own_tracker.py").write_text("FACTOR = 3.0\n", encoding="utf-8")
+    found, said = compared()
+    assert (found["a"], found["b"]) == (3.0, 6.0)
+    assert "0 runs are finished already, 2 are run again: own_tracker.py changed\n" in said
+    assert "2 runs are finished already, 2 are run again: own_tracker.py changed\n" in said
+
+
 PROGRAM = """
 [run]
 name = "rig"
@@ -387,7 +513,10 @@ type = "Evaluation"
 def test_two_builds_of_a_program_are_compared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One of them is lost in a quarter of the images; both lie beside the file."""
+    """One of them is lost in a quarter of the images; both lie beside the file.
+
+    A new one behind the same command is flown again, and the other is kept.
+    """
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     file = tmp_path / "rig.toml"
     client = str(ROOT / "nodes" / "outside" / "native")
@@ -409,6 +538,11 @@ def test_two_builds_of_a_program_are_compared(
     (found,) = json.loads((tmp_path / "c.json").read_bytes())
     assert (found["failures"], found["b"]) == ([0, 0], 100)
     assert found["a"] == pytest.approx(75, abs=5)
+    shutil.copy(tmp_path / "builds" / "old", tmp_path / "builds" / "new")
+    done = command_here("compare", file, *words, *options, folder=tmp_path)
+    assert "1 runs are finished already, 1 is run again: new changed\n" in done.stderr
+    (found,) = json.loads((tmp_path / "c.json").read_bytes())
+    assert found["b"] == found["a"]
 
 
 @pytest.mark.slow
@@ -422,7 +556,7 @@ def test_finished_sweeps_are_compared(file: Path, tmp_path: Path) -> None:
     runs = sorted((tmp_path / "old" / "runs").iterdir())
     assert len(read_folder(runs[0])) == 1
     done = command_here("compare", runs[0], runs[0], "--margin", "5", folder=tmp_path)
-    assert "not enough runs: 5 more may tell" in done.stdout
+    assert "identical so far: 5 more may tell" in done.stdout
     assert done.returncode == 1  # with a margin, what is not shown counts as inferior
 
 

@@ -20,6 +20,8 @@ from nodes.judging.evaluation import Evaluation
 from nodes.judging.report.folder import read_run
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import read_tum, write_euroc, write_kitti, write_tum
+from runtime.commit import commit
+from runtime.run.sources import content_hash
 from runtime.testing import run_node
 from tests.nodes.judging.evaluation import flights
 from tests.nodes.judging.judge import bags
@@ -345,3 +347,14 @@ def test_a_final_trajectory_stands_beside_its_estimate(
     done = said(tmp_path, *words, "--final", "closed.tum")
     assert done.returncode == 2
     assert "expected the name of an estimate (vo), found closed" in done.stderr
+
+
+def test_the_summary_says_what_was_judged_and_by_which_version(
+    pair: tuple[Trajectory, Trajectory], tmp_path: Path
+) -> None:
+    said(tmp_path, "--truth", "truth.tum", "--estimate", "vo=vo.tum")
+    found = json.loads((tmp_path / "judged" / "trajectories" / "summary.json").read_text())
+    assert found["environment"]["commit"] == commit()
+    assert found["judged"] == {"truth": "truth.tum", "vo": "vo.tum"}
+    hashes = {name: content_hash(tmp_path / file) for name, file in found["judged"].items()}
+    assert found["judged_hashes"] == hashes

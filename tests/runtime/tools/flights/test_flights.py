@@ -20,7 +20,6 @@ from runtime.config.model import Config
 from runtime.config.reading import load
 from runtime.errors import NodeError
 from runtime.tools.flights import (
-    _imported,
     content_key,
     flight_of,
     fly,
@@ -188,28 +187,6 @@ def test_the_key_knows_modules_beside_a_node_of_ones_own(
         file.write_text(file.read_text() + "# changed\n")
         keys.add(content_key(part))
     assert len(keys) == 1 + len(files)
-
-
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "import json, helper",
-        "from os import (\n    path,\n)\nfrom helper import (\n    it,\n)",
-        "from . import (\n    air as a,\n    helper,\n)",
-        "from .helper \\\n    import it",
-        "if TYPE_CHECKING:\n    import helper",
-        "def later():\n    try:\n        x = 1; import helper\n    except ImportError: pass",
-    ],
-)
-def test_every_way_to_import_is_known(statement: str, tmp_path: Path) -> None:
-    package = tmp_path / "flying"
-    package.mkdir()
-    for file in ("__init__.py", "air.py", "helper.py"):
-        (package / file).write_text("")
-    (tmp_path / "helper.py").write_text("")
-    (package / "craft.py").write_text(statement)
-    found = {*_imported(package / "craft.py", "flying")}
-    assert ("flying.helper" if "from ." in statement else "helper") in found
 
 
 @pytest.mark.slow

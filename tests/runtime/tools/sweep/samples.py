@@ -61,6 +61,10 @@ class Judge(Node[JudgeConfig]):
         self.stop("judged")
 
 
+BESIDE = f"from {__name__} import Judge\n\n\nclass Own(Judge):\n    pass\n"
+"""Module beside a file, with a judge of one's own."""
+
+
 def judge_file(
     folder: Path, settings: str = "", type_: str = f"{__name__}:Judge", run: str = ""
 ) -> Path:
@@ -88,6 +92,11 @@ def pretend(job: Job) -> Row:
     row["exit_code"], row["passed"], row["wall_seconds"] = 0, error < 50, 0.5
     row["estimators"] = {"vo": figures, "slam": figures | {"ate_percent": error / 2}}
     return row
+
+
+def figures_of(rows: Sequence[Row]) -> list[Row]:
+    """Return rows without what they were made from."""
+    return [{k: v for k, v in row.items() if k != "made_from"} for row in rows]  # type: ignore[misc]
 
 
 def refuse(job: Job) -> Row:

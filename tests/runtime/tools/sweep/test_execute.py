@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
+import re
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from runtime.errors import ConfigError
-from runtime.tools.sweep import Job, Row, Watch, sweep
+from runtime.run.made_from import made_from
+from runtime.tools.sweep import Children, Job, Plan, Row, Watch, make_plan, run_here, sweep
+from runtime.tools.sweep.console import Display, listed
 from runtime.tools.sweep.tables import Rows, crashed
-from tests.runtime.tools.sweep.samples import die, plan_in, pretend, refuse
+from tests.runtime.tools.sweep.samples import (
+    BESIDE,
+    die,
+    figures_of,
+    judge_file,
+    plan_in,
+    pretend,
+    refuse,
+)
 
 
 @contextmanager
@@ -54,6 +67,10 @@ class Diary(Watch):
         self.finished = 0
         self.rows: list[Row] = []
         self.interruptions = 0
+        self.changed: dict[str, list[str]] = {}
+
+    def again(self, changed: Mapping[Job, Sequence[str]]) -> None:
+        self.changed = {str(job): [*why] for job, why in changed.items()}
 
     def begin(self, missing: Sequence[Job], finished: int) -> None:
         self.missing, self.finished = list(missing), finished
@@ -74,7 +91,7 @@ def test_every_executor_gives_the_same_rows_in_the_order_of_the_plan(
     with executor() as pool:
         rows = sweep(plan, pool, run=pretend, watch=diary)
         assert sweep(plan, pool, run=refuse) == rows
-    assert rows == [pretend(job) for job in plan.jobs]
+    assert figures_of(rows) == [pretend(job) for job in plan.jobs]
     assert (len(diary.missing), diary.finished, len(diary.rows)) == (6, 0, 6)
 
 
@@ -88,7 +105,7 @@ def test_a_process_that_takes_its_pool_along_is_a_row(tmp_path: Path) -> None:
     with threads() as pool:
         again = sweep(plan, pool, run=pretend)
     assert [row.pop("crashes") for row in again] == [[error] for error in errors]
-    assert again == [pretend(job) for job in plan.jobs]
+    assert figures_of(again) == [pretend(job) for job in plan.jobs]
 
 
 def test_what_failed_is_run_again_and_what_is_finished_is_not(tmp_path: Path) -> None:
@@ -190,3 +207,105 @@ def test_a_figure_that_is_no_number_is_none(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as pool:
         (row,) = sweep(plan, pool, run=run)
     assert row["estimators"] == {"vo": {"ate_percent": None}}
+
+
+class Shown(Diary):
+    """Shows the beginning in a terminal, too."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self.display = Display(console)
+
+    def again(self, changed: Mapping[Job, Sequence[str]]) -> None:
+        super().again(changed)
+        self.display.again(changed)
+
+    def begin(self, missing: Sequence[Job], finished: int) -> None:
+        super().begin(missing, finished)
+        self.display.begin(missing, finished)
+
+
+def swept(plan: Plan, run: Callable[[Job], Row] = pretend) -> tuple[Diary, str]:
+    """Sweep, and return what its observers are told, and what a terminal shows."""
+    output = io.StringIO()
+    diary = Shown(Console(file=output, width=200))
+    with ThreadPoolExecutor(1) as pool:
+        sweep(plan, pool, run=run, watch=diary)
+    return diary, output.getvalue()
+
+
+def plan_of_own(folder: Path, name: str, rates: str = "1,2") -> Plan:
+    """Plan a sweep of a node beside the file, which imports a helper."""
+    if not (folder / f"{name}.py").exists():
+        (folder / f"{name}.py").write_text(f"import {name}_helper\n{BESIDE}", encoding="utf-8")
+        (folder / f"{name}_helper.py").write_text("", encoding="utf-8")
+    config = judge_file(folder, type_=f"{name}:Own")
+    return make_plan(config, [f"judge.rate={rates}"], out=folder / "out")
+
+
+def test_finished_runs_are_run_again_if_what_they_were_made_from_has_changed(
+    tmp_path: Path,
+) -> None:
+    plan = plan_of_own(tmp_path, "judge_edited")
+    assert swept(plan)[1] == ""
+    assert swept(plan, refuse)[1] == "2 runs are finished already, 0 to do\n"
+    with (tmp_path / "judge_edited_helper.py").open("a") as file:
+        file.write("# another\n")
+    more = plan_of_own(tmp_path, "judge_edited", "1,2,3")
+    diary, shown = swept(more)
+    assert diary.changed == {
+        f"judge.rate={n} seed=3": ["judge_edited_helper.py changed"] for n in (1, 2)
+    }
+    what = "judge_edited_helper.py changed"
+    assert shown == f"0 runs are finished already, 1 to do, 2 are run again: {what}\n"
+    assert swept(more, refuse)[0].finished == 3
+    (tmp_path / "unrelated.py").write_text("")
+    assert swept(more, refuse)[0].finished == 3
+
+
+def test_runs_of_which_nothing_says_what_they_were_made_from_are_run_again(tmp_path: Path) -> None:
+    """As those of earlier versions, or those whose parts a full disk has cut."""
+    plan = plan_of_own(tmp_path, "judge_unknown")
+    for name in ("made_from.jsonl", "rows.jsonl"):
+        swept(plan)
+        path = plan.out / name
+        text = re.sub(r',"made_from":"\w+"', "", path.read_text())
+        path.write_text(text if name == "rows.jsonl" else text[:-20])
+        told = "nothing says what they were made from"
+        assert swept(plan)[1] == f"0 runs are finished already, 2 are run again: {told}\n"
+        assert swept(plan, refuse)[0].finished == 2
+
+
+def test_a_run_during_which_a_file_was_edited_is_run_again(tmp_path: Path) -> None:
+    """Nobody knows which of the two it has read, even where the file is as before by now."""
+    plan = plan_of_own(tmp_path, "judge_meanwhile")
+
+    def run(job: Job) -> Row:
+        row = pretend(job)
+        row["parts"] = made_from(job.roots)
+        row["edited"] = ["judge_meanwhile.py changed"] * ("rate=2" in str(job))
+        return row
+
+    swept(plan, run)
+    diary, shown = swept(plan)
+    why = "judge_meanwhile.py changed while it ran"
+    assert diary.changed == {"judge.rate=2 seed=3": [why]}
+    assert shown == f"1 runs are finished already, 1 is run again: {why}\n"
+    assert swept(plan, refuse)[0].finished == 2
+
+
+def test_from_python_it_is_logged_what_is_run_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Children, "run", lambda _, job: pretend(job))
+    plan = plan_of_own(tmp_path, "judge_logged")
+    run_here(plan)
+    assert caplog.text == ""
+    (tmp_path / "judge_logged_helper.py").unlink()
+    run_here(plan)
+    assert caplog.messages == ["2 are run again: judge_logged_helper.py is gone"]
+
+
+def test_many_changes_are_counted() -> None:
+    assert listed(["a changed", "b changed"]) == "a changed, b changed"
+    assert listed(map(str, range(9))) == "0, 1, 2, 3 and 5 more"

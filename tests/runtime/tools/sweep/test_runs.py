@@ -20,10 +20,9 @@ from runtime.tools.sweep import Children, make_plan, sweep, write_tables
 from runtime.tools.sweep.process import kill_tree, last_error, read_results
 from tests.runtime.tools.flights.samples import flight_file
 from tests.runtime.tools.samples_cli import summary
-from tests.runtime.tools.sweep.samples import Judge, judge_file, plan_in, started
+from tests.runtime.tools.sweep.samples import BESIDE, judge_file, plan_in, started
 
 pytestmark = pytest.mark.timeout(240)
-BESIDE = f"from {Judge.__module__} import Judge\n\n\nclass Own(Judge):\n    pass\n"
 
 
 @pytest.mark.slow
@@ -100,6 +99,25 @@ def test_a_run_that_hangs_is_ended_with_its_workers_and_is_a_row(tmp_path: Path)
         row = future.result()
     assert (row["error"], row["exit_code"]) == ("timed out after 8 s", -signal.SIGKILL)
     assert children.usage() == (0, 0.0)
+
+
+@pytest.mark.slow
+def test_an_edit_during_a_run_is_noted_with_the_run(tmp_path: Path) -> None:
+    sign = tmp_path / "sign"
+    (tmp_path / "judge_in_flight.py").write_text(BESIDE, encoding="utf-8")
+    config = judge_file(tmp_path, type_="judge_in_flight:Own", run="clock = 'real'")
+    plan = make_plan(config, [f"judge.sign={sign}"], out=tmp_path / "out")
+    children = Children()
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(children.run, plan.jobs[0])
+        while not sign.exists() and not future.done():
+            time.sleep(0.05)  # it is another process that writes it
+        with (tmp_path / "judge_in_flight.py").open("a") as file:
+            file.write("# another\n")
+        children.interrupt()
+        row = future.result()
+    assert row["edited"] == ["judge_in_flight.py changed"]
+    assert "judge_in_flight.py" in row["parts"]
 
 
 @pytest.mark.slow

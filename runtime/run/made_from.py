@@ -1,0 +1,561 @@
+"""What a run is made from: code, programs, files and libraries, each part with a hash.
+
+A run, a recorded flight and an estimator are known by the same parts. A finished run is valid as
+long as each part has the hash that it was made with; so is a flight, whose parts are those of the
+nodes that fly. Parts have names for readers, relative to the folder that they are found in, so that
+machines on which folders differ agree:
+
+    my_estimator.py      a module, a script or a program, with the files that it needs itself
+    mav0                 a folder named by a setting, without results of runs in it
+    numpy                an installed distribution: version and hash
+    python, machine      versions
+
+What is not seen: files that a program opens by names of its own, libraries that it loads while it
+runs, what is in a container.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from runtime.config.model import Config, NodeSpec
+from runtime.node import CommandLine
+from runtime.paths import inputs, written
+from runtime.run.results import MARKER
+from runtime.run.sources import (
+    LARGE,
+    OURS,
+    Finder,
+    Found,
+    code_modules,
+    content_hash,
+    distributions,
+    find_sources,
+    hashed,
+    text_of,
+)
+from runtime.units import plain
+
+Parts = dict[str, str]
+"""Hash by the name of a part."""
+
+
+class Roots(msgspec.Struct, frozen=True):
+    """Where the parts of a run begin; the same for equal settings.
+
+    Attributes:
+        modules: Of the nodes' classes, and of whoever carries out the run.
+        folder: In which modules of nodes and relative paths are looked for, beside the usual
+            places.
+        inputs: Files and folders that are inputs by the type of their settings.
+        texts: Other texts of settings, which may name files, folders or modules.
+        programs: Programs that nodes start.
+    """
+
+    modules: tuple[str, ...] = ()
+    folder: str = ""
+    inputs: tuple[str, ...] = ()
+    texts: tuple[str, ...] = ()
+    programs: tuple[CommandLine, ...] = ()
+
+
+RUN = ("runtime.run.execute", "events")
+"""Modules that carry out every run."""
+
+
+def roots_of(config: Config, folder: Path | None = None, modules: Iterable[str] = RUN) -> Roots:
+    """Return where the parts of a run begin.
+
+    Args:
+        folder: Of the file with the settings.
+        modules: Of whoever carries out the run.
+    """
+    files: dict[str, None] = {}
+    texts: dict[str, None] = {}
+    programs: list[CommandLine] = []
+    for spec in config.nodes:
+        besides = [*spec.node.made_from(spec.config)]
+        lines = [each for each in besides if isinstance(each, CommandLine)]
+        of_programs = {text for line in lines for text in line.texts()}
+        own_files = [each for each in inputs(spec.config) if each not in of_programs]
+        files |= dict.fromkeys(own_files)
+        files |= dict.fromkeys(str(each) for each in besides if isinstance(each, Path))
+        apart = {*written(spec.config), *of_programs, *own_files}
+        own = msgspec.to_builtins(spec.config, enc_hook=plain)
+        texts |= dict.fromkeys(text for text in _texts(own) if text not in apart)
+        programs += lines
+    named = (spec.type_name.partition(":") for spec in config.nodes)
+    own_modules = {spec.node.__module__ for spec in config.nodes}
+    own_modules |= {module for module, colon, _ in named if colon}
+    return Roots(
+        modules=tuple(sorted({*modules, *own_modules})),
+        folder=str(folder or ""),
+        inputs=tuple(files),
+        texts=tuple(texts),
+        programs=tuple(programs),
+    )
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        if len(value) < 4096 and value.isprintable():
+            yield value
+    elif isinstance(value, dict | list | tuple):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _texts(each)
+
+
+def made_from(roots: Roots) -> Parts:
+    """Return the parts of a run as they are now.
+
+    Never raises: a file that is missing or cannot be read is a part of its own kind.
+    """
+    found = _Collector(roots.folder)
+    finder = Finder([Path(roots.folder)] if roots.folder else [])
+    found.read_settings(roots.inputs, finder)
+    possible = found.read_settings(roots.texts, finder, certain=False)
+    found.add_code(finder, roots.modules, possible=possible)
+    for line in roots.programs:
+        found.add_program(line)
+    return found.parts() | {"python": platform.python_version(), "machine": platform.machine()}
+
+
+def code_of(spec: NodeSpec, folder: Path | None = None) -> str:
+    """Return the hash of a node's own files: its class with local imports, and its programs.
+
+    The events and the runtime, which the commit tells, are no part of it.
+    """
+    found = _Collector(str(folder or ""))
+    finder, module = Finder([folder] if folder else []), spec.node.__module__
+    if module == "__main__":  # a script, or a notebook
+        script = Path(getattr(sys.modules[module], "__file__", None) or "")
+        found.add_code(finder, scripts=[script] if script.is_file() else [], libraries=False)
+        with contextlib.suppress(OSError, TypeError):
+            found.add_text(spec.node.__qualname__, inspect.getsource(spec.node))
+    else:
+        found.add_code(finder, [module], ours=_of_nodes, libraries=False)
+    for each in spec.node.made_from(spec.config):
+        if isinstance(each, CommandLine):
+            found.add_program(each, libraries=False)
+    return key_of(found.parts())
+
+
+def _of_nodes(module: str) -> bool:
+    return module.partition(".")[0] not in {"events", "runtime"}
+
+
+def key_of(parts: Parts) -> str:
+    """Return a key, equal for equal parts."""
+    return hashed(f"{name} {parts[name]}" for name in sorted(parts))
+
+
+def changes(before: Parts, now: Parts) -> list[str]:
+    """Return what differs between parts, in words: ``my_estimator.py changed``.
+
+    A new file that is only named somewhere is no difference: without it the run went well, and may
+    have written it.
+    """
+    changed = sorted(name for name in before.keys() & now.keys() if before[name] != now[name])
+    new = sorted(now.keys() - before.keys())
+    ours = [name for name in changed if name.partition("/")[0] in OURS]
+    if len(ours) > _MOST_OF_OURS:
+        changed = ["visnav-runtime", *(name for name in changed if name not in ours)]
+    return [
+        *(f"{name} changed" for name in changed),
+        *(f"{name} is new" for name in new if not now[name].startswith(_NAMED)),
+        *(f"{name} is gone" for name in sorted(before.keys() - now.keys())),
+    ]
+
+
+def during(before: Parts, after: Parts) -> tuple[Parts, list[str]]:
+    """Return what a run was made from, and what of it changed while the run was under way.
+
+    A file that is only named somewhere, and neither code nor settings, was written by the run if it
+    changed meanwhile: that is no part of it.
+    """
+    made = {
+        name
+        for name in before
+        if before[name].startswith(_WRITABLE) and before[name] != after.get(name)
+    }
+    parts = {name: each for name, each in before.items() if name not in made}
+    return parts, changes(parts, {k: v for k, v in after.items() if k not in made})
+
+
+_NAMED, _WRITABLE = "~", "~~"
+"""Begin the hashes of files that are only named somewhere: of all, and of those that are data."""
+
+_MOST_OF_OURS = 3  # files of this project that are named one by one
+
+
+_SETTINGS = frozenset({
+    ".bash", ".cfg", ".conf", ".ini", ".jinja", ".json", ".launch", ".sh", ".toml", ".xml", ".yaml",
+    ".yml",
+})  # fmt: skip
+_SOURCES = frozenset({
+    ".c", ".cc", ".cmake", ".cpp", ".cu", ".cuh", ".cxx", ".f90", ".go", ".h", ".hh", ".hpp",
+    ".hxx", ".inl", ".ipp", ".jl", ".py", ".pyx", ".rs", ".toml", ".zig",
+})  # fmt: skip
+_BUILD_FILES = frozenset({"CMakeLists.txt", "Makefile", "makefile", "Cargo.lock", "package.xml"})
+_BUILT = frozenset({"build", "install", "log", "target", "devel", "CMakeFiles", "node_modules"})
+_RESULTS = frozenset({"runs", "sweeps", "compared", "judged", "__pycache__"})
+_SYSTEM = (
+    "/bin/", "/dev/", "/etc/", "/lib/", "/lib32/", "/lib64/", "/proc/", "/sbin/", "/sys/", "/usr/",
+)  # fmt: skip
+_TOKEN = re.compile(r"""[^\s"'`=;:,|&()<>{}\[\]$#]+""")
+_FILES = re.compile(r"""\bfile\w*\s*=\s*["']([^"']+)["']""")
+_FOLDERS = re.compile(r"""(?:mesh|texture|asset)dir\s*=\s*["']([^"']+)["']""")
+
+
+class _Collector:
+    """Parts of a run while they are gathered."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder or Path.cwd())
+        self._files: dict[str, set[str]] = {}  # paths by name
+        self._others: Parts = {}
+        self._named: dict[str, str] = {}  # how hashes of files that are only named begin
+
+    def parts(self) -> Parts:
+        """Return the hashes of all that was added."""
+        files = {
+            name: self._named.get(name, "")
+            + hashed(content_hash(Path(path)) for path in sorted(paths))
+            for name, paths in self._files.items()
+        }
+        return files | self._others
+
+    def add_text(self, name: str, text: str) -> None:
+        """Add a text that is in no file."""
+        self._others[name] = hashed([text])
+
+    def read_settings(
+        self, texts: Iterable[str], finder: Finder, *, certain: bool = True
+    ) -> list[str]:
+        """Add the files and folders named by settings; return the names of possible modules.
+
+        Args:
+            certain: Whether they are inputs.
+        """
+        modules = []
+        for text in texts:
+            module, colon, _ = text.partition(":")
+            if colon and module.replace(".", "_").isidentifier():
+                modules.append(module)
+            elif text.replace(".", "_").isidentifier() and finder.is_beside(text):
+                modules.append(text)
+            if text.startswith("/"):
+                if _is_file(Path(text)) or _is_data(Path(text)):
+                    self._add(Path(text), [], certain=certain)
+            elif "/" in text or "." in text:
+                for base in (self._folder, Path.cwd()):
+                    if _is_file(base / text):
+                        self._add(base / text, [], certain=certain)
+                        break
+        return modules
+
+    def add_code(
+        self,
+        finder: Finder,
+        modules: Iterable[str] = (),
+        scripts: Iterable[Path] = (),
+        *,
+        possible: Iterable[str] = (),
+        ours: Callable[[str], bool] = lambda _: True,
+        libraries: bool = True,
+    ) -> None:
+        """Add the files of modules and scripts with what they import."""
+        found: Found = find_sources(finder, modules, scripts, possible=possible, ours=ours)
+        for name, paths in found.files.items():
+            for path in paths:
+                self._note(name, path, certain=name not in found.named)
+                if path.endswith(".so") and name.partition("/")[0] not in OURS and libraries:
+                    self._add_libraries(Path(path), None)
+        if libraries:
+            self._others |= distributions(found.installed, finder.sites)
+
+    def add_program(self, line: CommandLine, *, libraries: bool = True) -> None:
+        """Add a program and the files on its command line."""
+        environment = {**os.environ, "VISNAV_PYTHON": sys.executable, **dict(line.environment)}
+        working = Path(line.folder).absolute()
+        words = [_expanded(word, environment) for word in line.words]
+        scripts: list[Path] = []
+        first = [Path(each) for each in environment.get("PYTHONPATH", "").split(":") if each]
+        for text in (value for _, value in line.environment):
+            if _is_file(working / text):
+                scripts += self._add(working / text, [working], line, certain=False)
+        for text in _arguments(words[1:]):
+            path = Path(os.path.normpath(working / text))
+            inside = "/" in text and path not in {working, *working.parents}
+            if _is_file(path) or (inside and _is_data(path)):
+                scripts += self._add(path, [working], line, certain=False)
+        for word in line.build:
+            if _is_file(path := working / _expanded(word, environment)):
+                self._add(path, [working], line)
+        if line.build:
+            self._add_sources(working)
+        program = _executable(words, working, environment)
+        modules: list[str] = []
+        sites: Sequence[Path] | None = None
+        if program is not None and re.fullmatch(r"(python|pypy)[\d.]*", program.name):
+            script, modules = _python_arguments(words[1:], working)
+            first = [script.parent if script else working, *first]
+            sites = _sites(program)
+            if Path(os.path.realpath(program)) != Path(os.path.realpath(sys.executable)):
+                self._note(program.name, str(program))
+        elif program is not None:
+            scripts += self._add(program, [working], line, libraries=libraries)
+            if program in scripts:
+                first = [program.parent, *first]
+                sites = _sites(program)
+        if scripts or modules:
+            first += [script.parent for script in scripts]
+            self.add_code(Finder(first, sites), modules, scripts, libraries=libraries)
+
+    def _note(self, name: str, path: str, *, certain: bool = True) -> None:
+        if not certain and name not in self._files:
+            self._named[name] = _NAMED if _kind(Path(path)) else _WRITABLE
+        elif certain:
+            self._named.pop(name, None)
+        self._files.setdefault(name, set()).add(os.path.normpath(Path(path).absolute()))
+
+    def _add(
+        self,
+        path: Path,
+        bases: Sequence[Path],
+        line: CommandLine | None = None,
+        *,
+        certain: bool = True,
+        libraries: bool = True,
+    ) -> list[Path]:
+        """Add a file with the files that it names, or a folder; return the Python scripts.
+
+        Args:
+            bases: Folders in which files are looked for, and from which they are named.
+            line: Of the program that is given the file.
+            certain: Whether it is an input, and not perhaps an output.
+        """
+        scripts, todo, seen = [], [path], set()
+        while todo:
+            path = todo.pop()
+            if path in seen or path.suffix == ".pyc":
+                continue
+            seen.add(path)
+            if not _is_file(path):
+                if _is_data(path):
+                    self._add_folder(path, certain=certain)
+                continue
+            kind = _kind(path)
+            if kind == "program" and line is not None and line.build and _within(path, bases):
+                continue  # it is made from sources, which count
+            self._note(self._name(path, bases), str(path), certain=certain)
+            if kind == "python":
+                scripts.append(path)
+            elif kind == "program" and libraries:
+                self._add_libraries(path, line)
+            elif path.suffix == ".xml":
+                todo += _included(path)
+            elif kind == "text":
+                todo += _named_in(path, [path.parent, *bases])
+        if line is None and scripts:
+            self.add_code(Finder([each.parent for each in scripts]), scripts=scripts)
+        return scripts
+
+    def _name(self, path: Path, bases: Sequence[Path]) -> str:
+        for base in [*bases, self._folder]:
+            with contextlib.suppress(ValueError):
+                return path.absolute().relative_to(base).as_posix()
+        return path.name
+
+    def _add_folder(self, folder: Path, *, certain: bool) -> None:
+        found = sorted(_files_in(folder))
+        large = sum(size for _, size in found) > LARGE
+        hashes = [f"{name} {content_hash(folder / name, large=large)}" for name, _ in found]
+        before = self._others.get(folder.name, "")
+        key = hashed([*filter(None, [before]), *hashes])
+        self._others[folder.name] = key if certain else f"{_WRITABLE}{key}"
+
+    def _add_sources(self, folder: Path) -> None:
+        for name, _ in _files_in(folder, without=_RESULTS | _BUILT):
+            path = folder / name
+            if path.suffix in _SOURCES or path.name in _BUILD_FILES:
+                self._note(name, str(path))
+
+    def _add_libraries(self, program: Path, line: CommandLine | None) -> None:
+        environment = dict(line.environment) if line is not None else {}
+        system = []
+        for path in _libraries(program, environment.get("LD_LIBRARY_PATH")):
+            if path.startswith(_SYSTEM):
+                system.append(f"{Path(path).name} {content_hash(Path(path))}")
+            else:
+                self._note(Path(path).name, path)
+        if system:
+            name = f"system libraries of {program.name}"
+            self._others[name] = hashed(sorted(system))
+
+
+def _expanded(word: str, environment: Mapping[str, str]) -> str:
+    return re.sub(r"\$(?:(\w+)|{(\w+)})", lambda m: environment.get(m[1] or m[2], m[0]), word)
+
+
+def _arguments(words: Iterable[str]) -> list[str]:
+    """Return all that may be a path, such as ``x.yaml`` of ``--settings=x.yaml``."""
+    found: dict[str, None] = {}
+    for word in words:
+        pieces = [word]
+        if re.search(r"\s", word):
+            with contextlib.suppress(ValueError):
+                pieces += shlex.split(word)
+        for piece in pieces:
+            found |= dict.fromkeys([piece, *re.split(":=|=|:", piece)[1:]])
+    return [text for text in found if text.strip("-.") and "\0" not in text]
+
+
+def _executable(words: Sequence[str], working: Path, environment: Mapping[str, str]) -> Path | None:
+    if not words or "$" in words[0]:
+        return None
+    place = str(working / words[0]) if "/" in words[0] else words[0]
+    found = shutil.which(place, path=environment.get("PATH"))
+    if found is None and _is_file(Path(place)):
+        found = place
+    return None if found is None else Path(found)
+
+
+def _python_arguments(words: Sequence[str], working: Path) -> tuple[Path | None, list[str]]:
+    """Return the script and the modules that an interpreter is given."""
+    rest = iter(words)
+    for word in rest:
+        if word == "-m":
+            return None, [next(rest, "")]
+        if word == "-c":
+            return None, [*code_modules(next(rest, ""))]
+        if word in {"-X", "-W"}:
+            next(rest, None)
+        elif not word.startswith("-"):
+            return working / word, []
+    return None, []
+
+
+def _sites(program: Path) -> Sequence[Path] | None:
+    """Return the folders of packages of the interpreter of a program; `None` for our own."""
+    prefix = program.absolute().parent.parent
+    if prefix in {Path(sys.prefix), Path(sys.base_prefix)}:
+        return None
+    return sorted(
+        folder
+        for name in ("site-packages", "dist-packages")
+        for folder in prefix.glob(f"l*/python*/{name}")
+    )
+
+
+def _kind(path: Path) -> str:
+    with contextlib.suppress(OSError):
+        with path.open("rb") as file:
+            head = file.read(128)
+        if head.startswith(b"\x7fELF"):
+            return "program"
+        if path.suffix == ".py" or (head.startswith(b"#!") and b"python" in head):
+            return "python"
+        if head.startswith(b"#!") or path.suffix in _SETTINGS:
+            return "text"
+    return ""
+
+
+def _is_file(path: Path) -> bool:
+    with contextlib.suppress(OSError, ValueError):  # too long a name, a zero in it
+        return path.is_file()
+    return False
+
+
+def _is_data(path: Path) -> bool:
+    """Tell whether a path is a folder of data, and none that everything lies in."""
+    path, home = Path(os.path.normpath(path)), Path(os.environ.get("HOME") or "/")
+    around = {Path("/"), home, *home.parents}
+    return path.is_dir() and path not in around and not f"{path}/".startswith(_SYSTEM)
+
+
+def _within(path: Path, folders: Iterable[Path]) -> bool:
+    return any(path.absolute().is_relative_to(folder) for folder in folders)
+
+
+_LINKED: dict[tuple[str, str | None, int, int], list[str]] = {}
+
+
+def _libraries(program: Path, search: str | None) -> list[str]:
+    """Return the shared libraries that a program is linked with."""
+    found = program.stat()
+    key = str(program), search, found.st_mtime_ns, found.st_size
+    if key not in _LINKED:
+        environment = {**os.environ, **({"LD_LIBRARY_PATH": search} if search else {})}
+        output = ""
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            output = subprocess.run(  # noqa: S603  # a program that the run starts anyway
+                ["ldd", str(program.absolute())], env=environment,  # noqa: S607
+                capture_output=True, text=True, check=False, timeout=20.0,
+            ).stdout  # fmt: skip
+        _LINKED[key] = re.findall(r"(?:=>|^)\s*(/\S+) \(0x", output, re.MULTILINE)
+    return _LINKED[key]
+
+
+def _included(path: Path) -> list[Path]:
+    """Return the files that a MuJoCo model and the models that it includes name."""
+    found, todo, folders = {path}, [path], {path.parent}
+    while todo:
+        if (file := todo.pop()).suffix == ".xml":
+            text = file.read_text(encoding="utf-8", errors="replace")
+            folders |= {base / name for name in _FOLDERS.findall(text) for base in [*folders]}
+            named = {folder / name for folder in folders for name in _FILES.findall(text)}
+            todo += (new := sorted({each for each in named if each.is_file()} - found))
+            found.update(new)
+            folders |= {each.parent for each in new if each.suffix == ".xml"}
+    return sorted(found - {path})
+
+
+def _named_in(path: Path, bases: Iterable[Path]) -> Iterator[Path]:
+    """Yield the files that a script or a file of settings names."""
+    for token in dict.fromkeys(_TOKEN.findall(text_of(path))):
+        if "." not in token and "/" not in token:
+            continue
+        for base in bases:
+            named = base / token
+            if _is_file(named) and not str(named).startswith(_SYSTEM):
+                yield named
+                break
+
+
+def _files_in(folder: Path, without: frozenset[str] = _RESULTS) -> Iterator[tuple[str, int]]:
+    """Yield relative path and size of a folder's files, without hidden ones and results of runs."""
+    seen: set[tuple[int, int]] = set()
+    todo = [""]
+    while todo:
+        inside = todo.pop()
+        with contextlib.suppress(OSError):
+            entries = list(os.scandir(folder / inside))
+            names = {each.name for each in entries}
+            mark = (folder / inside).stat()
+            if (mark.st_dev, mark.st_ino) in seen:
+                continue
+            seen.add((mark.st_dev, mark.st_ino))
+            if inside and (MARKER in names or "rows.jsonl" in names):
+                continue
+            for each in entries:
+                path = f"{inside}/{each.name}".lstrip("/")
+                if each.name.startswith(".") or each.name in without:
+                    continue
+                if each.is_dir():
+                    todo.append(path)
+                elif each.is_file() and not each.name.endswith(".pyc"):
+                    yield path, each.stat().st_size

@@ -1,0 +1,567 @@
+"""Files of Python code: modules with all that they import, and installed distributions.
+
+A module counts with its imports anywhere in its code, with modules that it loads by a name written
+there (``importlib.import_module("x")``, ``"module:Class"``), and, outside this project, with files
+in its folder that its texts name. Where a name is computed, all modules of the package or folder
+count. Code that is installed counts by its distribution: version and hashes of ``RECORD``; the
+standard library by Python's version.
+
+Nothing is imported to find this out. Files are read once a process, until their size or time of
+change differs.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import importlib.machinery
+import os
+import re
+import stat
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeGuard, TypeVar
+
+import msgspec
+import xxhash
+
+from runtime.commit import NOTE
+
+T = TypeVar("T")
+
+
+class _Text(ast.Constant):
+    value: str
+
+
+TOOL = Path(__file__).resolve().parents[2]
+"""Folder of this project's packages."""
+
+OURS = frozenset({"bench", "events", "nodes", "runtime", "sims"})
+
+LARGE = 64_000_000
+"""Bytes beyond which a file counts by name, size and time of change instead of its content."""
+
+_SETTLED = 2.0  # seconds after which a change of a file also changes its time
+_INSTALLED = {"site-packages", "dist-packages"}
+_ENDS = tuple(importlib.machinery.all_suffixes())
+_PARSING = threading.Lock()
+"""Lock for Python 3.11's parser: all threads share a depth counter (cpython#106905)."""
+
+
+def hashed(parts: Iterable[str | bytes]) -> str:
+    """Return a hash of texts, in their order."""
+    digest = xxhash.xxh3_128()
+    for part in parts:
+        digest.update(part.encode(errors="surrogateescape") if isinstance(part, str) else part)
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def content_hash(path: Path, *, large: bool = False) -> str:
+    """Return the hash of a file's content; of a `large` one that of name, size and time."""
+    with contextlib.suppress(OSError):
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            return "no file"
+        if large or found.st_size > LARGE:
+            return hashed([path.name, str(found.st_size), str(found.st_mtime_ns)])
+        return _once(path, _hash)
+    return "missing"
+
+
+def _hash(content: bytes) -> str:
+    return xxhash.xxh3_128_hexdigest(content)
+
+
+_KNOWN: dict[tuple[str, Any], tuple[tuple[int, ...], Any]] = {}
+
+
+def _once(path: Path | str, make: Callable[[bytes], T]) -> T:
+    """Return what is made of a file's content, as long as the file does not change."""
+    key = str(path), make
+    path = Path(path)
+    found = path.stat()
+    mark = found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    known = _KNOWN.get(key)
+    if known is not None and known[0] == mark:
+        result: T = known[1]
+        return result
+    result = make(path.read_bytes())
+    if time.time() - found.st_mtime > _SETTLED:
+        _KNOWN[key] = mark, result
+    return result
+
+
+def text_of(path: Path, most: int = 1_000_000) -> str:
+    """Return the text of a small file; empty if it is large, binary, or cannot be read."""
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        if path.is_file() and path.stat().st_size <= most:
+            return _once(path, bytes.decode)
+    return ""
+
+
+_Import = tuple[int, str, tuple[str, ...]]
+
+
+class Code(msgspec.Struct, frozen=True):
+    """What a Python file refers to.
+
+    Attributes:
+        imports: Level, module and names of its import statements.
+        loaded: Modules loaded by a name in the text; ``.*`` at the end stands for all of a package.
+        dynamic: Whether it loads modules by names that are computed.
+        texts: Texts that may name files, modules or folders.
+    """
+
+    imports: tuple[_Import, ...] = ()
+    loaded: tuple[str, ...] = ()
+    dynamic: bool = False
+    texts: tuple[str, ...] = ()
+
+
+_LOADERS = {"import_module", "__import__", "run_module", "find_spec"}
+_DISCOVERIES = {"iter_modules", "walk_packages", "spec_from_file_location", "run_path"}
+_WRITERS = {"write_text", "write_bytes", "savetxt", "save", "savez", "imwrite", "to_csv", "savefig"}
+_FILE = re.compile(r"[\w./ +~-]{1,200}")
+_REFERENCE = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):[A-Za-z_]\w*(?:\.\w+)*")
+_DOTTED = re.compile(r"\.*[A-Za-z_]\w*(?:\.\w+)*")
+
+
+def read_code(path: Path, *, whole: bool = True) -> Code:
+    """Read what a file refers to; with `whole` also outside of its import statements."""
+    if path.suffix not in {".py", ".pyi", ""}:
+        return Code()
+    with contextlib.suppress(OSError):
+        return _once(path, _read_whole if whole else _read_imports)
+    return Code()
+
+
+def code_modules(text: str) -> Iterator[str]:
+    """Yield the modules that code given as a text imports."""
+    for _, module, names in _read_whole(text.encode()).imports:
+        yield from (module, *(f"{module}.{name}" for name in names))
+
+
+def _read_imports(content: bytes) -> Code:
+    if any(name.encode() in content for name in ("import_module(", "__import__(")):
+        return msgspec.structs.replace(_read_whole(content), dynamic=False, texts=())
+    imports: list[_Import] = []
+    todo: list[Any] = [_parsed(content)]
+    while todo:  # statements only, which takes a third of the time of `ast.walk`
+        node = todo.pop()
+        for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+            todo += getattr(node, field, ())
+        imports += _import(node)
+    return Code(tuple(imports))
+
+
+def _read_whole(content: bytes) -> Code:
+    imports: list[_Import] = []
+    loaded, texts, dynamic = [], [], False
+    written: set[str] = set()
+    for node in ast.walk(_parsed(content)):
+        imports += _import(node)
+        if _is_text(node):
+            texts.append(node.value)
+        elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+            texts.append("/".join(_joined(node)))
+        elif isinstance(node, ast.Call):
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            if name in _LOADERS and (given := [*node.args, *(k.value for k in node.keywords)]):
+                text, complete = _beginning(given[0])
+                if complete:
+                    loaded.append(text)
+                elif "." in text:
+                    loaded.append(text.rpartition(".")[0] + ".*")
+                else:
+                    dynamic = True
+            dynamic |= name in _DISCOVERIES
+            if name in _WRITERS or (name == "open" and _writes(node)):
+                written |= {each.value for each in ast.walk(node) if _is_text(each)}
+    kept = dict.fromkeys(
+        text
+        for text in texts
+        if text not in written and (_FILE.fullmatch(text) or _REFERENCE.fullmatch(text))
+    )
+    return Code(tuple(imports), tuple(dict.fromkeys(loaded)), dynamic, tuple(kept))
+
+
+def _is_text(node: ast.AST) -> TypeGuard[_Text]:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def _writes(call: ast.Call) -> bool:
+    """Tell whether a call of ``open`` has a mode to write."""
+    given = [*call.args, *(each.value for each in call.keywords)]
+    return any(_is_text(each) and re.fullmatch("[wax][bt+]*", each.value) for each in given)
+
+
+def _parsed(content: bytes) -> ast.AST:
+    with contextlib.suppress(SyntaxError, ValueError), _PARSING:
+        return ast.parse(content)
+    return ast.Module(body=[], type_ignores=[])
+
+
+def _import(node: ast.AST) -> Iterator[_Import]:
+    if isinstance(node, ast.Import):
+        yield from ((0, alias.name, ()) for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        yield node.level, node.module or "", tuple(alias.name for alias in node.names)
+
+
+def _joined(node: ast.expr) -> list[str]:
+    """Return the texts at the end of ``folder / "a" / "b.npz"``."""
+    if _is_text(node):
+        return [node.value]
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+        last = _joined(node.right)
+        return [*_joined(node.left), *last] if last else []
+    return []
+
+
+def _beginning(node: ast.expr) -> tuple[str, bool]:
+    """Return the text that an expression begins with, and whether that is all of it."""
+    if _is_text(node):
+        return node.value, True
+    if isinstance(node, ast.JoinedStr) and node.values:
+        return _beginning(node.values[0])[0], False
+    if isinstance(node, ast.BinOp):
+        return _beginning(node.left)[0], False
+    return "", False
+
+
+class Finder:
+    """Where the modules of a process are: first folders, then those of its interpreter.
+
+    Args:
+        first: Folders before all others, such as that of a script.
+        sites: Folders of installed packages of another interpreter; `None` for this process's.
+    """
+
+    def __init__(self, first: Iterable[Path] = (), sites: Sequence[Path] | None = None) -> None:
+        self.first = list(dict.fromkeys(map(str, first)))
+        self.sites = sites
+        self._roots: dict[str, tuple[str, list[str]]] = {}
+        self._lists: dict[str, frozenset[str]] = {}
+
+    def add(self, folder: str) -> None:
+        """Search another folder, too."""
+        if folder not in self.first:
+            self.first.append(folder)
+            self._roots.clear()
+
+    def find(self, name: str) -> tuple[str, list[str]]:
+        """Return a module's file (empty if it has none), and a package's folders."""
+        root, *inner = name.split(".")
+        if root not in self._roots:
+            self._roots[root] = self._root(root)
+        file, folders = self._roots[root]
+        for part in inner:
+            file, folders = self._inside(folders, part) if folders else ("", [])
+        return file, folders
+
+    def is_beside(self, name: str) -> bool:
+        """Tell whether a module is in one of the first folders."""
+        return bool(self._inside(self.first, name.partition(".")[0])[0])
+
+    def modules(self, folders: Iterable[str]) -> list[str]:
+        """Return the names of the modules in a package's folders."""
+        names = {
+            entry.removesuffix(end)
+            for folder in folders
+            for entry in self._listed(folder)
+            for end in _ENDS
+            if entry.endswith(end)
+        }
+        return sorted(name for name in names if name.isidentifier() and name != "__init__")
+
+    def _root(self, root: str) -> tuple[str, list[str]]:
+        if root and (found := self._inside(self.first, root))[0]:
+            return found
+        if not root.isidentifier() or root in sys.stdlib_module_names:
+            return "", []
+        if self.sites is not None:
+            return self._inside([*map(str, self.sites), *_linked(self.sites)], root)
+        for (
+            finder
+        ) in sys.meta_path:  # `find_spec` of `importlib` knows what is loaded, perhaps gone
+            spec = None
+            with contextlib.suppress(Exception):  # whatever a package's own finder does
+                spec = finder.find_spec(root, None)
+            if spec is not None:
+                file = spec.origin if spec.has_location and spec.origin else ""
+                return file, list(spec.submodule_search_locations or ())
+        return self._inside(self.first, root)
+
+    def _inside(self, folders: Sequence[str], name: str) -> tuple[str, list[str]]:
+        spaces = []
+        for folder in folders:
+            listed = self._listed(folder)
+            path = f"{folder}/{name}"
+            if name in listed:
+                if "__init__.py" in self._listed(path):
+                    return f"{path}/__init__.py", [path]
+                spaces.append(path)
+            for end in _ENDS:
+                if f"{name}{end}" in listed:
+                    return f"{path}{end}", []
+        return "", [each for each in spaces if self._listed(each)]
+
+    def _listed(self, folder: str) -> frozenset[str]:
+        if folder not in self._lists:
+            try:
+                self._lists[folder] = frozenset(entry.name for entry in os.scandir(folder))
+            except OSError:
+                self._lists[folder] = frozenset()
+        return self._lists[folder]
+
+
+def _linked(sites: Iterable[Path]) -> Iterator[str]:
+    """Yield the folders of packages that are installed as links to their sources."""
+    for site in sites:
+        for link in sorted(site.glob("*.pth")):
+            for line in text_of(link).splitlines():
+                if line.startswith("/") and Path(line.strip()).is_dir():
+                    yield line.strip()
+        for link in sorted(site.glob("__editable__*_finder.py")):
+            for path in re.findall(r"'\w+': '([^']+)'", text_of(link).partition("NAMESPACES")[0]):
+                yield str(Path(path).parent)
+
+
+def is_installed(path: str) -> bool:
+    """Tell whether a file belongs to an installed package."""
+    return not _INSTALLED.isdisjoint(path.split("/"))
+
+
+class Found(msgspec.Struct):
+    """Files of code.
+
+    Attributes:
+        files: Paths by their name for readers.
+        installed: Names of installed packages that are imported.
+        named: Names of files that are only named in a text, and may be read or written.
+    """
+
+    files: dict[str, set[str]] = {}
+    installed: set[str] = set()
+    named: set[str] = set()
+
+    def add(self, name: str, path: str) -> None:
+        """Add a file."""
+        self.files.setdefault(name, set()).add(path)
+
+
+def find_sources(
+    finder: Finder,
+    modules: Iterable[str],
+    scripts: Iterable[Path] = (),
+    *,
+    ours: Callable[[str], bool] = lambda _: True,
+    possible: Iterable[str] = (),
+) -> Found:
+    """Find the files of modules and scripts, and of all that they import.
+
+    Args:
+        modules: Their packages count with their files, even if they are installed.
+        ours: Which of this project's modules count.
+        possible: Names that may be modules.
+    """
+    found = Found()
+    todo = [*modules]
+    roots = {name.partition(".")[0] for name in todo}
+    todo += possible
+    seen = {""}
+    read: set[str] = set()
+
+    def read_file(path: str, name: str, package: str) -> None:
+        own = name.partition(".")[0] in OURS and path.startswith(f"{TOOL}/")
+        code = read_code(Path(path), whole=not own)
+        for level, module, names in code.imports:
+            base = _absolute(level, module, package)
+            todo.extend([base, *(f"{base}.{each}" for each in names)] if base else ())
+        for each in code.loaded:
+            level = len(each) - len(each.lstrip("."))
+            todo.append(_absolute(level, each.lstrip("."), package) or each)
+        if own:
+            return
+        folder = Path(path).parent
+        if code.dynamic:
+            todo.append(f"{package}.*" if package else "*")
+            finder.add(str(folder))
+        adds_folders = "sys.path" in text_of(Path(path))
+        for text in code.texts:
+            if match := _REFERENCE.fullmatch(text):
+                todo.append(match[1])
+            elif code.dynamic and _DOTTED.fullmatch(text):
+                todo.append(text.lstrip("."))
+            if ("." in text or "/" in text) and (beside := folder / text).is_file():
+                named = beside.name if text.startswith("/") else text
+                found.named.add(named)
+                add_script(str(beside), named)
+            if adds_folders:
+                others = (Path(os.path.normpath(up / text)) for up in (folder, folder.parent))
+                for other in others:
+                    if other.is_dir():
+                        finder.add(str(other))
+
+    def add_script(path: str, name: str) -> None:
+        found.add(name, path)
+        if path not in read and (path.endswith(".py") or _is_python(path)):
+            read.add(path)
+            read_file(path, "", "")
+
+    for script in scripts:
+        add_script(str(script), script.name)
+    while todo:
+        name = todo.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        root = name.partition(".")[0]
+        if name.endswith("*"):
+            package = name.removesuffix("*").removesuffix(".")
+            inside = finder.find(package)[1] if package else finder.first
+            if root not in roots and any(map(is_installed, inside)):
+                found.installed.add(root)
+            else:
+                prefix = f"{package}." if package else ""
+                todo += [prefix + each for each in finder.modules(inside)]
+            continue
+        file, folders = finder.find(name)
+        place = file or next(iter(folders), "")
+        if root not in roots and is_installed(place):
+            found.installed.add(root)
+            continue
+        if root in OURS and not ours(name):
+            continue
+        todo.append(name.rpartition(".")[0])
+        if not file or file in read:
+            continue
+        read.add(file)
+        parts = name.split(".")
+        is_package = bool(folders)
+        base = "/".join(parts if is_package else parts[:-1])
+        found.add(f"{base}/{Path(file).name}".lstrip("/"), file)
+        if is_package:
+            for beside in os.scandir(folders[0]):
+                skipped = beside.name.endswith((".py", ".pyc", ".pyi")) or beside.path == str(NOTE)
+                if not skipped and beside.is_file():
+                    found.add(f"{base}/{beside.name}", beside.path)
+        read_file(file, name, name if is_package else ".".join(parts[:-1]))
+    return found
+
+
+def _absolute(level: int, module: str, package: str) -> str:
+    if not level:
+        return module
+    parts = package.split(".") if package else []
+    if level - 1 > len(parts) or not parts:
+        return module if not parts else ""
+    return ".".join([*parts[: len(parts) - level + 1], *filter(None, [module])])
+
+
+def _is_python(path: str) -> bool:
+    first = text_of(Path(path)).partition("\n")[0]
+    return first.startswith("#!") and "python" in first
+
+
+def distributions(roots: Iterable[str], sites: Sequence[Path] | None = None) -> dict[str, str]:
+    """Return version and hash of the distributions of installed packages, by their names.
+
+    What they require counts, too, where it is installed.
+
+    Args:
+        roots: Names as imported: ``cv2``.
+        sites: Folders of installed packages; by default those of this process.
+    """
+    if sites is None:
+        sites = [Path(each) for each in dict.fromkeys(sys.path) if is_installed(each)]
+    known: dict[str, Path] = {}
+    for site in sites:
+        with contextlib.suppress(OSError):
+            for each in sorted(site.iterdir()):
+                if each.suffix in {".dist-info", ".egg-info"}:
+                    known.setdefault(_normal(each.name.partition("-")[0]), each)
+    todo = []
+    for root in roots:
+        todo += [name for name, info in known.items() if root in _provides(info)]
+    result: dict[str, str] = {}
+    while todo:
+        name = todo.pop()
+        if name in result or name not in known:
+            continue
+        metadata = _metadata(known[name])
+        if _normal(metadata.name) == "visnav-runtime":
+            continue
+        result[name] = f"{metadata.version} {_record_hash(known[name])}"
+        todo += metadata.requires
+    return result
+
+
+class _Metadata(msgspec.Struct, frozen=True):
+    name: str = ""
+    version: str = ""
+    requires: tuple[str, ...] = ()
+
+
+def _metadata(info: Path) -> _Metadata:
+    for name in ("METADATA", "PKG-INFO"):
+        with contextlib.suppress(OSError):
+            return _once(info / name, _read_metadata)
+    return _Metadata()
+
+
+def _read_metadata(content: bytes) -> _Metadata:
+    head = content.decode(errors="replace").replace("\r", "").partition("\n\n")[0]
+    fields: dict[str, list[str]] = {}
+    for line in head.splitlines():
+        key, colon, value = line.partition(":")
+        if colon:
+            fields.setdefault(key, []).append(value.strip())
+    requires = (
+        _normal(match[0])
+        for each in fields.get("Requires-Dist", [])
+        if "extra ==" not in each and (match := re.match(r"[\w.-]+", each))
+    )
+    return _Metadata(fields.get("Name", [""])[0], fields.get("Version", [""])[0], tuple(requires))
+
+
+def _provides(info: Path) -> frozenset[str]:
+    for name, make in (("RECORD", _roots_in), ("top_level.txt", _lines)):
+        with contextlib.suppress(OSError):
+            return _once(info / name, make)
+    return frozenset({_normal(info.name.partition("-")[0]).replace("-", "_")})
+
+
+def _roots_in(content: bytes) -> frozenset[str]:
+    roots = {line.partition(b",")[0].partition(b"/")[0] for line in content.splitlines()}
+    return frozenset(root.decode(errors="replace").partition(".")[0] for root in roots)
+
+
+def _lines(content: bytes) -> frozenset[str]:
+    return frozenset(content.decode(errors="replace").split())
+
+
+def _record_hash(info: Path) -> str:
+    with contextlib.suppress(OSError):
+        return _once(info / "RECORD", _hash_record)
+    return ""
+
+
+def _hash_record(content: bytes) -> str:
+    """Return the hash of the files of a distribution, without those that installing makes."""
+    made = (b".pyc,", b".dist-info/")
+    lines = (
+        line
+        for line in content.splitlines()
+        if not line.startswith(b"..") and not any(each in line for each in made)
+    )
+    return hashed(sorted(lines))[:16]
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()

@@ -1,0 +1,64 @@
+"""An infinite threshold is none: for all estimators or one, and also where there is a default."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from nodes.judging.evaluation.node import EvaluationConfig
+from nodes.judging.evaluation.verdict import Thresholds
+from runtime.config.reading import load
+from runtime.errors import ConfigError
+from runtime.figures import FIGURES
+
+EVALUATION = """
+[[nodes]]
+name = "evaluation"
+type = "Evaluation"
+thresholds = { ate_percent = inf, coverage_percent = -inf, repeated_stamps = inf }
+
+[nodes.estimators.odometry.thresholds]
+frame_coverage_percent = inf
+"""
+
+
+def evaluation(folder: Path, text: str) -> EvaluationConfig:
+    """Read the settings of a file with an evaluation."""
+    path = folder / "c.toml"
+    path.write_text(text, encoding="utf-8")
+    (spec,) = load(path).nodes
+    assert isinstance(spec.config, EvaluationConfig)
+    return spec.config
+
+
+def test_a_file_may_have_infinite_thresholds(tmp_path: Path) -> None:
+    config = evaluation(tmp_path, EVALUATION)
+    assert config.thresholds.ate_percent == math.inf  # type: ignore[attr-defined]
+    assert config.thresholds.repeated_stamps == math.inf  # type: ignore[attr-defined]
+    own = config.own_thresholds()["odometry"]
+    assert own.frame_coverage_percent == math.inf  # type: ignore[attr-defined]
+    assert not config.thresholds.given()
+    for wrong in ("thresholds = { ate_percent = nan }", "gap = inf"):
+        with pytest.raises(ConfigError, match="expected"):
+            evaluation(tmp_path, f"[[nodes]]\nname = 'e'\ntype = 'Evaluation'\n{wrong}\n")
+
+
+@pytest.mark.parametrize("limit", [math.inf, -math.inf])
+@pytest.mark.parametrize("name", [each.name for each in FIGURES.values() if each.limit])
+@pytest.mark.parametrize("value", [None, 0.0, 1e9])
+def test_no_value_and_no_missing_figure_misses_an_infinite_threshold(
+    name: str, limit: float, value: float | None
+) -> None:
+    assert FIGURES[name].missed(limit, value) == ""
+
+
+def test_infinite_thresholds_turn_defaults_off() -> None:
+    figures = {"coverage_percent": 10.0, "ate_percent": 99.0, "repeated_stamps": 3}
+    names = {"coverage_percent", "repeated_stamps"}
+    asked = Thresholds()
+    assert names <= {each.partition(":")[0] for each in asked.missed(figures)}
+    off = Thresholds(ate_percent=math.inf, **dict.fromkeys(names, math.inf))
+    assert not names & {each.partition(":")[0] for each in off.missed(figures)}
+    assert not off.given()
