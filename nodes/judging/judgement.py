@@ -147,6 +147,7 @@ def judge_all(
         _check_frames(truth, frames)
     judgements: dict[str, Judgement] = {}
     notes = [*complaints(), *(f"truth: {note}" for note in truth.notes)]
+    notes += _without_axes(truth, estimates, config)
     truth, moved = to_common_axes(
         truth, [*estimates, *finals.values()], worlds_matter=config.alignment == "none"
     )
@@ -163,6 +164,21 @@ def judge_all(
         notes += [f"{source.name}: {judgement.note}"] if judgement.note else []
     verdict = _conclude(judgements, config, known=frames is not None)
     return truth, judgements, verdict, notes
+
+
+def _without_axes(truth: Source, estimates: Sequence[Source], config: JudgeConfig) -> Iterator[str]:
+    """Yield a sentence where given axes change nothing, as the other side declares none."""
+    if config.axes and truth.axes == Axes():
+        yield (
+            f"truth: declares no axes, so those of the estimates (--axes {config.axes}) are taken "
+            "for its own; if they are not, say which by --truth-axes"
+        )
+    for source in estimates:
+        if config.truth_axes and source.axes == Axes():
+            yield (
+                f"{source.name}: declares no axes, so those of the truth (--truth-axes "
+                f"{config.truth_axes}) are taken for its own; if they are not, say which by --axes"
+            )
 
 
 def _judge_one(
@@ -303,7 +319,7 @@ def _check_frames(truth: Source, frames: Stamps) -> None:
         raise ValueError(
             f"frames: row {back[0] + 1}: expected a stamp above {before} ns, found {after} ns"
         )
-    if len(frames) > 1 and float(np.median(np.diff(frames))) < 100_000:
+    if len(frames) > 1 and float(np.median(np.diff(frames))) < 1_000_000:
         raise ValueError(
             "frames: expected nanoseconds, found stamps of another unit, "
             f"{np.median(np.diff(frames)):g} apart"

@@ -334,14 +334,19 @@ def _by_size(values: Sequence[decimal.Decimal], unit: str) -> str:
     steps = steps[steps > 0.0]
     first = float(values[0])
 
-    def sensible(name: str) -> tuple[bool, bool]:
-        scale = UNITS[name]
-        step = float(np.median(steps)) * scale / SECOND if len(steps) else 1.0
-        return _RATES[0] <= step <= _RATES[1], _CALENDAR[0] <= first * scale <= _CALENDAR[1]
+    def has_rate(name: str) -> bool:
+        return bool(_RATES[0] <= np.median(steps) * UNITS[name] / SECOND <= _RATES[1])
 
-    if len(steps) and sensible(unit)[0] and abs(first) * UNITS[unit] < _TOO_LATE:
+    if not len(steps):
+        known = abs(first) * UNITS[unit] <= _CALENDAR[1]
+        others = UNITS
+    else:
+        known = has_rate(unit) and abs(first) * UNITS[unit] < _TOO_LATE
+        others = {name: scale for name, scale in UNITS.items() if has_rate(name)}
+    if known:
         return unit
-    return next((name for name in UNITS if all(sensible(name))), unit)
+    times = {name: first * scale for name, scale in others.items()}
+    return next((n for n, time in times.items() if _CALENDAR[0] <= time <= _CALENDAR[1]), unit)
 
 
 def read_named(path: Path, options: Options) -> Source:

@@ -23,7 +23,7 @@ from nodes.trajectory import Trajectory
 from runtime.errors import suggest
 from runtime.time.clock import SECOND
 
-TREE, PATH = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Path"
+TREES, PATH = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"), "nav_msgs/msg/Path"
 SUFFIXES = (".mcap", ".db3", ".bag")
 
 
@@ -75,7 +75,7 @@ TYPES: dict[str, Callable[[Any], Posed] | None] = {
     "geometry_msgs/msg/TransformStamped": _transform_stamped,
     "geometry_msgs/msg/PointStamped": _point_stamped,
     "sensor_msgs/msg/NavSatFix": None,  # east, north, up of the first fix
-    TREE: None,  # between two named frames
+    **dict.fromkeys(TREES),  # between two named frames
 }
 """Readable types of messages, and how a pose is read of one."""
 
@@ -107,7 +107,7 @@ def read_topic(path: Path, options: Options) -> Source:
     with readable(path), contextlib.closing(open_bag(path)) as bag:
         topic, frames = _chosen(path, bag, options.part)
         type_ = bag.topics()[topic][0]
-        if type_ == TREE:
+        if type_ in TREES:
             source = _read_tree(path, bag, topic, frames)
         elif type_ == "sensor_msgs/msg/NavSatFix":
             source = _read_fixes(path, bag, topic)
@@ -274,7 +274,7 @@ def _edges(path: Path, bag: Bag, topic: str) -> dict[str, tuple[str, _Edge]]:
     static = [name for name in bag.topics() if name.strip("/") == "tf_static"]
     edges: dict[str, tuple[str, _Edge]] = {}
     for name, type_, _, message in bag.messages({topic, *static}):
-        for each in message.transforms if type_ == TREE else ():
+        for each in message.transforms if type_ in TREES else ():
             posed = _transform_stamped(each)
             child, parent = posed.child.lstrip("/"), posed.header.frame_id.lstrip("/")
             if child not in edges:

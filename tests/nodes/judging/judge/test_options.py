@@ -1,0 +1,242 @@
+"""Options of the command and arguments of `visnav.judge`; what is said where one may be meant."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import visnav
+from nodes.judging.commands import judge as command
+from nodes.judging.evaluation.judging import Judgement
+from nodes.judging.evaluation.judging import judge as evaluate
+from nodes.judging.judgement import JudgeConfig, first_of, judge_all, offset_of
+from nodes.judging.readers import Source
+from nodes.trajectory import Trajectory
+from nodes.trajectory_files import write_kitti, write_tum
+from runtime.errors import ConfigError
+from tests.nodes.judging.judge.test_judge import said
+from tests.nodes.trajectory.samples import moved, walk
+
+SECOND = 10**9
+START = 1_700_000_000 * SECOND
+
+
+def source(poses: Trajectory, name: str = "vo") -> Source:
+    return Source(name=name, file=f"{name}.tum", poses=poses)
+
+
+def at(poses: Trajectory, stamps: Any) -> Trajectory:
+    return Trajectory(np.asarray(stamps, np.int64), poses.positions, poses.orientations)
+
+
+def judged(
+    truth: Trajectory, estimate: Trajectory, frames: Any = None, **config: Any
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the figures, and notes."""
+    given = JudgeConfig(**config)
+    _, _, verdict, notes = judge_all(source(truth), [source(estimate)], frames, given)
+    return verdict.estimators["vo"], notes
+
+
+def test_the_command_and_python_take_the_same() -> None:
+    ours = {*inspect.signature(visnav.judge).parameters}
+    theirs = {*inspect.signature(command).parameters}
+    renamed = {"estimate": "estimates", "threshold": "thresholds"}
+    assert {renamed.get(name, name) for name in theirs} - ours == {"name", "junit", "json"}
+    assert ours - {renamed.get(name, name) for name in theirs} == set()
+
+
+@pytest.mark.parametrize(
+    ("given", "offset"),
+    [(0, 0), (0.3, 3 * 10**8), (-18, -18 * SECOND), ("30ms", 30_000_000), ("-30 ms", -30_000_000),
+     ("+1.5", 15 * 10**8), ("-2e-3", -2_000_000)],
+)  # fmt: skip
+def test_an_offset_is_seconds_or_a_text(given: float | str, offset: int) -> None:
+    assert offset_of(given) == offset
+
+
+def test_an_offset_is_added_to_the_estimates_stamps() -> None:
+    truth = walk(200)
+    late = at(truth, truth.stamps + 300_000_000)
+    assert judged(truth, late)[0]["ate_rmse_m"] > 0.05
+    figures, _ = judged(truth, late, time_offset="-300ms")
+    assert figures["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    assert figures["coverage_percent"] == 100.0
+
+
+@pytest.mark.parametrize("given", ["soon", "1 fortnight", float("nan")])
+def test_an_offset_that_is_none_is_refused(given: Any) -> None:
+    with pytest.raises(ValueError, match="time_offset: "):
+        JudgeConfig(time_offset=given)
+
+
+def test_a_share_to_align_by_is_poses_or_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+
+    def judge(*args: Any, **kwargs: Any) -> Judgement:
+        given.clear()
+        given.update(kwargs)
+        kwargs.pop("align_first", None)
+        return evaluate(*args, **kwargs)
+
+    monkeypatch.setattr("nodes.judging.judgement.judge", judge)
+    for said_, expected in ((20, 20), ("20", 20), ("5s", 5.0), ("500 ms", 0.5)):
+        judged(walk(50), walk(50), align_first=said_)
+        assert given["align_first"] == expected
+        assert type(given["align_first"]) is type(expected)
+    judged(walk(50), walk(50))
+    assert "align_first" not in given
+    for wrong in (0, -3, "0", "first"):
+        with pytest.raises(ValueError, match="expected"):
+            first_of(wrong)
+
+
+FRAMES = np.arange(0, 400) * 50_000_000 + START
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (FRAMES / 1e9, r"frames: expected stamps in whole nanoseconds, .* found float64"),
+        (FRAMES[::-1], r"frames: row 1: expected a stamp above \d+ ns, found"),
+        (np.repeat(FRAMES, 2), r"frames: row 1: expected a stamp above \d+ ns, found"),
+        (np.arange(20) + START // SECOND, r"frames: expected nanoseconds, found stamps of another"),
+        (
+            FRAMES // 1000,
+            r"frames: expected nanoseconds, found stamps of another unit, 50000 apart",
+        ),
+        (FRAMES - 10**13, r"frames: expected images within the truth's time"),
+        (
+            FRAMES[None],
+            r"frames: expected stamps in whole nanoseconds, shape \(n,\), found int64 of",
+        ),
+        (FRAMES[:0], r"frames: expected stamps in whole nanoseconds, shape \(n,\)"),
+    ],
+)
+def test_stamps_of_images_are_checked_as_files_are(frames: Any, message: str) -> None:
+    truth = walk(400, start=START)
+    with pytest.raises(ValueError, match=message):
+        visnav.judge(truth, truth, frames=frames)
+
+
+def test_poses_for_few_of_the_images_fail() -> None:
+    """Every ninth image: never silent for half a second, so that all the time is covered."""
+    truth = walk(400, start=START)
+    few = truth.take(slice(0, None, 9))
+    figures, _ = judged(truth, few, FRAMES)
+    assert figures["coverage_percent"] == 100.0
+    assert figures["passed"] is False
+    (failed,) = figures["failed"]
+    assert failed.startswith("frame_coverage_percent: expected at least 30, found 11.25 (of key f")
+    assert judged(truth, few, FRAMES, gap=2.0)[0]["passed"] is None  # key frames
+    half = truth.take(slice(0, None, 2))
+    assert judged(truth, half, FRAMES)[0]["passed"] is None
+    limits = JudgeConfig().thresholds
+    asked = type(limits)(frame_coverage_percent=10.0)
+    assert judged(truth, few, FRAMES, thresholds=asked)[0]["passed"] is True
+
+
+def test_coverage_that_is_missed_names_the_images() -> None:
+    """As of TUM's sets, whose truth is longer than the images."""
+    truth = walk(400, start=START)
+    part = truth.take(slice(20, 370))
+    (failed,) = judged(truth, part)[0]["failed"]
+    assert failed.startswith("coverage_percent: expected at least 90, found 87.")
+    assert "name their stamps with --frames" in failed
+    assert judged(truth, part, truth.stamps[20:370])[0]["failed"] == []
+
+
+def test_a_sparse_truth_names_the_option() -> None:
+    truth = walk(400, start=START)
+    with pytest.raises(
+        ValueError, match=r"1 s apart \(median\); --max-difference 0.6s lets them c"
+    ):
+        judged(truth.take(slice(0, None, 20)), at(truth, truth.stamps + 310_000_000))
+    every = at(truth, truth.stamps + 310_000_000).take(slice(0, 370))
+    figures, _ = judged(truth.take(slice(0, None, 20)), every, max_difference=0.6)
+    assert figures["compared"] == 370
+
+
+CLOCK = walk(50).stamps + SECOND  # of a run, from its beginning
+UNIX = CLOCK + START
+
+
+@pytest.mark.parametrize(
+    ("truth", "estimate", "why"),
+    [
+        (UNIX, CLOCK, "one is Unix time, the other counts from a beginning; see --time-offset"),
+        (CLOCK, CLOCK * 10**3, "are the stamps of the estimate in milliseconds, and read as sec"),
+        (CLOCK, CLOCK * 10**6, "are the stamps of the estimate in microseconds, and read as sec"),
+        (CLOCK * 10**6, CLOCK, "are the stamps of the truth in microseconds, and read as seconds?"),
+        (UNIX, UNIX + 10**13, "found 1700010001.000 to 1700010003.450 s; see --time-offset"),
+        (UNIX, [0], "expected stamps, found that all are zero: the sender sets none"),
+    ],
+)
+def test_no_time_in_common_says_what_differs(truth: Any, estimate: Any, why: str) -> None:
+    poses = walk(50)
+    figures, _ = judged(at(poses, truth), at(poses.take(slice(len(estimate))), estimate))
+    assert why in figures["why"]
+    assert why in figures["failed"][0]
+
+
+def test_everything_the_command_has_is_had_in_python(tmp_path: Path) -> None:
+    truth = walk(201, start=START)
+    mounted = np.array([[0.0, 0, 1, 0.1], [1, 0, 0, -0.2], [0, 1, 0, 0.3], [0, 0, 0, 1]])
+    camera = Trajectory.from_matrices(truth.stamps, moved(truth).matrices() @ mounted)
+    write_kitti(tmp_path / "k.txt", camera)
+    (tmp_path / "times").write_text("".join(f"{s / 1e9:.9f}\n" for s in truth.stamps))
+    write_tum(tmp_path / "truth.tum", truth.take(slice(0, None, 4)))
+    given: dict[str, Any] = {
+        "times": tmp_path / "times",
+        "time_offset": "0ms",
+        "max_difference": "300ms",
+        "gap": "1s",
+        "thresholds": {"ate_percent": 1},
+        "final": tmp_path / "k.txt",
+    }
+    for mounting in (mounted, "0.1 -0.2 0.3 0.5 0.5 0.5 0.5"):
+        run = visnav.judge(
+            tmp_path / "truth.tum", tmp_path / "k.txt", body_from_camera=mounting, **given
+        )
+        figures = run.figures["k"]
+        assert figures["rot_rmse_deg"] < 5.0  # between true poses 0.2 s apart
+        assert figures["final_ate_rmse_m"] == pytest.approx(figures["ate_rmse_m"])
+        assert figures["passed"] is True
+    with pytest.raises(
+        ValueError, match=r"body_from_camera: expected a transform of shape \(4, 4\)"
+    ):
+        visnav.judge(truth, truth, body_from_camera=2 * np.eye(4))
+    with pytest.raises(ValueError, match="expected the name of an estimate"):
+        visnav.judge(truth, {"a": truth, "b": truth}, final=truth)
+    with pytest.raises(ConfigError, match=r"judge\.axes"):
+        visnav.judge(truth, truth, axes="flu")
+    with pytest.raises(ValueError, match=r"expected stamps in seconds, as TUM's, found 1\.7e"):
+        visnav.judge(np.c_[truth.stamps, np.zeros((201, 6)), np.ones(201)], truth)
+
+
+def test_axes_that_change_nothing_are_said() -> None:
+    truth = walk(50)
+    with pytest.warns(
+        UserWarning, match=r"truth: declares no axes, so .* \(--axes enu\) are taken"
+    ):
+        visnav.judge(truth, truth, axes="enu")
+    with pytest.warns(UserWarning, match=r"estimate: declares no axes, so .*--truth-axes\s?ned"):
+        visnav.judge(truth, truth, truth_axes="ned")
+    visnav.judge(truth, truth, truth_axes="ned", axes="ned")
+
+
+@pytest.mark.slow
+def test_figures_are_plain_numbers(tmp_path: Path) -> None:
+    truth = walk(200)
+    write_tum(tmp_path / "t.tum", truth)
+    turned = Trajectory.from_matrices(truth.stamps, truth.matrices() @ np.diag([-1.0, -1, 1, 1]))
+    write_tum(tmp_path / "turned.tum", turned)
+    for name, rotation in (("t", "rotation 0°"), ("turned", "rotation 180°")):
+        done = said(tmp_path, "--truth", "t.tum", "--estimate", f"{name}.tum")
+        assert rotation in done.stdout
+        assert "e-" not in done.stdout.replace("estimate-", "")
+        assert "e+" not in done.stdout
