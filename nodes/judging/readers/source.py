@@ -6,6 +6,7 @@ go back, poses in another frame than the first one's.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -163,7 +164,7 @@ class Collected:
         velocity: Sequence[float] | None = None,
     ) -> None:
         """Add a pose: nanoseconds (`None` for NaN), metres, quaternion w x y z, if there is one."""
-        if stamp is None or not np.isfinite([*position, *(orientation or ())]).all():
+        if stamp is None or not all(map(math.isfinite, (*position, *(orientation or ())))):
             self.not_numbers += 1
             return
         if self._last is not None and stamp <= self._last:
@@ -182,7 +183,7 @@ class Collected:
         self._rows.append(row)
         if covariance is not None and not (covariance.any() and np.isfinite(covariance).all()):
             covariance = None
-        if velocity is not None and not np.isfinite(velocity).all():
+        if velocity is not None and not all(map(math.isfinite, velocity)):
             velocity = None
         self._covariances.append(covariance)
         self._velocities.append(velocity)
