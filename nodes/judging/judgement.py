@@ -226,7 +226,8 @@ def _usual(truth: Source, source: Source, config: JudgeConfig) -> How:
     """Return how an estimate is laid on the truth: as in a run where both name their frames."""
     if config.scale_free:
         return "sim3"
-    if truth.frame_id != "map" or not source.frame_id or source.positions_only:
+    oriented = not (truth.positions_only or source.positions_only)
+    if truth.frame_id != "map" or not source.frame_id or not oriented:
         return "se3"
     return "none" if source.frame_id == "map" else "origin"
 

@@ -37,9 +37,11 @@ _UNIT_NAMES = {
     "usec": "us", "µs": "us", "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns",
     "nanoseconds": "ns",
 }  # fmt: skip
+_UNIT_WORDS = "|".join(name for name in _UNIT_NAMES if name != "s")
 _STAMP = re.compile(
-    r"(?:.*[._])?(?:time_?stamps?|stamps?|time|t|ts)(?:_(?:\w+_)?(?P<unit>[a-zµ]+))?"
-    rf"|(?:.*[._])?(?P<name>{'|'.join(name for name in _UNIT_NAMES if name != 's')})"
+    r"(?:(?:.*[._])?(?:time_?stamps?|stamps?)|(?:ros_|sim_|unix_|gps_)?time|t|ts)"
+    r"(?:_(?:\w+_)?(?P<unit>[a-zµ]+))?"
+    rf"|(?:.*(?:stamp|time)[._]?)?(?P<name>{_UNIT_WORDS})"
 )
 _POSITION = (
     re.compile(r"(?:(?:p|t|pos|trans|translation)(?:_\w+)?_?)?([xyz])"),
@@ -49,6 +51,7 @@ _QUATERNION = (
     re.compile(r"(?:q|quat|quaternion)(?:_\w+)?_?([wxyz])"),
     re.compile(r"(?:.*[._])?(?:orientation|rotation|quaternion)[._]([wxyz])"),
 )
+_NO_QUATERNION = re.compile(r"(?:q|quat|quaternion|.*orientation)[._\[]?\w?")  # q0, q1, …
 _VELOCITY = re.compile(r"v_(?:\w+)_[rw]_([xyz])")  # of a frame in a world: v_RS_R_x, v_WS_W_x
 
 
@@ -99,11 +102,13 @@ def columns_of(names: Sequence[str]) -> list[Column] | None:
     if twice := sorted({kind for kind in kinds if kinds.count(kind) > 1}):
         same = [name.strip() for name, c in zip(names, found, strict=True) if c.kind == twice[0]]
         raise ValueError(f"expected one column of {twice[0]} (see --columns), found {same}")
-    some = {*QUATERNION} & {*kinds}
-    if some and some != {*QUATERNION}:
+    some = sorted({*QUATERNION} & {*kinds}) or [
+        name.strip() for name in names if _NO_QUATERNION.fullmatch(_plain(name))
+    ]
+    if some and not {*QUATERNION} <= {*kinds}:
         raise ValueError(
-            "expected four columns of a quaternion, or none (see --columns), found "
-            f"{', '.join(sorted(some))}"
+            "expected four columns of a quaternion with w, x, y, z in their names, or none (see "
+            f"--columns), found {', '.join(some)}"
         )
     return found
 
@@ -112,13 +117,11 @@ def _choose_stamp(names: Sequence[str], columns: list[Column]) -> None:
     """Leave one stamp among the columns, a message's own if there is one, or its two parts."""
     stamps = [k for k, column in enumerate(columns) if column.kind == "stamp"]
     own = [k for k in stamps if "stamp" in _plain(names[k])] or stamps
-    whole = next((k for k in own if columns[k].unit == "s"), own[0])
-    rest = next((k for k in own if "nsec" in _plain(names[k]) or "nanosec" in _plain(names[k])), -1)
+    whole, rest = own[0], own[0] + 1
+    parts = rest in stamps and (columns[whole].unit, columns[rest].unit) == ("s", "ns")
     for k in stamps:
-        if k == rest and columns[whole].unit == "s":
-            columns[k] = Column("rest")
-        elif k != whole:
-            columns[k] = SKIPPED
+        if k != whole:
+            columns[k] = Column("rest") if parts and k == rest else SKIPPED
 
 
 def columns_from(text: str) -> list[Column]:

@@ -42,6 +42,8 @@ FORMATS = (
     'the end); else say what the columns are, as --columns "sec x y z qw qx qy qz"'
 )
 
+NOTHING = "nothing"
+
 _OURS = re.compile(r"base_link \(FRD\) in (?:(map) \(NED|(\S+), as it was sent|)")
 
 
@@ -63,8 +65,16 @@ VINS_MOVING = Layout(
 EUROC = Layout(",", _columns("t x y z qw qx qy qz v_rs_r_x v_rs_r_y v_rs_r_z _ _ _ _ _ _"), "ns")
 
 
-def _of_layout(*layouts: Layout, usual: Axes = UNDECLARED) -> dict[str, object]:
-    """Return `matches` and `read` of a reader of files without names of columns."""
+def _plain(
+    *layouts: Layout,
+    name: str,
+    recognized: str,
+    columns: str,
+    stamps: str,
+    axes: str = NOTHING,
+    usual: Axes = UNDECLARED,
+) -> Reader:
+    """Return the reader of files without names of columns, recognized by the number of fields."""
 
     def layout_of(start: Start | None) -> Layout | None:
         if start is None or not start.number:
@@ -90,7 +100,15 @@ def _of_layout(*layouts: Layout, usual: Axes = UNDECLARED) -> dict[str, object]:
         assert layout is not None
         return read_columns(path, layout, usual=usual)
 
-    return {"matches": matches, "read": read}
+    return Reader(
+        name=name,
+        recognized=recognized,
+        columns=columns,
+        stamps=stamps,
+        axes=axes,
+        matches=matches,
+        read=read,
+    )
 
 
 def _head(start: Start | None) -> str:
@@ -216,7 +234,6 @@ def refuse(path: Path, start: Start | None) -> NoReturn:
     Row(f"{path}:{start.number}", []).wrong(FORMATS, start.row)
 
 
-NOTHING = "nothing"
 READERS = (
     Reader(
         name="a run's own",
@@ -257,37 +274,39 @@ READERS = (
         matches=_by_header,
         read=read_named,
     ),
-    Reader(
+    _plain(
+        TUM,
+        POSITIONS,
         name="TUM",
         recognized="8 fields with blanks between; 4 are positions only",
         columns="t x y z qx qy qz qw",
         stamps="s (ns from ORB-SLAM3)",
-        axes=NOTHING,
-        **_of_layout(TUM, POSITIONS),  # type: ignore[arg-type]
     ),
-    Reader(
+    _plain(
+        OPENVINS,
         name="OpenVINS",
         recognized="20 fields with blanks between",
         columns="TUM's, and upper triangles of the covariances of rotation and position",
         stamps="s",
-        axes=NOTHING,
-        **_of_layout(OPENVINS),  # type: ignore[arg-type]
     ),
-    Reader(
+    _plain(
+        EUROC,
         name="EuRoC",
         recognized="17 fields with commas between",
         columns="t x y z qw qx qy qz, velocity, biases",
         stamps="ns",
         axes=f"{NOTHING} (drawn with z up)",
-        **_of_layout(EUROC, usual=AXES["nwu"]),  # type: ignore[arg-type]
+        usual=AXES["nwu"],
     ),
-    Reader(
+    _plain(
+        VINS,
+        VINS_MOVING,
         name="VINS-Mono, VINS-Fusion",
         recognized="8 or 11 fields with commas, the last of them at the end of the line",
         columns="t x y z qw qx qy qz, velocity",
         stamps="ns",
         axes=f"{NOTHING} (drawn with z up)",
-        **_of_layout(VINS, VINS_MOVING, usual=AXES["nwu"]),  # type: ignore[arg-type]
+        usual=AXES["nwu"],
     ),
     Reader(
         name="KITTI",
