@@ -237,19 +237,19 @@ def rows_of(path: Path, layout: Layout) -> Iterator[Row]:
     assert start is not None  # as it was when the layout was found
     least = 1 + max(k for k, column in enumerate(layout.columns) if column.kind)
     expected = len(fields_of(start.row, layout.separator))
-    with path.open(encoding="utf-8-sig") as file:
-        for number, line in enumerate(file, start=1):
-            content = line.partition("#")[0].strip()
-            if number < start.number or not content or content[0] == "%":
-                continue
-            row = Row(f"{path}:{number}", fields_of(content, layout.separator))
-            if len(row.fields) < least or (
-                layout.separator != "\t" and len(row.fields) != expected
-            ):
-                row.wrong(
-                    f"{expected} fields, as in the first row", f"{len(row.fields)}: {content}"
-                )
-            yield row
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: expected a text file of rows, found: {error}") from None
+    for number, line in enumerate(text.split("\n"), start=1):
+        content = line.partition("#")[0].strip()
+        if number < start.number or not content or content[0] == "%":
+            continue
+        row = Row(f"{path}:{number}", fields_of(content, layout.separator))
+        count = len(row.fields)
+        if count < least or (layout.separator != "\t" and count != expected):
+            row.wrong(f"{expected} fields, as in the first row", f"{count}: {content}")
+        yield row
 
 
 def _numbers(row: Row, place: dict[str, int], kinds: Sequence[str]) -> list[float]:
@@ -283,6 +283,7 @@ def _covariance(row: Row, place: dict[str, int], quaternion: Sequence[float]) ->
 
 _RATES = (1e-4, 100.0)  # seconds between poses that are plausible
 _CALENDAR = (946_684_800 * SECOND, 4_102_444_800 * SECOND)  # Unix time of 2000 to 2100, ns
+_DIGITS = 30  # of a stamp, at most
 _TOO_LATE = 1 << 63  # first number of nanoseconds beyond 64 bits
 
 
@@ -325,6 +326,8 @@ def _decimal(row: Row, field: int) -> decimal.Decimal | None:
     try:
         value = decimal.Decimal(text) if text else decimal.Decimal("nan")
     except decimal.InvalidOperation:
+        row.wrong("a stamp", text)
+    if value.is_finite() and value.adjusted() > _DIGITS:
         row.wrong("a stamp", text)
     return value if value.is_finite() else None
 

@@ -136,21 +136,25 @@ def _read_ours(path: Path, _: Options) -> Source:
     )
 
 
+_AIRSIM = {"timestamp", "pos_x", "pos_y", "pos_z", "q_w", "q_x", "q_y", "q_z"}
+
+
+def _airsim_names(start: Start | None) -> list[str]:
+    """Return the names of a recording's columns, in small letters; empty if it is none."""
+    lines = start.head if start is not None and start.number else []
+    rows = [fields_of(line.casefold(), "\t") for line in lines]
+    return next((names for names in rows if {*names} >= _AIRSIM), [])
+
+
 def _is_airsim(_: Path, start: Start | None) -> bool:
-    names = _head(start).casefold().split()
-    return {"timestamp", "pos_x", "q_w"} <= {*names}
+    return bool(_airsim_names(start))
 
 
 def _read_airsim(path: Path, options: Options) -> Source:
     """Read a recording; of several vehicles, `Options.part` names one."""
-    start = Start.of(path)
-    assert start is not None
-    names = fields_of(start.head[-1], "\t")
-    columns = [
-        Column("stamp", "ms") if name.casefold() == "timestamp" else column_of(name)
-        for name in names
-    ]
-    vehicle = next((k for k, name in enumerate(names) if name.casefold() == "vehiclename"), None)
+    names = _airsim_names(Start.of(path))
+    columns = [Column("stamp", "ms") if name == "timestamp" else column_of(name) for name in names]
+    vehicle = names.index("vehiclename") if "vehiclename" in names else None
     layout = Layout("\t", columns, "ms")
     return read_columns(path, layout, axes=AXES["ned"], group=vehicle, wanted=options.part)
 

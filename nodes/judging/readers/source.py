@@ -20,6 +20,7 @@ from nodes.trajectory import UNIT_LENGTH, Trajectory
 
 Floats = npt.NDArray[np.float64]
 
+_TOO_LATE = 1 << 63  # first number of nanoseconds beyond 64 bits
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -167,6 +168,8 @@ class Collected:
         if stamp is None or not all(map(math.isfinite, (*position, *(orientation or ())))):
             self.not_numbers += 1
             return
+        if not abs(stamp) < _TOO_LATE:
+            raise ValueError(f"{self._place}{row}: expected a stamp in 64 bits, found {stamp} ns")
         if self._last is not None and stamp <= self._last:
             self.repeated += stamp == self._last
             self.back += stamp < self._last

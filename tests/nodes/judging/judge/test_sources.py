@@ -98,6 +98,9 @@ WRONG = [
     (GOOD + "1 0 0 0 0 0 0 0\n", r"t:2: expected a quaternion of length 1"),
     (GOOD + "33333333 0 0 0 0 0 0 1\n", r"t: pose 2: expected stamps of one unit and one clock"),
     ("1e25 0 0 0 0 0 0 1\n", r"t:1: expected a stamp in seconds, found '1e25'"),
+    ("1e999999 0 0 0 0 0 0 1\n", r"t:1: expected a stamp, found '1e999999'"),
+    ("sec,nsec,x,y,z\n1e12,0,0,0,0\n", r"t:2: expected a stamp in 64 bits, found 1000000000000000"),
+    (GOOD * 2000 + "\xff", r"t: expected a text file of rows, found: 'utf-8' codec can't decode"),
     ("nan 0 0 0 0 0 0 1\n", r"t: expected poses, found none: left out: 1 pose with NaN"),
     (LAB + "1.5,0,0,0,0,0,0,1\n", r"t:2: expected a stamp in whole nanoseconds, found '1\.5'"),
     (LAB + "1,0,0\n", r"t:2: expected a trajectory: .* found '1,0,0'"),
@@ -111,7 +114,7 @@ WRONG = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("text", "message"), WRONG)
 def test_each_bad_input_has_its_sentence(text: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "t").write_text(text)
+    (tmp_path / "t").write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=message):
         read(str(tmp_path / "t"))
     write_tum(tmp_path / "truth", walk(5))
