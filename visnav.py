@@ -358,7 +358,7 @@ def judge(
     Args:
         truth: A trajectory: a file (TUM, EuRoC, KITTI, VINS, OpenVINS, AirSim, …), ``BAG:/TOPIC``,
             the folder of a run, a `Trajectory`, or an array of TUM's rows, shape (n, 8): seconds,
-            x, y, z in metres, and a quaternion x, y, z, w.
+            x, y, z in metres, and a quaternion x, y, z, w; or (n, 4), without the quaternion.
         estimates: One, named after its file or ``estimate``; or several by name.
         final: Trajectories after loop closures, by the names of their estimates; or one, of the
             only estimate.
@@ -420,14 +420,14 @@ def judge(
             text = f"{name}={trajectory}" if name else str(trajectory)
             return judgement.read(text, config.axes, str(times), camera, columns=config.columns)
         name = name or "estimate"
-        return judgement.in_axes(name, _trajectory(trajectory, name), config.axes, camera)
+        return judgement.of_memory(name, trajectory, config.axes, camera)
 
     true = (
         judgement.read_truth(
             str(truth), str(times), config.truth_axes, columns=config.truth_columns
         )
         if isinstance(truth, str | Path)
-        else judgement.in_axes("truth", _trajectory(truth, "truth"), config.truth_axes)
+        else judgement.of_memory("truth", truth, config.truth_axes)
     )
     named = estimates if isinstance(estimates, Mapping) else {"": estimates}
     sources = [read(trajectory, name) for name, trajectory in named.items()]
@@ -484,27 +484,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return value.tolist() if hasattr(value, "tolist") else value
-
-
-def _trajectory(given: Any, name: str) -> Trajectory:
-    import numpy as np
-
-    from nodes.trajectory import Trajectory
-
-    if isinstance(given, Trajectory):
-        return given
-    rows = np.asarray(given, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 8:
-        raise ValueError(
-            f"{name}: expected a file, a Trajectory, or TUM's rows of shape (n, 8), found an array "
-            f"of shape {rows.shape}"
-        )
-    if not abs(rows[:, 0]).max(initial=0.0) < 9.2e9:
-        raise ValueError(
-            f"{name}: expected stamps in seconds, as TUM's, found {abs(rows[:, 0]).max():.6g}"
-        )
-    stamps = np.round(rows[:, 0] * 1e9).astype(np.int64)
-    return Trajectory(stamps, rows[:, 1:4], rows[:, [7, 4, 5, 6]])
 
 
 def main() -> None:

@@ -25,6 +25,7 @@ from nodes.judging.readers import (
     AXES,
     Axes,
     AxesName,
+    Collected,
     Source,
     complaints,
     of_body,
@@ -46,7 +47,7 @@ from runtime.run.summarise import command_line, commit, environment
 from runtime.time.clock import SECOND
 
 __all__ = [
-    "JudgeConfig", "Source", "in_axes", "in_memory", "judge_all", "mounting_of", "read",
+    "JudgeConfig", "Source", "in_memory", "judge_all", "mounting_of", "of_memory", "read",
     "read_mounting", "read_stamps", "read_truth", "write",
 ]  # fmt: skip
 
@@ -444,12 +445,40 @@ def mounting_of(matrix: Floats) -> Floats:
     return matrix
 
 
-def in_axes(
-    name: str, poses: Trajectory, axes: AxesName | None, camera: Floats | None = None
-) -> Source:
-    """Return the source of a trajectory in memory; arguments as of `read`."""
-    source = Source(name=name, file=name, poses=poses, axes=AXES[axes] if axes else Axes())
+def of_memory(name: str, given: Any, axes: AxesName | None, camera: Floats | None = None) -> Source:
+    """Return the source of a trajectory in memory; `axes` and `camera` as of `read`.
+
+    Args:
+        given: A `Trajectory`, or rows as TUM's, whose bad ones are left out and counted as a
+            file's: seconds, x, y, z in metres, and a quaternion x, y, z, w, shape (n, 8), or
+            without the quaternion, (n, 4).
+
+    Raises:
+        ValueError: It is neither.
+    """
+    if isinstance(given, Trajectory):
+        source = Source(name=name, file=name, poses=given)
+    else:
+        rows = np.asarray(given, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] not in {4, 8}:
+            raise ValueError(
+                f"{name}: expected a file, a Trajectory, or TUM's rows of shape (n, 8), or (n, 4) "
+                f"without a quaternion, found an array of shape {rows.shape}"
+            )
+        if len(far := rows[abs(rows[:, 0]) > _LONGEST_SECONDS, 0]):
+            raise ValueError(f"{name}: expected stamps in seconds, as TUM's, found {far[0]:.6g}")
+        collected = Collected(name)
+        for number, (stamp, *row) in enumerate(rows.tolist()):
+            time = round(stamp * 1e9) if np.isfinite(stamp) else None
+            turn = [row[6], *row[3:6]] if len(row) == 7 else None
+            collected.add(time, row[:3], turn, row=f": row {number}")
+        source = msgspec.structs.replace(collected.source(), name=name, file=name)
+    if axes:
+        source = msgspec.structs.replace(source, axes=AXES[axes])
     return source if camera is None else of_body(source, camera)
+
+
+_LONGEST_SECONDS = 9.2e9  # what 64 bits of nanoseconds hold
 
 
 def read_stamps(path: Path) -> Stamps:

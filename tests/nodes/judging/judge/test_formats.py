@@ -19,6 +19,7 @@ from nodes.judging.readers import read, readers
 from nodes.judging.readers.columns import column_of, columns_of
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_euroc, write_kitti, write_tum
+from sims.airsim.server.measurements import HEADER
 from tests.nodes.judging.judge import bags
 from tests.nodes.trajectory.samples import angle, walk
 
@@ -57,7 +58,7 @@ def rows(stamp: Callable[[int], str], kinds: str, separator: str, end: str = "")
 
 XYZW, WXYZ = "x y z qx qy qz qw", "x y z qw qx qy qz"
 STATES = "# timestamp(s) q p v bg ba cam_imu_dt num_cam cam0_k cam0_d cam0_rot cam0_trans etc\n"
-AIRSIM = "VehicleName\tTimeStamp\tPOS_X\tPOS_Y\tPOS_Z\tQ_W\tQ_X\tQ_Y\tQ_Z\tImageFile\n"
+AIRSIM = f"{HEADER}\n"  # of our own recordings
 COVARIANCE = "1e-4 0 0 1e-4 0 1e-4 1e-2 0 0 1e-2 0 1e-2"
 TABLES = {
     "TUM": "# timestamp tx ty tz qx qy qz qw\n" + rows(seconds, XYZW, " "),

@@ -218,6 +218,42 @@ def test_everything_the_command_has_is_had_in_python(tmp_path: Path) -> None:
         visnav.judge(np.c_[truth.stamps, np.zeros((201, 6)), np.ones(201)], truth)
 
 
+def test_rows_in_memory_are_read_as_a_file_of_them() -> None:
+    """Bad ones are left out and counted; without a quaternion they are positions only."""
+    truth = walk(100)
+    seconds = truth.stamps[:, None] / 1e9
+    rows = np.hstack([seconds, truth.positions, truth.orientations[:, [1, 2, 3, 0]]])
+    rows[7, 2], rows[9, 0], rows[20, 0] = np.nan, np.nan, rows[19, 0]
+    with pytest.warns(UserWarning, match="left out: 2 poses with NaN, 1 repeated stamp"):
+        figures = visnav.judge(truth, rows).figures["estimate"]
+    assert figures["estimates"] == 97
+    assert figures["repeated_stamps"] == 1
+    assert figures["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    rows[30, 7] = 3.0
+    with pytest.raises(ValueError, match="estimate: row 30: expected a quaternion of length 1"):
+        visnav.judge(truth, rows)
+    with pytest.warns(UserWarning, match="estimate: positions without orientations"):
+        figures = visnav.judge(truth, rows[40:, :4]).figures["estimate"]
+    assert figures["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_run_with_one_estimator_is_an_estimate(tmp_path: Path) -> None:
+    folder = tmp_path / "run" / "trajectories"
+    folder.mkdir(parents=True)
+    truth = walk(100)
+    write_tum(folder / "truth.tum", truth)
+    write_tum(folder / "vo.tum", moved(truth), "base_link (FRD) in odom, as it was sent")
+    (tmp_path / "run" / "summary.json").write_text("{}")
+    run = visnav.judge(tmp_path / "run", tmp_path / "run")
+    assert run.figures["vo"]["alignment"] == "origin"
+    assert run.figures["vo"]["ate_rmse_m"] == pytest.approx(0, abs=1e-8)
+    write_tum(folder / "orb.tum", truth)
+    with pytest.raises(
+        ValueError, match=r"expected one estimate, found orb\.tum, vo\.tum: name its"
+    ):
+        visnav.judge(tmp_path / "run", tmp_path / "run")
+
+
 def test_axes_that_change_nothing_are_said() -> None:
     truth = walk(50)
     with pytest.warns(
