@@ -16,7 +16,7 @@ from events import Quaternion, Vector3
 from events.frames import slerp
 from events.geometry import Pose
 
-__all__ = ["PoseRows", "RecentPoses", "Trajectory", "associate"]
+__all__ = ["PoseRows", "RecentPoses", "Trajectory", "associate", "bridged", "is_sparser", "pair"]
 
 
 Floats = npt.NDArray[np.float64]
@@ -25,6 +25,7 @@ Stamps = npt.NDArray[np.int64]
 UNIT_LENGTH = 0.01  # tolerated deviation of a quaternion's length from 1, for files of few decimals
 
 
+_UNITS = {"seconds": 1e9, "milliseconds": 1e6, "microseconds": 1e3}  # nanoseconds of each
 _CALENDAR = 10**17  # least stamp (ns) taken for Unix time (1973)
 _ROW = np.dtype([("stamp", "i8"), ("position", "f8", 3), ("orientation", "f8", 4)])
 _BLOCK = 1024  # rows of a pose, and how many are written at once: 64 KiB take the loop 30 µs
@@ -100,9 +101,15 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         """Return the length of the path in metres, pose to pose."""
         return float(self.distances()[-1])
 
-    def distances(self) -> Floats:
-        """Return the path's length from the start to each pose, metres, shape (n,)."""
+    def distances(self, hole: int | None = None) -> Floats:
+        """Return the path's length from the start to each pose, metres, shape (n,).
+
+        Args:
+            hole: Nanoseconds: what lies between poses farther apart has no length.
+        """
         steps = np.linalg.norm(np.diff(self.positions, axis=0), axis=1)
+        if hole is not None:
+            steps[np.diff(self.stamps) > hole] = 0.0
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def near(self, stamps: Stamps) -> Trajectory:
@@ -156,6 +163,19 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
             step = self.stamps[after] - self.stamps[after - (after > 0)]
             inside &= (step <= hole) | (self.stamps[after] == stamps)
         return np.asarray(inside)
+
+    def pieces(self, stamps: Stamps, hole: int) -> Stamps:
+        """Return the number of the piece that covered stamps (ns) lie in, shape as given.
+
+        Args:
+            hole: As of `covers`: a piece ends where the next pose is farther away.
+        """
+        ends = self.stamps[:-1][np.diff(self.stamps) > hole]
+        return np.searchsorted(ends, stamps)
+
+    def step(self) -> int:
+        """Return the median time from a pose to the next, nanoseconds; 0 for one pose."""
+        return int(np.median(np.diff(self.stamps))) if len(self) > 1 else 0
 
     def at(self, stamps: Stamps) -> Trajectory:
         """Return the poses at other times: positions linear, orientations by slerp.
@@ -290,12 +310,16 @@ def associate(
             usual = np.median(np.diff(truth.stamps)) / 1e9
             raise ValueError(
                 f"{name}{name and ': '}expected estimates between true poses at most "
-                f"{hole / 1e9:g} s apart, found none: the truth's are {usual:.3g} s apart (median)"
+                f"{hole / 1e9:g} s apart, found none: the truth's are {usual:.3g} s apart "
+                f"(median); max_difference ({hole / 2e9:g} s) is half of what is bridged"
             )
         first, second = int(truth.stamps[-1]), int(estimate.stamps[-1])
         why = ""
-        if 0.5e9 < max(first, second) / max(min(first, second), 1) < 2e9:
-            why = ": is one in seconds and the other in nanoseconds?"
+        ratio = max(first, second) / max(min(first, second), 1)
+        if min(first, second) == 0:
+            why = ": all stamps of one are zero"
+        elif unit := next((u for u, r in _UNITS.items() if 0.5 * r < ratio < 2.0 * r), ""):
+            why = f": is one in {unit} and the other in nanoseconds?"
         elif (first > _CALENDAR) != (second > _CALENDAR):
             why = ": one is Unix time, the other counts from a run's beginning"
         raise ValueError(
@@ -305,6 +329,42 @@ def associate(
         )
     kept = estimate.take(known)
     return truth.at(kept.stamps), kept
+
+
+def is_sparser(truth: Trajectory, estimate: Trajectory) -> bool:
+    """Return whether true poses are farther apart in time than estimates, by their medians."""
+    return truth.step() > 1.05 * estimate.step() > 0.0
+
+
+def bridged(trajectory: Trajectory, hole: int) -> int:
+    """Return the longest time (ns) over which a trajectory is interpolated.
+
+    At least two and a half of its usual steps: what is regular has no holes.
+    """
+    return max(hole, 5 * trajectory.step() // 2)
+
+
+def pair(
+    truth: Trajectory, estimate: Trajectory, hole: int = HOLE
+) -> tuple[Trajectory, Trajectory]:
+    """Return the truth and the estimate at the stamps of the one whose poses are farther apart.
+
+    The denser one is interpolated: a chord over a second of a sparse truth, as of GNSS or a total
+    station, would be off the path by more than many an estimate.
+
+    Args:
+        hole: As of `Trajectory.covers`, of the denser one; see `bridged` for a dense estimate.
+
+    Raises:
+        ValueError: As of `associate`.
+    """
+    if not is_sparser(truth, estimate):
+        return associate(truth, estimate, hole)
+    known = estimate.covers(truth.stamps, bridged(estimate, hole))
+    if not known.any():
+        return associate(truth, estimate, hole)  # raises, and says why
+    kept = truth.take(known)
+    return kept, estimate.at(kept.stamps)
 
 
 def quaternions(rotations: Floats) -> Floats:

@@ -42,6 +42,11 @@ class Figure(msgspec.Struct, frozen=True):
     of_flight: bool = False
 
     @property
+    def of_orientation(self) -> bool:
+        """Whether it means nothing unless orientations are those of the truth's body."""
+        return self.name.startswith(_OF_ORIENTATION)
+
+    @property
     def unit(self) -> str:
         """Of its values; "" if they have none."""
         return next((unit for end, unit in _UNITS.items() if self.name.endswith(end)), "")
@@ -71,6 +76,9 @@ class Figure(msgspec.Struct, frozen=True):
         return f"{self.name}: expected at {self.limit} {limit:g}, found {found}"
 
 
+_OF_ORIENTATION = (
+    "rpe_", "rot_", "heading_", "final_rot_", "newest_pose_rot_", "end_error_", "nees_pose",
+)  # fmt: skip
 _UNITS = {
     "_percent": "%", "_deg_per_m": "°/m", "_m_per_s": "m/s", "_deg": "°", "_ms": "ms", "_hz": "Hz",
     "_m": "m", "_seconds": "s",
@@ -122,6 +130,7 @@ _TABLE = (
     _detail("scale", "by what Sim(3) multiplies its lengths; 1 is right if they are in metres"),
     _detail("estimates", "poses that count"),
     _detail("compared", "poses for whose time a true pose is known"),
+    _share("compared_percent", "share of the poses near a compared one", default=50.0, report=""),
     _detail("path_m", "length of the true path in the flight"),
     _error("ate_rmse_m", "absolute trajectory error (ATE), RMS", report="head", sweep=1),
     _error(
@@ -206,6 +215,10 @@ _TABLE = (
     Figure("reads_truth", "whether it reads the truth"),
     _count("collisions", "collisions of the vehicle", of_flight=True),
     Figure("rate_hz", "estimates a second"),
+    _detail("time_offset_ms", "what added to its stamps would make it fit best"),
+    _detail("body_rotation_deg", "constant turn of its body against the truth's"),
+    _detail("body_rotation_spread_deg", "rotations beside that turn, RMS"),
+    _detail("why_no_rotations", "why figures of rotations and relative errors are left out"),
     _detail("why", "why it, or a part of it, could not be judged"),
 )  # fmt: skip
 

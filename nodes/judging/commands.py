@@ -98,7 +98,7 @@ def judge(
         try:
             settings = {
                 "alignment": alignment,
-                "align_first": align_first or None,
+                "align_first": int(align_first) if align_first.isdecimal() else align_first or None,
                 "scale_free": scale_free,
                 "axes": axes or None,
                 "truth_axes": truth_axes or None,

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.data.export import mounting
+from nodes.judging.evaluation.alignment import AlignmentMethod
 from nodes.judging.evaluation.judging import Judgement, judge
-from nodes.judging.evaluation.metrics import How
 from nodes.judging.evaluation.node import EvaluationConfig
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.judging.evaluation.verdict import FRAMES, Thresholds, conclude, write_results
@@ -70,8 +70,6 @@ class JudgeConfig(EvaluationConfig):
             declare, or else the truth's.
         truth_axes: Likewise of the truth.
         time_offset: Added to the estimates' stamps: seconds, or a text as ``-30ms``.
-        align_first: Poses, or a duration, from the first pose on that an alignment fits; by
-            default all.
     """
 
     scale_free: bool = False
@@ -80,24 +78,10 @@ class JudgeConfig(EvaluationConfig):
     axes: AxesName | None = None
     truth_axes: AxesName | None = None
     time_offset: float | str = 0.0
-    align_first: int | str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         offset_of(self.time_offset)
-        first_of(self.align_first)
-
-
-def first_of(given: int | str | None) -> int | float | None:
-    """Return a number of poses as it is, and a duration in seconds; a `ValueError` of others."""
-    first: int | float | None
-    if isinstance(given, str) and not given.isdecimal():
-        first = float(Duration.parse(given))
-    else:
-        first = None if given is None else int(given)
-    if first is not None and first <= 0:
-        raise ValueError(f'align_first: expected a number of poses or "5s", found {given!r}')
-    return first
 
 
 def offset_of(given: float | str) -> int:
@@ -195,35 +179,51 @@ def _judge_one(
         record.covariances.add(stamp, row)
     for stamp, row in _rows(source, source.velocities):
         record.velocities.add(stamp, row)
-    more: dict[str, Any] = {}
-    if config.align_first is not None:
-        more["align_first"] = first_of(config.align_first)
     judgement = judge(
         record,
         truth.poses,
         cameras=None if frames is None else {"": frames},
         alignment=_usual(truth, source, config) if config.alignment == "auto" else config.alignment,
+        align_first=config.alignment_span(),
         gap=config.gap,
         hole=config.hole,
-        **more,
     )
     figures = judgement.figures
     if not figures["compared"]:
-        if truth.poses.covers(source.poses.stamps).any():
-            step = float(np.median(np.diff(truth.poses.stamps))) / SECOND
-            raise ValueError(
-                f"{source.file}: expected poses between true poses at most {config.hole / SECOND:g}"
-                f" s apart, found none: the truth's are {step:.3g} s apart (median); "
-                f"--max-difference {np.ceil(step * 60) / 100:g}s lets them count"
-            )
-        figures = {**figures, "why": _no_common_time(truth, source)}
+        figures = {**figures, "why": _why_not(truth, source, figures["why"])}
     unknown = {"restarts", "repeated_stamps", "future_stamps", "other_bodies"}
     figures = {k: v for k, v in figures.items() if k not in unknown} | source.counts
     figures["method"] = source.file
-    return msgspec.structs.replace(judgement, figures=figures)
+    note = "; ".join(filter(None, (judgement.note, _option_for(judgement))))
+    return msgspec.structs.replace(judgement, figures=figures, note=note)
 
 
-def _usual(truth: Source, source: Source, config: JudgeConfig) -> How:
+def _option_for(judgement: Judgement) -> str:
+    """Return the options that mend what a judgement says of bodies and clocks, if it does."""
+    options = {
+        "turned": "declare the axes of both by --axes and --truth-axes, or say where the camera "
+        "is by --body-from-camera",
+        "order": "name the columns by --columns",
+    }
+    orientations = judgement.orientations
+    hints = [options.get(orientations.kind, "")] if orientations is not None else []
+    if "added to its stamps it would fit" in judgement.note:
+        hints.append("shift it by --time-offset")
+    return "; ".join(filter(None, hints))
+
+
+def _why_not(truth: Source, source: Source, why: str) -> str:
+    """Return why nothing is compared, with the option that may be meant, or raise `ValueError`."""
+    if truth.poses.covers(source.poses.stamps).any():
+        step = truth.poses.step() / SECOND
+        if "max_difference" in why:
+            why += f"; --max-difference {np.ceil(step * 60) / 100:g}s lets them count"
+        raise ValueError(f"{source.file}: {why}")
+    _, fits, offset = why.partition("; with ")
+    return _no_common_time(truth, source) + (f"{fits}{offset} (--time-offset)" if fits else "")
+
+
+def _usual(truth: Source, source: Source, config: JudgeConfig) -> AlignmentMethod:
     """Return how an estimate is laid on the truth: as in a run where both name their frames."""
     if config.scale_free:
         return "sim3"
@@ -302,8 +302,8 @@ def _no_common_time(truth: Source, source: Source) -> str:
                 which = "the estimate" if one is source else "the truth"
                 return f"{spans}: are the stamps of {which} in {unit}, and read as seconds?"
     if (last > _CALENDAR) != (end > _CALENDAR):
-        return f"{spans}: one is Unix time, the other counts from a beginning; see --time-offset"
-    return f"{spans}; see --time-offset"
+        return f"{spans}: one is Unix time, the other counts from a beginning"
+    return spans
 
 
 def _check_frames(truth: Source, frames: Stamps) -> None:

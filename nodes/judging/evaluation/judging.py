@@ -18,12 +18,10 @@ import numpy.typing as npt
 
 from events import Collision, Odometry, PlannedPose, PositionSetpoint, Vector3
 from events.frames import from_yaw
+from nodes.judging.evaluation.alignment import Alignment, AlignmentMethod, align, transform
 from nodes.judging.evaluation.metrics import (
-    Alignment,
     Floats,
-    How,
     absolute_errors,
-    align,
     consistency,
     end_error_percent,
     frame_errors,
@@ -33,8 +31,8 @@ from nodes.judging.evaluation.metrics import (
     rms,
     rotation_errors,
     segment_errors,
-    transform,
 )
+from nodes.judging.evaluation.orientations import Orientations, examine
 from nodes.judging.evaluation.record import (
     EstimatorRecord,
     Interval,
@@ -44,7 +42,17 @@ from nodes.judging.evaluation.record import (
     cover,
     seconds,
 )
-from nodes.trajectory import HOLE, PoseRows, RecentPoses, Trajectory, associate
+from nodes.judging.evaluation.time_offset import best_time_offset
+from nodes.trajectory import (
+    HOLE,
+    PoseRows,
+    RecentPoses,
+    Trajectory,
+    bridged,
+    is_sparser,
+    pair,
+)
+from runtime.figures import figure
 from runtime.time.clock import SECOND
 
 
@@ -107,6 +115,8 @@ def _path_at(truth: Trajectory, stamps: Stamps) -> Floats:
 MILLISECOND = 1_000_000
 _MOST_TICKS = 100_000
 _BLOCK = 65_536
+_NEAR = SECOND  # nanoseconds from a compared pose within which others count as compared
+_BURST = 4  # poses in a usual step, on average, from which one of them counts
 _LATE = 5  # largest delay of a pose, image periods: two of the estimator, two of a camera
 
 
@@ -124,7 +134,8 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
 
     figures: dict[str, Any]  # by name, which ends with the unit
     estimate: Trajectory | None  # as sent
-    note: str = ""  # of poses that are not compared
+    note: str = ""  # what a reader of the figures has to know; empty if nothing
+    orientations: Orientations | None = None  # whether they are the body's, if that can be told
     # The same in the truth's frame, where there is a truth; `None` if there are none.
     aligned: Trajectory | None = None
     of_images: Errors | None = None  # errors of each pose at the time of its image
@@ -142,7 +153,8 @@ def judge(
     end: int | None = None,  # end of the run (ns); of the truth if not given
     planned: int | None = None,  # planned end (ns), if it ended before
     body: str = "base_link",  # frame of the truth's body
-    alignment: How | Literal["auto"] = "auto",  # see `choose_alignment`
+    alignment: AlignmentMethod | Literal["auto"] = "auto",  # see `choose_alignment`
+    align_first: float | None = None,  # see `align`
     rate: float = 400.0,  # control ticks a second
     gap: float = 0.5,  # seconds of silence that count as lost
     hole: int = HOLE,  # time between true poses (ns) over which none is made up
@@ -167,14 +179,20 @@ def judge(
     due = truth.stamps if frames is None else frames
     due = due[: max(int(np.searchsorted(due, end - waits, side="right")), 1)]
     coverage = cover(due, poses, round(gap * SECOND), record.reported_lost(end), planned)
-    due = due[truth.covers(due, hole)]
+    weighed = None if estimate is None else _weighed(estimate, frames)
+    sparse = weighed is not None and is_sparser(truth, weighed)
+    longest = bridged(truth, hole) if sparse else hole
     start, stop = coverage.flight
     inside = (truth.stamps >= start) & (truth.stamps <= stop)
-    path = float(np.ptp(truth.distances()[inside] if inside.any() else truth.distances()))
+    if sparse:  # the truth at images between its poses is not known
+        due = truth.stamps[inside]
+    due = due[truth.covers(due, longest)]
+    lengths = truth.distances(longest)
+    path = float(np.ptp(lengths[inside] if inside.any() else lengths))
     figures: dict[str, Any] = {
         "method": record.method,
         "estimates": len(record),
-        "compared": int(truth.covers(poses, hole).sum()),
+        "compared": 0 if sparse else int(truth.covers(poses, hole).sum()),
         "coverage_percent": coverage.percent,
         "frame_coverage_percent": None if frames is None else coverage.frames_percent,
         "lost_seconds": seconds(coverage.lost),
@@ -199,12 +217,10 @@ def judge(
         return _held(held_errors(truth, due, poses[:0], np.empty(0), coverage.lost), path)
 
     how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
-    final = _judge_final(record, truth, hole, due, path, alignment, figures)
-    note = _not_compared(truth, poses, hole)
-    judgement = Judgement(figures, estimate, note, lost=coverage.lost, final=final)
-    if estimate is None:
+    final = _judge_final(record, truth, hole, due, path, alignment, align_first, figures)
+    if estimate is None or weighed is None:
         figures |= without()
-        return judgement
+        return Judgement(figures, estimate, lost=coverage.lost, final=final)
     # An interval that lasts to the end of the flight counts as long as it is: it took no less.
     if took := [seconds([each]) for each in coverage.lost if each.start >= poses[0]]:
         figures["relocalization_p50_seconds"] = float(np.median(took))
@@ -212,41 +228,157 @@ def judge(
     figures["alignment"] = how
     figures["rate_hz"] = (len(estimate) - 1) / estimate.seconds if estimate.seconds else 0.0
     if len(arrivals):
-        latencies = (arrivals - poses) / MILLISECOND
-        figures["latency_p50_ms"] = float(np.percentile(latencies, 50))
-        figures["latency_p99_ms"] = float(np.percentile(latencies, 99))
-        period = max((np.median(np.diff(s)) for s in (poses, due) if len(s) > 1), default=0.0)
-        figures["not_causal"] = int((arrivals - poses > _LATE * period).sum()) if period else 0
+        figures |= _latencies(poses, arrivals, due)
+    notes = [_not_compared(truth, poses, longest)]
+    if frames is None and len(weighed) < len(estimate):
+        notes.append(f"of {len(estimate)} poses in bursts {len(weighed)} weigh, one a usual step")
     try:
-        there, kept = associate(truth, estimate, hole)
-        aligned = align(kept, there, how)
+        there, kept = pair(truth, weighed, hole)
+        aligned = align(kept, there, how, align_first)
     except ValueError as error:  # too little to align, or no time in common
-        figures |= {**without(), "why": str(error)}
-        return judgement
-    moved = aligned.trajectory
-    figures |= absolute_errors(there, moved) | _aligned_as_a_whole(there, kept)
-    figures["ate_percent"] = 100.0 * figures["ate_rmse_m"] / path if path > 0 else None
-    try:
-        figures["end_error_percent"] = end_error_percent(there, moved)
-        figures |= frame_errors(there, moved) | segment_errors(there, moved, path)
-        figures |= path_errors(there, moved)
-    except ValueError as error:  # it did not get that far
-        figures["why"] = str(error)
-    inside = truth.covers(poses, hole)
+        figures |= {**without(), "why": f"{error}{_elsewhere_in_time(truth, estimate)}"}
+        note = "; ".join(filter(None, notes))
+        return Judgement(figures, estimate, note, lost=coverage.lost, final=final)
+    if sparse:
+        figures["compared"] = len(there)
+    figures["compared_percent"] = 100.0 * float(_near(there.stamps, poses).mean())
+    figures |= _errors(there, kept, aligned.trajectory, path, truth.pieces(there.stamps, longest))
+    offset = best_time_offset(truth, weighed, with_scale=how == "sim3")
+    if offset is not None:
+        figures["time_offset_ms"] = 1e3 * offset.seconds
+        notes.append(offset.text())
+    orientations = examine(there, kept)
+    if orientations is not None:
+        figures["body_rotation_deg"] = orientations.degrees
+        figures["body_rotation_spread_deg"] = orientations.spread
+        notes.append(orientations.text())
+    moved, arrived = aligned.trajectory, arrivals[:0]
+    whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
+    if not sparse:
+        rows = truth.covers(poses, hole)
+        there, moved = truth.at(poses[rows]), whole.take(rows)
+        arrived = arrivals[rows] if len(arrivals) else arrivals
     of_images = Errors(
         stamps=there.stamps,
-        since=arrivals[inside] if len(arrivals) else arrivals,
+        since=arrived,
         position=position_errors(there.positions, moved.positions),
         rotation=rotation_errors(there.orientations, moved.orientations),
     )
     held = held_errors(truth, due, there.stamps, of_images.position, coverage.lost)
-    figures |= _held(held, path) | _said_with_poses(record, truth, there, aligned)
-    whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
+    figures |= _held(held, path) | _said_with_poses(record, truth, there, moved, aligned)
     of_ticks = None
     if len(arrivals):
         of_ticks, available = errors_at_ticks(truth, whole, arrivals, rate, hole)
         figures |= available
-    return Judgement(figures, estimate, note, moved, of_images, of_ticks, coverage.lost, final)
+    if orientations is not None and not orientations.usable:
+        figures = {k: v for k, v in figures.items() if not figure(k).of_orientation}
+        figures["why_no_rotations"] = orientations.text()
+    note = "; ".join(filter(None, notes))
+    return Judgement(
+        figures, estimate, note, orientations, moved, of_images, of_ticks, coverage.lost, final
+    )
+
+
+def _weighed(estimate: Trajectory, frames: Stamps | None) -> Trajectory:
+    """Return the poses of which errors are means: one an image, or one a step without images.
+
+    Otherwise, many poses where it is easy would hide those where it is not.
+    """
+    stamps = estimate.stamps
+    return estimate.take(one_a_step(stamps) if frames is None else one_an_image(frames, stamps))
+
+
+def _latencies(poses: Stamps, arrivals: Stamps, due: Stamps) -> dict[str, float]:
+    late = arrivals - poses
+    period = max((np.median(np.diff(s)) for s in (poses, due) if len(s) > 1), default=0.0)
+    return {
+        "latency_p50_ms": float(np.percentile(late / MILLISECOND, 50)),
+        "latency_p99_ms": float(np.percentile(late / MILLISECOND, 99)),
+        "not_causal": int((late > _LATE * period).sum()) if period else 0,
+    }
+
+
+def _errors(
+    truth: Trajectory,
+    estimate: Trajectory,  # in its own frame
+    aligned: Trajectory,  # in the truth's
+    path: float,  # metres of the flight
+    pieces: Stamps,  # of the truth, see `Trajectory.pieces`
+) -> dict[str, Any]:
+    """Return absolute and relative errors of poses at equal stamps."""
+    figures: dict[str, Any] = {
+        **absolute_errors(truth, aligned),
+        **_aligned_as_a_whole(truth, estimate),
+    }
+    figures["ate_percent"] = 100.0 * figures["ate_rmse_m"] / path if path > 0 else None
+    try:
+        if pieces[0] == pieces[-1]:  # or else the length of the path between is not known
+            figures["end_error_percent"] = end_error_percent(truth, aligned)
+        figures |= frame_errors(truth, aligned, pieces)
+        figures |= segment_errors(truth, aligned, path, pieces)
+        figures |= path_errors(truth, aligned, pieces=pieces)
+    except ValueError as error:  # it did not get that far
+        figures["why"] = str(error)
+    return figures
+
+
+def one_an_image(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
+    """Return a mask of the poses nearest to an image each, within half the image period.
+
+    An image has one pose, and a pose one image: the nearer. If no image has a pose, all count.
+
+    Args:
+        frames: Stamps of the images (ns), strictly rising, shape (n,), n ≥ 1.
+        poses: Stamps of the poses (ns), strictly rising, shape (m,), m ≥ 1.
+    """
+    after = np.clip(np.searchsorted(frames, poses), 1, max(len(frames) - 1, 1))
+    nearer = abs(frames[after - 1] - poses) <= abs(frames[after % len(frames)] - poses)
+    image = np.where(nearer, after - 1, after % len(frames))  # of each pose
+    distance = abs(frames[image] - poses)
+    order = np.lexsort((distance, image))
+    first = np.append(True, np.diff(image[order]) > 0)
+    mask = np.zeros(len(poses), np.bool_)
+    mask[order[first]] = True
+    period = int(np.median(np.diff(frames))) if len(frames) > 1 else 0
+    mask &= 2 * distance <= period
+    return mask if mask.any() else np.ones(len(poses), np.bool_)
+
+
+def one_a_step(poses: Stamps) -> npt.NDArray[np.bool_]:
+    """Return a mask of the first pose in each usual step, if poses come in bursts; else of all.
+
+    The usual step is the one at which half of the time has passed in longer ones.
+
+    Args:
+        poses: Stamps (ns), strictly rising, shape (n,), n ≥ 1.
+    """
+    everything = np.ones(len(poses), np.bool_)
+    if len(poses) < 2:
+        return everything
+    steps = np.sort(np.diff(poses))
+    passed = np.cumsum(steps)
+    usual = int(steps[np.searchsorted(passed, passed[-1] / 2)])
+    bins = (poses - poses[0]) // usual
+    first = np.append(True, np.diff(bins) > 0)
+    return first if len(poses) > _BURST * first.sum() else everything
+
+
+def _near(compared: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
+    """Return a mask of the poses at most `_NEAR` from a compared one."""
+    after = np.clip(np.searchsorted(compared, poses), 0, len(compared) - 1)
+    before = np.clip(after - 1, 0, None)
+    nearest = np.minimum(abs(compared[after] - poses), abs(compared[before] - poses))
+    return np.asarray(nearest <= _NEAR)
+
+
+def _elsewhere_in_time(truth: Trajectory, estimate: Trajectory) -> str:
+    """Return the time offset with which an estimate fits, if it has no time in common."""
+    if truth.covers(estimate.stamps).any() or estimate.covers(truth.stamps).any():
+        return ""
+    offset = best_time_offset(truth, estimate, with_scale=True, anywhere=True)
+    if offset is None or offset.after > 0.02 * np.linalg.norm(truth.positions.std(axis=0)):
+        return ""
+    return f"; with {offset.seconds:+.4f} s added to its stamps it would fit"
 
 
 def _not_compared(truth: Trajectory, stamps: Stamps, hole: int) -> str:
@@ -266,7 +398,7 @@ def _not_compared(truth: Trajectory, stamps: Stamps, hole: int) -> str:
 def _aligned_as_a_whole(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
     """Return the ATE after each alignment as a whole, and the scale; nothing for a line."""
     found: dict[str, float] = {}
-    wholes: tuple[How, How] = ("se3", "sim3")
+    wholes: tuple[AlignmentMethod, ...] = ("se3", "sim3")
     with contextlib.suppress(ValueError):
         for how in wholes:
             laid = align(estimate, truth, how)
@@ -289,7 +421,8 @@ def _judge_final(
     hole: int,
     frames: Stamps,
     path: float,
-    alignment: How | Literal["auto"],
+    alignment: AlignmentMethod | Literal["auto"],
+    align_first: float | None,
     figures: dict[str, Any],
 ) -> Trajectory | None:
     """Judge the trajectory after loop closures: add figures, return aligned poses."""
@@ -299,8 +432,9 @@ def _judge_final(
     if alignment == "auto":
         alignment = choose_alignment(record.scale_free, record.final_frame_id)
     try:
-        there, kept = associate(truth, record.final, hole)
-        moved = align(kept, there, alignment).trajectory
+        final = record.final.take(one_a_step(record.final.stamps))
+        there, kept = pair(truth, final, hole)
+        moved = align(kept, there, alignment, align_first).trajectory
     except ValueError as error:
         figures["why_not_final"] = str(error)
         return None
@@ -312,7 +446,11 @@ def _judge_final(
 
 
 def _said_with_poses(
-    record: EstimatorRecord, truth: Trajectory, there: Trajectory, aligned: Alignment
+    record: EstimatorRecord,
+    truth: Trajectory,
+    there: Trajectory,
+    moved: Trajectory,
+    aligned: Alignment,
 ) -> dict[str, Any]:
     """Return the figures of velocities and covariances, as far as they were given."""
     figures: dict[str, Any] = {}
@@ -331,7 +469,7 @@ def _said_with_poses(
     if rows.any():
         turn = np.kron(np.diag([scale, 1.0]), rotation)
         turned = turn @ said.reshape(-1, 6, 6) @ turn.T
-        figures |= consistency(there.take(rows), aligned.trajectory.take(rows), turned)
+        figures |= consistency(there.take(rows), moved.take(rows), turned)
     return figures
 
 
@@ -345,7 +483,7 @@ def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
     return {"plan_rmse_m": rms(distances), "plan_max_m": float(distances.max())}
 
 
-def choose_alignment(scale_free: bool, frame_id: str) -> How:
+def choose_alignment(scale_free: bool, frame_id: str) -> AlignmentMethod:
     """Return ``sim3`` for a unit of its own, ``none`` in ``map``, else ``origin`` (first pose)."""
     if scale_free:
         return "sim3"

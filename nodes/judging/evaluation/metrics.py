@@ -1,16 +1,16 @@
 """Errors of an estimated trajectory: absolute, relative, drift; and its covariances against them.
 
 Definitions are those of J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems"
-(IROS 2012), as evo computes them. Both trajectories have the same stamps; `align` brings them
-together, in frame and in scale.
+(IROS 2012), as evo computes them. Both trajectories have the same stamps, and are in one frame
+(`nodes.judging.evaluation.alignment`). Relative errors stay within a piece of the truth, if pieces
+are given: a number for each pose, which changes where the truth has a hole.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from typing import Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -52,7 +52,12 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
     }
 
 
-def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> dict[str, float]:
+def path_errors(
+    truth: Trajectory,
+    estimate: Trajectory,
+    delta: float = 1.0,
+    pieces: Indices | None = None,
+) -> dict[str, float]:
     """Return the relative errors (RPE) over all pairs of poses a given path length apart.
 
     As evo's ``--delta 1 --delta_unit m --all_pairs --pairs_from_reference``; only an alignment's
@@ -66,7 +71,7 @@ def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> 
     """
     same_stamps(truth, estimate)
     distances = truth.distances()
-    first, last = path_pairs(distances, delta)
+    first, last = path_pairs(distances, delta, pieces=pieces)
     if not len(first):
         raise ValueError(
             f"relative error: expected poses {delta:g} m apart along the path, found none "
@@ -79,17 +84,23 @@ def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> 
     }
 
 
-def frame_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
+def frame_errors(
+    truth: Trajectory, estimate: Trajectory, pieces: Indices | None = None
+) -> dict[str, float]:
     """Return the relative errors from pose to pose, evo's default; a `ValueError` below two."""
     same_stamps(truth, estimate)
-    if len(truth) < 2:
-        raise ValueError(f"relative error: expected two poses, found {len(truth)}")
     first = np.arange(len(truth) - 1)
+    if pieces is not None:
+        first = first[pieces[1:] == pieces[:-1]]
+    if not len(first):
+        raise ValueError(f"relative error: expected two poses in a piece, found {len(truth)}")
     shifts, angles = relative_errors(truth, estimate, first, first + 1)
     return {"rpe_frame_trans_m": rms(shifts), "rpe_frame_rot_deg": rms(np.degrees(angles))}
 
 
-def segment_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict[str, float | None]:
+def segment_errors(
+    truth: Trajectory, estimate: Trajectory, path: float, pieces: Indices | None = None
+) -> dict[str, float | None]:
     """Return the relative errors over stretches of a flight: shares of its path, and KITTI's.
 
     As the development kit of KITTI's odometry benchmark (A. Geiger, P. Lenz, R. Urtasun, CVPR 2012;
@@ -115,7 +126,9 @@ def segment_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict
     for lengths, mean in ((shares, "mean"), (metres, "kitti")):
         everything: list[tuple[Floats, Floats]] = []
         for name, length in lengths.items():
-            shifts, angles = relative_errors(truth, estimate, *path_pairs(distances, length))
+            shifts, angles = relative_errors(
+                truth, estimate, *path_pairs(distances, length, pieces=pieces)
+            )
             each = 100.0 * shifts / length, np.degrees(angles) / length
             everything.append(each)
             found |= dict(zip(_segment_names(name), map(_mean, each), strict=True))
@@ -154,6 +167,7 @@ def path_pairs(
     distances: Floats,  # path length from the start to each pose, metres, not falling, shape (n,)
     delta: float,  # metres between the two, above 0
     tolerance: float = 0.1,  # share by which a pair may miss it
+    pieces: Indices | None = None,  # of the poses, not falling, shape (n,): no pair leaves one
 ) -> tuple[Indices, Indices]:
     """Return all pairs of poses a given path length apart, as evo's `filter_pairs_by_path` does.
 
@@ -167,6 +181,14 @@ def path_pairs(
     """
     if not 0.0 < delta < math.inf:
         raise ValueError(f"path_pairs: delta: expected a length above 0 m, found {delta}")
+    if pieces is not None and len(pieces) and pieces[0] != pieces[-1]:
+        starts = [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist(), len(pieces)]
+        pairs = [
+            [start + rows for rows in path_pairs(distances[start:end], delta, tolerance)]
+            for start, end in itertools.pairwise(starts)
+        ]
+        first, second = (np.concatenate(rows) for rows in zip(*pairs, strict=True))
+        return first, second
     n = len(distances)
     first = np.arange(n - 1)
     above = np.clip(np.searchsorted(distances, distances[:-1] + delta), first + 1, n - 1)
@@ -302,97 +324,3 @@ def positive_definite(matrices: Floats) -> npt.NDArray[np.bool_]:
     scaled = scaled / (deviations[:, :, None] * deviations[:, None, :])
     skew = abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2))
     return np.asarray(possible & (skew < 1e-6) & (np.linalg.eigvalsh(scaled)[:, 0] > _SINGULAR))
-
-
-How = Literal["none", "origin", "se3", "sim3"]
-"""``none``: as is. ``origin``: first pose on first pose. ``se3``: rigid, least squares.
-
-``sim3``: the same with scale, for estimates in their own unit.
-"""
-
-
-class Alignment(msgspec.Struct, frozen=True, eq=False):
-    """Aligned estimate, and its transform: position ``scale · R · p + t``."""
-
-    trajectory: Trajectory  # the estimate, now in the truth's frame
-    rotation: Floats  # R, estimate's frame to the truth's, shape (3, 3)
-    translation: Floats  # t, metres in the truth's frame, shape (3,)
-    scale: float  # true length of the estimate's unit
-
-
-def align(estimate: Trajectory, truth: Trajectory, how: How) -> Alignment:
-    """Move an estimate into the truth's frame.
-
-    Args:
-        truth: True poses at the same stamps; see `nodes.trajectory.associate`.
-        how: See `How`.
-
-    Raises:
-        ValueError: The stamps differ; or all positions of one lie on a line or a point.
-    """
-    same_stamps(truth, estimate)
-    rotation, translation, scale = np.eye(3), np.zeros(3), 1.0
-    if how == "none":
-        return Alignment(estimate, rotation, translation, scale)
-    if how == "origin":
-        rotation = (truth.rotations()[0] * estimate.rotations()[0].inv()).as_matrix()
-        translation = truth.positions[0] - rotation @ estimate.positions[0]
-    else:
-        rotation, translation, scale = umeyama(
-            estimate.positions, truth.positions, with_scale=how == "sim3"
-        )
-    moved = transform(estimate, rotation, translation, scale)
-    return Alignment(moved, rotation, translation, scale)
-
-
-def transform(
-    trajectory: Trajectory, rotation: Floats, translation: Floats, scale: float = 1.0
-) -> Trajectory:
-    """Return a trajectory in another frame: position ``scale · R · p + t``, orientation ``R · q``.
-
-    Args:
-        rotation: R, old frame to new, shape (3, 3).
-        translation: t, metres in the new frame, shape (3,).
-    """
-    turned = Rotation.from_matrix(rotation) * trajectory.rotations()
-    return Trajectory(
-        trajectory.stamps,
-        scale * trajectory.positions @ rotation.T + translation,
-        turned.as_quat(scalar_first=True),
-    )
-
-
-def umeyama(source: Floats, target: Floats, *, with_scale: bool) -> tuple[Floats, Floats, float]:
-    """Return R (3, 3), t (3,), c with the least mean square of ``target - (c · R · source + t)``.
-
-    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
-    IEEE PAMI 13(4), 1991; equation numbers are that paper's.
-
-    Args:
-        source: Points, shape (n, 3).
-        target: The same points elsewhere, shape (n, 3).
-        with_scale: Whether c may differ from 1.
-
-    Raises:
-        ValueError: One of the sets lies on a line (or a point).
-    """
-    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)  # (34), (35)
-    a, b = source - mean_source, target - mean_target
-    u, d, vt = np.linalg.svd(b.T @ a / len(a))  # of (38)
-    # These are products of spreads: the second direction must be a millionth of the first.
-    if not d[1] > 1e-12 * d[0] > 0.0:
-        raise ValueError(
-            f"alignment: expected positions that do not all lie on one line, found {len(a)} with "
-            f"spreads {_spreads(a)} m in the estimate and {_spreads(b)} m in the truth"
-        )
-    s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # (43)
-    rotation = u * s @ vt  # (40)
-    # (42) with (36)
-    scale = float(d @ s / np.mean(np.sum(a**2, axis=1))) if with_scale else 1.0
-    return rotation, mean_target - scale * rotation @ mean_source, scale  # (41)
-
-
-def _spreads(points: Floats) -> str:
-    """Return the standard deviations along the principal directions, for a message."""
-    deviations = np.linalg.svd(points, compute_uv=False) / np.sqrt(len(points))
-    return " × ".join(f"{value:.3g}" for value in deviations)

@@ -80,7 +80,7 @@ class LiveErrors:
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
-Laid = Literal["auto", "none", "origin", "se3", "sim3"]
+Laid = Literal["auto", "none", "origin", "posyaw", "se3", "sim3"]
 
 
 class OwnConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -100,9 +100,11 @@ class EvaluationConfig(NodeConfig):
 
     Attributes:
         alignment: How an estimate is laid on the truth: ``none``, ``origin`` (first pose on first
-            pose), ``se3``, ``sim3``; ``auto`` is ``sim3`` for scale-free estimators, ``none`` for
-            estimates in ``map``, and ``origin`` for all others. The verdict always has trajectory
-            errors after ``se3`` and ``sim3``, too.
+            pose), ``posyaw`` (translation and heading), ``se3``, ``sim3``; ``auto`` is ``sim3`` for
+            scale-free estimators, ``none`` for estimates in ``map``, and ``origin`` for all others.
+            The verdict always has trajectory errors after ``se3`` and ``sim3``, too.
+        align_first: Beginning that the alignment is computed from: a number of poses, or a
+            duration (``"5s"``); the whole if not given.
         vehicle: Vehicle whose truth all estimates are held against; if empty, the one in an
             estimator's source, or of its camera, else the first.
         control_rate: Hertz of the controller for which newest poses are judged.
@@ -118,6 +120,7 @@ class EvaluationConfig(NodeConfig):
     """
 
     alignment: Laid = "auto"
+    align_first: Annotated[int, msgspec.Meta(ge=1)] | str | None = None
     vehicle: str = ""
     control_rate: Positive = 400
     gap: Duration = Duration(0.5)  # immutable
@@ -127,6 +130,12 @@ class EvaluationConfig(NodeConfig):
     image_count: Annotated[int, msgspec.Meta(ge=0, le=100)] = 12
 
     def __post_init__(self) -> None:
+        try:
+            self.alignment_span()
+        except ValueError as error:
+            raise ValueError(
+                f"align_first: expected a number of poses or a duration: {error}"
+            ) from None
         for name, own in self.estimators.items():
             for each in own.thresholds:
                 known = [k for k in self.thresholds.__struct_fields__ if not FIGURES[k].of_flight]
@@ -140,6 +149,12 @@ class EvaluationConfig(NodeConfig):
     def hole(self) -> int:
         """Nanoseconds between true poses over which none is made up."""
         return 2 * round(self.max_difference * SECOND)
+
+    def alignment_span(self) -> int | float | None:
+        """Return `align_first` as `align` takes it: poses (int), or seconds (float)."""
+        if isinstance(self.align_first, str):
+            return float(Duration.parse(self.align_first))
+        return self.align_first
 
     def alignment_of(self, estimator: str) -> Laid:
         """Return how an estimator's poses are laid on the truth."""
@@ -377,6 +392,7 @@ class Evaluation(Node[EvaluationConfig]):
                 truth,
                 **seen,
                 alignment=config.alignment_of(name),
+                align_first=config.alignment_span(),
                 rate=config.control_rate,
                 gap=config.gap,
                 hole=config.hole,

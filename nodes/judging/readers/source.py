@@ -223,9 +223,6 @@ class Collected:
         counts = {"restarts": self.restarts} if counted else {}
         if counted or self.repeated or self.back:
             counts["repeated_stamps"] = self.repeated + self.back
-        notes = self._left_out()
-        if positions_only:
-            notes.append("positions without orientations")
         return Source(
             name="",
             file="",
@@ -235,7 +232,7 @@ class Collected:
             usual=usual,
             positions_only=positions_only,
             counts=counts,
-            notes=tuple(notes),
+            notes=tuple(self._left_out()),
             covariances=_filled(self._covariances, (6, 6)),
             velocities=_filled(self._velocities, (3,)),
         )

@@ -28,7 +28,7 @@ from events import (
 from events.camera_info import COEFFICIENTS
 from events.geometry import pose_matrix
 from nodes.estimators import Estimator, EstimatorConfig
-from nodes.judging.evaluation.metrics import umeyama
+from nodes.judging.evaluation.alignment import umeyama
 from runtime import Node, on
 from runtime.errors import VisnavError
 from runtime.node import make_node

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from nodes.data.export import export_trajectories, load
-from nodes.judging.evaluation.metrics import absolute_errors, align, path_errors
+from nodes.judging.evaluation.alignment import align
+from nodes.judging.evaluation.metrics import absolute_errors, path_errors
 from nodes.trajectory import Trajectory, associate
 from nodes.trajectory_files import read_euroc, read_kitti, read_tum, write_tum
 from tests.nodes.trajectory.samples import moved, noisy, walk

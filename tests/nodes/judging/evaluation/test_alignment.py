@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from evo.core.geometry import umeyama_alignment
 from hypothesis import given, settings
+from scipy.spatial.transform import Rotation
 
-from nodes.judging.evaluation.metrics import How, absolute_errors, align, umeyama
+from nodes.judging.evaluation.alignment import AlignmentMethod, align, umeyama
+from nodes.judging.evaluation.metrics import absolute_errors
 from nodes.trajectory import Trajectory, associate
 from tests.nodes.trajectory.samples import angle, as_evo, moved, noisy, walk
 
@@ -18,7 +20,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 @pytest.mark.parametrize("how", ["origin", "se3", "sim3"])
 @given(seed=SEEDS, n=st.integers(20, 60))
 @settings(max_examples=10, deadline=None)
-def test_alignments_are_evos(how: How, seed: int, n: int) -> None:
+def test_alignments_are_evos(how: AlignmentMethod, seed: int, n: int) -> None:
     truth = walk(n, seed)
     estimate = noisy(moved(truth, scale=1.7, seed=seed), seed=seed + 1)
     ours = align(estimate, truth, how)
@@ -38,7 +40,7 @@ def test_alignments_are_evos(how: How, seed: int, n: int) -> None:
 
 @pytest.mark.parametrize(("how", "scale"), [("origin", 1.0), ("se3", 1.0), ("sim3", 0.4)])
 def test_an_estimate_that_is_the_truth_in_another_frame_has_no_error(
-    how: How, scale: float
+    how: AlignmentMethod, scale: float
 ) -> None:
     truth = walk()
     found = align(moved(truth, scale), truth, how)
@@ -98,3 +100,63 @@ def test_no_time_in_common_is_an_error_that_names_both_times() -> None:
     seconds = Trajectory(np.array([1, 2]), np.zeros((2, 3)), walk(2).orientations)
     with pytest.raises(ValueError, match="ns: is one in seconds and the other in nanoseconds"):
         associate(walk(2, start=10**9), seconds)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 25.0, 180.0, -90.0])
+def test_heading_and_translation_are_aligned_and_nothing_else(degrees: float) -> None:
+    truth = walk()
+    turn = Rotation.from_euler("z", degrees, degrees=True)
+    tilt = Rotation.from_euler("x", 2.0, degrees=True)
+    frame = turn * tilt
+    estimate = Trajectory(
+        truth.stamps,
+        frame.apply(truth.positions.copy()) + np.array([1.0, 2.0, 3.0]),
+        (frame * truth.rotations()).as_quat(scalar_first=True),
+    )
+    found = align(estimate, truth, "posyaw")
+    assert found.rotation[2].tolist() == [0.0, 0.0, 1.0]
+    # No heading fits better.
+    least = absolute_errors(truth, found.trajectory)["ate_rmse_m"]
+    for beside in (-0.5, 0.5):
+        other = Rotation.from_euler("z", beside, degrees=True)
+        positions = other.apply(found.trajectory.positions.copy())
+        positions += (truth.positions - positions).mean(axis=0)
+        assert np.sqrt(((positions - truth.positions) ** 2).sum(axis=1).mean()) > least
+    assert angle(found.trajectory, truth) == pytest.approx(np.radians(2.0), rel=0.2)
+
+
+def test_one_pose_is_enough_for_heading_and_translation() -> None:
+    truth = walk()
+    turn = Rotation.from_euler("z", 70, degrees=True)
+    estimate = Trajectory(
+        truth.stamps,
+        turn.apply(truth.positions.copy()) + np.array([5.0, 0.0, 0.0]),
+        (turn * truth.rotations()).as_quat(scalar_first=True),
+    )
+    found = align(estimate, truth, "posyaw", 1)
+    assert absolute_errors(truth, found.trajectory)["ate_max_m"] < 1e-9
+
+
+@pytest.mark.parametrize("method", ["origin", "posyaw", "se3", "sim3"])
+@pytest.mark.parametrize("first", [100, 4.95])
+def test_an_alignment_of_the_first_poses_is_evos(method: AlignmentMethod, first: float) -> None:
+    """100 poses, or 4.95 s of them at 20 Hz."""
+    truth = walk()
+    estimate = noisy(moved(truth), seed=3)
+    found = align(estimate, truth, method, first)
+    beginning = align(estimate.take(slice(100)), truth.take(slice(100)), method)
+    assert found.rotation.tolist() == beginning.rotation.tolist()
+    assert len(found.trajectory) == len(truth)
+    if method in {"se3", "sim3"}:
+        theirs = as_evo(estimate)
+        theirs.align(as_evo(truth), correct_scale=method == "sim3", n=100)
+        assert found.trajectory.positions == pytest.approx(theirs.positions_xyz, abs=1e-9)
+
+
+def test_heading_needs_positions_beside_the_vertical() -> None:
+    truth = walk(20)
+    upright = Trajectory(
+        truth.stamps, np.outer(np.arange(20.0), [0.0, 0.0, 1.0]), truth.orientations
+    )
+    with pytest.raises(ValueError, match="expected positions that differ beside their height"):
+        align(upright, truth, "posyaw")

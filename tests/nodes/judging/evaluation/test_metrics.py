@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
 from events.frames import angle_between
+from nodes.judging.evaluation.alignment import align
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.metrics import (
     absolute_errors,
-    align,
     end_error_percent,
     frame_errors,
     path_errors,

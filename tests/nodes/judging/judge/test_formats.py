@@ -243,7 +243,7 @@ def test_the_unit_of_a_stamp_is_seen_by_its_size(
     assert source.poses.stamps.tolist() == list(stamps)
 
 
-def test_positions_alone_are_read_and_said(tmp_path: Path) -> None:
+def test_positions_alone_are_read_and_judged(tmp_path: Path) -> None:
     for text in (
         rows(seconds, "x y z", " "),
         "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]\n" + rows(str, "x y z", ","),
@@ -252,7 +252,11 @@ def test_positions_alone_are_read_and_said(tmp_path: Path) -> None:
         (tmp_path / "t").write_text(text)
         source = read(str(tmp_path / "t"))
         assert source.positions_only
-        assert source.notes == ("positions without orientations",)
+        write_tum(tmp_path / "truth", POSE)
+        alone = judged(str(tmp_path / "truth"), str(tmp_path / "t"))
+        assert alone.figures["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+        assert alone.figures["why_no_rotations"].startswith("it has no orientations")
+        assert "rot_rmse_deg" not in alone.figures
         assert source.poses.positions == pytest.approx(POSE.positions)
         assert (source.poses.orientations == [1.0, 0.0, 0.0, 0.0]).all()
 

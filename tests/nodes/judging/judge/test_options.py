@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import visnav
 from nodes.judging.commands import judge as command
-from nodes.judging.evaluation.judging import Judgement
-from nodes.judging.evaluation.judging import judge as evaluate
-from nodes.judging.judgement import JudgeConfig, first_of, judge_all, offset_of
+from nodes.judging.judgement import JudgeConfig, judge_all, offset_of
 from nodes.judging.readers import Source
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_kitti, write_tum
@@ -74,25 +73,49 @@ def test_an_offset_that_is_none_is_refused(given: Any) -> None:
         JudgeConfig(time_offset=given)
 
 
-def test_a_share_to_align_by_is_poses_or_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: dict[str, Any] = {}
+@pytest.mark.parametrize("first", [40, "2s", "1999 ms"])
+def test_the_beginning_alone_is_aligned(first: int | str) -> None:
+    """An estimate that goes wrong after two seconds is right until then."""
+    truth = walk(200)
+    positions = moved(truth).positions.copy()
+    positions[40:] += np.linspace(0.0, 3.0, 160)[:, None]
+    wrong = Trajectory(truth.stamps, positions, moved(truth).orientations)
+    whole, _ = judged(truth, wrong)
+    begun, _ = judged(truth, wrong, align_first=first)
+    assert begun["ate_max_m"] == pytest.approx(3.0 * np.sqrt(3.0), abs=1e-6)
+    assert whole["ate_max_m"] < 4.0
 
-    def judge(*args: Any, **kwargs: Any) -> Judgement:
-        given.clear()
-        given.update(kwargs)
-        kwargs.pop("align_first", None)
-        return evaluate(*args, **kwargs)
 
-    monkeypatch.setattr("nodes.judging.judgement.judge", judge)
-    for said_, expected in ((20, 20), ("20", 20), ("5s", 5.0), ("500 ms", 0.5)):
-        judged(walk(50), walk(50), align_first=said_)
-        assert given["align_first"] == expected
-        assert type(given["align_first"]) is type(expected)
-    judged(walk(50), walk(50))
-    assert "align_first" not in given
-    for wrong in (0, -3, "0", "first"):
-        with pytest.raises(ValueError, match="expected"):
-            first_of(wrong)
+@pytest.mark.parametrize("words", [["--align-first", "40"], ["--align-first", "2s"]])
+def test_the_command_takes_a_beginning(words: list[str], tmp_path: Path) -> None:
+    write_tum(tmp_path / "t.tum", walk(200))
+    done = said(tmp_path, "--truth", "t.tum", "--estimate", "t.tum", *words)
+    assert done.returncode == 0, done.stderr
+    for wrong in ("0", "-3", "soon"):
+        done = said(tmp_path, "--truth", "t.tum", "--estimate", "t.tum", "--align-first", wrong)
+        assert done.returncode == 2
+        assert "align_first: expected" in done.stderr
+
+
+def test_heading_and_position_are_aligned_alone() -> None:
+    """A tilt stays an error, a turn about the vertical axis is none."""
+    truth = walk(200)
+    for axis, expected in (((0, 0, 1), 0.0), ((1, 0, 0), 10.0)):
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(np.radians(10.0) * np.array(axis)).as_matrix()
+        turned = Trajectory.from_matrices(truth.stamps, turn @ truth.matrices())
+        figures, _ = judged(truth, turned, alignment="posyaw")
+        assert figures["rot_rmse_deg"] == pytest.approx(expected, abs=1.5)
+
+
+def test_a_turned_body_and_a_late_clock_name_their_options() -> None:
+    truth = walk(400)
+    camera = truth.matrices() @ np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    _, notes = judged(truth, Trajectory.from_matrices(truth.stamps, camera))
+    assert any("by --axes and --truth-axes, or say where" in note for note in notes)
+    _, notes = judged(truth, at(truth, truth.stamps + 300_000_000))
+    assert any(note.endswith("shift it by --time-offset") for note in notes)
+    assert judged(truth, truth)[1] == []
 
 
 FRAMES = np.arange(0, 400) * 50_000_000 + START
@@ -150,15 +173,18 @@ def test_coverage_that_is_missed_names_the_images() -> None:
     assert judged(truth, part, truth.stamps[20:370])[0]["failed"] == []
 
 
-def test_a_sparse_truth_names_the_option() -> None:
+def test_a_truth_as_sparse_as_the_estimate_names_the_option() -> None:
+    """A sparse truth of a dense estimate is compared at its own stamps."""
     truth = walk(400, start=START)
+    late = at(truth, truth.stamps + 310_000_000)
+    sparse = truth.take(slice(0, None, 20))
     with pytest.raises(
-        ValueError, match=r"1 s apart \(median\); --max-difference 0.6s lets them c"
+        ValueError, match=r"1 s apart \(median\).*; --max-difference 0.6s lets them"
     ):
-        judged(truth.take(slice(0, None, 20)), at(truth, truth.stamps + 310_000_000))
-    every = at(truth, truth.stamps + 310_000_000).take(slice(0, 370))
-    figures, _ = judged(truth.take(slice(0, None, 20)), every, max_difference=0.6)
-    assert figures["compared"] == 370
+        judged(sparse, late.take(slice(0, 380, 20)))
+    figures, _ = judged(sparse, late.take(slice(0, 380, 20)), max_difference=0.6)
+    assert figures["compared"] == 19
+    assert judged(sparse, truth)[0]["compared"] == 20
 
 
 CLOCK = walk(50).stamps + SECOND  # of a run, from its beginning
@@ -168,11 +194,15 @@ UNIX = CLOCK + START
 @pytest.mark.parametrize(
     ("truth", "estimate", "why"),
     [
-        (UNIX, CLOCK, "one is Unix time, the other counts from a beginning; see --time-offset"),
+        (UNIX, CLOCK, "one is Unix time, the other counts from a beginning"),
         (CLOCK, CLOCK * 10**3, "are the stamps of the estimate in milliseconds, and read as sec"),
         (CLOCK, CLOCK * 10**6, "are the stamps of the estimate in microseconds, and read as sec"),
         (CLOCK * 10**6, CLOCK, "are the stamps of the truth in microseconds, and read as seconds?"),
-        (UNIX, UNIX + 10**13, "found 1700010001.000 to 1700010003.450 s; see --time-offset"),
+        (
+            UNIX,
+            UNIX + 10**13,
+            "found 1700010001.000 to 1700010003.450 s; with -10000.0000 s added to its st",
+        ),
         (UNIX, [0], "expected stamps, found that all are zero: the sender sets none"),
     ],
 )
@@ -232,7 +262,7 @@ def test_rows_in_memory_are_read_as_a_file_of_them() -> None:
     rows[30, 7] = 3.0
     with pytest.raises(ValueError, match="estimate: row 30: expected a quaternion of length 1"):
         visnav.judge(truth, rows)
-    with pytest.warns(UserWarning, match="estimate: positions without orientations"):
+    with pytest.warns(UserWarning, match="estimate: it has no orientations"):
         figures = visnav.judge(truth, rows[40:, :4]).figures["estimate"]
     assert figures["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
 

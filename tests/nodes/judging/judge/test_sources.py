@@ -190,7 +190,7 @@ def test_no_time_in_common_fails_and_says_why(tmp_path: Path) -> None:
     later = Trajectory(truth.stamps + 10**18, truth.positions, truth.orientations)
     found = judged(tmp_path, truth, later).figures
     assert "ate_rmse_m" not in found
-    assert "one is Unix time, the other counts from a beginning; see --time-offset" in found["why"]
+    assert "one is Unix time, the other counts from a beginning" in found["why"]
 
 
 def test_a_truth_too_sparse_to_judge_by_is_an_error(tmp_path: Path) -> None:

@@ -168,7 +168,7 @@ def test_fixes_are_places_east_north_and_up_of_the_first(tmp_path: Path) -> None
     expected = np.delete(POSE.positions - POSE.positions[0], 5, axis=0)
     assert source.poses.positions == pytest.approx(expected, abs=1e-4)  # on an ellipsoid
     assert source.axes == Axes("enu")
-    assert source.notes == ("left out: 1 row without a pose", "positions without orientations")
+    assert source.notes == ("left out: 1 row without a pose",)
 
 
 def test_a_topic_of_ros_1_has_no_slash(tmp_path: Path) -> None:

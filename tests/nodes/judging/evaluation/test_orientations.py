@@ -1,0 +1,97 @@
+"""Orientations that are none of the truth's body are found by positions that fit."""
+
+from __future__ import annotations
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.spatial.transform import Rotation
+
+from nodes.judging.evaluation.judging import judge
+from nodes.judging.evaluation.orientations import examine
+from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.trajectory import Trajectory
+from tests.nodes.trajectory.samples import moved, noisy, walk
+
+TRUTH = walk(400)
+
+
+def oriented(rotations: Rotation, trajectory: Trajectory = TRUTH) -> Trajectory:
+    """Return a trajectory with other orientations."""
+    quaternions = rotations.as_quat(scalar_first=True)
+    return Trajectory(trajectory.stamps, trajectory.positions, quaternions)
+
+
+@given(seed=st.integers(0, 2**32 - 1), degrees=st.floats(6.0, 179.0), scale=st.floats(0.2, 5.0))
+@settings(max_examples=30, deadline=None)
+def test_a_constant_turn_between_bodies_is_found(seed: int, degrees: float, scale: float) -> None:
+    axis = np.random.default_rng(seed).normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis))
+    estimate = moved(oriented(TRUTH.rotations() * turn.inv()), scale, seed)
+    orientations = examine(TRUTH, estimate)
+    assert orientations is not None
+    assert orientations.kind == "turned"
+    assert orientations.degrees == pytest.approx(degrees)
+    assert orientations.spread < 1e-6
+    found = Rotation.from_quat(orientations.turn, scalar_first=True)
+    assert (found * turn).magnitude() < 1e-9  # from its body to the truth's
+
+
+def test_a_turn_is_named_by_its_axis() -> None:
+    estimate = oriented(TRUTH.rotations() * Rotation.from_euler("x", 180, degrees=True))
+    orientations = examine(TRUTH, estimate)
+    assert orientations is not None
+    assert "turned by 180.0° about x against the truth's" in orientations.text()
+    optical = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    orientations = examine(TRUTH, oriented(TRUTH.rotations() * optical))
+    assert orientations is not None
+    assert "turned by 120.0° about (0.58, 0.58, 0.58)" in orientations.text().replace("-", "")
+
+
+def test_an_estimate_with_noise_and_drift_is_of_the_same_body() -> None:
+    orientations = examine(TRUTH, moved(noisy(TRUTH)))
+    assert orientations is not None
+    assert (orientations.kind, orientations.text()) == ("same", "")
+
+
+SENT = moved(TRUTH)
+ODD = {
+    "inverse": oriented(SENT.rotations().inv(), SENT),
+    "order": Trajectory(SENT.stamps, SENT.positions, np.roll(SENT.orientations, 1, axis=1)),
+    "estimate without": oriented(Rotation.identity(len(TRUTH)), SENT),
+    "other": oriented(Rotation.random(len(TRUTH), rng=np.random.default_rng(1)), SENT),
+}
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_figures_of_orientations_that_are_none_are_left_out(kind: str) -> None:
+    record = EstimatorRecord.of(ODD[kind])
+    judgement = judge(record, TRUTH, alignment="se3")
+    assert judgement.orientations is not None
+    assert judgement.orientations.kind == kind
+    assert judgement.figures["ate_rmse_m"] < 1e-9
+    for name in ("rot_rmse_deg", "heading_rmse_deg", "rpe_1m_trans_percent", "end_error_percent"):
+        assert name not in judgement.figures
+    assert judgement.figures["why_no_rotations"] in judgement.note
+
+
+def test_a_truth_of_positions_only_judges_positions_only() -> None:
+    truth = oriented(Rotation.identity(len(TRUTH)))
+    judgement = judge(EstimatorRecord.of(noisy(TRUTH)), truth, alignment="se3")
+    assert "rot_rmse_deg" not in judgement.figures
+    assert "the truth has no orientations" in judgement.note
+    assert judgement.figures["ate_rmse_m"] < 0.1
+
+
+def test_nothing_is_said_where_positions_do_not_fit_or_lie_on_a_line() -> None:
+    assert examine(TRUTH, walk(400, seed=5)) is None
+    line = Trajectory(TRUTH.stamps, np.outer(np.arange(400.0), [1.0, 0.0, 0.0]), TRUTH.orientations)
+    assert examine(line, line) is None
+
+
+def test_a_vehicle_that_never_turns_is_judged_as_ever() -> None:
+    still = Trajectory(TRUTH.stamps, TRUTH.positions, np.tile([1.0, 0.0, 0.0, 0.0], (400, 1)))
+    judgement = judge(EstimatorRecord.of(still), still, alignment="se3")
+    assert judgement.figures["rot_rmse_deg"] < 1e-6
+    assert judgement.note == ""
