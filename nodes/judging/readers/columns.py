@@ -51,7 +51,9 @@ _QUATERNION = (
     re.compile(r"(?:q|quat|quaternion)(?:_\w+)?_?([wxyz])"),
     re.compile(r"(?:.*[._])?(?:orientation|rotation|quaternion)[._]([wxyz])"),
 )
-_NO_QUATERNION = re.compile(r"(?:q|quat|quaternion|.*orientation)[._\[]?\w?")  # q0, q1, …
+_NO_QUATERNION = re.compile(  # q0, q1, …; i, j, k, w; rx, ry, rz, rw
+    r"(?:q|quat|quaternion|.*orientation)[._]?\w?|[ijkw]|(?:r|o|rot)_?w"
+)
 _VELOCITY = re.compile(r"v_(?:\w+)_[rw]_([xyz])")  # of a frame in a world: v_RS_R_x, v_WS_W_x
 
 

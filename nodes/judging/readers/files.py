@@ -257,6 +257,7 @@ READERS = (
         axes="`ned`",
         matches=_is_airsim,
         read=_read_airsim,
+        part="vehicle",
     ),
     Reader(
         name="OpenVINS, states",

@@ -108,6 +108,7 @@ class Reader(msgspec.Struct, frozen=True, kw_only=True):
         axes: What it declares of its axes, in words.
         matches: Whether a path is of this format; `Start` is `None` of what is no text.
         read: Reader of such a path; raises `ValueError` with the file and the line.
+        part: What `Options.part` is, such as a topic; "" if a path is one trajectory.
     """
 
     name: str
@@ -117,6 +118,7 @@ class Reader(msgspec.Struct, frozen=True, kw_only=True):
     axes: str
     matches: Callable[[Path, Start | None], bool]
     read: Callable[[Path, Options], Source]
+    part: str = ""
 
 
 def words(line: str) -> list[str]:

@@ -174,6 +174,7 @@ def _estimate_of(run: Path) -> Path:
 def _read(path: Path, options: Options) -> Source:
     start = None if path.is_dir() else Start.of(path)
     if options.columns and start is not None and not bags_in(path):
+        _check_part(path, options, "named columns", "")
         return read_named(path, options)
     match = _matching(path, start)
     if match is None:
@@ -185,6 +186,7 @@ def _read(path: Path, options: Options) -> Source:
             )
         refuse(path, start)
     offer, reader = match
+    _check_part(path, options, reader.name, reader.part)
     try:
         return reader.read(path, options)
     except (ValueError, OSError):
@@ -193,6 +195,14 @@ def _read(path: Path, options: Options) -> Source:
         if offer.package == OURS:
             raise
         raise ValueError(f"{path}: {_blame(offer, reader, error)}") from error
+
+
+def _check_part(path: Path, options: Options, name: str, part: str) -> None:
+    if options.part and not part:
+        raise ValueError(
+            f"{path}: expected nothing after a file of one trajectory ({name}), found "
+            f"{options.part!r}"
+        )
 
 
 def _check_steps(source: Source) -> None:

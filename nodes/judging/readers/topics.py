@@ -329,5 +329,6 @@ READERS = (
         axes="world ENU in `map`, else z up; body FLU, or optical by its name (REP 103)",
         matches=_is_bag,
         read=read_topic,
+        part="topic",
     ),
 )

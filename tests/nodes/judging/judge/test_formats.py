@@ -196,6 +196,8 @@ def test_other_columns_are_left_alone(name: str) -> None:
     ("header", "message"),
     [
         ("t,x,y,z,q0,q1,q2,q3", r"with w, x, y, z in their names, .*, found q0, q1, q2, q3"),
+        ("t,x,y,z,i,j,k,w", r"four columns of a quaternion .*, found i, j, k, w"),
+        ("t,x,y,z,rx,ry,rz,rw", r"four columns of a quaternion .*, found rw"),
         ("t,x,y,z,qx,qy,qz,q", r"four columns of a quaternion .*, found qx, qy, qz"),
     ],
 )

@@ -131,6 +131,15 @@ def test_a_file_that_is_not_there_is_named(missing: str, tmp_path: Path) -> None
     assert (done.returncode, done.stderr) == (2, "error: nothing: No such file or directory\n")
 
 
+@pytest.mark.parametrize("columns", ["", "sec x y z qx qy qz qw"])
+def test_a_topic_of_a_file_is_refused(columns: str, tmp_path: Path) -> None:
+    write_tum(tmp_path / "t", walk(5))
+    with pytest.raises(
+        ValueError, match=r"t: expected nothing after a file of one .*, found '/odom'"
+    ):
+        read(f"{tmp_path / 't'}:/odom", columns=columns)
+
+
 def test_kittis_poses_and_stamps_are_as_many(tmp_path: Path) -> None:
     write_all(tmp_path / "k", walk(5))
     (tmp_path / "times").write_text("0\n1\n2\n")
