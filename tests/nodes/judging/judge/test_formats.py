@@ -150,6 +150,7 @@ SPELLINGS = {
 }
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(max_examples=60, deadline=None)
 def test_columns_are_found_in_any_order_by_any_name(data: st.DataObject) -> None:
@@ -385,6 +386,7 @@ def test_an_alignment_is_left_out_only_if_both_are_in_map(
     assert figures["alignment"] == usual
 
 
+@pytest.mark.slow
 def test_covariances_of_openvins_are_of_the_body_and_judged(tmp_path: Path) -> None:
     """The rotation's are about the body's axes: a long axis of the body turns with it."""
     truth = walk(400, start=START)
