@@ -115,11 +115,15 @@ class Run:
         return figures
 
     def __repr__(self) -> str:
+        from runtime.units import significant
+
         states = {True: "passed", False: "failed", None: "not judged"}
         found = []
         for name, figures in self.figures.items():
             ate = figures.get("ate_percent")
-            error = "" if ate is None else f", ATE {ate:.3g} % of the path ({figures['alignment']})"
+            error = ""
+            if ate is not None:
+                error = f", ATE {significant(ate, 3)} % of the path ({figures['alignment']})"
             missed = "".join(f", {reason}" for reason in figures.get("failed", ()))
             found.append(f"{name} {states[figures['passed']]}{error}{missed}")
         where = "" if self.folder is None else f" in {self.folder}"
@@ -336,29 +340,53 @@ def judge(
     truth: str | Path | npt.NDArray[np.float64] | Trajectory,
     estimates: Any,
     *,
+    final: Any = None,
     alignment: str = "auto",
+    align_first: int | str | None = None,
     scale_free: bool = False,
     axes: str | None = None,
-    thresholds: Mapping[str, float] | None = None,
+    truth_axes: str | None = None,
+    columns: str = "",
+    truth_columns: str = "",
+    times: str | Path = "",
+    time_offset: float | str = 0.0,
     frames: str | Path | npt.NDArray[np.int64] | None = None,
+    max_difference: float | str = 0.1,
+    gap: float | str = 0.5,
+    body_from_camera: str | npt.NDArray[np.float64] | None = None,
+    thresholds: Mapping[str, float] | None = None,
     out: str | Path | None = None,
 ) -> Run:
     """Judge trajectories that somebody else computed, as a run judges its estimators.
 
     An estimator that was lost for most of a sequence does not look good: poses for 90 % of the
-    images, or of the truth's time, are asked for by default, and shares of it are figures.
+    flight's time, and with `frames` for 30 % of the images, are asked for by default, and shares of
+    it are figures. Arguments are the options of the command ``judge``.
 
     Args:
-        truth: A trajectory: a file (TUM, EuRoC, KITTI, VSLAM-LAB), ``BAG:/TOPIC``, the folder of a
-            run, a `Trajectory`, or an array of TUM's rows, shape (n, 8): seconds, x, y, z in
-            metres, and a quaternion x, y, z, w.
+        truth: A trajectory: a file (TUM, EuRoC, KITTI, VINS, OpenVINS, AirSim, …), ``BAG:/TOPIC``,
+            the folder of a run, a `Trajectory`, or an array of TUM's rows, shape (n, 8): seconds,
+            x, y, z in metres, and a quaternion x, y, z, w; or (n, 4), without the quaternion.
         estimates: One, named after its file or ``estimate``; or several by name.
-        alignment: ``auto``, ``none``, ``origin``, ``se3`` or ``sim3``; see the command ``judge``.
+        final: Trajectories after loop closures, by the names of their estimates; or one, of the
+            only estimate.
+        alignment: ``auto``, ``none``, ``origin``, ``posyaw``, ``se3`` or ``sim3``; see the command.
+        align_first: Poses (a number) or time (``"5s"``) that the alignment fits; by default all.
         scale_free: Whether the estimates' unit of length is their own.
-        axes: Of estimates from files, if not their format's: ned, nwu, enu or optical.
-        thresholds: What figures may be: ``{"ate_percent": 1}``.
+        axes: Of the estimates, instead of what they declare: ned, nwu, enu or optical.
+        truth_axes: Of the truth, likewise.
+        columns: Meaning of the columns of the estimates' files: ``"sec x y z qw qx qy qz"``.
+        truth_columns: Of the truth's, likewise.
+        times: File of the stamps of poses without any, such as KITTI's.
+        time_offset: Added to the estimates' stamps: seconds, or a text as ``"-30ms"``.
         frames: Stamps of the images, for the share of them that have a pose: a file, or
-            nanoseconds, shape (n,).
+            nanoseconds, shape (n,), strictly rising.
+        max_difference: From a time to the nearest true pose in a hole of the truth: seconds, or
+            ``"100ms"``.
+        gap: Silence that counts as lost, likewise; more for files of key frames.
+        body_from_camera: Optical frame in the truth's body, if the estimates are a camera's: as in
+            the command, or a transform of shape (4, 4).
+        thresholds: What figures may be: ``{"ate_percent": 1}``.
         out: Folder for figures and report; if not given, nothing is written.
 
     Raises:
@@ -367,35 +395,61 @@ def judge(
         ConfigError: A setting is wrong.
     """
     _check_runtime()
+    import numpy as np
+
     from nodes.judging import judgement
     from runtime.config.reading import convert
 
     config = convert(
         {
             "alignment": alignment,
+            "align_first": align_first,
             "scale_free": scale_free,
             "axes": axes,
+            "truth_axes": truth_axes,
+            "columns": columns,
+            "truth_columns": truth_columns,
+            "time_offset": time_offset,
+            "max_difference": max_difference,
+            "gap": gap,
             "thresholds": dict(thresholds or {}),
         },
         judgement.JudgeConfig,
         "judge",
     )
+    camera = None
+    if isinstance(body_from_camera, str) and body_from_camera:
+        camera = judgement.read_mounting(body_from_camera, str(truth))
+    elif body_from_camera is not None and not isinstance(body_from_camera, str):
+        camera = judgement.mounting_of(np.asarray(body_from_camera, np.float64))
+
+    def read(trajectory: Any, name: str) -> judgement.Source:
+        if isinstance(trajectory, str | Path):
+            text = f"{name}={trajectory}" if name else str(trajectory)
+            return judgement.read(text, config.axes, str(times), camera, columns=config.columns)
+        name = name or "estimate"
+        return judgement.of_memory(name, trajectory, config.axes, camera)
+
     true = (
-        judgement.read_truth(str(truth), "")
+        judgement.read_truth(
+            str(truth), str(times), config.truth_axes, columns=config.truth_columns
+        )
         if isinstance(truth, str | Path)
-        else judgement.Source(name="truth", file="truth", poses=_trajectory(truth, "truth"))
+        else judgement.of_memory("truth", truth, config.truth_axes)
     )
     named = estimates if isinstance(estimates, Mapping) else {"": estimates}
-    found = []
-    for name, each in named.items():
-        if isinstance(each, str | Path):
-            text = f"{name}={each}" if name else str(each)
-            found.append(judgement.read(text, config.axes))
-        else:
-            name = name or "estimate"
-            found.append(judgement.Source(name=name, file=name, poses=_trajectory(each, name)))
-    stamps = judgement.read_stamps(Path(frames)) if isinstance(frames, str | Path) else frames
-    judgements, verdict, notes = judgement.judge_all(true, found, stamps, config)
+    sources = [read(trajectory, name) for name, trajectory in named.items()]
+    if final is not None and not isinstance(final, Mapping):
+        final = {sources[0].name: final} if len(sources) == 1 else {"final": final}
+    finals = {name: read(trajectory, name) for name, trajectory in (final or {}).items()}
+    stamps = (
+        judgement.read_stamps(Path(frames))
+        if isinstance(frames, str | Path)
+        else None
+        if frames is None
+        else np.asarray(frames)
+    )
+    true, judgements, verdict, notes = judgement.judge_all(true, sources, stamps, config, finals)
     for note in notes:
         warnings.warn(note, stacklevel=2)
     if out is not None:
@@ -446,23 +500,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return value.tolist() if hasattr(value, "tolist") else value
-
-
-def _trajectory(given: Any, name: str) -> Trajectory:
-    import numpy as np
-
-    from nodes.trajectory import Trajectory
-
-    if isinstance(given, Trajectory):
-        return given
-    rows = np.asarray(given, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 8:
-        raise ValueError(
-            f"{name}: expected a file, a Trajectory, or TUM's rows of shape (n, 8), found an array "
-            f"of shape {rows.shape}"
-        )
-    stamps = np.round(rows[:, 0] * 1e9).astype(np.int64)
-    return Trajectory(stamps, rows[:, 1:4], rows[:, [7, 4, 5, 6]])
 
 
 def main() -> None:

@@ -1,14 +1,14 @@
-"""Trajectory files: TUM, EuRoC and KITTI, read and written, VSLAM-LAB, read; rows of numbers.
+"""Trajectory files: TUM, EuRoC and KITTI, read strictly and written; rows of numbers.
 
 - TUM (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): ``timestamp tx ty tz qx qy qz qw``
   in seconds and metres, the scalar last.
 - EuRoC's ground truth (M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016):
   nanoseconds, position, quaternion with the scalar first, velocity, biases; with commas.
-- VSLAM-LAB (github.com/VSLAM-LAB/VSLAM-LAB): nanoseconds, position, the scalar last; with commas.
 - KITTI (cvlibs.net/datasets/kitti/eval_odometry.php): the first three rows of the transform from
   child to parent, row by row; no stamps, so two such files go together line by line.
 
-Written with nanoseconds, nanometres and 12 decimals of a quaternion.
+Written with nanoseconds, nanometres and 12 decimals of a quaternion. What other programs write is
+read by `nodes.judging.readers`.
 
 Files of a run grow with the run, so that a killed run lacks only its last second; those of before a
 node's restart are never overwritten.
@@ -98,15 +98,6 @@ def euroc_rows(
         yield row, row.nanoseconds(), values
 
 
-def read_vslamlab(path: Path) -> Trajectory:
-    """Read VSLAM-LAB's ``ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw``; may raise `ValueError`."""
-    rows = [
-        (row, row.nanoseconds(), row.numbers(1, 8))
-        for row in read_rows(path, ",", (8,), "ts, t x 3, qx, qy, qz, qw", header=True)
-    ]
-    return _trajectory([(row, stamp, [*v[:3], v[6], *v[3:6]]) for row, stamp, v in rows])
-
-
 def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
     """Write a EuRoC ground truth; velocities by differences, biases zero; may raise `OSError`."""
     velocities = [(x, y, z) for x, y, z in trajectory.velocities().tolist()]
@@ -130,12 +121,16 @@ def euroc_row(
     )
 
 
-def read_kitti(path: Path) -> Floats:
-    """Read a KITTI file: child to parent, (n, 4, 4); a `ValueError` names a wrong line."""
-    rows = list(read_rows(path, None, (12,), "r11 r12 r13 tx r21 … tz"))
+def read_kitti(path: Path, *, first: int = 0) -> Floats:
+    """Read a KITTI file: child to parent, (n, 4, 4); a `ValueError` names a wrong line.
+
+    Args:
+        first: Number of other fields before the twelve.
+    """
+    rows = list(read_rows(path, None, (first + 12,), "r11 r12 r13 tx r21 … tz"))
     matrices = np.zeros((len(rows), 4, 4))
     matrices[:, 3, 3] = 1.0
-    matrices[:, :3, :] = np.reshape([row.numbers(0, 12) for row in rows], (-1, 3, 4))
+    matrices[:, :3, :] = np.reshape([row.numbers(first, first + 12) for row in rows], (-1, 3, 4))
     if wrong := not_rotations(matrices[:, :3, :3]):
         rows[wrong[0]].wrong("a rotation matrix", str(matrices[wrong[0], :3, :3].tolist()))
     return matrices

@@ -67,3 +67,17 @@ def plain(value: Any) -> float | str:
     if isinstance(value, Latency) and value > LONGEST_BARE:
         return f"{float(value)!r}s"
     return float(value)
+
+
+ROUNDING = 1e-6  # least figure that is more than rounding: micrometres, millionths of a degree
+
+
+def significant(value: float, digits: int = 4) -> str:
+    """Return a figure with significant digits and no exponent; 0 below `ROUNDING`."""
+    if not math.isfinite(value):
+        return f"{value:g}"
+    if abs(value) < ROUNDING:
+        return "0"
+    decimals = digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2])
+    text = f"{round(value, decimals):.{max(decimals, 0)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text

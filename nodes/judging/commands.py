@@ -30,18 +30,33 @@ def judge(
         list[str] | None,
         typer.Option(metavar="NAME=FILE", help="The same after loop closures. May be repeated."),
     ] = None,
-    alignment: Annotated[str, typer.Option(help="auto, none, origin, se3 or sim3.")] = "auto",
+    alignment: Annotated[
+        str, typer.Option(help="auto, none, origin, posyaw, se3 or sim3.")
+    ] = "auto",
+    align_first: Annotated[
+        str, typer.Option(metavar="N", help="Poses, or a time as 5s, that it fits; else all.")
+    ] = "",
     scale_free: Annotated[
         bool, typer.Option("--scale-free", help="The estimates' unit of length is their own.")
     ] = False,
+    axes: Annotated[str, typer.Option(help="Of the estimates: ned, nwu, enu or optical.")] = "",
+    truth_axes: Annotated[str, typer.Option(help="Of the truth, likewise.")] = "",
+    columns: Annotated[
+        str, typer.Option(metavar="NAMES", help='Of estimates: "sec x y z qw qx qy qz", _ skips.')
+    ] = "",
+    truth_columns: Annotated[
+        str, typer.Option(metavar="NAMES", help="Of the truth, likewise.")
+    ] = "",
     times: Annotated[str, typer.Option(help="File of stamps of KITTI's poses.")] = "",
+    time_offset: Annotated[
+        str, typer.Option(metavar="TIME", help="Added to the estimates' stamps: seconds, or -30ms.")
+    ] = "0",
     frames: Annotated[str, typer.Option(help="File of stamps of the images, for coverage.")] = "",
     max_difference: Annotated[str, typer.Option(help="Half of a hole of the truth.")] = "100ms",
     gap: Annotated[str, typer.Option(help="Silence that counts as lost.")] = "500ms",
     body_from_camera: Annotated[
         str, typer.Option(metavar="POSE", help="Where the camera is whose poses these are.")
     ] = "",
-    axes: Annotated[str, typer.Option(help="Of the files: ned, nwu, enu or optical.")] = "",
     threshold: Annotated[
         list[str] | None,
         typer.Option(metavar="FIGURE=VALUE", help="As ate_percent=1. May be repeated."),
@@ -53,20 +68,23 @@ def judge(
 ) -> None:
     """Judge trajectories computed elsewhere, as a run judges its estimators.
 
-    Reads TUM, EuRoC, KITTI (with --times: seconds, one a line) and VSLAM-LAB files, and Path,
-    Odometry, PoseStamped and PoseWithCovarianceStamped topics of bags. Figures, report and
-    thresholds are those of a run, but for figures that need more than poses, such as latencies.
-    --frames is a times.txt, rgb.txt, rgb.csv or cam0/data.csv; without it the flight is that of the
-    truth. --final NAME=FILE is the trajectory of the estimate NAME after loop closures, judged
-    beside it.
-    Alignment is sim3 with --scale-free; otherwise none for an estimate in the frame map, origin for
-    one in another named frame, and se3 for all others. World and body are NED and FRD in TUM files;
-    z up, with the body as it is, in EuRoC and VSLAM-LAB files (nwu); those of a camera that looks
-    ahead in KITTI files (optical); enu is ENU and FLU. --axes sets the axes of other files. If
-    estimates are of a camera, --body-from-camera is its optical frame in the truth's body: "tx ty
-    tz qx qy qz qw", a TUM file with one pose, or a camera of the truth's run. Exit codes: 0; 1 if a
-    threshold is missed (by default also: poses for 90 % of the flight, orientations within 15°,
-    motions over a metre within 75 %; NAME=inf is none); 2 if an input cannot be read.
+    Reads TUM, EuRoC, KITTI (with --times), VINS, OpenVINS, OKVIS2, VSLAM-LAB, AirSim and other
+    tables whose header names the columns (or --columns), topics of bags (BAG:/odom,
+    BAG:/tf:map.base_link), and folders of runs. Figures, report and thresholds are those of a run,
+    but for figures that need more than poses, such as latencies. --frames is a times.txt, rgb.txt,
+    rgb.csv or cam0/data.csv; without it the flight is that of the truth. --final NAME=FILE is the
+    trajectory of the estimate NAME after loop closures, judged beside it.
+    Poses are taken as they stand, and the body is the same in truth and estimate, unless a source
+    declares its axes: by --axes or --truth-axes, as a run's own files (ned), as a topic (REP 103).
+    A source that declares nothing takes the declaration of the other one. ned is NED and FRD; nwu
+    is z up, with the body as it is; enu is ENU and FLU; optical are those of a camera that looks
+    ahead. If estimates are of a camera, --body-from-camera is its optical frame in the truth's
+    body: "tx ty tz qx qy qz qw", a TUM file with one pose, or a camera of the truth's run.
+    Alignment is sim3 with --scale-free; none if truth and estimate are both in the frame map;
+    origin for an estimate in another named frame and a truth in map; and se3 for all others. Exit
+    codes: 0; 1 if a threshold is missed (by default also: poses for 90 % of the flight,
+    orientations within 15°, motions over a metre within 75 %; NAME=inf is none); 2 if an input
+    cannot be read.
     """
     from rich.console import Console
 
@@ -79,24 +97,37 @@ def judge(
 
     with writing(name, junit, json) as outcomes:
         try:
-            said = {
+            settings = {
                 "alignment": alignment,
+                "align_first": int(align_first) if align_first.isdecimal() else align_first or None,
                 "scale_free": scale_free,
                 "axes": axes or None,
+                "truth_axes": truth_axes or None,
+                "columns": columns,
+                "truth_columns": truth_columns,
+                "time_offset": time_offset,
                 "max_difference": max_difference,
                 "gap": gap,
                 "thresholds": {
                     k: given(v) for k, _, v in (t.partition("=") for t in threshold or ())
                 },
             }
-            config = convert(said, judgement.JudgeConfig, "judge")
-            true = judgement.read_truth(truth, times)
+            config = convert(settings, judgement.JudgeConfig, "judge")
+            true = judgement.read_truth(
+                truth, times, config.truth_axes, columns=config.truth_columns
+            )
             camera = judgement.read_mounting(body_from_camera, truth) if body_from_camera else None
-            found = [judgement.read(each, config.axes, times, camera) for each in estimate]
+            estimates, finals = (
+                [
+                    judgement.read(text, config.axes, times, camera, columns=config.columns)
+                    for text in texts
+                ]
+                for texts in (estimate, final or ())
+            )
             stamps = judgement.read_stamps(Path(frames)) if frames else None
-            corrected = [judgement.read(each, config.axes, times, camera) for each in final or ()]
-            finals = {each.name: each.poses for each in corrected}
-            judgements, verdict, notes = judgement.judge_all(true, found, stamps, config, finals)
+            true, judgements, verdict, notes = judgement.judge_all(
+                true, estimates, stamps, config, {source.name: source for source in finals}
+            )
             page = judgement.write(Path(out or f"judged/{name}"), true, judgements, verdict, notes)
             outcomes += of_verdict(name, verdict)
         except ValueError as error:
@@ -197,7 +228,7 @@ def vslamlab(
         config = convert(
             {"scale_free": mode == "mono", "gap": "2s"}, judgement.JudgeConfig, "judge"
         )
-        truth = judgement.read_truth(str(sequence / "groundtruth.csv"), "")
+        truth = judgement.read_truth(str(sequence / "groundtruth.csv"))
         images = judgement.read_stamps(sequence / "rgb.csv")
         camera = judgement.read_mounting(body_from_camera, "") if body_from_camera else None
         runs.mkdir(parents=True, exist_ok=True)
@@ -206,12 +237,12 @@ def vslamlab(
             given = arguments(sequence, run, mode, settings, dashes=dashes)
             try:
                 path = run_once([*command, *given], run, limit)
-                source = judgement.read(f"{run.name}={path}", None, "", camera)
+                source = judgement.read(f"{run.name}={path}", camera=camera)
                 judgement.judge_all(truth, [source], images, config)  # raises, of another flight
                 found.append(source)
             except ValueError as error:
                 failed[run.name] = {"passed": False, "failure": str(error)}
-        judgements, verdict, notes = judgement.judge_all(truth, found, images, config)
+        truth, judgements, verdict, notes = judgement.judge_all(truth, found, images, config)
         errors = [each.figures.get("ate_rmse_m", np.nan) for each in judgements.values()]
         if np.isfinite(errors).any():  # of two key frames there is none
             least, middle, most = np.nanpercentile(errors, [0, 50, 100])

@@ -1,60 +1,65 @@
-"""Evaluation of trajectories from outside a run: their sources, common truth, and results.
+"""Evaluation of trajectories from outside a run: common axes and truth, and results.
 
 The figures are those of an evaluation, but for those of arrivals: latencies, errors at control
-ticks and future stamps.
-
-A file's format is recognized by its content; its axes are the user's word, or the format's habit
-(`AXES`). Messages of a topic are read in our frames (`nodes.ros2.messages.incoming`); of
-``nav_msgs/msg/Path`` the last one counts.
+ticks and future stamps. What is read, and how, is a table: `nodes.judging.readers`.
 """
 
 from __future__ import annotations
 
-import contextlib
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import PoseEstimate
-from events.frames import Axes as EventAxes
-from events.frames import axes_of
 from nodes.data.export import mounting
-from nodes.data.replay.bags import chosen, open_bag, readable
-from nodes.data.replay.reader import BagTopic
 from nodes.judging.evaluation.alignment import AlignmentMethod
 from nodes.judging.evaluation.judging import Judgement, judge
 from nodes.judging.evaluation.node import EvaluationConfig
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.verdict import FRAMES, conclude, write_results
+from nodes.judging.evaluation.verdict import FRAMES, Thresholds, conclude, write_results
+from nodes.judging.readers import (
+    AXES,
+    Axes,
+    AxesName,
+    Collected,
+    Source,
+    complaints,
+    of_body,
+    read,
+    read_truth,
+    to_common_axes,
+)
+from nodes.judging.readers.files import stamp_rows
 from nodes.judging.report.page import write_report
 from nodes.judging.report.tables import COLORS, Estimator, Facts, Run, Verdict
-from nodes.ros2.messages.incoming import MessageContext
-from nodes.ros2.messages.mappings import READERS
-from nodes.ros2.messages.typestore import Bag
-from nodes.trajectory import Trajectory
-from nodes.trajectory_files import (
-    Row,
-    read_euroc,
-    read_kitti,
-    read_rows,
-    read_tum,
-    read_vslamlab,
-    write_tum,
-)
+from nodes.kalibr import mounting_of_kalibr
+from nodes.trajectory import Trajectory, not_rotations
+from nodes.trajectory_files import Row, read_tum, write_tum
+from runtime import Duration
 from runtime.commit import commit
 from runtime.errors import ResultsError
 from runtime.paths import source_file
 from runtime.run import results
-from runtime.run.results import newest, run_folder
+from runtime.run.results import newest
 from runtime.run.sources import content_hash
 from runtime.run.summarise import command_line, environment
 from runtime.time.clock import SECOND
+
+__all__ = [
+    "JudgeConfig", "Source", "in_memory", "judge_all", "mounting_of", "of_memory", "read",
+    "read_mounting", "read_stamps", "read_truth", "write",
+]  # fmt: skip
+
+Floats = npt.NDArray[np.float64]
+Stamps = npt.NDArray[np.int64]
+
+IMAGES_PERCENT = 30.0
+"""Share of the images with a pose that is asked for where their stamps are given, but for files of
+key frames (a longer ``gap``): an estimator may skip two images of three, not eight of nine."""
 
 
 class JudgeConfig(EvaluationConfig):
@@ -62,64 +67,274 @@ class JudgeConfig(EvaluationConfig):
 
     Attributes:
         scale_free: Whether the estimates' unit of length is their own.
-        axes: Those of the estimates' files; see `nodes.judging.judgement.AXES`.
+        columns: Meaning of the columns of the estimates' text files: ``sec x y z qw qx qy qz``.
+        truth_columns: Likewise of the truth's.
+        axes: Those of the estimates; see `nodes.judging.readers.AXES`. By default, what they
+            declare, or else the truth's.
+        truth_axes: Likewise of the truth.
+        time_offset: Added to the estimates' stamps: seconds, or a text as ``-30ms``.
     """
 
     scale_free: bool = False
-    axes: Axes | None = None
+    columns: str = ""
+    truth_columns: str = ""
+    axes: AxesName | None = None
+    truth_axes: AxesName | None = None
+    time_offset: float | str = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        offset_of(self.time_offset)
+
+
+def offset_of(given: float | str) -> int:
+    """Return nanoseconds of seconds, or of a text as ``-30ms``; a `ValueError` if it is neither."""
+    sign, size = 1, given
+    if isinstance(given, str):
+        text = given.strip()
+        sign, size = (-1 if text.startswith("-") else 1), text.lstrip("+-")
+        try:
+            size = float(size)
+        except ValueError:
+            size = str(size)
+    elif given < 0:
+        sign, size = -1, -given
+    try:
+        return sign * round(Duration.parse(size) * SECOND)
+    except ValueError as error:
+        raise ValueError(f"time_offset: {error}, after a sign or none; found {given!r}") from None
 
 
 def judge_all(
     truth: Source,
     estimates: Sequence[Source],
-    frames: npt.NDArray[np.int64] | None,  # stamps of the images (ns), if known
+    frames: Stamps | None,  # stamps of the images (ns), if known
     config: JudgeConfig,
-    finals: Mapping[str, Trajectory] = MappingProxyType({}),
-) -> tuple[dict[str, Judgement], Verdict, list[str]]:
+    finals: Mapping[str, Source] = MappingProxyType({}),
+) -> tuple[Source, dict[str, Judgement], Verdict, list[str]]:
     """Judge estimates against the truth, at the stamps of the images if known.
 
     Args:
         finals: The trajectories after loop closures, by estimate.
 
     Returns:
-        Judgements by name, the verdict, and notes on exclusions.
+        The truth in the report's axes, judgements by name, the verdict, and notes on what was left
+        out.
 
     Raises:
-        ValueError: A name is not unique, an estimate is nowhere near a true pose in time, or a
-            final trajectory names no estimate.
+        ValueError: A name is not unique, an estimate is nowhere near a true pose in time, a final
+            trajectory names no estimate, images are at other times than the truth, or axes are not
+            known.
     """
     names = [source.name for source in estimates]
     if strangers := finals.keys() - {*names}:
         raise ValueError(
             f"final: expected the name of an estimate ({', '.join(names)}), found {min(strangers)}"
         )
+    if frames is not None:
+        _check_frames(truth, frames)
     judgements: dict[str, Judgement] = {}
-    notes = []
-    for source in estimates:
+    notes = [*complaints(), *(f"truth: {note}" for note in truth.notes)]
+    notes += _without_axes(truth, estimates, config)
+    truth, moved = to_common_axes(
+        truth, [*estimates, *finals.values()], worlds_matter=config.alignment == "none"
+    )
+    moved = [_later(source, offset_of(config.time_offset)) for source in moved]
+    corrected = dict(zip(finals, moved[len(estimates) :], strict=True))
+    for source in moved[: len(estimates)]:
         if source.name in {*judgements, "truth", "plan"}:
             raise ValueError(f"{source.file}: expected a name of its own, NAME={source.file}")
-        by_frame: dict[str, AlignmentMethod] = {"": "se3", "map": "none"}
-        usual = "sim3" if config.scale_free else by_frame.get(source.frame_id, "origin")
-        record = EstimatorRecord.of(source.poses)
-        record.final = finals.get(source.name)
-        judgement = judge(
-            record,
-            truth.poses,
-            cameras=None if frames is None else {"": frames},
-            alignment=usual if config.alignment == "auto" else config.alignment,
-            align_first=config.alignment_span(),
-            gap=config.gap,
-            hole=config.hole,
-        )
-        if not judgement.figures["compared"] and truth.poses.covers(source.poses.stamps).any():
-            raise ValueError(f"{source.file}: {judgement.figures['why']}")
-        unknown = {"restarts", "repeated_stamps", "future_stamps", "other_bodies"}
-        figures = {k: v for k, v in judgement.figures.items() if k not in unknown} | source.counts
-        figures["method"] = source.file
-        judgements[source.name] = msgspec.structs.replace(judgement, figures=figures)
+        final = corrected.get(source.name)
+        judgement = _judge_one(truth, source, final, frames, config)
+        judgements[source.name] = judgement
+        for one in [source] if final is None else [source, final]:
+            notes += [f"{source.name}: {note}" for note in one.notes]
         notes += [f"{source.name}: {judgement.note}"] if judgement.note else []
-    verdict = conclude({k: j.figures for k, j in judgements.items()}, config.thresholds)
-    return judgements, msgspec.convert(verdict, Verdict), notes
+    verdict = _conclude(judgements, config, known=frames is not None)
+    return truth, judgements, verdict, notes
+
+
+def _without_axes(truth: Source, estimates: Sequence[Source], config: JudgeConfig) -> Iterator[str]:
+    """Yield a sentence where given axes change nothing, as the other side declares none."""
+    if config.axes and truth.axes == Axes():
+        yield (
+            f"truth: declares no axes, so those of the estimates (--axes {config.axes}) are taken "
+            "for its own; if they are not, say which by --truth-axes"
+        )
+    for source in estimates:
+        if config.truth_axes and source.axes == Axes():
+            yield (
+                f"{source.name}: declares no axes, so those of the truth (--truth-axes "
+                f"{config.truth_axes}) are taken for its own; if they are not, say which by --axes"
+            )
+
+
+def _judge_one(
+    truth: Source,
+    source: Source,
+    final: Source | None,
+    frames: Stamps | None,
+    config: JudgeConfig,
+) -> Judgement:
+    record = EstimatorRecord.of(source.poses)
+    record.final = None if final is None else final.poses
+    for stamp, row in _rows(source, source.covariances):
+        record.covariances.add(stamp, row)
+    for stamp, row in _rows(source, source.velocities):
+        record.velocities.add(stamp, row)
+    judgement = judge(
+        record,
+        truth.poses,
+        cameras=None if frames is None else {"": frames},
+        alignment=_usual(truth, source, config) if config.alignment == "auto" else config.alignment,
+        align_first=config.alignment_span(),
+        gap=config.gap,
+        hole=config.hole,
+    )
+    figures = judgement.figures
+    if not figures["compared"]:
+        figures = {**figures, "why": _why_not(truth, source, figures["why"])}
+    unknown = {"restarts", "repeated_stamps", "future_stamps", "other_bodies"}
+    figures = {k: v for k, v in figures.items() if k not in unknown} | source.counts
+    figures["method"] = source.file
+    note = "; ".join(filter(None, (judgement.note, _option_for(judgement))))
+    return msgspec.structs.replace(judgement, figures=figures, note=note)
+
+
+def _option_for(judgement: Judgement) -> str:
+    """Return the options that mend what a judgement says of bodies and clocks, if it does."""
+    options = {
+        "turned": "declare the axes of both by --axes and --truth-axes, or say where the camera "
+        "is by --body-from-camera",
+        "order": "name the columns by --columns",
+    }
+    orientations = judgement.orientations
+    hints = [options.get(orientations.kind, "")] if orientations is not None else []
+    if "added to its stamps it would fit" in judgement.note:
+        hints.append("shift it by --time-offset")
+    return "; ".join(filter(None, hints))
+
+
+def _why_not(truth: Source, source: Source, why: str) -> str:
+    """Return why nothing is compared, with the option that may be meant, or raise `ValueError`."""
+    if truth.poses.covers(source.poses.stamps).any():
+        step = truth.poses.step() / SECOND
+        if "max_difference" in why:
+            why += f"; --max-difference {np.ceil(step * 60) / 100:g}s lets them count"
+        raise ValueError(f"{source.file}: {why}")
+    _, fits, offset = why.partition("; with ")
+    return _no_common_time(truth, source) + (f"{fits}{offset} (--time-offset)" if fits else "")
+
+
+def _usual(truth: Source, source: Source, config: JudgeConfig) -> AlignmentMethod:
+    """Return how an estimate is laid on the truth: as in a run where both name their frames."""
+    if config.scale_free:
+        return "sim3"
+    oriented = not (truth.positions_only or source.positions_only)
+    if truth.frame_id != "map" or not source.frame_id or not oriented:
+        return "se3"
+    return "none" if source.frame_id == "map" else "origin"
+
+
+def _later(source: Source, offset: int) -> Source:
+    """Return a source with an offset (ns) added to its stamps."""
+    poses = source.poses
+    poses = Trajectory(poses.stamps + offset, poses.positions, poses.orientations)
+    return msgspec.structs.replace(source, poses=poses) if offset else source
+
+
+def _rows(source: Source, values: Floats | None) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Yield stamps and rows of what some of the poses have."""
+    if values is not None:
+        rows = values.reshape(len(values), -1)
+        known = np.isfinite(rows).all(axis=1)
+        stamps = source.poses.stamps[known].tolist()
+        yield from zip(stamps, map(tuple, rows[known].tolist()), strict=True)
+
+
+def _conclude(judgements: dict[str, Judgement], config: JudgeConfig, *, known: bool) -> Verdict:
+    """Return the verdict; a missed coverage names the option that may be meant."""
+    figures = {name: judgement.figures for name, judgement in judgements.items()}
+    own: dict[str, Thresholds] = {}
+    asked = msgspec.structs.asdict(config.thresholds)["frame_coverage_percent"]
+    if known and asked is None and config.gap <= _USUAL_GAP:
+        few = msgspec.structs.replace(config.thresholds, frame_coverage_percent=IMAGES_PERCENT)
+        own = {
+            name: few
+            for name, each in figures.items()
+            if each["frame_coverage_percent"] < IMAGES_PERCENT
+        }
+    verdict = conclude(figures, config.thresholds, own=own)
+    hints = {
+        "frame_coverage_percent": "of key frames only, set --gap; else say what is enough by "
+        "--threshold frame_coverage_percent=…",
+    }
+    if not known:
+        hints["coverage_percent"] = (
+            "of the truth's time; if the images cover less of it, name their stamps with --frames"
+        )
+    for each in verdict["estimators"].values():
+        each["failed"] = [
+            f"{text} ({hints[name]})" if (name := text.partition(":")[0]) in hints else text
+            for text in each["failed"]
+        ]
+    return msgspec.convert(verdict, Verdict)
+
+
+_USUAL_GAP = JudgeConfig().gap
+_CALENDAR = 10**17  # least stamp (ns) taken for Unix time (1973)
+_UNITS = {"seconds": 1.0, "milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+
+
+def _no_common_time(truth: Source, source: Source) -> str:
+    """Return why nothing can be compared: another unit, another clock, no stamps at all."""
+    first, last = truth.poses.stamps[[0, -1]].tolist()
+    begin, end = source.poses.stamps[[0, -1]].tolist()
+    spans = (
+        f"expected poses within the truth's time, {first / SECOND:.3f} to {last / SECOND:.3f} s, "
+        f"found {begin / SECOND:.3f} to {end / SECOND:.3f} s"
+    )
+    if not begin and not end:
+        return "expected stamps, found that all are zero: the sender sets none"
+    for one, other in ((source, truth), (truth, source)):
+        for unit, scale in _UNITS.items():
+            if unit == "seconds" or one.poses.stamps[-1] <= 0:
+                continue
+            shrunk = one.poses.stamps[-1] / scale
+            if scale > 1 and 0.9 < shrunk / max(int(other.poses.stamps[-1]), 1) < 1.1:
+                which = "the estimate" if one is source else "the truth"
+                return f"{spans}: are the stamps of {which} in {unit}, and read as seconds?"
+    if (last > _CALENDAR) != (end > _CALENDAR):
+        return f"{spans}: one is Unix time, the other counts from a beginning"
+    return spans
+
+
+def _check_frames(truth: Source, frames: Stamps) -> None:
+    """Raise a `ValueError` unless stamps of images are whole ns, rise, and are at the truth's time.
+
+    Those of a file are checked by `read_stamps`, too, with the line.
+    """
+    if frames.dtype.kind not in "iu" or frames.ndim != 1 or not len(frames):
+        raise ValueError(
+            f"frames: expected stamps in whole nanoseconds, shape (n,), found {frames.dtype} of "
+            f"shape {frames.shape}"
+        )
+    if back := np.flatnonzero(np.diff(frames) <= 0).tolist():
+        before, after = frames[back[0] : back[0] + 2]
+        raise ValueError(
+            f"frames: row {back[0] + 1}: expected a stamp above {before} ns, found {after} ns"
+        )
+    if len(frames) > 1 and float(np.median(np.diff(frames))) < 1_000_000:
+        raise ValueError(
+            "frames: expected nanoseconds, found stamps of another unit, "
+            f"{np.median(np.diff(frames)):g} apart"
+        )
+    if not truth.poses.covers(frames).any():
+        first, last = truth.poses.stamps[[0, -1]].tolist()
+        raise ValueError(
+            f"frames: expected images within the truth's time, {first} to {last} ns, found "
+            f"{frames[0]} to {frames[-1]} ns"
+        )
 
 
 def write(
@@ -210,170 +425,81 @@ def _hash(file: str) -> str:
     return content_hash(path) if path.is_file() else ""
 
 
-_PATH, _POSE = "nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped"
-_NEVER = 1 << 62  # stands for the stamp of a message that has none
-
-
-def read_topic(path: Path, topic: str) -> tuple[Trajectory, EventAxes, EstimatorRecord]:
-    """Read the poses of a topic: frames with z up get z down, those of cameras stay optical.
-
-    Returns:
-        The poses that count, the kind of their child frame (by default a body), and the record with
-        counts of the others.
-
-    Raises:
-        ValueError: It cannot be read, or holds something else; the message names the pose.
-    """
-    record, child = EstimatorRecord(), ""
-    with readable(path), contextlib.closing(open_bag(path)) as bag:
-        chosen(bag.topics(), (BagTopic(topic=topic, use="estimate"),), "")
-        for number, (type_, message) in enumerate(_poses(bag, topic), start=1):
-            try:
-                event = _estimate(type_, message)
-            except ValueError as error:
-                raise ValueError(f"{path}:{topic}: pose {number}: {error}") from None
-            child = child or event.child_frame_id
-            record.add(event, None)
-    if not len(record):
-        raise ValueError(f"{path}:{topic}: expected poses, found none")
-    return record.rows.trajectory(), axes_of(child), record
-
-
-def _poses(bag: Bag, topic: str) -> Iterator[tuple[str, Any]]:
-    """Yield type and message for each pose of a topic; a Path gives the newest message's poses."""
-    path = bag.topics()[topic][0] == _PATH
-    for _, type_, _, message in bag.messages([topic], newest=path):
-        if not path:
-            yield type_, message
-        for pose in message.poses if path else ():
-            pose.header.frame_id = pose.header.frame_id or message.header.frame_id
-            yield _POSE, pose
-
-
-def _estimate(type_: str, message: Any) -> PoseEstimate:
-    q = (message.pose if type_ == _POSE else message.pose.pose).orientation
-    length = float(np.linalg.norm([q.w, q.x, q.y, q.z]))
-    if not abs(length - 1.0) < 0.01:
-        raise ValueError(f"expected a quaternion of length 1, found one of length {length:.6g}")
-    event = READERS[type_, "estimate"].read(message, MessageContext(source="bag", now=_NEVER))
-    assert isinstance(event, PoseEstimate)
-    # A run begins at 0; a node that forgets the stamp sends many of these, which are counted.
-    return msgspec.structs.replace(event, stamp=0) if event.stamp == _NEVER else event
-
-
-Floats = npt.NDArray[np.float64]
-Axes = Literal["ned", "nwu", "enu", "optical"]
-
-_SAME, _HALF_TURN, _OPTICAL = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)[[2, 0, 1, 3]]
-AXES: dict[Axes, tuple[Floats, Floats]] = {
-    "ned": (_SAME, _SAME),
-    "nwu": (_HALF_TURN, _SAME),
-    "enu": (np.eye(4)[[1, 0, 2, 3]] * [1.0, 1.0, -1.0, 1.0], _HALF_TURN),
-    "optical": (_OPTICAL, _OPTICAL),
-}
-"""Transforms from a file's world to NED, and from its body to the truth's body, shape (4, 4).
-
-``ned``: our own files and TUM's; ``nwu``: z up, the body as it is, as EuRoC and VSLAM-LAB; ``enu``:
-REP 103, with a body FLU; ``optical``: both of a camera that looks ahead, as KITTI.
-"""
-
-_FORMATS = (
-    "a trajectory: rows of TUM (8 fields with blanks between), KITTI (12), EuRoC (17 with commas), "
-    "or 8 with commas under a header that names the columns (EuRoC, VSLAM-LAB)"
-)
-_SCALAR = re.compile(r"q\w*w\b")  # of a header: the column of a quaternion's scalar part
-_FRAME = re.compile(r"# base_link \(FRD\) in (\S+), as it was sent")  # of a run's estimate
-_LONGEST_STEP = 10 * 86_400 * SECOND  # more are stamps of different units or clocks
-
-
-class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """A trajectory from outside: poses of the truth's body in a world NED."""
-
-    name: str
-    file: str
-    poses: Trajectory
-    frame_id: str = ""  # of the poses, if the source says so
-    counts: dict[str, int] = {}  # figures that only a topic has: restarts and repeated stamps
-
-
-def read_truth(text: str, times: str) -> Source:
-    """Read true poses of a file, a topic, or a run's folder; a `ValueError` names the line."""
-    path = newest(Path(text))
-    own = path / "trajectories" / "truth.tum"
-    if path.is_dir() and not (path / "metadata.yaml").is_file():
-        run_folder(path)  # raises, of a folder that is none
-        text = str(own)
-    found = read(str(own) if own.is_file() else text, None, times)
-    if odd := {name: count for name, count in found.counts.items() if count}:
-        raise ValueError(f"{text}: expected one truth with stamps that rise, found {odd}")
-    return found
-
-
-def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = None) -> Source:
-    """Read a trajectory: a file, or a topic as ``bag:/topic``.
-
-    Args:
-        text: Its place, after an optional ``NAME=``.
-        axes: Those of a file, if they are not its format's; a topic's are REP 103's.
-        times: File of the stamps of a KITTI file.
-        camera: Transform from the optical frame to the body, shape (4, 4), if the poses are a
-            camera's; the body's axes are then of no account.
-
-    Raises:
-        ValueError: It cannot be read; the message names file and line, or pose.
-    """
-    name, equals, file = text.partition("=")
-    if not equals or Path(text).exists():
-        name, file = "", text
-    bag, colon, topic = file.rpartition(":/")
-    path = newest(Path(bag if colon and not Path(file).exists() else file))
-    if path.suffix in {".mcap", ".db3", ".bag"} or (path / "metadata.yaml").is_file():
-        topic = f"/{topic}" if colon and not Path(file).exists() else ""
-        poses, child, record = read_topic(path, topic)
-        name, frame_id = name or topic.strip("/"), record.frame_id
-        counts = {"restarts": record.restarts, "repeated_stamps": record.repeated}
-        world, body = _SAME, _OPTICAL if child == "optical" else _SAME
-        if camera is not None and child == "body":  # as which a camera's poses were read, then
-            camera = camera @ _HALF_TURN
-    else:
-        usual, frame_id, poses = _read_file(path, times)
-        name, counts = name or path.stem, {}
-        world, body = AXES[axes or usual]
-    if far := np.flatnonzero(np.diff(poses.stamps) > _LONGEST_STEP).tolist():
-        before, after = (poses.stamps[far[0] + k] / SECOND for k in (0, 1))
-        raise ValueError(
-            f"{file}: pose {far[0] + 2}: expected stamps of one unit and one clock, found "
-            f"{after:.3f} s after {before:.3f} s"
-        )
-    body = body if camera is None else camera
-    if world is not _SAME or body is not _SAME:
-        matrices = world @ poses.matrices() @ np.linalg.inv(body)
-        poses = Trajectory.from_matrices(poses.stamps, matrices)
-    return Source(name=name, file=file, poses=poses, frame_id=frame_id, counts=counts)
-
-
 def read_mounting(text: str, run: str) -> Floats:
     """Return the transform from a camera's optical frame to the body, shape (4, 4).
 
-    Given as ``tx ty tz qx qy qz qw`` (metres, the scalar last), a TUM file with one pose, or the
-    name of a camera that the run announced.
+    Given as ``tx ty tz qx qy qz qw`` (metres, the scalar last), a TUM file with one pose, a chain
+    of Kalibr's (``camchain.yaml``, ``camchain.yaml:cam1``), a sensor.yaml of EuRoC's, or the name of
+    a camera that the run announced. In files of Kalibr and EuRoC the body is the IMU.
 
     Raises:
         ValueError: It is none of these.
     """
+    if (mounted := mounting_of_kalibr(text)) is not None:
+        return mounted
     if Path(text).is_file():
         return np.asarray(read_tum(Path(text)).matrices()[0])
     row = Row("--body-from-camera", text.replace(",", " ").split())
     if len(row.fields) == 1 and Path(run).is_dir():
         return mounting(newest(Path(run)), text)
     if len(row.fields) != 7:
-        row.wrong('"tx ty tz qx qy qz qw", a file, or a camera of the run that is the truth', text)
+        row.wrong(
+            '"tx ty tz qx qy qz qw", a file (TUM, Kalibr, EuRoC\'s sensor.yaml), or a camera of the '
+            "run that is the truth",
+            text,
+        )
     values = np.array([row.numbers(0, 7)])
     pose = Trajectory(np.array([0]), values[:, :3], values[:, [6, 3, 4, 5]])
     return np.asarray(pose.matrices()[0])
 
 
-def read_stamps(path: Path) -> npt.NDArray[np.int64]:
+def mounting_of(matrix: Floats) -> Floats:
+    """Return a transform of shape (4, 4) as it is; a `ValueError` if it is none."""
+    if matrix.shape != (4, 4) or not_rotations(matrix[None, :3, :3]) or matrix[3, 3] != 1.0:
+        raise ValueError(
+            "body_from_camera: expected a transform of shape (4, 4), found "
+            f"{matrix.tolist() if matrix.shape == (4, 4) else matrix.shape}"
+        )
+    return matrix
+
+
+def of_memory(name: str, given: Any, axes: AxesName | None, camera: Floats | None = None) -> Source:
+    """Return the source of a trajectory in memory; `axes` and `camera` as of `read`.
+
+    Args:
+        given: A `Trajectory`, or rows as TUM's, whose bad ones are left out and counted as a
+            file's: seconds, x, y, z in metres, and a quaternion x, y, z, w, shape (n, 8), or
+            without the quaternion, (n, 4).
+
+    Raises:
+        ValueError: It is neither.
+    """
+    if isinstance(given, Trajectory):
+        source = Source(name=name, file=name, poses=given)
+    else:
+        rows = np.asarray(given, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] not in {4, 8}:
+            raise ValueError(
+                f"{name}: expected a file, a Trajectory, or TUM's rows of shape (n, 8), or (n, 4) "
+                f"without a quaternion, found an array of shape {rows.shape}"
+            )
+        if len(far := rows[abs(rows[:, 0]) > _LONGEST_SECONDS, 0]):
+            raise ValueError(f"{name}: expected stamps in seconds, as TUM's, found {far[0]:.6g}")
+        collected = Collected(name)
+        for number, (stamp, *row) in enumerate(rows.tolist()):
+            time = round(stamp * 1e9) if np.isfinite(stamp) else None
+            turn = [row[6], *row[3:6]] if len(row) == 7 else None
+            collected.add(time, row[:3], turn, row=f": row {number}")
+        source = msgspec.structs.replace(collected.source(), name=name, file=name)
+    if axes:
+        source = msgspec.structs.replace(source, axes=AXES[axes])
+    return source if camera is None else of_body(source, camera)
+
+
+_LONGEST_SECONDS = 9.2e9  # what 64 bits of nanoseconds hold
+
+
+def read_stamps(path: Path) -> Stamps:
     """Return the stamps (ns) of a list of images or of poses: the first field of each row.
 
     With commas nanoseconds (EuRoC, VSLAM-LAB), else seconds (TUM, KITTI).
@@ -381,51 +507,9 @@ def read_stamps(path: Path) -> npt.NDArray[np.int64]:
     Raises:
         ValueError: It cannot be read, or the stamps do not rise; the message names the line.
     """
-    commas = "," in _start(path)[2]
-    rows = list(read_rows(path, "," if commas else None, range(1, 100), "stamps, …", header=commas))
-    stamps = np.array([row.nanoseconds() if commas else row.seconds() for row in rows], np.int64)
+    rows = stamp_rows(path)
+    stamps = np.array([stamp for _, stamp in rows], np.int64)
     if back := np.flatnonzero(np.diff(stamps) <= 0).tolist():
         before, after = stamps[back[0] : back[0] + 2]
-        rows[back[0] + 1].wrong(f"a stamp above {before} ns", f"{after} ns")
+        rows[back[0] + 1][0].wrong(f"a stamp above {before} ns", f"{after} ns")
     return stamps
-
-
-def _read_file(path: Path, times: str) -> tuple[Axes, str, Trajectory]:
-    """Return the usual axes of a file's format, the frame named in the file, and its poses."""
-    number, head, row = _start(path)
-    commas = "," in row
-    fields = row.split("," if commas else None)
-    names = head[-1].lower().split(",") if head else []
-    scalar = [k for k, name in enumerate(names) if _SCALAR.search(name)]
-    if commas and len(fields) == 8 and scalar == [7]:
-        return "nwu", "", read_vslamlab(path)
-    if commas and (len(fields) == 17 or (len(fields) == 8 and scalar == [4])):
-        return "nwu", "", read_euroc(path)
-    if not commas and len(fields) == 8:
-        named = _FRAME.search("\n".join(head))
-        return "ned", named[1] if named else "", read_tum(path)
-    if commas or len(fields) != 12:
-        Row(f"{path}:{number}", fields).wrong(_FORMATS, row)
-    if not times:
-        raise ValueError(f"{path}: expected --times beside KITTI's poses, which have no stamps")
-    stamps, matrices = read_stamps(Path(times)), read_kitti(path)
-    if len(stamps) != len(matrices):
-        raise ValueError(
-            f"{path}: expected {len(stamps)} poses, as many as {times} has stamps, "
-            f"found {len(matrices)}"
-        )
-    return "optical", "", Trajectory.from_matrices(stamps, matrices)
-
-
-def _start(path: Path) -> tuple[int, list[str], str]:
-    """Return the line number of a file's first row, the lines before, and the row."""
-    head: list[str] = []
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            for number, line in enumerate(map(str.strip, file), start=1):
-                if line and not (line[0] == "#" or line[0].isalpha()):
-                    return number, head, line
-                head += [line] if line else []
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: expected {_FORMATS}, found: {error}") from None
-    raise ValueError(f"{path}: expected {_FORMATS}, found no rows")

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime import Duration
-from runtime.units import LONGEST_BARE, Latency, plain
+from runtime.units import LONGEST_BARE, ROUNDING, Latency, plain, significant
 
 FACTORS = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -105,3 +105,22 @@ def test_a_latency_is_a_number_up_to_a_second_and_has_a_unit_above(number: float
 def test_a_latency_that_is_written_is_read_as_it_was(seconds: float) -> None:
     assert Latency.parse(plain(Latency(seconds))) == seconds
     assert Duration.parse(plain(Duration(seconds))) == seconds
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (180.0, 2, "180"), (183.2, 2, "180"), (12345678.0, 4, "12350000"), (0.05, 4, "0.05"),
+        (0.00012345, 3, "0.000123"), (1.11e-14, 4, "0"), (-1e-9, 4, "0"), (99.996, 4, "100"),
+        (0.0, 2, "0"), (-2.5, 4, "-2.5"), (float("inf"), 2, "inf"), (float("nan"), 2, "nan"),
+    ],
+)  # fmt: skip
+def test_a_figure_has_digits_and_no_exponent(value: float, digits: int, text: str) -> None:
+    assert significant(value, digits) == text
+
+
+@given(st.floats(ROUNDING, 1e9), st.integers(1, 9))
+def test_a_figure_is_as_near_as_its_digits(value: float, digits: int) -> None:
+    text = significant(value, digits)
+    assert "e" not in text
+    assert float(text) == float(f"{value:.{digits}g}")

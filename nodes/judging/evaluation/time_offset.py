@@ -24,6 +24,7 @@ Stamps = npt.NDArray[np.int64]
 _RANGE = 60.0  # seconds of offset looked for either way
 _LEAST_OVERLAP = 0.5  # share of the rows that has to be left
 _ROWS = 1000  # most rows used
+_MOST = 4_000_000  # samples of a speed to correlate, at most: eleven hours at 100 Hz
 _LEAST_ROWS = 10
 _HOLE = 10  # steps of the denser one beyond which it is not interpolated
 _STEPS = 12  # most steps of the least squares
@@ -89,6 +90,8 @@ def best_time_offset(
 def _correlated(truth: Trajectory, estimate: Trajectory, start: float) -> float | None:
     """Return the offset (s) near `start` at which the speeds are most alike, if they tell any."""
     step = max(min(truth.step(), estimate.step()), 10_000_000)
+    if max(int(np.ptp(each.stamps)) for each in (truth, estimate)) > _MOST * step:
+        return None  # as of stamps in another unit
     lengths = []
     for trajectory, shift in ((truth, 0), (estimate, round(start * 1e9))):
         stamps = trajectory.stamps + shift

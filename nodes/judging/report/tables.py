@@ -29,6 +29,7 @@ from runtime.summary import (
     TwiceSummary,
     WorkerSummary,
 )
+from runtime.units import ROUNDING
 
 
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
@@ -164,7 +165,7 @@ def show(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return number(value)
+        return number(0.0 if abs(value) < ROUNDING else value)
     if isinstance(value, list | dict):
         return msgspec.json.encode(value).decode()
     return str(value)

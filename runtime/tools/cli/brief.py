@@ -21,6 +21,7 @@ from runtime.errors import ResultsError
 from runtime.summary import Summary, Verdict
 from runtime.time.clock import SECOND
 from runtime.tools.cli.commands import NOBODY
+from runtime.units import significant
 
 if TYPE_CHECKING:
     from runtime.config.model import RunConfig
@@ -83,7 +84,7 @@ def _row(folder: Path) -> tuple[str, str, str, str]:
         state = f"[red]{'crashed' if has_flown(folder) else 'did not start'}[/red]"
     judged = summary.verdict.estimators if summary.verdict else {}
     errors = (
-        f"{name} {figures['ate_percent']:.2g} %" if figures.get("ate_percent") else name
+        f"{name} {significant(figures['ate_percent'], 2)} %" if figures.get("ate_percent") else name
         for name, figures in judged.items()
     )
     return f"{summary.sim_seconds:.1f}", f"{summary.seed}", state, escape(", ".join(errors))
@@ -185,7 +186,7 @@ def _flight(vehicle: str, figures: Mapping[str, Any]) -> Iterator[str]:
     if figures.get("collisions"):
         shown.append(f"{figures['collisions']} collisions")
     if figures.get("plan_rmse_m") is not None:
-        shown.append(f"{figures['plan_rmse_m']:.3g} m from its plan, RMS")
+        shown.append(f"{significant(figures['plan_rmse_m'], 3)} m from its plan, RMS")
     if shown or figures["passed"] is not None:
         state = "" if figures["passed"] is None else f" {_WORDS[figures['passed']]}"
         yield f"[bold]flight of {escape(vehicle)}[/bold]{state}   {', '.join(shown)}".rstrip()
@@ -194,18 +195,18 @@ def _flight(vehicle: str, figures: Mapping[str, Any]) -> Iterator[str]:
 def _figures(figures: Mapping[str, Any]) -> Iterator[str]:
     if figures.get("ate_rmse_m") is None:
         return
-    shown = [f"ATE {figures['ate_rmse_m']:.3g} m"]
+    shown = [f"ATE {significant(figures['ate_rmse_m'], 3)} m"]
     if figures.get("ate_percent") is not None:
-        shown[0] += f" ({figures['ate_percent']:.2g} %)"
-    for name, text in (
-        ("ate_max_m", "max {:.3g} m"),
-        ("rot_rmse_deg", "rotation {:.2g}°"),
-        ("rpe_1m_trans_percent", "RPE(1 m) {:.2g} %"),
+        shown[0] += f" ({significant(figures['ate_percent'], 2)} %)"
+    for name, text, digits in (
+        ("ate_max_m", "max {} m", 3),
+        ("rot_rmse_deg", "rotation {}°", 2),
+        ("rpe_1m_trans_percent", "RPE(1 m) {} %", 2),
     ):
         if figures.get(name) is not None:
-            shown.append(text.format(figures[name]))
+            shown.append(text.format(significant(figures[name], digits)))
     if figures.get("lost_count") and figures.get("flight_ate_percent") is not None:
-        shown.append(f"with lost time {figures['flight_ate_percent']:.2g} %")
+        shown.append(f"with lost time {significant(figures['flight_ate_percent'], 2)} %")
     yield f"{', '.join(shown)}   alignment: {figures.get('alignment', 'none')}"
 
 
@@ -319,7 +320,7 @@ def _show(value: Any) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return significant(value) if isinstance(value, float) else str(value)
 
 
 def table_of(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> Table:

@@ -16,7 +16,7 @@ from nodes.judging import judgement
 from nodes.judging.evaluation.judging import Judgement
 from nodes.judging.judgement import read, read_mounting, read_stamps, read_truth
 from nodes.trajectory import Trajectory
-from nodes.trajectory_files import read_vslamlab, write_euroc, write_kitti, write_tum
+from nodes.trajectory_files import write_euroc, write_kitti, write_tum
 from tests.nodes.judging.judge import bags
 from tests.nodes.judging.judge.test_judge import said
 from tests.nodes.trajectory.samples import angle, walk
@@ -50,7 +50,7 @@ FORMATS = (write_tum, write_euroc, write_lab, write_all)
 def test_each_format_is_recognized_and_read_as_it_was_written(
     write: Callable[[Path, Trajectory], None], trajectory: Trajectory
 ) -> None:
-    steps = np.concatenate([[0], np.minimum(np.diff(trajectory.stamps), 10**14)])
+    steps = np.concatenate([[0], np.clip(np.diff(trajectory.stamps), 10**6, 10**14)])
     first = max(int(trajectory.stamps[0]), 0)
     trajectory = Trajectory(first + np.cumsum(steps), trajectory.positions, trajectory.orientations)
     with TemporaryDirectory() as folder:
@@ -88,32 +88,25 @@ def test_damaged_files_are_errors_of_one_line(
             assert_names(wrong, path)
 
 
-@given(trajectory=trajectories())
-@settings(max_examples=20, deadline=None)
-def test_vslam_labs_files_are_read_as_written(trajectory: Trajectory) -> None:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "00000_KeyFrameTrajectory.csv"
-        write_lab(path, trajectory)
-        found = read_vslamlab(path)
-    assert (found.stamps == trajectory.stamps).all()
-    assert (found.positions == trajectory.positions).all()
-
-
 WRONG = [
-    ("1 2 3\n", r"t:1: expected a trajectory: rows of TUM \(8 fields.* found '1 2 3'"),
+    ("1 2 3\n", r"t:1: expected a trajectory: .* or of TUM \(8 fields.* found '1 2 3'"),
     ("# only\n", r"t: expected a trajectory: .*, found no rows"),
-    ("7,1,2,3,1,0,0,0\n", r"t:1: expected a trajectory: .* under a header that names the col"),
-    (GOOD + "1.0 0 x 0 0 0 0 1\n", r"t:2: expected finite numbers, found '0 x 0 0 0 0 1'"),
-    (GOOD + "1.0 nan 0 0 0 0 0 1\n", r"t:2: expected finite numbers"),
-    (GOOD + GOOD, r"t:2: expected a stamp above 0 ns, found '0 ns'"),
-    ("2.0 0 0 0 0 0 0 1\n" + GOOD, r"t:2: expected a stamp above 2000000000 ns, found '0 ns'"),
+    ("7,1,2,3,1,0,0,0\n", r't:1: expected a trajectory: .* --columns "sec x y z qw qx qy qz", fou'),
+    (GOOD + "1.0 0 x 0 0 0 0 1\n", r"t:2: expected finite numbers, found '0 x 0'"),
+    (GOOD + "1.0 0 0 0 0 0 0\n", r"t:2: expected 8 fields, as in the first row, found '7: 1\.0"),
     (GOOD + "1 0 0 0 0 0 0 2\n", r"t:2: expected a quaternion of length 1"),
-    ("1403636579763555584.0 0 0 0 0 0 0 1\n", r"t:1: expected a stamp in seconds, not in nanos"),
+    (GOOD + "1 0 0 0 0 0 0 0\n", r"t:2: expected a quaternion of length 1"),
     (GOOD + "33333333 0 0 0 0 0 0 1\n", r"t: pose 2: expected stamps of one unit and one clock"),
+    ("1e25 0 0 0 0 0 0 1\n", r"t:1: expected a stamp in seconds, found '1e25'"),
+    ("1e999999 0 0 0 0 0 0 1\n", r"t:1: expected a stamp, found '1e999999'"),
+    ("sec,nsec,x,y,z\n1e12,0,0,0,0\n", r"t:2: expected a stamp in 64 bits, found 1000000000000000"),
+    (GOOD * 2000 + "\xff", r"t: expected a text file of rows, found: 'utf-8' codec can't decode"),
+    ("nan 0 0 0 0 0 0 1\n", r"t: expected poses, found none: left out: 1 pose with NaN"),
     (LAB + "1.5,0,0,0,0,0,0,1\n", r"t:2: expected a stamp in whole nanoseconds, found '1\.5'"),
-    (LAB + "1,0,0,0,0,0,0,0\n", r"t:2: expected a quaternion of length 1"),
-    (LAB + "1,0,0,0,0,0,0,1\n" * 2, r"t:3: expected a stamp above 1 ns, found '1 ns'"),
     (LAB + "1,0,0\n", r"t:2: expected a trajectory: .* found '1,0,0'"),
+    ("t,x,y,z,qx,qy,qz\n1,0,0,0,0,0,0\n", r"t: expected four columns of a quaternion .* or none"),
+    ("t,x,p_x,y,z\n1,0,0,0,0\n", r"t: expected one column of x .*, found \['x', 'p_x'\]"),
+    ("a,b,c,d,e,f,g,h\n1,0,0,0,1,0,0,0,\n", r"t:2: expected a trajectory: .* header that names"),
     ("1 0 0 0 0 1 0 0 0 0 1 0\n", r"t: expected --times beside KITTI's poses"),
 ]
 
@@ -121,9 +114,9 @@ WRONG = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("text", "message"), WRONG)
 def test_each_bad_input_has_its_sentence(text: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "t").write_text(text)
+    (tmp_path / "t").write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=message):
-        read(str(tmp_path / "t"), None)
+        read(str(tmp_path / "t"))
     write_tum(tmp_path / "truth", walk(5))
     done = said(tmp_path, "--truth", "truth", "--estimate", "t")
     assert done.returncode == 2
@@ -138,14 +131,23 @@ def test_a_file_that_is_not_there_is_named(missing: str, tmp_path: Path) -> None
     assert (done.returncode, done.stderr) == (2, "error: nothing: No such file or directory\n")
 
 
+@pytest.mark.parametrize("columns", ["", "sec x y z qx qy qz qw"])
+def test_a_topic_of_a_file_is_refused(columns: str, tmp_path: Path) -> None:
+    write_tum(tmp_path / "t", walk(5))
+    with pytest.raises(
+        ValueError, match=r"t: expected nothing after a file of one .*, found '/odom'"
+    ):
+        read(f"{tmp_path / 't'}:/odom", columns=columns)
+
+
 def test_kittis_poses_and_stamps_are_as_many(tmp_path: Path) -> None:
     write_all(tmp_path / "k", walk(5))
     (tmp_path / "times").write_text("0\n1\n2\n")
     with pytest.raises(ValueError, match=r"k: expected 3 poses, as many as .*times has stamps, fo"):
         read(str(tmp_path / "k"), None, str(tmp_path / "times"))
     (tmp_path / "times").write_text("0\n1\n1\n2\n3\n")
-    with pytest.raises(ValueError, match=r"times:3: expected a stamp above 1000000000 ns"):
-        read(str(tmp_path / "k"), None, str(tmp_path / "times"))
+    source = read(str(tmp_path / "k"), None, str(tmp_path / "times"))
+    assert source.counts == {"repeated_stamps": 1}
 
 
 @pytest.mark.parametrize(
@@ -183,11 +185,12 @@ def test_a_camera_that_the_run_has_not_is_refused(tmp_path: Path) -> None:
         read_mounting("drone/left", str(tmp_path))
 
 
-def judged(tmp_path: Path, truth: Trajectory, estimate: Trajectory, **config: Any) -> Judgement:
+def judged(tmp_path: Path, truth: Trajectory, estimate: Trajectory, **settings: Any) -> Judgement:
     write_tum(tmp_path / "truth", truth)
     write_tum(tmp_path / "vo", estimate)
     true, found = read_truth(str(tmp_path / "truth"), ""), read(str(tmp_path / "vo"), None)
-    judgements, _, _ = judgement.judge_all(true, [found], None, judgement.JudgeConfig(**config))
+    config = judgement.JudgeConfig(**settings)
+    _, judgements, _, _ = judgement.judge_all(true, [found], None, config)
     return judgements["vo"]
 
 
@@ -196,7 +199,7 @@ def test_no_time_in_common_fails_and_says_why(tmp_path: Path) -> None:
     later = Trajectory(truth.stamps + 10**18, truth.positions, truth.orientations)
     found = judged(tmp_path, truth, later).figures
     assert "ate_rmse_m" not in found
-    assert "one is Unix time, the other counts from a run's beginning" in found["why"]
+    assert "one is Unix time, the other counts from a beginning" in found["why"]
 
 
 def test_a_truth_too_sparse_to_judge_by_is_an_error(tmp_path: Path) -> None:
@@ -237,10 +240,9 @@ def test_wrong_options_are_named(words: list[str], message: str, tmp_path: Path)
 @pytest.mark.parametrize(
     ("topic", "change", "message"),
     [
-        ("", None, r"topics: expected one of the bag's, found ''"),
+        ("", None, r"bag: expected a topic of poses, as bag:/TOPIC, found ''; poses are on /slam"),
         ("/slam/pose", None, r"found '/slam/pose' \(did you mean '/slam/poses"),
-        ("/rosout", None, r"topics: /rosout: expected .*nav_msgs/msg/Odometry.* found std_msgs"),
-        ("/slam/poses", (1.0, np.nan), r":/slam/poses: pose 3: expected finite numbers, found"),
+        ("/rosout", None, r"bag: expected poses on /rosout, found std_msgs/msg/String; poses"),
         (
             "/slam/poses",
             (2.0, 0.0),
