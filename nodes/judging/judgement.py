@@ -429,8 +429,8 @@ def read_mounting(text: str, run: str) -> Floats:
     """Return the transform from a camera's optical frame to the body, shape (4, 4).
 
     Given as ``tx ty tz qx qy qz qw`` (metres, the scalar last), a TUM file with one pose, a chain
-    of Kalibr's (``camchain.yaml``, ``camchain.yaml:cam1``), a sensor.yaml of EuRoC's, or the name of
-    a camera that the run announced. In files of Kalibr and EuRoC the body is the IMU.
+    of Kalibr's (``camchain.yaml``, ``camchain.yaml:cam1``), a sensor.yaml of EuRoC's, or the name
+    of a camera that the run announced. In files of Kalibr and EuRoC the body is the IMU.
 
     Raises:
         ValueError: It is none of these.
@@ -444,8 +444,8 @@ def read_mounting(text: str, run: str) -> Floats:
         return mounting(newest(Path(run)), text)
     if len(row.fields) != 7:
         row.wrong(
-            '"tx ty tz qx qy qz qw", a file (TUM, Kalibr, EuRoC\'s sensor.yaml), or a camera of the '
-            "run that is the truth",
+            '"tx ty tz qx qy qz qw", a file (TUM, Kalibr, a sensor.yaml), or a camera of the run '
+            "that is the truth",
             text,
         )
     values = np.array([row.numbers(0, 7)])
