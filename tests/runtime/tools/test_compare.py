@@ -451,12 +451,12 @@ def test_settings_are_flown_and_compared(
 
 OWN = f"""
 from {__name__} import Judge, JudgeConfig
-import own_tracker
+import edited_tracker
 
 
 class OwnJudge(Judge):
     async def on_shutdown(self) -> None:
-        error = own_tracker.FACTOR * self.config.error
+        error = edited_tracker.FACTOR * self.config.error
         self.conclude("vo", {{"ate_percent": error, "frame_coverage_percent": 100.0}})
 """
 
@@ -465,9 +465,9 @@ class OwnJudge(Judge):
 @pytest.mark.timeout(240)
 def test_after_an_edit_of_an_estimator_its_figures_are_new(file: Path, tmp_path: Path) -> None:
     """The loop of everybody: compare, edit a file, compare again."""
-    (tmp_path / "own_judge.py").write_text(OWN, encoding="utf-8")
-    (tmp_path / "own_tracker.py").write_text("FACTOR = 1.0\n", encoding="utf-8")
-    file.write_text(file.read_text().replace(f"{__name__}:Judge", "own_judge:OwnJudge"))
+    (tmp_path / "edited_judge.py").write_text(OWN, encoding="utf-8")
+    (tmp_path / "edited_tracker.py").write_text("FACTOR = 1.0\n", encoding="utf-8")
+    file.write_text(file.read_text().replace(f"{__name__}:Judge", "edited_judge:OwnJudge"))
     options = ["--b", "judge.error=2", "--seeds", "2", "--figure", "ate_percent"]
 
     def compared() -> tuple[dict[str, Any], str]:
@@ -480,11 +480,11 @@ def test_after_an_edit_of_an_estimator_its_figures_are_new(file: Path, tmp_path:
     assert (found["a"], found["b"]) == (1.0, 2.0)
     _, said = compared()
     assert said == "2 runs are finished already, 0 to do\n4 runs are finished already, 0 to do\n"
-    (tmp_path / "own_tracker.py").write_text("FACTOR = 3.0\n", encoding="utf-8")
+    (tmp_path / "edited_tracker.py").write_text("FACTOR = 3.0\n", encoding="utf-8")
     found, said = compared()
     assert (found["a"], found["b"]) == (3.0, 6.0)
-    assert "0 runs are finished already, 2 are run again: own_tracker.py changed\n" in said
-    assert "2 runs are finished already, 2 are run again: own_tracker.py changed\n" in said
+    assert "0 runs are finished already, 2 are run again: edited_tracker.py changed\n" in said
+    assert "2 runs are finished already, 2 are run again: edited_tracker.py changed\n" in said
 
 
 PROGRAM = """
