@@ -19,6 +19,7 @@ import numpy as np
 
 from events import CameraInfo
 from sims.cameras import raster as rasters
+from sims.cameras.optics import pixel_rays
 from sims.cameras.raster import Raster
 from sims.cameras.stage import View
 
@@ -195,7 +196,7 @@ def main(path: str, first: int, count: int) -> int:
     checked = ctypes.CDLL(path)
     checked.raster_new.restype = ctypes.c_void_p
     builds["checked"] = checked
-    rasters.pixel_rays = functools.cache(rasters.pixel_rays)
+    vars(rasters)["pixel_rays"] = functools.cache(pixel_rays)
     warnings.simplefilter("error")
     same = True
     for seed in range(first, first + count):
