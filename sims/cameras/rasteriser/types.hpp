@@ -50,7 +50,7 @@ inline void store(T* to, V value) { std::memcpy(to, &value, sizeof value); }
 
 inline fv as_float(iv value) { return __builtin_convertvector(value, fv); }
 
-// Towards 0. What it gets must be within the whole numbers: of others processors make different ones.
+// Towards 0. It must fit: what does not becomes another number on another processor.
 inline iv as_whole(fv value) {
 #ifdef RASTER_CHECKED  // sanitizers look at scalars only
     iv found{};

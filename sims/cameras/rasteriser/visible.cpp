@@ -305,8 +305,10 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
         at.z = near;
         see(lens_->pixel(at));
     };
-    for (int k = 0; k < count; ++k) {
-        if (points[k].z >= near) see(pixels[k]);
+    int ahead = 0;
+    for (int k = 0; k < count; ++k)
+        if (points[k].z >= near) see(pixels[k]), ++ahead;
+    for (int k = 0; ahead && ahead < count && k < count; ++k) {
         cross_near(points[k], points[k % 3 == 2 ? k - 2 : k + 1]);
         for (int later = 3; k < 3 && later < count; ++later) cross_near(points[k], points[later]);
     }
