@@ -182,9 +182,9 @@ def images_of(seed: int, instructions: str) -> list[bytes]:
         for camera in cameras:
             stage.keep(camera, qpos, 0.0)
         stage.look(pick.randrange(2), qpos, 0.0, pick.choice((1.0, 1.0, 1e30)))
-        wanted = [pick.random() < 0.8 for _ in range(3)]
-        if any(wanted):
-            images += [i.tobytes() for i in stage.draw(View(info), *wanted) if i is not None]
+        colour, depth, numbers = (pick.random() < 0.8 for _ in range(3))
+        drawn = stage.draw(View(info), colour, depth, numbers)
+        images += [image.tobytes() for image in drawn if image is not None]
     stage.close()
     return images
 
