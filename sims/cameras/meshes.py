@@ -17,6 +17,13 @@ FARTHEST = 2000.0  # half length of a plane without end, metres
 MOST_CELLS = 40  # along a side of a plane; MuJoCo's 200 look the same, and cost more
 
 _Kind = mujoco.mjtGeom
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+def narrow(values: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Return numbers as finite float32: the largest for what is beyond, and 0 for NaN."""
+    finite = np.nan_to_num(np.asarray(values, np.float64), nan=0.0)
+    return np.ascontiguousarray(np.clip(finite, -_LARGEST, _LARGEST), np.float32)
 
 
 class Mesh:
@@ -33,10 +40,14 @@ class Mesh:
         corners: npt.ArrayLike,
         places: npt.ArrayLike,
     ) -> None:
-        self.points = np.ascontiguousarray(points, np.float32)  # metres, shape (n, 3)
-        self.normals = np.ascontiguousarray(normals, np.float32)  # shape (n, 3)
+        self.points = narrow(points)  # metres, shape (n, 3)
+        self.normals = narrow(normals)  # shape (n, 3)
         self.corners = np.ascontiguousarray(corners, np.int32)  # of triangles, shape (m, 3)
-        self.places = np.ascontiguousarray(places, np.float32)  # u and v, shape (n, 2)
+        self.places = narrow(places)  # u and v, shape (n, 2)
+
+    def turned(self) -> Mesh:
+        """Return the same triangles, to be seen from their other side, with the same normals."""
+        return Mesh(self.points, self.normals, self.corners[:, ::-1], self.places)
 
 
 def shape_of(model: Any, geom: int) -> tuple[Any, ...]:
@@ -47,6 +58,7 @@ def shape_of(model: Any, geom: int) -> tuple[Any, ...]:
     return kind, *model.geom_size[geom].tolist()
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # `narrow` bounds what is too large
 def mesh_of(model: Any, kind: int, *of: Any) -> Mesh:
     """Return the mesh of a `shape_of`; `ValueError` for a kind that is not drawn."""
     quality = model.vis.quality
@@ -200,7 +212,7 @@ def _plane(size: Floats) -> Mesh:
 
 def _cells(count: float) -> int:
     """Return a whole number of cells along a side of a plane."""
-    return int(np.clip(round(count), 1, MOST_CELLS))
+    return int(np.clip(np.rint(np.nan_to_num(count)), 1, MOST_CELLS))
 
 
 def _unit(u: Floats, v: Floats) -> Floats:

@@ -19,7 +19,7 @@ from typing_extensions import override
 
 from events import CameraInfo
 from events.camera_info import srgb_light
-from sims.cameras.meshes import Mesh, mesh_of, shape_of
+from sims.cameras.meshes import Mesh, mesh_of, narrow, shape_of
 from sims.cameras.optics import pixel_rays
 from sims.cameras.stage import (
     NEAR,
@@ -60,6 +60,8 @@ VIEW = np.dtype(
 
 _Kind = mujoco.mjtGeom
 _OPTICAL = np.tile([1.0, -1.0, -1.0], 3)  # MuJoCo's camera looks along -z, with y up
+MOST_TRIANGLES = 1 << 24  # of all geoms: the rasteriser numbers them with 24 bits
+FROM_BEHIND = 0.3  # factor on the opacity of a plane that is seen from behind, as MuJoCo's
 SUN_AWAY = 200.0  # distance at which a directional light's map is drawn, in half widths of it
 _GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing is said
 
@@ -90,7 +92,8 @@ class Raster(Stage):
 
     Raises:
         GraphicsError: The rasteriser was not compiled with the package.
-        ValueError: The model has skins, flexes or geoms that are not drawn.
+        ValueError: The model has skins, flexes or geoms that are not drawn, more texels or
+            triangles than have room, or settings without a meaning (`check_settings`).
     """
 
     keeps_rows = True
@@ -105,11 +108,14 @@ class Raster(Stage):
         super().__init__(model, dynamics)
         self._threads = threads
         self._colours = b""  # those that the geoms have
-        self._map_size = min(int(model.vis.quality.shadowsize), SHADOW_SIZE)
+        size = int(model.vis.quality.shadowsize)
+        # MuJoCo leaves out the outermost pixels of a map: it throws no shadows with two.
+        self._map_size = min(size, SHADOW_SIZE) if size > 2 else 0
         self._maps: list[npt.NDArray[Any]] = []  # of the lights that throw shadows
         self._mapped: list[bytes] = []  # what each shows
         self._map_lenses: dict[float, int] = {}
-        self._sun_reach = float(model.stat.extent * model.vis.map.shadowclip)  # metres
+        # Metres; a sun whose map covers nothing throws no shadows.
+        self._sun_reach = float(model.stat.extent) * float(model.vis.map.shadowclip)
         self._kept: list[tuple[npt.NDArray[Any], npt.NDArray[Any]]] = []  # poses of eye and geoms
         for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
             if count:
@@ -131,12 +137,24 @@ class Raster(Stage):
         self._sky = self._textures[skies[0]] if skies.size else -1
         self._drawn = np.flatnonzero(model.geom_group < 3)
         self._geoms = np.zeros(len(self._drawn), GEOM)
-        meshes: dict[Any, int] = {}
+        self._planes = np.flatnonzero(model.geom_type[self._drawn] == _Kind.mjGEOM_PLANE)
+        self._behind: dict[int, int] = {}  # by a plane's mesh, that of its other side
+        meshes: dict[Any, tuple[int, int]] = {}  # numbers, and how many triangles
+        triangles = 0
         for place, geom in enumerate(self._drawn.tolist()):
             shape = shape_of(model, geom)
             if shape not in meshes:
-                meshes[shape] = self._add_mesh(mesh_of(model, *shape))
-            self._geoms["mesh"][place] = meshes[shape]
+                mesh = mesh_of(model, *shape)
+                meshes[shape] = self._add_mesh(mesh), len(mesh.corners)
+                if shape[0] == _Kind.mjGEOM_PLANE:
+                    self._behind[meshes[shape][0]] = self._add_mesh(mesh.turned())
+            self._geoms["mesh"][place], count = meshes[shape]
+            triangles += count
+        if triangles >= MOST_TRIANGLES:
+            raise ValueError(
+                f'renderer = "raster": expected geoms of fewer than {MOST_TRIANGLES} triangles in '
+                f'all, found {triangles}; "mujoco" draws them'
+            )
         self._describe()
         self._lenses: dict[CameraInfo, int] = {}
 
@@ -186,11 +204,13 @@ class Raster(Stage):
         frame["first"], frame["last"], frame["sky"] = first, last, self._sky
         frame["near"], frame["far"], frame["poses"] = NEAR, RANGE, len(self._kept)
         if (fog := self._fog()) is not None:
-            frame["fogged"], frame["fog"] = 1, self.model.vis.rgba.fog[:3]
-            frame["fog_start"], frame["fog_end"] = fog
+            frame["fogged"], frame["fog"] = 1, narrow(self.model.vis.rgba.fog[:3])
+            frame["fog_start"], frame["fog_end"] = narrow(fog)
         geoms, lights = self._coloured(), self._lights()
+        eye, places = self._kept[len(self._kept) // 2]
         if colour:
-            self._draw_shadows(lights, geoms, self._kept[len(self._kept) // 2][1])
+            self._draw_shadows(lights, geoms, places)
+        geoms = self._from_behind(geoms, places, eye["position"][0])
         self._kept = []
         self._library.raster_draw(
             self._world, self._lens(view.info), _at(frame), _at(eyes), len(geoms), _at(geoms),
@@ -227,27 +247,34 @@ class Raster(Stage):
             to["ambient"], to["diffuse"], to["specular"] = of.ambient, of.diffuse, of.specular
             # MuJoCo gives the scene's point lights none.
             fall = self.model.light_attenuation[of.id] if to["kind"] == 1 else of.attenuation
-            to["attenuation"], to["exponent"] = fall, of.exponent
-            to["cutoff"] = math.cos(math.radians(of.cutoff))
+            to["attenuation"], to["exponent"] = fall, max(of.exponent, 0.0)
+            throws = of.castshadow and to["kind"] != 1
+            if 0.0 <= of.cutoff <= 90.0:
+                to["cutoff"] = math.cos(math.radians(of.cutoff))
+            elif to["kind"] == 2:
+                to["kind"] = 1  # OpenGL has no such cones, and lets it shine to all sides
             # Light from everywhere, as a headlight often is, has no place: it would move with the
             # camera, and the light on all surfaces would be computed anew.
             if to["kind"] or of.diffuse.any() or of.specular.any():
                 to["position"], to["direction"] = of.pos, of.dir
-                if of.castshadow and to["kind"] != 1:
+                if throws:
                     self._cast(to, of, int((found["size"] > 0).sum()))
         return found
 
     def _cast(self, light: Any, of: Any, number: int) -> None:
         """Have a light throw shadows, by a map (of this number) of what MuJoCo's map covers."""
         ahead = of.dir.astype(float)
-        if not self._map_size or not (length := float(np.linalg.norm(ahead))):
+        length = float(np.linalg.norm(ahead))
+        angle = of.cutoff if 0.0 <= of.cutoff <= 80.0 else 80.0
+        reach, back = math.tan(math.radians(angle)), 0.0
+        if light["kind"] == 0:  # rays of a sun are parallel: seen from far away
+            reach, back = 1.0 / SUN_AWAY, SUN_AWAY * self._sun_reach
+        covers = reach > 1e-6 and (light["kind"] != 0 or 0.0 < back < math.inf)
+        if not (self._map_size and covers and 0.0 < length < math.inf):
             return
         ahead /= length
         aside = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
         aside /= np.linalg.norm(aside)
-        reach, back = math.tan(math.radians(min(of.cutoff, 80.0))), 0.0
-        if light["kind"] == 0:  # rays of a sun are parallel: seen from far away
-            reach, back = 1.0 / SUN_AWAY, SUN_AWAY * self._sun_reach
         light["size"], light["step"] = self._map_size, 2.0 * reach / self._map_size
         if number == len(self._maps):
             self._maps.append(np.empty((self._map_size, self._map_size), np.float32))
@@ -261,7 +288,9 @@ class Raster(Stage):
         size = self._map_size
         casting = lights[lights["size"] > 0]
         for number, (light, depth) in enumerate(zip(casting, self._maps, strict=False)):
-            seen = b"".join(each.tobytes() for each in (light["eye"], geoms["rgba"], poses))
+            seen = b"".join(
+                each.tobytes() for each in (light[["eye", "step"]], geoms["rgba"], poses)
+            )
             if seen == self._mapped[number]:
                 continue
             self._mapped[number] = seen
@@ -279,6 +308,21 @@ class Raster(Stage):
                 self._world, self._map_lenses[step], _at(frame), _at(eye), len(geoms),
                 _at(geoms), _at(poses), len(lights), _at(lights), None, _at(depth), None,
             )  # fmt: skip
+
+    def _from_behind(self, geoms: Any, poses: Any, eye: Floats) -> Any:
+        """Return the geoms, of planes that an eye is behind the other side, see-through."""
+        if not self._planes.size:
+            return geoms
+        places = poses[self._planes]
+        with np.errstate(invalid="ignore", over="ignore"):
+            ahead = ((eye - places["position"]) * places["turn"][:, 2::3]).sum(axis=1)
+        behind = self._planes[ahead < 0.0]
+        if not behind.size:
+            return geoms
+        turned = geoms.copy()
+        turned["mesh"][behind] = [self._behind[mesh] for mesh in geoms["mesh"][behind].tolist()]
+        turned["rgba"][behind, 3] *= np.float32(FROM_BEHIND)
+        return turned
 
     @override
     def keep(self, camera_id: int, qpos: Floats, seconds: float) -> None:
@@ -308,6 +352,7 @@ class Raster(Stage):
         geoms["rgba"] = rgba
         return geoms
 
+    @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # `narrow` bounds it
     def _describe(self) -> None:
         """Fill in the geoms' fields that stay as they are."""
         model, geoms = self.model, self._geoms
@@ -327,8 +372,13 @@ class Raster(Stage):
                 geoms[field][has] = getattr(model, f"mat_{field}")[material]
             textures = model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
             geoms["texture"][has] = np.append(self._textures, -1)[textures]
-            geoms["repeat"][has] = model.mat_texrepeat[material] * self._scale()[has]
-            geoms["cube"] = self._cube()
+            repeat = model.mat_texrepeat[material].astype(np.float64)
+            # With places on the surface, MuJoCo takes 0 and less for 1.
+            in_metres = np.isin(kind, (_Kind.mjGEOM_MESH, _Kind.mjGEOM_HFIELD))
+            on_surface = (self._own_places | ~in_metres)[has, None]
+            repeat = np.where(on_surface & ~(repeat > 0.0), 1.0, repeat)
+            geoms["repeat"][has] = narrow(repeat * self._scale()[has])
+            geoms["cube"] = narrow(self._cube())
 
     def _scale(self) -> Floats:
         """Return how often a texture is repeated on each geom for its size, shape (n, 2)."""
@@ -357,9 +407,15 @@ class Raster(Stage):
         cube = model.tex_type[number] != mujoco.mjtTexture.mjTEXTURE_2D
         if cube and height == width:  # all of its faces
             data, height = np.tile(data, 6), 6 * height
-        return int(
+        found = int(
             self._library.raster_texture(self._world, width, height, channels, _at(data), int(cube))
         )
+        if found < 0:
+            raise ValueError(
+                f"texture {model.texture(number).name or number}: expected fewer than 2³¹ texels "
+                f"of all textures and their smaller copies, found more with its {width} x {height}"
+            )
+        return found
 
     def _add_mesh(self, mesh: Mesh) -> int:
         points, corners = mesh.points, mesh.corners
@@ -372,17 +428,22 @@ class Raster(Stage):
 
     def _lens(self, info: CameraInfo) -> int:
         if info not in self._lenses:
-            if info.is_pinhole:
-                x = (np.arange(info.width) - info.cx) / info.fx
-                y = (np.arange(info.height) - info.cy) / info.fy
-                planes: Any = x, y, None
-            else:
-                planes = np.moveaxis(pixel_rays(info), -1, 0)
-            planes = [p if p is None else np.ascontiguousarray(p, np.float32) for p in planes]
+            x = ((np.arange(info.width) - info.cx) / info.fx).astype(np.float32)
+            y = ((np.arange(info.height) - info.cy) / info.fy).astype(np.float32)
+            planes: Any = x, y, None
+            if not (info.is_pinhole and _even(x) and _even(y)):
+                planes = np.moveaxis(pixel_rays(info), -1, 0).astype(np.float32)
+                planes = [np.ascontiguousarray(plane) for plane in planes]
             self._lenses[info] = self._library.raster_lens(
                 self._world, info.width, info.height, *map(_at, planes)
             )
         return self._lenses[info]
+
+
+def _even(rays: npt.NDArray[np.float32]) -> bool:
+    """Return whether rays are at equal steps, if float32 can tell them apart at all."""
+    steps = np.diff(rays.astype(np.float64))
+    return not steps.size or bool(steps.min() > max(0.9 * steps.max(), 1e-30))
 
 
 def _sizes(kind: npt.NDArray[Any], size: Floats) -> Floats:

@@ -61,16 +61,37 @@ class Changing(Protocol):
         """Set the world to its state at a time."""
 
 
+def check_settings(model: Any) -> None:
+    """Check what a model says of its drawing; `ValueError` for numbers without a meaning."""
+    for name in ("shadowsize", "numslices", "numstacks", "numquads"):
+        if (count := int(getattr(model.vis.quality, name))) < 0:
+            raise ValueError(f"visual/quality: {name}: expected 0 or more, found {count}")
+    if not 1e-9 <= model.stat.extent < math.inf:
+        raise ValueError(
+            f"statistic: extent: expected a number from 1e-9 m, found {model.stat.extent:g} m"
+        )
+    for number, fall in enumerate(model.light_attenuation.tolist()):
+        if not all(0.0 <= part < math.inf for part in fall):
+            raise ValueError(
+                f"light {model.light(number).name or number}: attenuation: expected numbers of at "
+                f"least 0, found {' '.join(f'{part:g}' for part in fall)}"
+            )
+
+
 class Stage(ABC):
     """Stage for the geoms of groups 0 to 2 (MuJoCo's default) of a model.
 
     Not thread-safe: stay in the thread that made it.
+
+    Raises:
+        ValueError: The model says of its drawing what has no meaning.
     """
 
     keeps_rows = False
     """Whether it draws each row at its own time, by `keep`."""
 
     def __init__(self, model: Any, dynamics: Changing | None = None) -> None:
+        check_settings(model)
         self.model = model
         self._dynamics = dynamics
         self._data = mujoco.MjData(model)
@@ -124,9 +145,10 @@ class Stage(ABC):
         self._camera.fixedcamid = camera_id
         self._update()
         if light != 1.0:
-            for source in self._scene.lights[: self._scene.nlight]:
-                for part in (source.ambient, source.diffuse, source.specular):
-                    part *= light
+            with np.errstate(over="ignore", invalid="ignore"):  # they are bounded when drawn
+                for source in self._scene.lights[: self._scene.nlight]:
+                    for part in (source.ambient, source.diffuse, source.specular):
+                        part *= light
 
     def _place(self, qpos: Floats, seconds: float) -> None:
         """Set all bodies to a state and time."""

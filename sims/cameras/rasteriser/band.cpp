@@ -301,13 +301,13 @@ void Band::measure() const {
         float* to = images_.depth + std::size_t(y - view_.first) * lens_.width;
         if (lens_.pinhole) {
             for (int x = 0; x < lens_.width; ++x) {
-                const float depth = 1.0f / from[x];
+                const float depth = from[x] > 0.0f ? 1.0f / from[x] : none;
                 to[x] = depth > far ? none : depth;
             }
         } else {
             const float* ahead = &lens_.z[std::size_t(y) * lens_.stride];
             for (int x = 0; x < lens_.width; ++x) {
-                const float depth = 1.0f / from[x] * ahead[x];
+                const float depth = from[x] > 0.0f ? 1.0f / from[x] * ahead[x] : none;
                 to[x] = ahead[x] > 0.0f && depth <= far ? depth : none;
             }
         }

@@ -104,15 +104,18 @@ void Lens::find_spots() {
 
 // From a pixel near it by Newton's method, one step.
 Lens::Pixel Lens::near_pixel(Vec3 towards) const {
-    const Vec3f ahead = narrow(towards * (1.0 / root(dot(towards, towards))));
-    if (!(ahead.x == ahead.x)) return {-1, -1};
+    const double squared = dot(towards, towards);
+    if (!(squared > 1e-300 && squared < 1e300)) return {-1, -1};
+    const Vec3f ahead = narrow(towards * (1.0 / root(squared)));
     const Spot near = spots_[spot(ahead)];
     if (near.column < 0) return {-1, -1};
     const Vec3f here = ray(near.column, near.row), way = ahead - here;
     const Vec3f across = ray(near.column + 1, near.row) - here;
     const Vec3f down = ray(near.column, near.row + 1) - here;
     const float a = dot(across, across), b = dot(across, down), c = dot(down, down);
-    const float u = dot(way, across), v = dot(way, down), share = 1.0f / (a * c - b * b);
+    const float u = dot(way, across), v = dot(way, down), area = a * c - b * b;
+    if (area == 0) return {-1, -1};
+    const float share = 1.0f / area;
     return {near.column + (c * u - b * v) * share, near.row + (a * v - b * u) * share};
 }
 

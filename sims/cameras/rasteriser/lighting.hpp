@@ -7,8 +7,11 @@
 
 namespace raster {
 
-// 2 to the power of x, for -126 < x < 127; relative error below 2e-7.
+// 2 to the power of x, relative error below 2e-7; 0 where that would be below 2 to the power of -126,
+// and no more than that of 127.
 inline float power_of_2(float x) {
+    if (!(x >= -126.0f)) return 0;
+    x = std::min(x, 127.0f);
     int whole = static_cast<int>(x);
     whole -= x < static_cast<float>(whole);
     const float y = (x - whole) * 0.693147180559945f;  // Taylor's series about 0, ln 2 at most
@@ -37,13 +40,22 @@ inline Vec3 unit(Vec3 a) {
     return length > 0 ? a * (1.0 / length) : a;
 }
 
+constexpr double brightest = 1e6;  // the most light of a light on a point: white is 1
+
+// Light as a number with which all that follows can compute: 0 if it is none.
+inline float bounded(double light) {
+    return static_cast<float>(light >= -brightest ? std::min(light, brightest)
+                              : light < 0         ? -brightest
+                                                  : 0.0);
+}
+
 // Light of a point with a unit normal, both in the world, each part from 0 to 1; and after it, so far
 // apart, what each light that throws shadows adds where it shines.
 inline void lit(const Geom& geom, const std::vector<Light>& lights, Vec3 point, Vec3 normal,
                 Vec3 eye, Vec3f* to, std::size_t apart) {
     float sums[3];
     const auto within = [](float part) { return std::min(std::max(part, 0.0f), 1.0f); };
-    for (int k = 0; k < 3; ++k) sums[k] = geom.emission * geom.rgba[k];
+    for (int k = 0; k < 3; ++k) sums[k] = bounded(geom.emission * geom.rgba[k]);
     Vec3f* added = to;
     for (const Light& light : lights) {
         Vec3 towards{-light.direction[0], -light.direction[1], -light.direction[2]};
@@ -52,8 +64,9 @@ inline void lit(const Geom& geom, const std::vector<Light>& lights, Vec3 point, 
             const Vec3 way = Vec3{light.position[0], light.position[1], light.position[2]} - point;
             const double distance = root(dot(way, way));
             const Vec3 ray = unit(way);
-            strength = 1.0 / (light.attenuation[0] + light.attenuation[1] * distance +
-                              light.attenuation[2] * distance * distance);
+            strength = 1.0 / std::max(light.attenuation[0] + light.attenuation[1] * distance +
+                                          light.attenuation[2] * distance * distance,
+                                      1e-30);
             if (light.kind == 2) {
                 const double along = dot(ray, towards);
                 strength *= along < light.cutoff || along <= 0 ? 0.0
@@ -73,7 +86,7 @@ inline void lit(const Geom& geom, const std::vector<Light>& lights, Vec3 point, 
         }
         float parts[3];
         for (int k = 0; k < 3; ++k)
-            parts[k] = static_cast<float>(
+            parts[k] = bounded(
                 strength * (geom.rgba[k] * (light.ambient[k] + light.diffuse[k] * facing) +
                             geom.specular * light.specular[k] * shine));
         if (light.size) *(added += apart) = {parts[0], parts[1], parts[2]};

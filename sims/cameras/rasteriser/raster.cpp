@@ -32,8 +32,12 @@ Scene* raster_new() { return new Scene; }
 
 void raster_free(Scene* scene) { delete scene; }
 
+// -1 if there is no room for it: all texels have a number.
 int raster_texture(Scene* scene, int width, int height, int channels, const std::uint8_t* data,
                    int cube) {
+    const auto before = static_cast<std::int64_t>(scene->texels.size());
+    if (before + Texture::count(width, height, cube) > std::numeric_limits<std::int32_t>::max())
+        return -1;
     scene->textures.push_back(std::make_unique<Texture>(
         scene->texels, width, height, channels, data, cube));
     return static_cast<int>(scene->textures.size()) - 1;

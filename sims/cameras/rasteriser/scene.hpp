@@ -114,7 +114,7 @@ struct Planes {
 
     Planes() = default;
     explicit Planes(const Corners& of) {
-        const double share = 1.0 / of.away(), side = of.away() > 0 ? 1.0 : -1.0;
+        const double share = inverse(of.away()), side = of.away() > 0 ? 1.0 : -1.0;
         const auto planes = [=](d4 edges) {
             d4 found = edges * side;
             found[3] = (edges[0] + edges[1] + edges[2]) * share;
@@ -216,8 +216,8 @@ class Scene {
     static double ball(Vec3 middle, double reach, Vec3f& ahead, float& least);
     bool in_squares(Placed& placed, const Placed& later) const;
     void add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving);
-    bool bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels,
-                 int count) const;
+    bool bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels, int count,
+                 bool turns) const;
     void light(const Geom& geom, const Pose& pose, Slot& slot) const;
     void spread(int parts, const std::function<void(int)>& work) const;
 
@@ -226,6 +226,7 @@ class Scene {
     int frame_ = 0;
     int first_ = 0, last_ = 0;  // rows that are being drawn: first to last - 1
     double start_ = 0, step_ = 0;  // row of the first pose, and how many there are to the next one
+    int passed_ = 0;  // how many poses since that of the rows before these
     Pose eye_{}, next_eye_{}, middle_eye_{};
     const Pose* middle_poses_ = nullptr;  // of geoms; their light is that of all rows
     std::vector<Light> lights_;

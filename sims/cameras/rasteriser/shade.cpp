@@ -51,7 +51,7 @@ std::int32_t Band::surface(std::int32_t number, int y) {
     const Corners seen =
         rolling ? between_poses(number, y)
                 : Corners({placed.seen[corners[0]], placed.seen[corners[1]], placed.seen[corners[2]]});
-    const double share = 1.0 / seen.away();
+    const double share = inverse(seen.away());
     const d4 weights[3] = {seen.edge(1) * share, seen.edge(2) * share, seen.edge(0) * share};
     const auto plane = [&](float (&to)[3], float a, float b, float c) {
         put(to, weights[0] * double(a) + weights[1] * double(b) + weights[2] * double(c));
@@ -116,7 +116,7 @@ std::int32_t Band::surface(std::int32_t number, int y) {
         plane(shade.place[0], at[0].x, at[1].x, at[2].x);
         plane(shade.place[1], at[0].y, at[1].y, at[2].y);
         plane(shade.place[2], at[0].z, at[1].z, at[2].z);
-        put(shade.depth, (from.edge(0) + from.edge(1) + from.edge(2)) * (1.0 / from.away()));
+        put(shade.depth, (from.edge(0) + from.edge(1) + from.edge(2)) * inverse(from.away()));
         shades_.push_back(shade);
     }
     return index;

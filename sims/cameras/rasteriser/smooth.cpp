@@ -20,10 +20,12 @@ void Mesh::find_parts() {
     std::vector<std::int32_t> root(points.size()), same(points.size());
     std::iota(root.begin(), root.end(), 0), std::iota(same.begin(), same.end(), 0);
     std::vector<std::array<std::int64_t, 6>> places;  // rounded: a turn ends where it began
+    const auto whole = [](float x) {
+        return std::int64_t(std::llrint(std::min(9e18f, std::max(-9e18f, x))));
+    };
     for (std::size_t k = 0; k < points.size(); ++k) {
         const Vec3f p = points[k] * 1e5f, n = normals[k] * 1e3f;
-        places.push_back({std::llrint(p.x), std::llrint(p.y), std::llrint(p.z), std::llrint(n.x),
-                          std::llrint(n.y), std::llrint(n.z)});
+        places.push_back({whole(p.x), whole(p.y), whole(p.z), whole(n.x), whole(n.y), whole(n.z)});
     }
     const auto less = [&](std::int32_t a, std::int32_t b) { return places[a] < places[b]; };
     const auto find = [&](std::int32_t at) {
@@ -75,7 +77,7 @@ const Triangle* Band::seen_by(std::int32_t number, int y, Triangle& row) const {
     if (y >= scene_.first_) return seen((row = triangle(number)).planes, number, y) ? &row : nullptr;
     const Moving& moving = scene_.before_moving_[number];
     row = scene_.before_[number];  // it is above these rows
-    row.planes = Planes({moving.from, moving.to, share(y) + 1});
+    row.planes = Planes({moving.from, moving.to, share(y) + scene_.passed_});
     return &row;
 }
 
@@ -147,6 +149,7 @@ void Band::smooth(int x, int y, bool below) {
             const float inside = mine[3] - behind[3], outside = beyond[3] - theirs[3];
             if (!(inside >= 0 && outside < 0)) return;
             share = inside / (inside - outside);
+            if (!(share >= 0)) return;  // too large to tell
             plane = nearer[3] - farther[3];
         }
     }

@@ -36,6 +36,17 @@ class Texture {
   public:
     const bool is_cube;
 
+    // How many texels one takes, with all of its sizes.
+    static std::int64_t count(std::int64_t width, std::int64_t height, bool cube) {
+        std::int64_t found = 0;
+        const int sides = cube ? 6 : 1;
+        for (height /= sides;; width = std::max<std::int64_t>(width / 2, 1),
+                               height = std::max<std::int64_t>(height / 2, 1)) {
+            found += sides * (width + 2) * (height + 2);
+            if (width == 1 && height == 1) return found;
+        }
+    }
+
     // Adds its texels, red in their lowest bytes, to those of all.
     Texture(std::vector<std::uint32_t>& all, int width, int height, int channels,
             const std::uint8_t* data, bool cube)
@@ -99,10 +110,24 @@ class Texture {
         taps.set(Taps::share, x, iv{} + (part << 8 | part << 24));
     }
 
+    struct Along {
+        iv texel, share;  // of two neighbours the first, and the weight of the other
+    };
+
+    // Where places from 0 to 1 lie along a side of so many texels.
+    static Along along(fv at, int count) {
+        if (count < 32768) {
+            const iv found = as_whole(at * (count * 65536.0f)) + 32768;  // in 65536ths
+            return {found >> 16, twice(found)};
+        }
+        const fv found = at * static_cast<float>(count) + 0.5f, first = floored(found);
+        const iv texel = as_whole(first), most = iv{} + count;
+        return {texel < most ? texel : most, twice(as_whole((found - first) * 65536.0f))};
+    }
+
     void place(Taps& taps, int x, fv u, fv v, iv face, int size, const Level& level) const {
-        const iv column = as_whole(u * (level.width * 65536.0f)) + 32768;  // in 65536ths
-        const iv row = as_whole(v * (level.height * 65536.0f)) + 32768;
-        iv at = (row >> 16) * level.stride() + ((column >> 16) + level.start);
+        const Along column = along(u, level.width), row = along(v, level.height);
+        iv at = row.texel * level.stride() + (column.texel + level.start);
         if (is_cube) at += face * (level.stride() * (level.height + 2));
         taps.set(Taps::upper + size, x, at);
         taps.set(Taps::lower + size, x, at + level.stride());
@@ -111,8 +136,8 @@ class Texture {
                 __builtin_prefetch(taps.texels + at[k]);
                 __builtin_prefetch(taps.texels + at[k] + level.stride());
             }
-        taps.set(Taps::right + size, x, twice(column));
-        taps.set(Taps::low + size, x, twice(row));
+        taps.set(Taps::right + size, x, column.share);
+        taps.set(Taps::low + size, x, row.share);
     }
 
     void border(std::vector<std::uint32_t>& all, const std::vector<std::uint32_t>& texels,
@@ -150,16 +175,17 @@ class Texture {
         for (int y = 0; y < down; ++y)
             for (int x = 0; x < across; ++x) {
                 std::uint64_t sums[3] = {0, 0, 0};
-                const auto shares = [](int at, int size, int smaller, auto found) {
-                    const int begin = at * size, end = begin + size;
-                    for (int k = begin / smaller; k * smaller < end; ++k)
+                using Wide = std::int64_t;
+                const auto shares = [](Wide at, Wide size, Wide smaller, auto found) {
+                    const Wide begin = at * size, end = begin + size;
+                    for (Wide k = begin / smaller; k * smaller < end; ++k)
                         found(k, std::min((k + 1) * smaller, end) - std::max(k * smaller, begin));
                 };
-                shares(y, height, down, [&](int row, int rows) {
-                    shares(x, width, across, [&](int column, int columns) {
-                        const std::uint32_t texel = from[std::size_t(row) * width + column];
+                shares(y, height, down, [&](Wide row, Wide rows) {
+                    shares(x, width, across, [&](Wide column, Wide columns) {
+                        const std::uint32_t texel = from[row * width + column];
                         for (int k = 0; k < 3; ++k)
-                            sums[k] += std::uint64_t(rows) * columns * (texel >> 8 * k & 255);
+                            sums[k] += std::uint64_t(rows * columns) * (texel >> 8 * k & 255);
                     });
                 });
                 const std::uint64_t count = std::uint64_t(width) * height;

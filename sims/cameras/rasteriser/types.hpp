@@ -11,6 +11,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <memory>
 #include <vector>
 
@@ -48,7 +49,17 @@ template <typename V, typename T>
 inline void store(T* to, V value) { std::memcpy(to, &value, sizeof value); }
 
 inline fv as_float(iv value) { return __builtin_convertvector(value, fv); }
-inline iv as_whole(fv value) { return __builtin_convertvector(value, iv); }  // towards 0
+
+// Towards 0. It must fit: what does not becomes another number on another processor.
+inline iv as_whole(fv value) {
+#ifdef RASTER_CHECKED  // sanitizers look at scalars only
+    iv found{};
+    for (int k = 0; k < lanes; ++k) found[k] = static_cast<std::int32_t>(value[k]);
+    return found;
+#else
+    return __builtin_convertvector(value, iv);
+#endif
+}
 inline bool any(iv mask) {  // whether a lane is not 0
 #if defined(__AVX2__)
     const auto bits = reinterpret_cast<__m256i>(mask);
@@ -72,9 +83,15 @@ inline int bits(i4 mask) {  // one for each lane
 #ifdef __AVX2__
 inline int bits(iv mask) { return _mm256_movemask_ps(reinterpret_cast<__m256>(mask)); }
 #endif
-inline fv floored(fv value) {
-    const fv whole = as_float(as_whole(value));
-    return value < whole ? whole - 1.0f : whole;
+inline fv floored(fv value) {  // of any size
+#if defined(__AVX2__)
+    return reinterpret_cast<fv>(_mm256_floor_ps(reinterpret_cast<__m256>(value)));
+#elif defined(__SSE4_1__)
+    return reinterpret_cast<fv>(_mm_floor_ps(reinterpret_cast<__m128>(value)));
+#else
+    for (int k = 0; k < lanes; ++k) value[k] = std::floor(value[k]);
+    return value;
+#endif
 }
 
 // The upper halves of the products.
@@ -123,6 +140,12 @@ inline void put(float (&to)[3], d4 from) {
 }
 
 inline double root(double x) { return std::sqrt(x); }  // IEEE 754 requires it to be exact
+
+// The inverse as IEEE 754 has it, of 0 too, for which C++ has none.
+template <typename T>
+inline T inverse(T x) {
+    return x != 0 ? 1 / x : std::copysign(std::numeric_limits<T>::infinity(), x);
+}
 
 struct Matrix {  // 3 x 3, row by row
     double m[9];

@@ -25,6 +25,7 @@ void Scene::draw(const Lens& lens, const View& view, const Pose* eyes, const Geo
                  const Images& images) {
     lens_ = &lens;
     view_ = view;
+    for (float& part : view_.fog) part = part > 0 ? std::min(part, 1.0f) : 0.0f;
     ++frame_;
     if (lights_.size() != std::size_t(light_count) ||
         (light_count && std::memcmp(lights_.data(), lights, sizeof(Light) * light_count))) {
@@ -39,17 +40,21 @@ void Scene::draw(const Lens& lens, const View& view, const Pose* eyes, const Geo
     visible_.resize(std::size_t(view.last - view.first) * lens.stride + widest);
     const int steps = view.poses - 1, middle = view.poses / 2;
     middle_eye_ = eyes[middle], middle_poses_ = poses + std::size_t(middle) * count;
-    bool fresh = true;
+    const bool alone = view.height == 1;  // a single row sees what is in the middle
+    step_ = steps && !alone ? (view.height - 1.0) / steps : 1.0;
+    const auto row_of = [&](int pose) { return alone ? pose - 0.5 * steps : pose * step_; };
+    int before = -1;  // the last pose that rows were drawn from
     for (int k = 0; k < std::max(steps, 1); ++k) {
-        step_ = steps ? (view.height - 1.0) / steps : 1.0, start_ = k * step_;
+        start_ = row_of(k);
         eye_ = eyes[k], next_eye_ = eyes[std::min(k + 1, steps)];
         const int first = std::max(static_cast<int>(std::ceil(start_)), view.first);
-        const int end = k + 1 >= steps ? view.height : static_cast<int>(std::ceil(start_ + step_));
+        const int end = k + 1 >= steps ? view.height : static_cast<int>(std::ceil(row_of(k + 1)));
         const int last = std::min(end, view.last);
         if (first >= last) continue;
-        if (!fresh) std::swap(placed_, later_);  // where all came to
-        draw_rows(first, last, geoms, poses + std::size_t(k) * count, count, images, fresh);
-        fresh = false;
+        const bool follows = before >= 0 && before + 1 == k;
+        if (follows) std::swap(placed_, later_);  // where all came to
+        passed_ = before < 0 ? 0 : k - before, before = k;
+        draw_rows(first, last, geoms, poses + std::size_t(k) * count, count, images, !follows);
     }
 }
 
@@ -70,7 +75,8 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
         } else if (!in_squares(placed, rolling ? later_[index] : placed)) {
             continue;
         }
-        order.emplace_back(dot(placed.shift, placed.shift), index);
+        const double distance = dot(placed.shift, placed.shift);
+        if (distance == distance) order.emplace_back(distance, index);  // else it is nowhere
     }
     std::sort(order.begin(), order.end());  // front to back: of equal depths the first counts
     // So many that no thread waits long for another, and that triangles' numbers have room for.
@@ -164,7 +170,7 @@ int Scene::beyond(const Placed& placed) const {
 // Direction of a ball from the eye and least cosine of rays that meet it. Returns the sine's square
 // of the angle between them, or 1 if the eye is inside.
 double Scene::ball(Vec3 middle, double reach, Vec3f& ahead, float& least) {
-    const double away = dot(middle, middle), share = reach / away * 1.01;
+    const double away = dot(middle, middle), share = away > 0 ? reach / away * 1.01 : 1.0;
     if (!(share < 1.0)) {
         ahead = {}, least = -1;  // met by all
         return 1.0;
@@ -204,6 +210,10 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
     Placed& placed = placed_[index];
     const bool rolling = view_.poses > 1;
     const std::vector<std::int32_t>& corners = placed.mesh->corners;
+    double same = 0;  // 1 and twice the cosine of the turn until the next pose
+    if (rolling)
+        for (int k = 0; k < 9; ++k) same += placed.turn.m[k] * later_[index].turn.m[k];
+    const bool turns = rolling && !(same > 2.99);
     placed.list = &to;
     if (!rolling) placed.listed.assign(corners.size() / 3, Placed::faces_away);
     const double start = lens_->pinhole ? lens_->y[0] : 0;  // of rows, and some more for rounding
@@ -238,14 +248,14 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
             if (!(away < 0)) continue;
             std::int32_t& listed = placed.listed[corner / 3];
             listed = Placed::out_of_view;
-            if (!bounded(triangle, points, pixels, 3)) continue;
+            if (!bounded(triangle, points, pixels, 3, false)) continue;
             listed = static_cast<std::int32_t>(to.size());
             triangle.planes = Planes(Corners(now));
             to.push_back(triangle);
             continue;
         }
         put(later_[index], 3);
-        if (!bounded(triangle, points, pixels, 6)) continue;
+        if (!bounded(triangle, points, pixels, 6, turns)) continue;
         const Corners from(now), next(*reinterpret_cast<Vec3(*)[3]>(points + 3));
         if (from.away() >= 0 && next.away() >= 0) continue;
         triangle.planes = Planes(from);
@@ -254,9 +264,10 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
     }
 }
 
-// Find the pixels about triangles' image; false if there are none.
-bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels,
-                    int count) const {
+// Find the pixels about triangles' image; false if there are none. If it turns far from one pose to
+// the next, all of them: its way there is not straight.
+bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels, int count,
+                    bool turns) const {
     triangle.left = 0, triangle.right = lens_->width;
     triangle.top = first_, triangle.bottom = last_;
     double low[2] = {1e30, 1e30}, high[2] = {-1e30, -1e30};
@@ -286,15 +297,20 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
         triangle.bottom = std::min(triangle.bottom, static_cast<int>(high[1] + more) + 1);
         return triangle.left < triangle.right && triangle.top < triangle.bottom;
     }
+    if (turns) return true;
     const double near = view_.near;
-    for (int k = 0; k < count; ++k) {
-        const Vec3 from = points[k], to = points[k % 3 == 2 ? k - 2 : k + 1];
-        if (from.z >= near) see(pixels[k]);
-        if ((from.z >= near) != (to.z >= near)) {
-            Vec3 at = from + (to - from) * ((near - from.z) / (to.z - from.z));
-            at.z = near;
-            see(lens_->pixel(at));
-        }
+    const auto cross_near = [&](Vec3 from, Vec3 to) {
+        if ((from.z >= near) == (to.z >= near)) return;
+        Vec3 at = from + (to - from) * ((near - from.z) / (to.z - from.z));
+        at.z = near;
+        see(lens_->pixel(at));
+    };
+    int ahead = 0;
+    for (int k = 0; k < count; ++k)
+        if (points[k].z >= near) see(pixels[k]), ++ahead;
+    for (int k = 0; ahead && ahead < count && k < count; ++k) {
+        cross_near(points[k], points[k % 3 == 2 ? k - 2 : k + 1]);
+        for (int later = 3; k < 3 && later < count; ++later) cross_near(points[k], points[later]);
     }
     // Columns are at equal steps of x, rows of y; a pixel more on each side for rounding, and one
     // for a way between two poses that is not quite straight.
