@@ -278,6 +278,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         not_deterministic: Nodes because of which equal runs may have unequal digests.
         truth_readers: Nodes that received true poses, but those that fly, judge, record or show.
         environment: Machine and versions; the command line, and the commit of the current folder.
+        truth: What is otherwise than it was announced, as a camera's calibration, by subject.
         processes: Where which nodes ran, if not all in one process.
         workers: Costs of workers, by ``node.Factory``, and of programs, by their nodes.
         outside: Answers of systems outside the process, by name.
@@ -309,6 +310,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     truth_readers: list[str]
     announcements: list[dict[str, Any]]
     environment: dict[str, str]
+    truth: dict[str, dict[str, Any]] = {}
     processes: list[ProcessSummary] = []
     workers: dict[str, WorkerSummary] = {}
     outside: dict[str, OutsideSummary] = {}

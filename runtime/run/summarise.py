@@ -208,6 +208,7 @@ def summarise(
             "command": command_line(),
             "commit": commit(),
         },
+        truth=state.truth,
         workers={
             name: WorkerSummary.of(each)
             for name, each in (
