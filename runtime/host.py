@@ -143,6 +143,9 @@ class Host:
     def note_environment(self, name: str, value: str) -> None:
         """Record a dependency of the run in the summary."""
 
+    def note_truth(self, subject: str, facts: Mapping[str, Any]) -> None:
+        """Put what nobody may know during the run into its summary."""
+
     def after_run(self, call: Callable[[Path], Any]) -> None:
         """Call a function once the summary is written."""
 

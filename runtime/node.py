@@ -369,6 +369,10 @@ class Node(Generic[C]):
         """Record a machine property relevant to figures, beside the summary's versions."""
         self._host.note_environment(name, value)
 
+    def note_truth(self, subject: str, facts: Mapping[str, Any]) -> None:
+        """Record what no node and no program may know during the run, for its summary alone."""
+        self._host.note_truth(subject, facts)
+
     def after_run(self, call: Callable[[Path], Any]) -> None:
         """Have a function called with the run's folder, if any, once its summary is written."""
         self._host.after_run(call)

@@ -281,6 +281,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         environment: Machine and versions; the command line, and the commit of this project.
         code: Hash of each estimator's own files, by its node: its class with local imports, and the
             program of a `Process`; as they were when the run began.
+        truth: What is otherwise than it was announced, as a camera's calibration, by subject.
         processes: Where which nodes ran, if not all in one process.
         workers: Costs of workers, by ``node.Factory``, and of programs, by their nodes.
         outside: Answers of systems outside the process, by name.
@@ -313,6 +314,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     announcements: list[dict[str, Any]]
     environment: dict[str, str]
     code: dict[str, str] = {}
+    truth: dict[str, dict[str, Any]] = {}
     processes: list[ProcessSummary] = []
     workers: dict[str, WorkerSummary] = {}
     outside: dict[str, OutsideSummary] = {}

@@ -69,6 +69,7 @@ class RunState(Host):
         links: All links of the nodes that there are, by ``node.port``.
         environment: What nodes found of the machine on which figures depend.
         code: Hash of the files of each node that may estimate.
+        truth: What nodes announced otherwise than it is, by subject, for the summary alone.
         afterwards: Functions to call once the summary is written.
         make_worker: The class of workers, or a function that makes one as that does.
         changes: Output for changes of settings; its listeners include the changed node.
@@ -109,6 +110,7 @@ class RunState(Host):
         self.flights: dict[str, dict[str, Any]] = {}
         self.environment: dict[str, str] = {}
         self.code: dict[str, str] = {}
+        self.truth: dict[str, dict[str, Any]] = {}
         self.costs: dict[str, Costs] = {}
         self.outside: dict[str, Answers] = {}
         self.make_worker: Callable[..., Worker[Any]] = Worker
@@ -296,6 +298,10 @@ class RunState(Host):
     @override
     def note_environment(self, name: str, value: str) -> None:
         self.environment[name] = value
+
+    @override
+    def note_truth(self, subject: str, facts: Mapping[str, Any]) -> None:
+        self.truth[subject] = dict(facts)
 
     @override
     def conclude(

@@ -204,6 +204,7 @@ def summarise(
                 for each in state.announcements
             )
         },
+        truth=state.truth,
         workers={
             name: WorkerSummary.of(each)
             for name, each in (

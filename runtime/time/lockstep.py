@@ -421,7 +421,10 @@ def waits_of(process: int) -> dict[str, int]:
     """Return how long each thread of a process and of its children has waited to run (ns)."""
     found, processes = {}, [process]
     for number in processes:
-        for thread in Path(f"/proc/{number}/task").glob("*"):
+        threads: list[Path] = []
+        with contextlib.suppress(OSError):  # it has ended
+            threads += Path(f"/proc/{number}/task").iterdir()
+        for thread in threads:
             with contextlib.suppress(OSError, IndexError):  # it has ended, or the kernel is another
                 found[thread.name] = int((thread / "schedstat").read_bytes().split()[1])
                 processes += map(int, (thread / "children").read_bytes().split())

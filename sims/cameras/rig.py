@@ -15,9 +15,10 @@ import events as ev
 from events.base import Quaternion, Vector3
 from runtime import Node, Worker
 from runtime.channels.sender import Sender
+from sims.cameras.calibration import Calibration, announced, difference
 from sims.cameras.optics import ExposureControl, undistorted
 from sims.cameras.renderer import CameraRenderer, Frame, Motion, Shot, delay_of, stamp_error
-from sims.cameras.spec import CameraSpec, announcement, eyes, optical_frame, optical_in_body
+from sims.cameras.spec import CameraSpec, announcement, calibration, eyes, optical_frame
 from sims.cameras.stage import RendererName
 
 STEP = 1_000_000  # interval of the states recorded during an exposure, nanoseconds
@@ -148,14 +149,19 @@ class CameraRig:
                     prefix=f"{name}/",
                     parent_frame_id=parent_frame_id,
                     stamp=self._node.clock.now(),
+                    known=self._known(eye),
                 )
                 if spec.stereo and eye is not left:
                     said = msgspec.structs.replace(
                         said,
                         latency=said.latency - spec.offset,  # both are delivered together
-                        baseline=spec.stereo.baseline,
+                        baseline=spec.stereo.baseline
+                        if spec.wrong is None
+                        else math.dist(said.position, self._known(left).position),
                         stereo=f"{name}/{left.name}",
                     )
+                if spec.wrong is not None:  # no word of it is in what anybody can read meanwhile
+                    self._node.note_truth(said.source, difference(said, calibration(eye)))
                 yield said
                 if spec.undistorted:
                     source, (pinhole, _, _) = said.source, undistorted(said.info)
@@ -172,16 +178,23 @@ class CameraRig:
         """Return the pose of each camera's optical frame in the body's, constant for the run."""
         name = self._node.name
         for spec in (eye for entry in self._specs.values() for eye in eyes(entry)):
-            position, orientation = optical_in_body(spec)
+            known = self._known(spec)
             yield ev.TransformStamped(
                 stamp=self._node.clock.now(),
                 source=f"{name}/{spec.name}",
                 frame_id=parent_frame_id,
                 child_frame_id=optical_frame(spec, f"{name}/"),
-                translation=position,
-                rotation=orientation,
+                translation=known.position,
+                rotation=known.orientation,
                 static=True,
             )
+
+    def _known(self, eye: CameraSpec) -> Calibration:
+        """Return the announced calibration of a camera, or of a rig's eye."""
+        true = calibration(eye)
+        if eye.wrong is None:
+            return true
+        return announced(true, eye.wrong, self._node.rng, eye.name)
 
     @property
     def past(self) -> float:

@@ -30,6 +30,8 @@ from events.frames import (
 from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
+from sims.cameras.calibration import USUAL, Calibration, CalibrationError
+from sims.cameras.calibration import check as check_calibration
 from sims.cameras.optics import AutoExposure, Intrinsics, Lens, intrinsics, noise_at, read_response
 from sims.mounting import Matrix, apply_matrix
 from sims.presets import CAMERAS, DEPTH_SENSORS
@@ -160,6 +162,8 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         time_offset: Delay of all stamps of an exposure on the clock of the IMU and the ground
             truth.
         time_jitter: Greatest random error of the stamps besides, either way.
+        calibration_error: Errors of what is announced: intrinsics, mounting, time offset; ``true``
+            for those of a good calibration. The images, depth and camera poses are what they are.
         stereo: Makes two cameras: ``<name>_left`` and, a baseline to the right, ``<name>_right``.
         render_time: Least real time to draw a frame, to test a run on a machine too slow for it.
     """
@@ -195,6 +199,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     loss: Changeable[Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]] = 0.0
     time_offset: Latency = Latency(0)
     time_jitter: Latency = Latency(0)
+    calibration_error: CalibrationError | bool = False
     stereo: Stereo | None = None
     render_time: Latency = Latency(0)
 
@@ -224,6 +229,13 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
                 "depth_sensor: expected a camera without distortion, as such a sensor rectifies "
                 f"its images, found {camera_info(self).distortion_model}"
             )
+        if (error := self.wrong) is not None:
+            check_calibration(error, len(camera_info(self).distortion), 2 if self.stereo else 1)
+            if self.undistorted and error.of_lens:
+                raise ValueError(
+                    "undistorted: expected exact intrinsics, by which the simulator undistorts, "
+                    "found a calibration_error beside it"
+                )
         if self.undistorted and self.vignette:
             raise ValueError(
                 "undistorted: expected no vignette, whose shape would change, found one beside it"
@@ -234,6 +246,12 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
                 "vignette: expected shares of light from 0 to 1 all over the image, found "
                 f"{shares.min():.3g} to {shares.max():.3g}"
             )
+
+    @property
+    def wrong(self) -> CalibrationError | None:
+        """Errors of the announced calibration; `None` if it is exact."""
+        error = USUAL if self.calibration_error is True else self.calibration_error
+        return error if isinstance(error, CalibrationError) else None
 
     @property
     def longest_exposure(self) -> float:
@@ -255,11 +273,18 @@ def eyes(spec: CameraSpec) -> tuple[CameraSpec, ...]:
     """Return the cameras of an entry: itself, or the left and right of a stereo rig."""
     if spec.stereo is None:
         return (spec,)
-    left = msgspec.structs.replace(spec, name=f"{spec.name}_left", stereo=None)
+    errors = [
+        spec.calibration_error if spec.wrong is None else spec.wrong.of_eye(k) for k in (0, 1)
+    ]
+    left = msgspec.structs.replace(
+        spec, name=f"{spec.name}_left", stereo=None, calibration_error=errors[0]
+    )
     place, turn = optical_in_body(spec)
     x, y, z = rotate(turn, (spec.stereo.baseline, 0.0, 0.0))
     there = (place[0] + x, place[1] + y, place[2] + z)
-    return left, msgspec.structs.replace(left, name=f"{spec.name}_right", position=there)
+    return left, msgspec.structs.replace(
+        left, name=f"{spec.name}_right", position=there, calibration_error=errors[1]
+    )
 
 
 def check_cameras(specs: Iterable[CameraSpec]) -> None:
@@ -330,23 +355,38 @@ def optical_frame(spec: CameraSpec, prefix: str) -> str:
     return f"{prefix}{spec.name}_optical"
 
 
+def calibration(spec: CameraSpec) -> Calibration:
+    """Return a camera's true calibration."""
+    return Calibration(camera_info(spec), *optical_in_body(spec), float(spec.time_offset))
+
+
 def announcement(
-    spec: CameraSpec, *, source: str, prefix: str, parent_frame_id: str, stamp: int = 0
+    spec: CameraSpec,
+    *,
+    source: str,
+    prefix: str,
+    parent_frame_id: str,
+    stamp: int = 0,
+    known: Calibration | None = None,
 ) -> events.CameraAnnouncement:
-    """Return the announcement of a camera: its images, and its pose on the body."""
-    position, orientation = optical_in_body(spec)
+    """Return the announcement of a camera: its images, and its pose on the body.
+
+    Args:
+        known: What is announced as its calibration; the true one if not given.
+    """
+    known = known or calibration(spec)
     response = read_response(spec.response)
     electrons = spec.full_well / spec.gain
     return events.CameraAnnouncement(
         stamp=stamp,
         source=source,
         images=spec.images,
-        info=camera_info(spec),
+        info=known.info,
         rate=spec.rate,
         latency=float(spec.latency),
         exposure=float(spec.longest_exposure),
         readout=float(spec.readout),
-        time_offset=float(spec.time_offset),
+        time_offset=known.time_offset,
         time_jitter=float(spec.time_jitter),
         noise=noise_at(response_light(response), 128, spec.noise, electrons),
         full_well=spec.full_well,
@@ -356,8 +396,8 @@ def announcement(
         **_depth_truth(spec),
         frame_id=optical_frame(spec, prefix),
         parent_frame_id=parent_frame_id,
-        position=position,
-        orientation=orientation,
+        position=known.position,
+        orientation=known.orientation,
     )
 
 

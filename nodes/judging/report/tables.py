@@ -59,6 +59,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     stalls: dict[str, int] = {}
     announcements: list[dict[str, Any]] = []
     environment: dict[str, str] = {}
+    truth: dict[str, dict[str, Any]] = {}
     judged: dict[str, str] = {}
     judged_hashes: dict[str, str] = {}
     notes: list[str] = []
@@ -207,11 +208,22 @@ def facts(run: Run) -> list[tuple[str, str]]:
         (f"link {port}", f"{link.lost} lost, {link.thinned} left out")
         for port, link in f.links.items()
     ]
+    rows += [(f"{name} as announced, less as it is", _off(each)) for name, each in f.truth.items()]
     rows += [(f"{name} is slow", each.slower) for name, each in f.workers.items() if each.slower]
     rows += [(f"loop stood still in {node}", f"{count} times") for node, count in f.stalls.items()]
     if f.clock is not None and not any(s.dropped or s.missed for s in f.streams.values()):
         rows.append(("dropped or unmatched", "nothing"))
     return rows
+
+
+def _off(facts: dict[str, Any]) -> str:
+    """Return by how much the announced numbers of a sensor are off, number by number."""
+    texts = []
+    for name, true in facts["true"].items():
+        said = np.atleast_1d(facts["announced"][name]) - np.atleast_1d(true)
+        if said.any():
+            texts.append(f"{name} {' '.join(f'{value:+.2g}' for value in said.tolist())}")
+    return "; ".join(texts)
 
 
 def _digest(f: Facts) -> str:

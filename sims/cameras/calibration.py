@@ -1,0 +1,169 @@
+"""Errors of a camera's calibration: what is announced of a camera differs from what is drawn.
+
+A simulator that announces its exact calibration flatters estimators that live off it. Real
+calibrations err: by some tenths of a pixel in focal length and principal point, and by a few
+hundredths of a degree between two eyes.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraAnnouncement, CameraInfo, Quaternion, Vector3
+from events.frames import multiply
+from runtime.units import Latency
+
+_Error = Annotated[float, msgspec.Meta(ge=0.0)] | tuple[float, ...]
+
+
+class CalibrationError(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the errors of a camera's announced calibration.
+
+    A number is a standard deviation: each error is drawn once a run, from the run's seed, for each
+    eye of a stereo rig by itself. A list has the errors themselves, a rig's left eye's first. An
+    error is what is announced less what is true.
+
+    Attributes:
+        focal: Of fx and fy, pixels.
+        centre: Of the principal point cx and cy, pixels.
+        distortion: Of the coefficients k1 and k2; that of all others (p1, p2, k3, …) is a tenth
+            of it. A list has all coefficients of the lens's model.
+        rotation: Of the mounting, about each axis of the optical frame, degrees.
+        position: Of the mounting, along each axis of the body, metres.
+        time: Of the time offset. All cameras of a vehicle share the draw, as they share a trigger.
+    """
+
+    focal: _Error = 0.0
+    centre: _Error = 0.0
+    distortion: _Error = 0.0
+    rotation: _Error = 0.0
+    position: _Error = 0.0
+    time: Latency = Latency(0)  # immutable
+
+    @property
+    def of_lens(self) -> bool:
+        """Whether the announced intrinsics err."""
+        return any(np.any(each) for each in (self.focal, self.centre, self.distortion))
+
+    def of_eye(self, number: int) -> CalibrationError:
+        """Return the errors of an eye of a stereo rig: 0 for the left one, 1 for the right."""
+        halves = {}
+        for name in ("focal", "centre", "distortion", "rotation", "position"):
+            values = getattr(self, name)
+            if isinstance(values, tuple):
+                half = len(values) // 2
+                halves[name] = values[number * half : (number + 1) * half]
+        return msgspec.structs.replace(self, **halves)
+
+
+USUAL = CalibrationError(
+    # The uncertainty that Kalibr reports of a careful calibration with a board of AprilTags, as of
+    # EuRoC's and TUM VI's cameras (estimate, from the differences of their repeated calibrations).
+    focal=0.15, centre=0.15, distortion=3e-4, rotation=0.01, position=2e-4, time=Latency(0.0005),
+)  # fmt: skip
+"""Errors of a good calibration, as of ``calibration_error = true``."""
+
+
+class Calibration(NamedTuple):
+    """Intrinsics, mounting and clock of a camera."""
+
+    info: CameraInfo
+    position: Vector3  # in the body's frame, metres
+    orientation: Quaternion  # optical frame to the body's
+    time_offset: float  # seconds, as `events.CameraAnnouncement` has it
+
+
+def announced(
+    true: Calibration, error: CalibrationError, parent: np.random.Generator, name: str
+) -> Calibration:
+    """Return the calibration that is announced of a camera.
+
+    Args:
+        parent: Generator of the node; its state stays.
+        name: Name of the camera, which together with the node's seed decides the draws.
+    """
+    info = true.info
+    count = len(info.distortion)
+    generator = _generator(parent, f"{name} calibration")
+    # All are drawn whatever is asked for: one setting changes no other's errors.
+    draws = [generator.standard_normal(size) for size in (2, 2, count, 3, 3)]
+    late = float(error.time) * float(_generator(parent, "calibrated clock").standard_normal())
+    shares = np.array([1.0, 1.0, *[0.1] * (count - 2)])
+    focal = _errors(error.focal, draws[0])
+    centre = _errors(error.centre, draws[1])
+    lens = _errors(error.distortion, draws[2] * shares)
+    turn = np.radians(_errors(error.rotation, draws[3]))
+    shift = _errors(error.position, draws[4])
+    changed = msgspec.structs.replace(
+        info,
+        fx=info.fx + focal[0],
+        fy=info.fy + focal[1],
+        cx=info.cx + centre[0],
+        cy=info.cy + centre[1],
+        distortion=tuple(k + e for k, e in zip(info.distortion, lens, strict=True)),
+    )
+    x, y, z = (p + e for p, e in zip(true.position, shift, strict=True))
+    return Calibration(
+        changed if error.of_lens else info,
+        (x, y, z),
+        multiply(true.orientation, _quaternion(turn)) if any(turn) else true.orientation,
+        true.time_offset + late,
+    )
+
+
+def check(error: CalibrationError, coefficients: int, eyes: int) -> None:
+    """Check the lengths of lists; raise a `ValueError` that names the setting."""
+    sizes = {"focal": 2, "centre": 2, "distortion": coefficients, "rotation": 3, "position": 3}
+    for name, size in sizes.items():
+        values = getattr(error, name)
+        if isinstance(values, tuple) and len(values) != size * eyes:
+            raise ValueError(
+                f"calibration_error.{name}: expected a standard deviation, or a list of "
+                f"{size * eyes} errors, found a list of {len(values)}"
+            )
+
+
+def difference(said: CameraAnnouncement, true: Calibration) -> dict[str, Any]:
+    """Return the true calibration behind an announcement, for a run's summary."""
+    return {
+        "true": {
+            "intrinsics": [true.info.fx, true.info.fy, true.info.cx, true.info.cy],
+            "distortion": list(true.info.distortion),
+            "position": list(true.position),
+            "orientation": list(true.orientation),
+            "time_offset": true.time_offset,
+        },
+        "announced": {
+            "intrinsics": [said.info.fx, said.info.fy, said.info.cx, said.info.cy],
+            "distortion": list(said.info.distortion),
+            "position": list(said.position),
+            "orientation": list(said.orientation),
+            "time_offset": said.time_offset,
+        },
+    }
+
+
+def _generator(parent: np.random.Generator, name: str) -> np.random.Generator:
+    """Return a generator of its own; the parent's state stays, and so do all other draws."""
+    entropy = parent.bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
+    return np.random.default_rng([*entropy, zlib.crc32(name.encode())])
+
+
+def _errors(given: float | tuple[float, ...], draws: npt.NDArray[np.float64]) -> list[float]:
+    if isinstance(given, tuple):
+        return list(given)
+    values: list[float] = (given * draws).tolist()
+    return values
+
+
+def _quaternion(turn: npt.NDArray[np.float64]) -> Quaternion:
+    """Return the rotation of a rotation vector (radians) as w, x, y, z."""
+    angle = float(np.linalg.norm(turn))
+    x, y, z = (turn * (math.sin(angle / 2.0) / angle)).tolist()
+    return math.cos(angle / 2.0), x, y, z
