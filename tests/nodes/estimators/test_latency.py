@@ -273,13 +273,16 @@ class InRun(OwnEstimator):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_sweep_over_the_latency_is_no_flat_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "in_run.py").write_text(OWN)
     text = (ROOT / "examples" / "own_estimator.toml").read_text()
-    text = text.replace("own_estimator:OwnEstimator", "in_run:InRun").replace("20s", "8s")
+    text = text.replace("own_estimator:OwnEstimator", "in_run:InRun").replace("20s", "6s")
+    text = text.replace("rate = 20", "rate = 10").partition('[[nodes]]\nname = "report"')[0]
+    text = text.replace("VisualOdometry", "SyntheticOdometry")
     (tmp_path / "flight.toml").write_text(text)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     latencies = [0.0, 0.03, 0.4]
@@ -291,4 +294,4 @@ def test_a_sweep_over_the_latency_is_no_flat_line(
     assert [row["latency_p50_ms"] for row in own[:2]] == pytest.approx(declared[:2])
     assert own[2]["latency_p50_ms"] >= declared[2]  # images wait while it is busy
     newest = [row["newest_pose_rmse_m"] for row in own]
-    assert newest[0] < 0.7 * newest[1] < 0.5 * newest[2], newest
+    assert newest[0] < 0.9 * newest[1] < 0.4 * newest[2], newest
