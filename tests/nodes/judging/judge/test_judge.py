@@ -198,7 +198,7 @@ def test_restarts_and_repeated_stamps_of_a_topic_are_counted_and_fail(tmp_path: 
         return message
 
     truth = walk(200, start=10**18)
-    write_tum(tmp_path / "truth.tum", truth)
+    write_tum(tmp_path / "truth.tum", truth, FRAMES.format("map (NED)"))
     bags.bag(tmp_path / "bag", bags.POSE, truth, frame_id="odom", change=change)
     words = ["--truth", "truth.tum", "--estimate", "slam=bag:/slam/poses"]
     found = judge(tmp_path, *words, code=1)["slam"]

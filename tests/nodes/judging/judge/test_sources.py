@@ -169,7 +169,7 @@ def test_stamps_of_images_are_read_as_data_sets_have_them(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 2 3", r'--body-from-camera: expected "tx ty tz qx qy qz qw", a file, or a camera of'),
+        ("1 2 3", r'--body-from-camera: expected "tx ty tz qx qy qz qw", a file \(TUM, Kalibr'),
         ("drone/front", r"--body-from-camera: expected .* found 'drone/front'"),
         ("0 0 0 0 0 0 x", r"--body-from-camera: expected finite numbers"),
         ("0 0 0 0 0 0 2", r"expected a quaternion of length 1, found \[2\.0, 0\.0, 0\.0, 0\.0\]"),
