@@ -32,6 +32,7 @@ _EXTENT = (
 )
 _TURNED = 5.0  # degrees from which a constant turn is told
 _STILL = 2.0  # degrees: rotations below tell nothing
+_ROTATES = 10.0  # degrees that an estimate rotates by, beside a truth that never does
 _LOOSE = 30.0  # degrees of spread from which orientations are none of this body
 _BETTER = 0.25  # share of the spread that a guess has to leave to be right
 
@@ -98,10 +99,10 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
     same_stamps(truth, estimate)
     true, said = truth.rotations(), estimate.rotations()
     constant = [float(np.ptp(t.orientations, axis=0).max()) < 1e-9 for t in (truth, estimate)]
-    moves = [_mean_and_spread(rotations)[1] > _STILL for rotations in (true, said)]
-    if constant[0] and moves[1]:
+    rotates = [_mean_and_spread(rotations)[1] for rotations in (true, said)]
+    if constant[0] and rotates[1] > _ROTATES:
         return Orientations(kind="truth without")
-    if constant[1] and moves[0]:
+    if constant[1] and rotates[0] > _STILL:
         return Orientations(kind="estimate without")
     try:
         matrix, translation, scale = umeyama(estimate.positions, truth.positions, with_scale=True)
@@ -126,7 +127,7 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
             left = min(_mean_and_spread(true.inv() * frame * guess)[1] for guess in rotations)
             if left < max(_BETTER * spread, _STILL) and left < 0.5 * spread:
                 kind = name
-        if kind == "same" and spread > max(_LOOSE, 0.5 * _mean_and_spread(true)[1]):
+        if kind == "same" and spread > max(_LOOSE, 0.5 * rotates[0]):
             kind = "other"
     if kind == "same" and degrees > max(_TURNED, 3.0 * spread):
         kind = "turned"

@@ -95,3 +95,11 @@ def test_a_vehicle_that_never_turns_is_judged_as_ever() -> None:
     judgement = judge(EstimatorRecord.of(still), still, alignment="se3")
     assert judgement.figures["rot_rmse_deg"] < 1e-6
     assert judgement.note == ""
+
+
+def test_an_estimate_that_rotates_a_little_beside_a_truth_that_never_does_is_wrong() -> None:
+    still = oriented(Rotation.identity(len(TRUTH)))
+    angles = 5.0 * np.sin(np.arange(len(TRUTH)) / 20)
+    turns = Rotation.from_euler("z", angles[:, None], degrees=True)
+    judgement = judge(EstimatorRecord.of(oriented(turns)), still, alignment="se3")
+    assert judgement.figures["rot_rmse_deg"] == pytest.approx(5.0 / np.sqrt(2.0), rel=0.1)
