@@ -25,7 +25,6 @@ from runtime.errors import NodeError, VisnavError
 from runtime.logs import executor, file_handler, lines_of, logging_to
 from runtime.node import Node
 from runtime.run import event_loop, results
-from runtime.run.made_from import code_of
 from runtime.run.node_runner import log_error, with_place, wrap
 from runtime.run.results import Folder, private_results
 from runtime.run.summarise import summarise
@@ -92,6 +91,8 @@ def execute(
 
 def code_of_estimators(config: Config, only: Collection[str] = ()) -> dict[str, str]:
     """Return the hash of the files of each node that may send estimates, by its name."""
+    from runtime.run.made_from import code_of  # only runs that leave results need it
+
     estimates = (PoseEstimate, TrajectoryEstimate)
     return {
         spec.name: code_of(spec)
