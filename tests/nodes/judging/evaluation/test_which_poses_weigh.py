@@ -141,3 +141,13 @@ def test_pairs_of_pieces_are_those_of_each_as_evo_has_them() -> None:
         metric.process_data((as_evo(truth.take(rows)), as_evo(estimate.take(rows))))
         errors += list(metric.error)
     assert len(first) == len(errors)
+
+
+def test_the_chord_of_a_hole_is_no_path() -> None:
+    known = (TRUTH.stamps <= 10 * SECOND) | (TRUTH.stamps >= 25 * SECOND)
+    truth = TRUTH.take(known)
+    assert truth.distances()[-1] == pytest.approx(60.0 - 15.0 + 10.0 * np.sin(1.5), abs=0.02)
+    figures = judge(
+        EstimatorRecord.of(circle(np.arange(0.0, 60.0, 0.05))), truth, alignment="origin"
+    ).figures
+    assert figures["path_m"] == pytest.approx(60.0 - 15.0, abs=0.02)
