@@ -212,6 +212,8 @@ def _option_for(judgement: Judgement) -> str:
     hints = [options.get(orientations.kind, "")] if orientations is not None else []
     if "added to its stamps it would fit" in judgement.note:
         hints.append("shift it by --time-offset")
+    if "needs equal world axes" in judgement.note:
+        hints.append("declare both by --axes and --truth-axes")
     return "; ".join(filter(None, hints))
 
 

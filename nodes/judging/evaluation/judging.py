@@ -220,7 +220,9 @@ def judge(
         return _held(errors, path, due, planned)
 
     how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
-    final = _judge_final(record, truth, hole, due, path, alignment, align_first, figures, planned)
+    final, final_note = _judge_final(
+        record, truth, hole, due, path, alignment, align_first, figures, planned
+    )
     if estimate is None or weighed is None:
         figures |= without()
         return Judgement(figures, estimate, lost=coverage.lost, final=final)
@@ -232,11 +234,13 @@ def judge(
     figures["rate_hz"] = (len(estimate) - 1) / estimate.seconds if estimate.seconds else 0.0
     if len(arrivals):
         figures |= _latencies(poses, arrivals, due)
-    notes = [_not_compared(truth, poses, longest)]
+    notes = [_not_compared(truth, poses, longest), final_note]
     if frames is None and len(weighed) < len(estimate):
         notes.append(f"of {len(estimate)} poses in bursts {len(weighed)} weigh, one a usual step")
     try:
         there, kept = pair(truth, weighed, hole)
+        orientations = examine(there, kept)
+        how = figures["alignment"] = _possible(how, alignment, align_first, orientations)
         aligned = align(kept, there, how, align_first)
     except ValueError as error:  # too little to align, or no time in common
         figures |= {**without(), "why": f"{error}{_elsewhere_in_time(truth, estimate)}"}
@@ -250,7 +254,7 @@ def judge(
     if offset is not None:
         figures["time_offset_ms"] = 1e3 * offset.seconds
         notes.append(offset.text())
-    orientations = examine(there, kept)
+    notes.append(_tilted(there, aligned.trajectory, how))
     if orientations is not None:
         figures["orientations"] = orientations.kind
         figures["body_rotation_deg"] = orientations.degrees
@@ -460,26 +464,84 @@ def _judge_final(
     align_first: float | None,
     figures: dict[str, Any],
     planned: int | None,
-) -> Trajectory | None:
-    """Judge the trajectory after loop closures: add figures, return aligned poses."""
+) -> tuple[Trajectory | None, str]:
+    """Judge the trajectory after loop closures: add figures, return aligned poses and a note."""
     if record.final is None:
-        return None
+        return None, ""
     figures["final_poses"] = len(record.final)
-    if alignment == "auto":
-        alignment = choose_alignment(record.scale_free, record.final_frame_id)
+    how = alignment
+    if how == "auto":
+        how = choose_alignment(record.scale_free, record.final_frame_id)
     try:
         final = record.final.take(one_a_step(record.final.stamps))
         there, kept = pair(truth, final, hole)
-        moved = align(kept, there, alignment, align_first).trajectory
+        orientations = examine(there, kept)
+        how = _possible(how, alignment, align_first, orientations)
+        moved = align(kept, there, how, align_first).trajectory
     except ValueError as error:
         figures["why_not_final"] = str(error)
-        return None
+        return None, ""
     errors = absolute_errors(there, moved)
-    figures |= {f"final_{name}": errors[name] for name in ("ate_rmse_m", "rot_rmse_deg")}
+    figures["final_ate_rmse_m"] = errors["ate_rmse_m"]
+    notes = []
+    if orientations is not None:
+        notes.append(orientations.text())
+    if orientations is None or orientations.usable:
+        figures["final_rot_rmse_deg"] = errors["rot_rmse_deg"]
     figures["final_ate_percent"] = 100.0 * errors["ate_rmse_m"] / path if path > 0 else None
     held = interpolated_errors(truth, frames, moved)
     figures |= _held(held, path, frames, planned, "final_")
-    return moved
+    offset = best_time_offset(truth, final, with_scale=how == "sim3")
+    if offset is not None:
+        notes.append(offset.text())
+    said = "; ".join(filter(None, notes))
+    return moved, f"after loop closures: {said}" if said else ""
+
+
+def _possible(
+    method: AlignmentMethod,
+    asked: AlignmentMethod | Literal["auto"],
+    first: float | None,
+    orientations: Orientations | None,
+) -> AlignmentMethod:
+    """Return the alignment that is possible without orientations, if these are missing.
+
+    Raises:
+        ValueError: One that needs them was asked for.
+    """
+    if orientations is None or not orientations.missing:
+        return method
+    if method != "origin" and not (method == "posyaw" and first == 1):
+        return method
+    if asked != "auto":
+        reason = orientations.text().partition(";")[0]
+        raise ValueError(f"alignment: expected orientations for {method}, found none: {reason}")
+    return "se3" if orientations.kind == "truth without" else method
+
+
+_TILT = 10.0  # degrees of a vertical that is told
+_FITS = 0.2  # share of the error that is left without the tilt
+
+
+def _tilted(truth: Trajectory, aligned: Trajectory, method: AlignmentMethod) -> str:
+    """Return a sentence if an estimate's vertical is not the truth's, where it has to be."""
+    if method not in {"posyaw", "none"}:
+        return ""
+    try:
+        rigid = align(aligned, truth, "se3")
+    except ValueError:
+        return ""
+    before, after = (
+        rms(position_errors(truth.positions, each.positions))
+        for each in (aligned, rigid.trajectory)
+    )
+    tilt = math.degrees(math.acos(float(np.clip(rigid.rotation[2, 2], -1.0, 1.0))))
+    if tilt < _TILT or after > _FITS * before:
+        return ""
+    return (
+        f"its vertical is tilted by {tilt:.0f}° against the truth's ({after:.3g} m instead of "
+        f"{before:.3g} m if aligned as a whole): {method} needs equal world axes"
+    )
 
 
 def _said_with_poses(

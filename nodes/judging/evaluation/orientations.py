@@ -37,8 +37,8 @@ _LOOSE = 30.0  # degrees of spread from which orientations are none of this body
 _BETTER = 0.25  # share of the spread that a guess has to leave to be right
 
 
-AT_FAULT: frozenset[Kind] = frozenset({"estimate without", "inverse", "order", "other"})
-"""Findings for which the estimate is to blame."""
+WRONG: frozenset[Kind] = frozenset({"inverse", "order", "other"})
+"""Findings for which the estimate is to blame; in a run, that it has none, too."""
 
 
 class Orientations(msgspec.Struct, frozen=True, kw_only=True):
@@ -48,6 +48,11 @@ class Orientations(msgspec.Struct, frozen=True, kw_only=True):
     turn: Quaternion = (1.0, 0.0, 0.0, 0.0)  # mean D, estimate's body to the truth's, w x y z
     degrees: float = 0.0  # angle of the turn
     spread: float = 0.0  # root mean square of the angles from the turn, degrees
+
+    @property
+    def missing(self) -> bool:
+        """Whether the truth or the estimate has positions only."""
+        return self.kind in {"truth without", "estimate without"}
 
     @property
     def usable(self) -> bool:
@@ -91,7 +96,8 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
         estimate: In a frame and a unit of its own.
 
     Returns:
-        `None` if nothing can be told: positions on a line, or positions that do not fit.
+        `None` if nothing can be told: positions on a line, or positions that do not fit. Of two
+        without orientations the truth is named.
 
     Raises:
         ValueError: The stamps of the two differ.
@@ -100,9 +106,9 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
     true, said = truth.rotations(), estimate.rotations()
     constant = [float(np.ptp(t.orientations, axis=0).max()) < 1e-9 for t in (truth, estimate)]
     rotates = [_mean_and_spread(rotations)[1] for rotations in (true, said)]
-    if constant[0] and rotates[1] > _ROTATES:
+    if constant[0] and (constant[1] or rotates[1] > _ROTATES):
         return Orientations(kind="truth without")
-    if constant[1] and rotates[0] > _STILL:
+    if constant[1]:
         return Orientations(kind="estimate without")
     try:
         matrix, translation, scale = umeyama(estimate.positions, truth.positions, with_scale=True)

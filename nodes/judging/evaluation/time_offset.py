@@ -84,6 +84,8 @@ def best_time_offset(
     if best is None:
         return None
     without = _fit(truth, estimate, 0.0, with_scale, beside=best[0])
+    if without is None and not anywhere:  # what both offsets have in common tells nothing
+        return None
     return TimeOffset(best[0], math.inf if without is None else without[1], best[1])
 
 

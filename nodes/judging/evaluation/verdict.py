@@ -29,7 +29,7 @@ import numpy as np
 
 from events import Image, TrackedFeatures
 from nodes.judging.evaluation.judging import Errors, Judgement
-from nodes.judging.evaluation.orientations import AT_FAULT
+from nodes.judging.evaluation.orientations import WRONG
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_tum
 from runtime.figures import FIGURES, Figure, is_off
@@ -127,6 +127,7 @@ def conclude(
         known = {**figures, **of_run}
         asked = own.get(name, thresholds)
         missed = asked.missed(known) if "coverage_percent" in figures else []
+        missed += _no_rotations(figures, asked, missed, in_run=end is not None)
         if end is not None:
             by = end.by or "the clock"
             who = f" ({by} ended the run: {end.reason})"
@@ -136,7 +137,6 @@ def conclude(
                 failed.append(f"early_end_seconds: {unknown}")
             if end.error and node_of(owner_of(name, end), [end.by]):
                 failed.append(f"ended_by: expected no error of its own, found: {end.error}")
-            missed += _no_rotations(figures, asked, missed)
         failed += missed
         if name in ended_flights:
             failed.append(
@@ -172,16 +172,16 @@ def conclude(
 
 
 def _no_rotations(
-    figures: Mapping[str, Any], thresholds: Thresholds, missed: Sequence[str]
+    figures: Mapping[str, Any], thresholds: Thresholds, missed: Sequence[str], *, in_run: bool
 ) -> list[str]:
-    """Return a sentence if an estimator's orientations in a run are none of its vehicle's.
+    """Return a sentence if an estimator's orientations are none of its vehicle's.
 
-    Their figures are left out then. (Of files that is said, and nothing else: many have positions
-    only.)
+    Their figures are left out then. Many files have positions only, and may.
     """
     why, limit = figures.get("why_no_rotations", ""), getattr(thresholds, "rot_rmse_deg", None)
     known = any(text.startswith("rot_rmse_deg") for text in missed)
-    blamed = figures.get("orientations") in AT_FAULT
+    kind = figures.get("orientations")
+    blamed = kind in WRONG or (in_run and kind == "estimate without")
     if not blamed or known or limit is None or is_off(limit):
         return []
     return [f"rot_rmse_deg: expected at most {limit:g}, found none: {why}"]

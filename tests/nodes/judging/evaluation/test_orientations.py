@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
+from nodes.judging.evaluation.alignment import AlignmentMethod
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.orientations import examine
 from nodes.judging.evaluation.record import EstimatorRecord
@@ -92,8 +93,9 @@ def test_nothing_is_said_where_positions_do_not_fit_or_lie_on_a_line() -> None:
 
 def test_a_vehicle_that_never_turns_is_judged_as_ever() -> None:
     still = Trajectory(TRUTH.stamps, TRUTH.positions, np.tile([1.0, 0.0, 0.0, 0.0], (400, 1)))
-    judgement = judge(EstimatorRecord.of(still), still, alignment="se3")
-    assert judgement.figures["rot_rmse_deg"] < 1e-6
+    shakes = Rotation.from_rotvec(np.random.default_rng(3).normal(0.0, 0.001, (len(TRUTH), 3)))
+    judgement = judge(EstimatorRecord.of(oriented(shakes)), still, alignment="se3")
+    assert judgement.figures["rot_rmse_deg"] == pytest.approx(0.1, rel=0.1)
     assert judgement.note == ""
 
 
@@ -103,3 +105,63 @@ def test_an_estimate_that_rotates_a_little_beside_a_truth_that_never_does_is_wro
     turns = Rotation.from_euler("z", angles[:, None], degrees=True)
     judgement = judge(EstimatorRecord.of(oriented(turns)), still, alignment="se3")
     assert judgement.figures["rot_rmse_deg"] == pytest.approx(5.0 / np.sqrt(2.0), rel=0.1)
+
+
+def test_neither_has_orientations() -> None:
+    plain = Rotation.identity(len(TRUTH))
+    truth, estimate = oriented(plain), oriented(plain, moved(noisy(TRUTH)))
+    judgement = judge(EstimatorRecord.of(estimate), truth, alignment="se3")
+    assert judgement.figures["orientations"] == "truth without"
+    assert "rot_rmse_deg" not in judgement.figures
+    assert "rpe_1m_trans_percent" not in judgement.figures
+
+
+@pytest.mark.parametrize(("alignment", "first"), [("origin", None), ("posyaw", 1)])
+def test_a_first_pose_without_orientation_aligns_nothing(
+    alignment: AlignmentMethod, first: int | None
+) -> None:
+    for truth, estimate in ((TRUTH, ODD["estimate without"]), (ODD["estimate without"], TRUTH)):
+        judgement = judge(
+            EstimatorRecord.of(estimate), truth, alignment=alignment, align_first=first
+        )
+        assert f"expected orientations for {alignment}, found none" in judgement.figures["why"]
+    record = EstimatorRecord.of(SENT)
+    record.frame_id = "odom"
+    judgement = judge(record, oriented(Rotation.identity(len(TRUTH))))
+    assert judgement.figures["alignment"] == "se3"
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_a_final_trajectory_is_examined_too(kind: str) -> None:
+    record = EstimatorRecord.of(SENT)
+    record.final = ODD[kind]
+    judgement = judge(record, TRUTH, alignment="se3")
+    assert "rot_rmse_deg" in judgement.figures
+    assert "final_rot_rmse_deg" not in judgement.figures
+    assert "after loop closures: " in judgement.note
+
+
+def test_a_turn_is_told_only_where_it_is_constant() -> None:
+    turn = Rotation.from_euler("x", 10.0, degrees=True)
+    shakes = Rotation.from_rotvec(np.random.default_rng(3).normal(0.0, 0.02, (len(TRUTH), 3)))
+    orientations = examine(TRUTH, oriented(TRUTH.rotations() * turn * shakes))
+    assert orientations is not None
+    assert orientations.kind == "turned"
+    wide = Rotation.from_rotvec(np.random.default_rng(3).normal(0.0, 0.08, (len(TRUTH), 3)))
+    orientations = examine(TRUTH, oriented(TRUTH.rotations() * turn * wide))
+    assert orientations is not None
+    assert orientations.kind == "same"
+
+
+def test_a_tilted_vertical_is_told_where_it_has_to_be_the_truths() -> None:
+    turn = Rotation.from_euler("x", 180.0, degrees=True)
+    estimate = Trajectory(
+        TRUTH.stamps,
+        turn.apply(TRUTH.positions.copy()),
+        (turn * TRUTH.rotations()).as_quat(scalar_first=True),
+    )
+    record = EstimatorRecord.of(estimate)
+    told = judge(record, TRUTH, alignment="posyaw").note
+    assert "its vertical is tilted by 180° against the truth's" in told
+    assert "vertical" not in judge(record, TRUTH, alignment="se3").note
+    assert "vertical" not in judge(EstimatorRecord.of(noisy(TRUTH)), TRUTH, alignment="none").note

@@ -89,3 +89,26 @@ def test_a_circle_at_constant_speed_tells_no_offset() -> None:
     assert offset is not None
     assert abs(offset.seconds) < 1e-3
     assert not offset.matters
+
+
+def test_an_offset_of_a_millisecond_is_no_other_clock() -> None:
+    offset = best_time_offset(TRUTH, late(flight(np.arange(20.0, 60.0, 0.05)), 0.001))
+    assert offset is not None
+    assert offset.seconds == pytest.approx(-0.001, abs=1e-4)
+    assert not offset.matters
+
+
+def test_a_flight_that_begins_on_a_line_has_no_other_clock() -> None:
+    """What two offsets have in common may be a straight climb, which tells nothing of either."""
+    times = np.arange(0.0, 4.0, 0.01)
+    climb = np.minimum(times, 2.0) + 0.1 * np.sin(3.0 * times)
+    aside = 0.3 * np.maximum(times - 2.0, 0.0) ** 2
+    positions = np.stack([aside, 0.2 * aside**2, -climb], axis=1)
+    stamps = np.round(times * SECOND).astype(np.int64)
+    truth = Trajectory(stamps, positions, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1)))
+    noise = np.random.default_rng(1).normal(0.0, 0.02, (80, 3))
+    rows = truth.take(slice(0, 400, 5))
+    estimate = Trajectory(rows.stamps, rows.positions + noise, rows.orientations)
+    offset = best_time_offset(truth, estimate)
+    assert offset is None or not offset.matters
+    assert offset is None or offset.before < np.inf

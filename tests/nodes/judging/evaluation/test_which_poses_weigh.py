@@ -151,3 +151,12 @@ def test_the_chord_of_a_hole_is_no_path() -> None:
         EstimatorRecord.of(circle(np.arange(0.0, 60.0, 0.05))), truth, alignment="origin"
     ).figures
     assert figures["path_m"] == pytest.approx(60.0 - 15.0, abs=0.02)
+
+
+def test_the_alignment_may_be_of_the_beginning() -> None:
+    estimate = drifting(FRAMES / 1e9)  # right in the first half
+    record = EstimatorRecord.of(estimate)
+    for first in (200, 10.0):
+        figures = judge(record, TRUTH, alignment="se3", align_first=first).figures
+        assert figures["ate_max_m"] == pytest.approx(2.0 * np.sqrt(3.0), rel=1e-3)
+    assert judge(record, TRUTH, alignment="se3").figures["ate_max_m"] < 3.2
