@@ -117,7 +117,8 @@ class Estimator(Node[C], ABC):
     **Latency.** An image arrives when `frames` gives it; its estimate goes out when the setting
     ``latency`` is over, wherever the tracker runs: in a process by `start_tracker`, in a thread by
     `offload`, or in `run` itself. Until then `frames` gives no further image: with
-    ``keep="latest"`` images arriving meanwhile are skipped.
+    ``keep="latest"`` images arriving meanwhile are skipped. `publish` sees to that; what is sent by
+    `estimates` itself goes out at once.
 
     **Frame and alignment.** The `frame_id` of the estimates, chosen with the first pose of each
     map, says how `nodes.judging.evaluation` aligns them with the ground truth:
