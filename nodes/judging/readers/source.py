@@ -74,8 +74,8 @@ class Start(msgspec.Struct, frozen=True):
 
     Attributes:
         number: Line of the first row; 0 if there is none.
-        head: Lines before it, stripped: comments, names of columns.
-        row: The first row, stripped: a line with a number in it.
+        head: Lines before it, without blanks around: comments, names of columns.
+        row: The first row, so, and without a comment after it: a line with a number in it.
     """
 
     number: int
@@ -89,8 +89,9 @@ class Start(msgspec.Struct, frozen=True):
         try:
             with path.open(encoding="utf-8-sig") as file:
                 for number, line in enumerate(map(str.strip, file), start=1):
-                    if line and line[0] not in "#%" and any(map(is_number, words(line))):
-                        return cls(number, head, line)
+                    row = line.partition("#")[0].strip()
+                    if row and row[0] != "%" and any(map(is_number, words(row))):
+                        return cls(number, head, row)
                     head += [line] if line else []
         except UnicodeDecodeError:
             return None

@@ -121,6 +121,17 @@ def test_columns_are_the_users_words(columns: str, text: str, tmp_path: Path) ->
     assert source.poses.positions == pytest.approx(POSE.positions)
 
 
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("name", ["TUM without a header", "EuRoC without a header", "VINS-Fusion"])
+def test_a_comment_after_a_row_is_none_of_it(name: str, number: int, tmp_path: Path) -> None:
+    lines = TABLES[name].splitlines()
+    lines[number] += "  # 1 of 60"
+    (tmp_path / "t").write_text("\n".join(lines) + "\n")
+    source = read(str(tmp_path / "t"))
+    assert source.poses.stamps.tolist() == POSE.stamps.tolist()
+    assert source.poses.positions == pytest.approx(POSE.positions, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
