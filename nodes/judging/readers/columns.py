@@ -4,7 +4,7 @@ A name is that of many programs: ``x``, ``tx``, ``p_x``, ``p_RS_R_x``, ``POS_X``
 ``field.pose.pose.position.x`` are all the position's. The user's words (``--columns``) are such
 names, too; ``_`` skips a column, and ``sec``, ``ms``, ``us``, ``ns`` are a stamp in that unit. A
 stamp's unit is the file's word or its format's habit, unless only another one makes a plausible
-time and rate of them.
+time and rate of them. A length's is the file's word, as in ``x [mm]``, or metres.
 """
 
 from __future__ import annotations
@@ -34,13 +34,27 @@ POSITION_COVARIANCE = tuple(f"pt{place}" for place in _UPPER)  # m²
 _UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]")
 _UNIT_NAMES = {
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us",
-    "usec": "us", "µs": "us", "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns",
-    "nanoseconds": "ns",
+    "usec": "us", "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns",
 }  # fmt: skip
+_STAMP_UNITS = _UNIT_NAMES | {  # in brackets
+    "second": "s", "millisecond": "ms", "milliseconds": "ms", "microsecond": "us",
+    "microseconds": "us", "nanosecond": "ns", "usecs": "us", "msecs": "ms",
+}  # fmt: skip
+LENGTHS = {"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3}
+"""Metres of a unit of positions; per second, of velocities."""
+_LENGTH_UNITS = {name: name for name in LENGTHS} | {
+    f"{prefix}{name}": f"{letter}m"
+    for prefix, letter in (
+        ("", ""), ("deci", "d"), ("centi", "c"), ("milli", "m"), ("micro", "u"), ("nano", "n"),
+        ("kilo", "k"),
+    )
+    for name in ("meter", "meters", "metre", "metres")
+}  # fmt: skip
+_PER_SECOND = re.compile(r"(?:(?:/|per)s(?:ec|econd)?|[*.·]?s\^?\(?[-−]1\)?|[*.·]?s⁻¹)$")
 _UNIT_WORDS = "|".join(name for name in _UNIT_NAMES if name != "s")
 _STAMP = re.compile(
     r"(?:(?:.*[._])?(?:time_?stamps?|stamps?)|(?:ros_|sim_|unix_|gps_)?time|t|ts)"
-    r"(?:_(?:\w+_)?(?P<unit>[a-zµ]+))?"
+    r"(?:_(?:\w+_)?(?P<unit>[a-z]+))?"
     rf"|(?:.*(?:stamp|time)[._]?)?(?P<name>{_UNIT_WORDS})"
 )
 _POSITION = (
@@ -61,7 +75,7 @@ class Column(NamedTuple):
     """What a column holds: "stamp", "rest" (nanoseconds of it), x, qw, vx, pr11, …; or ""."""
 
     kind: str
-    unit: str = ""  # of a stamp, if its name says so
+    unit: str = ""  # of a stamp or a length, if its name says so: also one that nobody knows
     sure: bool = False  # whether the unit is the user's word
 
 
@@ -70,31 +84,47 @@ SKIPPED = Column("")
 
 def column_of(name: str) -> Column:
     """Return what a column holds by its name, with a unit in brackets or without."""
-    given = _UNIT.search(name)
+    given = [_folded(unit).replace(" ", "") for unit in _UNIT.findall(name)]
     plain = _plain(name)
     if plain in {*ROTATION_COVARIANCE, *POSITION_COVARIANCE}:
         return Column(plain)
     if match := _STAMP.fullmatch(plain):
-        named = given[1].strip().casefold() if given else match["unit"] or match["name"] or ""
-        if named in _UNIT_NAMES or given or match["unit"] is None:
+        if any(given):
+            return Column("stamp", _unit(given, _STAMP_UNITS))
+        named = match["unit"] or match["name"] or ""
+        if named in _UNIT_NAMES or match["unit"] is None:
             return Column("stamp", _UNIT_NAMES.get(named, ""))
     for patterns, prefix in ((_POSITION, ""), (_QUATERNION, "q"), ((_VELOCITY,), "v")):
         for pattern in patterns:
             if match := pattern.fullmatch(plain):
-                return Column(prefix + match[1])
+                if prefix == "v":
+                    given = [_PER_SECOND.sub("", unit) for unit in given]
+                unit = _unit(given, _LENGTH_UNITS) if prefix != "q" else ""
+                return Column(prefix + match[1], unit)
     return SKIPPED
 
 
 def _plain(name: str) -> str:
     """Return a column's name without its unit and the sign of a comment, in small letters."""
-    return _UNIT.sub("", name).strip(" #%").casefold()
+    return _folded(_UNIT.sub("", name).strip(" #%"))
+
+
+def _folded(text: str) -> str:
+    """Return a text in small letters, and with u for the micro sign."""
+    return text.casefold().replace("\N{GREEK SMALL LETTER MU}", "u")
+
+
+def _unit(given: Sequence[str], known: dict[str, str]) -> str:
+    """Return the unit among texts in brackets: one that is known, else the first text, or ""."""
+    texts = [text for text in given if text]
+    return next((known[text] for text in texts if text in known), texts[0] if texts else "")
 
 
 def columns_of(names: Sequence[str]) -> list[Column] | None:
     """Return what columns hold by their names; `None` if that is no stamp, or no position.
 
     Raises:
-        ValueError: Two columns hold the same, or a quaternion is not whole.
+        ValueError: Two columns hold the same, a quaternion is not whole, or a unit is unknown.
     """
     found = [column_of(name) for name in names]
     if not {"stamp", *POSITION} <= {column.kind for column in found}:
@@ -112,6 +142,19 @@ def columns_of(names: Sequence[str]) -> list[Column] | None:
             "expected four columns of a quaternion with w, x, y, z in their names, or none (see "
             f"--columns), found {', '.join(some)}"
         )
+    for name, column in zip(names, found, strict=True):
+        known = UNITS if column.kind == "stamp" else LENGTHS
+        if column.unit and column.unit not in known:
+            per = " per second" if column.kind in VELOCITY else ""
+            raise ValueError(
+                f"expected the unit of {_UNIT.sub('', name).strip(' #%')!r} among "
+                f"{', '.join(known)}{per} (see --columns), found {column.unit!r}"
+            )
+    for group in (POSITION, VELOCITY):  # "tx ty tz[mm]" is of all three
+        units = {column.unit for column in found if column.kind in group} - {""}
+        if len(units) == 1:
+            (unit,) = units
+            found = [c._replace(unit=unit) if c.kind in group else c for c in found]
     return found
 
 
@@ -174,7 +217,7 @@ def layout_by_header(start: Start) -> Layout | None:
     """Return the layout that a line of the head names, the last such; `None` if none does.
 
     Raises:
-        ValueError: It names something twice, or a quaternion in part.
+        ValueError: It names something twice, a quaternion in part, or an unknown unit.
     """
     separator = separator_of(start)
     count = len(fields_of(start.row, separator))
@@ -224,10 +267,10 @@ def read_columns(
         quaternion = _numbers(row, place, QUATERNION) if oriented else None
         collected.add(
             stamp,
-            _numbers(row, place, POSITION),
+            _metres(row, layout, place, POSITION),
             quaternion,
             row=row.where.removeprefix(str(path)),
-            velocity=_numbers(row, place, VELOCITY) if moving else None,
+            velocity=_metres(row, layout, place, VELOCITY) if moving else None,
             covariance=_covariance(row, place, quaternion) if covariances and quaternion else None,
         )
     return collected.source(axes=axes, usual=usual)
@@ -261,6 +304,13 @@ def _numbers(row: Row, place: dict[str, int], kinds: Sequence[str]) -> list[floa
         return [float(field) if field else np.nan for field in fields]
     except ValueError:
         row.wrong("finite numbers", " ".join(fields))
+
+
+def _metres(row: Row, layout: Layout, place: dict[str, int], kinds: Sequence[str]) -> list[float]:
+    """Return lengths (m), or velocities (m/s), from fields in the units of their columns."""
+    units = [layout.columns[place[kind]].unit or "m" for kind in kinds]
+    values = zip(_numbers(row, place, kinds), units, strict=True)
+    return [value * LENGTHS[unit] for value, unit in values]
 
 
 def _covariance(row: Row, place: dict[str, int], quaternion: Sequence[float]) -> Floats | None:

@@ -223,6 +223,72 @@ def test_a_quaternion_whose_order_is_not_named_is_refused(
 
 
 @pytest.mark.parametrize(
+    ("header", "metres"),
+    [
+        ("timestamp [s],x [mm],y [mm],z [mm]", (1e-3, 1e-3, 1e-3)),
+        ("time (s),x (cm),y (cm),z (cm)", (0.01, 0.01, 0.01)),
+        ("t;p_RS_R_x [km];p_RS_R_y [km];p_RS_R_z [km]", (1e3, 1e3, 1e3)),
+        ("# t x [um] y [µm] z [micrometers]", (1e-6, 1e-6, 1e-6)),
+        ("t x [dm] y [nm] z [m]", (0.1, 1e-9, 1.0)),
+        ("# t[s] tx ty tz[mm]", (1e-3, 1e-3, 1e-3)),
+        ("t,x [world] [mm],y [world] [mm],z [world] [mm]", (1e-3, 1e-3, 1e-3)),
+        ("t,x [],y [],z []", (1.0, 1.0, 1.0)),
+    ],
+)
+@pytest.mark.parametrize("by_user", [False, True])
+def test_positions_are_metres_whatever_their_unit(
+    header: str, metres: tuple[float, float, float], by_user: bool, tmp_path: Path
+) -> None:
+    separator = next((s for s in ",;" if s in header), " ")
+    names = header.lstrip("# ").replace(" [", "[").replace(" (", "(")
+    (tmp_path / "t").write_text(
+        ("" if by_user else header + "\n")
+        + "".join(separator.join([f"{time}.5", "1", "2", "-3"]) + "\n" for time in range(3))
+    )
+    source = read(str(tmp_path / "t"), columns=names if by_user else "")
+    assert source.poses.positions[0] == pytest.approx(np.array([1, 2, -3]) * metres, rel=1e-12)
+    assert source.poses.stamps.tolist() == [500_000_000, 1_500_000_000, 2_500_000_000]
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"),
+    [("m s^-1", 1), ("mm/s", 1e-3), ("mm s^-1", 1e-3), ("cm·s⁻¹", 0.01), ("km/sec", 1e3), ("", 1)],
+)
+def test_velocities_are_metres_per_second(unit: str, scale: float, tmp_path: Path) -> None:
+    names = ",".join(f"v_RS_R_{axis} [{unit}]" for axis in "xyz")
+    (tmp_path / "t").write_text(f"t [s],x,y,z,{names}\n0.5,0,0,0,1,2,3\n1.5,0,0,0,1,2,3\n")
+    source = read(str(tmp_path / "t"))
+    assert source.velocities is not None
+    assert source.velocities[1] == pytest.approx(np.array([1, 2, 3]) * scale, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("t [min],x,y,z", r"/t: expected the unit of 't' among s, ms, us, ns .*'min'"),
+        ("t,x,y [ft],z", r"/t: expected the unit of 'y' among m, dm, .* km .*, found 'ft'"),
+        (
+            "t,x,y,z,v_RS_R_x [km/h],v_RS_R_y [km/h],v_RS_R_z [km/h]",
+            r"the unit of 'v_RS_R_x' among m, .* km per second .*, found 'km/h'",
+        ),
+    ],
+)
+def test_an_unknown_unit_is_refused(header: str, message: str, tmp_path: Path) -> None:
+    row = ",".join(["0.5"] * len(header.split(",")))
+    (tmp_path / "t").write_text(f"{header}\n{row}\n")
+    with pytest.raises(ValueError, match=message):
+        read(str(tmp_path / "t"))
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("time [µs]", "us"), ("time [μs]", "us"), ("t [milliseconds]", "ms"), ("t [UTC] [ns]", "ns")],
+)
+def test_a_stamps_unit_has_several_spellings(name: str, unit: str) -> None:
+    assert column_of(name)[:2] == ("stamp", unit)
+
+
+@pytest.mark.parametrize(
     ("header", "kinds"),
     [
         ("t,x,y,z,track_sec,cost_ms", "stamp x y z - -"),
