@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nodes.judging.readers.axes import AXES, UNDECLARED, Axes
-from nodes.judging.readers.source import Collected, Floats, Options, Source, Start
+from nodes.judging.readers.source import Collected, Floats, Options, Source, Start, is_number
 from nodes.trajectory_files import Row
 from runtime.time.clock import SECOND
 
@@ -105,8 +105,8 @@ def column_of(name: str) -> Column:
 
 
 def _plain(name: str) -> str:
-    """Return a column's name without its unit and the sign of a comment, in small letters."""
-    return _folded(_UNIT.sub("", name).strip(" #%"))
+    """Return a column's name, in small letters, without unit, quotes and a comment's sign."""
+    return _folded(_UNIT.sub("", name).strip(' #%"'))
 
 
 def _folded(text: str) -> str:
@@ -217,21 +217,61 @@ def layout_by_header(start: Start) -> Layout | None:
     """Return the layout that a line of the head names, the last such; `None` if none does.
 
     Raises:
-        ValueError: It names something twice, a quaternion in part, or an unknown unit.
+        ValueError: It names something twice, a quaternion in part, or an unknown unit; or it has a
+            name less than the rows have fields, and it is not clear which.
     """
     separator = separator_of(start)
-    count = len(fields_of(start.row, separator))
+    fields = fields_of(start.row, separator)
+    count = len(fields)
+    unnamed: list[str] = []
     for line in reversed(start.head):
+        comment = line.lstrip()[:1] in {"#", "%"}
         # A blank between a name and its unit is none between columns.
-        joined = _UNIT.sub(lambda unit: f"[{unit[1].replace(' ', '')}]", line.strip("#%"))
+        joined = _UNIT.sub(
+            lambda unit: f"[{unit[1].replace(' ', '')}]", line.lstrip(" ").strip("#%")
+        )
         for each in dict.fromkeys((separator, ",", None)):
-            names = fields_of(joined.strip(), each)
-            if abs(len(names) - count) > (separator == "\t"):  # whose last field may be empty
+            names = fields_of(joined, each)
+            if comment and names[:1] == [""] and len(names) > count:  # of the comment's sign
+                names = names[1:]
+            columns: list[Column] | None
+            if len(names) == count or (separator == each == "\t" and len(names) == count + 1):
+                columns = columns_of(names)  # without the last field of the row, if it is empty
+            elif each == separator and len(names) == count - 1 and (each == "\t" or not comment):
+                unnamed = unnamed or names
+                columns = columns_of(names) if _has_name(fields, names) else None
+                columns = columns and [SKIPPED, *columns]
+            else:
                 continue
-            columns = columns_of(names)
             if columns is not None:
                 return Layout(separator, columns, _usual_unit(start, separator, columns))
+    if unnamed and columns_of(unnamed):
+        raise ValueError(
+            f"expected a name for each of {count} fields, found {len(unnamed)} names: say what the "
+            'columns are, as --columns "_ sec x y z" if the first one has no name'
+        )
     return None
+
+
+def _has_name(fields: Sequence[str], names: Sequence[str]) -> bool:
+    """Return whether the first field is a row's name, of R's ``write.table``, in any case.
+
+    It is one if it is no number, although the first column is one; or if a stamp before it would
+    not be Unix time, and after it is.
+    """
+    place = next((k for k, name in enumerate(names) if column_of(name).kind == "stamp"), None)
+    if place is None:
+        return False
+    if column_of(names[0]).kind and not is_number(fields[0]):
+        return True
+    return _is_unix_time(fields[place + 1]) and not _is_unix_time(fields[place])
+
+
+def _is_unix_time(text: str) -> bool:
+    """Return whether a number is Unix time of 2000 to 2100, in any unit."""
+    return is_number(text) and any(
+        _CALENDAR[0] <= float(text) * scale <= _CALENDAR[1] for scale in UNITS.values()
+    )
 
 
 def read_columns(
@@ -287,12 +327,14 @@ def rows_of(path: Path, layout: Layout) -> Iterator[Row]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: expected a text file of rows, found: {error}") from None
     for number, line in enumerate(text.split("\n"), start=1):
-        content = line.partition("#")[0].strip()
+        line = line.partition("#")[0]
+        content = line.strip()
         if number < start.number or not content or content[0] == "%":
             continue
-        row = Row(f"{path}:{number}", fields_of(content, layout.separator))
+        row = Row(f"{path}:{number}", fields_of(line, layout.separator))
         count = len(row.fields)
-        if count < least or (layout.separator != "\t" and count != expected):
+        # Between tabs the last field may be empty.
+        if count < least or abs(count - expected) > (layout.separator == "\t"):
             row.wrong(f"{expected} fields, as in the first row", f"{count}: {content}")
         yield row
 

@@ -83,7 +83,7 @@ def _plain(
         count = len(fields_of(start.row, separator))
         if separator and any(len(fields_of(line, separator)) == count for line in start.head):
             return None  # a header names the columns, with names that nobody knows
-        ends = separator is not None and start.row.endswith(separator)
+        ends = separator is not None and start.row.rstrip().endswith(separator)
         fitting = (
             layout
             for layout in layouts

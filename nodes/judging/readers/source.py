@@ -21,6 +21,7 @@ from nodes.trajectory import UNIT_LENGTH, Trajectory
 Floats = npt.NDArray[np.float64]
 
 _TOO_LATE = 1 << 63  # first number of nanoseconds beyond 64 bits
+_BLANKS = " \r\n\v\f"  # without tabs
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -74,7 +75,8 @@ class Start(msgspec.Struct, frozen=True):
 
     Attributes:
         number: Line of the first row; 0 if there is none.
-        head: Lines before it, without blanks around: comments, names of columns.
+        head: Lines before it, without blanks around, but with tabs, beside which a field may be
+            empty: comments, names of columns.
         row: The first row, so, and without a comment after it: a line with a number in it.
     """
 
@@ -88,11 +90,11 @@ class Start(msgspec.Struct, frozen=True):
         head: list[str] = []
         try:
             with path.open(encoding="utf-8-sig") as file:
-                for number, line in enumerate(map(str.strip, file), start=1):
-                    row = line.partition("#")[0].strip()
-                    if row and row[0] != "%" and any(map(is_number, words(row))):
+                for number, line in enumerate(file, start=1):
+                    row = line.partition("#")[0].strip(_BLANKS)
+                    if not row.lstrip().startswith("%") and any(map(is_number, words(row))):
                         return cls(number, head, row)
-                    head += [line] if line else []
+                    head += [line.strip(_BLANKS)] if line.strip() else []
         except UnicodeDecodeError:
             return None
         return cls(0, head, "")

@@ -222,6 +222,60 @@ def test_a_quaternion_whose_order_is_not_named_is_refused(
         read(str(tmp_path / "t"))
 
 
+def with_names(name: Callable[[int], str], header: str, separator: str) -> str:
+    """Return a table of positions whose rows begin with a name, of their number."""
+    lines = rows(seconds, "x y z", separator).splitlines()
+    return f"{header}\n" + "".join(
+        f"{name(number)}{separator}{line}\n" for number, line in enumerate(lines)
+    )
+
+
+ROWS_WITH_NAMES = {
+    "pandas, tabs": with_names(str, "\ttimestamp\tx\ty\tz", "\t"),
+    "pandas, commas": with_names(str, ",timestamp,x,y,z", ","),
+    "tabs, an empty label": with_names(lambda k: "", "label\ttimestamp\tx\ty\tz", "\t"),
+    "tabs, a label of some": with_names("a".__mul__, "label\ttimestamp\tx\ty\tz", "\t"),
+    "tabs, a comment's sign": with_names(str, "# \ttimestamp\tx\ty\tz", "\t"),
+    "tabs, a sign in its own field": "#\tt\tx\ty\tz\n" + rows(seconds, "x y z", "\t"),
+    "tabs, a remark of some": "t\tx\ty\tz\tremark\n"
+    + rows(seconds, "x y z", "\t", "\t").replace("\t\n", "\tgood\n", 9),
+    "R, blanks": with_names(lambda k: f'"{k + 1}"', '"timestamp" "x" "y" "z"', " "),
+    "R, tabs": with_names(lambda k: f'"{k + 1}"', '"timestamp"\t"x"\t"y"\t"z"', "\t"),
+    "R, commas, no quotes": with_names(lambda k: f"{k + 1}", "timestamp,x,y,z", ","),
+    "R, tabs, no quotes": with_names(lambda k: f"{k + 1}", "timestamp\tx\ty\tz", "\t"),
+}
+
+
+@pytest.mark.parametrize("name", ROWS_WITH_NAMES)
+def test_columns_stand_under_their_names(name: str, tmp_path: Path) -> None:
+    (tmp_path / "t").write_text(ROWS_WITH_NAMES[name])
+    source = read(str(tmp_path / "t"))
+    assert source.poses.stamps.tolist() == POSE.stamps.tolist()
+    assert source.poses.positions == pytest.approx(POSE.positions, abs=1e-12)
+
+
+@pytest.mark.parametrize("separator", ["\t", " ", ",", ";"])
+def test_a_name_less_than_fields_is_refused_unless_it_is_clear_which(
+    separator: str, tmp_path: Path
+) -> None:
+    """A first field of 1, 2, 3, … may be a stamp in seconds."""
+    text = separator.join(["timestamp", "x", "y", "z"]) + "\n"
+    text += "".join(separator.join([f"{k}", f"{k / 10}", "4", "5", "6"]) + "\n" for k in (1, 2, 3))
+    (tmp_path / "t").write_text(text)
+    message = r"/t: expected a name for each of 5 fields, found 4 names: .* --columns \"_ sec x y z"
+    with pytest.raises(ValueError, match=message):
+        read(str(tmp_path / "t"))
+    source = read(str(tmp_path / "t"), columns="_ sec x y z")
+    assert source.poses.stamps.tolist() == [100_000_000, 200_000_000, 300_000_000]
+    assert source.poses.positions.tolist() == [[4, 5, 6]] * 3
+
+
+def test_a_row_between_tabs_lacks_its_last_field_at_most(tmp_path: Path) -> None:
+    (tmp_path / "t").write_text("t\tx\ty\tz\ta\tb\n0.5\t1\t2\t3\t4\t5\n0.6\t1\t2\t3\n")
+    with pytest.raises(ValueError, match=r"/t:3: expected 6 fields, as in the first row, found '4"):
+        read(str(tmp_path / "t"))
+
+
 @pytest.mark.parametrize(
     ("header", "metres"),
     [
