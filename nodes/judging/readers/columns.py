@@ -19,7 +19,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nodes.judging.readers.axes import AXES, UNDECLARED, Axes
-from nodes.judging.readers.source import Collected, Floats, Options, Source, Start, is_number
+from nodes.judging.readers.source import (
+    Collected,
+    Floats,
+    Options,
+    Source,
+    Start,
+    decimal_commas,
+    is_number,
+    with_decimal_comma,
+)
 from nodes.trajectory_files import Row
 from runtime.time.clock import SECOND
 
@@ -80,6 +89,9 @@ class Column(NamedTuple):
 
 
 SKIPPED = Column("")
+
+POINTS = "with a decimal point, not with a decimal comma"
+"""What is expected of numbers with a comma."""
 
 
 def column_of(name: str) -> Column:
@@ -198,7 +210,8 @@ class Layout(NamedTuple):
 
 def separator_of(start: Start) -> str | None:
     """Return what separates the fields of the first row; `None` for blanks."""
-    for separator in (",", "\t", ";"):
+    separators = ("\t", ";") if decimal_commas(start.row) else (",", "\t", ";")
+    for separator in separators:
         if separator in start.row:
             names = start.head[-1] if start.head else ""
             if separator == "\t" and separator not in names:
@@ -345,7 +358,12 @@ def _numbers(row: Row, place: dict[str, int], kinds: Sequence[str]) -> list[floa
     try:
         return [float(field) if field else np.nan for field in fields]
     except ValueError:
-        row.wrong("finite numbers", " ".join(fields))
+        row.wrong(_expected("finite numbers", fields), " ".join(fields))
+
+
+def _expected(what: str, fields: Sequence[str]) -> str:
+    """Return what is expected of fields, and that it has points, if one has a decimal comma."""
+    return f"{what}, {POINTS}" if any(map(with_decimal_comma, fields)) else what
 
 
 def _metres(row: Row, layout: Layout, place: dict[str, int], kinds: Sequence[str]) -> list[float]:
@@ -420,7 +438,7 @@ def _decimal(row: Row, field: int) -> decimal.Decimal | None:
     try:
         value = decimal.Decimal(text) if text else decimal.Decimal("nan")
     except decimal.InvalidOperation:
-        row.wrong("a stamp", text)
+        row.wrong(_expected("a stamp", [text]), text)
     if value.is_finite() and value.adjusted() > _DIGITS:
         row.wrong("a stamp", text)
     return value if value.is_finite() else None

@@ -138,6 +138,22 @@ def is_number(text: str) -> bool:
     return True
 
 
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+
+
+def with_decimal_comma(field: str) -> bool:
+    """Return whether a field is a number with a comma instead of a decimal point."""
+    return bool(_DECIMAL_COMMA.fullmatch(field))
+
+
+def decimal_commas(row: str) -> bool:
+    """Return whether the commas of a row are those of numbers, with other separators between."""
+    separator = next((each for each in ";\t" if each in row), None)
+    fields = [field.strip() for field in row.split(separator)]
+    with_comma = [field for field in fields if "," in field]
+    return len(fields) >= 4 and bool(with_comma) and all(map(with_decimal_comma, with_comma))
+
+
 class Collected:
     """Poses as they are read, in order; makes a `Source` of those that can be compared.
 

@@ -222,6 +222,28 @@ def test_a_quaternion_whose_order_is_not_named_is_refused(
         read(str(tmp_path / "t"))
 
 
+@pytest.mark.parametrize("header", [False, True])
+@pytest.mark.parametrize("columns", ["", "sec x y z qx qy qz qw"])
+@pytest.mark.parametrize("separator", [";", "; ", "\t", " "])
+def test_a_decimal_comma_is_named(
+    separator: str, columns: str, header: bool, tmp_path: Path
+) -> None:
+    """Also after a first row of whole numbers."""
+    text = rows(seconds, XYZW, separator).replace(".", ",")
+    zeros = separator.join("0" * 7 + "1") + "\n"
+    names = separator.join(["t", *XYZW.split()]) + "\n"
+    for lines in (text, zeros + text) if header or columns else (text,):
+        (tmp_path / "t").write_text(names * header + lines)
+        with pytest.raises(ValueError, match=r"/t:\d: expected .*with a decimal point, not with a"):
+            read(str(tmp_path / "t"), columns=columns)
+
+
+def test_a_decimal_comma_of_transforms_is_named(tmp_path: Path) -> None:
+    (tmp_path / "t").write_text("1,5 0,0 0,0 0,0 0,0 1,0 0,0 0,0 0,0 0,0 1,0 0,0\n")
+    with pytest.raises(ValueError, match=r"/t:1: expected numbers with a decimal point, not with"):
+        read(str(tmp_path / "t"))
+
+
 def with_names(name: Callable[[int], str], header: str, separator: str) -> str:
     """Return a table of positions whose rows begin with a name, of their number."""
     lines = rows(seconds, "x y z", separator).splitlines()
