@@ -4,7 +4,7 @@ A name is that of many programs: ``x``, ``tx``, ``p_x``, ``p_RS_R_x``, ``POS_X``
 ``field.pose.pose.position.x`` are all the position's. The user's words (``--columns``) are such
 names, too; ``_`` skips a column, and ``sec``, ``ms``, ``us``, ``ns`` are a stamp in that unit. A
 stamp's unit is the file's word or its format's habit, unless only another one makes a plausible
-time and rate of them.
+time and rate of them. A length's is the file's word, as in ``x [mm]``, or metres.
 """
 
 from __future__ import annotations
@@ -19,7 +19,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nodes.judging.readers.axes import AXES, UNDECLARED, Axes
-from nodes.judging.readers.source import Collected, Floats, Options, Source, Start
+from nodes.judging.readers.source import (
+    Collected,
+    Floats,
+    Options,
+    Source,
+    Start,
+    decimal_commas,
+    is_number,
+    with_decimal_comma,
+)
 from nodes.trajectory_files import Row
 from runtime.time.clock import SECOND
 
@@ -34,13 +43,27 @@ POSITION_COVARIANCE = tuple(f"pt{place}" for place in _UPPER)  # m²
 _UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]")
 _UNIT_NAMES = {
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us",
-    "usec": "us", "µs": "us", "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns",
-    "nanoseconds": "ns",
+    "usec": "us", "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns",
 }  # fmt: skip
+_STAMP_UNITS = _UNIT_NAMES | {  # in brackets
+    "second": "s", "millisecond": "ms", "milliseconds": "ms", "microsecond": "us",
+    "microseconds": "us", "nanosecond": "ns", "usecs": "us", "msecs": "ms",
+}  # fmt: skip
+LENGTHS = {"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3}
+"""Metres of a unit of positions; per second, of velocities."""
+_LENGTH_UNITS = {name: name for name in LENGTHS} | {
+    f"{prefix}{name}": f"{letter}m"
+    for prefix, letter in (
+        ("", ""), ("deci", "d"), ("centi", "c"), ("milli", "m"), ("micro", "u"), ("nano", "n"),
+        ("kilo", "k"),
+    )
+    for name in ("meter", "meters", "metre", "metres")
+}  # fmt: skip
+_PER_SECOND = re.compile(r"(?:(?:/|per)s(?:ec|econd)?|[*.·]?s\^?\(?[-−]1\)?|[*.·]?s⁻¹)$")
 _UNIT_WORDS = "|".join(name for name in _UNIT_NAMES if name != "s")
 _STAMP = re.compile(
     r"(?:(?:.*[._])?(?:time_?stamps?|stamps?)|(?:ros_|sim_|unix_|gps_)?time|t|ts)"
-    r"(?:_(?:\w+_)?(?P<unit>[a-zµ]+))?"
+    r"(?:_(?:\w+_)?(?P<unit>[a-z]+))?"
     rf"|(?:.*(?:stamp|time)[._]?)?(?P<name>{_UNIT_WORDS})"
 )
 _POSITION = (
@@ -61,40 +84,59 @@ class Column(NamedTuple):
     """What a column holds: "stamp", "rest" (nanoseconds of it), x, qw, vx, pr11, …; or ""."""
 
     kind: str
-    unit: str = ""  # of a stamp, if its name says so
+    unit: str = ""  # of a stamp or a length, if its name says so: also one that nobody knows
     sure: bool = False  # whether the unit is the user's word
 
 
 SKIPPED = Column("")
 
+POINTS = "with a decimal point, not with a decimal comma"
+"""What is expected of numbers with a comma."""
+
 
 def column_of(name: str) -> Column:
     """Return what a column holds by its name, with a unit in brackets or without."""
-    given = _UNIT.search(name)
+    given = [_folded(unit).replace(" ", "") for unit in _UNIT.findall(name)]
     plain = _plain(name)
     if plain in {*ROTATION_COVARIANCE, *POSITION_COVARIANCE}:
         return Column(plain)
     if match := _STAMP.fullmatch(plain):
-        named = given[1].strip().casefold() if given else match["unit"] or match["name"] or ""
-        if named in _UNIT_NAMES or given or match["unit"] is None:
+        if any(given):
+            return Column("stamp", _unit(given, _STAMP_UNITS))
+        named = match["unit"] or match["name"] or ""
+        if named in _UNIT_NAMES or match["unit"] is None:
             return Column("stamp", _UNIT_NAMES.get(named, ""))
     for patterns, prefix in ((_POSITION, ""), (_QUATERNION, "q"), ((_VELOCITY,), "v")):
         for pattern in patterns:
             if match := pattern.fullmatch(plain):
-                return Column(prefix + match[1])
+                if prefix == "v":
+                    given = [_PER_SECOND.sub("", unit) for unit in given]
+                unit = _unit(given, _LENGTH_UNITS) if prefix != "q" else ""
+                return Column(prefix + match[1], unit)
     return SKIPPED
 
 
 def _plain(name: str) -> str:
-    """Return a column's name without its unit and the sign of a comment, in small letters."""
-    return _UNIT.sub("", name).strip(" #%").casefold()
+    """Return a column's name, in small letters, without unit, quotes and a comment's sign."""
+    return _folded(_UNIT.sub("", name).strip(' #%"'))
+
+
+def _folded(text: str) -> str:
+    """Return a text in small letters, and with u for the micro sign."""
+    return text.casefold().replace("\N{GREEK SMALL LETTER MU}", "u")
+
+
+def _unit(given: Sequence[str], known: dict[str, str]) -> str:
+    """Return the unit among texts in brackets: one that is known, else the first text, or ""."""
+    texts = [text for text in given if text]
+    return next((known[text] for text in texts if text in known), texts[0] if texts else "")
 
 
 def columns_of(names: Sequence[str]) -> list[Column] | None:
     """Return what columns hold by their names; `None` if that is no stamp, or no position.
 
     Raises:
-        ValueError: Two columns hold the same, or a quaternion is not whole.
+        ValueError: Two columns hold the same, a quaternion is not whole, or a unit is unknown.
     """
     found = [column_of(name) for name in names]
     if not {"stamp", *POSITION} <= {column.kind for column in found}:
@@ -112,6 +154,19 @@ def columns_of(names: Sequence[str]) -> list[Column] | None:
             "expected four columns of a quaternion with w, x, y, z in their names, or none (see "
             f"--columns), found {', '.join(some)}"
         )
+    for name, column in zip(names, found, strict=True):
+        known = UNITS if column.kind == "stamp" else LENGTHS
+        if column.unit and column.unit not in known:
+            per = " per second" if column.kind in VELOCITY else ""
+            raise ValueError(
+                f"expected the unit of {_UNIT.sub('', name).strip(' #%')!r} among "
+                f"{', '.join(known)}{per} (see --columns), found {column.unit!r}"
+            )
+    for group in (POSITION, VELOCITY):  # "tx ty tz[mm]" is of all three
+        units = {column.unit for column in found if column.kind in group} - {""}
+        if len(units) == 1:
+            (unit,) = units
+            found = [c._replace(unit=unit) if c.kind in group else c for c in found]
     return found
 
 
@@ -155,7 +210,8 @@ class Layout(NamedTuple):
 
 def separator_of(start: Start) -> str | None:
     """Return what separates the fields of the first row; `None` for blanks."""
-    for separator in (",", "\t", ";"):
+    separators = ("\t", ";") if decimal_commas(start.row) else (",", "\t", ";")
+    for separator in separators:
         if separator in start.row:
             names = start.head[-1] if start.head else ""
             if separator == "\t" and separator not in names:
@@ -174,21 +230,61 @@ def layout_by_header(start: Start) -> Layout | None:
     """Return the layout that a line of the head names, the last such; `None` if none does.
 
     Raises:
-        ValueError: It names something twice, or a quaternion in part.
+        ValueError: It names something twice, a quaternion in part, or an unknown unit; or it has a
+            name less than the rows have fields, and it is not clear which.
     """
     separator = separator_of(start)
-    count = len(fields_of(start.row, separator))
+    fields = fields_of(start.row, separator)
+    count = len(fields)
+    unnamed: list[str] = []
     for line in reversed(start.head):
+        comment = line.lstrip()[:1] in {"#", "%"}
         # A blank between a name and its unit is none between columns.
-        joined = _UNIT.sub(lambda unit: f"[{unit[1].replace(' ', '')}]", line.strip("#%"))
+        joined = _UNIT.sub(
+            lambda unit: f"[{unit[1].replace(' ', '')}]", line.lstrip(" ").strip("#%")
+        )
         for each in dict.fromkeys((separator, ",", None)):
-            names = fields_of(joined.strip(), each)
-            if abs(len(names) - count) > (separator == "\t"):  # whose last field may be empty
+            names = fields_of(joined, each)
+            if comment and names[:1] == [""] and len(names) > count:  # of the comment's sign
+                names = names[1:]
+            columns: list[Column] | None
+            if len(names) == count or (separator == each == "\t" and len(names) == count + 1):
+                columns = columns_of(names)  # without the last field of the row, if it is empty
+            elif each == separator and len(names) == count - 1 and (each == "\t" or not comment):
+                unnamed = unnamed or names
+                columns = columns_of(names) if _has_name(fields, names) else None
+                columns = columns and [SKIPPED, *columns]
+            else:
                 continue
-            columns = columns_of(names)
             if columns is not None:
                 return Layout(separator, columns, _usual_unit(start, separator, columns))
+    if unnamed and columns_of(unnamed):
+        raise ValueError(
+            f"expected a name for each of {count} fields, found {len(unnamed)} names: say what the "
+            'columns are, as --columns "_ sec x y z" if the first one has no name'
+        )
     return None
+
+
+def _has_name(fields: Sequence[str], names: Sequence[str]) -> bool:
+    """Return whether the first field is a row's name, of R's ``write.table``, in any case.
+
+    It is one if it is no number, although the first column is one; or if a stamp before it would
+    not be Unix time, and after it is.
+    """
+    place = next((k for k, name in enumerate(names) if column_of(name).kind == "stamp"), None)
+    if place is None:
+        return False
+    if column_of(names[0]).kind and not is_number(fields[0]):
+        return True
+    return _is_unix_time(fields[place + 1]) and not _is_unix_time(fields[place])
+
+
+def _is_unix_time(text: str) -> bool:
+    """Return whether a number is Unix time of 2000 to 2100, in any unit."""
+    return is_number(text) and any(
+        _CALENDAR[0] <= float(text) * scale <= _CALENDAR[1] for scale in UNITS.values()
+    )
 
 
 def read_columns(
@@ -224,10 +320,10 @@ def read_columns(
         quaternion = _numbers(row, place, QUATERNION) if oriented else None
         collected.add(
             stamp,
-            _numbers(row, place, POSITION),
+            _metres(row, layout, place, POSITION),
             quaternion,
             row=row.where.removeprefix(str(path)),
-            velocity=_numbers(row, place, VELOCITY) if moving else None,
+            velocity=_metres(row, layout, place, VELOCITY) if moving else None,
             covariance=_covariance(row, place, quaternion) if covariances and quaternion else None,
         )
     return collected.source(axes=axes, usual=usual)
@@ -244,12 +340,14 @@ def rows_of(path: Path, layout: Layout) -> Iterator[Row]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: expected a text file of rows, found: {error}") from None
     for number, line in enumerate(text.split("\n"), start=1):
-        content = line.partition("#")[0].strip()
+        line = line.partition("#")[0]
+        content = line.strip()
         if number < start.number or not content or content[0] == "%":
             continue
-        row = Row(f"{path}:{number}", fields_of(content, layout.separator))
+        row = Row(f"{path}:{number}", fields_of(line, layout.separator))
         count = len(row.fields)
-        if count < least or (layout.separator != "\t" and count != expected):
+        # Between tabs the last field may be empty.
+        if count < least or abs(count - expected) > (layout.separator == "\t"):
             row.wrong(f"{expected} fields, as in the first row", f"{count}: {content}")
         yield row
 
@@ -260,7 +358,19 @@ def _numbers(row: Row, place: dict[str, int], kinds: Sequence[str]) -> list[floa
     try:
         return [float(field) if field else np.nan for field in fields]
     except ValueError:
-        row.wrong("finite numbers", " ".join(fields))
+        row.wrong(_expected("finite numbers", fields), " ".join(fields))
+
+
+def _expected(what: str, fields: Sequence[str]) -> str:
+    """Return what is expected of fields, and that it has points, if one has a decimal comma."""
+    return f"{what}, {POINTS}" if any(map(with_decimal_comma, fields)) else what
+
+
+def _metres(row: Row, layout: Layout, place: dict[str, int], kinds: Sequence[str]) -> list[float]:
+    """Return lengths (m), or velocities (m/s), from fields in the units of their columns."""
+    units = [layout.columns[place[kind]].unit or "m" for kind in kinds]
+    values = zip(_numbers(row, place, kinds), units, strict=True)
+    return [value * LENGTHS[unit] for value, unit in values]
 
 
 def _covariance(row: Row, place: dict[str, int], quaternion: Sequence[float]) -> Floats | None:
@@ -328,7 +438,7 @@ def _decimal(row: Row, field: int) -> decimal.Decimal | None:
     try:
         value = decimal.Decimal(text) if text else decimal.Decimal("nan")
     except decimal.InvalidOperation:
-        row.wrong("a stamp", text)
+        row.wrong(_expected("a stamp", [text]), text)
     if value.is_finite() and value.adjusted() > _DIGITS:
         row.wrong("a stamp", text)
     return value if value.is_finite() else None

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from nodes.judging.readers.axes import AXES, UNDECLARED, Axes
 from nodes.judging.readers.columns import (
+    POINTS,
     POSITION_COVARIANCE,
     ROTATION_COVARIANCE,
     Column,
@@ -33,7 +34,14 @@ from nodes.judging.readers.columns import (
     separator_of,
     stamps_of,
 )
-from nodes.judging.readers.source import Collected, Options, Reader, Source, Start
+from nodes.judging.readers.source import (
+    Collected,
+    Options,
+    Reader,
+    Source,
+    Start,
+    decimal_commas,
+)
 from nodes.trajectory_files import Row, read_kitti, read_rows
 
 FORMATS = (
@@ -83,7 +91,7 @@ def _plain(
         count = len(fields_of(start.row, separator))
         if separator and any(len(fields_of(line, separator)) == count for line in start.head):
             return None  # a header names the columns, with names that nobody knows
-        ends = separator is not None and start.row.endswith(separator)
+        ends = separator is not None and start.row.rstrip().endswith(separator)
         fitting = (
             layout
             for layout in layouts
@@ -180,6 +188,7 @@ def _is_kitti(_: Path, start: Start | None) -> bool:
     return (
         start is not None
         and separator_of(start) is None
+        and not decimal_commas(start.row)
         and len(fields_of(start.row, None)) in {12, 13}
     )
 
@@ -235,7 +244,8 @@ def refuse(path: Path, start: Start | None) -> NoReturn:
     """Raise a `ValueError` that names the formats and shows the file's first row."""
     if start is None or not start.number:
         raise ValueError(f"{path}: expected {FORMATS}, found no rows of text")
-    Row(f"{path}:{start.number}", []).wrong(FORMATS, start.row)
+    numbers = f"numbers {POINTS}, and " if decimal_commas(start.row) else ""
+    Row(f"{path}:{start.number}", []).wrong(numbers + FORMATS, start.row)
 
 
 READERS = (

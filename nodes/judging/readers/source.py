@@ -21,6 +21,7 @@ from nodes.trajectory import UNIT_LENGTH, Trajectory
 Floats = npt.NDArray[np.float64]
 
 _TOO_LATE = 1 << 63  # first number of nanoseconds beyond 64 bits
+_BLANKS = " \r\n\v\f"  # without tabs
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -74,8 +75,9 @@ class Start(msgspec.Struct, frozen=True):
 
     Attributes:
         number: Line of the first row; 0 if there is none.
-        head: Lines before it, stripped: comments, names of columns.
-        row: The first row, stripped: a line with a number in it.
+        head: Lines before it, without blanks around, but with tabs, beside which a field may be
+            empty: comments, names of columns.
+        row: The first row, so, and without a comment after it: a line with a number in it.
     """
 
     number: int
@@ -88,10 +90,11 @@ class Start(msgspec.Struct, frozen=True):
         head: list[str] = []
         try:
             with path.open(encoding="utf-8-sig") as file:
-                for number, line in enumerate(map(str.strip, file), start=1):
-                    if line and line[0] not in "#%" and any(map(is_number, words(line))):
-                        return cls(number, head, line)
-                    head += [line] if line else []
+                for number, line in enumerate(file, start=1):
+                    row = line.partition("#")[0].strip(_BLANKS)
+                    if not row.lstrip().startswith("%") and any(map(is_number, words(row))):
+                        return cls(number, head, row)
+                    head += [line.strip(_BLANKS)] if line.strip() else []
         except UnicodeDecodeError:
             return None
         return cls(0, head, "")
@@ -133,6 +136,22 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+
+
+def with_decimal_comma(field: str) -> bool:
+    """Return whether a field is a number with a comma instead of a decimal point."""
+    return bool(_DECIMAL_COMMA.fullmatch(field))
+
+
+def decimal_commas(row: str) -> bool:
+    """Return whether the commas of a row are those of numbers, with other separators between."""
+    separator = next((each for each in ";\t" if each in row), None)
+    fields = [field.strip() for field in row.split(separator)]
+    with_comma = [field for field in fields if "," in field]
+    return len(fields) >= 4 and bool(with_comma) and all(map(with_decimal_comma, with_comma))
 
 
 class Collected:

@@ -216,11 +216,21 @@ def _check_steps(source: Source) -> None:
 
 
 def of_body(source: Source, camera: Floats) -> Source:
-    """Return the poses of the truth's body, from those of a camera at a place in it."""
+    """Return the poses of the truth's body, from those of a camera at a place in it.
+
+    Raises:
+        ValueError: The camera is not at the body's origin, and its poses have no orientations.
+    """
+    if source.positions_only and camera[:3, 3].any():
+        raise ValueError(
+            f"{source.file}: expected orientations, without which the body's position does not "
+            "follow from the camera's (--body-from-camera), found positions only"
+        )
     matrices = source.poses.matrices() @ np.linalg.inv(camera)
     notes = source.notes
-    if source.covariances is not None:
-        notes = (*notes, "left out: covariances, which are of the camera's pose")
+    left = {"covariances": source.covariances, "velocities": source.velocities}
+    if names := " and ".join(name for name, values in left.items() if values is not None):
+        notes = (*notes, f"left out: {names}, which are of the camera's pose")
     return msgspec.structs.replace(
         source,
         poses=Trajectory.from_matrices(source.poses.stamps, matrices),

@@ -121,6 +121,17 @@ def test_columns_are_the_users_words(columns: str, text: str, tmp_path: Path) ->
     assert source.poses.positions == pytest.approx(POSE.positions)
 
 
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("name", ["TUM without a header", "EuRoC without a header", "VINS-Fusion"])
+def test_a_comment_after_a_row_is_none_of_it(name: str, number: int, tmp_path: Path) -> None:
+    lines = TABLES[name].splitlines()
+    lines[number] += "  # 1 of 60"
+    (tmp_path / "t").write_text("\n".join(lines) + "\n")
+    source = read(str(tmp_path / "t"))
+    assert source.poses.stamps.tolist() == POSE.stamps.tolist()
+    assert source.poses.positions == pytest.approx(POSE.positions, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
@@ -209,6 +220,148 @@ def test_a_quaternion_whose_order_is_not_named_is_refused(
     (tmp_path / "t").write_text(header + "\n" + rows(str, WXYZ, ","))
     with pytest.raises(ValueError, match=message):
         read(str(tmp_path / "t"))
+
+
+@pytest.mark.parametrize("header", [False, True])
+@pytest.mark.parametrize("columns", ["", "sec x y z qx qy qz qw"])
+@pytest.mark.parametrize("separator", [";", "; ", "\t", " "])
+def test_a_decimal_comma_is_named(
+    separator: str, columns: str, header: bool, tmp_path: Path
+) -> None:
+    """Also after a first row of whole numbers."""
+    text = rows(seconds, XYZW, separator).replace(".", ",")
+    zeros = separator.join("0" * 7 + "1") + "\n"
+    names = separator.join(["t", *XYZW.split()]) + "\n"
+    for lines in (text, zeros + text) if header or columns else (text,):
+        (tmp_path / "t").write_text(names * header + lines)
+        with pytest.raises(ValueError, match=r"/t:\d: expected .*with a decimal point, not with a"):
+            read(str(tmp_path / "t"), columns=columns)
+
+
+def test_a_decimal_comma_of_transforms_is_named(tmp_path: Path) -> None:
+    (tmp_path / "t").write_text("1,5 0,0 0,0 0,0 0,0 1,0 0,0 0,0 0,0 0,0 1,0 0,0\n")
+    with pytest.raises(ValueError, match=r"/t:1: expected numbers with a decimal point, not with"):
+        read(str(tmp_path / "t"))
+
+
+def with_names(name: Callable[[int], str], header: str, separator: str) -> str:
+    """Return a table of positions whose rows begin with a name, of their number."""
+    lines = rows(seconds, "x y z", separator).splitlines()
+    return f"{header}\n" + "".join(
+        f"{name(number)}{separator}{line}\n" for number, line in enumerate(lines)
+    )
+
+
+ROWS_WITH_NAMES = {
+    "pandas, tabs": with_names(str, "\ttimestamp\tx\ty\tz", "\t"),
+    "pandas, commas": with_names(str, ",timestamp,x,y,z", ","),
+    "tabs, an empty label": with_names(lambda k: "", "label\ttimestamp\tx\ty\tz", "\t"),
+    "tabs, a label of some": with_names("a".__mul__, "label\ttimestamp\tx\ty\tz", "\t"),
+    "tabs, a comment's sign": with_names(str, "# \ttimestamp\tx\ty\tz", "\t"),
+    "tabs, a sign in its own field": "#\tt\tx\ty\tz\n" + rows(seconds, "x y z", "\t"),
+    "tabs, a remark of some": "t\tx\ty\tz\tremark\n"
+    + rows(seconds, "x y z", "\t", "\t").replace("\t\n", "\tgood\n", 9),
+    "R, blanks": with_names(lambda k: f'"{k + 1}"', '"timestamp" "x" "y" "z"', " "),
+    "R, tabs": with_names(lambda k: f'"{k + 1}"', '"timestamp"\t"x"\t"y"\t"z"', "\t"),
+    "R, commas, no quotes": with_names(lambda k: f"{k + 1}", "timestamp,x,y,z", ","),
+    "R, tabs, no quotes": with_names(lambda k: f"{k + 1}", "timestamp\tx\ty\tz", "\t"),
+}
+
+
+@pytest.mark.parametrize("name", ROWS_WITH_NAMES)
+def test_columns_stand_under_their_names(name: str, tmp_path: Path) -> None:
+    (tmp_path / "t").write_text(ROWS_WITH_NAMES[name])
+    source = read(str(tmp_path / "t"))
+    assert source.poses.stamps.tolist() == POSE.stamps.tolist()
+    assert source.poses.positions == pytest.approx(POSE.positions, abs=1e-12)
+
+
+@pytest.mark.parametrize("separator", ["\t", " ", ",", ";"])
+def test_a_name_less_than_fields_is_refused_unless_it_is_clear_which(
+    separator: str, tmp_path: Path
+) -> None:
+    """A first field of 1, 2, 3, … may be a stamp in seconds."""
+    text = separator.join(["timestamp", "x", "y", "z"]) + "\n"
+    text += "".join(separator.join([f"{k}", f"{k / 10}", "4", "5", "6"]) + "\n" for k in (1, 2, 3))
+    (tmp_path / "t").write_text(text)
+    message = r"/t: expected a name for each of 5 fields, found 4 names: .* --columns \"_ sec x y z"
+    with pytest.raises(ValueError, match=message):
+        read(str(tmp_path / "t"))
+    source = read(str(tmp_path / "t"), columns="_ sec x y z")
+    assert source.poses.stamps.tolist() == [100_000_000, 200_000_000, 300_000_000]
+    assert source.poses.positions.tolist() == [[4, 5, 6]] * 3
+
+
+def test_a_row_between_tabs_lacks_its_last_field_at_most(tmp_path: Path) -> None:
+    (tmp_path / "t").write_text("t\tx\ty\tz\ta\tb\n0.5\t1\t2\t3\t4\t5\n0.6\t1\t2\t3\n")
+    with pytest.raises(ValueError, match=r"/t:3: expected 6 fields, as in the first row, found '4"):
+        read(str(tmp_path / "t"))
+
+
+@pytest.mark.parametrize(
+    ("header", "metres"),
+    [
+        ("timestamp [s],x [mm],y [mm],z [mm]", (1e-3, 1e-3, 1e-3)),
+        ("time (s),x (cm),y (cm),z (cm)", (0.01, 0.01, 0.01)),
+        ("t;p_RS_R_x [km];p_RS_R_y [km];p_RS_R_z [km]", (1e3, 1e3, 1e3)),
+        ("# t x [um] y [µm] z [micrometers]", (1e-6, 1e-6, 1e-6)),
+        ("t x [dm] y [nm] z [m]", (0.1, 1e-9, 1.0)),
+        ("# t[s] tx ty tz[mm]", (1e-3, 1e-3, 1e-3)),
+        ("t,x [world] [mm],y [world] [mm],z [world] [mm]", (1e-3, 1e-3, 1e-3)),
+        ("t,x [],y [],z []", (1.0, 1.0, 1.0)),
+    ],
+)
+@pytest.mark.parametrize("by_user", [False, True])
+def test_positions_are_metres_whatever_their_unit(
+    header: str, metres: tuple[float, float, float], by_user: bool, tmp_path: Path
+) -> None:
+    separator = next((s for s in ",;" if s in header), " ")
+    names = header.lstrip("# ").replace(" [", "[").replace(" (", "(")
+    (tmp_path / "t").write_text(
+        ("" if by_user else header + "\n")
+        + "".join(separator.join([f"{time}.5", "1", "2", "-3"]) + "\n" for time in range(3))
+    )
+    source = read(str(tmp_path / "t"), columns=names if by_user else "")
+    assert source.poses.positions[0] == pytest.approx(np.array([1, 2, -3]) * metres, rel=1e-12)
+    assert source.poses.stamps.tolist() == [500_000_000, 1_500_000_000, 2_500_000_000]
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"),
+    [("m s^-1", 1), ("mm/s", 1e-3), ("mm s^-1", 1e-3), ("cm·s⁻¹", 0.01), ("km/sec", 1e3), ("", 1)],
+)
+def test_velocities_are_metres_per_second(unit: str, scale: float, tmp_path: Path) -> None:
+    names = ",".join(f"v_RS_R_{axis} [{unit}]" for axis in "xyz")
+    (tmp_path / "t").write_text(f"t [s],x,y,z,{names}\n0.5,0,0,0,1,2,3\n1.5,0,0,0,1,2,3\n")
+    source = read(str(tmp_path / "t"))
+    assert source.velocities is not None
+    assert source.velocities[1] == pytest.approx(np.array([1, 2, 3]) * scale, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("t [min],x,y,z", r"/t: expected the unit of 't' among s, ms, us, ns .*'min'"),
+        ("t,x,y [ft],z", r"/t: expected the unit of 'y' among m, dm, .* km .*, found 'ft'"),
+        (
+            "t,x,y,z,v_RS_R_x [km/h],v_RS_R_y [km/h],v_RS_R_z [km/h]",
+            r"the unit of 'v_RS_R_x' among m, .* km per second .*, found 'km/h'",
+        ),
+    ],
+)
+def test_an_unknown_unit_is_refused(header: str, message: str, tmp_path: Path) -> None:
+    row = ",".join(["0.5"] * len(header.split(",")))
+    (tmp_path / "t").write_text(f"{header}\n{row}\n")
+    with pytest.raises(ValueError, match=message):
+        read(str(tmp_path / "t"))
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("time [µs]", "us"), ("time [μs]", "us"), ("t [milliseconds]", "ms"), ("t [UTC] [ns]", "ns")],
+)
+def test_a_stamps_unit_has_several_spellings(name: str, unit: str) -> None:
+    assert column_of(name)[:2] == ("stamp", unit)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import hypothesis.strategies as st
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +16,7 @@ from hypothesis import given, settings
 from nodes.judging import judgement
 from nodes.judging.evaluation.judging import Judgement
 from nodes.judging.judgement import read, read_mounting, read_stamps, read_truth
+from nodes.judging.readers import Source, of_body
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_euroc, write_kitti, write_tum
 from tests.nodes.judging.judge import bags
@@ -183,6 +185,42 @@ def test_a_mounting_that_is_none_is_refused(text: str, message: str) -> None:
 def test_a_camera_that_the_run_has_not_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"expected 'drone/left' among the cameras on a body, fou"):
         read_mounting("drone/left", str(tmp_path))
+
+
+MOUNTING = np.array([[0.0, 0, 1, 0.3], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("kinds", "note"),
+    [
+        ((), ()),
+        (("velocities",), ("left out: velocities, which are of the camera's pose",)),
+        (("covariances",), ("left out: covariances, which are of the camera's pose",)),
+        (
+            ("covariances", "velocities"),
+            ("left out: covariances and velocities, which are of the camera's pose",),
+        ),
+    ],
+)
+def test_what_is_of_the_camera_only_is_left_out_with_a_note(
+    kinds: tuple[str, ...], note: tuple[str, ...]
+) -> None:
+    values = {"velocities": np.ones((5, 3)), "covariances": np.ones((5, 6, 6))}
+    camera: Source = msgspec.structs.replace(
+        Source(name="vo", file="vo", poses=walk(5)), **{kind: values[kind] for kind in kinds}
+    )
+    body = of_body(camera, MOUNTING)
+    assert (body.notes, body.velocities, body.covariances) == (note, None, None)
+
+
+def test_a_lever_arm_needs_orientations(tmp_path: Path) -> None:
+    """Without one, the camera's positions are the body's."""
+    (tmp_path / "t").write_text("0.0 1 2 3\n0.1 2 3 4\n")
+    with pytest.raises(ValueError, match=r"/t: expected orientations, .* found positions only"):
+        read(str(tmp_path / "t"), camera=MOUNTING)
+    turned = MOUNTING.copy()
+    turned[:3, 3] = 0.0
+    assert read(str(tmp_path / "t"), camera=turned).poses.positions.tolist()[1] == [2, 3, 4]
 
 
 def judged(tmp_path: Path, truth: Trajectory, estimate: Trajectory, **settings: Any) -> Judgement:
