@@ -10,8 +10,11 @@ machines on which folders differ agree:
     numpy                an installed distribution: version and hash
     python, machine      versions
 
-What is not seen: files that a program opens by names of its own, libraries that it loads while it
-runs, what is in a container.
+A folder that is only named, in code, in a file of settings or on a command line, counts as such a
+file does, unless everything lies in it or it has more than `MOST_FILES` files.
+
+What is not seen: files that neither a text nor their folder's name tells of, those that a compiled
+program opens by names of its own, libraries that it loads while it runs, what is in a container.
 """
 
 from __future__ import annotations
@@ -532,12 +535,13 @@ def _is_folder(path: Path) -> bool:
 def _is_named_data(folder: Path, base: Path) -> bool:
     """Tell whether a folder that a text names is one of data, of at most `MOST_FILES` files.
 
-    It is none if it is around what is worked on, a package, or has results of runs.
+    It is none if it is around what is worked on, directly below ``/``, a package, or has results of
+    runs.
     """
     if not _is_folder(folder) or not _is_data(folder) or folder.name in _RESULTS:
         return False
     around = (base.absolute(), Path.cwd(), TOOL, Path(tempfile.gettempdir()))
-    if any(each.is_relative_to(folder) for each in around):
+    if len(folder.parts) <= 2 or any(each.is_relative_to(folder) for each in around):
         return False
     with contextlib.suppress(OSError):
         if any((folder / name).exists() for name in ("__init__.py", MARKER, "rows.jsonl")):

@@ -49,6 +49,7 @@ LARGE = 64_000_000
 MOST_FILES = 10_000
 """Files and folders in a folder beyond which it does not count where it is only named."""
 
+_MOST_MATCHES = 1000  # files beyond which those of a pattern do not count
 _SETTLED = 2.0  # seconds after which a change of a file also changes its time
 _INSTALLED = {"site-packages", "dist-packages"}
 _ENDS = tuple(importlib.machinery.all_suffixes())
@@ -612,11 +613,16 @@ def _up(folder: Path, count: int) -> Path:
 
 
 def _matches(base: Path, text: str) -> list[Path]:
-    """Return the files and folders that a path, or a pattern with ``*``, names in a folder."""
-    with contextlib.suppress(OSError, ValueError, NotImplementedError):
-        if "*" in text:
-            return sorted(itertools.islice(base.glob(text), MOST_FILES))
-        path = Path(os.path.normpath(base / text))
+    """Return the files and folders that a path, or a pattern with ``*``, names in a folder.
+
+    Of a pattern with a folder it is that folder; of one with very many files, none.
+    """
+    folder = text.partition("*")[0].rpartition("/")[0] if "*" in text else text
+    with contextlib.suppress(OSError, ValueError):
+        if not folder:
+            paths = [*itertools.islice(base.glob(text), _MOST_MATCHES + 1)]
+            return sorted(paths) if len(paths) <= _MOST_MATCHES else []
+        path = Path(os.path.normpath(base / folder))
         return [path] if path.exists() else []
     return []
 

@@ -131,7 +131,9 @@ HERE = "HERE = Path(__file__).parent\n"
         ("load(Path(__file__).resolve().parents[1] / 'data')", "../data/up.txt", "data"),
         ("load(dirname(dirname(__file__)) + '/x', '../data')", "../data/up.txt", "data"),
         ("np.load(Path(__file__).with_suffix('.npyy'))", "own.npyy", "own.npyy"),
-        ("open(f'{HERE}/weights/{name}.txt')", "weights/a.txt", "weights/a.txt"),
+        ("open(f'{HERE}/weights/{name}.txt')", "weights/a.txt", "weights"),
+        ("open(f'weights/{name}.txt')", "weights/a.txt", "weights"),
+        ("for f in HERE.glob('*.bin'): pass", "weights_1.bin", "weights_1.bin"),
         ("open(HERE / 'weights' / f'{name}.txt')", "weights/a.txt", "weights"),
         ("open(f'weights_{n}.bin')", "weights_1.bin", "weights_1.bin"),
         ("open(os.path.join(HERE, 'models', 'deep', name))", "models/deep/b.bin", "models/deep"),
@@ -181,7 +183,21 @@ def test_folders_around_the_code_with_results_or_with_too_many_files_do_not_coun
     for name in [*names, "../home/x"]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("1")
-    texts = ["/", ".", "..", "../..", "full", "swept", "runs", "../home", str(tmp_path), "few"]
+    texts = [
+        "/",
+        ".",
+        "..",
+        "../..",
+        "full",
+        "swept",
+        "runs",
+        "../home",
+        str(tmp_path),
+        "few",
+        "/home",
+        "/opt",
+        "*/x",
+    ]
     roots = own(folder, f"TEXTS = {texts}")
     for name in [*names[:-1], "../home/x"]:
         assert what_changes(roots, lambda name=name: edit(folder / name)) == []  # type: ignore[misc]
