@@ -294,7 +294,7 @@ class _Collector:
         )
         for name, paths in found.folders.items():
             for path in paths:
-                self._add_named_folder(Path(path), name)
+                self._add_named_folder(Path(path), name, [working or Path.cwd()])
         for name, paths in found.files.items():
             for path in paths:
                 self._note(name, path, certain=name not in found.named)
@@ -319,7 +319,7 @@ class _Collector:
             if _is_file(path) or (inside and _is_data(path)):
                 scripts += self._add(path, [working], line, certain=False)
             else:
-                self._add_named_folder(path, path.name)
+                self._add_named_folder(path, path.name, [working])
         for word in line.build:
             if _is_file(path := working / _expanded(word, environment)):
                 self._add(path, [working], line)
@@ -391,7 +391,9 @@ class _Collector:
             elif kind == "text":
                 for named in _named_in(path, [path.parent, *bases]):
                     if named.is_dir():
-                        self._add_named_folder(named, self._name(named, bases))
+                        self._add_named_folder(
+                            named, self._name(named, bases), [path.parent, *bases]
+                        )
                     else:
                         todo.append(named)
         if line is None and scripts:
@@ -409,10 +411,10 @@ class _Collector:
         folder = Path(os.path.normpath(folder.absolute()))
         of_name[folder] = certain or of_name.get(folder, False)
 
-    def _add_named_folder(self, folder: Path, name: str) -> None:
-        """Add a folder that is only named in a text, unless that is about something else."""
+    def _add_named_folder(self, folder: Path, name: str, around: Iterable[Path] = ()) -> None:
+        """Add a folder that is only named in a text, and is none around others."""
         folder = Path(os.path.normpath(folder.absolute()))
-        if _is_named_data(folder, self._folder):
+        if _is_named_data(folder, [self._folder, *around]):
             self._folders.setdefault(name, {}).setdefault(folder, False)
 
     def _hashes_of_folders(self) -> Parts:
@@ -532,7 +534,7 @@ def _is_folder(path: Path) -> bool:
     return False
 
 
-def _is_named_data(folder: Path, base: Path) -> bool:
+def _is_named_data(folder: Path, around: Iterable[Path]) -> bool:
     """Tell whether a folder that a text names is one of data, of at most `MOST_FILES` files.
 
     It is none if it is around what is worked on, directly below ``/``, a package, or has results of
@@ -540,8 +542,9 @@ def _is_named_data(folder: Path, base: Path) -> bool:
     """
     if not _is_folder(folder) or not _is_data(folder) or folder.name in _RESULTS:
         return False
-    around = (base.absolute(), Path.cwd(), TOOL, Path(tempfile.gettempdir()))
-    if len(folder.parts) <= 2 or any(each.is_relative_to(folder) for each in around):
+    around = (*around, Path.cwd(), TOOL, Path(tempfile.gettempdir()))
+    inside = (Path(os.path.normpath(each.absolute())) for each in around)
+    if len(folder.parts) <= 2 or any(each.is_relative_to(folder) for each in inside):
         return False
     with contextlib.suppress(OSError):
         if any((folder / name).exists() for name in ("__init__.py", MARKER, "rows.jsonl")):

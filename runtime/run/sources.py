@@ -545,7 +545,9 @@ def find_sources(
         for text, ups in code.places:
             for begin in dict.fromkeys([*(_up(folder, n) for n in ups), *working]):
                 for place in _matches(begin, text):
-                    is_code = adds_folders and any(place.glob("*.py"))
+                    is_code = _up(folder, 0).is_relative_to(place) or (
+                        adds_folders and any(place.glob("*.py"))
+                    )
                     if not is_code:
                         name_place(place, begin, file_too="*" in text or begin != folder)
         if code.of_stem:

@@ -197,8 +197,14 @@ def test_folders_around_the_code_with_results_or_with_too_many_files_do_not_coun
         "/home",
         "/opt",
         "*/x",
+        "../mine",
     ]
-    roots = own(folder, f"TEXTS = {texts}")
+    (folder / "deep.yaml").write_text("root: .\nup: ..\n")
+    roots = msgspec.structs.replace(
+        program(folder, "python", "own.py", "deep.yaml", "."),
+        modules=own(folder, f"TEXTS = {texts}").modules,
+        folder=str(tmp_path / "settings"),
+    )
     for name in [*names[:-1], "../home/x"]:
         assert what_changes(roots, lambda name=name: edit(folder / name)) == []  # type: ignore[misc]
     assert what_changes(roots, lambda: edit(folder / "few" / "1")) == ["few changed"]
