@@ -32,6 +32,8 @@ _NOISE = (
     "accelerometer_noise_density", "accelerometer_random_walk",
     "gyroscope_noise_density", "gyroscope_random_walk",
 )  # fmt: skip
+_ANGLE, _SHIFT = 1e-2, 1e-2
+"""How far T_cn_cnm1 may be from T_cam_imu of two cameras, rad and m: each is an estimate."""
 _PER_CAMERA = re.compile(r"cam(\d+)")
 _PER_IMU = re.compile(r"imu(\d+)")
 
@@ -72,7 +74,8 @@ def read_chain(paths: Sequence[Path]) -> Chain:
     """Read the files of a rig's calibration, as if they were one.
 
     Raises:
-        ValueError: A file cannot be read, or holds something else; the message names the key.
+        ValueError: A file cannot be read, holds something else, or contradicts itself; the message
+            names the key.
     """
     where = ", ".join(map(str, paths))
     texts = []
@@ -272,6 +275,8 @@ def _camera(keys: _Keys, name: str, before: Sequence[KalibrCamera]) -> KalibrCam
             in_first = last.in_first @ inverse(previous)
             if in_imu is None and last.in_imu is not None:
                 in_imu = last.in_imu @ inverse(previous)
+            elif in_imu is not None and last.in_imu is not None:
+                _check_step(keys.where, inverse(in_imu) @ last.in_imu, previous, last.name)
         elif in_imu is not None and first.in_imu is not None:
             in_first = inverse(first.in_imu) @ in_imu
         else:
@@ -293,6 +298,22 @@ def _camera(keys: _Keys, name: str, before: Sequence[KalibrCamera]) -> KalibrCam
         in_first=in_first,
         time_offset=0.0 - keys.number("timeshift_cam_imu", 0.0),
     )
+
+
+def _check_step(where: str, by_imu: Floats, by_chain: Floats, last: str) -> None:
+    """Raise a `ValueError` if two transforms from the camera before differ beyond their errors."""
+    odd = by_chain @ inverse(by_imu)
+    skew = odd[:3, :3] - odd[:3, :3].T
+    sine = np.linalg.norm([skew[2, 1], skew[0, 2], skew[1, 0]])
+    angle = float(np.arctan2(sine, np.trace(odd) - 2.0))
+    shift = float(np.linalg.norm(by_chain[:3, 3] - by_imu[:3, 3]))
+    if angle > _ANGLE or shift > _SHIFT:
+        raise ValueError(
+            f"{where}: T_cn_cnm1: expected what T_cam_imu of both cameras gives, T_cam_imu · "
+            f"T_cam_imu⁻¹ of {last}, that is {by_imu.round(4).tolist()}, found "
+            f"{by_chain.round(4).tolist()}, {np.degrees(angle):.3g}° and {shift:.3g} m from it: "
+            "T_imu_cam (as EuRoC's T_BS) may have been given for T_cam_imu"
+        )
 
 
 def _imu(keys: _Keys, name: str) -> KalibrImu:

@@ -10,8 +10,11 @@ machines on which folders differ agree:
     numpy                an installed distribution: version and hash
     python, machine      versions
 
-What is not seen: files that a program opens by names of its own, libraries that it loads while it
-runs, what is in a container.
+A folder that is only named, in code, in a file of settings or on a command line, counts as such a
+file does, unless everything lies in it or it has more than `MOST_FILES` files.
+
+What is not seen: files that neither a text nor their folder's name tells of, those that a compiled
+program opens by names of its own, libraries that it loads while it runs, what is in a container.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,7 +41,9 @@ from runtime.paths import inputs, written
 from runtime.run.results import MARKER
 from runtime.run.sources import (
     LARGE,
+    MOST_FILES,
     OURS,
+    TOOL,
     Finder,
     Found,
     code_modules,
@@ -226,6 +232,7 @@ class _Collector:
     def __init__(self, folder: str) -> None:
         self._folder = Path(folder or Path.cwd())
         self._files: dict[str, set[str]] = {}  # paths by name
+        self._folders: dict[str, dict[Path, bool]] = {}  # by name; whether they are inputs
         self._others: Parts = {}
         self._named: dict[str, str] = {}  # how hashes of files that are only named begin
 
@@ -236,7 +243,7 @@ class _Collector:
             + hashed(content_hash(Path(path)) for path in sorted(paths))
             for name, paths in self._files.items()
         }
-        return files | self._others
+        return files | self._hashes_of_folders() | self._others
 
     def add_text(self, name: str, text: str) -> None:
         """Add a text that is in no file."""
@@ -265,6 +272,9 @@ class _Collector:
                     if _is_file(base / text):
                         self._add(base / text, [], certain=certain)
                         break
+            if not text.startswith("/"):
+                for base in dict.fromkeys((self._folder, Path.cwd())):
+                    self._add_named_folder(base / text, Path(text).as_posix())
         return modules
 
     def add_code(
@@ -276,9 +286,15 @@ class _Collector:
         possible: Iterable[str] = (),
         ours: Callable[[str], bool] = lambda _: True,
         libraries: bool = True,
+        working: Path | None = None,
     ) -> None:
         """Add the files of modules and scripts with what they import."""
-        found: Found = find_sources(finder, modules, scripts, possible=possible, ours=ours)
+        found: Found = find_sources(
+            finder, modules, scripts, possible=possible, ours=ours, working=[working or Path.cwd()]
+        )
+        for name, paths in found.folders.items():
+            for path in paths:
+                self._add_named_folder(Path(path), name, [working or Path.cwd()])
         for name, paths in found.files.items():
             for path in paths:
                 self._note(name, path, certain=name not in found.named)
@@ -302,6 +318,8 @@ class _Collector:
             inside = "/" in text and path not in {working, *working.parents}
             if _is_file(path) or (inside and _is_data(path)):
                 scripts += self._add(path, [working], line, certain=False)
+            else:
+                self._add_named_folder(path, path.name, [working])
         for word in line.build:
             if _is_file(path := working / _expanded(word, environment)):
                 self._add(path, [working], line)
@@ -323,7 +341,9 @@ class _Collector:
                 sites = _sites(program)
         if scripts or modules:
             first += [script.parent for script in scripts]
-            self.add_code(Finder(first, sites), modules, scripts, libraries=libraries)
+            self.add_code(
+                Finder(first, sites), modules, scripts, libraries=libraries, working=working
+            )
 
     def _note(self, name: str, path: str, *, certain: bool = True) -> None:
         if not certain and name not in self._files:
@@ -369,7 +389,13 @@ class _Collector:
             elif path.suffix == ".xml":
                 todo += _included(path)
             elif kind == "text":
-                todo += _named_in(path, [path.parent, *bases])
+                for named in _named_in(path, [path.parent, *bases]):
+                    if named.is_dir():
+                        self._add_named_folder(
+                            named, self._name(named, bases), [path.parent, *bases]
+                        )
+                    else:
+                        todo.append(named)
         if line is None and scripts:
             self.add_code(Finder([each.parent for each in scripts]), scripts=scripts)
         return scripts
@@ -381,12 +407,27 @@ class _Collector:
         return path.name
 
     def _add_folder(self, folder: Path, *, certain: bool) -> None:
-        found = sorted(_files_in(folder))
-        large = sum(size for _, size in found) > LARGE
-        hashes = [f"{name} {content_hash(folder / name, large=large)}" for name, _ in found]
-        before = self._others.get(folder.name, "")
-        key = hashed([*filter(None, [before]), *hashes])
-        self._others[folder.name] = key if certain else f"{_WRITABLE}{key}"
+        of_name = self._folders.setdefault(folder.name, {})
+        folder = Path(os.path.normpath(folder.absolute()))
+        of_name[folder] = certain or of_name.get(folder, False)
+
+    def _add_named_folder(self, folder: Path, name: str, around: Iterable[Path] = ()) -> None:
+        """Add a folder that is only named in a text, and is none around others."""
+        folder = Path(os.path.normpath(folder.absolute()))
+        if _is_named_data(folder, [self._folder, *around]):
+            self._folders.setdefault(name, {}).setdefault(folder, False)
+
+    def _hashes_of_folders(self) -> Parts:
+        result = {}
+        for name, folders in self._folders.items():
+            hashes: list[str] = []
+            for folder in sorted(folders):
+                files = sorted(_files_in(folder))
+                large = sum(size for _, size in files) > LARGE
+                each = [f"{path} {content_hash(folder / path, large=large)}" for path, _ in files]
+                hashes.append(hashed(each))
+            result[name] = ("" if any(folders.values()) else _WRITABLE) + hashed(hashes)
+        return result
 
     def _add_sources(self, folder: Path) -> None:
         for name, _ in _files_in(folder, without=_RESULTS | _BUILT):
@@ -487,6 +528,49 @@ def _is_data(path: Path) -> bool:
     return path.is_dir() and path not in around and not f"{path}/".startswith(_SYSTEM)
 
 
+def _is_folder(path: Path) -> bool:
+    with contextlib.suppress(OSError, ValueError):
+        return path.is_dir()
+    return False
+
+
+def _is_named_data(folder: Path, around: Iterable[Path]) -> bool:
+    """Tell whether a folder that a text names is one of data, of at most `MOST_FILES` files.
+
+    It is none if it is around what is worked on, directly below ``/``, a package, or has results of
+    runs.
+    """
+    if not _is_folder(folder) or not _is_data(folder) or folder.name in _RESULTS:
+        return False
+    around = (*around, Path.cwd(), TOOL, Path(tempfile.gettempdir()))
+    inside = (Path(os.path.normpath(each.absolute())) for each in around)
+    if len(folder.parts) <= 2 or any(each.is_relative_to(folder) for each in inside):
+        return False
+    with contextlib.suppress(OSError):
+        if any((folder / name).exists() for name in ("__init__.py", MARKER, "rows.jsonl")):
+            return False
+        return not folder.name.startswith(".") and _is_small(folder)
+    return False
+
+
+def _is_small(folder: Path) -> bool:
+    """Tell whether a folder has at most `MOST_FILES` files and folders."""
+    count, todo, seen = 0, [str(folder)], set()
+    while todo:
+        inside = os.path.realpath(todo.pop())
+        if inside in seen:
+            continue
+        seen.add(inside)
+        with contextlib.suppress(OSError), os.scandir(inside) as entries:
+            for each in entries:
+                count += 1
+                if count > MOST_FILES:
+                    return False
+                if each.is_dir():
+                    todo.append(each.path)
+    return True
+
+
 def _within(path: Path, folders: Iterable[Path]) -> bool:
     return any(path.absolute().is_relative_to(folder) for folder in folders)
 
@@ -525,14 +609,14 @@ def _included(path: Path) -> list[Path]:
 
 
 def _named_in(path: Path, bases: Iterable[Path]) -> Iterator[Path]:
-    """Yield the files that a script or a file of settings names."""
+    """Yield the files and folders that a script or a file of settings names."""
     for token in dict.fromkeys(_TOKEN.findall(text_of(path))):
-        if "." not in token and "/" not in token:
-            continue
         for base in bases:
             named = base / token
-            if _is_file(named) and not str(named).startswith(_SYSTEM):
-                yield named
+            may_be_file = "." in token or "/" in token
+            if (may_be_file and _is_file(named)) or _is_folder(named):
+                if not str(named).startswith(_SYSTEM):
+                    yield named
                 break
 
 

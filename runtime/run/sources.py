@@ -2,9 +2,9 @@
 
 A module counts with its imports anywhere in its code, with modules that it loads by a name written
 there (``importlib.import_module("x")``, ``"module:Class"``), and, outside this project, with files
-in its folder that its texts name. Where a name is computed, all modules of the package or folder
-count. Code that is installed counts by its distribution: version and hashes of ``RECORD``; the
-standard library by Python's version.
+and folders beside it that its texts name. Where a name is computed, all modules of the package or
+folder count. Code that is installed counts by its distribution: version and hashes of ``RECORD``;
+the standard library by Python's version.
 
 Nothing is imported to find this out. Files are read once a process, until their size or time of
 change differs.
@@ -15,6 +15,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib.machinery
+import itertools
 import os
 import re
 import stat
@@ -45,6 +46,10 @@ OURS = frozenset({"bench", "events", "nodes", "runtime", "sims"})
 LARGE = 64_000_000
 """Bytes beyond which a file counts by name, size and time of change instead of its content."""
 
+MOST_FILES = 10_000
+"""Files and folders in a folder beyond which it does not count where it is only named."""
+
+_MOST_MATCHES = 1000  # files beyond which those of a pattern do not count
 _SETTLED = 2.0  # seconds after which a change of a file also changes its time
 _INSTALLED = {"site-packages", "dist-packages"}
 _ENDS = tuple(importlib.machinery.all_suffixes())
@@ -115,17 +120,27 @@ class Code(msgspec.Struct, frozen=True):
         loaded: Modules loaded by a name in the text; ``.*`` at the end stands for all of a package.
         dynamic: Whether it loads modules by names that are computed.
         texts: Texts that may name files, modules or folders.
+        places: Paths, or patterns with ``*``, that may be of files or folders, each with how many
+            folders up from the file's they may begin.
+        of_stem: Whether it makes the name of a file from its own.
     """
 
     imports: tuple[_Import, ...] = ()
     loaded: tuple[str, ...] = ()
     dynamic: bool = False
     texts: tuple[str, ...] = ()
+    places: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    of_stem: bool = False
 
 
 _LOADERS = {"import_module", "__import__", "run_module", "find_spec"}
 _DISCOVERIES = {"iter_modules", "walk_packages", "spec_from_file_location", "run_path"}
-_WRITERS = {"write_text", "write_bytes", "savetxt", "save", "savez", "imwrite", "to_csv", "savefig"}
+_WRITERS = {
+    "write_text", "write_bytes", "savetxt", "save", "savez", "savez_compressed", "imwrite",
+    "to_csv", "savefig", "tofile", "touch", "mkdir", "makedirs", "rmtree",
+}  # fmt: skip
+_OF_STEM = ("with_suffix", "splitext", "stem", "removesuffix", "replace", "[:-3]")
+_PATTERN = re.compile(r"(?!.*\*\*)(?=.*\w)[\w./ +~*-]{1,200}")
 _FILE = re.compile(r"[\w./ +~-]{1,200}")
 _REFERENCE = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):[A-Za-z_]\w*(?:\.\w+)*")
 _DOTTED = re.compile(r"\.*[A-Za-z_]\w*(?:\.\w+)*")
@@ -148,7 +163,9 @@ def code_modules(text: str) -> Iterator[str]:
 
 def _read_imports(content: bytes) -> Code:
     if any(name.encode() in content for name in ("import_module(", "__import__(")):
-        return msgspec.structs.replace(_read_whole(content), dynamic=False, texts=())
+        return msgspec.structs.replace(
+            _read_whole(content), dynamic=False, texts=(), places=(), of_stem=False
+        )
     imports: list[_Import] = []
     todo: list[Any] = [_parsed(content)]
     while todo:  # statements only, which takes a third of the time of `ast.walk`
@@ -163,14 +180,19 @@ def _read_whole(content: bytes) -> Code:
     imports: list[_Import] = []
     loaded, texts, dynamic = [], [], False
     written: set[str] = set()
-    for node in ast.walk(_parsed(content)):
+    joined: list[list[str]] = []
+    tree = _parsed(content)
+    paths = _Paths(tree)
+    places: list[tuple[list[_Text], str, tuple[int, ...]]] = []
+    placed: set[int] = set()
+    for node in ast.walk(tree):
         imports += _import(node)
         if _is_text(node):
             texts.append(node.value)
         elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
-            texts.append("/".join(_joined(node)))
+            joined.append([each.value for each in _joined(node)])
         elif isinstance(node, ast.Call):
-            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            name = _called(node)
             if name in _LOADERS and (given := [*node.args, *(k.value for k in node.keywords)]):
                 text, complete = _beginning(given[0])
                 if complete:
@@ -181,13 +203,120 @@ def _read_whole(content: bytes) -> Code:
                     dynamic = True
             dynamic |= name in _DISCOVERIES
             if name in _WRITERS or (name == "open" and _writes(node)):
-                written |= {each.value for each in ast.walk(node) if _is_text(each)}
+                written |= {each.value for each in paths.texts_in(node)}
+        inner, place, base = _place(node)
+        if place and placed.isdisjoint(map(id, inner)):  # an outer expression is read first
+            placed.update(map(id, inner))
+            places.append((inner, place, paths.ups(base)))
+    texts += ["/".join(each) for each in joined if not written.issuperset(each)]
     kept = dict.fromkeys(
         text
         for text in texts
         if text not in written and (_FILE.fullmatch(text) or _REFERENCE.fullmatch(text))
     )
-    return Code(tuple(imports), tuple(dict.fromkeys(loaded)), dynamic, tuple(kept))
+    kept_places = dict.fromkeys(
+        (place, ups)
+        for inner, place, ups in places
+        if _PATTERN.fullmatch(place) and not written.issuperset(each.value for each in inner)
+    )
+    text = content.decode(errors="replace")
+    of_stem = "__file__" in text and any(each in text for each in _OF_STEM)
+    return Code(
+        tuple(imports),
+        tuple(dict.fromkeys(loaded)),
+        dynamic,
+        tuple(kept),
+        tuple(kept_places),
+        of_stem,
+    )
+
+
+class _Paths:
+    """Expressions of paths in a file, with the names that are assigned once."""
+
+    def __init__(self, tree: ast.AST) -> None:
+        values: dict[str, list[ast.expr]] = {}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                for target in targets:
+                    values.setdefault(_name(target), []).append(node.value)
+        self._values = {name: each[0] for name, each in values.items() if name and len(each) == 1}
+
+    def texts_in(self, node: ast.AST) -> Iterator[_Text]:
+        """Yield the texts in an expression and in the values of the names in it."""
+        todo, seen = [node], {""}
+        while todo:
+            for each in ast.walk(todo.pop()):
+                if _is_text(each):
+                    yield each
+                elif (name := _name(each)) not in seen and name in self._values:
+                    seen.add(name)
+                    todo.append(self._values[name])
+
+    def ups(self, base: ast.expr | None) -> tuple[int, ...]:
+        """Return how many folders up from a file's folder an expression in it may be."""
+        count, seen = 0, {""}
+        while base is not None:
+            name = _name(base)
+            if name == "__file__":
+                return (max(0, count - 1),)
+            if name == "parent" and isinstance(base, ast.Attribute):
+                count, base = count + 1, base.value
+            elif isinstance(base, ast.Subscript) and _name(base.value) == "parents":
+                number = base.slice.value if isinstance(base.slice, ast.Constant) else 0
+                count += 1 + (number if isinstance(number, int) and 0 <= number < _UPS else 0)
+                base = base.value.value if isinstance(base.value, ast.Attribute) else None
+            elif isinstance(base, ast.Call):
+                count += _called(base) == "dirname"
+                method = isinstance(base.func, ast.Attribute) and _called(base) not in _WITH_PATH
+                base = base.func.value if method else next(iter(base.args), None)  # type: ignore[attr-defined]
+            elif isinstance(base, ast.BinOp):
+                base = base.left
+            else:
+                base = None if name in seen else self._values.get(name)
+                seen.add(name)
+        return tuple(range(min(count, _UPS) + 1))
+
+
+_UPS = 4
+_WITH_PATH = {"Path", "PurePath", "abspath", "realpath", "dirname", "fspath", "join", "normpath"}
+
+
+def _name(node: ast.AST) -> str:
+    name = getattr(node, "id", getattr(node, "attr", ""))
+    return name if isinstance(name, str) else ""
+
+
+def _called(call: ast.Call) -> str:
+    return _name(call.func)
+
+
+def _place(node: ast.AST) -> tuple[list[_Text], str, ast.expr | None]:
+    """Return the texts of a path, the path, and the expression that it begins with, if any."""
+    base: ast.expr | None = None
+    inner: list[_Text] = []
+    if _is_text(node):
+        return [node], node.value, None
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+        inner, base = _joined(node), node.left
+    elif isinstance(node, ast.Call) and _called(node) in {"join", "joinpath"}:
+        given = list(node.args)
+        if _called(node) == "joinpath" and isinstance(node.func, ast.Attribute):
+            base = node.func.value
+        elif len(given) > 1 and not _is_text(given[0]):
+            base = given.pop(0)
+        if len(node.args) > 1 or base is not None:
+            others = (n for n, each in enumerate(given) if not _is_text(each))
+            inner = [each for each in given[: next(others, len(given))] if _is_text(each)]
+    elif isinstance(node, ast.JoinedStr):
+        inner = [each for each in node.values if _is_text(each)]
+        first = node.values[0] if node.values else None
+        place = "".join(each.value if _is_text(each) else "*" for each in node.values)
+        if isinstance(first, ast.FormattedValue) and place.startswith("*/"):
+            return inner, place[2:], first.value
+        return inner, place, None
+    return inner, "/".join(each.value for each in inner), base
 
 
 def _is_text(node: ast.AST) -> TypeGuard[_Text]:
@@ -213,10 +342,10 @@ def _import(node: ast.AST) -> Iterator[_Import]:
         yield node.level, node.module or "", tuple(alias.name for alias in node.names)
 
 
-def _joined(node: ast.expr) -> list[str]:
+def _joined(node: ast.expr) -> list[_Text]:
     """Return the texts at the end of ``folder / "a" / "b.npz"``."""
     if _is_text(node):
-        return [node.value]
+        return [node]
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
         last = _joined(node.right)
         return [*_joined(node.left), *last] if last else []
@@ -344,11 +473,13 @@ class Found(msgspec.Struct):
         files: Paths by their name for readers.
         installed: Names of installed packages that are imported.
         named: Names of files that are only named in a text, and may be read or written.
+        folders: Paths of folders that are only named, by their name for readers.
     """
 
     files: dict[str, set[str]] = {}
     installed: set[str] = set()
     named: set[str] = set()
+    folders: dict[str, set[str]] = {}
 
     def add(self, name: str, path: str) -> None:
         """Add a file."""
@@ -362,6 +493,7 @@ def find_sources(
     *,
     ours: Callable[[str], bool] = lambda _: True,
     possible: Iterable[str] = (),
+    working: Iterable[Path] = (),
 ) -> Found:
     """Find the files of modules and scripts, and of all that they import.
 
@@ -369,8 +501,10 @@ def find_sources(
         modules: Their packages count with their files, even if they are installed.
         ours: Which of this project's modules count.
         possible: Names that may be modules.
+        working: Folders in which paths in code may begin, beside those of its files.
     """
     found = Found()
+    working = list(working)
     todo = [*modules]
     roots = {name.partition(".")[0] for name in todo}
     todo += possible
@@ -407,6 +541,27 @@ def find_sources(
                 for other in others:
                     if other.is_dir():
                         finder.add(str(other))
+
+        for text, ups in code.places:
+            for begin in dict.fromkeys([*(_up(folder, n) for n in ups), *working]):
+                for place in _matches(begin, text):
+                    is_code = _up(folder, 0).is_relative_to(place) or (
+                        adds_folders and any(place.glob("*.py"))
+                    )
+                    if not is_code:
+                        name_place(place, begin, file_too="*" in text or begin != folder)
+        if code.of_stem:
+            for place in _matches(folder, f"{Path(path).stem}.*"):
+                name_place(place, folder, file_too=True)
+
+    def name_place(place: Path, base: Path, *, file_too: bool) -> None:
+        name = place.relative_to(base).as_posix() if place.is_relative_to(base) else place.name
+        if place.is_dir():
+            found.folders.setdefault(name, set()).add(str(place))
+        elif file_too and place.is_file() and place.suffix not in {".py", ".pyc", ".pyi"}:
+            if name not in found.files:
+                found.named.add(name)
+            found.add(name, str(place))
 
     def add_script(path: str, name: str) -> None:
         found.add(name, path)
@@ -453,6 +608,25 @@ def find_sources(
                     found.add(f"{base}/{beside.name}", beside.path)
         read_file(file, name, name if is_package else ".".join(parts[:-1]))
     return found
+
+
+def _up(folder: Path, count: int) -> Path:
+    return Path(os.path.normpath(folder.absolute().joinpath(*[".."] * count)))
+
+
+def _matches(base: Path, text: str) -> list[Path]:
+    """Return the files and folders that a path, or a pattern with ``*``, names in a folder.
+
+    Of a pattern with a folder it is that folder; of one with very many files, none.
+    """
+    folder = text.partition("*")[0].rpartition("/")[0] if "*" in text else text
+    with contextlib.suppress(OSError, ValueError):
+        if not folder:
+            paths = [*itertools.islice(base.glob(text), _MOST_MATCHES + 1)]
+            return sorted(paths) if len(paths) <= _MOST_MATCHES else []
+        path = Path(os.path.normpath(base / folder))
+        return [path] if path.exists() else []
+    return []
 
 
 def _absolute(level: int, module: str, package: str) -> str:

@@ -119,7 +119,10 @@ class Rows:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._file.close()
-            raise ConfigError(f"{path}: expected it free, found another sweep writing it") from None
+            raise ConfigError(
+                f"{path}: expected it free, found another sweep writing it: wait for it, or name "
+                "another folder with --out"
+            ) from None
         if fresh:
             self._file.truncate(0)
         self._file.seek(0)

@@ -102,6 +102,61 @@ def test_a_chain_without_all_transforms_is_closed_from_camera_to_camera(
     np.testing.assert_allclose(third.in_first, step @ step, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("angle", "shift", "same"),
+    [(0.009, 0.009, True), (0.011, 0.0, False), (0.0, 0.011, False), (math.pi, 0.0, False)],
+)
+def test_a_chain_that_contradicts_itself_is_refused(angle: float, shift: float, same: bool) -> None:
+    """T_cn_cnm1 beside T_cam_imu of both cameras, from which it is off."""
+    first = pose_matrix((0.1, -0.2, 0.3), from_rpy(1.0, -0.5, 2.0))
+    step = pose_matrix((0.1, 0.0, 0.0), from_rpy(0.02, 0.01, -0.01))
+    odd = pose_matrix((0.0, shift, 0.0), from_rpy(0.0, 0.0, angle))
+    common = "camera_model: pinhole, intrinsics: [1, 1, 0, 0], resolution: [2, 2]"
+    given = inverse(step)
+    given[:3, :3] = odd[:3, :3] @ given[:3, :3]
+    given[:3, 3] += odd[:3, 3]
+    text = (
+        f"cam0: {{{common}, T_cam_imu: {inverse(first).tolist()}}}\n"
+        f"cam1: {{{common}, T_cam_imu: {inverse(first @ step).tolist()}, "
+        f"T_cn_cnm1: {given.tolist()}}}"
+    )
+    if same:
+        assert len(parse_chain(text, "chain").cameras) == 2
+    else:
+        with pytest.raises(ValueError, match="chain: cam1: T_cn_cnm1: expected what T_cam_imu of"):
+            parse_chain(text, "chain")
+
+
+T_BS = (
+    [
+        [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
+        [0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768],
+        [-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949],
+        [0.0, 0.0, 0.0, 1.0],
+    ],
+    [
+        [0.0125552670891, -0.999755099723, 0.0182237714554, -0.0198435579556],
+        [0.999598781151, 0.0130119051815, 0.0251588363115, 0.0453689425024],
+        [-0.0253898008918, 0.0179005838253, 0.999517347078, 0.00786212447038],
+        [0.0, 0.0, 0.0, 1.0],
+    ],
+)
+"""Of EuRoC's two cameras, as published in their sensor.yaml."""
+
+
+def test_the_inverse_given_for_t_cam_imu_is_named() -> None:
+    first, second = map(np.array, T_BS)
+    common = "camera_model: pinhole, intrinsics: [1, 1, 0, 0], resolution: [2, 2]"
+    step = f"T_cn_cnm1: {(inverse(second) @ first).tolist()}"
+    text = (
+        f"cam0: {{{common}, T_imu_cam: {T_BS[0]}}}\n"
+        f"cam1: {{{common}, T_imu_cam: {T_BS[1]}, {step}}}"
+    )
+    assert len(parse_chain(text, "chain").cameras) == 2
+    with pytest.raises(ValueError, match=r"T_imu_cam \(as EuRoC's T_BS\) may have been given"):
+        parse_chain(text.replace("T_imu_cam", "T_cam_imu"), "chain")
+
+
 def test_numbers_that_yaml_takes_for_texts_are_numbers() -> None:
     """YAML 1.1 wants a point in them; who writes by hand does not."""
     imu = parse_chain(IMU.replace("8.0e-5", "8e-5"), "imu.yaml").imu

@@ -119,6 +119,115 @@ def test_code_that_a_node_imports_or_loads_by_name_counts(
     assert what_changes(roots, lambda: edit(tmp_path / "notes.txt")) == []
 
 
+HERE = "HERE = Path(__file__).parent\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "file", "expected"),
+    [
+        ("for f in (HERE / 'weights').glob('*.txt'): pass", "weights/a.txt", "weights"),
+        ("MODELS = HERE / 'models'\nopen(MODELS / 'dir.bin')", "models/dir.bin", "models"),
+        ("open(HERE.parent / 'data' / 'up.txt')", "../data/up.txt", "data/up.txt"),
+        ("load(Path(__file__).resolve().parents[1] / 'data')", "../data/up.txt", "data"),
+        ("load(dirname(dirname(__file__)) + '/x', '../data')", "../data/up.txt", "data"),
+        ("np.load(Path(__file__).with_suffix('.npyy'))", "own.npyy", "own.npyy"),
+        ("open(f'{HERE}/weights/{name}.txt')", "weights/a.txt", "weights"),
+        ("open(f'weights/{name}.txt')", "weights/a.txt", "weights"),
+        ("for f in HERE.glob('*.bin'): pass", "weights_1.bin", "weights_1.bin"),
+        ("open(HERE / 'weights' / f'{name}.txt')", "weights/a.txt", "weights"),
+        ("open(f'weights_{n}.bin')", "weights_1.bin", "weights_1.bin"),
+        ("open(os.path.join(HERE, 'models', 'deep', name))", "models/deep/b.bin", "models/deep"),
+        ("open(HERE.joinpath('models', name))", "models/deep/b.bin", "models"),
+        ("open('weights/' + name)", "weights/a.txt", "weights"),
+    ],
+)
+def test_data_that_code_reads_through_a_folder_or_a_computed_name_counts(
+    code: str, file: str, expected: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "mine"
+    for name in (
+        "weights/a.txt", "models/dir.bin", "models/deep/b.bin", "../data/up.txt", "own.npyy",
+        "weights_1.bin", "other/x.bin", "own.md",
+    ):  # fmt: skip
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("1")
+    roots = own(folder, HERE + code)
+    assert what_changes(roots, lambda: edit(folder / file)) == [f"{expected} changed"]
+    assert what_changes(roots, lambda: edit(folder / "other" / "x.bin")) == []
+
+
+def test_folders_that_code_writes_into_or_that_a_run_changes_do_not_count(tmp_path: Path) -> None:
+    code = "OUT = HERE / 'out'\nOUT.mkdir()\nLATER = HERE / 'later'\n"
+    code += "open(HERE / 'logs' / 'a.csv', 'w')"
+    roots = own(tmp_path, HERE + code)
+    for name in ("out", "logs"):
+        (tmp_path / name).mkdir()
+        assert what_changes(roots, partial(edit, tmp_path / name / "a.csv")) == []
+    before = made_from(roots)  # without it a run went well, and may have written it
+    (tmp_path / "later").mkdir()
+    assert changes(before, made_from(roots)) == []
+    before = made_from(roots)
+    edit(tmp_path / "later" / "x.txt")
+    parts, edited = during(before, made_from(roots))
+    assert edited == []
+    assert changes(parts, made_from(roots)) == []
+
+
+def test_folders_around_the_code_with_results_or_with_too_many_files_do_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MOST_FILES", 3)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    folder = tmp_path / "mine"
+    names = ["full/1", "full/2", "full/3", "full/4", "swept/rows.jsonl", "runs/1/x", "few/1"]
+    for name in [*names, "../home/x"]:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("1")
+    texts = [
+        "/",
+        ".",
+        "..",
+        "../..",
+        "full",
+        "swept",
+        "runs",
+        "../home",
+        str(tmp_path),
+        "few",
+        "/home",
+        "/opt",
+        "*/x",
+        "../mine",
+    ]
+    (folder / "deep.yaml").write_text("root: .\nup: ..\n")
+    roots = msgspec.structs.replace(
+        program(folder, "python", "own.py", "deep.yaml", "."),
+        modules=own(folder, f"TEXTS = {texts}").modules,
+        folder=str(tmp_path / "settings"),
+    )
+    for name in [*names[:-1], "../home/x"]:
+        assert what_changes(roots, lambda name=name: edit(folder / name)) == []  # type: ignore[misc]
+    assert what_changes(roots, lambda: edit(folder / "few" / "1")) == ["few changed"]
+
+
+def test_folders_that_a_settings_file_a_command_line_or_a_setting_names_count(
+    tmp_path: Path,
+) -> None:
+    for name in ("cfg/w/a.bin", "weights/b.bin", "set/c.bin", "data/d.bin", "deep/x.bin"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("1")
+    (tmp_path / "cfg" / "deep.yaml").write_text("weights: w\nroot: /\n")
+    (tmp_path / "slam.py").write_text("open('data/' + name)")
+    roots = program(tmp_path, "python", "slam.py", "--with=weights", "cfg/deep.yaml", ".")
+    roots = msgspec.structs.replace(roots, texts=("set",))
+    for name, expected in (
+        ("cfg/w/a.bin", "cfg/w"), ("weights/b.bin", "weights"), ("set/c.bin", "set"),
+        ("data/d.bin", "data"),
+    ):  # fmt: skip
+        assert what_changes(roots, partial(edit, tmp_path / name)) == [f"{expected} changed"]
+    assert what_changes(roots, lambda: edit(tmp_path / "deep" / "x.bin")) == []
+
+
 def test_files_that_a_node_writes_do_not_count(tmp_path: Path) -> None:
     code = "open('log.csv', 'w'); np.savetxt('poses.txt', x); open('in.csv')"
     roots = own(tmp_path, code)
