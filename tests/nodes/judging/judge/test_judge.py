@@ -123,11 +123,12 @@ def test_every_exported_format_gives_the_same_figures(
 ) -> None:
     folder, expected = run
     for form in ("tum", "euroc", "kitti"):
-        export_trajectories(folder, form, tmp_path)
-    seconds = [line.split()[0] for line in (tmp_path / "est.tum").read_text().splitlines()]
+        export_trajectories(folder, form, tmp_path / form)
+    tum = tmp_path / "tum" / "est.tum"
+    seconds = [line.split()[0] for line in tum.read_text().splitlines()]
     (tmp_path / "times").write_text("\n".join(line for line in seconds if line[0] != "#"))
     lab = "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n"
-    for stamp, (x, y, z), (qw, qx, qy, qz) in read_tum(tmp_path / "est.tum").poses():
+    for stamp, (x, y, z), (qw, qx, qy, qz) in read_tum(tum).poses():
         lab += f"{stamp},{x},{y},{z},{qx},{qy},{qz},{qw}\n"
     (tmp_path / "lab.csv").write_text(lab)
     direct = only(
@@ -137,10 +138,10 @@ def test_every_exported_format_gives_the_same_figures(
         )
     )  # fmt: skip
     for truth, estimate, more in (
-        ("truth.tum", "est.tum", ()),
-        ("truth.csv", "est.csv", ()),
-        ("truth.csv", "lab.csv", ()),
-        ("est.truth.kitti.txt", "est.kitti.txt", ("--times", "times")),
+        ("tum/truth.tum", "tum/est.tum", ()),
+        ("euroc/truth.csv", "euroc/est.csv", ()),
+        ("tum/truth.tum", "lab.csv", ()),
+        ("kitti/est.truth.kitti.txt", "kitti/est.kitti.txt", ("--times", "times")),
     ):
         found = only(judge(tmp_path, "--truth", truth, "--estimate", estimate, *more))
         for key in ("ate_rmse_m", "ate_max_m", "rpe_1m_rot_deg_per_m", "rot_rmse_deg"):
