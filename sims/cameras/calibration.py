@@ -63,11 +63,10 @@ class CalibrationError(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 USUAL = CalibrationError(
-    # The uncertainty that Kalibr reports of a careful calibration with a board of AprilTags, as of
-    # EuRoC's and TUM VI's cameras (estimate, from the differences of their repeated calibrations).
+    # All of them: estimate.
     focal=0.15, centre=0.15, distortion=3e-4, rotation=0.01, position=2e-4, time=Latency(0.0005),
 )  # fmt: skip
-"""Errors of a good calibration, as of ``calibration_error = true``."""
+"""Errors of ``calibration_error = true``: a good calibration of a pair of cameras."""
 
 
 class Calibration(NamedTuple):

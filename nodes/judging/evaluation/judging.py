@@ -225,7 +225,7 @@ def judge(
     )
     if estimate is None or weighed is None:
         figures |= without()
-        return Judgement(figures, estimate, lost=coverage.lost, final=final)
+        return Judgement(figures, estimate, final_note, lost=coverage.lost, final=final)
     # An interval that lasts to the end of the flight counts as long as it is: it took no less.
     if took := [seconds([each]) for each in coverage.lost if each.start >= poses[0]]:
         figures["relocalization_p50_seconds"] = float(np.median(took))

@@ -165,3 +165,10 @@ def test_a_tilted_vertical_is_told_where_it_has_to_be_the_truths() -> None:
     assert "its vertical is tilted by 180° against the truth's" in told
     assert "vertical" not in judge(record, TRUTH, alignment="se3").note
     assert "vertical" not in judge(EstimatorRecord.of(noisy(TRUTH)), TRUTH, alignment="none").note
+
+
+def test_a_final_trajectory_is_examined_where_nothing_else_was_sent() -> None:
+    record = EstimatorRecord()
+    record.final = ODD["inverse"]
+    judgement = judge(record, TRUTH, alignment="se3")
+    assert "after loop closures: its orientations are inverted" in judgement.note
