@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Any
 
 import events as ev
 from events import Vector3
 from runtime import Output, Tick, every, on
-from sims.cameras import CameraSpec, add_camera, check_cameras
-from sims.sensors import SensorsConfig, SensorSuite, mount_imu
+from sims.cameras import add_camera
+from sims.sensors import mount_imu
+from sims.sensors.platform import FRAME, PlatformConfig, SensorPlatform
 from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,
@@ -24,24 +24,20 @@ from sims.vehicle import (
 )
 from sims.vehicle.autopilot import FALL, Clearance, trouble_at_start, trouble_on_path
 from sims.vehicle.physics import Contact
-from sims.world import Rate, SharedWorld, Simulator, join_world
+from sims.world import Rate, SharedWorld
 from sims.worlds import Dynamics, Scene
 
-FRAME = "base_link"  # frame of the vehicle's body
 DEEPEST = 100.0  # greatest depth in a solid without divergence of the physics, metres
 
 
-class MultirotorConfig(SensorsConfig):
-    """Settings of a multirotor, besides those of every simulator and of its sensors.
+class MultirotorConfig(PlatformConfig):
+    """Settings of a multirotor, besides those of its sensors.
 
     Attributes:
         position: Position on the ground at the start: x north and y east, metres.
         height: Height of the ground there, metres above the world's zero.
         yaw: Heading at the start, degrees clockwise from north.
         control_rate: Rate of the controller, Hz.
-        trigger: ``free``: each camera exposes at its own rate. ``imu``: an IMU sample triggers the
-            exposure, so that image, depth, pose and IMU share their stamps; a camera whose rate
-            does not divide the IMU's is free as well. In any case the intervals are equal.
         gains: Gains of the controller.
         limits: Limits of the controller.
     """
@@ -50,16 +46,11 @@ class MultirotorConfig(SensorsConfig):
     height: float = 0.0
     yaw: float = 0.0
     control_rate: Rate = 400
-    trigger: Literal["free", "imu"] = "free"
     gains: Gains = Gains()
     limits: Limits = Limits()
 
-    def __post_init__(self) -> None:
-        check_cameras(self.cameras)
-        super().__post_init__()
 
-
-class Multirotor(Simulator[MultirotorConfig]):
+class Multirotor(SensorPlatform[MultirotorConfig]):
     """A quadrotor with cameras, an IMU and ground truth, in a MuJoCo world.
 
     It obeys commands (`Arm`, `Takeoff`, `Hover`, `Land`, `Disarm`), and follows set-points of
@@ -68,61 +59,30 @@ class Multirotor(Simulator[MultirotorConfig]):
     are in one world: they collide, see one another, and obey what names them.
     """
 
-    imu = Output(ev.Imu)
-    pressures = Output(ev.FluidPressure)
-    fixes = Output(ev.NavSatFix)
-    magnetic_fields = Output(ev.MagneticField)
-    ranges = Output(ev.Range)
-    lidar_scans = Output(ev.LidarScan)
     vehicle_events = Output(ev.VehicleEvent)
 
-    frame_id = FRAME
     vehicle = True
 
-    async def on_startup(self) -> None:
-        """Build the world and start the renderers."""
-        await super().on_startup()
-        config = self.config
-        await self.rig.start(self._join)  # what draws is imported meanwhile
-        self._world.remember(self.rig.past)
-        tied = [camera for camera in config.cameras if self._is_tied(camera)]
-        for camera in tied:
-            self.every(camera.rate, functools.partial(self._trigger, camera.name), camera.name)
-        self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
-        for camera in config.cameras:  # an image without latency comes after the IMU's sample
-            if camera not in tied:
-                self.every(camera.rate, functools.partial(self._expose, camera.name), camera.name)
-        await self._suite.start()
-
-    async def _join(self) -> SharedWorld:
+    async def join(self, world: SharedWorld) -> Physics:
+        """Stand on the ground, at rest, with an autopilot."""
         config = self.config
         self._start = start_of(config)
-        self._world = await join_world(self)
-        assert self._world.simulation is not None
-        self._physics = Physics(self._world.simulation, self.name)
-        self._clearance = Clearance(self._world.model, self.name)
+        assert world.simulation is not None
+        self._physics = Physics(world.simulation, self.name)
+        self._clearance = Clearance(world.model, self.name)
         if not self._physics.time_ns:
             await self.offload(self._physics.settle)
-            self._world.starts[self.name] = self._physics.state()
+            world.starts[self.name] = self._physics.state()
         self._autopilot = Autopilot(
             self._physics.parameters,
             config.gains,
             config.limits,
             setpoint_timeout=config.setpoint_timeout,
         )
-        self._suite = SensorSuite(self, config, FRAME, self._physics, self._advance, self._world)
         self._pilots: list[ev.PilotAnnouncement] = []
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
-        self._odometry_stamp = -1
-        self._triggered: list[str] = []
-        return self._world
-
-    async def run(self) -> None:
-        """Send the poses of cameras and sensors on the body, once."""
-        await super().run()
-        for mounting in self._suite.transforms():
-            self.transforms.send(mounting)
+        return self._physics
 
     async def on_shutdown(self) -> None:
         """Stop the motors: without a controller the vehicle falls, if others fly on."""
@@ -139,7 +99,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         return Dynamics()
 
     def announce(self) -> Iterable[ev.Announcement]:
-        """Announce the vehicle, its IMU and its cameras."""
+        """Announce the vehicle, its sensors and its cameras."""
         parameters, state = self._physics.parameters, self._physics.state()
         yield ev.VehicleAnnouncement(
             stamp=0,
@@ -150,22 +110,7 @@ class Multirotor(Simulator[MultirotorConfig]):
             position=state.position,
             orientation=state.orientation,
         )
-        yield from self._suite.announcements()
         yield from super().announce()
-        for camera in self.config.cameras:
-            if self.config.trigger == "imu" and not self._is_tied(camera):
-                self.log.warning(
-                    "%s: %g Hz does not divide the %g Hz of the IMU that is to trigger it: it "
-                    "exposes at its own rate, and shares no stamps with the IMU",
-                    camera.name,
-                    camera.rate,
-                    self.config.imu_rate,
-                )
-
-    def _is_tied(self, camera: CameraSpec) -> bool:
-        periods = self.config.imu_rate / camera.rate
-        whole = round(periods) > 0 and math.isclose(periods, round(periods))
-        return self.config.trigger == "imu" and whole
 
     def on_announcement(self, announcement: ev.Announcement) -> None:
         """Record pilots, and refuse a path the vehicle cannot fly."""
@@ -252,35 +197,6 @@ class Multirotor(Simulator[MultirotorConfig]):
     def _send_events(self) -> None:
         for event in self._autopilot.take_events():
             self.vehicle_events.send(event(stamp=self._physics.time_ns, source=self.name))
-
-    def sample_sensors(self, tick: Tick) -> None:
-        """Send an IMU sample and the ground truth, and expose the triggered cameras."""
-        stamp = self._advance(tick)
-        state, qpos, qvel = self._physics.state_at(stamp)
-        self.imu.send(self._suite.imu.sample(stamp, state))
-        self._send_odometry(stamp, state)
-        for camera in self._triggered:
-            self.rig.expose(camera, stamp, qpos, qvel, self._world.past_state)
-        self._triggered.clear()
-
-    def _trigger(self, camera: str, _: Tick) -> None:
-        self._triggered.append(camera)
-
-    def _expose(self, camera: str, tick: Tick) -> None:
-        stamp = self._advance(tick)
-        state, qpos, qvel = self._physics.state_at(stamp)
-        self._send_odometry(stamp, state)
-        self.rig.expose(camera, stamp, qpos, qvel, self._world.past_state)
-
-    def _advance(self, tick: Tick) -> int:
-        """Step the physics up to a tick; return the state's stamp, in real time maybe later."""
-        self._physics.advance_to(tick.stamp)
-        return max(tick.stamp, self._physics.time_ns)
-
-    def _send_odometry(self, stamp: int, state: State) -> None:
-        if stamp > self._odometry_stamp:
-            self._odometry_stamp = stamp
-            self._send_state(stamp, state)
 
     def _send_collisions(self) -> None:
         contacts = [c for c in self._physics.contacts() if not _stands_on(c)]

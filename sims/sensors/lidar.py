@@ -21,7 +21,7 @@ from sims.cameras.stage import object_numbers
 from sims.presets import LIDARS
 from sims.sensors.rays import Floats, Rays
 from sims.sensors.sensor import Mounted, Name, NonNegative, Positive, SensorSpec, generator_of
-from sims.vehicle import TIMESTEP_NS, Physics
+from sims.vehicle import TIMESTEP_NS, VehicleMotion
 from sims.worlds import Dynamics
 
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
@@ -368,16 +368,20 @@ class LidarRig:
     """All lidars of a vehicle.
 
     A turn, from one tick to the next, is made from the vehicle's states meanwhile, and sent
-    `latency` after its end, with the stamp of its first ray; `advance` steps the physics up to a
+    `latency` after its end, with the stamp of its first ray; `advance` steps the world up to a
     tick.
     """
 
     def __init__(
-        self, node: Node[Any], lidars: list[Lidar], physics: Physics, advance: Callable[[Tick], int]
+        self,
+        node: Node[Any],
+        lidars: list[Lidar],
+        body: VehicleMotion,
+        advance: Callable[[Tick], int],
     ) -> None:
         self._node: Any = node
         self._lidars = lidars
-        self._physics = physics
+        self._body = body
         self._advance = advance
         self._scanner: Worker[Scanner] | None = None
         self._starts: dict[str, int] = {}
@@ -394,8 +398,7 @@ class LidarRig:
         self._scanner = await self._node.worker(
             Scanner, model, world.dynamics, specs, self._node.name, seed
         )
-        simulation = self._physics.simulation
-        simulation.keep(max(1.0 / spec.rate for spec in specs) + LATE + 2e-3)
+        self._body.keep(max(1.0 / spec.rate for spec in specs) + LATE + 2e-3)
         for lidar in self._lidars:
             self._node.every(lidar.spec.rate, functools.partial(self._turn, lidar), lidar.spec.name)
 
@@ -414,8 +417,7 @@ class LidarRig:
             self._skipped.add(lidar.source)
             return
         stamps = range(start, end, TIMESTEP_NS)
-        past = self._physics.simulation.past
-        states = np.stack([past(stamp)[0] for stamp in (*stamps, end)])
+        states = np.stack([self._body.past(stamp) for stamp in (*stamps, end)])
         self._in_flight[lidar.source] += 1
         self._node.start(self._deliver(lidar, start, end, states))
 

@@ -29,7 +29,7 @@ from sims.sensors.sensor import (
     Truth,
     generator_of,
 )
-from sims.vehicle import Physics, State
+from sims.vehicle import State, VehicleMotion
 from sims.world import Rate, SimulatorConfig
 
 _RATE = 200
@@ -81,29 +81,27 @@ def mount_imu(world: mujoco.MjSpec, vehicle: str, parameters: ImuParameters) -> 
 
 
 class VehicleImu(ImuModel):
-    """IMU of a vehicle: its model, fed from the physics."""
+    """IMU of a vehicle: its model, fed from the vehicle's motion."""
 
     def __init__(
-        self, node: Node[Any], config: SensorsConfig, physics: Physics, place: Place
+        self, node: Node[Any], config: SensorsConfig, body: VehicleMotion, place: Place
     ) -> None:
         constants = generator_of(node.rng, "imu")
         super().__init__(config.imu, config.imu_rate, node.rng, constants, place)
-        self._physics = physics
+        self._body = body
         self._before: tuple[int, Motion] | None = None
         self._frame_id = self.announcement().frame_id
 
     def sample(self, stamp: int, state: State) -> Imu:
         """Return the measurement of the present, in a state of the same stamp."""
-        physics = self._physics
-        rates, force = physics.imu(stamp)
+        rates, force = self._body.imu(stamp)
         if self.spec.sampling == "mean":
             motion = motion_at(self.spec, state.orientation, state.velocity, state.angular_velocity)
             if self._before is not None and stamp > self._before[0]:
                 seconds = (stamp - self._before[0]) / 1e9
-                gravity = physics.parameters.gravity
-                rates, force = mean_between(self._before[1], motion, seconds, gravity)
+                rates, force = mean_between(self._before[1], motion, seconds, self._body.gravity)
             self._before = stamp, motion
-        rates, force = self.measure(rates, force, physics.thrusts)
+        rates, force = self.measure(rates, force, self._body.thrusts)
         return Imu(
             stamp=stamp,
             source=self.source,
@@ -124,8 +122,8 @@ class SensorSuite:
     numbers depend on the run's seed, its node's name and its own only.
 
     Args:
-        physics: The vehicle, in a world that `mount_imu` has seen.
-        advance: Steps the physics up to a tick, and returns the stamp of the state then.
+        body: The vehicle's motion.
+        advance: Steps the world up to a tick, and returns the stamp of the state then.
     """
 
     def __init__(
@@ -133,12 +131,12 @@ class SensorSuite:
         node: Node[Any],
         config: SensorsConfig,
         frame_id: str,
-        physics: Physics,
+        body: VehicleMotion,
         advance: Callable[[Tick], int],
         world: DrawnWorld,
     ) -> None:
         self._node = node
-        self._physics = physics
+        self._body = body
         self._advance = advance
         self._world = world
         self._frame_id = frame_id
@@ -147,7 +145,7 @@ class SensorSuite:
         def place(name: str) -> Place:
             return Place(f"{node.name}/{name}", frame_id, config.origin)
 
-        self._make_imu = functools.partial(VehicleImu, node, config, physics, place("imu"))
+        self._make_imu = functools.partial(VehicleImu, node, config, body, place("imu"))
 
         def making(
             model: Callable[..., Sensor[Any]], spec: Any, name: str, *rest: Any
@@ -161,12 +159,12 @@ class SensorSuite:
             if getattr(config, name) is not None
         ]
         if config.range_finders:
-            rays = Rays(physics.model, world.dynamics, f"{node.name}/base_link")
+            rays = Rays(body.model, world.dynamics, f"{node.name}/base_link")
             self._making += [making(RangeFinder, s, s.name, rays) for s in config.range_finders]
         self._begin()
         lidars = [Lidar(spec, place(spec.name)) for spec in config.lidars]
         self.mounted: list[Mounted[Any]] = [*self.sensors, *lidars]
-        self.lidars = LidarRig(node, lidars, physics, advance)
+        self.lidars = LidarRig(node, lidars, body, advance)
 
     async def start(self) -> None:
         """Start the measurements of all sensors; call in `on_startup`."""
@@ -209,7 +207,7 @@ class SensorSuite:
         sensor = self.sensors[index]
         if tick.stamp >= sensor.spec.startup_delay * 1e9:
             stamp = self._advance(tick)
-            state, qpos, _ = self._physics.state_at(stamp)
+            state, qpos, _ = self._body.state_at(stamp)
             truth = Truth(stamp=stamp, qpos=qpos, **msgspec.structs.asdict(state))
             self._send_later(sensor, sensor.measure(truth))
 

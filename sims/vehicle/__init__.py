@@ -9,6 +9,7 @@ Everything here is pure: time is an argument, nothing waits, nothing is sent. On
 
 from sims.vehicle.autopilot import Autopilot, Phase
 from sims.vehicle.control import Controller, Motors, Setpoint
+from sims.vehicle.motion import VehicleMotion
 from sims.vehicle.physics import Contact, Physics, State
 from sims.vehicle.position import Gains, Limits
 from sims.vehicle.simulation import (
@@ -26,5 +27,6 @@ from sims.vehicle.simulation import (
 __all__ = [
     "STANDING_HEIGHT", "TIMESTEP_NS", "Autopilot", "Contact", "Controller", "Gains", "Limits",
     "Mixer", "Motor", "Motors", "Phase", "Physics", "PhysicsDivergedError", "Setpoint",
-    "Simulation", "State", "VehicleParameters", "attach_vehicle", "read_parameters",
+    "Simulation", "State", "VehicleMotion", "VehicleParameters", "attach_vehicle",
+    "read_parameters",
 ]  # fmt: skip

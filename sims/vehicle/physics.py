@@ -102,9 +102,23 @@ class Physics:
         """Nanoseconds simulated since the start or the last `reset`; whole milliseconds."""
         return self.simulation.time_ns
 
+    @property
+    def gravity(self) -> float:
+        """Acceleration of free fall, m/s²."""
+        return self.parameters.gravity
+
     def advance_to(self, stamp_ns: int) -> None:
         """Step the simulation; see `Simulation.advance_to`."""
         self.simulation.advance_to(stamp_ns)
+
+    def keep(self, seconds: float) -> None:
+        """Keep past states; see `Simulation.keep`."""
+        self.simulation.keep(seconds)
+
+    def past(self, stamp_ns: int) -> Floats:
+        """Return the world's positions at a kept time, shape (nq,); see `Simulation.past`."""
+        self.simulation.advance_to(stamp_ns)
+        return self.simulation.past(stamp_ns)[0]
 
     def set_motors(self, m0: float, m1: float, m2: float, m3: float) -> None:
         """Set the motor commands, each 0 to 1 of its full thrust; clamped beyond."""
