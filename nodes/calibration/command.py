@@ -91,7 +91,7 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
         ConfigError: The file cannot be flown.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    table = _alone(config, spec)
+    table = _alone(config, spec, folder)
     world = folder / "room.xml"
     table["world"] = str(world.resolve())
     world.write_text(mjcf(0.05), encoding="utf-8")
@@ -121,7 +121,7 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
         begin = max(kept.imu[0].stamp, kept.taken_off) + 50_000_000  # in mid-flight
         figures[1].append(proofs.integration(kept.imu_announced, kept.imu, motion, begin))
         seconds = needed(imu, standing)
-        still = _run([table | {"cameras": [], "control_rate": 20}, _COLLECTOR], config, seconds)
+        still = _run(_rest(table, seconds), config, seconds)
         samples = {
             "gyroscope": np.array([sample.angular_velocity for sample in still.imu]),
             "accelerometer": np.array([sample.linear_acceleration for sample in still.imu]),
@@ -146,7 +146,11 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
     return result
 
 
-def _alone(config: Config, spec: NodeSpec) -> dict[str, Any]:
+def _is_carried(table: dict[str, Any]) -> bool:
+    return "trajectory" in table and "imu" in table
+
+
+def _alone(config: Config, spec: NodeSpec, folder: Path) -> dict[str, Any]:
     """Return the vehicle's node table at the room's centre, without inputs and links."""
     (table,) = (each for each in to_builtins(config)["nodes"] if each["name"] == spec.name)
     for key in ("inputs", "links", "barometer", "gnss", "magnetometer", "range_finders", "lidars"):
@@ -157,7 +161,11 @@ def _alone(config: Config, spec: NodeSpec) -> dict[str, Any]:
         camera["rate"] /= max(math.ceil(camera["rate"] / _RATE - 1e-9), 1)
         images = set(camera["images"]) | {"depth"}
         camera["images"] = sorted(images if images & {"rgb", "grey"} else images | {"rgb"})
-    if "trajectory" in spec.config.__struct_fields__:
+    if _is_carried(table):
+        table |= {"rest": 0.0, "speed": 1.0, "lever": [0.0, 0.0, 0.0], "margin": 0.0}
+        table |= {"axes": "ned", "body": "frd", "columns": "", "topic": "", "knots": 0.05}
+        table |= {"trajectory": _written(folder, 10), "place": "recorded"}
+    elif "trajectory" in table:
         table["rate"] /= max(math.ceil(table["rate"] / _RATE - 1e-9), 1)
     else:
         table |= {"position": [0.0, 0.0], "height": 0.0}
@@ -165,10 +173,12 @@ def _alone(config: Config, spec: NodeSpec) -> dict[str, Any]:
 
 
 def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
+    if "imu" in table:
+        table = table | {"imu": table["imu"] | {"ideal": True}}
+    if _is_carried(table):
+        return [table, _COLLECTOR]
     if "trajectory" in table:
-        path = folder.resolve() / "path.tum"
-        path.write_text("".join(_path()), encoding="utf-8")
-        return [table | {"trajectory": str(path)}, _COLLECTOR]
+        return [table | {"trajectory": _written(folder, 1)}, _COLLECTOR]
     pilot = {
         "name": "selftest_pilot",
         "type": "WaypointFollower",
@@ -177,14 +187,25 @@ def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
         "heading": "fixed",
         "excitation": {"duration": "6s", "amplitude": 0.3, "frequency": 0.4, "yaw": 45.0},
     }
-    if "imu" in table:
-        table = table | {"imu": table["imu"] | {"ideal": True}}
     return [table, pilot, _COLLECTOR]
 
 
-def _path() -> Iterator[str]:
-    """Yield a smooth path about all axes for a free camera, as rows of a TUM file."""
-    for millisecond in range(round(_SECONDS * 1e3) + 1):
+def _rest(table: dict[str, Any], seconds: float) -> list[dict[str, Any]]:
+    """Return the nodes of a run in which the vehicle rests, without cameras."""
+    slow = {"rest": seconds + 1.0} if _is_carried(table) else {"control_rate": 20}
+    return [table | {"cameras": []} | slow, _COLLECTOR]
+
+
+def _written(folder: Path, step: int) -> str:
+    """Write the path of what is not flown, with a row each `step` ms; return the file."""
+    path = folder.resolve() / "path.tum"
+    path.write_text("".join(_path(step)), encoding="utf-8")
+    return str(path)
+
+
+def _path(step: int) -> Iterator[str]:
+    """Yield a smooth path about all axes, as rows of a TUM file."""
+    for millisecond in range(0, round(_SECONDS * 1e3) + 1, step):
         t = millisecond / 1e3
         x, y, z = (0.4 * math.sin(w * t) for w in (2.5, 3.2, 2.0))
         yaw, pitch, roll = (a * math.sin(w * t) for a, w in ((0.8, 1.1), (0.3, 1.9), (0.3, 2.3)))

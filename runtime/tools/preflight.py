@@ -54,11 +54,13 @@ class Findings(msgspec.Struct, frozen=True):
     Attributes:
         errors: With any of these the run cannot do what the file says: a line each.
         warnings: What is odd, and may be meant.
+        facts: What nodes say of what they have read.
     """
 
     errors: list[str]
     warnings: list[str]
     announcements: tuple[Announcement, ...] = ()
+    facts: tuple[str, ...] = ()
 
 
 def of_file(config: Config, only: Collection[str] = ()) -> Findings:
@@ -84,9 +86,10 @@ def of_nodes(config: Config) -> Findings:
     """Bring all nodes up to where their first update would be, and take them down again."""
     errors: list[str] = []
     loop = make_loop(config.run)
-    with asyncio.Runner(loop_factory=lambda: loop) as runner, _warnings() as warnings:
+    with asyncio.Runner(loop_factory=lambda: loop) as runner, _logged() as logged:
+        warnings, facts = logged[logging.WARNING], logged[logging.INFO]
         announced = runner.run(_rehearse(config, errors, warnings))
-    return Findings(errors, warnings, tuple(announced))
+    return Findings(errors, warnings, tuple(announced), tuple(facts))
 
 
 async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> list[Announcement]:
@@ -194,22 +197,27 @@ class _DryHost(Host):
 
 
 @contextlib.contextmanager
-def _warnings() -> Iterator[list[str]]:
-    found: list[str] = []
+def _logged() -> Iterator[dict[int, list[str]]]:
+    """Collect the messages of nodes by level: information and warnings."""
+    messages: dict[int, list[str]] = {logging.INFO: [], logging.WARNING: []}
 
     class Collect(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            if record.levelno == logging.WARNING:
-                found.append(f"{record.name.removeprefix('visnav.')}: {record.getMessage()}")
+            if record.levelno in messages:
+                name = record.name.removeprefix("visnav.")
+                messages[record.levelno].append(f"{name}: {record.getMessage()}")
 
     ours, handler = logging.getLogger("visnav"), Collect()
-    before, ours.propagate = ours.propagate, False
+    before = ours.propagate, ours.level
+    ours.propagate = False
+    ours.setLevel(logging.INFO)
     ours.addHandler(handler)
     try:
-        yield found
+        yield messages
     finally:
         ours.removeHandler(handler)
-        ours.propagate = before
+        ours.propagate = before[0]
+        ours.setLevel(before[1])
 
 
 def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:

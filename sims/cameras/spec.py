@@ -449,15 +449,20 @@ def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ..
     """Add a body with cameras, without collisions; return their prefix; `ValueError` if taken."""
     if world.body(name) is not None:
         raise ValueError(f"free camera {name}: expected a name of its own, but the world has one")
-    # A free joint, because the renderer takes qpos; a mass, because a free joint needs one.
-    body = world.worldbody.add_body(
-        name=name, gravcomp=1.0, explicitinertial=True, mass=0.1, inertia=[1e-4, 1e-4, 1e-4]
-    )
-    body.add_freejoint(name=name)
+    add_free_body(world, name, name)
     prefix = f"{name}/"
     for spec in specs:
         add_camera(world, name, spec, prefix)
     return prefix
+
+
+def add_free_body(world: mujoco.MjSpec, name: str, joint: str) -> None:
+    """Add a body without shape, whose free joint has its pose in the state of the world."""
+    # A free joint, because the renderer takes qpos; a mass, because a free joint needs one.
+    body = world.worldbody.add_body(
+        name=name, gravcomp=1.0, explicitinertial=True, mass=0.1, inertia=[1e-4, 1e-4, 1e-4]
+    )
+    body.add_freejoint(name=joint)
 
 
 def pose_to_qpos(position: Vector3, orientation: Quaternion) -> npt.NDArray[np.float64]:

@@ -79,7 +79,8 @@ def to_common_axes(
     for axes in reversed([*(s.axes for s in sources), *(s.usual for s in sources)]):
         world, body = axes.world or world, axes.body or body
     moved = [
-        _moved(source, source.axes.world or world, source.axes.body or body) for source in sources
+        converted(source, source.axes.world or world, source.axes.body or body)
+        for source in sources
     ]
     return moved[0], moved[1:]
 
@@ -97,7 +98,8 @@ def _check_agreement(what: str, estimates: Sequence[Source], names: Sequence[str
         )
 
 
-def _moved(source: Source, world: World, body: Body) -> Source:
+def converted(source: Source, world: World, body: Body) -> Source:
+    """Return a source of these axes in NED and FRD."""
     if (world, body) == ("ned", "frd"):
         return source
     to_ned, to_frd = WORLDS[world], BODIES[body]

@@ -39,8 +39,11 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     if not found.errors:
         nodes = preflight.of_nodes(settings)
         odd = [] if nodes.errors else [str(e) for e in lint(settings, nodes.announcements)]
-        found = preflight.Findings(nodes.errors, found.warnings + nodes.warnings + odd)
+        warnings = found.warnings + nodes.warnings + odd
+        found = preflight.Findings(nodes.errors, warnings, nodes.announcements, nodes.facts)
     errors = found.errors
+    for fact in found.facts:
+        print(fact)
     for warning in found.warnings:
         warn(warning)
     for error in errors:
