@@ -1,0 +1,169 @@
+"""Distance from points to the nearest solid of a world that stands still."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from events import Vector3
+from events.frames import flip_yz
+from sims.vehicle.simulation import mover_of, name_of
+
+Floats = npt.NDArray[np.float64]
+
+_TYPES = mujoco.mjtGeom
+
+
+class Clearance:
+    """Solids of a compiled world, as at its start; what moves is none of them.
+
+    Distances are exact of planes, boxes, spheres, capsules and cylinders. That of an ellipsoid is
+    an estimate, that of a mesh is of its convex hull, which is what vehicles touch, and of the
+    nearest of the hull's planes: not more than the true one. Sums are taken in a fixed order, so
+    that every processor gives the same bits.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self._data: Any = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self._data)
+        solid = (model.geom_contype | model.geom_conaffinity) != 0
+        self._geoms = [
+            int(geom)
+            for geom in np.flatnonzero(solid)
+            if not mover_of(model, int(geom)) and int(model.geom_type[geom]) in _DISTANCES
+        ]
+        self._places = self._data.geom_xpos
+        self._axes = self._data.geom_xmat.reshape(-1, 3, 3)
+        self._hulls = {
+            geom: _hull(model, geom)
+            for geom in self._geoms
+            if model.geom_type[geom] == _TYPES.mjGEOM_MESH
+        }
+
+    def distances(self, points: Floats) -> Floats:
+        """Return metres to the nearest solid from points (m NED, shape (n, 3)); inside negative."""
+        return self.nearest(points)[0]
+
+    def nearest(self, points: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
+        """Return metres to the nearest solid, and its number; ``inf`` and -1 in an empty world."""
+        nwu = points * (1.0, -1.0, -1.0)
+        least, geoms = np.full(len(points), np.inf), np.full(len(points), -1, np.intp)
+        for geom in self._geoms:
+            away = nwu - self._places[geom]
+            turn = self._axes[geom]
+            local = [
+                away[:, 0] * turn[0, k] + away[:, 1] * turn[1, k] + away[:, 2] * turn[2, k]
+                for k in range(3)
+            ]
+            size = self._model.geom_size[geom].tolist()
+            if geom in self._hulls:
+                distance = _to_hull(local, self._hulls[geom])
+            else:
+                distance = _DISTANCES[int(self._model.geom_type[geom])](local, size)
+            nearer = distance < least
+            least[nearer], geoms[nearer] = distance[nearer], geom
+        return least, geoms
+
+    def covered(self, point: Vector3) -> bool:
+        """Return whether anything is above a point, m NED: whether it is indoors, as a rule."""
+        hit = np.zeros(1, np.int32)
+        origin, upwards = np.array(flip_yz(point)), np.array((0.0, 0.0, 1.0))
+        return mujoco.mj_ray(self._model, self._data, origin, upwards, None, 1, -1, hit) >= 0.0
+
+    def name_of(self, geom: int) -> str:
+        """Return the name of a solid for a reader."""
+        ground = self._model.geom_type[geom] == _TYPES.mjGEOM_PLANE
+        return "the ground" if ground else name_of(self._model, geom) or f"geom {geom}"
+
+    def bounds(self) -> Floats:
+        """Return the corners of the box around all solids but planes, m NED, shape (2, 3)."""
+        corners = []
+        for geom in self._geoms:
+            if self._model.geom_type[geom] == _TYPES.mjGEOM_PLANE:
+                continue
+            middle, half = self._model.geom_aabb[geom, :3], self._model.geom_aabb[geom, 3:]
+            axes = self._axes[geom]
+            centre = self._places[geom] + (axes * middle).sum(axis=1)
+            reach = (abs(axes) * half).sum(axis=1)
+            corners += [centre - reach, centre + reach]
+        if not corners:
+            return np.array([[-20.0, -20.0, -10.0], [20.0, 20.0, 0.0]])
+        low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+        return np.array([[low[0], -high[1], -high[2]], [high[0], -low[1], -low[2]]])
+
+
+def _to_plane(local: list[Floats], size: list[float]) -> Floats:
+    inside = np.ones(len(local[0]), np.bool_)
+    for axis in (0, 1):
+        if size[axis] > 0.0:
+            inside &= abs(local[axis]) <= size[axis]
+    return np.where(inside, local[2], np.inf)
+
+
+def _to_sphere(local: list[Floats], size: list[float]) -> Floats:
+    return np.sqrt(local[0] ** 2 + local[1] ** 2 + local[2] ** 2) - size[0]
+
+
+def _to_capsule(local: list[Floats], size: list[float]) -> Floats:
+    along = np.maximum(abs(local[2]) - size[1], 0.0)
+    return np.sqrt(local[0] ** 2 + local[1] ** 2 + along**2) - size[0]
+
+
+def _to_box(local: list[Floats], size: list[float]) -> Floats:
+    beyond = [abs(part) - half for part, half in zip(local, size, strict=True)]
+    return _outside(beyond)
+
+
+def _to_cylinder(local: list[Floats], size: list[float]) -> Floats:
+    across = np.sqrt(local[0] ** 2 + local[1] ** 2) - size[0]
+    return _outside([across, abs(local[2]) - size[1]])
+
+
+def _outside(beyond: list[Floats]) -> Floats:
+    """Return the distance from a convex shape, from how far a point is beyond each face."""
+    squares = sum(np.maximum(part, 0.0) ** 2 for part in beyond)
+    inside = beyond[0]
+    for part in beyond[1:]:
+        inside = np.maximum(inside, part)
+    return np.sqrt(squares) + np.minimum(inside, 0.0)
+
+
+def _to_ellipsoid(local: list[Floats], size: list[float]) -> Floats:
+    """Return the first-order distance: the scaled one by the length of its gradient."""
+    scaled = [part / half for part, half in zip(local, size, strict=True)]
+    length = np.sqrt(sum(part**2 for part in scaled))
+    slope = np.sqrt(sum((part / half) ** 2 for part, half in zip(scaled, size, strict=True)))
+    return np.where(slope > 1e-12, length * (length - 1.0) / np.maximum(slope, 1e-12), -min(size))
+
+
+_DISTANCES = {
+    int(_TYPES.mjGEOM_PLANE): _to_plane,
+    int(_TYPES.mjGEOM_SPHERE): _to_sphere,
+    int(_TYPES.mjGEOM_CAPSULE): _to_capsule,
+    int(_TYPES.mjGEOM_BOX): _to_box,
+    int(_TYPES.mjGEOM_CYLINDER): _to_cylinder,
+    int(_TYPES.mjGEOM_ELLIPSOID): _to_ellipsoid,
+    int(_TYPES.mjGEOM_MESH): _to_sphere,  # stands for `_to_hull`, which needs the mesh
+}
+
+
+def _hull(model: Any, geom: int) -> Floats:
+    """Return the planes around a mesh: unit normals and offsets, shape (n, 4)."""
+    from scipy.spatial import ConvexHull
+
+    mesh = int(model.geom_dataid[geom])
+    begin, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    vertices = model.mesh_vert[begin : begin + count].astype(np.float64)
+    return np.asarray(ConvexHull(vertices).equations)
+
+
+def _to_hull(local: list[Floats], planes: Floats) -> Floats:
+    farthest = np.full(len(local[0]), -math.inf)
+    for a, b, c, d in planes.tolist():
+        farthest = np.maximum(farthest, local[0] * a + local[1] * b + local[2] * c + d)
+    return farthest
