@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from runtime.errors import VisnavError
 from runtime.extras import offers
 
 GROUP = "visnav.motions"
@@ -19,6 +20,10 @@ WorldAxes = Literal["auto", "ned", "nwu", "enu", "optical"]
 """Axes of a recording's world, and of its body unless named: what it declares itself, as a rule;
 ``ned``, with a body in FRD; ``nwu``, z up; ``enu``, with a body in FLU; ``optical``, those of a
 camera that looks ahead, with such a body."""
+
+
+class MotionError(VisnavError, ValueError):
+    """Recorded motion that cannot be read, placed or followed."""
 
 
 class MotionFile(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,9 +70,12 @@ class ReadMotion(Protocol):
 
 
 def read_motion(file: MotionFile) -> RecordedMotion:
-    """Read a recorded motion, or raise `ValueError` with what is wrong."""
+    """Read a recorded motion, or raise `MotionError`."""
     offer, *_ = offers(GROUP)
     try:
         return cast("ReadMotion", offer.load())(file)
     except OSError as error:
-        raise ValueError(f"{error.filename}: expected a file, found: {error.strerror}") from None
+        text = f"{error.filename or file.path}: expected a file, found: {error.strerror or error}"
+        raise MotionError(text) from None
+    except ValueError as error:
+        raise MotionError(str(error)) from None

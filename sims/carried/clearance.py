@@ -73,7 +73,8 @@ class Clearance:
         """Return whether anything is above a point, m NED: whether it is indoors, as a rule."""
         hit = np.zeros(1, np.int32)
         origin, upwards = np.array(flip_yz(point)), np.array((0.0, 0.0, 1.0))
-        return mujoco.mj_ray(self._model, self._data, origin, upwards, None, 1, -1, hit) >= 0.0
+        distance = mujoco.mj_ray(self._model, self._data, origin, upwards, None, 1, -1, hit)
+        return float(distance) >= 0.0
 
     def name_of(self, geom: int) -> str:
         """Return the name of a solid for a reader."""
@@ -106,12 +107,12 @@ def _to_plane(local: list[Floats], size: list[float]) -> Floats:
 
 
 def _to_sphere(local: list[Floats], size: list[float]) -> Floats:
-    return np.sqrt(local[0] ** 2 + local[1] ** 2 + local[2] ** 2) - size[0]
+    return np.asarray(np.sqrt(local[0] ** 2 + local[1] ** 2 + local[2] ** 2) - size[0])
 
 
 def _to_capsule(local: list[Floats], size: list[float]) -> Floats:
     along = np.maximum(abs(local[2]) - size[1], 0.0)
-    return np.sqrt(local[0] ** 2 + local[1] ** 2 + along**2) - size[0]
+    return np.asarray(np.sqrt(local[0] ** 2 + local[1] ** 2 + along**2) - size[0])
 
 
 def _to_box(local: list[Floats], size: list[float]) -> Floats:
@@ -130,7 +131,7 @@ def _outside(beyond: list[Floats]) -> Floats:
     inside = beyond[0]
     for part in beyond[1:]:
         inside = np.maximum(inside, part)
-    return np.sqrt(squares) + np.minimum(inside, 0.0)
+    return np.asarray(np.sqrt(squares) + np.minimum(inside, 0.0))
 
 
 def _to_ellipsoid(local: list[Floats], size: list[float]) -> Floats:

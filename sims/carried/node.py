@@ -13,7 +13,7 @@ from events import Vector3
 from events.frames import yaw_of
 from runtime import Duration, Tick
 from runtime.paths import InputPath
-from runtime.recorded import MotionFile, WorldAxes, read_motion
+from runtime.recorded import MotionError, MotionFile, WorldAxes, read_motion
 from sims.cameras import add_camera, add_free_body
 from sims.carried.clearance import Clearance
 from sims.carried.motion import BodyAxes, CarriedMotion, axes_of, rows_of
@@ -89,7 +89,10 @@ class Carried(SensorPlatform[CarriedConfig]):
     async def join(self, world: SharedWorld) -> CarriedMotion:
         """Read the motion, place it in the world, and refuse one that cannot be followed."""
         self.doing = "fitting the motion"
-        self._spline = await self.offload(self._prepared, world)
+        try:
+            self._spline = await self.offload(self._prepared, world)
+        except ValueError as error:
+            raise MotionError(str(error)) from None
         self.doing = ""
         self._carried = CarriedMotion(
             world, self.name, self._spline, self.config.imu, self.config.thrust

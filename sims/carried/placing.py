@@ -119,14 +119,14 @@ def find_place(rows: Floats, clearance: Clearance) -> Placement:
             candidates.append((float(scores[index]), place))
     candidates.sort(key=lambda candidate: -candidate[0])
     refined = [_refined(path, place, clearance) for _, place in candidates[:6]]
-    room, _, place = max(refined, key=lambda each: each[1], default=(0.0, 0.0, None))
-    if place is None or room <= 0.0:
+    free = [each for each in refined if each[0] > 0.0]
+    if not free:
         x, y, z = np.ptp(rows[:, 1:4], axis=0).tolist()
         raise ValueError(
             f"place: expected room for a motion of {x:.3g} x {y:.3g} x {z:.3g} m in the world, "
             "found none: try a scale, or a larger world"
         )
-    return place
+    return max(free, key=lambda each: each[1])[2]
 
 
 def _thinned(rows: Floats, count: int) -> Floats:

@@ -20,6 +20,7 @@ from events import (
     LidarScan,
     Odometry,
     PathAnnouncement,
+    PoseStamped,
     Range,
     TransformStamped,
     VehicleAnnouncement,
@@ -230,7 +231,7 @@ def test_a_body_inside_something_is_refused_and_one_near_it_warned_of(
     on_the_way = refusal(folder, trajectory=write(folder / "half.tum", half), place="recorded")
     assert re.search(r"found it in wall at 2\.\d\d s", on_the_way)
     assert "in the ground" in refusal(folder, place={"position": [0.0, 0.0, 0.5]})
-    near = circle(times) + np.eye(8)[1] * (RADIUS + 1.9)
+    near = circle(times) + np.eye(8)[1] * 5.9
     file = write(folder / "near.tum", near)
     with caplog.at_level(logging.WARNING, "visnav"):
         carry(folder, 0.1, trajectory=file, place="recorded")
@@ -301,7 +302,7 @@ def test_a_camera_tells_where_its_rows_were_exposed(folder: Path) -> None:
     result = carry(folder, 1.0, cameras=[rolling], trigger="imu", camera_processes=1)
     (announced,) = result.of(CameraAnnouncement)
     assert announced.parent_frame_id == "base_link"
-    poses = [e for e in result.sent if type(e).__name__ == "PoseStamped"]
+    poses = result.of(PoseStamped)
     assert len(poses) >= 3 * 8
     for pose in poses[6:]:
         row = circle(np.array([pose.stamp / 1e9]))[0]
