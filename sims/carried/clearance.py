@@ -1,4 +1,4 @@
-"""Distance from points to the nearest solid of a world that stands still."""
+"""Distance from points to the nearest solid of a world, still or moving."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from events import Vector3
 from events.frames import flip_yz
 from sims.vehicle.simulation import mover_of, name_of
+from sims.worlds import Dynamics
 
 Floats = npt.NDArray[np.float64]
 
@@ -19,7 +20,7 @@ _TYPES = mujoco.mjtGeom
 
 
 class Clearance:
-    """Solids of a compiled world, as at its start; what moves is none of them.
+    """Solids of a compiled world that stand still; or, with its dynamics, those that they move.
 
     Distances are exact of planes, boxes, spheres, capsules and cylinders. That of an ellipsoid is
     an estimate, that of a mesh is of its convex hull, which is what vehicles touch, and of the
@@ -27,15 +28,18 @@ class Clearance:
     that every processor gives the same bits.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, dynamics: Dynamics | None = None) -> None:
         self._model = model
+        self._dynamics = dynamics
         self._data: Any = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self._data)
         solid = (model.geom_contype | model.geom_conaffinity) != 0
+        moves = model.body_mocapid[model.body_rootid[model.geom_bodyid]] >= 0
         self._geoms = [
             int(geom)
-            for geom in np.flatnonzero(solid)
-            if not mover_of(model, int(geom)) and int(model.geom_type[geom]) in _DISTANCES
+            for geom in np.flatnonzero(solid & (moves == (dynamics is not None)))
+            if int(model.geom_type[geom]) in _DISTANCES
+            and (dynamics is not None or not mover_of(model, int(geom)))
         ]
         self._places = self._data.geom_xpos
         self._axes = self._data.geom_xmat.reshape(-1, 3, 3)
@@ -44,6 +48,16 @@ class Clearance:
             for geom in self._geoms
             if model.geom_type[geom] == _TYPES.mjGEOM_MESH
         }
+
+    def __bool__(self) -> bool:
+        return bool(self._geoms)
+
+    def at(self, seconds: float) -> Clearance:
+        """Move what moves to where it is at a time."""
+        if self._dynamics is not None:
+            self._dynamics.solid.apply(self._model, self._data, seconds)
+            mujoco.mj_kinematics(self._model, self._data)
+        return self
 
     def distances(self, points: Floats) -> Floats:
         """Return metres to the nearest solid from points (m NED, shape (n, 3)); inside negative."""
@@ -79,7 +93,9 @@ class Clearance:
     def name_of(self, geom: int) -> str:
         """Return the name of a solid for a reader."""
         ground = self._model.geom_type[geom] == _TYPES.mjGEOM_PLANE
-        return "the ground" if ground else name_of(self._model, geom) or f"geom {geom}"
+        if ground:
+            return "the ground"
+        return mover_of(self._model, geom) or name_of(self._model, geom) or f"geom {geom}"
 
     def bounds(self) -> Floats:
         """Return the corners of the box around all solids but planes, m NED, shape (2, 3)."""

@@ -19,7 +19,7 @@ from sims.carried.clearance import Clearance
 from sims.carried.motion import BodyAxes, CarriedMotion, axes_of, rows_of
 from sims.carried.placing import Placement, eased, find_place, placed
 from sims.carried.spline import MotionSpline, fit
-from sims.carried.survey import approaches, collision, in_words, survey
+from sims.carried.survey import collision, in_time, in_words, survey
 from sims.sensors.platform import FRAME, PlatformConfig, SensorPlatform
 from sims.vehicle.autopilot import show
 from sims.world import SharedWorld
@@ -118,8 +118,9 @@ class Carried(SensorPlatform[CarriedConfig]):
         if isinstance(place, Placement):
             rows = placed(rows, place)
         spline, report = fit(rows, config.knots)
-        eyes = (camera.position for camera in config.cameras)
-        result = survey(spline, clearance, [(0.0, 0.0, 0.0), *eyes], config.margin)
+        points = [(0.0, 0.0, 0.0), *(camera.position for camera in config.cameras)]
+        moving = Clearance(world.model, world.dynamics)
+        result = survey(spline, clearance, moving, points, config.margin)
         start = spline.at(spline.start_ns)
         for note in recorded.notes:
             self.log.warning("trajectory: %s", note)
@@ -133,8 +134,9 @@ class Carried(SensorPlatform[CarriedConfig]):
             self.log.info("trajectory: %s", line)
         if inside := collision(result):
             raise ValueError(f"place: expected a free way, found it {inside}")
-        if near := approaches(result):
-            self.log.warning("margin: nearer than %g m to something: %s", config.margin, near)
+        for near in (result.near, result.met):
+            if near:
+                self.log.warning("margin: nearer than %g m: %s", config.margin, in_time(near))
         return spline
 
     @classmethod

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import groupby
 
 import msgspec
 import numpy as np
@@ -13,6 +14,8 @@ from events import Vector3
 from events.frames import rotate
 from sims.carried.clearance import Clearance
 from sims.carried.spline import FitReport, MotionSpline
+
+Floats = npt.NDArray[np.float64]
 
 STEP = 20_000_000  # interval of the moments that are looked at, nanoseconds
 _SHOWN = 3  # stretches that a warning names
@@ -33,11 +36,16 @@ class Survey(msgspec.Struct, frozen=True):
     acceleration: float  # m/s²
     rate: float  # rad/s
     nearest: Nearness | None  # `None` in an empty world
-    near: tuple[Nearness, ...]  # of each stretch within the margin, in time
+    near: tuple[Nearness, ...]  # of each stretch within the margin of what stands
+    met: tuple[Nearness, ...]  # of each stretch within the margin of what moves by itself
 
 
 def survey(
-    spline: MotionSpline, clearance: Clearance, points: Sequence[Vector3], margin: float
+    spline: MotionSpline,
+    still: Clearance,
+    moving: Clearance,
+    points: Sequence[Vector3],
+    margin: float,
 ) -> Survey:
     """Return what a motion is like.
 
@@ -48,37 +56,43 @@ def survey(
     stamps = [*range(spline.start_ns, spline.end_ns, STEP), spline.end_ns]
     moments = [spline.at(stamp) for stamp in stamps]
     places = np.array(
-        [
-            np.add(moment.position, rotate(moment.orientation, point))
-            for moment in moments
-            for point in points
-        ]
+        [[np.add(m.position, rotate(m.orientation, point)) for point in points] for m in moments]
     )
-    distances, geoms = clearance.nearest(places)
-    rows = distances.reshape(len(moments), len(points))
-    which = rows.argmin(axis=1)
-    least = rows[np.arange(len(rows)), which]
-    touched = geoms.reshape(rows.shape)[np.arange(len(rows)), which]
-
-    def nearness(begin: int, end: int) -> Nearness:
-        index = begin + int(least[begin:end].argmin())
-        name = clearance.name_of(int(touched[index]))
-        return Nearness(float(least[index]), name, stamps[index] / 1e9)
-
+    nearest = _nearest(still, stamps, *still.nearest(places.reshape(-1, 3)))
+    met: list[Nearness] = []
+    if moving:
+        rows = [moving.at(s / 1e9).nearest(p) for s, p in zip(stamps, places, strict=True)]
+        distances, geoms = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+        met = _nearest(moving, stamps, distances, geoms)
     return Survey(
         speed=max(math.hypot(*moment.velocity) for moment in moments),
         acceleration=max(math.hypot(*moment.acceleration) for moment in moments),
         rate=max(math.hypot(*moment.angular_velocity) for moment in moments),
-        nearest=nearness(0, len(rows)) if np.isfinite(least).any() else None,
-        near=tuple(
-            nearness(begin, end) for begin, end in _stretches((least < margin) | (least <= 0.0))
-        ),
+        nearest=min(nearest, key=lambda each: each.distance, default=None),
+        near=_stretches(nearest, margin),
+        met=_stretches(met, margin),
     )
 
 
-def _stretches(mask: npt.NDArray[np.bool_]) -> Iterable[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
-    return zip(edges[::2], edges[1::2], strict=True)
+def _nearest(
+    clearance: Clearance, stamps: Sequence[int], distances: Floats, geoms: npt.NDArray[np.intp]
+) -> list[Nearness]:
+    """Return the nearest solid at each time, from those of several points at each."""
+    rows = distances.reshape(len(stamps), -1)
+    index = np.arange(len(rows)), rows.argmin(axis=1)
+    least, solids = rows[index].tolist(), geoms.reshape(rows.shape)[index].tolist()
+    names = {geom: clearance.name_of(geom) for geom in set(solids) if geom >= 0}
+    return [
+        Nearness(distance, names[geom], stamp / 1e9)
+        for distance, geom, stamp in zip(least, solids, stamps, strict=True)
+        if geom >= 0
+    ]
+
+
+def _stretches(nearest: Iterable[Nearness], margin: float) -> tuple[Nearness, ...]:
+    """Return the nearest of each stretch within a margin."""
+    groups = groupby(nearest, lambda each: each.distance < margin or each.distance <= 0.0)
+    return tuple(min(g, key=lambda each: each.distance) for near, g in groups if near)
 
 
 def in_words(rows: int, report: FitReport, result: Survey) -> list[str]:
@@ -109,10 +123,10 @@ def collision(result: Survey) -> str:
     return " and ".join(f"in {near.name} at {near.seconds:.2f} s" for near in inside[:_SHOWN])
 
 
-def approaches(result: Survey) -> str:
-    """Return where the motion is within the margin of something; empty if it is nowhere."""
+def in_time(stretches: Sequence[Nearness]) -> str:
+    """Return stretches in words, the first of many; empty if there is none."""
     parts = [
-        f"{near.distance:.2g} m from {near.name} at {near.seconds:.2f} s" for near in result.near
+        f"{near.distance:.2g} m from {near.name} at {near.seconds:.2f} s" for near in stretches
     ]
     more = f" and {len(parts) - _SHOWN} times more" if len(parts) > _SHOWN else ""
     return ", ".join(parts[:_SHOWN]) + more
