@@ -27,6 +27,7 @@ from sims.worlds import Dynamics, Scene
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+HARDEST = 500.0  # m/s², what nothing carried does: the file has other units, or a jump
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
 
@@ -132,6 +133,15 @@ class Carried(SensorPlatform[CarriedConfig]):
         )
         for line in in_words(len(recorded.stamps), report, result):
             self.log.info("trajectory: %s", line)
+        if result.acceleration > HARDEST:
+            raise ValueError(
+                f"trajectory, speed: expected accelerations of up to {HARDEST:g} m/s², found "
+                f"{result.acceleration:.3g} m/s²"
+            )
+        if 0.0 < config.imu.accelerometer_range < result.acceleration:
+            self.log.warning("imu: some accelerations are beyond the range of the accelerometer")
+        if 0.0 < config.imu.gyroscope_range < result.rate:
+            self.log.warning("imu: some angular velocities are beyond the range of the gyroscope")
         if inside := collision(result):
             raise ValueError(f"place: expected a free way, found it {inside}")
         for near in (result.near, result.met):

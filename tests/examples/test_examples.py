@@ -75,6 +75,15 @@ def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_rig_is_carried_along_a_recorded_motion(tmp_path: Path) -> None:
+    """`carried` ends with its motion, as planned, and its estimator passes."""
+    summary = run("carried", tmp_path, "report.figures=[]")
+    assert summary["verdict"]["estimators"]["odometry"]["passed"]
+    assert summary["reason"] == "trajectory ended"
+
+
+@pytest.mark.slow
 def test_computer_vision_follows_the_trajectory(tmp_path: Path) -> None:
     """`computer_vision` ends with its trajectory, having given one set of images per update."""
     summary = run("computer_vision", tmp_path, "camera.rate=5")

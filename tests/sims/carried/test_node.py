@@ -26,12 +26,17 @@ from events import (
     VehicleAnnouncement,
 )
 from events.frames import cross, rotate, rotate_inverse
+from nodes.data.dataset import DatasetWriter
+from nodes.data.replay import Replay
+from runtime.config.model import Config, RunConfig
 from runtime.errors import ConfigError, NodeError
 from runtime.recorded import MotionFile, RecordedMotion, read_motion
 from runtime.testing import NodeResult, run_node, run_nodes, spec
+from runtime.tools.preflight import of_nodes
 from sims.carried import Carried
 from sims.carried.motion import BODIES, axes_of, rows_of
 from sims.multirotor import Multirotor
+from sims.world import World
 
 SECOND = 1_000_000_000
 GRAVITY = 9.81
@@ -43,6 +48,7 @@ WORLD = """
   </worldbody>
 </mujoco>
 """
+CAMERA = {"name": "eye", "width": 8, "height": 6, "images": ["grey"], "position": [0, 0, 0]}
 RADIUS, RATE = 2.0, 1.2  # of the circle, metres and rad/s
 Floats = npt.NDArray[np.float64]
 
@@ -166,6 +172,7 @@ def test_it_announces_a_vehicle_without_motors_and_its_sensors(folder: Path) -> 
     assert first.orientation == pytest.approx(vehicle.orientation, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_rays_start_where_the_body_is_at_their_time(folder: Path) -> None:
     """Of a turn during which it comes nearer to a wall 8 m north of the start, at 4 m/s."""
     seconds = np.arange(0.0, 2.0, 0.02)
@@ -242,7 +249,63 @@ def test_a_body_inside_something_is_refused_and_one_near_it_warned_of(
     assert "margin" not in caplog.text
 
 
-def test_nobody_flies_it(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_is_too_fast_is_refused_or_warned_of(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert "expected accelerations of up to 500 m/s²" in refusal(folder, speed=20.0)
+    with caplog.at_level(logging.WARNING, "visnav"):
+        carry(folder, 0.1, imu={"gyroscope_range": 1.0, "accelerometer_range": 100.0})
+    assert "beyond the range of the gyroscope" in caplog.text
+    assert "beyond the range of the accelerometer" not in caplog.text
+
+
+def test_what_moves_by_itself_in_the_way_is_told(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of a person who stands where the circle comes by after a second."""
+    x, y = circle(np.array([1.0]))[0, 1:3].tolist()
+    person = {"name": "ann", "kind": "person", "waypoints": [[x, y, 0.0]]}
+    world = spec(World, "world", {"bodies": [person]})
+    with caplog.at_level(logging.WARNING, "visnav"):
+        run_nodes([world, spec(Carried, "rig", settings(folder, place="recorded"))], duration=0.1)
+    assert re.search(r"margin: nearer than 0\.3 m: .* m from world/ann at (0\.9|1\.)", caplog.text)
+
+
+def test_a_check_tells_what_the_motion_is_like(folder: Path) -> None:
+    config = Config(run=RunConfig(), nodes=(spec(Carried, "rig", settings(folder)),))
+    findings = of_nodes(config)
+    assert findings.errors == []
+    text = " ".join(findings.facts)
+    for fact in ("400 rows, each 10 ms, no gap", "at most 2.4 m/s, 2.88 m/s², 68.8°/s",
+                 "nearest to the ground, 1.50 m"):  # fmt: skip
+        assert fact in text
+
+
+@pytest.mark.slow
+def test_a_data_set_replayed_and_written_again_is_the_same(folder: Path, tmp_path: Path) -> None:
+    files = []
+    config = settings(folder, imu={"sampling": "mean"}, cameras=[CAMERA], trigger="imu")
+    carried = spec(Carried, "rig", config)
+    for name in ("first", "second"):
+        out = tmp_path / name
+        out.mkdir()
+        run_nodes(
+            [carried, spec(DatasetWriter, "data", {"format": "euroc", "folder": "euroc"})],
+            duration=2.0,
+            out=out,
+        )
+        carried = spec(Replay, "rig", {"file": str(tmp_path / "first" / "euroc")})
+        samples, truth = (
+            np.loadtxt(out / "euroc" / "mav0" / file / "data.csv", delimiter=",")
+            for file in ("imu0", "state_groundtruth_estimate0")
+        )
+        files.append((samples, truth))
+    np.testing.assert_array_equal(files[0][0], files[1][0])
+    np.testing.assert_array_equal(files[0][1], files[1][1])
+    assert len(files[0][0]) == 400
+
+
+def test_nobody_flies_it(folder: Path) -> None:
     path = PathAnnouncement(stamp=0, source="pilot", waypoints=((1.0, 0.0, -1.0),))
     with pytest.raises(NodeError, match="expected no path for a carried body, found that of pilot"):
         run_node(Carried, inputs=[path], config=settings(folder), duration=0.1, name="rig")
@@ -291,9 +354,6 @@ def test_a_body_that_lies_on_no_axis_is_asked_for() -> None:
     )
     with pytest.raises(ValueError, match="body: expected one of frd, flu, optical, euroc"):
         axes_of(recorded)
-
-
-CAMERA = {"name": "eye", "width": 8, "height": 6, "images": ["grey"], "position": [0, 0, 0]}
 
 
 @pytest.mark.slow
