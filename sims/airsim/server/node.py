@@ -130,7 +130,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         def drawn_state() -> tuple[int, Any]:
             return vehicles.drawn_state(now())
 
-        carriers = self.siblings(Simulator)
+        carriers = [each for each in self.siblings(Simulator) if each.name in vehicles]
         objects = Objects(world, spare_objects(self.name, config.objects), now, log)
         cameras = Cameras(carriers, config.cameras, world.model, drawn_state, log)
         ids = objects.segmentation_ids
