@@ -141,7 +141,7 @@ def fit(rows: Floats, knots: float) -> tuple[MotionSpline, FitReport]:
         fitted = sum(basis[:, k, None] * points[first + k, :3] for k in range(_DEGREE + 1))
         residuals = np.sqrt(((fitted - values[:, :3]) ** 2).sum(axis=1))
         limit = _HUBER * (1.4826 * float(np.median(residuals)) + 1e-5)
-        weights = np.minimum(1.0, limit / np.maximum(residuals, 1e-12)) ** 2
+        weights = np.minimum(1.0, limit / np.maximum(residuals, 1e-12))
     report = FitReport(
         rows=len(rows),
         seconds=whole,
