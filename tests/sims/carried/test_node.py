@@ -28,6 +28,7 @@ from events import (
 from events.frames import cross, rotate, rotate_inverse
 from nodes.data.dataset import DatasetWriter
 from nodes.data.replay import Replay
+from nodes.trajectory import Trajectory
 from runtime.config.model import Config, RunConfig
 from runtime.errors import ConfigError, NodeError
 from runtime.recorded import MotionFile, RecordedMotion, read_motion
@@ -37,6 +38,7 @@ from sims.carried import Carried
 from sims.carried.motion import BODIES, axes_of, rows_of
 from sims.multirotor import Multirotor
 from sims.world import World
+from tests.nodes.judging.judge import bags
 
 SECOND = 1_000_000_000
 GRAVITY = 9.81
@@ -332,6 +334,44 @@ def test_the_body_is_upright_whatever_its_recorded_axes(axes: Any, folder: Path)
     signs = np.sign((rows[:, 4:] * expected[:, 4:]).sum(axis=1))
     np.testing.assert_allclose(rows[:, 4:] * signs[:, None], expected[:, 4:], atol=1e-9)
     np.testing.assert_allclose(rows[:, :4], expected[:, :4], atol=1e-9)
+
+
+def test_every_format_gives_the_same_motion(folder: Path) -> None:
+    """A bag's, EuRoC's with z up, KITTI's with y down and a file of times, and a run's."""
+    rows = circle(np.arange(0.0, 2.0, 0.01))
+    turns = Rotation.from_quat(rows[:, 4:], scalar_first=True)
+    up = np.diag([1.0, -1.0, -1.0])
+    euroc = (
+        Rotation.from_matrix(up) * turns * Rotation.from_quat(BODIES["euroc"], scalar_first=True)
+    )
+    stamps = [f"{1_400_000_000 * SECOND + round(s * 1e9)}" for s in rows[:, 0].tolist()]
+    table = np.column_stack(
+        [rows[:, 1:4] @ up, euroc.as_quat(scalar_first=True), np.zeros((200, 9))]
+    )
+    lines = [
+        ",".join([stamp, *(f"{value:.12f}" for value in row)])
+        for stamp, row in zip(stamps, table.tolist(), strict=True)
+    ]
+    (folder / "data.csv").write_text("\n".join(lines))
+    axes = Rotation.from_quat(BODIES["optical"], scalar_first=True)
+    matrices = (axes.inv() * turns * axes).as_matrix()
+    transforms = np.concatenate([matrices, axes.inv().apply(rows[:, 1:4])[:, :, None]], axis=2)
+    np.savetxt(folder / "00.txt", transforms.reshape(200, 12), fmt="%.12e")
+    np.savetxt(folder / "times.txt", rows[:, 0], fmt="%.6e")
+    (folder / "flight" / "trajectories").mkdir(parents=True)
+    write(folder / "flight" / "trajectories" / "truth.tum", rows)
+    numbers = np.round(rows[:, 0] * SECOND).astype(np.int64)
+    bag = bags.bag(folder / "bag", bags.POSE, Trajectory(numbers, rows[:, 1:4], rows[:, 4:]))
+    for file in (
+        MotionFile(path=str(bag), part="/slam/poses"),
+        MotionFile(path=str(folder / "data.csv")),
+        MotionFile(path=str(folder / "00.txt"), times=str(folder / "times.txt")),
+        MotionFile(path=str(folder / "flight")),
+    ):
+        recorded = read_motion(file)
+        again = rows_of(recorded, axes_of(recorded), (0.0, 0.0, 0.0), 1.0)
+        again[:, 4:] *= np.sign((again[:, 4:] * rows[:, 4:]).sum(axis=1))[:, None]
+        np.testing.assert_allclose(again, rows, atol=1e-6)
 
 
 def test_a_lever_is_where_the_recorded_point_is_on_the_body(folder: Path) -> None:
