@@ -48,6 +48,23 @@ name = "pilot"
 type = "WaypointFollower"
 {path}
 """
+CARRIED = f"""
+[run]
+name = "carried"
+clock = "lockstep"
+duration = "6s"
+
+[[nodes]]
+name = "rig"
+type = "Carried"
+world = "hall"
+trajectory = "{ROOT}/examples/motions/hall_tour.tum"
+imu = {{ sampling = "mean" }}
+gnss = {{}}
+lidars = [{{ name = "lidar", rate = 5, channels = 16 }}]
+range_finders = [{{ name = "below" }}]
+cameras = [{{ name = "camera", width = 64, height = 48, rate = 5, readout = "10ms" }}]
+"""
 PATHS = {
     "waypoints": ("hall", "waypoints = [[-2.5, 0.0, -1.4], [2.0, 1.0, -1.5], [1.0, 2.0, -1.2]]"),
     "excitation": ("yard", "waypoints = [[-2.5, 0.0, -1.4]]\nexcitation = { duration = '5s' }"),
@@ -70,9 +87,22 @@ def inputs(file: Path, **environment: str) -> dict[str, Any]:
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="OpenBLAS's kernels are named by kind")
 @pytest.mark.parametrize("path", PATHS)
 def test_inputs_depend_on_no_width_of_vectors_and_no_kernels(path: str, tmp_path: Path) -> None:
-    file = tmp_path / "flight.toml"
     world, words = PATHS[path]
-    file.write_text(FLIGHT.format(seconds=12, world=world, path=words), encoding="utf-8")
+    assert_portable(FLIGHT.format(seconds=12, world=world, path=words), tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="OpenBLAS's kernels are named by kind")
+def test_inputs_of_a_carried_body_depend_on_them_neither(tmp_path: Path) -> None:
+    """Nor does the fit of its motion, or the place that is found for it."""
+    assert_portable(CARRIED, tmp_path)
+
+
+def assert_portable(config: str, folder: Path) -> None:
+    """A run has the same inputs without what this processor can do beyond others."""
+    file = folder / "flight.toml"
+    file.write_text(config, encoding="utf-8")
     simd = np.show_config(mode="dicts")["SIMD Extensions"]
     here = simd.get("found", [])
     plain = inputs(file, NPY_DISABLE_CPU_FEATURES=" ".join(here), OPENBLAS_CORETYPE="Prescott")

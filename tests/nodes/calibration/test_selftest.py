@@ -93,6 +93,17 @@ def test_a_free_camera_passes_without_an_imu(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
+def test_a_carried_rig_passes(tmp_path: Path) -> None:
+    """Whatever its own motion is: it is moved along the self-test's."""
+    motion = ROOT / "examples" / "motions" / "hall_tour.tum"
+    node = {"type": "Carried", "cameras": [CAMERA], "trajectory": str(motion), "speed": 0.5}
+    result = proven(node, tmp_path)
+    assert missed(result) == {}
+    assert all(result.figures.values())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_simulator_that_lies_fails_with_sentences(tmp_path: Path) -> None:
     result = proven({"type": f"{__name__}:WrongFocal", "cameras": [CAMERA]}, tmp_path)
     said = missed(result)
