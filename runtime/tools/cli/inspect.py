@@ -25,8 +25,9 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     recordings and other files are opened, cameras and vehicles announced, and every node says
     whether it finds what it needs. Checked are, among others, names of nodes, cameras, inputs and
     files; that no input is without a sender or a reader; that no two nodes write the same file;
-    and that start and waypoints are in free space. Nothing is rendered, written or sent. Ends
-    with 0, or with 2 if there is a mistake; what may be meant, as what lint finds, is a warning.
+    and that start and waypoints are in free space. What nodes say of what they read, such as a
+    carried body of its motion, is printed. Nothing is rendered, written or sent. Ends with 0, or
+    with 2 if there is a mistake; what may be meant, as what lint finds, is a warning.
     """
     from runtime.config.reading import load_configuration
     from runtime.run.graph import edges_of
