@@ -27,7 +27,7 @@ from nodes.estimators.rig import cross
 from nodes.estimators.visual_odometry.alignment import Alignment
 from nodes.estimators.visual_odometry.features import BELIEVED, FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.landmarks import MapMatch, Rows
-from nodes.estimators.visual_odometry.node import StereoMatcher, StereoSettings, baseline
+from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings, baseline
 from runtime import Bundle
 
 _KNOWN = 0.3, 0.03  # largest deviations of velocity (m/s) and gravity (rad) to use the IMU

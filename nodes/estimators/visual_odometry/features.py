@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import cv2
 import msgspec
@@ -49,9 +49,7 @@ from nodes.estimators.visual_odometry.landmarks import (
     half_width,
     squares,
 )
-
-if TYPE_CHECKING:
-    from nodes.estimators.visual_odometry.node import StereoMatcher
+from nodes.estimators.visual_odometry.stereo import StereoMatcher
 
 _FLOW_WINDOW = 15
 _LARGE = 320  # least side (pixels) of images halved before following corners

@@ -9,7 +9,7 @@ from events import CameraAnnouncement
 from nodes.estimators import TrackingResult
 from nodes.estimators.inertial_odometry.tracker import InertialSettings, InertialTracker
 from nodes.estimators.visual_odometry.features import FeatureSettings
-from nodes.estimators.visual_odometry.node import StereoSettings
+from nodes.estimators.visual_odometry.stereo import StereoSettings
 from tests.nodes.estimators.inertial_odometry.test_preintegration import IMU
 from tests.nodes.estimators.visual_odometry.test_stereo import BASELINE, pair
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose

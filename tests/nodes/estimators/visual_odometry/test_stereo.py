@@ -10,7 +10,8 @@ from events import CameraAnnouncement
 from nodes.estimators.odometry import inverse_depth, surfaces_at
 from nodes.estimators.rectification import ALIGNED, misalignment
 from nodes.estimators.visual_odometry.features import FeatureSettings
-from nodes.estimators.visual_odometry.node import StereoMatcher, StereoSettings, StereoTracker
+from nodes.estimators.visual_odometry.node import StereoTracker
+from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
 BASELINE = 0.1
