@@ -399,3 +399,12 @@ def cross(vector: Floats) -> Floats:
     """Return the matrix of a cross product with a vector from the left, shape (3, 3)."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def crosses(vectors: Floats) -> Floats:
+    """Return the matrices of cross products with vectors, shape (n, 3), from the left."""
+    found = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
+    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
+    return found

@@ -23,10 +23,9 @@ from nodes.estimators.inertial_odometry.preintegration import (
     Floats,
     ImuModel,
     Preintegrated,
-    crosses,
 )
 from nodes.estimators.odometry import huber
-from nodes.estimators.rig import cross
+from nodes.estimators.rig import cross, crosses
 
 THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))  # slices of the error state
 G = slice(15, 17)  # slice of gravity's direction: small rotations about the two level axes

@@ -119,15 +119,6 @@ class ImuModel:
         return Preintegrated(seconds, rotation, velocity, position, by_bias, covariance)
 
 
-def crosses(vectors: Floats) -> Floats:
-    """Return the matrices of cross products with vectors, shape (n, 3), from the left."""
-    found = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
-    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
-    return found
-
-
 _STEP = 8  # spacing of the computed shifts, pixels
 
 

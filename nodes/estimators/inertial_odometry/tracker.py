@@ -75,6 +75,8 @@ class InertialTracker(FeatureTracker):
         mounted = inverse(self._imu.pose) @ pose_matrix(camera.position, camera.orientation)
         common = _COMMON if matcher is None else _COMMON_BY_EYES
         self._filter = InertialFilter(self._imu, mounted, features.keyframes + 1, common)
+        # Relative uncertainty of the unit of length, which the baseline is.
+        self._scale = stereo.baseline_noise / baseline if baseline else 0.0
         self._samples = np.empty((0, 7))
         self._time: float | None = None  # of the filter, seconds
         self._epoch: int | None = None
@@ -165,8 +167,10 @@ class InertialTracker(FeatureTracker):
         moved = np.zeros((6, 6))
         moved[:3, :3] = -state.rotation @ cross(camera[:3, 3])
         moved[:3, 3:], moved[3:, :3] = np.eye(3), state.rotation
-        found: Floats = moved @ self._filter.covariance[POSE, POSE] @ moved.T
-        return (found + found.T) / 2
+        covariance: Floats = moved @ self._filter.covariance[POSE, POSE] @ moved.T
+        way = self._scale * self._camera_pose()[:3, 3]
+        covariance[:3, :3] += np.outer(way, way)
+        return (covariance + covariance.T) / 2
 
     def _straightened(
         self, image: npt.NDArray[np.uint8], other: npt.NDArray[np.uint8] | Depth

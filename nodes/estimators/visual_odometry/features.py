@@ -49,6 +49,7 @@ from nodes.estimators.visual_odometry.landmarks import (
     half_width,
     squares,
 )
+from nodes.estimators.visual_odometry.misalignment import disparity_information
 from nodes.estimators.visual_odometry.stereo import StereoMatcher
 
 _FLOW_WINDOW = 15
@@ -169,6 +170,8 @@ class FeatureTracker:
         noise = self._settings.depth_noise
         read = self._surfaces_at(inverse_of, match.pixels[agree], noise)
         self._map.fuse(self._pose, rows[agree], read, _READING * noise)
+        if self._matcher is not None:
+            self._correct_disparities(self._matcher, match, read)
         self._before = self._reduced(grey), rows[agree], match.pixels[agree]
         self._note(grey, inverse_of, alignment is not None)
         points, inliers = match.pixels, agree
@@ -209,6 +212,16 @@ class FeatureTracker:
         believed = BELIEVED * alignment.information
         found = self._find(grey, inverse_of, alignment.pose, believed)
         return found or MapMatch.without_landmarks(alignment.pose)
+
+    def _correct_disparities(self, matcher: StereoMatcher, match: MapMatch, read: Surfaces) -> None:
+        """Correct the matcher's disparities, and the depth of all landmarks, by those in view."""
+        field, table = matcher.disparities, self._map.table
+        change = field.update(
+            *disparity_information(
+                field, matcher.unit, self._map, match, read, matcher.depth_noise, self._matrix
+            )
+        )
+        self._map.change_depths(field.terms(table["pixel"]) @ change / matcher.unit)
 
     def _note(self, grey: Grey, inverse_of: Depth, aligned: bool) -> None:
         """Remember an image of known pose, and whether known by an alignment."""

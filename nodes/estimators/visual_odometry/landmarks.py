@@ -36,6 +36,7 @@ from nodes.estimators.visual_odometry.alignment import Alignment, Reference, Vie
 _SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5  # limits of a landmark's look relative to the first
 _MEAN_OF = 20.0  # depth readings in the mean of a landmark's depth; a moving mean beyond
 _CONTRADICTS = 5.0  # largest difference of a depth reading from a landmark's, standard deviations
+_FARTHEST = 0.01  # least inverse depth, 1/m
 _HIDES = 0.05  # least difference of another surface from a landmark, relative to inverse depth
 
 
@@ -180,6 +181,12 @@ class Landmarks:
         these["readings"] = np.minimum(total, _MEAN_OF)
         these["place"] = these["origin"] + these["directions"][:, :, 2] / these["inverse"][:, None]
         self.table[rows] = these
+
+    def change_depths(self, changes: Floats) -> None:
+        """Change all inverse depths, 1/m, shape (n,), as far as they stay ahead."""
+        table = self.table
+        table["inverse"] = np.maximum(table["inverse"] + changes, _FARTHEST)
+        table["place"] = table["origin"] + table["directions"][:, :, 2] / table["inverse"][:, None]
 
 
 class MapMatch(msgspec.Struct, frozen=True, eq=False):

@@ -9,7 +9,6 @@ lost.
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any, Literal
 
 import cv2

@@ -28,12 +28,14 @@ from nodes.estimators.odometry import (
     surfaces_at,
 )
 from nodes.estimators.visual_odometry.landmarks import SAME, around, correlation
+from nodes.estimators.visual_odometry.misalignment import SmoothField
 
 _LARGE = 320  # least side (pixels) of images halved before block matching
 _BLOCK = 11
 _WINDOW = 15
 _REFINED = 1.5  # largest correction of block matching by flow, pixels
-_OFF_ROW = 0.6  # largest distance of a corner from its row, pixels
+_OFF_ROW = 0.6  # largest distance of a corner from its row, pixels, when that is known
+_UNSURE = 3.0  # standard deviations of a row's offset added to it
 _COARSE = 2.0  # noise of block matching, relative to flow
 _STEP, _DISTINCT = 3.0, 1.5  # pixels beside a disparity, least ratio of differences there
 _LEVELS = 3  # halvings of the images for flow, where block matching found nothing
@@ -50,11 +52,14 @@ class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             the left edge.
         max_depth: Metres, above which there is no depth.
         noise: Standard deviation of a corner's disparity, pixels.
+        baseline_noise: Standard deviation of the calibrated baseline, metres: a share of each
+            covariance that the images cannot lessen.
     """
 
     min_depth: Annotated[float, msgspec.Meta(gt=0)] = 0.6
     max_depth: Annotated[float, msgspec.Meta(gt=0)] = 50.0
     noise: Annotated[float, msgspec.Meta(gt=0)] = 0.08
+    baseline_noise: Annotated[float, msgspec.Meta(ge=0)] = 2e-4
 
     def __post_init__(self) -> None:
         if self.min_depth >= self.max_depth:
@@ -64,7 +69,13 @@ class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class StereoMatcher:
-    """Meter of depth in the left camera of a rectified pair without distortion."""
+    """Meter of depth in the left camera of a rectified pair without distortion.
+
+    Attributes:
+        rows: Offset of rows, right less left, by which the calibration errs; estimated here.
+        disparities: What disparities lack because of it; left to who sees the pair move.
+        unit: Disparity (pixels) times depth (metres).
+    """
 
     def __init__(
         self,
@@ -74,12 +85,13 @@ class StereoMatcher:
     ) -> None:
         self._info = info
         settings = settings or StereoSettings()
-        self._unit = info.fx * baseline  # disparity (pixels) times depth
+        self.unit = info.fx * baseline
+        self.rows, self.disparities = SmoothField(info), SmoothField(info)
         # Standard deviation of a corner's inverse depth, 1/m.
-        self.depth_noise = settings.noise / self._unit
-        self._least = self._unit / settings.max_depth
+        self.depth_noise = settings.noise / self.unit
+        self._least = self.unit / settings.max_depth
         self._reduction = 2 if min(info.width, info.height) >= _LARGE else 1
-        nearest = self._unit / settings.min_depth / self._reduction
+        nearest = self.unit / settings.min_depth / self._reduction
         self._blocks = cv2.StereoBM.create(16 * math.ceil(nearest / 16), _BLOCK)
         self._blocks.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
         self._blocks.setUniquenessRatio(10)
@@ -101,12 +113,14 @@ class StereoMatcher:
                 np.asarray(cv2.pyrDown(pair[1]), np.uint8),
             )
         found: Any = self._blocks.compute(*pair)  # sixteenths of a pixel
-        disparity = found.astype(np.float32) * (self._reduction / 16.0)
+        disparity: Any = found.astype(np.float32) * (self._reduction / 16.0)
         if self._reduction > 1:
             size = self._info.width, self._info.height
             disparity = cv2.resize(disparity, size, interpolation=cv2.INTER_NEAREST)
+        known = disparity > 0.0
+        disparity += self.disparities.everywhere()
         depth = np.full(disparity.shape, np.inf, np.float32)
-        np.divide(self._unit, disparity, out=depth, where=disparity > self._least)
+        np.divide(self.unit, disparity, out=depth, where=known & (disparity > self._least))
         return depth
 
     def surfaces_at(
@@ -120,7 +134,7 @@ class StereoMatcher:
         if self._pair is None or not len(pixels):
             return found
         rows, without = np.flatnonzero(found.continuous), np.flatnonzero(~found.continuous)
-        there, slope = found.inverse * self._unit, found.slope.copy()
+        there, slope = found.inverse * self.unit, found.slope.copy()
         fine = np.zeros(len(pixels))
         if len(rows):
             disparity, good = self._disparity(pixels[rows], there[rows], 0)
@@ -142,24 +156,34 @@ class StereoMatcher:
             good &= self._is_distinct(centre, disparity)
             fine[without[good]] = disparity[good]
             change = np.stack([right - left, below - above], axis=1) / (2 * _ASIDE)
-            slope[without] = change / self._unit
-        return Surfaces(fine / self._unit, slope, fine > 0)
+            slope[without] = change / self.unit
+        return Surfaces(fine / self.unit, slope, fine > 0)
 
     def _disparity(
         self, pixels: Floats, guess: Floats, levels: int
     ) -> tuple[Floats, npt.NDArray[np.bool_]]:
         """Return disparities by flow from a guess, and a mask of the good, both (n,)."""
         assert self._pair is not None
-        there = pixels - guess[:, None] * (1.0, 0.0)
-        found, good = follow_both_ways(*self._pair, pixels, there, _WINDOW, levels)
-        disparity = pixels[:, 0] - found[:, 0]
-        good &= np.abs(found[:, 1] - pixels[:, 1]) < _OFF_ROW
-        return disparity, good & (disparity > self._least)
+        there = self._right_of(pixels, guess)
+        matches, good = follow_both_ways(*self._pair, pixels, there, _WINDOW, levels)
+        disparity = pixels[:, 0] - matches[:, 0] + self.disparities.at(pixels)
+        offsets = matches[:, 1] - pixels[:, 1]
+        tolerance = _OFF_ROW + _UNSURE * self.rows.deviation(pixels)
+        good &= (np.abs(offsets - self.rows.at(pixels)) < tolerance) & (disparity > self._least)
+        if not levels:
+            self.rows.measure(pixels[good], offsets[good])
+            good &= np.abs(offsets - self.rows.at(pixels)) < _OFF_ROW
+        return disparity, good
+
+    def _right_of(self, pixels: Floats, disparity: Floats) -> Floats:
+        """Return where pixels of the left image are in the right one, shape (n, 2)."""
+        across, down = self.disparities.at(pixels) - disparity, self.rows.at(pixels)
+        return pixels + np.stack([across, down], axis=1)
 
     def _is_distinct(self, pixels: Floats, disparity: Floats) -> npt.NDArray[np.bool_]:
         """Return a mask of distinct disparities; noise and level edges fit any."""
         assert self._pair is not None
-        left, there = around(self._pair[0], pixels, _WINDOW), pixels - disparity[:, None] * (1, 0)
+        left, there = around(self._pair[0], pixels, _WINDOW), self._right_of(pixels, disparity)
         at, before, after = (
             correlation(left, around(self._pair[1], there + np.array([step, 0.0]), _WINDOW))
             for step in (0.0, -_STEP, _STEP)
