@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from events import Vector3
 from sims.carried.clearance import Clearance
+from sims.carried.spline import continuous
 
 Floats = npt.NDArray[np.float64]
 
@@ -43,22 +44,22 @@ def eased(rows: Floats, rest: float) -> Floats:
     if not rest or seconds[-1] < EASE:
         return rows
     interval = float(np.median(np.diff(seconds)))
-    still = np.arange(math.ceil(rest / interval)) * interval
+    count = math.ceil(rest / interval - 1e-9)
+    still = np.arange(count) * (rest / count)
     share = np.arange(0.0, 1.0, min(interval / EASE, 1.0))
     square = share * share  # not a power, whose last bits are the processor's
     # The speed's share is 10 s³ - 15 s⁴ + 6 s⁵; its integral has passed half of `EASE` at the end.
     passed = EASE * square * square * (2.5 + share * (-3.0 + share))
-    first, values = float(still[-1]) + interval, rows[:, 1:].copy()
-    flips = np.cumprod(np.where((values[1:, 3:] * values[:-1, 3:]).sum(axis=1) < 0.0, -1.0, 1.0))
-    values[1:, 3:] *= flips[:, None]
+    values = rows[:, 1:].copy()
+    values[:, 3:] = continuous(values[:, 3:])
     slow = np.stack([np.interp(passed, seconds, column) for column in values.T], axis=1)
     slow[:, 3:] /= np.sqrt((slow[:, 3:] ** 2).sum(axis=1))[:, None]
     later = seconds > EASE / 2.0 + interval / 2.0
     return np.vstack(
         [
             np.column_stack([still, np.tile(values[0], (len(still), 1))]),
-            np.column_stack([first + share * EASE, slow]),
-            np.column_stack([first + EASE / 2.0 + seconds[later], values[later]]),
+            np.column_stack([rest + share * EASE, slow]),
+            np.column_stack([rest + EASE / 2.0 + seconds[later], values[later]]),
         ]
     )
 

@@ -2,9 +2,10 @@
 
 Knots are equidistant; the third differences of the control points are penalised, which bridges gaps
 (P. Eilers, B. Marx, "Flexible smoothing with B-splines and penalties", Statistical Science 1996),
-and Huber's weights leave out jumps. Positions and sign-continuous quaternions, normalised when they
-are read, are fitted alike. All sums are taken in a fixed order, so that every processor gives the
-same bits.
+and Huber's weights leave out jumps: a row counts as little as the worse of its position and its
+rotation deserves. Positions and sign-continuous quaternions, normalised when they are read, are
+fitted alike. All sums are taken in a fixed order, none by `sum` of numbers, which rounds otherwise
+from Python 3.12 on, so that every processor and Python gives the same bits.
 """
 
 from __future__ import annotations
@@ -24,9 +25,13 @@ Floats = npt.NDArray[np.float64]
 SLOWEST = 8.0  # least rows per second
 LONGEST_GAP = 2.0  # seconds
 LARGEST_RESIDUAL = 0.05  # metres, of the median row
+LARGEST_TURN = 0.1  # radians, of the median row
 _SPARSE = 1.05  # least interval of the knots, in intervals of the rows
 _GAP = 5.0  # intervals of the rows from which a step is a gap
 _PENALTY, _HUBER, _ROUNDS = 1e-3, 3.0, 4
+_EXACT = 1e-5  # metres or radians, residual that always counts in full
+_APART = 0.5  # product of quaternions 120° apart, which no body rotates from row to row
+_BURST = 20  # wrong rotations in a row that are recognized as such
 _DEGREE = 5
 _PIECES = (
     (1.0, -5.0, 10.0, -10.0, 5.0, -1.0),
@@ -61,6 +66,8 @@ class FitReport(msgspec.Struct, frozen=True):
     gaps: tuple[tuple[float, float], ...]  # begin and length of each, seconds
     residual: float  # median distance of a row from the curve, metres
     largest_residual: float
+    turn: float  # median angle of a row's rotation from the curve's, radians
+    largest_turn: float
     reduced: float  # share of the rows that count less than others, 0 to 1
 
 
@@ -86,32 +93,55 @@ class MotionSpline:
         inside = min(max(stamp_ns, self.start_ns), self.end_ns)
         place = (inside * 1e-9 - self._start) / self._knots
         first = min(max(math.floor(place), 0), self._last)
-        rows = self._points[first : first + _DEGREE + 1]
-        value, slope, bend = (
-            [
-                sum(weight * row[k] for weight, row in zip(weights, rows, strict=True))
-                for k in range(7)
-            ]
-            for weights in _weights(place - first, self._knots)
+        value, slope, bend = _values(
+            self._points[first : first + _DEGREE + 1], place - first, self._knots
         )
-        x, y, z, *turn = value
-        quaternion, change, second = (_quaternion(each[3:]) for each in (value, slope, bend))
-        square = sum(q * q for q in turn)
+        x, y, z, w, i, j, k = value
+        square = w * w + i * i + j * j + k * k
         length = math.sqrt(square)
-        w, i, j, k = quaternion
         position, orientation = (x, y, z), (w / length, i / length, j / length, k / length)
         if inside != stamp_ns:
             still = (0.0, 0.0, 0.0)
             return Moment(position, orientation, still, still, still, still)
-        # q* q' of a quaternion of any length has the body's rates, but for its scalar part.
+        # 2 q* q' / |q|² of a q of any length has the body's rates, but for its scalar part.
         back = (w, -i, -j, -k)
-        _, *rates = (2.0 * c / square for c in multiply(back, change))
-        growth = 2.0 * sum(a * b for a, b in zip(quaternion, change, strict=True)) / square
-        _, *twice = (2.0 * c / square for c in multiply(back, second))
-        turning = [b - growth * a for a, b in zip(rates, twice, strict=True)]
+        vx, vy, vz, *change = slope
+        ax, ay, az, *second = bend
+        growth, rx, ry, rz = multiply(back, _quaternion(change))
+        _, bx, by, bz = multiply(back, _quaternion(second))
+        share, growth = 2.0 / square, 2.0 * growth / square
+        rx, ry, rz = share * rx, share * ry, share * rz
         return Moment(
-            position, orientation, _vector(slope), _vector(bend), _vector(rates), _vector(turning)
+            position,
+            orientation,
+            (vx, vy, vz),
+            (ax, ay, az),
+            (rx, ry, rz),
+            (share * bx - growth * rx, share * by - growth * ry, share * bz - growth * rz),
         )
+
+
+def continuous(quaternions: Floats) -> Floats:
+    """Return quaternions, shape (n, 4), with signs that follow each other.
+
+    A few that are far from those before and after them, as of a tracker that takes a marker for its
+    reflection, do not decide about the signs of the rest.
+    """
+    products = (quaternions[1:] * quaternions[:-1]).sum(axis=1)
+    signs = np.where(products < 0.0, -1.0, 1.0)
+    after = 0
+    for row in np.flatnonzero(abs(products) < _APART).tolist():
+        if row < after:
+            continue
+        later = quaternions[row + 2 : row + 2 + _BURST]
+        across = (later * quaternions[row]).sum(axis=1)
+        near = np.flatnonzero(abs(across) >= _APART)
+        if len(near):
+            after = row + 2 + int(near[0])
+            signs[after - 1] = signs[row : after - 1].prod() * np.sign(across[near[0]])
+    turned = quaternions.copy()
+    turned[1:] *= np.cumprod(signs)[:, None]
+    return turned
 
 
 def fit(rows: Floats, knots: float) -> tuple[MotionSpline, FitReport]:
@@ -127,8 +157,7 @@ def fit(rows: Floats, knots: float) -> tuple[MotionSpline, FitReport]:
     _check(seconds, values)
     steps = np.diff(seconds)
     interval = float(np.median(steps))
-    flips = np.cumprod(np.where((values[1:, 3:] * values[:-1, 3:]).sum(axis=1) < 0.0, -1.0, 1.0))
-    values[1:, 3:] *= flips[:, None]
+    values[:, 3:] = continuous(values[:, 3:])
     whole = float(seconds[-1] - seconds[0])
     count = max(math.floor(whole / max(knots, _SPARSE * interval) + 1e-9), 1)
     spacing = whole / count
@@ -138,10 +167,13 @@ def fit(rows: Floats, knots: float) -> tuple[MotionSpline, FitReport]:
     weights = np.ones(len(rows))
     for _ in range(_ROUNDS):
         points = _solved(basis, first, weights, values, count + _DEGREE)
-        fitted = sum(basis[:, k, None] * points[first + k, :3] for k in range(_DEGREE + 1))
-        residuals = np.sqrt(((fitted - values[:, :3]) ** 2).sum(axis=1))
-        limit = _HUBER * (1.4826 * float(np.median(residuals)) + 1e-5)
-        weights = np.minimum(1.0, limit / np.maximum(residuals, 1e-12))
+        fitted = sum(basis[:, k, None] * points[first + k] for k in range(_DEGREE + 1))
+        residuals = np.sqrt(((fitted[:, :3] - values[:, :3]) ** 2).sum(axis=1))
+        lengths = np.sqrt((fitted[:, 3:] ** 2).sum(axis=1))
+        units = fitted[:, 3:] / np.maximum(lengths, 1e-12)[:, None]
+        chords = np.sqrt(((units - values[:, 3:]) ** 2).sum(axis=1))
+        turns = 2.0 * chords  # angles, if they are small
+        weights = np.minimum(_huber(residuals), _huber(turns))
     report = FitReport(
         rows=len(rows),
         seconds=whole,
@@ -152,6 +184,8 @@ def fit(rows: Floats, knots: float) -> tuple[MotionSpline, FitReport]:
         ),
         residual=float(np.median(residuals)),
         largest_residual=float(residuals.max()),
+        turn=float(np.median(turns)),
+        largest_turn=min(4.0 * math.asin(min(float(chords.max()) / 2.0, 1.0)), math.pi),
         reduced=float((weights < 1.0).mean()),
     )
     if report.residual > LARGEST_RESIDUAL:
@@ -159,15 +193,35 @@ def fit(rows: Floats, knots: float) -> tuple[MotionSpline, FitReport]:
             f"trajectory: expected rows within {LARGEST_RESIDUAL:g} m of a smooth curve, found "
             f"half of them {report.residual:.3g} m and more beside it"
         )
+    if report.turn > LARGEST_TURN or float(lengths.min()) < _APART:
+        worst = float(seconds[int(lengths.argmin())])
+        raise ValueError(
+            "trajectory: expected rotations that follow each other, found jumps, such as at "
+            f"{worst:.3g} s"
+        )
     return MotionSpline(float(seconds[0]), spacing, points), report
 
 
+def _huber(residuals: Floats) -> Floats:
+    """Return Huber's weights of residuals, by their median."""
+    limit = _HUBER * (1.4826 * float(np.median(residuals)) + _EXACT)
+    return np.asarray(np.minimum(1.0, limit / np.maximum(residuals, 1e-12)))
+
+
 def _check(seconds: Floats, values: Floats) -> None:
-    if len(seconds) < 2 or not np.isfinite(values).all():
-        raise ValueError(f"trajectory: expected 2 or more finite poses, found {len(seconds)}")
+    if len(seconds) <= _DEGREE:
+        raise ValueError(f"trajectory: expected {_DEGREE + 1} poses or more, found {len(seconds)}")
+    finite = np.isfinite(seconds) & np.isfinite(values).all(axis=1)
+    if not finite.all():
+        row = int(finite.argmin()) + 1
+        raise ValueError(f"trajectory: expected numbers, found one that is not finite in row {row}")
     steps = np.diff(seconds)
     if not (steps > 0.0).all():
-        raise ValueError("trajectory: expected rising stamps, found a step back")
+        row = int((steps <= 0.0).argmax())
+        raise ValueError(
+            f"trajectory: expected rising stamps, found {seconds[row + 1]:.9g} s after "
+            f"{seconds[row]:.9g} s"
+        )
     if (rate := 1.0 / float(np.median(steps))) < SLOWEST:
         raise ValueError(
             f"trajectory: expected {SLOWEST:g} rows or more a second, found {rate:.3g}"
@@ -196,16 +250,26 @@ def _basis(share: Floats) -> Floats:
     return np.stack(columns, axis=1)
 
 
-def _weights(share: float, knots: float) -> tuple[list[float], list[float], list[float]]:
-    """Return six control points' weights of the value and of its derivatives by time."""
+def _values(
+    points: list[list[float]], share: float, knots: float
+) -> tuple[list[float], list[float], list[float]]:
+    """Return six control points' value at a share of an interval, and its derivatives by time."""
     value, slope, bend = [], [], []
+    once, twice = 120.0 * knots, 120.0 * knots * knots
     for a, b, c, d, e, f in _PIECES:
-        value.append((((((f * share + e) * share + d) * share + c) * share + b) * share + a) / 120)
-        first = (((5 * f * share + 4 * e) * share + 3 * d) * share + 2 * c) * share + b
-        slope.append(first / (120 * knots))
-        second = ((20 * f * share + 12 * e) * share + 6 * d) * share + 2 * c
-        bend.append(second / (120 * knots * knots))
-    return value, slope, bend
+        value.append(
+            (((((f * share + e) * share + d) * share + c) * share + b) * share + a) / 120.0
+        )
+        first = (((5.0 * f * share + 4.0 * e) * share + 3.0 * d) * share + 2.0 * c) * share + b
+        slope.append(first / once)
+        second = ((20.0 * f * share + 12.0 * e) * share + 6.0 * d) * share + 2.0 * c
+        bend.append(second / twice)
+    columns = list(zip(*points, strict=True))
+    values, slopes, bends = (
+        [a * p + b * q + c * r + d * s + e * t + f * u for p, q, r, s, t, u in columns]
+        for a, b, c, d, e, f in (value, slope, bend)
+    )
+    return values, slopes, bends
 
 
 def _solved(
@@ -250,10 +314,6 @@ def _cholesky_solved(band: list[list[float]], right: Floats) -> Floats:
                 column[i - k] -= band[i][k] * total
         columns.append(column)
     return np.array(columns).T.copy()
-
-
-def _vector(values: list[float]) -> Vector3:
-    return values[0], values[1], values[2]
 
 
 def _quaternion(values: list[float]) -> Quaternion:

@@ -106,7 +106,8 @@ def in_words(rows: int, report: FitReport, result: Survey) -> list[str]:
         f"{rows} rows, each {report.interval * 1e3:.3g} ms, {gaps}; "
         f"{report.seconds:.4g} s with the rest before them",
         f"fitted with knots each {report.knots * 1e3:.3g} ms: half of the rows within "
-        f"{report.residual * 1e3:.2g} mm, all within {report.largest_residual * 1e3:.2g} mm, "
+        f"{report.residual * 1e3:.2g} mm and {math.degrees(report.turn):.2g}°, all within "
+        f"{report.largest_residual * 1e3:.2g} mm and {math.degrees(report.largest_turn):.2g}°, "
         f"{report.reduced:.1%} of less weight",
         f"at most {result.speed:.3g} m/s, {result.acceleration:.3g} m/s², "
         f"{math.degrees(result.rate):.3g}°/s",

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from sims.carried.clearance import Clearance
 from sims.carried.placing import Placement, eased, find_place, placed
-from sims.carried.spline import fit
+from sims.carried.spline import MotionSpline, fit
 
 Floats = npt.NDArray[np.float64]
 SECOND = 1_000_000_000
@@ -34,10 +34,11 @@ def turn(quaternion: Any) -> Rotation:
 
 
 @settings(max_examples=20, deadline=None)
-@given(stamp=st.integers(SECOND, 4 * SECOND))
-def test_all_that_it_says_is_the_derivative_of_the_pose(stamp: int) -> None:
+@given(stamp=st.integers(SECOND, 4 * SECOND), fitted=st.booleans())
+def test_all_that_it_says_is_the_derivative_of_the_pose(stamp: int, fitted: bool) -> None:
     half = 50_000
-    before, now, after = (_SPLINE.at(stamp + sign * half) for sign in (-1, 0, 1))
+    spline = _SPLINE if fitted else _UNEVEN
+    before, now, after = (spline.at(stamp + sign * half) for sign in (-1, 0, 1))
     seconds = 2.0 * half / 1e9
     for value, slope in (("position", "velocity"), ("velocity", "acceleration"),
                          ("angular_velocity", "angular_acceleration")):  # fmt: skip
@@ -49,6 +50,57 @@ def test_all_that_it_says_is_the_derivative_of_the_pose(stamp: int) -> None:
 
 
 _SPLINE, _REPORT = fit(wandering(np.arange(0.0, 5.001, 0.01)), 0.05)
+_UNEVEN = MotionSpline(  # of quaternions whose length changes
+    0.0, 0.5, np.random.default_rng(2).uniform(0.3, 1.3, (15, 7))
+)
+
+
+@pytest.mark.parametrize(
+    ("climb", "rate"), [(0.0, 200.0), (0.3, 10.0), (0.3, 200.0), (0.3, 1000.0)]
+)
+def test_circle_and_screw_are_those_of_the_formula(climb: float, rate: float) -> None:
+    """Of a body that is pitched, so that it rotates about two of its axes."""
+    speed, pitch = 0.5, 0.3  # rad/s, rad
+
+    def screw(seconds: Floats) -> Floats:
+        angle = speed * seconds
+        place = 2.0 * np.cos(angle), 2.0 * np.sin(angle), -1.0 - climb * seconds
+        angles = np.column_stack([angle, np.full_like(angle, pitch), 0.0 * angle])
+        turns = Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
+        return np.column_stack([seconds, *place, turns])
+
+    spline, _ = fit(screw(np.arange(0.0, 6.0, 1.0 / rate)), 0.05)
+    rates = np.array((-math.sin(pitch), 0.0, math.cos(pitch))) * speed
+    for stamp in range(2 * SECOND, 4 * SECOND, 87_654_321):
+        moment, true = spline.at(stamp), screw(np.array([stamp / 1e9]))[0]
+        x, y, z = true[1:4]
+        for value, expected in (
+            (moment.position, (x, y, z)),
+            ((turn(true[4:]).inv() * turn(moment.orientation)).as_rotvec(), (0.0, 0.0, 0.0)),
+            (moment.velocity, (-speed * y, speed * x, -climb)),
+            (moment.acceleration, (-(speed**2) * x, -(speed**2) * y, 0.0)),
+            (moment.angular_velocity, rates),
+            (moment.angular_acceleration, (0.0, 0.0, 0.0)),
+        ):
+            np.testing.assert_allclose(value, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("half", [math.pi, -math.pi])
+@pytest.mark.parametrize("rows", [slice(300, 301), slice(300, 304)])
+def test_a_mirrored_marker_is_left_out(rows: slice, half: float) -> None:
+    """Its rotation is 180° off, at right places; the signs of the others do not depend on it."""
+    motion = wandering(np.arange(0.0, 6.0, 0.01))
+    mirrored = motion.copy()
+    mirrored[rows, 4:] = (turn(motion[rows, 4:]) * Rotation.from_rotvec((0, half, 0))).as_quat(
+        scalar_first=True
+    )
+    spline, report = fit(mirrored, 0.05)
+    assert report.turn < 1e-4
+    assert report.largest_turn > 1.0
+    for moment in (spline.at(stamp) for stamp in range(2 * SECOND, 4 * SECOND, 20_000_000)):
+        assert math.hypot(*moment.angular_velocity) < 3.0
+    error = turn(spline.at(3 * SECOND).orientation).inv() * turn(motion[300, 4:])
+    assert error.magnitude() < 0.02
 
 
 def test_gaps_are_bridged_jumps_left_out_and_signs_of_no_matter() -> None:
@@ -82,7 +134,13 @@ def test_it_rests_before_and_after() -> None:
         (lambda r: r[::20], "8 rows or more a second, found 5"),
         (lambda r: np.delete(r, slice(100, 320), axis=0), "more than 2 s, found one of 2.21"),
         (lambda r: r * ([1] * 4 + [0] * 4) + np.eye(8)[4], "rotation that changes"),
-        (lambda r: r[[0, 2, 1, *range(3, 500)]], "rising stamps"),
+        (lambda r: r[[0, 2, 1, *range(3, 500)]], "rising stamps, found 0.01 s after 0.02 s"),
+        (lambda r: r[[0, 1, 1, *range(2, 500)]], "rising stamps, found 0.01 s after 0.01 s"),
+        (lambda r: r[:5], "6 poses or more, found 5"),
+        (lambda r: np.where(np.arange(500)[:, None] == 7, np.nan, r), "not finite in row 8"),
+        (lambda r: np.where(np.eye(500, 8, -7) == 1, np.inf, r), "not finite in row 8"),
+        (lambda r: np.column_stack([r[:, :4], Rotation.random(500, rng=1).as_quat()]),
+         "rotations that follow each other, found jumps"),
         (lambda r: r + np.random.default_rng(1).normal(0, 0.1, r.shape) * np.eye(8)[1:4].sum(0),
          "within 0.05 m of a smooth curve"),
     ],
@@ -108,6 +166,23 @@ def test_a_motion_is_eased_in_from_rest() -> None:
     assert max(speeds) < 8.0
     late = wandering(np.array([2.0]))[0]
     np.testing.assert_allclose(spline.at(3_500_000_000).position, late[1:4], atol=1e-4)
+    whole = wandering(np.arange(0.0, 5.0, 0.01))[60:]  # after its first EASE / 2 only later
+    np.testing.assert_allclose(rows[-len(whole) :] - whole, np.eye(8)[:1] * 1.5 + 0 * whole,
+                               atol=1e-9)  # fmt: skip
+
+
+def test_speed_rises_smoothly_from_rest() -> None:
+    """Of a straight motion at 1 m/s: as the integral of 30 s² - 60 s³ + 30 s⁴ says."""
+    rows = wandering(np.arange(0.0, 5.0, 0.005))
+    rows[:, 1:4] = rows[:, :1] * (1.0, 0.0, 0.0)
+    spline, _ = fit(eased(rows, 1.0), 0.05)
+    for stamp in range(0, 3 * SECOND, 12_345_678):
+        share = min(max(stamp / 1e9 - 1.0, 0.0), 1.0)
+        moment = spline.at(stamp)
+        speed = share**3 * (10.0 + share * (-15.0 + 6.0 * share))
+        np.testing.assert_allclose(moment.velocity, (speed, 0.0, 0.0), atol=2e-3)
+        gain = 30.0 * (share * (1.0 - share)) ** 2
+        np.testing.assert_allclose(moment.acceleration, (gain, 0.0, 0.0), atol=0.1)
 
 
 BOXES = """<mujoco><worldbody><geom type="plane" size="9 9 1"/>
