@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -24,8 +25,9 @@ class Clearance:
 
     Distances are exact of planes, boxes, spheres, capsules and cylinders. That of an ellipsoid is
     an estimate, that of a mesh is of its convex hull, which is what vehicles touch, and of the
-    nearest of the hull's planes: not more than the true one. Sums are taken in a fixed order, so
-    that every processor gives the same bits.
+    nearest of the hull's planes, and that of a height field the height above it, made less by the
+    steepest slope: not more than the true ones. Sums are taken in a fixed order, so that every
+    processor gives the same bits.
     """
 
     def __init__(self, model: Any, dynamics: Dynamics | None = None) -> None:
@@ -38,15 +40,15 @@ class Clearance:
         self._geoms = [
             int(geom)
             for geom in np.flatnonzero(solid & (moves == (dynamics is not None)))
-            if int(model.geom_type[geom]) in _DISTANCES
+            if int(model.geom_type[geom]) in _DISTANCES | _MODELLED
             and (dynamics is not None or not mover_of(model, int(geom)))
         ]
         self._places = self._data.geom_xpos
         self._axes = self._data.geom_xmat.reshape(-1, 3, 3)
-        self._hulls = {
-            geom: _hull(model, geom)
+        self._modelled = {
+            geom: _MODELLED[kind](model, geom)
             for geom in self._geoms
-            if model.geom_type[geom] == _TYPES.mjGEOM_MESH
+            if (kind := int(model.geom_type[geom])) in _MODELLED
         }
 
     def __bool__(self) -> bool:
@@ -75,8 +77,8 @@ class Clearance:
                 for k in range(3)
             ]
             size = self._model.geom_size[geom].tolist()
-            if geom in self._hulls:
-                distance = _to_hull(local, self._hulls[geom])
+            if geom in self._modelled:
+                distance = self._modelled[geom](local)
             else:
                 distance = _DISTANCES[int(self._model.geom_type[geom])](local, size)
             nearer = distance < least
@@ -165,22 +167,56 @@ _DISTANCES = {
     int(_TYPES.mjGEOM_BOX): _to_box,
     int(_TYPES.mjGEOM_CYLINDER): _to_cylinder,
     int(_TYPES.mjGEOM_ELLIPSOID): _to_ellipsoid,
-    int(_TYPES.mjGEOM_MESH): _to_sphere,  # stands for `_to_hull`, which needs the mesh
 }
 
 
-def _hull(model: Any, geom: int) -> Floats:
-    """Return the planes around a mesh: unit normals and offsets, shape (n, 4)."""
+def _hull(model: Any, geom: int) -> Callable[[list[Floats]], Floats]:
+    """Return the distance from a mesh's convex hull, by the planes around it."""
     from scipy.spatial import ConvexHull
 
     mesh = int(model.geom_dataid[geom])
     begin, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     vertices = model.mesh_vert[begin : begin + count].astype(np.float64)
-    return np.asarray(ConvexHull(vertices).equations)
+    planes = ConvexHull(vertices).equations.tolist()  # unit normals and offsets
+
+    def distance(local: list[Floats]) -> Floats:
+        farthest = np.full(len(local[0]), -math.inf)
+        for a, b, c, d in planes:
+            farthest = np.maximum(farthest, local[0] * a + local[1] * b + local[2] * c + d)
+        return farthest
+
+    return distance
 
 
-def _to_hull(local: list[Floats], planes: Floats) -> Floats:
-    farthest = np.full(len(local[0]), -math.inf)
-    for a, b, c, d in planes.tolist():
-        farthest = np.maximum(farthest, local[0] * a + local[1] * b + local[2] * c + d)
-    return farthest
+def _field(model: Any, geom: int) -> Callable[[list[Floats]], Floats]:
+    """Return the distance from a height field, which is solid from its surface down."""
+    field = int(model.geom_dataid[geom])
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    begin, half = int(model.hfield_adr[field]), model.hfield_size[field].tolist()
+    heights = model.hfield_data[begin : begin + rows * columns].astype(np.float64)
+    heights = heights.reshape(rows, columns) * half[2]
+    cells = (columns - 1) / (2.0 * half[0]), (rows - 1) / (2.0 * half[1])  # per metre
+    slopes = [float(abs(np.diff(heights, axis=1 - k)).max()) * cells[k] for k in (0, 1)]
+    steepest = math.sqrt(1.0 + slopes[0] ** 2 + slopes[1] ** 2)
+
+    def distance(local: list[Floats]) -> Floats:
+        x, y = ((np.clip(local[k], -half[k], half[k]) + half[k]) * cells[k] for k in (0, 1))
+        column = np.minimum(x.astype(np.intp), columns - 2)
+        row = np.minimum(y.astype(np.intp), rows - 2)
+        x, y = x - column, y - row
+        near, far = heights[row, column], heights[row + 1, column + 1]
+        right, left = heights[row, column + 1], heights[row + 1, column]
+        surface = np.where(
+            x > y, near + x * (right - near) + y * (far - right),
+            near + y * (left - near) + x * (far - left),
+        )  # fmt: skip
+        above = local[2] - surface
+        beside = np.maximum(abs(local[0]) - half[0], abs(local[1]) - half[1])
+        lower = np.where(above > 0.0, above / steepest, above)
+        return np.asarray(np.where(beside > 0.0, np.maximum(beside, lower), lower))
+
+    return distance
+
+
+_MODELLED = {int(_TYPES.mjGEOM_MESH): _hull, int(_TYPES.mjGEOM_HFIELD): _field}
+"""Shapes whose data stand in the model: makers of their distances."""

@@ -207,14 +207,68 @@ def test_distances_are_those_of_the_shapes() -> None:
     assert names[6:] == ["the ground", "the ground"]
 
 
+def test_a_distance_from_a_mesh_is_that_of_its_hull() -> None:
+    corners = "1 0 0 -1 0 0 0 1 0 0 -1 0 0 0 1 0 0 -1"
+    xml = (
+        f'<mujoco><asset><mesh name="m" vertex="{corners}"/></asset><worldbody>'
+        '<geom type="mesh" mesh="m" pos="2 0 3"/></worldbody></mujoco>'
+    )
+    clearance = Clearance(mujoco.MjSpec.from_string(xml).compile())
+    points = np.array([(2.0, 0.0, -3.0), (3.0, 1.0, -4.0)])
+    expected = [-1.0 / math.sqrt(3.0), 2.0 / math.sqrt(3.0)]
+    np.testing.assert_allclose(clearance.distances(points), expected, atol=1e-6)
+
+
+def test_terrain_is_solid() -> None:
+    """A slope of 45° up to the north, whose foot is at the origin's south."""
+    spec = mujoco.MjSpec()
+    ramp = np.tile(np.linspace(0.0, 1.0, 9), (5, 1)).ravel().tolist()
+    spec.add_hfield(name="ramp", size=[2, 1, 4, 0.1], nrow=5, ncol=9, userdata=ramp)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ramp")
+    clearance = Clearance(spec.compile())
+    points = np.array([(0.0, 0.0, -3.0), (1.0, 0.5, -3.0), (1.3, 0.5, -3.1), (0.0, 3.0, -1.0)])
+    expected = [1.0 / math.sqrt(2.0), 0.0, -0.2, 2.0]
+    np.testing.assert_allclose(clearance.distances(points), expected, atol=1e-6)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_ray_meets_terrain_nearer_than_its_distance(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    spec = mujoco.MjSpec()
+    heights = random.uniform(0.0, 1.0, 35).tolist()
+    spec.add_hfield(name="hills", size=[3, 2, 1.5, 0.1], nrow=5, ncol=7, userdata=heights)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="hills")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    hit = np.zeros(1, np.int32)
+    for point in random.uniform((-4, -3, 0.1), (4, 3, 3), (10, 3)):
+        distance = float(Clearance(model).distances(point[None] * (1.0, -1.0, -1.0))[0])
+        for way in (*random.normal(size=(20, 3)), np.array((0.0, 0.0, -1.0))):
+            way /= np.linalg.norm(way)
+            ray = float(mujoco.mj_ray(model, data, point, way, None, 1, -1, hit))
+            assert distance <= 0.0 or ray < 0.0 or ray >= distance - 1e-6
+        if distance < 0.0 and (abs(point[:2]) < (3, 2)).all():  # the last ray, down from inside
+            above = point + np.array((0.0, 0.0, 5.0))
+            top = float(mujoco.mj_ray(model, data, above, way, None, 1, -1, hit))
+            assert distance == pytest.approx(top - 5.0, abs=1e-6)
+
+
+def room(x: float, y: float) -> Clearance:
+    """Return the clearance between four walls, without a floor."""
+    walls = "".join(
+        f'<geom type="box" size="{half} 1.5" pos="{place} 1.5"/>'
+        for half, place in ((f"{x} 0.1", f"0 {y}"), (f"{x} 0.1", f"0 {-y}"),
+                            (f"0.1 {y}", f"{x} 0"), (f"0.1 {y}", f"{-x} 0"))
+    )  # fmt: skip
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{walls}</worldbody></mujoco>")
+    return Clearance(spec.compile())
+
+
 def test_a_place_is_found_where_there_is_room() -> None:
     """Of a line of 3 m, which is longer than half of the room is wide."""
-    walls = "".join(
-        f'<geom type="box" size="{x} {y} 1.5" pos="{px} {py} 1.5"/>'
-        for x, y, px, py in ((2, 0.1, 0, 4), (2, 0.1, 0, -4), (0.1, 4, 2, 0), (0.1, 4, -2, 0))
-    )
-    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{walls}</worldbody></mujoco>")
-    clearance = Clearance(spec.compile())
+    clearance = room(2.0, 4.0)
     rows = np.zeros((100, 8))
     rows[:, 0], rows[:, 1], rows[:, 4] = np.arange(100) / 50, np.linspace(0.0, 3.0, 100), 1.0
     place = find_place(rows, clearance)
