@@ -96,7 +96,7 @@ def find_place(rows: Floats, clearance: Clearance) -> Placement:
     """Return the place of a motion with the greatest clearance, up to `ENOUGH`, near the origin.
 
     Turns of 30°, and shifts of half a metre or a 24th of the room, are tried inside the box of the
-    world's solids; then finer shifts about the best of them.
+    world's solids; then finer shifts and turns about the best of them.
 
     Raises:
         ValueError: There is no free place.
@@ -144,22 +144,39 @@ def _score(room: Floats, shifts: Floats) -> Floats:
 def _refined(
     path: Floats, place: Placement, clearance: Clearance
 ) -> tuple[float, float, Placement]:
-    """Return clearance, score and place of the best of finer shifts about a place."""
-    room = score = -math.inf
-    points = placed(path, place)[:, 1:4] - place.position
+    """Return clearance, score and place of the best of finer shifts and turns."""
     low, high = clearance.bounds()
-    least, most = low - points.min(axis=0), high - points.max(axis=0)
-    for step in (0.25, 0.125, 0.0625):
-        shifts = place.position + step * (np.array([*np.ndindex(3, 3, 3)]) - 1.0)
-        shifts = np.clip(shifts, least, np.maximum(least, most))
-        rooms = clearance.distances((shifts[:, None] + points).reshape(-1, 3))
-        rooms = rooms.reshape(len(shifts), -1).min(axis=1)
-        scores = _score(rooms, shifts)
-        index = int(scores.argmax())
-        x, y, z = shifts[index].tolist()
-        room, score = float(rooms[index]), float(scores[index])
-        place = msgspec.structs.replace(place, position=(x, y, z))
-    return room, score, place
+    room, score, best = -math.inf, -math.inf, place
+    for step, turn in ((0.25, 8.0), (0.125, 4.0), (0.0625, 2.0)):
+        place = best
+        for angle in (0.0, turn, -turn):
+            if angle and room >= ENOUGH:
+                break
+            turned = _turned(path, place, angle)
+            points = placed(path, turned)[:, 1:4] - turned.position
+            least, most = low - points.min(axis=0), high - points.max(axis=0)
+            shifts = turned.position + step * (np.array([*np.ndindex(3, 3, 3)]) - 1.0)
+            shifts = np.clip(shifts, least, np.maximum(least, most))
+            rooms = clearance.distances((shifts[:, None] + points).reshape(-1, 3))
+            rooms = rooms.reshape(len(shifts), -1).min(axis=1)
+            scores = _score(rooms, shifts)
+            index = int(scores.argmax())
+            if scores[index] > score:
+                x, y, z = shifts[index].tolist()
+                room, score = float(rooms[index]), float(scores[index])
+                best = msgspec.structs.replace(turned, position=(x, y, z))
+    return room, score, best
+
+
+def _turned(path: Floats, place: Placement, angle: float) -> Placement:
+    """Return a place turned by an angle, degrees, about the middle of the motion."""
+    turned = msgspec.structs.replace(place, heading=place.heading + angle)
+    before, after = (
+        (points.min(axis=0) + points.max(axis=0)) / 2.0
+        for points in (placed(path, each)[:, 1:4] for each in (place, turned))
+    )
+    x, y, z = (place.position + before - after).tolist()
+    return msgspec.structs.replace(turned, position=(x, y, z))
 
 
 class _Grid:

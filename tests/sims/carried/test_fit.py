@@ -266,6 +266,18 @@ def room(x: float, y: float) -> Clearance:
     return Clearance(spec.compile())
 
 
+@pytest.mark.parametrize("angle", [0.0, 15.0, 37.0])
+def test_a_motion_is_turned_to_where_a_narrow_room_has_most_of_it(angle: float) -> None:
+    """Of a line of 3 m, along the middle of a room 2.2 m wide: 1.1 m from its walls."""
+    clearance = room(1.2, 3.0)
+    ways = np.linspace(0.0, 3.0, 100)
+    rows = np.zeros((100, 8))
+    rows[:, 0], rows[:, 4] = ways / 2.0, 1.0
+    rows[:, 1], rows[:, 2] = (f(math.radians(angle)) * ways for f in (math.cos, math.sin))
+    place = find_place(rows, clearance)
+    assert clearance.distances(placed(rows, place)[:, 1:4]).min() > 1.0
+
+
 def test_a_place_is_found_where_there_is_room() -> None:
     """Of a line of 3 m, which is longer than half of the room is wide."""
     clearance = room(2.0, 4.0)
