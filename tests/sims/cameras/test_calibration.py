@@ -64,6 +64,14 @@ def test_a_setting_changes_no_others_error_and_zero_changes_nothing() -> None:
     assert drawn(USUAL, 7).time_offset == drawn(USUAL, 7, name="d").time_offset
 
 
+def test_the_draws_of_a_name_and_a_seed_stay_what_they_are() -> None:
+    errors = off(drawn(USUAL, 7))
+    assert errors["focal"] == pytest.approx([0.07171000241, 0.19338608059])
+    assert errors["position"] == pytest.approx(
+        [-1.629537e-05, 1.489699e-04, 3.310187e-05], rel=1e-5
+    )
+
+
 def test_lists_are_the_errors_themselves_the_left_eyes_first() -> None:
     error = CalibrationError(
         focal=(1.0, -2.0), distortion=(0.1, 0.0, 0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.5)
