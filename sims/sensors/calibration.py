@@ -54,7 +54,7 @@ _ASIDE = np.array([1, 2, 3, 5, 6, 7, 9 + 3, 9 + 6, 9 + 7])
 
 _DIAGONAL = np.array([0, 4, 8, 9, 9 + 4, 9 + 8])
 
-A = TypeVar("A", ImuAnnouncement, LidarAnnouncement)
+A = TypeVar("A", bound=ImuAnnouncement | LidarAnnouncement)
 
 
 def announced(true: A, error: MountingError, parent: np.random.Generator, name: str) -> A:
