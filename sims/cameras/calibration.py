@@ -36,7 +36,8 @@ class CalibrationError(MountingError, frozen=True, kw_only=True, forbid_unknown_
         focal: Of fx and fy, pixels.
         centre: Of the principal point cx and cy, pixels.
         distortion: Of the coefficients k1 and k2; that of all others (p1, p2, k3, …) is a tenth
-            of it. A list has all coefficients of the lens's model.
+            of it, and none of k3 and beyond where these are 0, as they are then not calibrated.
+            A list has all coefficients of the lens's model.
         rotation: Of the mounting, about each axis of the optical frame, degrees.
         position: Of the mounting, along each axis of the body, metres.
         time: Of the time offset. All cameras of a vehicle share the draw, as they share a trigger.
@@ -98,6 +99,7 @@ def announced(
     draws = [generator.standard_normal(size) for size in (2, 2, count, 3, 3)]
     late = float(error.time) * float(generator_of(parent, "calibrated clock").standard_normal())
     shares = np.array([1.0, 1.0, *[0.1] * (count - 2)])
+    shares[4:] *= np.array(info.distortion[4:]) != 0.0  # as radtan, which most programs read alone
     focal = errors_of(error.focal, draws[0])
     centre = errors_of(error.centre, draws[1])
     lens = errors_of(error.distortion, draws[2] * shares)

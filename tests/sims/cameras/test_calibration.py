@@ -15,6 +15,7 @@ from events import CameraAnnouncement, Image, PoseStamped, TransformStamped
 from runtime.testing import run_nodes, spec
 from sims.cameras import CameraSpec
 from sims.cameras.calibration import USUAL, Calibration, CalibrationError, announced
+from sims.cameras.optics import Lens
 from sims.cameras.spec import calibration, eyes
 from sims.computer_vision import FreeCamera
 
@@ -48,9 +49,18 @@ def test_errors_have_the_deviations_of_the_settings() -> None:
         assert values.std(axis=0) == pytest.approx(float(getattr(USUAL, name)), rel=0.1), name
         assert abs(values.mean(axis=0)).max() < 0.15 * float(getattr(USUAL, name))
     lens = np.array([each["distortion"] for each in errors]).std(axis=0)
-    assert lens == pytest.approx(3e-4 * np.array([1.0, 1.0, 0.1, 0.1, 0.1]), rel=0.1)
+    assert lens == pytest.approx(3e-4 * np.array([1.0, 1.0, 0.1, 0.1, 0.0]), rel=0.1)
     first, second = np.array([each["focal"] for each in errors]).T
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.15
+
+
+def test_k3_errs_where_the_lens_has_one() -> None:
+    lens = Lens(model="plumb_bob", coefficients=(-0.28, 0.07, 0.0, 0.0, 0.01))
+    for given, errs in ((lens, True), (None, False)):
+        camera = CameraSpec(name="c", intrinsics=(160.0, 160.0, 160.0, 120.0), lens=given)
+        true = calibration(camera)
+        said = announced(true, USUAL, np.random.default_rng([7]), "c")
+        assert (said.info.distortion[4] != true.info.distortion[4]) == errs
 
 
 def test_a_setting_changes_no_others_error_and_zero_changes_nothing() -> None:
