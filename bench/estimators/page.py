@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import statistics
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 import typer
 
-from bench.estimators.plan import FOLDER, Suite
+from bench.estimators.plan import EXACT, FOLDER, Suite
 from runtime.channels.wire import combined
 from runtime.errors import ConfigError
 from runtime.run.results import write
@@ -127,6 +128,33 @@ def cells(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Combination]]:
         cell = combine((scenario, name), name, [*group.values()], COLUMNS)
         found.setdefault(scenario, {})[name] = cell
     return found
+
+
+def worth(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
+    """Return what an exact calibration was worth, by scenario flown with both and estimator.
+
+    The error over the whole flight with the errors of calibration, divided by that without, of the
+    same seed: the median, and the range.
+    """
+    errors: dict[tuple[str, str, int], float] = {}
+    for job, row in in_order(plan, rows):
+        scenario, name = (text for _, text in job.settings)
+        error = row["estimators"].get(name, {}).get(RANKED)
+        if error is not None and job.repeat == 1:
+            errors[scenario, name, job.seed] = error
+    ratios: dict[str, dict[str, list[float]]] = {}
+    for (scenario, name, seed), error in errors.items():
+        if exact := errors.get((f"{scenario}{EXACT}", name, seed)):
+            ratios.setdefault(scenario, {}).setdefault(name, []).append(error / exact)
+    return {
+        scenario: {name: _times(values) for name, values in each.items()}
+        for scenario, each in ratios.items()
+    }
+
+
+def _times(ratios: Sequence[float]) -> str:
+    middle, least, most = (f"{f(ratios):.2g}" for f in (statistics.median, min, max))
+    return f"× {middle}" + f" ({least} to {most})" * (least != most)
 
 
 def repeating(plan: Plan, rows: Sequence[Row]) -> dict[str, str]:
@@ -274,6 +302,10 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
         verdict=verdict,
         short=short,
         repeats=repeating(plan, rows),
+        worth=worth(plan, rows),
+        errors=suite.calibration_errors,
+        both=[each for each in suite.scenarios if each.calibration == "both"],
+        exact=[each.name for each in suite.scenarios if each.calibration == "exact"],
         flights=flights(suite, plan),
         flaws=flaws(plan, rows),
         columns=COLUMNS,

@@ -17,6 +17,7 @@ from runtime.errors import CommandError, ConfigError, expect_known
 from runtime.tools.sweep import Plan, make_job, plan_of
 
 FOLDER = Path(__file__).parent
+EXACT = "_exact"  # ends the name of a scenario that is flown once more
 LEVELS = ("easy", "medium", "hard", "brutal")
 
 
@@ -28,12 +29,21 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         level: How hard it is.
         shows: What is in it, for the page.
         set: What differs from ``rig.toml``, as for ``--set``.
+        calibration: ``errs``: the suite's `calibration_errors` hold. ``exact``: they do not.
+            ``both``: they hold, and it is flown once more without them, with the same seeds, so
+            that the page says what exactness was worth.
     """
 
     name: str
     level: Literal["easy", "medium", "hard", "brutal"]
     shows: str
     set: tuple[str, ...] = ()
+    calibration: Literal["errs", "exact", "both"] = "errs"
+
+    @property
+    def exact(self) -> Scenario:
+        """The same with an exact calibration."""
+        return msgspec.structs.replace(self, name=f"{self.name}{EXACT}", calibration="exact")
 
 
 class Entrant(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,14 +79,21 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         rig: Path of the file of the vehicle with its sensors, in which the scenarios change
             something; in the file relative to it.
         thresholds: Of the evaluation: an estimator that misses one has failed.
+        calibration_errors: Settings of the rig's errors of calibration, as for ``--set``.
         scenarios: In the order of the page.
         estimators: In the order of the page.
     """
 
     rig: str
     thresholds: dict[str, float]
+    calibration_errors: tuple[str, ...] = ()
     scenarios: tuple[Scenario, ...]
     estimators: tuple[Entrant, ...]
+
+    def flown(self) -> list[Scenario]:
+        """Return the scenarios, each followed by its exact one if both are flown."""
+        pairs = ((s, s.exact) if s.calibration == "both" else (s,) for s in self.scenarios)
+        return [scenario for pair in pairs for scenario in pair]
 
     def only(self, scenarios: Sequence[str], estimators: Sequence[str]) -> Suite:
         """Return a part of the suite; an empty list of names stands for all.
@@ -125,7 +142,7 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
             (("scenario", scenario.name), ("estimator", entrant.name)),
             *(seed, folder, out, repeat),
         )
-        for scenario in suite.scenarios
+        for scenario in suite.flown()
         for seed in range(1, seeds + 1)
         for entrant in entrants
         for repeat in range(1, repeats + 1 if (scenario, seed) == (suite.scenarios[0], 1) else 2)
@@ -139,7 +156,8 @@ def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]
         table = tomllib.loads(Path(suite.rig).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{suite.rig}: expected a TOML file of a rig, found: {error}") from None
-    for change in (f"run.name={scenario.name}", *scenario.set):
+    errors = () if scenario.calibration == "exact" else suite.calibration_errors
+    for change in (f"run.name={scenario.name}", *scenario.set, *errors):
         override(table, change)
     table["nodes"] += [
         {"name": entrant.name, **entrant.node},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -107,8 +108,9 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
         f"Each camera takes about {_RATE:g} images a second, without noise, blur and what else is "
         "not geometry or time; the error of its depth is switched off, too."
     ]
-    specs: Sequence[Any] = getattr(spec.config, "cameras", ())
-    if any(camera.calibration_error for camera in specs):
+    lists = (getattr(spec.config, name, ()) for name in ("cameras", "lidars"))
+    sensors = (getattr(spec.config, "imu", None), *itertools.chain(*lists))
+    if any(getattr(sensor, "calibration_error", False) for sensor in sensors):
         notes.append("The errors of the announced calibrations, which are meant, are switched off.")
     kept = _run(_flight(table, folder), config)
     motion = Motion(kept.odometry)
@@ -155,6 +157,7 @@ def _alone(config: Config, spec: NodeSpec, folder: Path) -> dict[str, Any]:
     (table,) = (each for each in to_builtins(config)["nodes"] if each["name"] == spec.name)
     for key in ("inputs", "links", "barometer", "gnss", "magnetometer", "range_finders", "lidars"):
         table.pop(key, None)
+    table.get("imu", {}).pop("calibration_error", None)
     for camera in table.get("cameras", ()):
         for key in set(camera) - _KEPT:
             del camera[key]

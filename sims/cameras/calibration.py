@@ -7,22 +7,25 @@ hundredths of a degree between two eyes.
 
 from __future__ import annotations
 
-import math
-import zlib
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
+import sims.calibration
 from events import CameraAnnouncement, CameraInfo, Quaternion, Vector3
-from events.frames import multiply
 from runtime.units import Latency
+from sims.calibration import (
+    Error,
+    MountingError,
+    check_lists,
+    errors_of,
+    generator_of,
+    mounting_off,
+)
 
-_Error = Annotated[float, msgspec.Meta(ge=0.0)] | tuple[float, ...]
 
-
-class CalibrationError(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CalibrationError(MountingError, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the errors of a camera's announced calibration.
 
     A number is a standard deviation: each error is drawn once a run, from the run's seed, for each
@@ -33,17 +36,18 @@ class CalibrationError(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
         focal: Of fx and fy, pixels.
         centre: Of the principal point cx and cy, pixels.
         distortion: Of the coefficients k1 and k2; that of all others (p1, p2, k3, …) is a tenth
-            of it. A list has all coefficients of the lens's model.
+            of it, and none of k3 and beyond where these are 0, as they are then not calibrated.
+            A list has all coefficients of the lens's model.
         rotation: Of the mounting, about each axis of the optical frame, degrees.
         position: Of the mounting, along each axis of the body, metres.
         time: Of the time offset. All cameras of a vehicle share the draw, as they share a trigger.
     """
 
-    focal: _Error = 0.0
-    centre: _Error = 0.0
-    distortion: _Error = 0.0
-    rotation: _Error = 0.0
-    position: _Error = 0.0
+    focal: Error = 0.0
+    centre: Error = 0.0
+    distortion: Error = 0.0
+    rotation: Error = 0.0
+    position: Error = 0.0
     time: Latency = Latency(0)  # immutable
 
     @property
@@ -63,7 +67,8 @@ class CalibrationError(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 USUAL = CalibrationError(
-    # All of them: estimate.
+    # All of them: estimate. For comparison, the standard deviations with which OpenVINS' filter
+    # begins (ov_msckf/src/state/State.cpp): 1 px, 0.005, 0.057 degrees, 1 cm, 10 ms.
     focal=0.15, centre=0.15, distortion=3e-4, rotation=0.01, position=2e-4, time=Latency(0.0005),
 )  # fmt: skip
 """Errors of ``calibration_error = true``: a good calibration of a pair of cameras."""
@@ -89,16 +94,15 @@ def announced(
     """
     info = true.info
     count = len(info.distortion)
-    generator = _generator(parent, f"{name} calibration")
+    generator = generator_of(parent, f"{name} calibration")
     # All are drawn whatever is asked for: one setting changes no other's errors.
     draws = [generator.standard_normal(size) for size in (2, 2, count, 3, 3)]
-    late = float(error.time) * float(_generator(parent, "calibrated clock").standard_normal())
+    late = float(error.time) * float(generator_of(parent, "calibrated clock").standard_normal())
     shares = np.array([1.0, 1.0, *[0.1] * (count - 2)])
-    focal = _errors(error.focal, draws[0])
-    centre = _errors(error.centre, draws[1])
-    lens = _errors(error.distortion, draws[2] * shares)
-    turn = np.radians(_errors(error.rotation, draws[3]))
-    shift = _errors(error.position, draws[4])
+    shares[4:] *= np.array(info.distortion[4:]) != 0.0  # as radtan, which most programs read alone
+    focal = errors_of(error.focal, draws[0])
+    centre = errors_of(error.centre, draws[1])
+    lens = errors_of(error.distortion, draws[2] * shares)
     changed = msgspec.structs.replace(
         info,
         fx=info.fx + focal[0],
@@ -107,62 +111,27 @@ def announced(
         cy=info.cy + centre[1],
         distortion=tuple(k + e for k, e in zip(info.distortion, lens, strict=True)),
     )
-    x, y, z = (p + e for p, e in zip(true.position, shift, strict=True))
-    return Calibration(
-        changed if error.of_lens else info,
-        (x, y, z),
-        multiply(true.orientation, _quaternion(turn)) if any(turn) else true.orientation,
-        true.time_offset + late,
-    )
+    mounting = mounting_off(true.position, true.orientation, error, draws[3], draws[4])
+    return Calibration(changed if error.of_lens else info, *mounting, true.time_offset + late)
 
 
 def check(error: CalibrationError, coefficients: int, eyes: int) -> None:
     """Check the lengths of lists; raise a `ValueError` that names the setting."""
     sizes = {"focal": 2, "centre": 2, "distortion": coefficients, "rotation": 3, "position": 3}
-    for name, size in sizes.items():
-        values = getattr(error, name)
-        if isinstance(values, tuple) and len(values) != size * eyes:
-            raise ValueError(
-                f"calibration_error.{name}: expected a standard deviation, or a list of "
-                f"{size * eyes} errors, found a list of {len(values)}"
-            )
+    check_lists(error, {name: size * eyes for name, size in sizes.items()})
 
 
 def difference(said: CameraAnnouncement, true: Calibration) -> dict[str, Any]:
     """Return the true calibration behind an announcement, for a run's summary."""
+    return sims.calibration.difference(_facts(true), _facts(said))
+
+
+def _facts(known: CameraAnnouncement | Calibration) -> dict[str, Any]:
+    info = known.info
     return {
-        "true": {
-            "intrinsics": [true.info.fx, true.info.fy, true.info.cx, true.info.cy],
-            "distortion": list(true.info.distortion),
-            "position": list(true.position),
-            "orientation": list(true.orientation),
-            "time_offset": true.time_offset,
-        },
-        "announced": {
-            "intrinsics": [said.info.fx, said.info.fy, said.info.cx, said.info.cy],
-            "distortion": list(said.info.distortion),
-            "position": list(said.position),
-            "orientation": list(said.orientation),
-            "time_offset": said.time_offset,
-        },
+        "intrinsics": [info.fx, info.fy, info.cx, info.cy],
+        "distortion": list(info.distortion),
+        "position": list(known.position),
+        "orientation": list(known.orientation),
+        "time_offset": known.time_offset,
     }
-
-
-def _generator(parent: np.random.Generator, name: str) -> np.random.Generator:
-    """Return a generator of its own; the parent's state stays, and so do all other draws."""
-    entropy = parent.bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
-    return np.random.default_rng([*entropy, zlib.crc32(name.encode())])
-
-
-def _errors(given: float | tuple[float, ...], draws: npt.NDArray[np.float64]) -> list[float]:
-    if isinstance(given, tuple):
-        return list(given)
-    values: list[float] = (given * draws).tolist()
-    return values
-
-
-def _quaternion(turn: npt.NDArray[np.float64]) -> Quaternion:
-    """Return the rotation of a rotation vector (radians) as w, x, y, z."""
-    angle = float(np.linalg.norm(turn))
-    x, y, z = (turn * (math.sin(angle / 2.0) / angle)).tolist()
-    return math.cos(angle / 2.0), x, y, z

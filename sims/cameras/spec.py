@@ -30,6 +30,7 @@ from events.frames import (
 from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
+from sims.calibration import chosen
 from sims.cameras.calibration import USUAL, Calibration, CalibrationError
 from sims.cameras.calibration import check as check_calibration
 from sims.cameras.optics import AutoExposure, Intrinsics, Lens, intrinsics, noise_at, read_response
@@ -250,8 +251,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     @property
     def wrong(self) -> CalibrationError | None:
         """Errors of the announced calibration; `None` if it is exact."""
-        error = USUAL if self.calibration_error is True else self.calibration_error
-        return error if isinstance(error, CalibrationError) else None
+        return chosen(self.calibration_error, USUAL)
 
     @property
     def longest_exposure(self) -> float:

@@ -13,7 +13,9 @@ import numpy.typing as npt
 from events import ImuAnnouncement, Quaternion, Vector3
 from events.frames import cross, inverse, multiply, rotate, rotate_inverse, slerp
 from runtime.portable import sines
+from sims.calibration import check_lists, chosen
 from sims.presets import IMUS
+from sims.sensors.calibration import IMU_SIZES, USUAL_IMU, ImuCalibrationError
 from sims.sensors.sensor import Mount, Mounted, NonNegative, Place
 
 _BLOCK = 512  # samples per draw: a numpy call costs as much as a few hundred random numbers
@@ -71,6 +73,8 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
         vibration: Vibration by the rotors.
         sampling: ``instant``: a sample is the motion at its stamp. ``mean``: it is the mean since
             the sample before, as of IMUs that give delta angles and delta velocities.
+        calibration_error: Errors of what is announced: mounting, scale, misalignment; ``true`` for
+            those of a good calibration. The samples are what they are.
     """
 
     preset: Annotated[str | None, msgspec.Meta(extra={"presets": IMUS})] = None
@@ -95,6 +99,7 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
     accelerometer_resolution: NonNegative = 0.0
     vibration: Vibration = Vibration()
     sampling: Literal["instant", "mean"] = "instant"
+    calibration_error: ImuCalibrationError | bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,6 +107,18 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
             if len(getattr(self, field)) not in (0, 9):
                 found = len(getattr(self, field))
                 raise ValueError(f"{field}: expected 9 numbers, row by row, found {found}")
+        if self.wrong is not None:
+            check_lists(self.wrong, IMU_SIZES)
+
+    @property
+    def wrong(self) -> ImuCalibrationError | None:
+        """Errors of the announced calibration; `None` if it is exact, as an ideal IMU's is."""
+        return None if self.ideal else chosen(self.calibration_error, USUAL_IMU)
+
+    @property
+    def framed(self) -> bool:
+        """Whether the IMU has a frame of its own: its announced pose is not the body's."""
+        return self.mounted or (self.wrong is not None and self.wrong.of_mounting)
 
     @property
     def mounted(self) -> bool:
@@ -226,7 +243,7 @@ class ImuModel(Mounted[ImuParameters]):
             "accelerometer_matrix": accelerometer,
             "vibration": p.vibration.amplitude,
             "averaged": p.sampling == "mean",
-            "frame_id": self.source if p.mounted else self.place.parent_frame_id,
+            "frame_id": self.source if p.framed else self.place.parent_frame_id,
         }
 
     def _shake(self, rates: Vector3, force: Vector3, thrusts: Any) -> tuple[Vector3, Vector3]:

@@ -14,13 +14,15 @@ import numpy.typing as npt
 from events import LidarAnnouncement, LidarScan
 from events.frames import flip_yz, flip_yz_rotation
 from runtime import Node, Tick, Worker
+from sims.calibration import check_lists, chosen, generator_of
 from sims.cameras.optics import generator
 from sims.cameras.renderer import model_from_bytes
 from sims.cameras.rig import DrawnWorld
 from sims.cameras.stage import object_numbers
 from sims.presets import LIDARS
+from sims.sensors.calibration import LIDAR_SIZES, USUAL_LIDAR, LidarCalibrationError
 from sims.sensors.rays import Floats, Rays
-from sims.sensors.sensor import Mounted, Name, NonNegative, Positive, SensorSpec, generator_of
+from sims.sensors.sensor import Mounted, Name, NonNegative, Positive, SensorSpec
 from sims.vehicle import TIMESTEP_NS, VehicleMotion
 from sims.worlds import Dynamics
 
@@ -55,6 +57,8 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         min_intensity: What returns less light than this gives no point.
         full_range: Metres up to which a facing white surface has intensity 1; falling by the
             square.
+        calibration_error: Errors of the announced mounting; ``true`` for those of a good
+            calibration. The points are what they are.
     """
 
     name: Name
@@ -71,9 +75,12 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     dropout: Share = 0.0
     min_intensity: Share = 0.0
     full_range: Positive = 20.0
+    calibration_error: LidarCalibrationError | bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.wrong is not None:
+            check_lists(self.wrong, LIDAR_SIZES)
         first, last = self.azimuths
         low, high = self.elevations
         if not 0.0 < last - first <= 360.0:
@@ -91,6 +98,11 @@ class LidarSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=Tru
                 f"{self.name}: max_range: expected more than the {self.min_range:g} m of "
                 f"min_range, found {self.max_range:g} m"
             )
+
+    @property
+    def wrong(self) -> LidarCalibrationError | None:
+        """Errors of the announced mounting; `None` if it is exact."""
+        return chosen(self.calibration_error, USUAL_LIDAR)
 
 
 class Pattern(NamedTuple):

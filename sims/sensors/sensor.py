@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 from abc import ABC, abstractmethod
 from math import acos, asin, atan, cos, exp, radians, sin, sqrt, tan
 from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
@@ -158,12 +157,6 @@ class GaussMarkov:
         """Return the next values, shape (size,)."""
         self.value = self._keep * self.value + self._input * random.standard_normal(len(self.value))
         return self.value
-
-
-def generator_of(parent: np.random.Generator, name: str) -> np.random.Generator:
-    """Return a generator seeded by node and sensor name; the parent's state stays."""
-    entropy = parent.bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
-    return np.random.default_rng([*entropy, zlib.crc32(name.encode())])
 
 
 def _check_drift(drift: float, seconds: float) -> None:

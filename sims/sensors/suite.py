@@ -12,7 +12,9 @@ import mujoco
 from events import Announcement, Event, Imu, TransformStamped
 from events.frames import flip_yz, flip_yz_rotation
 from runtime import Node, Tick
+from sims.calibration import generator_of
 from sims.cameras.rig import DrawnWorld
+from sims.sensors.calibration import announced, difference
 from sims.sensors.imu import ImuModel, ImuParameters, Motion, mean_between, motion_at
 from sims.sensors.lidar import Lidar, LidarRig, LidarSpec
 from sims.sensors.rays import RangeFinder, RangeFinderSpec, Rays
@@ -27,7 +29,6 @@ from sims.sensors.sensor import (
     Place,
     Sensor,
     Truth,
-    generator_of,
 )
 from sims.vehicle import State, VehicleMotion
 from sims.world import Rate, SimulatorConfig
@@ -187,21 +188,32 @@ class SensorSuite:
     def announcements(self) -> Iterable[Announcement]:
         """Return the announcements of the sensors."""
         for sensor in (self.imu, *self.mounted):
-            yield sensor.announcement()
+            said = self._known(sensor)
+            if getattr(sensor.spec, "wrong", None) is not None:  # told once the run is over
+                self._node.note_truth(said.source, difference(said, sensor.announcement()))
+            yield said
 
     def transforms(self) -> Iterable[TransformStamped]:
-        """Return the pose of each sensor's frame in the body's, constant for the run."""
-        own = (self.imu,) if self.imu.spec.mounted else ()
+        """Return the announced pose of each sensor's frame in the body's, constant for the run."""
+        own = (self.imu,) if self.imu.spec.framed else ()
         for sensor in (*own, *self.mounted):
+            known = self._known(sensor)
             yield TransformStamped(
                 stamp=self._node.clock.now(),
                 source=sensor.source,
                 frame_id=self._frame_id,
                 child_frame_id=sensor.source,
-                translation=sensor.spec.position,
-                rotation=sensor.spec.rotation,
+                translation=known.position,
+                rotation=known.orientation,
                 static=True,
             )
+
+    def _known(self, sensor: Mounted[Any]) -> Any:
+        """Return the announcement of a sensor, with the errors of its calibration."""
+        true, error = sensor.announcement(), getattr(sensor.spec, "wrong", None)
+        if error is None:
+            return true
+        return announced(true, error, self._node.rng, sensor.source.partition("/")[2])
 
     def _measure(self, index: int, tick: Tick) -> None:
         sensor = self.sensors[index]

@@ -16,8 +16,18 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import astuple
 
+from events import CameraAnnouncement
 from events.base import Vector3
-from events.frames import flip_yz, flip_yz_rotation, from_rpy, multiply, normalize, rotate
+from events.frames import (
+    OPTICAL_TO_FRD,
+    flip_yz,
+    flip_yz_rotation,
+    from_rpy,
+    inverse,
+    multiply,
+    normalize,
+    rotate,
+)
 from runtime import Worker
 from runtime.host import Sibling
 from runtime.logs import NodeLogger
@@ -29,6 +39,7 @@ from sims.airsim.server.vehicles import ServedVehicle
 from sims.airsim.settings import DEFAULT_CAMERAS, default_mount
 from sims.airsim.wire import Pose
 from sims.cameras import GraphicsError
+from sims.cameras.optics import Intrinsics
 from sims.cameras.spec import CameraSpec, Pixels, camera_info, eyes
 from sims.cameras.stage import RendererName
 from sims.world import SharedWorld
@@ -83,16 +94,26 @@ class ServedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Camera(msgspec.Struct):
-    """Camera as known to clients."""
+    """Camera of clients: its true calibration, and the one that they are told."""
 
     body: int  # number of the body that carries it
     mount: Mount  # where on it
     # How it takes images, by their type; those of other types as type -1.
     specs: dict[int, CameraSpec]
+    errs: bool = False  # whether its announced calibration has errors
+    told_mount: Mount | None = None  # in place of `mount`
+    told_intrinsics: Intrinsics | None = None  # in place of those of `specs`
 
     def eye(self, image_type: int) -> Eye:
         """Return the eye for images of a type."""
         return Eye(self.body, self.mount, self.specs.get(image_type, self.specs[-1]))
+
+    def told(self, image_type: int) -> Eye:
+        """Return the eye for images of a type with the calibration that clients are told."""
+        body, mount, spec = self.eye(image_type)
+        if self.told_intrinsics is not None:
+            spec = msgspec.structs.replace(spec, intrinsics=self.told_intrinsics)
+        return Eye(body, self.told_mount or mount, spec)
 
 
 class Cameras:
@@ -142,6 +163,15 @@ class Cameras:
             raise RpcError(f"expected a camera of {vehicle.name} ({names}), found '{name}'")
         return named[name]
 
+    def announced(self, said: CameraAnnouncement) -> None:
+        """Take note of the announced calibration of a camera, if it has errors."""
+        vehicle, _, name = said.source.partition("/")
+        camera = self._named.get(vehicle, {}).get(name)
+        if camera is not None and camera.errs:
+            turn = multiply(said.orientation, inverse(OPTICAL_TO_FRD))
+            camera.told_mount = said.position, turn
+            camera.told_intrinsics = said.info.fx, said.info.fy, said.info.cx, said.info.cy
+
     def pose(self, vehicle: ServedVehicle, eye: Eye, qpos: npt.NDArray[np.float64]) -> Pose:
         """Return a camera's pose in the vehicle's local frame, x forward, in a state (nq,)."""
         model = self._model
@@ -154,8 +184,8 @@ class Cameras:
 
     @rpc("simGetCameraInfo", cosys=2)
     def info(self, camera: str, vehicle: ServedVehicle, external: bool = False) -> wire.CameraInfo:
-        """Return true pose, field of view and projection of a camera's scene images."""
-        eye = self.find(vehicle, camera, external).eye(0)
+        """Return pose, field of view and projection of a camera's scene images, as announced."""
+        eye = self.find(vehicle, camera, external).told(0)
         info = camera_info(eye.spec)
         tangent, longer = info.width / (2.0 * info.fx), max(info.width, info.height)
         across, down = (longer / (side * tangent) for side in (info.width, info.height))
@@ -177,7 +207,7 @@ class Cameras:
         if not (all(abs(each) <= FARTHEST for each in (*position, *turn)) and any(turn)):
             raise RpcError(f"expected a rotation, and numbers up to {FARTHEST:g}, found {pose}")
         found = self.find(vehicle, camera, external)
-        found.mount = position, normalize(turn)
+        found.mount, found.told_mount = (position, normalize(turn)), None
 
     @rpc("simSetCameraFov", cosys=3)
     def set_fov(
@@ -187,6 +217,7 @@ class Cameras:
         if not 1.0 <= degrees <= 170.0:
             raise RpcError(f"expected a field of view of 1 to 170 degrees, found {degrees}")
         found = self.find(vehicle, camera, external)
+        found.told_intrinsics = None
         found.specs = {
             kind: msgspec.structs.replace(spec, fov=degrees, intrinsics=None)
             for kind, spec in found.specs.items()
@@ -247,7 +278,9 @@ def camera_of_file(spec: CameraSpec, body: int) -> Camera:
     if spec.lens is not None:
         info = camera_info(spec)
         plain = msgspec.structs.replace(plain, intrinsics=(info.fx, info.fy, info.cx, info.cy))
-    return Camera(body, _mount(spec.position, spec.orientation), {-1: plain})
+    return Camera(
+        body, _mount(spec.position, spec.orientation), {-1: plain}, spec.wrong is not None
+    )
 
 
 def _of_entry(entry: ServedCamera, body: int, free: bool) -> Camera:
@@ -325,7 +358,7 @@ class Images:
         vehicle: ServedVehicle,
         external: bool = False,
     ) -> Awaitable[msgspec.Raw]:
-        """Return images of a single instant: a common stamp, and true camera poses."""
+        """Return images of a single instant: a common stamp, and the cameras' poses then."""
         return self.take(requests, vehicle, caller.flavour, external=external)
 
     @rpc("simGetImage")
@@ -392,7 +425,9 @@ class Images:
             form = "float" if each.pixels_as_float else form
             exposure.wanted.append(Wanted(eye, ImageType(each.image_type), form))
             if each.camera_name not in poses:
-                poses[each.camera_name] = self._cameras.pose(vehicle, eye, qpos)
+                poses[each.camera_name] = self._cameras.pose(
+                    vehicle, camera.told(each.image_type), qpos
+                )
             pose = poses[each.camera_name]
             width, height = eye.spec.width, eye.spec.height
             length += width * height * (5 if form == "float" else 3)

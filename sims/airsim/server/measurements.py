@@ -294,11 +294,11 @@ class Estimates:
         )
 
     def _mount(self, estimator: ScriptEstimator) -> tuple[Vector3, Quaternion] | None:
-        """Return the mount of the estimator's camera; `None` for poses of the vehicle."""
+        """Return the announced mount of its camera; `None` for poses of the vehicle."""
         vehicle = self._vehicles.find(estimator.vehicle)
         if not estimator.camera:
             return None
-        return self._cameras.find(vehicle, estimator.camera).mount
+        return self._cameras.find(vehicle, estimator.camera).told(0).mount
 
 
 def _checked(pose: Pose) -> tuple[Vector3, Quaternion]:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
-from events import Announcement, Command, PoseEstimate, Setpoint, VehicleEvent
+from events import Announcement, CameraAnnouncement, Command, PoseEstimate, Setpoint, VehicleEvent
 from runtime import Duration, NodeConfig, Output, Tick, every, on
 from runtime.host import Stepping
 from runtime.node import Node
@@ -142,7 +142,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         ]
         rates += [each.config.rate for each in self.siblings(FreeCamera)]
         frame_rate = max(rates, default=FRAMES_WITHOUT_CAMERAS)
-        self.vehicles = vehicles
+        self.vehicles, self.cameras = vehicles, cameras
         self.collisions = Collisions(vehicles, objects.identify)
         self.sensors = Sensors(vehicles, world, config.sensor_names, config.lidar_frame)
         self.recording = Recording(config.recording, self, vehicles, images)
@@ -267,6 +267,9 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
     def on_announcement(self, announcement: Announcement) -> None:
         """Take note of the vehicles' sensors."""
         self.sensors.announced(announcement)
+        if isinstance(announcement, CameraAnnouncement):
+            self.cameras.announced(announcement)
+            self.vehicles.announced(announcement)
 
     @on(*SAMPLES)
     def samples(self, event: Any) -> None:

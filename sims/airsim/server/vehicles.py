@@ -14,14 +14,16 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Collision, Vector3, VehicleEvent
-from events.frames import to_geodetic
+from events import CameraAnnouncement, Collision, Vector3, VehicleEvent
+from events.frames import OPTICAL_TO_FRD, to_geodetic
+from events.geometry import pose_matrix
 from runtime.node import Node
 from sims.airsim import wire
 from sims.airsim.server.methods import Named, RpcError, rpc
 from sims.airsim.wire import Pose, Quaternionr, Vector3r
 from sims.cameras import pose_to_qpos
 from sims.cameras.spec import CameraSpec, camera_info, eyes
+from sims.mounting import EurocMatrix, angles_of
 from sims.sensors.sensor import pressure_at, temperature_at
 from sims.vehicle import Physics, State
 from sims.vehicle.physics import Contact
@@ -183,6 +185,11 @@ class Vehicles(dict[str, ServedVehicle]):
     def __init__(self, world: SharedWorld, default: str, settings: str, node: Node[Any]) -> None:
         super().__init__()
         self._world, self._default, self._settings, self._node = world, default, settings, node
+        self._cameras: dict[str, CameraAnnouncement] = {}
+
+    def announced(self, camera: CameraAnnouncement) -> None:
+        """Take note of the announced calibration of a vehicle's camera."""
+        self._cameras[camera.source] = camera
 
     def find(self, name: str) -> ServedVehicle:
         """Return a vehicle of either kind by name, or raise `RpcError`."""
@@ -311,7 +318,12 @@ class Vehicles(dict[str, ServedVehicle]):
             vehicles[name] = {
                 "VehicleType": "SimpleFlight" if flies else "ComputerVision",
                 **dict(zip("XYZ", vehicle.origin, strict=True)),
-                "Cameras": {camera.name: _described_camera(camera) for camera in cameras},
+                "Cameras": {
+                    camera.name: _described_camera(
+                        camera, self._cameras.get(f"{name}/{camera.name}")
+                    )
+                    for camera in cameras
+                },
             }
         types = {vehicle["VehicleType"] for vehicle in vehicles.values()}
         mode = "ComputerVision" if types == {"ComputerVision"} else "Multirotor"
@@ -376,13 +388,17 @@ class Collisions:
         )
 
 
-def _described_camera(camera: CameraSpec) -> dict[str, Any]:
-    info = camera_info(camera)
+def _described_camera(camera: CameraSpec, said: CameraAnnouncement | None) -> dict[str, Any]:
+    info, position, angles = camera_info(camera), camera.position, camera.orientation
+    if camera.wrong is not None and said is not None:
+        matrix = pose_matrix(said.position, said.orientation)
+        data = EurocMatrix(data=tuple(matrix.ravel().tolist()))
+        info, (position, angles) = said.info, angles_of(data, OPTICAL_TO_FRD)
     fov = math.degrees(2 * math.atan(info.width / (2 * info.fx)))
     size = {"Width": info.width, "Height": info.height, "FOV_Degrees": fov}
     return {
-        **dict(zip("XYZ", camera.position, strict=True)),
-        **dict(zip(("Roll", "Pitch", "Yaw"), camera.orientation, strict=True)),
+        **dict(zip("XYZ", position, strict=True)),
+        **dict(zip(("Roll", "Pitch", "Yaw"), angles, strict=True)),
         "CaptureSettings": [{"ImageType": type_, **size} for type_ in range(8)],
     }
 

@@ -81,8 +81,10 @@ def test_the_projects_own_suite_is_right(monkeypatch: pytest.MonkeyPatch) -> Non
     suite = read_suite()
     monkeypatch.setattr(Entrant, "installed", lambda *_: True)
     plan = make_plan(suite, out=Path("out"), seeds=3, repeats=2)
-    assert len(plan.jobs) == (3 * len(suite.scenarios) + 1) * len(suite.estimators)
-    assert len({job.flight for job in plan.jobs}) == 3 * len(suite.scenarios)
+    flown = suite.flown()
+    assert [s.name for s in flown if s.calibration == "exact"] == ["hall", "evening_exact"]
+    assert len(plan.jobs) == (3 * len(flown) + 1) * len(suite.estimators)
+    assert len({job.flight for job in plan.jobs}) == 3 * len(flown)
     levels = [LEVELS.index(each.level) for each in suite.scenarios]
     assert levels == sorted(levels)
     assert {*levels} == {*range(len(LEVELS))}
@@ -171,6 +173,43 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
     assert page.count("- bad: its worker died") == 2
     page = page_of(suite, tmp_path, once)
     assert "**failed** 1 of 2" in line_of(page, "bad")
+
+
+def both(path: Path) -> Suite:
+    """Return the small suite, whose quick scenario is flown with and without an error."""
+    text = SMALL.replace("set =", 'calibration = "both"\nset =')
+    errors = 'calibration_errors = ["drone.imu.calibration_error=true"]\n'
+    path.write_text(text.replace("\n[[", f"{errors}\n[[", 1), encoding="utf-8")
+    return read_suite(path)
+
+
+def test_calibrations_err_in_all_scenarios_that_do_not_say_exact(small: Path) -> None:
+    plan = make_plan(both(small), out=Path("out"), seeds=2, repeats=1)
+    errs = {}
+    for job in plan.jobs:
+        (drone,) = (n for n in tomllib.loads(job.text)["nodes"] if n["name"] == "drone")
+        errs[dict(job.settings)["scenario"], job.seed] = drone["imu"]["calibration_error"]
+    names = ("slow", True), ("quick", True), ("quick_exact", False)
+    assert errs == {(name, seed): wrong for name, wrong in names for seed in (1, 2)}
+
+
+@pytest.mark.slow
+def test_a_column_says_what_an_exact_calibration_was_worth(small: Path, tmp_path: Path) -> None:
+    """The median over the seeds of errors divided by those of the same seed's exact flight."""
+    suite = both(small)
+    plan = make_plan(suite, out=tmp_path / "out", seeds=3, repeats=1)
+    rows: list[Row] = []
+    for job in plan.jobs:
+        scenario, name = (text for _, text in job.settings)
+        error = 0.1 if scenario.endswith("_exact") else 0.1 * job.seed**2
+        figures = {} if name == "bad" else {"flight_ate_percent": error}
+        rows.append(crashed(job, "") | {"estimators": {name: figures}})
+    write_page(suite, plan, rows, tmp_path / "SUITE.md", "runtime suite")
+    page = (tmp_path / "SUITE.md").read_text(encoding="utf-8")
+    assert line_of(page, "estimator").endswith("| quick: errs / exact |")
+    assert line_of(page, "good").endswith("| × 4 (1 to 9) |")
+    assert line_of(page, "bad").endswith("|  |")
+    assert "## quick_exact" not in page
 
 
 @pytest.mark.slow

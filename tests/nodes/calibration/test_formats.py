@@ -28,6 +28,7 @@ from nodes.data.dataset.recording import Rig
 from runtime.config.reading import parse
 from runtime.run.execute import execute
 from runtime.summary import plain
+from sims.sensors import calibration
 from tests.nodes.calibration.samples import IMU, LENSES, camera, stereo
 
 SAYS = {
@@ -252,6 +253,14 @@ def test_what_a_calibration_says_of_an_imu_undoes_its_errors(
     s1, s2, s3, s4, s5, s6 = bias["calib_accel_bias"][3:]
     undone = (np.eye(3) + np.array([[s1, 0, 0], [s2, s4, 0], [s3, s5, s6]])) @ lower
     np.testing.assert_allclose(undone, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [*FORMATS])
+def test_every_format_holds_the_announced_imu_of_a_usual_error(name: str) -> None:
+    """In words of its own, or in a remark."""
+    said = calibration.announced(IMU, calibration.USUAL_IMU, np.random.default_rng([1]), "imu")
+    exact, errs = (msgspec.structs.replace(stereo(), imu=imu) for imu in (IMU, said))
+    assert write_files(exact, name) != write_files(errs, name)
 
 
 def test_errors_of_an_imu_without_a_word_are_a_comment_or_refused() -> None:

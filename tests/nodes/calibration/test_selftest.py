@@ -83,6 +83,16 @@ def test_a_true_rig_passes(camera: dict[str, Any], tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
+def test_errors_of_calibration_are_meant(tmp_path: Path) -> None:
+    wrong = {"calibration_error": True}
+    sensors = {"imu": wrong, "lidars": [{"name": "lidar"} | wrong], "cameras": [CAMERA | wrong]}
+    result = proven({"type": "Multirotor"} | sensors, tmp_path)
+    assert missed(result) == {}
+    assert any("which are meant, are switched off" in note for note in result.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_free_camera_passes_without_an_imu(tmp_path: Path) -> None:
     node = {"type": f"{FreeCamera.__module__}:FreeCamera", "cameras": [CAMERA]}
     result = proven(node, tmp_path)

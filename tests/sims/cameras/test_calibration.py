@@ -15,6 +15,7 @@ from events import CameraAnnouncement, Image, PoseStamped, TransformStamped
 from runtime.testing import run_nodes, spec
 from sims.cameras import CameraSpec
 from sims.cameras.calibration import USUAL, Calibration, CalibrationError, announced
+from sims.cameras.optics import Lens
 from sims.cameras.spec import calibration, eyes
 from sims.computer_vision import FreeCamera
 
@@ -48,9 +49,18 @@ def test_errors_have_the_deviations_of_the_settings() -> None:
         assert values.std(axis=0) == pytest.approx(float(getattr(USUAL, name)), rel=0.1), name
         assert abs(values.mean(axis=0)).max() < 0.15 * float(getattr(USUAL, name))
     lens = np.array([each["distortion"] for each in errors]).std(axis=0)
-    assert lens == pytest.approx(3e-4 * np.array([1.0, 1.0, 0.1, 0.1, 0.1]), rel=0.1)
+    assert lens == pytest.approx(3e-4 * np.array([1.0, 1.0, 0.1, 0.1, 0.0]), rel=0.1)
     first, second = np.array([each["focal"] for each in errors]).T
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.15
+
+
+def test_k3_errs_where_the_lens_has_one() -> None:
+    lens = Lens(model="plumb_bob", coefficients=(-0.28, 0.07, 0.0, 0.0, 0.01))
+    for given, errs in ((lens, True), (None, False)):
+        camera = CameraSpec(name="c", intrinsics=(160.0, 160.0, 160.0, 120.0), lens=given)
+        true = calibration(camera)
+        said = announced(true, USUAL, np.random.default_rng([7]), "c")
+        assert (said.info.distortion[4] != true.info.distortion[4]) == errs
 
 
 def test_a_setting_changes_no_others_error_and_zero_changes_nothing() -> None:
@@ -62,6 +72,14 @@ def test_a_setting_changes_no_others_error_and_zero_changes_nothing() -> None:
     assert drawn(USUAL, 7).info != drawn(USUAL, 8).info
     assert drawn(USUAL, 7).info != drawn(USUAL, 7, name="d").info
     assert drawn(USUAL, 7).time_offset == drawn(USUAL, 7, name="d").time_offset
+
+
+def test_the_draws_of_a_name_and_a_seed_stay_what_they_are() -> None:
+    errors = off(drawn(USUAL, 7))
+    assert errors["focal"] == pytest.approx([0.07171000241, 0.19338608059])
+    assert errors["position"] == pytest.approx(
+        [-1.629537e-05, 1.489699e-04, 3.310187e-05], rel=1e-5
+    )
 
 
 def test_lists_are_the_errors_themselves_the_left_eyes_first() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -98,6 +99,36 @@ def test_default_names_are_always_there_and_given_ones_are_those_given(
     assert len({id(found[name]) for name in own | entries}) == len(own | entries)
     unnamed = len({default_mount(name, False) for name in set(found) - own - entries})
     assert len({id(camera) for camera in found.values()}) <= len(own | entries) + unnamed
+
+
+@pytest.mark.slow
+def test_clients_are_told_the_announced_calibration(tiny_world: str) -> None:
+    found: dict[str, Any] = {}
+
+    def script(call: Caller) -> None:
+        found["front"] = info(call, "front")
+        request = [{"camera_name": "front", "image_type": 0, "compress": False}]
+        (found["image"],) = call("simGetImages", request, "", False)
+        settings = json.loads(call("getSettingsString"))
+        found["settings"] = settings["Vehicles"]["drone"]["Cameras"]["front"]
+        call("simSetCameraPose", "front", {"position": {"x_val": 1.0}}, "", False)
+        found["moved"] = info(call, "front")
+
+    error = {"position": [0.0, 0.2, 0.0], "rotation": [0.0, 10.0, 0.0], "focal": [8.0, 8.0]}
+    camera = {"name": "front", "width": 64, "height": 48, "images": ["grey"]}
+    camera |= {"intrinsics": [32.0, 32.0, 31.5, 23.5], "calibration_error": error}
+    with_script(script, [drone(world=tiny_world, cameras=[camera], camera_processes=1)])
+    fov = 2.0 * math.degrees(math.atan(32.0 / 40.0))
+    place = vector(found["front"]["pose"]["position"])
+    assert place == pytest.approx((0.15, 0.2, 0.0), abs=2e-3)
+    assert found["front"]["fov"] == pytest.approx(fov)
+    half = math.radians(10.0) / 2.0  # about the optical y axis: down
+    assert found["front"]["pose"]["orientation"]["z_val"] == pytest.approx(math.sin(half))
+    assert vector(found["image"]["camera_position"]) == pytest.approx(place)
+    assert found["settings"]["Y"] == pytest.approx(0.2)
+    assert found["settings"]["Yaw"] == pytest.approx(10.0)
+    assert found["settings"]["CaptureSettings"][0]["FOV_Degrees"] == pytest.approx(fov)
+    assert vector(found["moved"]["pose"]["position"]) == pytest.approx((1.0, 0.0, 0.0), abs=2e-3)
 
 
 @pytest.mark.slow
