@@ -460,6 +460,7 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         self.method = f"ORB-SLAM3 ({mode.replace('_', ', ')})"
         self.scale_free = mode == "monocular"
         self.read(_FRAMES[mode])
+        self._slam: Any = None
 
     def check(self) -> Iterable[str]:
         """Return the errors: no camera, an IMU on another body, or no vocabulary."""
@@ -503,6 +504,8 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
 
     async def on_end(self) -> None:
         """Send the trajectory after loop closures and other corrections, if it can be saved."""
+        if self._slam is None:  # another node failed to start
+            return
         try:
             self.publish_trajectory(*await self._slam.call_for(0.0, OrbSlam3Process.trajectory))
         except RuntimeError as error:  # of its library: what it said in flight is judged
