@@ -144,7 +144,8 @@ class ImuAnnouncement(Announcement):
         accelerometer_range: Greatest acceleration, m/s²; 0 is no limit.
         gyroscope_resolution: Step, rad/s; 0 is none.
         accelerometer_resolution: Step, m/s²; 0 is none.
-        vibration: Amplitude of the rotors' vibration at full thrust, m/s²; 0 is none.
+        vibration: Amplitude of the rotors' vibration at full thrust, m/s², its noise as at half of
+            it included; 0 is none.
         averaged: True if a measurement is the mean since the one before, as of delta angles and
             delta velocities; False if it is that of its stamp.
         parent_frame_id: Frame that it is mounted on.

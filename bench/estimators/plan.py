@@ -157,7 +157,7 @@ def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]
     except (OSError, ValueError) as error:
         raise ConfigError(f"{suite.rig}: expected a TOML file of a rig, found: {error}") from None
     errors = () if scenario.calibration == "exact" else suite.calibration_errors
-    for change in (f"run.name={scenario.name}", *scenario.set, *errors):
+    for change in (f"run.name={scenario.name}", *errors, *scenario.set):
         override(table, change)
     table["nodes"] += [
         {"name": entrant.name, **entrant.node},

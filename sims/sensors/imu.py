@@ -12,35 +12,16 @@ import numpy.typing as npt
 
 from events import ImuAnnouncement, Quaternion, Vector3
 from events.frames import cross, inverse, multiply, rotate, rotate_inverse, slerp
-from runtime.portable import sines
+from runtime.units import Duration
 from sims.calibration import check_lists, chosen
 from sims.presets import IMUS
 from sims.sensors.calibration import IMU_SIZES, USUAL_IMU, ImuCalibrationError
-from sims.sensors.sensor import Mount, Mounted, NonNegative, Place
+from sims.sensors.sensor import GaussMarkov, Mount, Mounted, NonNegative, Place, check_drift
+from sims.sensors.vibration import Vibration, VibrationModel
 
 _BLOCK = 512  # samples per draw: a numpy call costs as much as a few hundred random numbers
 
 Floats = npt.NDArray[np.float64]
-
-
-class Vibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Vibration of the body by rotors out of balance, at multiples of their true speeds.
-
-    A rotor's force grows with the square of its speed, as its thrust does; it turns in the plane of
-    the rotors at odd multiples, and acts along their axis at even ones. Above half of the IMU's
-    rate it is seen at another frequency, as with a real IMU without a filter.
-
-    Attributes:
-        amplitude: Of the acceleration of each rotor's first harmonic at full thrust, m/s².
-        angular_amplitude: Of the angular velocity there, rad/s.
-        rotor_speed: Speed of a rotor at full thrust, revolutions per second.
-        harmonics: Strength of each multiple of the speed, relative to `amplitude`.
-    """
-
-    amplitude: NonNegative = 0.0
-    angular_amplitude: NonNegative = 0.0
-    rotor_speed: NonNegative = 130.0
-    harmonics: tuple[NonNegative, ...] = (1.0, 0.5)
 
 
 class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -59,6 +40,10 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
         ideal: No errors at all, whatever the other settings say of them.
         gyroscope_turn_on_bias: Standard deviation of the bias at the start, rad/s.
         accelerometer_turn_on_bias: Standard deviation of the bias at the start, m/s².
+        gyroscope_bias_instability: Standard deviation of a part of the bias that comes and goes, a
+            first-order Gauss-Markov process, rad/s (IEEE Std 952-1997, annex B).
+        accelerometer_bias_instability: The same of the accelerometer, m/s².
+        bias_instability_time: Time constant of both.
         gyroscope_scale_error: Standard deviation of each axis' relative error of scale.
         accelerometer_scale_error: Standard deviation of each axis' relative error of scale.
         gyroscope_misalignment: Standard deviation of the axes' small angles, rad.
@@ -70,7 +55,7 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
         accelerometer_range: Greatest acceleration that it shows, m/s²; 0 is no limit.
         gyroscope_resolution: Step of the angular velocity, rad/s; 0 is none.
         accelerometer_resolution: Step of the acceleration, m/s²; 0 is none.
-        vibration: Vibration by the rotors.
+        vibration: Vibration by the rotors; none at rest.
         sampling: ``instant``: a sample is the motion at its stamp. ``mean``: it is the mean since
             the sample before, as of IMUs that give delta angles and delta velocities.
         calibration_error: Errors of what is announced: mounting, scale, misalignment; ``true`` for
@@ -86,6 +71,9 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
     ideal: bool = False
     gyroscope_turn_on_bias: NonNegative = 0.0
     accelerometer_turn_on_bias: NonNegative = 0.0
+    gyroscope_bias_instability: NonNegative = 0.0
+    accelerometer_bias_instability: NonNegative = 0.0
+    bias_instability_time: Duration = Duration(100.0)  # immutable
     gyroscope_scale_error: NonNegative = 0.0
     accelerometer_scale_error: NonNegative = 0.0
     gyroscope_misalignment: NonNegative = 0.0
@@ -107,6 +95,8 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
             if len(getattr(self, field)) not in (0, 9):
                 found = len(getattr(self, field))
                 raise ValueError(f"{field}: expected 9 numbers, row by row, found {found}")
+        if self.gyroscope_bias_instability or self.accelerometer_bias_instability:
+            check_drift(1.0, self.bias_instability_time, "bias_instability_time")
         if self.wrong is not None:
             check_lists(self.wrong, IMU_SIZES)
 
@@ -141,8 +131,13 @@ class ImuNoise:
         rate: float,
         generator: np.random.Generator,
         bias: Floats | None = None,  # bias at the start: rad/s, then m/s², shape (6,)
+        slow: np.random.Generator | None = None,  # of the bias instability; none without
     ) -> None:
         p = parameters
+        parts = p.gyroscope_bias_instability, p.accelerometer_bias_instability
+        self._instability = np.repeat(parts, 3)
+        self._process = GaussMarkov(1.0, float(p.bias_instability_time), 1.0 / rate, 6)
+        self._slow = slow
         densities = p.gyroscope_noise_density, p.accelerometer_noise_density
         walks = p.gyroscope_random_walk, p.accelerometer_random_walk
         root = sqrt(1.0 / rate)
@@ -167,7 +162,11 @@ class ImuNoise:
         numbers = self._generator.standard_normal((_BLOCK, 12))
         bias = self._bias + np.cumsum(numbers[:, 6:] * self._step, axis=0)
         self._bias = bias[-1]
-        self._errors = (numbers[:, :6] * self._white + bias).tolist()
+        errors = numbers[:, :6] * self._white + bias
+        if self._slow is not None:
+            for row in errors:
+                row += self._instability * self._process.step(self._slow)
+        self._errors = errors.tolist()
         self._next = 0
 
 
@@ -208,23 +207,26 @@ class ImuModel(Mounted[ImuParameters]):
             )
         ]
         turn_on = np.repeat([p.gyroscope_turn_on_bias, p.accelerometer_turn_on_bias], 3)
-        self._noise = ImuNoise(p, rate, noise, turn_on * constants.standard_normal(6))
-        self._phases = constants.uniform(0.0, 2.0 * math.pi, 4)
+        bias = turn_on * constants.standard_normal(6)
+        self._vibration = VibrationModel(
+            p.vibration, rate, p.sampling == "mean", inverse(p.rotation), constants
+        )
+        unstable = p.gyroscope_bias_instability or p.accelerometer_bias_instability
+        slow = np.random.default_rng(constants.integers(2**63)) if unstable else None
+        self._noise = ImuNoise(p, rate, noise, bias, slow)
         self._limits = [
             (p.gyroscope_range, p.gyroscope_resolution),
             (p.accelerometer_range, p.accelerometer_resolution),
         ]
         self._linear = not p.g_sensitivity and all(np.array_equal(m, _EYE) for m in self.matrices)
-        self._shaken = bool(p.vibration.amplitude or p.vibration.angular_amplitude)
-        self._from_body = inverse(p.rotation)
 
     def measure(
         self, angular_velocity: Vector3, specific_force: Vector3, thrusts: Any
     ) -> tuple[Vector3, Vector3]:
         """Return the next sample, of true rad/s, m/s² in its frame, and rotors' thrusts, 0 to 1."""
         rates, force = angular_velocity, specific_force
-        if self._shaken:
-            rates, force = self._shake(rates, force, thrusts)
+        if self._vibration:
+            rates, force = self._vibration.add(rates, force, thrusts)
         if not self._linear:
             gyroscope, accelerometer = self.matrices
             # Not by matrix products, whose last bits are the processor's.
@@ -241,32 +243,10 @@ class ImuModel(Mounted[ImuParameters]):
             "rate": self._rate,
             "gyroscope_matrix": gyroscope,
             "accelerometer_matrix": accelerometer,
-            "vibration": p.vibration.amplitude,
+            "vibration": p.vibration.announced(self._rate),
             "averaged": p.sampling == "mean",
             "frame_id": self.source if p.framed else self.place.parent_frame_id,
         }
-
-    def _shake(self, rates: Vector3, force: Vector3, thrusts: Any) -> tuple[Vector3, Vector3]:
-        vibration = self.spec.vibration
-        share = np.clip(np.asarray(thrusts, dtype=np.float64), 0.0, None)
-        speeds = vibration.rotor_speed * np.sqrt(share)
-        self._phases = (self._phases + 2.0 * math.pi * speeds / self._rate) % (2.0 * math.pi)
-        total = np.zeros(3)
-        for index, strength in enumerate(vibration.harmonics, start=1):
-            weight = strength * share
-            if self.spec.sampling == "mean":
-                turns = np.maximum(math.pi * index * speeds / self._rate, 1e-9)
-                weight = weight * sines(turns) / turns
-            phases = (index * self._phases).tolist()
-            cosine = sum(w * math.cos(phase) for w, phase in zip(weight, phases, strict=True))
-            sine = sum(w * math.sin(phase) for w, phase in zip(weight, phases, strict=True))
-            total += np.array((cosine, sine, 0.0) if index % 2 else (0.0, 0.0, cosine))
-        x, y, z = rotate(self._from_body, _vector(total))
-        a, b = vibration.angular_amplitude, vibration.amplitude
-        return (
-            (rates[0] + a * x, rates[1] + a * y, rates[2] + a * z),
-            (force[0] + b * x, force[1] + b * y, force[2] + b * z),
-        )
 
 
 class Motion(msgspec.Struct, frozen=True, gc=False):

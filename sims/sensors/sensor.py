@@ -159,9 +159,10 @@ class GaussMarkov:
         return self.value
 
 
-def _check_drift(drift: float, seconds: float) -> None:
+def check_drift(drift: float, seconds: float, setting: str = "drift_time") -> None:
+    """Raise a `ValueError` for a drift without a time constant."""
     if drift and not seconds:
-        raise ValueError("drift_time: expected more than 0 s with a drift, found 0 s")
+        raise ValueError(f"{setting}: expected more than 0 s with a drift, found 0 s")
 
 
 _SEA_LEVEL = 101325.0
@@ -188,7 +189,7 @@ class BarometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_drift(self.drift, self.drift_time)
+        check_drift(self.drift, self.drift_time)
 
 
 def pressure_at(altitude: float) -> float:
@@ -349,7 +350,7 @@ class GnssSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_drift(self.horizontal_drift or self.vertical_drift, self.drift_time)
+        check_drift(self.horizontal_drift or self.vertical_drift, self.drift_time)
 
 
 class Gnss(Sensor[GnssSpec]):

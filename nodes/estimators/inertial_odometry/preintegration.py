@@ -23,6 +23,7 @@ from nodes.estimators.rig import cross
 
 Floats = npt.NDArray[np.float64]
 
+_TURNED = 0.03  # vibration of the angular velocity by that of the acceleration, rad/s per m/s²
 _GAP = 3.0  # sampling intervals; the motion in a longer gap between samples is unknown
 _UNKNOWN = np.array([1.0, 5.0])  # standard deviations then: of rates (rad/s), acceleration
 
@@ -47,12 +48,12 @@ class ImuModel:
         # The IMU in the frame of its parent, shape (4, 4).
         self.pose = pose_matrix(imu.position, imu.orientation)
         self.interval = 1.0 / imu.rate  # seconds between two samples
-        accelerometer = np.hypot(
-            imu.accelerometer_noise_density, imu.vibration * np.sqrt(self.interval)
-        )
+        shaken = imu.vibration * np.sqrt(self.interval)
+        accelerometer = np.hypot(imu.accelerometer_noise_density, shaken)
+        gyroscope = np.hypot(imu.gyroscope_noise_density, _TURNED * shaken)
         # Samples of a moving body are also samples of what happens between them.
         # Densities of the noise of gyroscope and accelerometer, shape (2,).
-        self.noise = 2.0 * np.array([imu.gyroscope_noise_density, accelerometer]) + (1e-5, 1e-4)
+        self.noise = 2.0 * np.array([gyroscope, accelerometer]) + (1e-5, 1e-4)
         # Densities of the random walks of their biases, shape (2,).
         self.walk = np.array([imu.gyroscope_random_walk, imu.accelerometer_random_walk]) + 1e-6
         # Standard deviations of their biases at the start, shape (2,).
