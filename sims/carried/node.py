@@ -142,6 +142,8 @@ class Carried(SensorPlatform[CarriedConfig]):
             self.log.warning("imu: some accelerations are beyond the range of the accelerometer")
         if 0.0 < config.imu.gyroscope_range < result.rate:
             self.log.warning("imu: some angular velocities are beyond the range of the gyroscope")
+        if config.imu.vibration.shakes and not config.thrust:
+            self.log.warning("thrust: 0, so that the IMU does not vibrate as its settings have it")
         if inside := collision(result):
             raise ValueError(f"place: expected a free way, found it {inside}")
         for near in (result.near, result.met):

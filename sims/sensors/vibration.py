@@ -48,6 +48,11 @@ class Vibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     angular_density: NonNegative = 0.0
     corner: NonNegative = 0.0
 
+    @property
+    def shakes(self) -> bool:
+        """Whether there is any."""
+        return any((self.amplitude, self.angular_amplitude, self.density, self.angular_density))
+
     def deviation(self, density: float, rate: float) -> float:
         """Return the standard deviation of a sample of noise at full thrust.
 

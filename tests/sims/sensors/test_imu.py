@@ -22,7 +22,8 @@ from events.frames import from_rpy, multiply, rotate
 from runtime.testing import run_node
 from sims.multirotor import Multirotor
 from sims.sensors import ImuModel, ImuNoise, ImuParameters, mount_imu
-from sims.sensors.imu import NOISES, Motion, Vibration, mean_between, motion_at
+from sims.sensors.imu import NOISES, Motion, mean_between, motion_at
+from sims.sensors.vibration import Vibration
 from sims.vehicle import Physics, State, attach_vehicle
 from tests.sims.sensors.truths import PLACE, random
 from tests.sims.vehicle.flight import UP, WORLD, Flight, airborne, velocity

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -96,8 +97,8 @@ def test_the_flight_preset_shakes_as_the_imu_of_euroc_in_flight() -> None:
 
 
 def test_a_bias_that_comes_and_goes_has_its_deviation_and_an_ideal_imu_has_none() -> None:
-    def bias(**settings: object) -> np.ndarray:
-        silent = dict.fromkeys(
+    def bias(**settings: Any) -> np.ndarray:
+        silent: dict[str, Any] = dict.fromkeys(
             ("gyroscope_noise_density", "gyroscope_random_walk",
              "accelerometer_noise_density", "accelerometer_random_walk"), 0.0
         )  # fmt: skip
