@@ -62,6 +62,7 @@ _FEWEST = 4  # least number of agreeing landmarks beside an alignment
 _SEARCHED = 20  # number of newest key frames searched to relocalize a lost camera
 _SEARCHED_PER_IMAGE = 2  # key frames tried with each image: each takes as long as tracking
 _SURE = 0.6  # least share of agreeing landmarks, among those searched, in a relocalized pose
+_PARALLAX = 0.02  # motion between corrections of disparities, relative to the median depth
 _NEAR = 64.0  # margin around the image for landmarks soon in view, pixels
 _SOON = 8  # images between updates of the list of such landmarks
 _READING = 0.5  # noise of a depth reading, a mean of many pixels, relative to a single pixel's
@@ -133,6 +134,7 @@ class FeatureTracker:
         self._maps = 0  # begun at a guessed pose
         self._searched = 0  # key frames, since tracking was lost
         self._near_until = 0
+        self._corrected_at: Floats | None = None  # place of the last correction, metres
         self._near: Rows | None = None  # landmarks that are or may soon be in view
         self._motion = Motion()
         self._references = References(self._matrix, self._settings.depth_noise)
@@ -214,8 +216,20 @@ class FeatureTracker:
         return found or MapMatch.without_landmarks(alignment.pose)
 
     def _correct_disparities(self, matcher: StereoMatcher, match: MapMatch, read: Surfaces) -> None:
-        """Correct the matcher's disparities, and the depth of all landmarks, by those in view."""
-        field, table = matcher.disparities, self._map.table
+        """Correct the matcher's disparities, and the depth of all landmarks, by those in view.
+
+        Once for each bit of motion: images from one place tell of noise alone.
+        """
+        field, table, place = matcher.disparities, self._map.table, inverse(self._pose)[:3, 3]
+        rows = match.rows[match.agree]
+        if len(rows) < self._settings.min_inliers:
+            return
+        if self._corrected_at is None:
+            self._corrected_at = place
+        _, depths = self._map.project(self._pose, rows)
+        if np.linalg.norm(place - self._corrected_at) < _PARALLAX * float(np.median(depths)):
+            return
+        self._corrected_at = place
         change = field.update(
             *disparity_information(
                 field, matcher.unit, self._map, match, read, matcher.depth_noise, self._matrix
@@ -378,6 +392,7 @@ class FeatureTracker:
         return {number: frame.image for number, frame in self._keyframes.items()}
 
     def _clear_map(self) -> None:
+        self._corrected_at = None
         self._map = Landmarks(self._matrix)
         self._keyframes: dict[int, Keyframe] = {}
         self._newest: deque[Described] = deque(maxlen=min(_SEARCHED, self._settings.keyframes))

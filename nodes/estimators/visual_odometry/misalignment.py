@@ -19,10 +19,10 @@ from nodes.estimators.rig import crosses
 from nodes.estimators.visual_odometry.landmarks import Landmarks, MapMatch
 
 _TERMS = 6
-_DEVIATIONS = np.array([2.0, 1.5, 1.5, 1.0, 1.0, 1.0])  # of the coefficients beforehand, pixels
+_DEVIATIONS = np.array([1.0, 0.7, 0.7, 0.4, 0.4, 0.4])  # of the coefficients beforehand, pixels
 _HUBER = 2.0
 _FEW = 10  # least number of a key frame's landmarks in an image that tell of the disparities
-_ALIKE = 0.03  # weight of a landmark: errors of matching are alike in all images
+_ALIKE = 0.1  # weight of a landmark: errors of matching are alike in all images
 _ROW_NOISE = 0.2  # standard deviation of a row, pixels
 _PIXEL_NOISE = 0.5  # standard deviation of a landmark's pixel, errors of its place included
 _READING, _BENT = 0.8, 0.003  # noise of a depth reading: of its stated one, of inverse depth
