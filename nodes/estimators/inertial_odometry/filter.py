@@ -129,13 +129,14 @@ class InertialFilter:
         self._with_frames = np.zeros((_SIZE, capacity))
         self._of_frames = np.zeros((capacity, capacity))
 
-    def remember(self, number: int, placed: Sighting | None = None) -> None:
+    def remember(self, number: int, placed: Sighting | None = None, deviation: float = 0.0) -> None:
         """Store the present pose as a key frame's.
 
         Args:
             number: That of the newest one; or below zero, for an image beside them, kept only if
                 noted again.
             placed: Its new landmarks, with the lasting noise of their places.
+            deviation: Standard deviation of an error common to their inverse depths, 1/m.
         """
         at = int(self._slots(np.array([number]))[0])
         self._frames.pop(number - self._capacity, None)
@@ -151,7 +152,7 @@ class InertialFilter:
             told = np.zeros((6, 6)) if found is None else found[0][POSE, POSE]
             shared = 1.0 + self._common[1] * (len(placed.places) - 1)
             self._of_frames[here, here] += np.linalg.inv(told / shared + np.eye(6) / _VAGUE**2)
-            self._of_frames[depth, depth] = shared / (placed.scale[:, 2] ** 2).sum()
+            self._of_frames[depth, depth] = shared / (placed.scale[:, 2] ** 2).sum() + deviation**2
         self._with_frames[:, here] = self.covariance[:, POSE]
         self._with_frames[:, depth] = 0.0
 

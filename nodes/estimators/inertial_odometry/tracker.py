@@ -36,6 +36,7 @@ _BENT = 0.003  # noise of depth on surfaces not quite planar, relative to invers
 _PLACED = 0.5, 0.5  # constant noise of a landmark's place, of a sighting's: pixel, depth
 _COMMON, _COMMON_BY_EYES = (0.02, 0.0), (0.02, 0.1)
 """Shares common to all landmarks' variance in an image, of depth, of stereo: sightings, places."""
+_MISALIGNED = 0.06  # what the correction of disparities leaves common to an image's, pixels
 _MISFIT = 1.5  # largest median error of the landmarks, in standard deviations of a pixel
 _PATIENCE, _DOUBTED = 0.4, 0.6  # averaging time (s), limit of contradicting share; then restart
 _PREDICTED = np.diag(np.repeat([0.05**-2, 0.02**-2], 3))  # of the predicted pose: 5 cm, 0.02 rad
@@ -262,7 +263,8 @@ class InertialTracker(FeatureTracker):
         new = np.flatnonzero(self._map.table["keyframe"] == number)
         pixels = self._map.table["pixel"][new]
         read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
-        self._filter.remember(number, self._seen(new, pixels, read, _PLACED))
+        off = _MISALIGNED / self._matcher.unit if self._matcher is not None else 0.0
+        self._filter.remember(number, self._seen(new, pixels, read, _PLACED), off)
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
         """Return a lost result; after a while, start a map at the IMU's pose or in a new frame."""
