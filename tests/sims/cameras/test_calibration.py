@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 import visnav
 from events import CameraAnnouncement, Image, PoseStamped, TransformStamped
 from runtime.testing import run_nodes, spec
+from runtime.units import Latency
 from sims.cameras import CameraSpec
 from sims.cameras.calibration import USUAL, Calibration, CalibrationError, announced
 from sims.cameras.optics import Lens
-from sims.cameras.spec import calibration, eyes
+from sims.cameras.spec import DepthSensor, announcement, calibration, eyes
 from sims.computer_vision import FreeCamera
 
 CAMERA = CameraSpec(name="c", width=320, height=240, orientation=(3.0, -20.0, 40.0))
@@ -80,6 +81,24 @@ def test_the_draws_of_a_name_and_a_seed_stay_what_they_are() -> None:
     assert errors["position"] == pytest.approx(
         [-1.629537e-05, 1.489699e-04, 3.310187e-05], rel=1e-5
     )
+
+
+def test_an_announcement_holds_nothing_of_the_true_calibration() -> None:
+    first = CameraSpec(name="c", images=("rgb", "depth"), depth_sensor=DepthSensor())
+    other = msgspec.structs.replace(
+        first,
+        intrinsics=(200.0, 210.0, 150.0, 130.0),
+        position=(1.0, 2.0, 3.0),
+        orientation=(4.0, 5.0, 6.0),
+        time_offset=Latency(0.007),
+    )
+    known = announced(calibration(first), USUAL, np.random.default_rng([7]), "c")
+    one, two = (
+        announcement(spec, source="d/c", prefix="d/", parent_frame_id="base_link", known=known)
+        for spec in (first, other)
+    )
+    assert one == two
+    assert one.depth_noise == pytest.approx(0.07 / (known.info.fx * 0.075))
 
 
 def test_lists_are_the_errors_themselves_the_left_eyes_first() -> None:
