@@ -67,8 +67,17 @@ class CalibrationError(MountingError, frozen=True, kw_only=True, forbid_unknown_
 
 
 USUAL = CalibrationError(
-    # All of them: estimate. For comparison, the standard deviations with which OpenVINS' filter
-    # begins (ov_msckf/src/state/State.cpp): 1 px, 0.005, 0.057 degrees, 1 cm, 10 ms.
+    # focal, centre: Kalibr reports standard deviations of 0.08 to 0.11 px and of 0.02 to 0.7 px for
+    # rigs of its users (github.com/ethz-asl/kalibr, issues 137 and 502).
+    # rotation, position: two published calibrations of one rig, the data set's own (in OpenVINS
+    # 6948812, config/*/kalibr_imucam_chain.yaml) and Basalt's (basalt-mirror 9656344,
+    # data/*_ds_calib.json), differ in the pose between the eyes as if each eye erred by 0.023
+    # degrees and 0.17 mm (EuRoC), by 0.015 degrees and 0.13 mm (TUM VI): half of the rms over the
+    # axes, as two eyes err twice.
+    # distortion, time: estimates: 0.14 px at 45 degrees with fx 460; a tenth of an IMU's period
+    # ("a fraction of the smallest measurement period": Furgale et al., IROS 2013).
+    # For comparison, OpenVINS' simulator, whose filter refines them all, draws 1 px, 0.005, 0.057
+    # degrees, 1 cm, 10 ms (ov_msckf/src/sim/Simulator.cpp, perturb_parameters).
     focal=0.15, centre=0.15, distortion=3e-4, rotation=0.01, position=2e-4, time=Latency(0.0005),
 )  # fmt: skip
 """Errors of ``calibration_error = true``: a good calibration of a pair of cameras."""

@@ -94,15 +94,22 @@ def _facts(known: ImuAnnouncement | LidarAnnouncement) -> dict[str, Any]:
 
 
 USUAL_IMU = ImuCalibrationError(
-    # All of them: estimate. Rotation and position are half and a fifth of the standard deviations
-    # with which OpenVINS' filter begins for camera to IMU (ov_msckf/src/state/State.cpp: 0.057
-    # degrees, 1 cm).
+    # rotation, position: the calibrations compared in sims/cameras/calibration.py differ in the
+    # cameras' poses in the IMU as if each had a standard deviation of 0.13 degrees and 3.2 mm
+    # (EuRoC), of 0.012 degrees and 0.7 mm (TUM VI).
+    # misalignment: 0.05 degrees, 9e-4 rad, are typical from axis to axis of an IMU calibrated by
+    # its maker (data sheets of ADIS16445 and ADIS16465); half of it.
+    # scale: estimate. For comparison, OpenVINS' simulator draws 0.004 of both.
     rotation=0.03, position=2e-3, scale=1e-3, misalignment=5e-4,
 )  # fmt: skip
 """Errors of ``calibration_error = true``: a good calibration of an IMU beside cameras."""
 
 USUAL_LIDAR = LidarCalibrationError(
-    # Both: estimate.
+    # position: lidar_align's results of four recordings with one planar lidar have standard
+    # deviations of 7 and 8 mm (github.com/ethz-asl/lidar_align, issue 31); LI-Init's are reported
+    # 6 mm off a drawing, 1 to 2 cm are acceptable to its author
+    # (github.com/hku-mars/LiDAR_IMU_Init, issue 15).
+    # rotation: estimate; of LI-Init 1 to 2 degrees are reported where settings differ (issue 103).
     rotation=0.1, position=5e-3,
 )  # fmt: skip
 """Errors of ``calibration_error = true``: a good calibration of a lidar."""
