@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Mapping
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import msgspec
 import numpy as np
@@ -91,11 +91,6 @@ def mounting_off(
     shift = errors_of(error.position, shifts)
     x, y, z = (p + e for p, e in zip(position, shift, strict=True))
     return (x, y, z), multiply(orientation, _quaternion(turn)) if any(turn) else orientation
-
-
-def difference(true: Mapping[str, Any], said: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the true calibration beside the announced one, for a run's summary."""
-    return {"true": dict(true), "announced": dict(said)}
 
 
 def _quaternion(turn: npt.NDArray[np.float64]) -> Quaternion:

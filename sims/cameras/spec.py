@@ -393,7 +393,7 @@ def announcement(
         reference_exposure=float(spec.reference_exposure),
         response=response,
         vignette=spec.vignette,
-        **_depth_truth(spec, known.info.fx),
+        **_depth_noise(spec, known.info.fx),
         frame_id=optical_frame(spec, prefix),
         parent_frame_id=parent_frame_id,
         position=known.position,
@@ -401,7 +401,7 @@ def announcement(
     )
 
 
-def _depth_truth(spec: CameraSpec, focal: float) -> dict[str, Any]:
+def _depth_noise(spec: CameraSpec, focal: float) -> dict[str, Any]:
     sensor = spec.depth_sensor
     if sensor is None:
         return {"depth_noise": spec.depth_noise}

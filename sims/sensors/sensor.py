@@ -14,6 +14,7 @@ import events as ev
 from events import Announcement, Event, Quaternion, Vector3
 from events.frames import IDENTITY, cross, from_rpy, multiply, rotate, rotate_inverse, to_geodetic
 from runtime.units import Duration, Latency
+from sims.calibration import MountingError
 from sims.mounting import Matrix, apply_matrix
 
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -45,6 +46,11 @@ class Mount(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """Rotation from the sensor's frame to the body."""
         roll, pitch, yaw = (math.radians(angle) for angle in self.orientation)
         return from_rpy(roll, pitch, yaw)
+
+    @property
+    def wrong(self) -> MountingError | None:
+        """Errors of the announced calibration; `None` if it is exact."""
+        return None
 
 
 class SensorSpec(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True):

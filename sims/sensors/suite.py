@@ -189,7 +189,7 @@ class SensorSuite:
         """Return the announcements of the sensors."""
         for sensor in (self.imu, *self.mounted):
             said = self._known(sensor)
-            if getattr(sensor.spec, "wrong", None) is not None:  # told once the run is over
+            if sensor.spec.wrong is not None:  # told once the run is over
                 self._node.note_truth(said.source, difference(said, sensor.announcement()))
             yield said
 
@@ -210,7 +210,7 @@ class SensorSuite:
 
     def _known(self, sensor: Mounted[Any]) -> Any:
         """Return the announcement of a sensor, with the errors of its calibration."""
-        true, error = sensor.announcement(), getattr(sensor.spec, "wrong", None)
+        true, error = sensor.announcement(), sensor.spec.wrong
         if error is None:
             return true
         return announced(true, error, self._node.rng, sensor.source.partition("/")[2])

@@ -39,6 +39,7 @@ class SmoothField:
         x = (np.arange(info.width) - info.cx) / info.fx
         y = (np.arange(info.height) - info.cy) / info.fy
         self._axes = x.astype(np.float32), y.astype(np.float32)[:, None]
+        self._drawn = self.coefficients, np.zeros((info.height, info.width), np.float32)
 
     def terms(self, pixels: Floats) -> Floats:
         """Return the powers at pixels (n, 2), shape (n, 6)."""
@@ -58,9 +59,12 @@ class SmoothField:
 
     def everywhere(self) -> npt.NDArray[np.float32]:
         """Return the offset at all pixels, shape (h, w)."""
-        x, y = self._axes
-        c = self.coefficients.astype(np.float32)
-        return np.asarray((c[0] + x * (c[1] + c[3] * x)) + y * (c[2] + c[4] * x + c[5] * y))
+        if self._drawn[0] is not self.coefficients:  # which are replaced, and never changed
+            x, y = self._axes
+            c = self.coefficients.astype(np.float32)
+            offsets = (c[0] + x * (c[1] + c[3] * x)) + y * (c[2] + c[4] * x + c[5] * y)
+            self._drawn = self.coefficients, offsets
+        return self._drawn[1]
 
     def update(self, information: Floats, gradient: Floats) -> Floats:
         """Take in a measurement; return the change of the coefficients.

@@ -223,3 +223,17 @@ def test_two_landmarks_do_not_carry_the_camera_off() -> None:
             Sighting(places, np.zeros(2, np.int64), measured, np.full((2, 3), 400.0))
         )
         assert made.state is before
+
+
+def test_an_error_common_to_depths_leaves_what_is_seen_from_elsewhere_less_certain() -> None:
+    def deviation(common: float) -> float:
+        made, seen = started(), sighting()
+        made.remember(1, seen, common)
+        made.state = msgspec.structs.replace(made.state, position=made.state.position + 0.5)
+        made.covariance[P, P] += np.eye(3)
+        there = msgspec.structs.replace(seen, keyframes=np.ones(len(seen.places), np.int64))
+        image = made._image(made.state, there)[2]
+        assert made.update(msgspec.structs.replace(there, measured=image))
+        return float(np.sqrt(np.trace(made.covariance[P, P])))
+
+    assert deviation(0.05) > 1.05 * deviation(0.0)

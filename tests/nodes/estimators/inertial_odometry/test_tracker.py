@@ -15,7 +15,7 @@ from tests.nodes.estimators.visual_odometry.test_stereo import BASELINE, pair
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 
 
-def started(baseline: float) -> InertialTracker:
+def started(baseline: float, baseline_noise: float = 2e-4) -> InertialTracker:
     """Return the tracker of a camera with depth, or of a stereo rig, whose body is the camera."""
     camera = CameraAnnouncement(
         stamp=0,
@@ -29,9 +29,29 @@ def started(baseline: float) -> InertialTracker:
         position=(0.0, 0.0, 0.0),
         orientation=(1.0, 0.0, 0.0, 0.0),
     )
-    return InertialTracker(
-        camera, IMU, baseline, FeatureSettings(), InertialSettings(), StereoSettings()
-    )
+    stereo = StereoSettings(baseline_noise=baseline_noise)
+    return InertialTracker(camera, IMU, baseline, FeatureSettings(), InertialSettings(), stereo)
+
+
+def test_the_covariance_has_the_uncertainty_of_the_baseline_along_the_way() -> None:
+    def fly(noise: float) -> TrackingResult:
+        tracker = started(BASELINE, noise)
+        for number in range(6):
+            time = number / 20
+            felt = [[(time - 0.05 + k / 200) * 1e9, 0, 0, 0, 0, 0, -9.81] for k in range(1, 11)]
+            left, right, _ = pair(pose(x=0.4 * time))
+            result = tracker.fuse(int(time * 1e9), left, right, np.array(felt))
+        return result
+
+    known, unsure = fly(0.0), fly(0.3 * BASELINE)
+    assert known.covariance is not None
+    assert unsure.covariance is not None
+    assert np.array_equal(known.pose, unsure.pose)
+    way = 0.3 * unsure.pose[:3, 3]
+    added = unsure.covariance - known.covariance
+    assert np.linalg.norm(way) > 0.02
+    assert np.allclose(added[:3, :3], np.outer(way, way), atol=1e-9)
+    assert np.allclose(added[3:], 0.0, atol=1e-12)
 
 
 def test_images_that_contradict_the_imu_are_lost_and_begin_a_frame_of_their_own() -> None:

@@ -121,6 +121,22 @@ def test_corners_keep_their_depth_where_the_right_eye_is_turned(pitch: float, ro
     assert np.median(np.abs(matcher.rows.at(pixels) - offsets)) < 0.1
 
 
+def test_images_from_one_place_correct_no_disparity() -> None:
+    random = np.random.default_rng(3)
+    tracker = StereoTracker(INFO, BASELINE, StereoSettings(), FeatureSettings())
+    eyes = look(pose())[0], look(pose(x=BASELINE))[0]
+    for step in range(8):
+        left, right = (
+            np.clip(eye + random.normal(0.0, 3.0, eye.shape), 0, 255).astype(np.uint8)
+            for eye in eyes
+        )
+        assert not tracker.track(step * 50_000_000, left, right).lost
+    matcher = tracker._matcher
+    assert matcher is not None
+    assert matcher.rows.coefficients.any()
+    assert not matcher.disparities.coefficients.any()
+
+
 def test_a_trajectory_is_right_although_the_right_eye_is_turned() -> None:
     def off(yaw: float) -> float:
         tracker = StereoTracker(INFO, BASELINE, StereoSettings(), FeatureSettings())
