@@ -4,7 +4,8 @@ Block matching (K. Konolige, "Small vision systems", ISRR 1997; OpenCV's `cv2.St
 images finds continuous surfaces, and starts the optical flow of a corner to the right image (to
 hundredths of a pixel) and back. Alone it draws slanted surfaces towards whole pixels, with four
 times the error. Where it finds nothing, flow starts from afar, and is checked by the corner's
-neighbours. What the calibration leaves of rows and disparities is estimated and taken off.
+neighbours. What the calibration leaves of rows and disparities is estimated and taken off, and so
+is a difference of the eyes' brightness, which flow would take for motion.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ _WINDOW = 15
 _REFINED = 1.5  # largest correction of block matching by flow, pixels
 _OFF_ROW = 0.6  # largest distance of a corner from its row, pixels, when that is known
 _UNSURE = 3.0  # standard deviations of a row's offset added to it
+_SPARSE = 2  # pixels from one pixel whose brightness is compared to the next, both ways
+_BLACK, _WHITE, _FEW = 8, 240, 200  # grey levels, least pixels of such a comparison
 _COARSE = 2.0  # noise of block matching, relative to flow
 _STEP, _DISTINCT = 3.0, 1.5  # pixels beside a disparity, least ratio of differences there
 _LEVELS = 3  # halvings of the images for flow, where block matching found nothing
@@ -106,14 +109,15 @@ class StereoMatcher:
         Raises:
             ValueError: The size is not that of the camera.
         """
-        self._pair = pair = grey_image(self._info, left), grey_image(self._info, right)
+        pair = whole = grey_image(self._info, left), grey_image(self._info, right)
         if self._reduction > 1:
             pair = (
                 np.asarray(cv2.pyrDown(pair[0]), np.uint8),
                 np.asarray(cv2.pyrDown(pair[1]), np.uint8),
             )
-        found: Any = self._blocks.compute(*pair)  # sixteenths of a pixel
-        disparity: Any = found.astype(np.float32) * (self._reduction / 16.0)
+        matched: Any = self._blocks.compute(*pair)  # sixteenths of a pixel
+        self._pair = whole[0], scaled(whole[1], brightness_ratio(*pair, matched))
+        disparity: Any = matched.astype(np.float32) * (self._reduction / 16.0)
         if self._reduction > 1:
             size = self._info.width, self._info.height
             disparity = cv2.resize(disparity, size, interpolation=cv2.INTER_NEAREST)
@@ -189,6 +193,28 @@ class StereoMatcher:
             for step in (0.0, -_STEP, _STEP)
         )
         return (at > SAME) & (1.0 - np.maximum(before, after) > _DISTINCT * (1.0 - at))
+
+
+def brightness_ratio(left: Grey, right: Grey, disparity: npt.NDArray[np.int16]) -> float:
+    """Return how much brighter the left image is than the right one, where blocks match.
+
+    Args:
+        disparity: Sixteenths of a pixel, shape (h, w) as the images; not positive where unknown.
+    """
+    rows, columns = np.nonzero(disparity[::_SPARSE, ::_SPARSE] > 0)
+    rows, columns = rows * _SPARSE, columns * _SPARSE
+    here = left[rows, columns]
+    there = right[rows, np.maximum(columns - ((disparity[rows, columns] + 8) >> 4), 0)]
+    usable = (np.minimum(here, there) > _BLACK) & (np.maximum(here, there) < _WHITE)
+    if np.count_nonzero(usable) < _FEW:
+        return 1.0
+    return int(here[usable].sum(dtype=np.int64)) / int(there[usable].sum(dtype=np.int64))
+
+
+def scaled(image: Grey, factor: float) -> Grey:
+    """Return an image whose grey levels are multiplied; within 0.2 % of one it is the same."""
+    levels = np.minimum(np.rint(np.arange(256) * factor), 255).astype(np.uint8)
+    return np.asarray(cv2.LUT(image, levels), np.uint8)
 
 
 def baseline(left: CameraAnnouncement, right: CameraAnnouncement) -> float:

@@ -24,9 +24,11 @@ def pair(camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return left, right, depth
 
 
-def test_depth_at_corners_is_within_the_stated_noise() -> None:
+@pytest.mark.parametrize("gain", [1.0, 0.8, 1.05, 1.3])
+def test_depth_at_corners_is_within_the_stated_noise(gain: float) -> None:
     matcher = StereoMatcher(INFO, BASELINE)
     left, right, truth = pair(pose(yaw=8.0))
+    right = np.minimum(np.rint(right * gain), 255).astype(np.uint8)
     coarse = inverse_depth(matcher.depth(left, right))
     columns, rows = np.meshgrid(np.arange(90, 300, 10), np.arange(20, 220, 10))
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
