@@ -38,6 +38,9 @@ class Vibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         angular_density: Density of the angular velocity's noise there, rad/s/√Hz.
         corner: Frequency above which the noise declines (first order), Hz; 0: nowhere. It is
             sampled, also by an IMU whose samples are means.
+        lower_corner: Frequency below which it declines (second order), Hz; 0: nowhere. What shakes
+            goes nowhere, while noise down to 0 Hz adds up to velocities and angles that the body
+            does not have.
     """
 
     amplitude: NonNegative = 0.0
@@ -47,6 +50,7 @@ class Vibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     density: NonNegative = 0.0
     angular_density: NonNegative = 0.0
     corner: NonNegative = 0.0
+    lower_corner: NonNegative = 0.0
 
     @property
     def shakes(self) -> bool:
@@ -98,6 +102,8 @@ class VibrationModel:
             self._generator = np.random.default_rng(constants.integers(2**63))
             self._keep = math.exp(-2.0 * math.pi * v.corner / rate) if v.corner else 0.0
             self._state = self._generator.standard_normal(6)
+            self._slow = math.exp(-2.0 * math.pi * v.lower_corner / rate)
+            self._means = np.zeros((2, 6))
 
     def __bool__(self) -> bool:
         return self._turns or self._noisy
@@ -125,11 +131,16 @@ class VibrationModel:
         return rates, force
 
     def _draw(self) -> None:
-        """Draw the next samples: those of an Ornstein-Uhlenbeck process, exactly."""
+        """Draw the next samples: those of an Ornstein-Uhlenbeck process, less its drift."""
         news = math.sqrt(1.0 - self._keep**2) * self._generator.standard_normal((_BLOCK, 6))
         for row in news:
             row += self._keep * self._state
-            self._state = row
+            self._state = row.copy()
+            if self._vibration.lower_corner:
+                for mean in self._means:  # high-pass filters, of gain 1 at half of the rate
+                    row -= mean
+                    mean += (1.0 - self._slow) * row
+                    row *= 0.5 * (1.0 + self._slow)
         self._noise = (news * self._deviations).tolist()
         self._next = 0
 

@@ -23,6 +23,8 @@ from nodes.estimators.rig import cross
 
 Floats = npt.NDArray[np.float64]
 
+# Share of a vibration that counts as white noise: what shakes goes nowhere, unlike noise.
+_SHAKEN = 0.3
 _TURNED = 0.03  # vibration of the angular velocity by that of the acceleration, rad/s per m/s²
 _GAP = 3.0  # sampling intervals; the motion in a longer gap between samples is unknown
 _UNKNOWN = np.array([1.0, 5.0])  # standard deviations then: of rates (rad/s), acceleration
@@ -48,7 +50,7 @@ class ImuModel:
         # The IMU in the frame of its parent, shape (4, 4).
         self.pose = pose_matrix(imu.position, imu.orientation)
         self.interval = 1.0 / imu.rate  # seconds between two samples
-        shaken = imu.vibration * np.sqrt(self.interval)
+        shaken = _SHAKEN * imu.vibration * np.sqrt(self.interval)
         accelerometer = np.hypot(imu.accelerometer_noise_density, shaken)
         gyroscope = np.hypot(imu.gyroscope_noise_density, _TURNED * shaken)
         # Samples of a moving body are also samples of what happens between them.

@@ -55,6 +55,22 @@ def test_the_noise_has_its_deviation_from_the_first_sample_on() -> None:
     assert vibration.deviation(0.1, 200.0) == pytest.approx(0.1 * math.sqrt(math.pi * 5.0))
 
 
+def test_what_shakes_goes_nowhere() -> None:
+    """Against the same noise down to 0 Hz, and against its stated share at two frequencies."""
+    open_, bound = (
+        samples(Vibration(density=0.1, lower_corner=lower), 200.0, 1.0, 200.0)
+        for lower in (0.0, 10.0)
+    )
+    fast, slow = (np.abs(rows[:, 3:].sum(axis=0) / 200.0).mean() for rows in (open_, bound))
+    assert slow < 0.02 < 0.3 < fast  # velocities, m/s
+    frequencies, power = welch(bound[:, 3:], 200.0, nperseg=512, axis=0)
+    for frequency in (5.0, 20.0):
+        near = np.abs(frequencies - frequency) < 1.0
+        ratio = (frequency / 10.0) ** 2
+        expected = 2 * 0.1**2 * (ratio / (1.0 + ratio)) ** 2
+        assert power[near].mean() == pytest.approx(expected, rel=0.25)
+
+
 def test_nothing_shakes_at_rest_and_noise_grows_with_thrust() -> None:
     vibration = Vibration(amplitude=1.0, density=0.1, angular_density=1e-3, corner=50.0)
     assert not samples(vibration, 200.0, 0.0, 0.5).any()
@@ -94,6 +110,9 @@ def test_the_flight_preset_shakes_as_the_imu_of_euroc_in_flight() -> None:
     assert (floor[3:] > 0.044).all()
     assert (floor[3:] < 0.088).all()
     assert frequencies[power[:, 3].argmax()] == pytest.approx(91.0, abs=2.0)
+    slow = np.sqrt(power[frequencies < 5.0].sum(axis=0) * width)
+    assert (slow[3:] < 0.05).all()
+    assert (slow[:3] < 6.5e-4).all()
 
 
 def test_a_bias_that_comes_and_goes_has_its_deviation_and_an_ideal_imu_has_none() -> None:
