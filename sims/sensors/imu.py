@@ -15,6 +15,7 @@ from events.frames import cross, inverse, multiply, rotate, rotate_inverse, sler
 from runtime.units import Duration
 from sims.calibration import check_lists, chosen
 from sims.presets import IMUS
+from sims.sensors.bandwidth import LowPass
 from sims.sensors.calibration import IMU_SIZES, USUAL_IMU, ImuCalibrationError
 from sims.sensors.sensor import GaussMarkov, Mount, Mounted, NonNegative, Place, check_drift
 from sims.sensors.vibration import Vibration, VibrationModel
@@ -55,6 +56,9 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
         accelerometer_range: Greatest acceleration that it shows, m/s²; 0 is no limit.
         gyroscope_resolution: Step of the angular velocity, rad/s; 0 is none.
         accelerometer_resolution: Step of the acceleration, m/s²; 0 is none.
+        gyroscope_bandwidth: Hz, above which motion is weakened, below half of the rate; all of it
+            comes later by 0.225/bandwidth. 0: everything is felt at once.
+        accelerometer_bandwidth: The same of the accelerometer.
         vibration: Vibration by the rotors; none at rest.
         sampling: ``instant``: a sample is the motion at its stamp. ``mean``: it is the mean since
             the sample before, as of IMUs that give delta angles and delta velocities.
@@ -85,6 +89,8 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
     accelerometer_range: NonNegative = 0.0
     gyroscope_resolution: NonNegative = 0.0
     accelerometer_resolution: NonNegative = 0.0
+    gyroscope_bandwidth: NonNegative = 0.0
+    accelerometer_bandwidth: NonNegative = 0.0
     vibration: Vibration = Vibration()
     sampling: Literal["instant", "mean"] = "instant"
     calibration_error: ImuCalibrationError | bool = False
@@ -218,6 +224,10 @@ class ImuModel(Mounted[ImuParameters]):
             (p.gyroscope_range, p.gyroscope_resolution),
             (p.accelerometer_range, p.accelerometer_resolution),
         ]
+        self._filters = [
+            LowPass(bandwidth, rate) if bandwidth else None
+            for bandwidth in (p.gyroscope_bandwidth, p.accelerometer_bandwidth)
+        ]
         self._linear = not p.g_sensitivity and all(np.array_equal(m, _EYE) for m in self.matrices)
 
     def measure(
@@ -227,6 +237,9 @@ class ImuModel(Mounted[ImuParameters]):
         rates, force = angular_velocity, specific_force
         if self._vibration:
             rates, force = self._vibration.add(rates, force, thrusts)
+        slow_rates, slow_force = self._filters
+        rates = slow_rates(rates) if slow_rates else rates
+        force = slow_force(force) if slow_force else force
         if not self._linear:
             gyroscope, accelerometer = self.matrices
             # Not by matrix products, whose last bits are the processor's.

@@ -63,6 +63,11 @@ class SensorsConfig(SimulatorConfig):
                 found = f"{self.imu_rate:g} and {self.imu.rate:g} Hz"
                 raise ValueError(f"imu.rate: expected imu_rate or this, found {found}")
             msgspec.structs.force_setattr(self, "imu_rate", self.imu.rate)
+        for field in ("gyroscope_bandwidth", "accelerometer_bandwidth"):
+            bandwidth, half = getattr(self.imu, field), self.imu_rate / 2
+            if bandwidth >= half:
+                found = f"{bandwidth:g} Hz of {self.imu_rate:g} Hz"
+                raise ValueError(f"imu.{field}: expected less than half of imu_rate, found {found}")
         names = {"imu", "barometer", "gnss", "magnetometer"}
         for field in ("cameras", "range_finders", "lidars"):
             for spec in getattr(self, field):
