@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-pythons test-all check fix size docs wheel peers bench bench-quick orbslam3 svo suite images clean
+.PHONY: help setup demo test test-core test-slow test-pythons test-all check fix size docs wheel peers bench bench-quick orbslam3 svo suite images clean
 
 # Setuptools warns at length of every editable install that folders here may hide packages.
 INSTALL = PYTHONWARNINGS='ignore:Editable installation' $(BIN)/python -m pip install --quiet
@@ -29,8 +29,8 @@ $(CORE): pyproject.toml setup.py $(wildcard sims/cameras/rasteriser/*)
 	@touch $@
 
 # The tests compare with MuJoCo's renderer, through EGL; what it lacks is installed if we may.
-$(READY): $(CORE)
-	$(INSTALL) -e '.[dev,docs]'
+$(READY): $(CORE) $(wildcard extensions/*/pyproject.toml)
+	$(INSTALL) -e '.[dev,docs]' $(addprefix -e ,$(wildcard extensions/*/))
 	@sh tools/system_packages.sh gl $(BIN)/python
 	@touch $@
 
@@ -40,6 +40,10 @@ demo: $(CORE)  ## Fly the standard tour, judge visual odometry on it, and report
 test: $(READY)  ## Run the quick tests.
 	@sh tools/system_packages.sh display
 	$(BIN)/python -m pytest -n 3 --dist loadfile -m 'not slow'
+
+test-core: $(READY)  ## Run the quick tests of the core, without those of the extensions.
+	@sh tools/system_packages.sh display
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m 'not slow' tests
 
 test-slow: $(READY)  ## Run the slow tests; what fails is repeated once, alone.
 	@sh tools/system_packages.sh display

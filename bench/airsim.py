@@ -24,8 +24,8 @@ from bench.benchmarks import Progress, Row
 from bench.harness import silent
 from bench.lateness import WINDOW, Window, figures, lateness, windows_beside
 from bench.system import free_port
-from sims.airsim.client.connection import RpcClient
-from sims.airsim.wire import ImageRequest
+from visnav_airsim.client.connection import RpcClient
+from visnav_airsim.wire import ImageRequest
 
 START = 12.0  # seconds from the start of the run until the first window at the latest
 

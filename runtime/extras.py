@@ -102,7 +102,27 @@ def why_missing(library: str) -> str:
 COMMANDS = "visnav.commands"
 NODES = "visnav.nodes"
 CONFIGURATIONS = "visnav.configurations"
+EXAMPLES = "visnav.examples"
 OURS = "visnav-runtime"
+
+EXTENSIONS = {
+    "airsim": ("AirsimClient", "AirsimServer", ".json"),
+}
+"""What the extensions of this repository offer: nodes, and suffixes of configuration files."""
+
+
+def is_ours(package: str) -> bool:
+    """Return whether a distribution or package is of this repository."""
+    name = package.replace("_", "-")
+    return name == OURS or name.removeprefix("visnav-") in EXTENSIONS
+
+
+def missing_extension(offered: str) -> str:
+    """Return what offers a node or suffix and how to install it; empty if no extension does."""
+    for name, offer in EXTENSIONS.items():
+        if offered in offer:
+            return f"the extension visnav-{name}: pip install ./extensions/{name}"
+    return ""
 
 
 class Offer(NamedTuple):
@@ -130,7 +150,7 @@ class Offer(NamedTuple):
 
 @cache
 def offers(group: str) -> tuple[Offer, ...]:
-    """Return the entry points of a group: this project's first, then other packages' by name.
+    """Return the entry points of a group: the core's, the extensions', other packages' by name.
 
     In a checkout this project's come from its ``pyproject.toml``, because the metadata of an
     editable installation is as old as the installation.
@@ -142,9 +162,9 @@ def offers(group: str) -> tuple[Offer, ...]:
         Offer(point.dist.name if point.dist else "?", point.name, point.value)
         for point in entry_points(group=group)
     ]
-    found.sort(key=lambda offer: (offer.package != OURS, offer.package))
+    found.sort(key=lambda o: (o.package != OURS, not is_ours(o.package), o.package))
     ours = _declared(group) or [offer for offer in found if offer.package == OURS]
-    if not ours:
+    if not ours and group != EXAMPLES:
         raise CommandError(
             f"expected the package {OURS} to be installed, found no {group} of it: "
             '"pip install ." in its folder installs it'

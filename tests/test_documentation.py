@@ -30,6 +30,7 @@ VALIDATOR = jsonschema.Draft7Validator(SCHEMA)
 PAGES = sorted(
     [
         *(ROOT / "docs").rglob("*.md"),
+        *ROOT.glob("extensions/*/docs/*.md"),
         *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "tools/configuration.md")),
     ]
 )
@@ -40,7 +41,7 @@ SESSION = "thirty-minutes.md"
 """The page whose blocks make sense in order only; tests/test_tutorial.py runs it."""
 
 ELSEWHERE = "import cosysairsim"
-"""Marks a script for AirSim's client, which tests/examples/test_airsim.py runs."""
+"""Marks a script for AirSim's client, which extensions/airsim/tests/test_examples.py runs."""
 
 
 class Block(NamedTuple):

@@ -19,11 +19,14 @@ MAY_IMPORT = {
     "runtime.tools": {"events", "runtime", "runtime.tools"},
     "sims": {"events", "runtime", "sims"},
     "nodes": {"events", "runtime", "runtime.tools", "nodes"},
-    "bench": {"events", "runtime", "runtime.tools", "sims", "nodes", "bench"},
+    "visnav_airsim": {"events", "runtime", "sims", "visnav_airsim"},
+    "bench": {"events", "runtime", "runtime.tools", "sims", "nodes", "bench", "visnav_airsim"},
 }
-"""Room to rooms; `runtime` is its core, without the tools around it."""
+"""Room to rooms; `runtime` is its core, without the tools around it, ``visnav_…`` an extension."""
 
-PACKAGES = ("events", "runtime", "sims", "nodes", "bench")
+EXTENSIONS = {path.name: path.parent for path in sorted(ROOT.glob("extensions/*/visnav_*"))}
+PACKAGES = ("events", "runtime", "sims", "nodes", "bench", *EXTENSIONS)
+PROMISED = (ROOT / "docs" / "reference" / "extension-interface.md").read_text(encoding="utf-8")
 BRIDGES = {
     "glfw",
     "OpenGL",
@@ -115,8 +118,9 @@ def module_names() -> dict[str, Path]:
     """Return the path of each module of ours, by its name."""
     found = {}
     for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            parts = path.relative_to(ROOT).with_suffix("").parts
+        parent = EXTENSIONS.get(package, ROOT)
+        for path in sorted((parent / package).rglob("*.py")):
+            parts = path.relative_to(parent).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
 
@@ -219,6 +223,15 @@ def test_entry_points_name_modules_of_ours() -> None:
     assert [name for name in modules if name not in known] == []
     nodes = {value.partition(".")[0] for value in groups["visnav.nodes"].values()}
     assert nodes == {"sims", "nodes"}
+
+
+@pytest.mark.parametrize("package", EXTENSIONS)
+def test_an_extension_imports_only_what_is_promised(package: str) -> None:
+    rows = re.findall(r"^\| `([\w.]+)` \| (.*) \|$", PROMISED, re.MULTILINE)
+    promised = {f"{module}.{name}" for module, row in rows for name in re.findall(r"\w+", row)}
+    promised |= {module for module, _ in rows}
+    found = {name for _, names in of_room(package) for name in names if room(name) in MAY_IMPORT}
+    assert {name for name in found if room(name) not in EXTENSIONS} - promised == set()
 
 
 def test_events_import_nothing_that_waits_or_talks() -> None:

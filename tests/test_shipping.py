@@ -20,7 +20,7 @@ from tests.runtime.tools.samples_cli import command_here
 
 ROOT = Path(__file__).parents[1]
 SCHEMA = json.loads((ROOT / "docs/reference/config.schema.json").read_text(encoding="utf-8"))
-EXAMPLES = sorted([ROOT / "config.toml", *(ROOT / "examples").glob("*.toml")])
+EXAMPLES = [*inspect.example_files().values()]
 
 
 def python(

@@ -39,12 +39,20 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "explanation/architecture.svg": architecture(imports_between_rooms()),
     }.items():
         files.append(File.generated(config, path, content=content))
+    for page in sorted(ROOT.glob("extensions/*/docs/*.md")):
+        name = f"extensions/{page.parts[-3]}/{page.name}"
+        files.append(File.generated(config, name, abs_src_path=str(page)))
     return files
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace a page's placeholder by the table of all figures."""
-    return re.sub(r"<!-- all figures.*-->", lambda _: figures_section(), markdown)
+    """Replace the placeholder of the table of all figures, and links that leave a folder of pages.
+
+    Pages of extensions stand in ``extensions/NAME/docs``, and in the site in ``extensions/NAME``.
+    """
+    markdown = re.sub(r"<!-- all figures.*-->", lambda _: figures_section(), markdown)
+    markdown = re.sub(r"\]\((?:\.\./){3}docs/", "](../../", markdown)
+    return re.sub(r"\]\(\.\./((?:\.\./)?extensions/\w+)/docs/", r"](\1/", markdown)
 
 
 def figures_section() -> str:

@@ -63,7 +63,7 @@ from runtime.config.model import (
     types_of,
 )
 from runtime.errors import ConfigError, DeclarationError, VisnavError, expect_known, suggest
-from runtime.extras import CONFIGURATIONS, NODES, offers
+from runtime.extras import CONFIGURATIONS, NODES, missing_extension, offers
 from runtime.node import Node
 from runtime.paths import not_utf8, resolve, unmarked
 from runtime.units import Duration
@@ -89,6 +89,8 @@ def load_configuration(path: Path, overrides: Sequence[str] = ()) -> Config:
     for offer in offers(CONFIGURATIONS):
         if path.suffix.lower() == f".{offer.name}":
             return load(path, overrides, partial(offer.load(), warn=_warn_once))
+    if whose := missing_extension(path.suffix.lower()):
+        raise ConfigError(f"{path}: {path.suffix} is read by {whose}")
     return load(path, overrides)
 
 
@@ -238,6 +240,8 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
     """
     if re.fullmatch(r"\w+", type_):
         offered = {offer.value: offer.package for offer in offers(NODES) if offer.name == type_}
+        if not offered and (whose := missing_extension(type_)):
+            raise ConfigError(f"{where}: {type_} is a node of {whose}")
         if not offered:
             names = [offer.name for offer in offers(NODES)]
             raise ConfigError(

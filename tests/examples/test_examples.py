@@ -11,12 +11,13 @@ from typing import Any
 import pytest
 
 from runtime.config.reading import load
+from runtime.tools.cli.inspect import example_files
 from sims.worlds import load_world
 from tests.nodes.data.replay import downloads
 from tests.runtime.peers.samples import free_port
 
 ROOT = Path(__file__).parents[2]
-EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
+EXAMPLES = [*example_files().values()]
 
 
 def run(example: str, out: Path, *changes: str, code: int = 0) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from events import Collision, Event, Image, Odometry
 from runtime import Input, Node, NodeConfig, on
 from runtime.extras import why_missing
 from runtime.paths import OutputPath
+from runtime.tools.cli.inspect import example_files
 from tests.runtime.tools.samples_cli import ROOT, command_here
 
 ROOM = """
@@ -219,7 +220,7 @@ def test_a_recording_is_looked_for_beside_the_file(tmp_path: Path) -> None:
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize(
     "path",
-    [ROOT / "config.toml", *sorted((ROOT / "examples").glob("*.toml"))],
+    example_files().values(),
     ids=lambda path: path.stem,
 )
 def test_our_own_files_are_right(

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from runtime import extras
+from runtime.config import reading
+from runtime.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
 
@@ -33,3 +35,33 @@ def test_every_extra_that_the_code_names_exists() -> None:
         for path in (ROOT / room).rglob("*.py"):
             for part in path.read_text(encoding="utf-8").split("install_command('")[1:]:
                 assert part.split("'")[0] in project["optional-dependencies"], path
+
+
+def test_the_table_of_extensions_is_that_of_their_entry_points() -> None:
+    offered = {}
+    for file in ROOT.glob("extensions/*/pyproject.toml"):
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        points = project["entry-points"]
+        suffixes = [f".{name}" for name in points.get(extras.CONFIGURATIONS, ())]
+        offered[file.parent.name] = (*points.get(extras.NODES, ()), *suffixes)
+        assert project["name"] == f"visnav-{file.parent.name}"
+        assert extras.is_ours(project["name"])
+    assert offered == extras.EXTENSIONS
+
+
+def test_a_node_of_an_extension_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one line, with the command that installs it; so is a file that one would read."""
+    core = [offer for offer in extras.offers(extras.NODES) if offer.package == extras.OURS]
+    monkeypatch.setattr(reading, "offers", lambda _: tuple(core))
+    expected = "the extension visnav-airsim: pip install ./extensions/airsim"
+    with pytest.raises(ConfigError, match=f"f.toml: AirsimServer is a node of {expected}"):
+        reading.find_node("AirsimServer", "f.toml")
+    monkeypatch.setattr(reading, "offers", lambda _: ())
+    with pytest.raises(ConfigError, match=f"settings.json: .json is read by {expected}"):
+        reading.load_configuration(Path("settings.json"))
+
+
+def test_a_stranger_is_not_ours() -> None:
+    assert [*map(extras.is_ours, ("visnav-runtime", "visnav_airsim", "visnav_mine", "other"))] == [
+        *(True, True, False, False)
+    ]

@@ -26,7 +26,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from runtime.errors import CommandError, ConfigError, expect_known
-from runtime.extras import COMMANDS, OURS, Offer, offers
+from runtime.extras import COMMANDS, Offer, is_ours, offers
 
 if TYPE_CHECKING:
     from runtime.summary import Verdict
@@ -66,7 +66,7 @@ class Commands(TyperGroup):
         if cmd_name not in _commands():
             return None
         offer = _chosen(cmd_name)
-        panel = None if offer.package == OURS else f"Commands of {offer.package}"
+        panel = None if is_ours(offer.package) else f"Commands of {offer.package}"
         return TyperCommand(cmd_name, help=_help(offer), rich_help_panel=panel)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ARG002

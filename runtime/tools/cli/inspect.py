@@ -448,7 +448,10 @@ def _copy(example: Path, out: Path, words: dict[str, str]) -> Path:
 
 def example_files() -> dict[str, Path]:
     """Return the examples by name, or raise `CommandError`; the standard tour is ``config``."""
+    from importlib.util import find_spec
+
     from runtime.errors import CommandError
+    from runtime.extras import EXAMPLES, offers
 
     if INSTALLED.is_dir():
         files = list(INSTALLED.glob("*.toml"))
@@ -456,7 +459,13 @@ def example_files() -> dict[str, Path]:
         files = [CHECKOUT / "config.toml", *(CHECKOUT / "examples").glob("*.toml")]
     if not files or not all(file.is_file() for file in files):
         raise CommandError(f"expected examples in {INSTALLED}, found none: install the project")
-    return {file.stem: file for file in sorted(files)}
+    for offer in offers(EXAMPLES):
+        spec = find_spec(offer.value)
+        for package in map(Path, spec.submodule_search_locations or () if spec else ()):
+            folder = package / "examples"  # in a checkout beside the package
+            files += (folder if folder.is_dir() else package.with_name("examples")).glob("*.toml")
+    files.sort(key=lambda file: (file.stem != "config", file.name))
+    return {file.stem: file for file in files}
 
 
 def _about(path: Path) -> str:

@@ -19,9 +19,9 @@ from nodes.judging.readers import read, readers
 from nodes.judging.readers.columns import column_of, columns_of
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_euroc, write_kitti, write_tum
-from sims.airsim.server.measurements import HEADER
 from tests.nodes.judging.judge import bags
 from tests.nodes.trajectory.samples import angle, walk
+from visnav_airsim.server.measurements import HEADER
 
 START = 1_700_000_000_000_000_000
 POSE = walk(60, start=START)

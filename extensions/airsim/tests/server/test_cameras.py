@@ -1,0 +1,507 @@
+"""The cameras that clients know, and the images that they get, decoded and compared by value."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from extensions.airsim.tests.scripts import Caller, RefusedError, drone, with_script
+from runtime.testing import spec
+from sims.cameras.spec import CameraSpec, Stereo
+from sims.computer_vision import FreeCamera
+from visnav_airsim.server.cameras import LONGEST, MOST, Capture, ServedCamera, cameras_by_name
+from visnav_airsim.server.objects import initial_id
+from visnav_airsim.server.rendering import ImageType, palette
+from visnav_airsim.settings import default_mount
+
+NAMES = "front_center", "0", "", "fpv", "front_right", "1", "2", "bottom_center", "3", "4"
+
+
+def vector(found: dict[str, float]) -> tuple[float, float, float]:
+    return found["x_val"], found["y_val"], found["z_val"]
+
+
+def info(call: Caller, name: str, vehicle: str = "") -> Any:
+    return call("simGetCameraInfo", name, vehicle, False)
+
+
+def test_a_vehicle_has_airsims_default_cameras(tiny_world: str) -> None:
+    found = {}
+
+    def script(call: Caller) -> None:
+        found.update({name: info(call, name) for name in NAMES})
+
+    with_script(script, [drone(world=tiny_world, yaw=90.0)])
+    for name in NAMES:
+        (x, y, z), (_, pitch, yaw) = default_mount(name, False)
+        assert vector(found[name]["pose"]["position"]) == pytest.approx((-y, x, z), abs=1e-6)
+        quaternion = found[name]["pose"]["orientation"]
+        half = math.radians(90.0 + yaw) / 2.0
+        expected = math.cos(half) * math.cos(math.radians(pitch) / 2.0)
+        assert abs(quaternion["w_val"]) == pytest.approx(abs(expected), abs=1e-6)
+    assert found["0"] == found[""] == found["fpv"] == found["front_center"] != found["1"]
+    assert found["0"]["fov"] == 90.0
+    assert found["0"]["proj_mat"]["matrix"] == [
+        pytest.approx(row)
+        for row in ([0, 1, 0, 0], [0, 0, -256 / 144, 0], [0, 0, 0, 10], [-1, 0, 0, 0])
+    ]
+
+
+def test_cameras_of_the_settings_and_of_the_file_go_before_default_ones() -> None:
+    entries = [
+        ServedCamera(name="front_center", captures=(Capture(image_type=5, fov=60.0),)),
+        ServedCamera(name="fpv", orientation=(0.0, -90.0, 0.0)),
+        ServedCamera(name="bottom_center", captures=(Capture(fov=30.0, width=100, height=200),)),
+        ServedCamera(name="both", position=(1.0, 2.0, 3.0)),
+    ]
+    own = [
+        CameraSpec(name="front_right", width=40, height=20, fov=120.0),
+        CameraSpec(name="pair", stereo=Stereo(baseline=0.3)),
+        CameraSpec(name="both"),
+    ]
+    found = cameras_by_name(own, entries, 3, free=False)
+    assert found["0"] is found[""] is found["front_center"] is not found["fpv"]
+    assert found["0"].eye(5).spec.fov == 60.0
+    assert found["0"].eye(0).spec.fov == 90.0
+    assert found["0"].mount == ((0.46, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    assert found["fpv"].mount[1] == pytest.approx((0.5**0.5, 0.0, -(0.5**0.5), 0.0))
+    assert found["3"] is found["bottom_center"]
+    assert found["3"].mount[0] == (0.0, 0.0, 0.12)
+    assert found["3"].eye(0).spec.height == 200
+    assert found["3"].eye(1).spec.height == 144
+    assert found["1"] is found["front_right"]
+    assert {found["1"].eye(kind).spec.width for kind in ImageType} == {40}
+    assert found["pair_right"].mount[0] == pytest.approx((0.15, 0.3, 0.0))
+    assert found["both"].mount[0] == (1.0, 2.0, 3.0)
+    assert "pair" not in found
+    assert found["4"].eye(0).body == 3
+
+
+@given(st.sets(st.sampled_from(NAMES)), st.sets(st.sampled_from(NAMES)))
+def test_default_names_are_always_there_and_given_ones_are_those_given(
+    entries: set[str], own: set[str]
+) -> None:
+    found = cameras_by_name(
+        [CameraSpec(name=name) for name in sorted(own)],
+        [ServedCamera(name=name) for name in sorted(entries)],
+        1,
+        free=False,
+    )
+    assert found.keys() >= {*NAMES, "front_left", "back_center"}
+    assert len({id(found[name]) for name in own | entries}) == len(own | entries)
+    unnamed = len({default_mount(name, False) for name in set(found) - own - entries})
+    assert len({id(camera) for camera in found.values()}) <= len(own | entries) + unnamed
+
+
+@pytest.mark.slow
+def test_clients_are_told_the_announced_calibration(tiny_world: str) -> None:
+    found: dict[str, Any] = {}
+
+    def script(call: Caller) -> None:
+        found["front"] = info(call, "front")
+        request = [{"camera_name": "front", "image_type": 0, "compress": False}]
+        (found["image"],) = call("simGetImages", request, "", False)
+        settings = json.loads(call("getSettingsString"))
+        found["settings"] = settings["Vehicles"]["drone"]["Cameras"]["front"]
+        call("simSetCameraPose", "front", {"position": {"x_val": 1.0}}, "", False)
+        found["moved"] = info(call, "front")
+
+    error = {"position": [0.0, 0.2, 0.0], "rotation": [0.0, 10.0, 0.0], "focal": [8.0, 8.0]}
+    camera = {"name": "front", "width": 64, "height": 48, "images": ["grey"]}
+    camera |= {"intrinsics": [32.0, 32.0, 31.5, 23.5], "calibration_error": error}
+    with_script(script, [drone(world=tiny_world, cameras=[camera], camera_processes=1)])
+    fov = 2.0 * math.degrees(math.atan(32.0 / 40.0))
+    place = vector(found["front"]["pose"]["position"])
+    assert place == pytest.approx((0.15, 0.2, 0.0), abs=2e-3)
+    assert found["front"]["fov"] == pytest.approx(fov)
+    half = math.radians(10.0) / 2.0  # about the optical y axis: down
+    assert found["front"]["pose"]["orientation"]["z_val"] == pytest.approx(math.sin(half))
+    assert vector(found["image"]["camera_position"]) == pytest.approx(place)
+    assert found["settings"]["Y"] == pytest.approx(0.2)
+    assert found["settings"]["Yaw"] == pytest.approx(10.0)
+    assert found["settings"]["CaptureSettings"][0]["FOV_Degrees"] == pytest.approx(fov)
+    assert vector(found["moved"]["pose"]["position"]) == pytest.approx((1.0, 0.0, 0.0), abs=2e-3)
+
+
+@pytest.mark.slow
+def test_in_computer_vision_mode_the_cameras_are_at_the_body(tiny_world: str) -> None:
+    found: dict[str, Any] = {}
+
+    def script(call: Caller) -> None:
+        found.update({name: info(call, name) for name in ("0", "1", "3", "any")})
+
+    settings = {"world": tiny_world, "camera_processes": 1, "position": [1, 2, -3]}
+    with_script(script, [spec(FreeCamera, "free", settings | {"cameras": [{"name": "any"}]})])
+    assert vector(found["0"]["pose"]["position"]) == pytest.approx((0, 0, 0))
+    assert vector(found["1"]["pose"]["position"]) == pytest.approx((0, 0.125, 0))
+    assert vector(found["3"]["pose"]["position"]) == pytest.approx((0, 0, 0))
+    assert vector(found["any"]["pose"]["position"]) == pytest.approx((0.15, 0, 0))
+
+
+def test_a_camera_that_is_not_there_fails_the_whole_call(tiny_world: str) -> None:
+    def script(call: Caller) -> None:
+        info(call, "own", "other")
+        with pytest.raises(RefusedError, match=r"expected a camera of drone .*, found 'own'\."):
+            info(call, "own", "drone")
+        call.refuses(
+            "'own'", "simGetImages", [{"camera_name": "0"}, {"camera_name": "own"}], "", False
+        )
+        call.refuses("external cameras", "simGetCameraInfo", "0", "", True)
+
+    two = [drone(world=tiny_world), drone("other", position=[-3.0, 0.0])]
+    with_script(script, two, cameras=[{"name": "own", "vehicle": "other"}])
+
+
+def test_clients_move_cameras_and_change_their_view(tiny_world: str) -> None:
+    pose = {
+        "position": {"x_val": 0.5, "y_val": -0.25, "z_val": 1.0},
+        "orientation": {"w_val": 1.0, "x_val": 0.0, "y_val": 0.0, "z_val": 1.0},
+    }
+    found: dict[str, Any] = {}
+
+    def script(call: Caller) -> None:
+        call("simSetCameraPose", "fpv", pose, "", False)
+        call("simSetCameraFov", "0", 60, "", False)
+        found.update({name: info(call, name) for name in ("0", "1")})
+        bad: dict[str, Any]
+        for bad in (
+            {"position": {"x_val": math.nan}},
+            {"position": {"y_val": 1e300}},
+            {"orientation": {"w_val": 0.0}},
+            {"orientation": {"z_val": math.inf}},
+        ):
+            call.refuses(
+                "expected a rotation, and numbers up to 1e",
+                "simSetCameraPose",
+                "0",
+                pose | bad,
+                "",
+                False,
+            )
+        for degrees in (0.5, 171.0, math.nan, math.inf):
+            call.refuses(
+                "expected a field of view of 1 to 170 degrees",
+                "simSetCameraFov",
+                "0",
+                degrees,
+                "",
+                False,
+            )
+        assert call("simGetDistortionParams", "0", "", False) == [0.0] * 5
+        call("simSetDistortionParam", "0", "K1", 0, "", False)
+        with pytest.raises(RefusedError, match=r"not supported by visnav-runtime: .*K1 = 0\.1"):
+            call("simSetDistortionParam", "0", "K1", 0.1, "", False)
+        assert info(call, "0") == found["0"]
+
+    with_script(script, [drone(world=tiny_world)])
+    assert vector(found["0"]["pose"]["position"]) == pytest.approx((0.5, -0.25, 1.0), abs=1e-5)
+    assert found["0"]["pose"]["orientation"]["z_val"] == pytest.approx(math.sqrt(0.5))
+    assert found["0"]["fov"] == 60.0
+    assert found["1"]["fov"] == 90.0
+
+
+@pytest.mark.parametrize(
+    ("cameras", "message"),
+    [
+        ([{"name": "a", "vehicle": "nobody"}], 'cameras: a: vehicle: .* found "nobody"'),
+        ([{"name": "a"}, {"name": "a", "vehicle": "drone"}], r"found \['a', 'a'\]"),
+    ],
+)
+def test_wrong_settings_are_refused(
+    tiny_world: str, cameras: list[dict[str, Any]], message: str
+) -> None:
+    with pytest.raises(Exception, match=message):
+        with_script(lambda _: None, [drone(world=tiny_world)], cameras=cameras)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"projection": "orthographic"}, {"image_type": 12}, {"fov": 171.0}, {"width": 9000}],
+    ids=str,
+)
+def test_wrong_captures_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(msgspec.ValidationError, match=next(iter(wrong))):
+        msgspec.convert(wrong, Capture)
+
+
+CAMERAS = [
+    {
+        "name": "eye",
+        "captures": [
+            {"image_type": kind, "width": 32 + kind, "height": 24, "fov": 60.0} for kind in range(8)
+        ],
+    },
+    {"name": "huge", "captures": [{"width": 4096, "height": 4096}]},
+]
+AHEAD = 5.0 - 1.0
+"""Distance of the wall of the tiny world from its origin, metres."""
+
+
+def request(name: str, kind: int, *, floats: bool = False, compress: bool = False) -> Any:
+    return {
+        "camera_name": name,
+        "image_type": kind,
+        "pixels_as_float": floats,
+        "compress": compress,
+    }
+
+
+def images(call: Caller, *requests: Any, vehicle: str = "") -> Any:
+    return call("simGetImages", list(requests), vehicle, False)
+
+
+def pixels(response: Any) -> Any:
+    """Return the image of a response, decoded as scripts do, shape (h, w) or (h, w, 3)."""
+    size = response["height"], response["width"]
+    if response["pixels_as_float"]:
+        assert response["image_data_uint8"] == b""
+        return np.array(response["image_data_float"], np.float32).reshape(size)
+    assert response["image_data_float"] == []
+    data = np.frombuffer(response["image_data_uint8"], np.uint8)
+    if not response["compress"]:
+        return data.reshape(*size, 3)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.shape == (*size, 4)
+    assert (image[..., 3] == 255).all()
+    return image[..., :3]
+
+
+@pytest.mark.slow
+def test_each_type_shows_what_is_there(tiny_world: str) -> None:
+    found: dict[str, Any] = {}
+
+    def script(call: Caller) -> None:
+        found["info"] = call("simGetCameraInfo", "eye", "", False)
+        found["float"] = images(call, *(request("eye", k, floats=True) for k in range(8)))
+        found["bytes"] = images(call, *(request("eye", k) for k in range(8)))
+        found["png"] = images(call, *(request("eye", k, compress=True) for k in range(8)))
+        found["one"] = call("simGetImage", "eye", 5, "", False)
+
+    with_script(script, [drone(world=tiny_world, position=[1.0, 0.0])], cameras=CAMERAS)
+    for response in found["float"] + found["bytes"] + found["png"]:
+        kind = response["image_type"]
+        assert (response["width"], response["height"]) == (32 + kind, 24)
+        assert response["time_stamp"] == 0
+        assert response["camera_name"] == "eye"
+        assert response["camera_position"] == found["info"]["pose"]["position"]
+        assert response["camera_orientation"] == found["info"]["pose"]["orientation"]
+        assert "annotation_name" not in response
+    middle = [pixels(each)[8, 16] for each in found["float"]]  # above the horizon: the wall
+    assert middle[1] == pytest.approx(AHEAD - 1.0, abs=1e-4)
+    assert middle[2] == pytest.approx(middle[1], rel=0.02)
+    assert middle[2] > middle[1]
+    assert middle[3] == pytest.approx(middle[1] / 100.0)
+    assert middle[4] == pytest.approx(0.25 / (2.0 * math.tan(math.radians(30.0)) * middle[1]))
+    wall = initial_id("wall")
+    colours = [pixels(each) for each in found["bytes"]]
+    assert (colours[1][8, 16] == 255).all()  # far beyond a metre
+    assert (colours[3][8, 16] == round(2.55 * middle[1])).all()
+    assert colours[5][8, 16].tolist() == palette()[wall][::-1].tolist()
+    assert colours[5][-1, 16].tolist() == palette()[initial_id("floor")][::-1].tolist()
+    south, up = [128, 128, 0], [0, 128, 128]  # blue first
+    assert colours[6][8, 16] == pytest.approx(south, abs=1)
+    assert colours[6][-1, 16] == pytest.approx(up, abs=1)
+    assert colours[7][8, 16].tolist() == [wall] * 3
+    for raw, png, floats in zip(colours, found["png"], found["float"], strict=True):
+        assert np.array_equal(raw, pixels(png))
+        if floats["image_type"] in {0, 5, 6, 7}:
+            assert pixels(floats) == pytest.approx(raw[..., 2] / 255.0)
+    assert found["one"] == found["png"][5]["image_data_uint8"]
+
+
+@pytest.mark.slow
+def test_cosys_gets_red_first_and_its_own_fields(tiny_world: str) -> None:
+    found: dict[str, Any] = {}
+
+    def script(call: Caller) -> None:
+        wanted = [request("eye", 5) | {"annotation_name": "mine"}]
+        (found["airsim"],) = call("simGetImages", wanted, "", False)
+        (found["cosys"],) = call("simGetImages", wanted, "")
+        found["one"] = call("simGetImage", "eye", 5, "", "")
+
+    with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
+    assert np.array_equal(pixels(found["airsim"])[..., ::-1], pixels(found["cosys"]))
+    assert found["cosys"].keys() - found["airsim"].keys() == {"annotation_name"}
+    assert found["cosys"]["annotation_name"] == "mine"
+    assert found["one"].startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_vehicles_see_each_other_and_fly_on_unchanged(tiny_world: str) -> None:
+    found: dict[str, Any] = {}
+
+    def script(call: Caller, *, takes_images: bool = True) -> None:
+        call("enableApiControl", True, "drone")
+        takeoff = call.send("takeoff", 20.0, "drone")
+        for second in range(2):
+            if takes_images:
+                (found[f"seen {second}"],) = images(call, request("eye", 7))
+                found[f"pose {second}"] = call("simGetVehiclePose", "drone")
+            call("simContinueForTime", 1.0)
+        if takes_images:
+            late = call.send("simGetImages", [request("eye", 1, floats=True)] * 2, "", False)
+            call("simContinueForTime", 0.5)
+            found["late"] = call.join(late)
+        else:
+            call("simContinueForTime", 0.5)
+        del takeoff
+
+    two = [drone(world=tiny_world), drone("other", position=[2.0, 0.0])]
+    flown = with_script(script, two, cameras=CAMERAS)
+    other = initial_id("other")
+    assert other in pixels(found["seen 0"])
+    for second in range(2):
+        response, pose = found[f"seen {second}"], found[f"pose {second}"]
+        assert response["time_stamp"] == second * 1_000_000_000
+        assert response["camera_position"] == pose["position"] != {}
+    assert found["pose 1"]["position"]["z_val"] < -0.01
+    stamps = {each["time_stamp"] for each in found["late"]}
+    assert stamps == {2_000_000_000}
+    assert found["late"][0] == found["late"][1]
+
+    without = with_script(lambda call: script(call, takes_images=False), two, cameras=CAMERAS)
+    assert flown.sent == without.sent
+
+
+@pytest.mark.slow
+def test_a_free_camera_shows_at_once_where_it_has_been_put(tiny_world: str) -> None:
+    found: list[Any] = []
+
+    def script(call: Caller) -> None:
+        for north in (0.0, 1.5, -2.0):
+            position = {"x_val": north, "y_val": 0.0, "z_val": 0.0}
+            call("simSetVehiclePose", {"position": position, "orientation": {}}, True, "")
+            found.extend(images(call, request("eye", 1, floats=True)))
+            assert call("simGetVehiclePose", "")["position"] == position
+
+    settings = {"world": tiny_world, "camera_processes": 1, "cameras": [{"name": "any"}]}
+    with_script(script, [spec(FreeCamera, "free", settings)], cameras=CAMERAS)
+    for response, north in zip(found, (0.0, 1.5, -2.0), strict=True):
+        assert response["camera_position"]["x_val"] == pytest.approx(north)
+        assert pixels(response)[10, 16] == pytest.approx(AHEAD - north, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_segmentation_ids_are_set_and_told(tiny_world: str) -> None:
+    found: dict[str, Any] = {}
+
+    def script(call: Caller) -> None:
+        def seen() -> set[int]:
+            (response,) = images(call, request("eye", 7))
+            return set(np.unique(pixels(response)).tolist())
+
+        assert call("simGetSegmentationObjectID", "WALL") == initial_id("wall")
+        assert call("simGetSegmentationObjectID", "nothing") == -1
+        before = call.send("simGetImages", [request("eye", 7)], "", False)
+        assert call("simSetSegmentationObjectID", "wall", 7, False) is True
+        assert initial_id("wall") in pixels(call.join(before)[0])
+        assert call("simSetSegmentationObjectID", "WALL", 8, False) is False
+        found["plain"] = seen()
+        assert call("simSetSegmentationObjectID", "W.*", 300, True) is True
+        assert call("simSetSegmentationObjectID", "w", 1, True) is False
+        assert call("simGetSegmentationObjectID", "wall") == 255
+        found["regex"] = seen()
+        assert call("simSetSegmentationObjectID", "wall", -1, False) is True
+        assert call("simGetSegmentationObjectID", "wall") == -1
+        found["hidden"] = seen()
+        call.refuses("regular expression", "simSetSegmentationObjectID", "(", 1, True)
+
+    with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
+    floor = initial_id("floor")
+    assert found["plain"] - {0} == {floor, 7}
+    assert found["regex"] - {0} == {floor, 255}
+    assert found["hidden"] == {0, floor}
+
+
+@pytest.mark.slow
+def test_any_list_of_requests_is_answered_in_order(tiny_world: str) -> None:
+    names = st.sampled_from(["eye", "0", "", "bottom_center", "camera"])
+    requests = st.builds(
+        request, names, st.integers(0, 7), floats=st.booleans(), compress=st.booleans()
+    )
+
+    def script(call: Caller) -> None:
+        @settings(max_examples=12, deadline=None)
+        @given(st.lists(requests, max_size=5))
+        def check(wanted: list[Any]) -> None:
+            responses = images(call, *wanted)
+            assert len(responses) == len(wanted)
+            for response, each in zip(responses, wanted, strict=True):
+                assert {key: response[key] for key in each} == each
+                eye = 32 + each["image_type"], 24
+                usual = {"eye": eye, "camera": (20, 10)}.get(each["camera_name"], (256, 144))
+                assert (response["width"], response["height"]) == usual
+                pixels(response)
+
+        check()
+
+    camera = {"name": "camera", "width": 20, "height": 10}
+    with_script(
+        script, [drone(world=tiny_world, cameras=[camera], camera_processes=1)], cameras=CAMERAS
+    )
+
+
+@pytest.mark.slow
+def test_what_cannot_be_drawn_is_refused_before_anything_is(tiny_world: str) -> None:
+    def script(call: Caller) -> None:
+        for kind in (-1, 8, 9, 10, 11, 12, 1 << 40):
+            with pytest.raises(RefusedError, match=f"not supported .* images of type {kind}: "):
+                images(call, request("eye", 0), request("eye", kind))
+            assert call("simGetImage", "eye", kind, "", False) == b""
+        with pytest.raises(RefusedError, match=f"at most {MOST} images of one call, found 1000"):
+            images(call, *[request("eye", 0)] * 1000)
+        with pytest.raises(RefusedError, match=f"at most {LONGEST} bytes, found"):
+            images(call, *[request("huge", 0)] * 2)
+        with pytest.raises(RefusedError, match="Vehicle Sim-API for 'nobody' is not available"):
+            images(call, request("eye", 0), vehicle="nobody")
+        wrong: Any
+        for wrong in ([1], [{"image_type": "0"}], [{"camera_name": 5}], {}, None):
+            call.refuses("simGetImages", "simGetImages", wrong, "", False)
+        assert images(call) == []
+
+    with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
+
+
+@pytest.mark.slow
+def test_clients_may_leave_and_the_next_one_is_served(tiny_world: str) -> None:
+    def script(call: Caller) -> None:
+        for _ in range(15):
+            gone = Caller(call._socket.getpeername()[1])
+            for _ in range(2 * MOST):
+                gone.send("simGetImages", [request("large", 6, compress=True)] * 3, "", False)
+            gone.send("ping")
+            gone.close()
+        served, refused = 0, 0
+        while not served:
+            waiting = [call.send("simGetImages", [request("eye", 0)], "", False) for _ in range(3)]
+            for each in waiting:
+                try:
+                    served += len(call.join(each))
+                except RefusedError as error:
+                    refused += 1
+                    assert f"at most {MOST} calls" in str(error)  # noqa: PT017  # either will do
+
+    large = {"name": "large", "captures": [{"image_type": 6, "width": 300, "height": 300}]}
+    with_script(script, [drone(world=tiny_world)], cameras=[*CAMERAS, large])
+
+
+@pytest.mark.slow
+def test_without_gl_all_else_is_served(tiny_world: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")  # in the worker
+
+    def script(call: Caller) -> None:
+        for _ in range(2):
+            with pytest.raises(RefusedError, match="cannot render: expected a working EGL"):
+                images(call, request("eye", 0))
+        assert call("ping") is True
+
+    with_script(script, [drone(world=tiny_world)], cameras=CAMERAS, renderer="mujoco")
