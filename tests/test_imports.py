@@ -20,6 +20,7 @@ MAY_IMPORT = {
     "sims": {"events", "runtime", "sims"},
     "nodes": {"events", "runtime", "runtime.tools", "nodes"},
     "visnav_airsim": {"events", "runtime", "sims", "visnav_airsim"},
+    "visnav_mavlink": {"events", "runtime", "nodes", "visnav_mavlink"},
     "bench": {"events", "runtime", "runtime.tools", "sims", "nodes", "bench", "visnav_airsim"},
 }
 """Room to rooms; `runtime` is its core, without the tools around it, ``visnav_…`` an extension."""
@@ -199,8 +200,9 @@ def test_no_circle_closes() -> None:
 
 
 def folder(module: str) -> str:
-    """Return the folder of a module; one at the root of its room stands for itself."""
-    if module_names()[module].name == "__init__.py" or module.count(".") == 1:
+    """Return the folder of a module; one at the root of a room of the core stands for itself."""
+    alone = module.count(".") == 1 and room(module) not in EXTENSIONS
+    if module_names()[module].name == "__init__.py" or alone:
         return module
     return module.rpartition(".")[0]
 

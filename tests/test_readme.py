@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from runtime.tools.cli.inspect import example_files
 from tests.runtime.tools.samples_cli import command, command_here, summary
 
 ROOT = Path(__file__).parents[1]
@@ -121,7 +122,7 @@ def test_each_example_and_linked_file_exists() -> None:
     """Files that the README names are there."""
     examples = set(re.findall(r"`(\w+\.toml)`", README.partition("## Examples")[2]))
     assert len(examples) > 10
-    assert examples <= {path.name for path in (ROOT / "examples").glob("*.toml")}
+    assert examples <= {path.name for path in example_files().values()}
     for link in re.findall(r"\[[^]]*\]\(([^)]+)\)", README):
         assert (ROOT / link).is_file(), link
 

@@ -29,11 +29,10 @@ from events import (
 from nodes.pilots.pilot import VehicleController, VehicleControllerConfig
 from runtime import Duration, Input, Node, Output, Tick, every, on
 from runtime.errors import MissingDependencyError
-from runtime.extras import install_command
 
 if TYPE_CHECKING:
-    from nodes.mavlink.door import Door
-    from nodes.mavlink.links import Wire
+    from visnav_mavlink.door import Door
+    from visnav_mavlink.links import Wire
 
 RATE = 50.0  # of telemetry, and of set-points on the way to a place, Hz
 ORIGIN = (47.397742, 8.545594, 488.0)  # PX4's in simulations, for vehicles that have none
@@ -116,7 +115,7 @@ class Mavlink(VehicleController[MavlinkConfig]):
         _expect_library("Mavlink")
         if self.checking:
             return
-        from nodes.mavlink.door import Door
+        from visnav_mavlink.door import Door
 
         origins = [getattr(each.config, "origin", None) for each in self.siblings(Node)]
         origin = next(filter(None, origins), ORIGIN)
@@ -235,7 +234,7 @@ class Px4(VehicleController[Px4Config]):
         _expect_library("Px4")
         if self.checking:
             return
-        from nodes.mavlink.links import Wire
+        from visnav_mavlink.links import Wire
 
         host, port = self.config.host, self.config.port
         try:
@@ -278,7 +277,7 @@ class Px4(VehicleController[Px4Config]):
 
     async def run(self) -> None:
         """Give each sample to PX4, and its answer to the motors."""
-        from nodes.mavlink.links import motors, satellites, sensors
+        from visnav_mavlink.links import motors, satellites, sensors
 
         assert self._wire is not None
         wire, config = self._wire, self.config
@@ -314,7 +313,7 @@ class Px4(VehicleController[Px4Config]):
 def _expect_library(node: str) -> None:
     """Raise a `MissingDependencyError` if MAVLink's library cannot be imported."""
     try:
-        import nodes.mavlink.links  # noqa: F401
+        import visnav_mavlink.links  # noqa: F401
     except ImportError as error:
-        wanted = install_command("mavlink")
+        wanted = "pip install ./extensions/mavlink"
         raise MissingDependencyError(f"{node} needs pymavlink ({error}): {wanted}") from error

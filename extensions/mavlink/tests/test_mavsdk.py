@@ -33,7 +33,15 @@ def flown(
 ) -> tuple[str, dict[str, Any]]:
     """Run a script beside an example; return what it prints, and the run's summary."""
     endpoints = f'{node}.endpoints=["udp://127.0.0.1:{port}"]'
-    words = ["run", f"examples/{example}.toml", "--quiet", "--out", str(out), "--set", endpoints]
+    words = [
+        "run",
+        f"extensions/mavlink/examples/{example}.toml",
+        "--quiet",
+        "--out",
+        str(out),
+        "--set",
+        endpoints,
+    ]
     with start(words, ROOT) as process:
         done = subprocess.run(
             [sys.executable, *script], cwd=ROOT, capture_output=True, text=True, timeout=100
@@ -47,7 +55,7 @@ def flown(
 
 def test_the_script_of_the_example_flies(tmp_path: Path) -> None:
     port = free_udp_port()
-    script = "examples/mavsdk_flight.py", f"udpin://127.0.0.1:{port}"
+    script = "extensions/mavlink/examples/mavsdk_flight.py", f"udpin://127.0.0.1:{port}"
     printed, ended = flown(tmp_path, port, *script)
     assert printed.splitlines()[-1] == "landed"
     assert ended["outputs"]["drone.vehicle_events"] == 4  # armed, taken off, landed, disarmed
@@ -57,7 +65,7 @@ def test_the_script_of_the_example_flies(tmp_path: Path) -> None:
 def test_an_estimator_outside_is_judged(tmp_path: Path) -> None:
     """By pymavlink's own connection: its poses are one percent too long, and hardly late."""
     port = free_udp_port()
-    script = "examples/external_vision.py", f"udpin:127.0.0.1:{port}", "3"
+    script = "extensions/mavlink/examples/external_vision.py", f"udpin:127.0.0.1:{port}", "3"
     printed, ended = flown(tmp_path, port, *script, example="external_vision", node="vision")
     figures = ended["verdict"]["estimators"]["vision"]
     assert printed == f"{figures['estimates']} poses\n"
@@ -120,7 +128,7 @@ async def everything(address: str) -> None:
 
 def test_all_plugins_fly(tmp_path: Path) -> None:
     port = free_udp_port()
-    code = "import asyncio, sys; from tests.nodes.mavlink.test_mavsdk import everything; "
+    code = "import asyncio, sys; from extensions.mavlink.tests.test_mavsdk import everything; "
     code += "asyncio.run(everything(sys.argv[1]))"
     _, ended = flown(tmp_path, port, "-c", code, f"udpin://127.0.0.1:{port}")
     assert ended["outputs"]["drone.vehicle_events"] == 4

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from events.frames import Geodetic, from_rpy
-from nodes.mavlink.flight import Flight
-from nodes.mavlink.links import Links, mav
-from nodes.mavlink.vehicle import SECOND, Missions, Parameters, Telemetry, Vehicle
 from runtime.logs import NodeLogger
+from visnav_mavlink.flight import Flight
+from visnav_mavlink.links import Links, mav
+from visnav_mavlink.vehicle import SECOND, Missions, Parameters, Telemetry, Vehicle
 
 if TYPE_CHECKING:
-    from nodes.mavlink.node import MavlinkConfig
+    from visnav_mavlink.node import MavlinkConfig
 
 OLDEST = 10 * SECOND  # age of a vision stamp beyond which its clock is not ours
 MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it

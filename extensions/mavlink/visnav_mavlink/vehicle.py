@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from events import Odometry, PoseEstimate, Quaternion, Vector3
 from events.frames import Geodetic, rotate, rotate_inverse, to_geodetic, yaw_of
-from nodes.mavlink.links import mav
+from visnav_mavlink.links import mav
 
 SECOND = 1_000_000_000
 

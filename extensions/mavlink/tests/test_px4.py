@@ -15,9 +15,9 @@ from pymavlink.dialects.v20 import common as mav
 
 import visnav
 from events import Odometry
-from nodes.mavlink.links import Wire
 from runtime import Node, on
 from runtime.errors import VisnavError
+from visnav_mavlink.links import Wire
 
 HOVER = 0.62
 """Of full thrust at which the vehicle climbs, straight up: there is no wind."""

@@ -9,6 +9,6 @@
 Facts are of MAVLink's common dialect (mavlink.io), and of PX4's conventions, which programs expect.
 """
 
-from nodes.mavlink.node import Mavlink, MavlinkConfig, Px4, Px4Config
+from visnav_mavlink.node import Mavlink, MavlinkConfig, Px4, Px4Config
 
 __all__ = ["Mavlink", "MavlinkConfig", "Px4", "Px4Config"]

@@ -9,8 +9,8 @@ from typing import Any
 import events as ev
 from events import Setpoint, Vector3
 from events.frames import from_geodetic, yaw_of
-from nodes.mavlink.links import mav
-from nodes.mavlink.vehicle import MODES, SECOND, Item, Missions, Parameters, Telemetry, Vehicle
+from visnav_mavlink.links import mav
+from visnav_mavlink.vehicle import MODES, SECOND, Item, Missions, Parameters, Telemetry, Vehicle
 
 OFFBOARD_TIMEOUT = SECOND // 2  # PX4's COM_OF_LOSS_T: without a set-point for longer it holds
 ARRIVED = 0.3  # metres from a place at which it is reached

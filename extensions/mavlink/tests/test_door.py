@@ -14,14 +14,14 @@ from pymavlink.dialects.v20 import common as mav
 
 import events as ev
 from events import Odometry
-from nodes.mavlink.door import Door
-from nodes.mavlink.links import BURST, MOST_PEERS, Links
-from nodes.mavlink.node import Mavlink, MavlinkConfig, Px4
 from runtime.errors import VisnavError
 from runtime.logs import NodeLogger
 from runtime.testing import run_nodes, spec
 from tests.nodes.pilots.test_pilot import Vehicle
 from tests.runtime.tools.samples_cli import ROOT, command_here
+from visnav_mavlink.door import Door
+from visnav_mavlink.links import BURST, MOST_PEERS, Links
+from visnav_mavlink.node import Mavlink, MavlinkConfig, Px4
 
 SECOND = 1_000_000_000
 ORIGIN = (47.0, 8.0, 400.0)
@@ -369,7 +369,9 @@ async def test_streams_are_so_many_are_answered_and_end() -> None:
     ],
 )
 def test_what_is_wrong_in_a_file_is_said_before_the_flight(change: str, message: str) -> None:
-    done = command_here("check", "examples/mavsdk.toml", "--set", change, folder=ROOT)
+    done = command_here(
+        "check", "extensions/mavlink/examples/mavsdk.toml", "--set", change, folder=ROOT
+    )
     assert done.returncode == 2
     assert message in " ".join(done.stderr.split())
 
