@@ -107,6 +107,7 @@ OURS = "visnav-runtime"
 
 EXTENSIONS = {
     "airsim": ("AirsimClient", "AirsimServer", ".json"),
+    "foxglove": ("FoxgloveServer",),
     "mavlink": ("Mavlink", "Px4"),
 }
 """What the extensions of this repository offer: nodes, and suffixes of configuration files."""

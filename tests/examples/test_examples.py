@@ -218,14 +218,6 @@ def test_rerun_leaves_a_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_foxglove_runs_where_nobody_looks(tmp_path: Path) -> None:
-    """`foxglove` flies on without a viewer."""
-    changes = "run.duration=4s", "foxglove.port=0", "report.figures=[]"
-    summary = run("foxglove", tmp_path, *changes)
-    assert summary["events"]["Odometry"] > 300
-
-
-@pytest.mark.slow
 def test_a_recording_takes_the_simulators_place(tmp_path: Path) -> None:
     """`replay` gives the estimates that `record` gave in flight, to the byte."""
     run("record", tmp_path / "live", "run.duration=4s", "report.figures=[]")

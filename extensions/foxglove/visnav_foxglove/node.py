@@ -59,10 +59,10 @@ from nodes.viewers.common import (
     moving_body,
     truth_colour,
 )
-from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 from runtime import Node, Stream, Tick, every, on
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.time.clock import SECOND
+from visnav_foxglove.server import FoxgloveConfig, Server
 
 
 class Messages:

@@ -22,10 +22,9 @@ from events import (
     TrackedFeatures,
     TrackingLost,
 )
+from extensions.foxglove.tests.client import Viewer, doubles, fields
 from nodes.ros2.messages import images
 from nodes.ros2.messages.images import LIDAR_POINT, POINT
-from nodes.viewers.foxglove.node import Publishing
-from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 from tests.nodes.ros2.messages.samples import store
 from tests.nodes.viewers.common.samples import (
     CAMERA,
@@ -48,7 +47,8 @@ from tests.nodes.viewers.common.samples import (
     scan,
     score,
 )
-from tests.nodes.viewers.foxglove.client import Viewer, doubles, fields
+from visnav_foxglove.node import Publishing
+from visnav_foxglove.server import FoxgloveConfig, Server
 
 STAMP = 3_000_000_007
 

@@ -14,15 +14,15 @@ from typing import Any
 import pytest
 
 from events import Event
-from nodes.viewers.foxglove import FoxgloveServer
-from nodes.viewers.foxglove.server import FoxgloveConfig, Server
+from extensions.foxglove.tests.client import Viewer
 from runtime.errors import ConfigError, FatalError, MissingDependencyError
 from runtime.testing import run_node
 from tests.nodes.ros2.messages.samples import store
 from tests.nodes.viewers.common.samples import CAMERA, ESTIMATOR, MS, VEHICLE, image, imu, odometry
-from tests.nodes.viewers.foxglove.client import Viewer
+from visnav_foxglove import FoxgloveServer
+from visnav_foxglove.server import FoxgloveConfig, Server
 
-ROOT = Path(__file__).parents[4]
+ROOT = Path(__file__).parents[3]
 
 
 def test_it_runs_where_nobody_looks(caplog: pytest.LogCaptureFixture) -> None:
@@ -52,14 +52,14 @@ def test_settings_that_are_wrong_say_where(config: dict[str, Any], message: str)
 
 def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[foxglove\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install \./extensions/foxglove"):
         Server(FoxgloveConfig(), "test")
 
 
 def test_who_connects_and_says_nothing_does_not_hold_up_the_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("nodes.viewers.foxglove.server._CLOSING", 0.1)
+    monkeypatch.setattr("visnav_foxglove.server._CLOSING", 0.1)
     server = Server(FoxgloveConfig(port=0), "test")
     port = int(server.address.rpartition(":")[2])
     with socket.create_connection(("127.0.0.1", port)):
@@ -78,7 +78,7 @@ def test_a_viewer_comes_and_goes_while_the_example_flies(tmp_path: Path) -> None
         port = probe.getsockname()[1]
     process = subprocess.Popen(
         [
-            *(sys.executable, "-m", "runtime", "run", "examples/foxglove.toml"),
+            *(sys.executable, "-m", "runtime", "run", "extensions/foxglove/examples/foxglove.toml"),
             *("--out", str(tmp_path), "--set", f"foxglove.port={port}"),
         ],
         cwd=ROOT,

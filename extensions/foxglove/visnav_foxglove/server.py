@@ -21,7 +21,6 @@ import msgspec
 
 from runtime import NodeConfig
 from runtime.errors import MissingDependencyError, VisnavError
-from runtime.extras import install_command
 
 MOST = 64  # viewers at a time, including those still to send their request
 _HEAD_TIMEOUT = 10.0  # real seconds for a viewer to send its request
@@ -236,7 +235,7 @@ class Server:
             import foxglove.websocket
         except ImportError as error:
             raise MissingDependencyError(
-                f"the server needs foxglove ({error}): {install_command('foxglove')}"
+                f"the server needs foxglove ({error}): pip install ./extensions/foxglove"
             ) from error
         self.types: Any = foxglove.messages
         self._channel, self._schema = foxglove.Channel, foxglove.Schema

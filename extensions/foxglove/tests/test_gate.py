@@ -12,9 +12,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from nodes.viewers.foxglove import server as gate
-from nodes.viewers.foxglove.server import FoxgloveConfig, Gate, HttpError, Server, hidden_host
-from tests.nodes.viewers.foxglove.client import Viewer
+from extensions.foxglove.tests.client import Viewer
+from visnav_foxglove import server as gate
+from visnav_foxglove.server import FoxgloveConfig, Gate, HttpError, Server, hidden_host
 
 PROTOCOL = [Subprotocol("foxglove.sdk.v1")]
 
