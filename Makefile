@@ -76,7 +76,7 @@ wheel: $(READY)  ## Build the wheel into dist.
 	$(BIN)/python -m build --outdir dist .
 
 orbslam3: $(READY)  ## Install ORB-SLAM3 (GPL) and train its vocabulary from rendered images.
-	$(INSTALL) -e '.[orbslam3]'
+	$(INSTALL) -e 'extensions/estimators[orbslam3]'
 	@sh tools/system_packages.sh orbslam3 $(BIN)/python
 	$(BIN)/python -m runtime vocabulary config.toml
 

@@ -107,6 +107,7 @@ OURS = "visnav-runtime"
 
 EXTENSIONS = {
     "airsim": ("AirsimClient", "AirsimServer", ".json"),
+    "estimators": ("Evalio", "OrbSlam3", "Svo", "Vit", "VocabularyTrainer"),
     "foxglove": ("FoxgloveServer",),
     "mavlink": ("Mavlink", "Px4"),
 }

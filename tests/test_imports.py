@@ -20,6 +20,7 @@ MAY_IMPORT = {
     "sims": {"events", "runtime", "sims"},
     "nodes": {"events", "runtime", "runtime.tools", "nodes"},
     "visnav_airsim": {"events", "runtime", "sims", "visnav_airsim"},
+    "visnav_estimators": {"events", "runtime", "runtime.tools", "nodes", "visnav_estimators"},
     "visnav_foxglove": {"events", "runtime", "nodes", "visnav_foxglove"},
     "visnav_mavlink": {"events", "runtime", "nodes", "visnav_mavlink"},
     "bench": {"events", "runtime", "runtime.tools", "sims", "nodes", "bench", "visnav_airsim"},

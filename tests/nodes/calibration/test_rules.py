@@ -15,7 +15,7 @@ from runtime.config.reading import parse
 from runtime.tools.preflight import Finding, lint
 from runtime.tools.preflight import rules as all_rules
 from tests.nodes.calibration.samples import IMU, camera, stereo
-from tests.nodes.estimators.test_evalio import lidar
+from tests.nodes.estimators.lidar_samples import lidar
 from tests.runtime.tools.samples_cli import command
 
 SLAM: dict[str, Any] = {"name": "slam", "type": "OrbSlam3"}

@@ -405,3 +405,28 @@ def _undisturbed(record: Record) -> list[int]:
     """Return the stamps up to the second darkness."""
     dark = [stamp for stamp, kind in record.flight.kinds.items() if kind == "b"]
     return [stamp for stamp in record.flight.kinds if stamp < dark[3]]
+
+
+def flights(cases: Mapping[str, Case]) -> list[Any]:
+    """Return the cases as parameters of a test that flies; those that need a library are slow."""
+    return [
+        pytest.param(case, id=name, marks=[pytest.mark.slow] if case.slow else [])
+        for name, case in cases.items()
+    ]
+
+
+def refusals(cases: Mapping[str, Case]) -> list[Any]:
+    """Return cases and what each may lack, as parameters of a test."""
+    return [
+        pytest.param(case, lack, id=f"{name}, {lack.name} missing")
+        for name, case in cases.items()
+        for lack in lacks(case)
+    ]
+
+
+def lenses_of(node: type[Estimator[Any]], settings: dict[str, Any]) -> set[str]:
+    """Return the models of lenses that an estimator announces to know."""
+    made = make_node(node, "est", spec(node, "est", settings).config, NoHost())
+    (announced,) = made.announce()
+    assert isinstance(announced, EstimatorAnnouncement)
+    return set(announced.lenses)

@@ -19,8 +19,8 @@ from runtime.run.execute import execute
 from runtime.testing import run_nodes, spec
 from runtime.units import Duration
 from tests.nodes.estimators.conformance import in_process
+from tests.nodes.estimators.lidar_samples import lidar, scan
 from tests.nodes.estimators.test_estimator import MS, camera, rgbd
-from tests.nodes.estimators.test_evalio import lidar, scan
 
 ROOT = Path(__file__).parents[3]
 Came = list[tuple[int, int, float]]

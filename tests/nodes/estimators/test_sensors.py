@@ -21,20 +21,16 @@ from events import (
 )
 from events.camera_info import COEFFICIENTS
 from nodes.estimators import Estimator, StereoInertialFrame, TrackingResult
-from nodes.estimators.evalio import Evalio
 from nodes.estimators.inertial_odometry import RgbdInertialOdometry, StereoInertialOdometry
 from nodes.estimators.monocular_odometry import MonocularOdometry
-from nodes.estimators.orb_slam3 import OrbSlam3
 from nodes.estimators.rig import SensorChoice
-from nodes.estimators.svo import Svo
 from nodes.estimators.visual_odometry import VisualOdometry
 from nodes.estimators.visual_odometry.node import StereoOdometry
 from nodes.outside.process import Process
-from nodes.outside.vit import Vit
 from runtime import Bundle, Input, on
 from runtime.errors import NodeError, RefusedError
-from runtime.node import make_node
 from runtime.testing import run_nodes, spec
+from tests.nodes.estimators.conformance import lenses_of
 from tests.nodes.estimators.test_estimator import (
     INFO,
     MS,
@@ -46,7 +42,6 @@ from tests.nodes.estimators.test_estimator import (
     track,
     vehicle,
 )
-from tests.runtime.small_events import NoHost
 
 
 def test_the_first_camera_that_gives_what_is_needed_is_read() -> None:
@@ -275,19 +270,10 @@ def test_a_stream_of_single_images_is_rectified_too() -> None:
         (RgbdInertialOdometry, {}, set()),
         (StereoInertialOdometry, {}, set()),
         (MonocularOdometry, {}, set()),
-        (Svo, {}, set()),
-        (Evalio, {}, set()),
-        (OrbSlam3, {"mode": "rgbd"}, {"plumb_bob"}),
-        (OrbSlam3, {"mode": "monocular"}, {"plumb_bob", "equidistant"}),
-        (OrbSlam3, {"mode": "stereo"}, set()),
-        (Vit, {"library": "libvit.so"}, set(COEFFICIENTS)),
         (Process, {"command": ["slam"]}, set(COEFFICIENTS)),
     ],
 )
 def test_each_of_ours_says_which_lenses_it_knows(
     node: type[Estimator[Any]], settings: dict[str, Any], lenses: set[str]
 ) -> None:
-    made = make_node(node, "est", spec(node, "est", settings).config, NoHost())
-    (said,) = made.announce()
-    assert isinstance(said, EstimatorAnnouncement)
-    assert set(said.lenses) == lenses
+    assert lenses_of(node, settings) == lenses

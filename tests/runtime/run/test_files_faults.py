@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.estimators.orb_slam3.settings import Vocabulary, write_vocabulary
 from nodes.mapping import write_ply
 from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
@@ -31,15 +30,6 @@ pytestmark = pytest.mark.timeout(180)
 
 def write_ply_here(path: Path, _: bytes) -> None:
     write_ply(path, np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), "map")
-
-
-def write_vocabulary_here(path: Path, _: bytes) -> None:
-    words = np.zeros((2, 32), np.uint8)
-    ones = np.ones(2, int)
-    tree = Vocabulary(
-        branching=10, depth=1, parents=ones, leaves=ones, descriptors=words, weights=np.ones(2)
-    )
-    write_vocabulary(tree, path)
 
 
 def trace_here(path: Path, _: bytes) -> None:
@@ -69,7 +59,7 @@ DEVICE = os.makedev(1, 7)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("write", [write, write_ply_here, trace_here, write_vocabulary_here])
+@pytest.mark.parametrize("write", [write, write_ply_here, trace_here])
 @pytest.mark.parametrize("kind", ["device", "link to a device", "fifo", "folder"])
 def test_what_is_no_file_is_never_removed_nor_replaced(
     kind: str, write: Callable[[Path, bytes], object], tmp_path: Path
@@ -97,7 +87,7 @@ def test_what_is_no_file_is_never_removed_nor_replaced(
     assert sorted(tmp_path.iterdir()) == sorted({path, real})
 
 
-@pytest.mark.parametrize("write", [write, write_ply_here, trace_here, write_vocabulary_here])
+@pytest.mark.parametrize("write", [write, write_ply_here, trace_here])
 def test_a_link_to_a_file_stays_one(write: Callable[[Path, bytes], object], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("file")

@@ -12,7 +12,6 @@ import pytest
 
 from tests.nodes.outside.process.killing import SIGNALS, kill
 from tests.nodes.outside.process.rig import ROOT, STUB
-from tests.nodes.outside.vit.library import stub_settings
 from tests.runtime.peers.samples import free_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -65,14 +64,6 @@ def in_cpp() -> tuple[str, str, str]:
     return "slam", "/odometry", f'name = "slam"\ntype = "Process"\n{node}'
 
 
-def as_vit() -> tuple[str, str, str]:
-    """Return those of a library of VIT's interface."""
-    given = stub_settings("delay 2")
-    settings = "".join(f'{name} = "{value}"\n' for name, value in given.items())
-    text = f'name = "vio"\ntype = "Vit"\nmode = "monocular_inertial"\n{settings}'
-    return "vio", given["library"], text
-
-
 def by_ros2() -> tuple[str, str, str]:
     """Return those of the example in ROS 2."""
     pytest.importorskip("zenoh_ros2_sdk")
@@ -85,7 +76,7 @@ def by_ros2() -> tuple[str, str, str]:
 
 
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
-@pytest.mark.parametrize("program", [in_python, in_cpp, as_vit, by_ros2])
+@pytest.mark.parametrize("program", [in_python, in_cpp, by_ros2])
 def test_a_run_whose_program_is_killed_names_it_and_loses_nothing(
     program: Callable[[], tuple[str, str, str]], number: signal.Signals, tmp_path: Path
 ) -> None:

@@ -20,12 +20,11 @@ from events.geometry import pose_matrix
 from nodes.estimators import Estimator, EstimatorConfig, TrackingResult, sample_rows
 from runtime import Input, on
 from runtime.errors import MissingDependencyError, suggest
-from runtime.extras import install_command
 
 Name = Literal["ct", "dlio", "form", "genz", "kiss", "liosam", "loam", "mad"]
 Floats = npt.NDArray[np.float64]
 
-INSTALL = install_command("evalio")
+INSTALL = "pip install './extensions/estimators[evalio]'"
 
 _INERTIAL = ("dlio", "liosam")  # pipelines that cannot do without an IMU
 _FIXED = {

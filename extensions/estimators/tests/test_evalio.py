@@ -19,7 +19,6 @@ from events import (
     Event,
     Imu,
     ImuAnnouncement,
-    LidarAnnouncement,
     LidarScan,
     PoseEstimate,
     TrackedFeatures,
@@ -27,35 +26,16 @@ from events import (
     TrackingRegained,
 )
 from nodes.estimators import TrackingResult
-from nodes.estimators.evalio import Evalio, EvalioConfig, EvalioProcess, Name
 from runtime import Node
 from runtime.config.model import Config, RunConfig
 from runtime.errors import MissingDependencyError, NodeError
 from runtime.testing import run_node, run_nodes, spec
 from runtime.tools.preflight import of_nodes
 from tests.nodes.estimators.conformance import in_process
+from tests.nodes.estimators.lidar_samples import PERIOD, lidar, scan
+from visnav_estimators.evalio import Evalio, EvalioConfig, EvalioProcess, Name
 
 Floats = npt.NDArray[np.float64]
-PERIOD = 100_000_000
-DOWN = tuple(Rotation.from_euler("y", -90, degrees=True).as_quat(scalar_first=True).tolist())
-
-
-def lidar(source: str = "drone/top") -> LidarAnnouncement:
-    return LidarAnnouncement(
-        stamp=0,
-        source=source,
-        rate=10.0,
-        frame_id="top",
-        position=(0.0, 0.0, -0.1),
-        orientation=DOWN,  # its x is down
-        channels=16,
-        columns=64,
-        horizontal_fov=6.28,
-        elevations=(-0.3, 0.3),
-        noise=0.0,
-        min_range=0.5,
-        max_range=50.0,
-    )
 
 
 def imu(source: str = "drone/imu") -> ImuAnnouncement:
@@ -68,21 +48,6 @@ def imu(source: str = "drone/imu") -> ImuAnnouncement:
         gyroscope_random_walk=1e-5,
         accelerometer_noise_density=1e-3,
         accelerometer_random_walk=1e-4,
-    )
-
-
-def scan(
-    number: int, points: Floats, source: str = "drone/top", span: float = 0.09375
-) -> LidarScan:
-    count = len(points)
-    return LidarScan(
-        stamp=number * PERIOD,
-        source=source,
-        frame_id="top",
-        points=points.astype(np.float32),
-        intensities=np.ones(count, np.float32),
-        times=np.linspace(0.0, span, count, dtype=np.float32),
-        rings=np.zeros(count, np.uint16),
     )
 
 

@@ -1,5 +1,5 @@
 """ORB-SLAM3 as an estimator: an extra, since under the GPL."""
 
-from nodes.estimators.orb_slam3.node import OrbSlam3, OrbSlam3Config
+from visnav_estimators.orb_slam3.node import OrbSlam3, OrbSlam3Config
 
 __all__ = ["OrbSlam3", "OrbSlam3Config"]

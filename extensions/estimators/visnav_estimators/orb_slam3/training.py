@@ -11,15 +11,15 @@ import numpy as np
 import typer
 
 from events import Image
-from nodes.estimators.orb_slam3.settings import (
+from runtime import Input, Node, NodeConfig
+from runtime.tools.cli.commands import ConfigFile, Overrides
+from visnav_estimators.orb_slam3.settings import (
     Bytes,
     TreeShape,
     cached_vocabulary,
     train,
     write_vocabulary,
 )
-from runtime import Input, Node, NodeConfig
-from runtime.tools.cli.commands import ConfigFile, Overrides
 
 
 class VocabularyTrainerConfig(NodeConfig):
@@ -100,7 +100,6 @@ def vocabulary(
     import msgspec
     from rich.console import Console
 
-    from nodes.estimators.orb_slam3.node import OrbSlam3
     from runtime.config.model import Config, NodeSpec
     from runtime.config.reading import load_configuration
     from runtime.errors import ConfigError
@@ -109,6 +108,7 @@ def vocabulary(
     from runtime.tools.cli.brief import progress
     from runtime.tools.cli.run import leave_behind
     from runtime.units import Duration
+    from visnav_estimators.orb_slam3.node import OrbSlam3
 
     if out is not None and out.suffix != ".txt":  # ORB-SLAM3 would read it as binary
         raise ConfigError(f"--out: expected a name that ends with .txt, found {out}")

@@ -39,7 +39,11 @@ from nodes.estimators import (
     TrackingResult,
     sample_rows,
 )
-from nodes.estimators.orb_slam3.settings import (
+from runtime import Bundle, Duration
+from runtime.errors import MissingDependencyError
+from runtime.node import CommandLine
+from runtime.paths import InputPath
+from visnav_estimators.orb_slam3.settings import (
     LENSES,
     Mode,
     OrbSettings,
@@ -50,11 +54,6 @@ from nodes.estimators.orb_slam3.settings import (
     find_vocabulary,
     make_settings,
 )
-from runtime import Bundle, Duration
-from runtime.errors import MissingDependencyError
-from runtime.extras import install_command
-from runtime.node import CommandLine
-from runtime.paths import InputPath
 
 Floats = npt.NDArray[np.float64]
 
@@ -134,7 +133,7 @@ def first_key_frame(trajectory: Path) -> KeyFrame | None:
 Points = npt.NDArray[np.float32]
 
 INSTALL = (
-    f"make orbslam3, or: {install_command('orbslam3')}, on Debian and Ubuntu "
+    "make orbslam3, or: pip install './extensions/estimators[orbslam3]', on Debian and Ubuntu "
     "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6, and then "
     "python -m runtime vocabulary config.toml"
 )  # installation of ORB-SLAM3 with its vocabulary; `make` serves in a checkout

@@ -26,10 +26,10 @@ from events import (
     TrackingLost,
     TrackingRegained,
 )
-from nodes.estimators.svo import Svo, SvoProcess, SvoSettings, _matrix, _threads, _wait_for
+from extensions.estimators.tests.svo.stub.svo_cpp import SE3d
 from runtime.errors import ConfigError, MissingDependencyError, NodeError
 from runtime.testing import run_node
-from tests.nodes.estimators.svo.stub.svo_cpp import SE3d
+from visnav_estimators.svo import Svo, SvoProcess, SvoSettings, _matrix, _threads, _wait_for
 
 STUB = Path(__file__).parent / "stub"
 FRAME = 50_000_000

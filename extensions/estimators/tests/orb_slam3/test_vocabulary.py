@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.estimators.orb_slam3.settings import (
+from visnav_estimators.orb_slam3.settings import (
     Bytes,
     TreeShape,
     Vocabulary,

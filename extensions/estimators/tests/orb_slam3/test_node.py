@@ -20,13 +20,13 @@ from events import (
     TrackingLost,
     TrajectoryEstimate,
 )
-from nodes.estimators.orb_slam3 import OrbSlam3
+from extensions.estimators.tests.orb_slam3.scene import StubProcess, UnsavedProcess
 from runtime.errors import NodeError, RefusedError
 from runtime.node import make_node
 from runtime.testing import run_nodes, spec
-from tests.nodes.estimators.orb_slam3.scene import StubProcess, UnsavedProcess
 from tests.nodes.estimators.test_estimator import MS, camera, imu, rgbd, sample, vehicle
 from tests.runtime.small_events import NoHost
+from visnav_estimators.orb_slam3 import OrbSlam3
 
 
 def announced(mode: str) -> EstimatorAnnouncement:
@@ -111,8 +111,8 @@ NAMED = {"frames.left": "drone/left", "frames.right": "drone/right"}
 
 @pytest.fixture
 def stub(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nodes.estimators.orb_slam3.node.OrbSlam3Process", StubProcess)
-    monkeypatch.setattr("nodes.estimators.orb_slam3.node.find_vocabulary", Path)
+    monkeypatch.setattr("visnav_estimators.orb_slam3.node.OrbSlam3Process", StubProcess)
+    monkeypatch.setattr("visnav_estimators.orb_slam3.node.find_vocabulary", Path)
 
 
 def test_a_pair_that_may_not_be_rectified_is_refused_before_it_flies(stub: None) -> None:
@@ -165,7 +165,7 @@ def test_each_mode_gets_its_sensors_and_says_its_trajectory_twice(
 def test_what_it_said_counts_though_its_final_trajectory_cannot_be_saved(
     stub: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("nodes.estimators.orb_slam3.node.OrbSlam3Process", UnsavedProcess)
+    monkeypatch.setattr("visnav_estimators.orb_slam3.node.OrbSlam3Process", UnsavedProcess)
     cameras = [vehicle(), camera("drone/front", "rgb", "depth")]
     flown = [event for k in (10, 20) for event in rgbd(k * MS, "drone/front")]
     node = spec(OrbSlam3, "slam", {"latency": "1ms"}, inputs={"frames": "drone/front"})

@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
 from events import CameraAnnouncement, CameraInfo, Image, ImuAnnouncement
-from nodes.estimators.orb_slam3.node import OrbSlam3Result, check_arrays
-from nodes.estimators.orb_slam3.settings import Settings
 from runtime import Node, Output, Tick, every
+from visnav_estimators.orb_slam3.node import OrbSlam3Result, check_arrays
+from visnav_estimators.orb_slam3.settings import Settings
 
 Floats = npt.NDArray[np.float64]
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from events import Event, Image
-from nodes.estimators.orb_slam3.training import VocabularyTrainer, describe, vocabulary
+from extensions.estimators.tests.orb_slam3.scene import views
+from extensions.estimators.tests.orb_slam3.test_vocabulary import read_vocabulary
 from runtime.errors import ConfigError, NodeError
 from runtime.testing import run_node
-from tests.nodes.estimators.orb_slam3.scene import views
-from tests.nodes.estimators.orb_slam3.test_vocabulary import read_vocabulary
+from visnav_estimators.orb_slam3.training import VocabularyTrainer, describe, vocabulary
 
 SHAPE = {"branching": 5, "depth": 2, "index_level": 0}
 CONFIG = """
@@ -21,7 +21,7 @@ duration = "1s"
 
 [[nodes]]
 name = "camera"
-type = "tests.nodes.estimators.orb_slam3.scene:Still"
+type = "extensions.estimators.tests.orb_slam3.scene:Still"
 
 [[nodes]]
 name = "slam"
@@ -50,7 +50,7 @@ def test_some_images_of_each_camera_make_a_vocabulary(
         described.append(data.shape)
         return describe(data, features)
 
-    monkeypatch.setattr("nodes.estimators.orb_slam3.training.describe", noting)
+    monkeypatch.setattr("visnav_estimators.orb_slam3.training.describe", noting)
     colour = [image(k * 10_000_000) for k in range(5)]
     grey = [image(k * 10_000_000 + 1, "drone/down", grey=True) for k in range(2)]
     path = tmp_path / "vocabulary.txt"

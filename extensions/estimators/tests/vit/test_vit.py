@@ -10,12 +10,12 @@ import pytest
 from msgspec.structs import replace
 
 from events import CameraAnnouncement, Event, Image, PoseEstimate, TrackingLost, TrackingRegained
-from nodes.outside.vit import Vit, patience_left
+from extensions.estimators.tests.vit.library import stub_settings
 from runtime.errors import NodeError, VisnavError
 from runtime.testing import run_nodes, spec
 from tests.nodes.estimators.conformance import Case, Record, run
 from tests.nodes.estimators.flight import announcements, fly
-from tests.nodes.outside.vit.library import stub_settings
+from visnav_estimators.vit import Vit, patience_left
 
 FLIGHT = "sss fff ffff fffff"
 READS = ("grey", "imu")

@@ -18,7 +18,12 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nodes.estimators.orb_slam3.node import (
+from extensions.estimators.tests.orb_slam3.scene import CAMERA, IMU, INFO, RIGHT, View, views
+from runtime.errors import MissingDependencyError
+from runtime.testing import run_in_lockstep
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.workers.worker import Worker
+from visnav_estimators.orb_slam3.node import (
     Anchor,
     KeyFrame,
     OrbSlam3Process,
@@ -27,7 +32,7 @@ from nodes.estimators.orb_slam3.node import (
     first_key_frame,
     wait_for_other_threads,
 )
-from nodes.estimators.orb_slam3.settings import (
+from visnav_estimators.orb_slam3.settings import (
     Mode,
     OrbSettings,
     TreeShape,
@@ -35,12 +40,7 @@ from nodes.estimators.orb_slam3.settings import (
     train,
     write_vocabulary,
 )
-from nodes.estimators.orb_slam3.training import describe
-from runtime.errors import MissingDependencyError
-from runtime.testing import run_in_lockstep
-from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.workers.worker import Worker
-from tests.nodes.estimators.orb_slam3.scene import CAMERA, IMU, INFO, RIGHT, View, views
+from visnav_estimators.orb_slam3.training import describe
 
 ROOT = Path(__file__).parents[4]
 Floats = npt.NDArray[np.float64]
@@ -238,14 +238,14 @@ def test_a_missing_library_is_an_error_that_says_what_to_install(
     vocabulary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyorbslam3", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[orbslam3\]'.*libegl1"):
+    with pytest.raises(MissingDependencyError, match=r"estimators\[orbslam3\]'.*libegl1"):
         OrbSlam3Process(make_settings("rgbd", [CAMERA]), vocabulary)
 
 
 @pytest.mark.slow
 def test_importing_the_module_does_not_import_the_library() -> None:
     """In a fresh interpreter, since other tests of this process may have used it."""
-    code = "import sys, nodes.estimators.orb_slam3.node as p; sys.exit('pyorbslam3' in sys.modules)"
+    code = "import sys, visnav_estimators.orb_slam3.node; sys.exit('pyorbslam3' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 

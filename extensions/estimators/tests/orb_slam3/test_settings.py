@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from nodes.estimators.orb_slam3.settings import Mode, OrbSettings, make_settings
-from tests.nodes.estimators.orb_slam3.scene import CAMERA, IMU, INFO, RIGHT
+from extensions.estimators.tests.orb_slam3.scene import CAMERA, IMU, INFO, RIGHT
+from visnav_estimators.orb_slam3.settings import Mode, OrbSettings, make_settings
 
 MODES: tuple[Mode, ...] = ("rgbd", "monocular", "rgbd_inertial", "monocular_inertial")
 PAIR = (CAMERA, RIGHT)
