@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -240,6 +241,34 @@ def test_a_missing_library_is_an_error_that_says_what_to_install(
     monkeypatch.setitem(sys.modules, "pyorbslam3", None)
     with pytest.raises(MissingDependencyError, match=r"estimators\[orbslam3\]'.*libegl1"):
         OrbSlam3Process(make_settings("rgbd", [CAMERA]), vocabulary)
+
+
+def test_measurements_later_than_an_image_wait_for_the_next(
+    vocabulary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As those of an image that was exposed before the first of all; the library refuses them."""
+    given: list[list[float]] = []
+
+    class Slam:
+        def __init__(self, *_: object, **__: object) -> None: ...
+        def track_rgbd(self, _: object, __: object, ___: float, chunk: np.ndarray) -> object:
+            given.append(chunk[:, 0].round(3).tolist())
+            return None
+
+        def is_shutdown(self) -> bool:
+            return True
+
+    stub = SimpleNamespace(Slam=Slam, Sensor=SimpleNamespace(IMU_RGBD=0))
+    monkeypatch.setitem(sys.modules, "pyorbslam3", stub)
+    monkeypatch.setattr(OrbSlam3Process, "_result", lambda *_: None)
+    process = OrbSlam3Process(make_settings("rgbd_inertial", [CAMERA], IMU), vocabulary, 0.0)
+    [view] = views(1)
+    for stamp, times in ((-1, [0.0]), (50, [10.0, 60.0]), (100, [70.0, 100.0])):
+        imu = np.zeros((len(times), 7))
+        imu[:, 0] = np.array(times) * 1e6
+        process.track(stamp * 1_000_000, view.rgb, view.depth, None, imu)
+    process.close()
+    assert given == [[], [0.0, 0.01], [0.06, 0.07, 0.1]]
 
 
 @pytest.mark.slow

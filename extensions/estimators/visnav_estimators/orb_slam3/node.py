@@ -183,6 +183,7 @@ class OrbSlam3Process:
         self._anchor = Anchor()
         self._was_ok = self._new = False
         self._stamps: list[int] = []
+        self._ahead = np.empty((0, 7))  # measurements later than the last image
         self._first_keyframe = -1
         self._folder = tempfile.TemporaryDirectory(prefix="orb_slam3_")
         file = Path(self._folder.name) / "settings.yaml"
@@ -217,7 +218,11 @@ class OrbSlam3Process:
         # thread must have found by now: if not, it is lost at once.
         share = max(_FIRST if self._new else 0.0, self._mapping_time)
         wait_for_other_threads(self._left_alone + share)
-        chunk = None if imu is None else imu * (1e-9, 1, 1, 1, 1, 1, 1)
+        chunk = None
+        if imu is not None:
+            imu = np.vstack([self._ahead, imu])
+            later = imu[:, 0] > stamp
+            self._ahead, chunk = imu[later], imu[~later] * (1e-9, 1, 1, 1, 1, 1, 1)
         if depth is not None:
             # 0 is how ORB-SLAM3 knows that there is no depth.
             known = np.where(np.isfinite(depth), depth, np.float32(0))
