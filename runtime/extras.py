@@ -103,15 +103,18 @@ COMMANDS = "visnav.commands"
 NODES = "visnav.nodes"
 CONFIGURATIONS = "visnav.configurations"
 EXAMPLES = "visnav.examples"
+PROCESSES = "visnav.processes"
 OURS = "visnav-runtime"
 
 EXTENSIONS = {
     "airsim": ("AirsimClient", "AirsimServer", ".json"),
     "estimators": ("Evalio", "OrbSlam3", "Svo", "Vit", "VocabularyTrainer"),
     "foxglove": ("FoxgloveServer",),
+    "machines": ("Peers",),
     "mavlink": ("Mavlink", "Px4"),
 }
-"""What the extensions of this repository offer: nodes, and suffixes of configuration files."""
+"""What the extensions of this repository offer: nodes, suffixes of configuration files, and the
+processes of a run beside this one."""
 
 
 def is_ours(package: str) -> bool:
@@ -173,6 +176,17 @@ def offers(group: str) -> tuple[Offer, ...]:
             '"pip install ." in its folder installs it'
         )
     return (*ours, *(offer for offer in found if offer.package != OURS))
+
+
+def extension(group: str, name: str) -> Any:
+    """Import and return what an extension offers.
+
+    Raises:
+        CommandError: It is not installed, or cannot be imported.
+    """
+    for offer in entry_points(group=group, name=name):
+        return Offer(offer.dist.name if offer.dist else "?", name, offer.value).load()
+    raise CommandError(f"{name} is needed of {missing_extension(name)}")
 
 
 def _declared(group: str) -> list[Offer]:

@@ -9,7 +9,7 @@
 set -u
 cd "$(dirname "$0")/.." || exit 1
 
-tests="tests/events tests/runtime --ignore=tests/runtime/tools --ignore=tests/runtime/peers"
+tests="tests/events tests/runtime --ignore=tests/runtime/tools"
 needs="hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist"
 mine="$(.venv/bin/python -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)"
 

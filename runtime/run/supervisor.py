@@ -25,11 +25,12 @@ from events import Announcement, EstimatorAnnouncement, Event, Shutdown, WindowC
 from runtime.channels.sender import Deliver, Listener, Tap, Voices
 from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
+from runtime.extras import PROCESSES, extension
 from runtime.host import RunEnd
-from runtime.peers import Others
 from runtime.run import event_loop, graph
 from runtime.run.event_loop import RunTask
 from runtime.run.node_runner import Announced, NodeRunner, Phase, log_error, start_up, wrap
+from runtime.run.others import Others
 from runtime.run.run_state import Instruments, RunState
 from runtime.time.clock import SECOND, Clock, Once
 
@@ -80,9 +81,8 @@ class Supervisor:
         self._voices = Voices([spec.name for spec in config.nodes], scripted)
         self.others = Others(clock)
         if self.state.several_processes:
-            from runtime.peers.peers import Peers
-
-            self.others = Peers(config, only, clock, self.stop, self.connect)
+            peers = extension(PROCESSES, "Peers")
+            self.others = peers(config, only, clock, self.stop, self.connect)
         self._ended = asyncio.Event()
         self._startup: asyncio.Task[None] | None = None
         self._tasks: dict[asyncio.Task[Any], None] = {}

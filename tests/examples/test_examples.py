@@ -14,7 +14,6 @@ from runtime.config.reading import load
 from runtime.tools.cli.inspect import example_files
 from sims.worlds import load_world
 from tests.nodes.data.replay import downloads
-from tests.runtime.peers.samples import free_port
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = [*example_files().values()]
@@ -181,33 +180,6 @@ def test_a_recording_takes_the_simulators_place(tmp_path: Path) -> None:
     assert summary["reason"] == "the recording ended"
     name = "trajectories/odometry.tum"
     assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(180)
-@pytest.mark.parametrize("clock", ["lockstep", "real"])
-@pytest.mark.parametrize("first", [0, 1])
-def test_two_machines_start_in_either_order(tmp_path: Path, clock: str, first: int) -> None:
-    """`two_machines` runs as two processes, whichever comes first, as it does in one."""
-    changes = ["run.duration=4s", f"run.clock={clock}", f"network.meet=tcp/127.0.0.1:{free_port()}"]
-    settings = [word for change in changes for word in ("--set", change)]
-    command = [sys.executable, "-m", "runtime", "run", "examples/two_machines.toml", "--quiet"]
-    groups = ["drone,pilot", "odometry,evaluation"]
-    started = []
-    for only in groups if first == 0 else reversed(groups):
-        out = ["--only", only, "--out", str(tmp_path / only)]
-        process = subprocess.Popen(
-            [*command, *settings, *out], cwd=ROOT, stderr=subprocess.PIPE, text=True
-        )
-        started.append(process)
-    for process in started:
-        _, said = process.communicate(timeout=150)
-        assert process.returncode == 0, said
-    one, other = (json.loads((tmp_path / only / "summary.json").read_text()) for only in groups)
-    assert one["digest"] == other["digest"]
-    assert one["events"]["PoseEstimate"] > 30
-    if clock == "lockstep":
-        assert one["digest"] == run("two_machines", tmp_path / "alone", *changes)["digest"]
 
 
 @pytest.mark.slow

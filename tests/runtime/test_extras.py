@@ -43,7 +43,8 @@ def test_the_table_of_extensions_is_that_of_their_entry_points() -> None:
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
         points = project["entry-points"]
         suffixes = [f".{name}" for name in points.get(extras.CONFIGURATIONS, ())]
-        offered[file.parent.name] = (*points.get(extras.NODES, ()), *suffixes)
+        classes = *points.get(extras.NODES, ()), *points.get(extras.PROCESSES, ())
+        offered[file.parent.name] = (*classes, *suffixes)
         assert project["name"] == f"visnav-{file.parent.name}"
         assert extras.is_ours(project["name"])
     assert offered == extras.EXTENSIONS

@@ -167,12 +167,16 @@ def test_the_page_of_what_happens_when_names_tests_and_messages_that_there_are()
     rows = [line.split("|")[1:-1] for line in page.splitlines() if line.startswith("| ")][1:]
     assert len(rows) >= 18
     sources = "".join(
-        path.read_text(encoding="utf-8") for path in sorted((ROOT / "runtime").rglob("*.py"))
+        path.read_text(encoding="utf-8")
+        for folder in (ROOT / "runtime", ROOT / "extensions" / "machines")
+        for path in sorted(folder.rglob("*.py"))
     )
     for row in rows:
         assert len(row) == 5, row
         tests = row[4].strip().strip("`")
-        assert any((ROOT / "tests").rglob(tests)), row
+        assert any(
+            found for room in ("tests", "extensions") for found in (ROOT / room).rglob(tests)
+        ), row
         assert row[3].strip() in {"0", "1", "2", "130", "137", "signal", "as else", ""}, row
         for quoted in re.findall(r"expected [a-z' ]+", row[2]):
             assert quoted.removeprefix("expected ").split(" to end")[0].strip() in sources, quoted

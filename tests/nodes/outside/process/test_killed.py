@@ -12,7 +12,7 @@ import pytest
 
 from tests.nodes.outside.process.killing import SIGNALS, kill
 from tests.nodes.outside.process.rig import ROOT, STUB
-from tests.runtime.peers.samples import free_port
+from tests.runtime.ports import free_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

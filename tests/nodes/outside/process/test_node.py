@@ -28,7 +28,7 @@ from runtime.testing import spec
 from runtime.tools.preflight import of_nodes
 from tests.nodes.outside.process.rig import ROOT, STUB, AsWorker, fly, program
 from tests.nodes.outside.process.test_program import alive, gone_soon
-from tests.runtime.peers.samples import free_port
+from tests.runtime.ports import free_port
 
 pytestmark = pytest.mark.timeout(120)
 
