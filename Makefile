@@ -66,8 +66,8 @@ fix: $(READY)  ## Mend what style checks can mend.
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-size:  ## Print how many lines and files each room has.
-	@$(PYTHON) tools/size.py
+size: $(CORE)  ## Print the lines of each room, of the core, and of what an import brings.
+	@$(BIN)/python tools/size.py
 
 docs: $(READY)  ## Build the documentation into build/site; every broken link is an error.
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -1,35 +1,109 @@
-"""Size of the product and of its tests: files, lines, and the longest and shortest files."""
+"""What a maintainer must hold: lines of the core and of the extensions, and what an import brings.
+
+A line of code is one that is neither blank nor a comment nor part of a docstring.
+"""
 
 from __future__ import annotations
 
+import ast
+import io
 import subprocess
-from collections.abc import Iterable
+import sys
+import tokenize
+from collections import defaultdict
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-LONGEST, SHORTEST = 500, 80  # limits of a file's lines; a file beyond them needs a reason
+CORE = ("events", "runtime", "sims", "nodes", "visnav.py", "visnav_pytest.py")
+CLOSURES = ("runtime.node", "runtime.run.execute")
+
+
+class Size(NamedTuple):
+    """Lines of files."""
+
+    files: int = 0
+    lines: int = 0
+    code: int = 0
+
+    def __add__(self, other: tuple[int, ...]) -> Size:  # type: ignore[override]
+        return Size(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+def room(name: str) -> str:
+    """Return what a file belongs to: a room, an extension, or the tests of either."""
+    first, *rest = name.split("/")
+    if first != "extensions" or len(rest) < 2:
+        return first
+    return f"extensions/{rest[0]}" + ("/tests" if rest[1] == "tests" else "")
+
+
+def code_lines(text: str) -> int:
+    """Return the number of lines of code of a Python source."""
+    documented = {
+        line
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if isinstance(node.value.value, str) and node.end_lineno
+        for line in range(node.lineno, node.end_lineno + 1)
+    }
+    nothing = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
+    coded = {
+        line
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type not in nothing | {tokenize.ENDMARKER}
+        for line in range(token.start[0], token.end[0] + 1)
+    }
+    return len(coded - documented)
+
+
+def sizes() -> dict[str, Size]:
+    """Return the sizes of all rooms: Python, and beside it C++ as ``room (C++)``."""
+    command = ["git", "ls-files", "*.py", "*.cpp", "*.hpp"]
+    total: dict[str, Size] = defaultdict(Size)
+    for name in subprocess.check_output(command, cwd=ROOT, text=True).split():  # noqa: S603
+        text = (ROOT / name).read_text(encoding="utf-8")
+        lines = len(text.splitlines())
+        if name.endswith(".py"):
+            total[room(name)] += (1, lines, code_lines(text))
+        else:
+            stated = [line.strip() for line in text.splitlines()]
+            total[f"{room(name)} (C++)"] += (1, lines, sum(map(is_cpp_code, stated)))
+    return dict(sorted(total.items()))
+
+
+def is_cpp_code(line: str) -> bool:
+    """Return whether a stripped line of C++ is code."""
+    return bool(line) and not line.startswith(("//", "/*", "*"))
+
+
+def core(total: dict[str, Size]) -> Size:
+    """Return the size of the core, Python and C++."""
+    found = [size for name, size in total.items() if name.removesuffix(" (C++)") in CORE]
+    return sum(found, Size())  # type: ignore[return-value]
+
+
+def closure(module: str) -> Size:
+    """Return the size of all of `events` and `runtime` that is loaded with a module."""
+    code = (
+        f"import sys, {module}\n"
+        "for name, module in list(sys.modules.items()):\n"
+        "    if name.partition('.')[0] in ('events', 'runtime'): print(module.__file__)"
+    )
+    command = [sys.executable, "-c", code]
+    names = subprocess.check_output(command, cwd=ROOT, text=True).split()  # noqa: S603
+    texts = [Path(name).read_text(encoding="utf-8") for name in names]
+    return Size(len(texts), sum(len(t.splitlines()) for t in texts), sum(map(code_lines, texts)))
 
 
 def main() -> None:
-    """Print a row for each room, and the files too long or too short."""
-    command = ["git", "ls-files", "*.py"]
-    names = subprocess.check_output(command, cwd=ROOT, text=True).split()  # noqa: S603  # ours
-    lines = {name: len((ROOT / name).read_text(encoding="utf-8").splitlines()) for name in names}
-    tests = {name for name in names if name.startswith("tests/")}
-    product = [name for name in names if name not in tests]
-    rooms = sorted({name.partition("/")[0] for name in product if "/" in name})
-    for room in rooms:
-        _row(room, [lines[name] for name in product if name.startswith(f"{room}/")])
-    _row("outside tests", [lines[name] for name in product])
-    _row("tests", [lines[name] for name in tests])
-    files = [name for name in product if not name.endswith(("__init__.py", "__main__.py"))]
-    print(f"above {LONGEST}:", *(n for n in files if lines[n] > LONGEST))
-    print(f"below {SHORTEST}:", *(n for n in files if lines[n] < SHORTEST))
-
-
-def _row(name: str, counts: Iterable[int]) -> None:
-    counts = list(counts)
-    print(f"{name:14} {sum(counts):7,} lines {len(counts):5} files")
+    """Print a row for each room, for the core, and for what an import brings."""
+    total = sizes()
+    print(f"{'':30} {'files':>6} {'lines':>8} {'code':>8}")
+    rows = [*total.items(), ("", None), ("core, Python and C++", core(total))]
+    rows += [(f"loaded with {module}", closure(module)) for module in CLOSURES]
+    for name, size in rows:
+        print(f"{name:30} {size.files:6,} {size.lines:8,} {size.code:8,}" if size else "")
 
 
 if __name__ == "__main__":
