@@ -422,7 +422,7 @@ class FeatureTracker:
             pose=inverse(self._pose),
             reason=reason,
             points=pixels.astype(np.float32),
-            inliers=np.ones(count, np.bool_),
+            inliers=np.ones(len(pixels), np.bool_),
             map=self._maps,
         )
 

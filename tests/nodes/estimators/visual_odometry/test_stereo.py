@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -82,6 +83,18 @@ def test_images_that_do_not_match_have_no_depth(other: str) -> None:
     columns, rows = np.meshgrid(np.arange(90, 300, 10), np.arange(20, 220, 10))
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
     assert matcher.surfaces_at(coarse, pixels, matcher.depth_noise).continuous.mean() < 0.03
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.3])
+def test_each_corner_of_a_new_map_is_an_inlier(slope: float) -> None:
+    """Also where rows are off so far that some corners lose their depth once that is known."""
+    left, right, _ = pair(pose(yaw=8.0))
+    height, width = right.shape[:2]
+    off_rows = np.array([[1.0, 0.0, 0.0], [2.0 * slope / width, 1.0, -slope / 2.0]])
+    right = cv2.warpAffine(right, off_rows, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    tracker = StereoTracker(INFO, BASELINE, StereoSettings(), FeatureSettings())
+    result = tracker.track(0, left, np.asarray(right, np.uint8))
+    assert len(result.inliers) == len(result.points) > 50
 
 
 @pytest.mark.slow
