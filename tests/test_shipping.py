@@ -136,16 +136,21 @@ def test_a_new_estimator_has_a_name_that_a_module_may_have(tmp_path: Path) -> No
     assert not [*tmp_path.iterdir()]
 
 
+def built(folder: Path, out: Path, *options: str) -> list[Path]:
+    """Build a distribution; return its wheels."""
+    command = [sys.executable, "-m", "build", *options, "--outdir", str(out), str(folder)]
+    subprocess.run(command, check=True, capture_output=True)
+    return [*out.glob("*.whl")]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
-    """Built, installed with what it needs and nothing else, and used away from the checkout."""
-    subprocess.run(
-        [sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(ROOT)],
-        check=True,
-        capture_output=True,
-    )
-    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    """Built, installed with what it needs and nothing else, and used away from the checkout.
+
+    Then the extensions' wheels: their nodes and examples are there, which before were one line.
+    """
+    (wheel,) = built(ROOT, tmp_path / "dist")
     venv.create(tmp_path / "venv", with_pip=True)
     bin_ = tmp_path / "venv" / "bin"
     environment = {k: v for k, v in os.environ.items() if k not in {"PYTHONPATH", "VIRTUAL_ENV"}}
@@ -195,3 +200,24 @@ def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
     assert summary["environment"]["commit"] == noted
     assert summary["code"].keys() == {"odometry"}
     assert (folder / "report.html").stat().st_size > 10_000
+    foxglove = ROOT / "extensions" / "foxglove" / "examples" / "foxglove.toml"
+    refused = subprocess.run(
+        [str(visnav), "check", str(foxglove)], env=environment, capture_output=True, text=True
+    )
+    told = "FoxgloveServer is a node of the extension visnav-foxglove: pip install ./extensions/"
+    assert refused.returncode == 2
+    assert told in refused.stderr
+    wheels = [
+        wheel
+        for extension in sorted((ROOT / "extensions").glob("*/pyproject.toml"))
+        for wheel in built(extension.parent, tmp_path / extension.parent.name, "--wheel")
+    ]
+    assert len(wheels) == 5
+    done(bin_ / "pip", "install", "--quiet", *wheels)
+    assert {"AirsimServer", "Mavlink", "OrbSlam3"} <= set(done(visnav, "nodes").split())
+    for example in ("airsim", "foxglove", "mavsdk", "two_machines", "svo"):
+        done(visnav, "example", example, "--out", example)
+    for example in ("foxglove", "mavsdk", "two_machines"):
+        done(visnav, "check", f"{example}/{example}.toml")
+    short = "--set", "run.duration=1s", "--set", "foxglove.port=0"
+    done(visnav, "run", "foxglove/foxglove.toml", "--quiet", *short)
