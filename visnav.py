@@ -506,6 +506,9 @@ def main() -> None:
     """Run the command line, if the packages found are those installed together with this file."""
     try:
         _check_runtime()
+        from runtime.extras import check_events
+
+        check_events()
         from runtime.tools.cli import program
     except KeyboardInterrupt:  # importing takes a moment
         print("error: interrupted", file=sys.stderr)

@@ -11,34 +11,54 @@ Read the core in this order:
   `execute`; `watchdogs` find the node that blocks the loop or holds up the run.
 - Results: the digest in `channels.wire`, `summary` (made by `run.summarise`), `run.results`,
   `logs`.
-- `config`: the file, and changes during a run; `units` and `paths` are types of settings.
+- `config`: the file, and changes during a run; `units`, `paths` and `changeable` are types of
+  settings.
 - `workers`: objects in processes of their own. `channels.hold`, `answers`: outside systems.
-- `channels.wire`: events as bytes. `peers`: a run in several processes. `figures`: those of a
+- `channels.wire`: events as bytes. `run.others`: other processes of a run. `figures`: those of a
   verdict.
 
 `testing` is for tests of nodes. `tools` is no part of the core: the command line, the monitor,
 tracing and sweeps.
 """
 
-import signal as _signal
-import sys as _sys
+from __future__ import annotations
 
-# Until `runtime.__main__` has taken over, Ctrl-C ends the process without a traceback.
-if _sys.argv[:1] == ["-m"] and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
-    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from runtime import extras as _extras  # noqa: F401  # first, as it checks `events`
-from runtime.channels.bundles import Bundle
-from runtime.channels.ports import Input, Output, every, on
-from runtime.channels.streams import Stream
-from runtime.config.parameters import Changeable
-from runtime.errors import RefusedError, VisnavError
-from runtime.node import Node, NodeConfig
-from runtime.time.clock import Clock, Tick
-from runtime.units import Duration
-from runtime.workers.worker import Worker
+if TYPE_CHECKING:
+    from runtime.changeable import Changeable
+    from runtime.channels.bundles import Bundle
+    from runtime.channels.ports import Input, Output, every, on
+    from runtime.channels.streams import Stream
+    from runtime.errors import RefusedError, VisnavError
+    from runtime.node import Node, NodeConfig
+    from runtime.time.clock import Clock, Tick
+    from runtime.units import Duration
+    from runtime.workers.worker import Worker
 
 __all__ = [
     "Bundle", "Changeable", "Clock", "Duration", "Input", "Node", "NodeConfig", "Output",
     "RefusedError", "Stream", "Tick", "VisnavError", "Worker", "every", "on",
 ]  # fmt: skip
+
+_PLACES = {
+    "changeable": ("Changeable",),
+    "channels.bundles": ("Bundle",),
+    "channels.ports": ("Input", "Output", "every", "on"),
+    "channels.streams": ("Stream",),
+    "errors": ("RefusedError", "VisnavError"),
+    "node": ("Node", "NodeConfig"),
+    "time.clock": ("Clock", "Tick"),
+    "units": ("Duration",),
+    "workers.worker": ("Worker",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of `__all__` when it is first asked for, and what it needs, no more."""
+    for module, names in _PLACES.items():
+        if name in names:
+            globals()[name] = found = getattr(import_module(f"{__name__}.{module}"), name)
+            return found
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

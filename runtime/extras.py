@@ -35,8 +35,7 @@ def check_events() -> None:
     """Check where the package `events` comes from.
 
     Raises:
-        ImportError: It is another project's; `name` is then ``runtime``, so that
-            ``python -m runtime`` prints one line instead of a traceback.
+        ImportError: It is another project's; `name` is then ``runtime``.
     """
     expected = Path(__file__).resolve().parents[1] / "events" / "__init__.py"
     try:
@@ -54,9 +53,6 @@ def check_events() -> None:
             f"{over}: another package of this name stands in the way; remove or rename it",
             name="runtime",
         )
-
-
-check_events()  # an import of the runtime reports it before anything else fails
 
 
 _PROJECT = Path(__file__).parents[1] / "pyproject.toml"

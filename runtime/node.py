@@ -13,7 +13,16 @@ import functools
 import zlib
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, ParamSpec, dataclass_transform, get_args
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    ParamSpec,
+    dataclass_transform,
+    get_args,
+)
 
 import msgspec
 import numpy as np
@@ -21,18 +30,21 @@ from typing_extensions import TypeVar
 
 from events import Announcement, Event
 from runtime.channels.bundles import Declared, Matcher, read_declarations
-from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.ports import MAX_HZ
 from runtime.channels.sender import Listener, Sender
 from runtime.channels.streams import Stream
 from runtime.errors import DeclarationError, expect_known
-from runtime.host import Host, RunEnd, Sibling, Stepping
+from runtime.host import Host, RunEnd, Sibling
+from runtime.json_values import plain
 from runtime.logs import NodeLogger
-from runtime.summary import plain
 from runtime.time.clock import SECOND, Clock, Tick, Ticker
-from runtime.workers.worker import Worker
 
 P = ParamSpec("P")
+if TYPE_CHECKING:
+    from runtime.channels.hold import Hold, HoldConfig
+    from runtime.time.stepping import Stepping
+    from runtime.workers.worker import Worker
+
 R = TypeVar("R")
 W = TypeVar("W")
 

@@ -45,7 +45,7 @@ from nodes.pilots.waypoint_path import (
     plan,
 )
 from runtime import Duration, Node, NodeConfig, Output, on
-from runtime.config.parameters import Changeable
+from runtime.changeable import Changeable
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 

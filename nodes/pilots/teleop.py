@@ -24,7 +24,7 @@ from events import (
 from events.base import KEYS
 from nodes.pilots.pilot import Positive, VehicleController, VehicleControllerConfig
 from runtime import NodeConfig, Output, Tick, every, on
-from runtime.config.parameters import Changeable
+from runtime.changeable import Changeable
 from runtime.errors import suggest
 
 _MOTIONS: dict[str, tuple[int, int, int, int]] = {

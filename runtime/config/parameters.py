@@ -13,26 +13,18 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, NamedTuple, TypeVar, get_origin
+from typing import Any, NamedTuple
 
 import msgspec
 import tomli_w
 
+from runtime.changeable import is_marked
 from runtime.config.model import override, struct_in, types_of, without_none
 from runtime.config.reading import convert
 from runtime.errors import ConfigError
 from runtime.node import NodeConfig
 from runtime.paths import unmarked
 from runtime.units import plain
-
-T = TypeVar("T")
-
-_MARK = "changeable"
-
-Changeable = Annotated[T, msgspec.Meta(extra={_MARK: True})]
-"""Type of a setting changeable during a run: ``Changeable[float]``. Inside a table or a list of
-tables, this applies to the setting (``drone.cameras.front.loss``); around them, to all settings.
-"""
 
 
 class Change(NamedTuple):
@@ -147,12 +139,6 @@ def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
             return True
         struct = struct_in(field)
     return False
-
-
-def is_marked(type_: Any) -> bool:
-    """Tell whether a setting of this type can change in a run."""
-    marks = type_.__metadata__ if get_origin(type_) is Annotated else ()
-    return any(isinstance(m, msgspec.Meta) and (m.extra or {}).get(_MARK) for m in marks)
 
 
 def settings(config: NodeConfig) -> dict[str, str]:

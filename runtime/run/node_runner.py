@@ -30,9 +30,9 @@ from runtime.errors import (
     VisnavError,
 )
 from runtime.host import Host
+from runtime.json_values import plain
 from runtime.node import Node, make_node, streams
 from runtime.run import event_loop
-from runtime.summary import plain
 from runtime.time.clock import Ticker
 from runtime.time.lockstep import ended
 from runtime.workers.worker import Worker

@@ -40,6 +40,7 @@ from runtime.node import Node
 from runtime.run import graph
 from runtime.run.node_runner import Create, NodeRunner
 from runtime.time.clock import SECOND, Clock, Tick, Ticker
+from runtime.time.stepping import Stepping
 from runtime.workers.process import Costs
 from runtime.workers.worker import Worker
 
@@ -85,9 +86,8 @@ class RunState(Host):
         stop: Callable[[str, str], None],
         fault: Callable[[str, BaseException], None],
     ) -> None:
-        super().__init__(
-            clock, config.run.seed, siblings(config, runners), over=lambda: bool(self.reason)
-        )
+        super().__init__(clock, config.run.seed, siblings(config, runners))
+        self.stepping = Stepping(clock, lambda: bool(self.reason))
         self.config = config
         self.runners = runners
         self.instruments = instruments

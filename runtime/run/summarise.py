@@ -25,6 +25,7 @@ from events import (
 from runtime.channels.answers import Answers
 from runtime.channels.wire import Digest, combined, fingerprint
 from runtime.commit import commit
+from runtime.json_values import plain
 from runtime.node import matchers, senders, streams
 from runtime.run.run_state import RunState
 from runtime.summary import (
@@ -35,7 +36,6 @@ from runtime.summary import (
     Summary,
     TickSummary,
     WorkerSummary,
-    plain,
     verdict_of,
 )
 from runtime.time.clock import SECOND

@@ -26,7 +26,6 @@ from types import FrameType, TracebackType
 from typing import Any
 
 from runtime.errors import NodeTimeoutError
-from runtime.host import Stepping
 from runtime.logs import RunThread
 from runtime.run import event_loop
 from runtime.run.event_loop import frame_of
@@ -35,6 +34,7 @@ from runtime.run.run_state import RunState
 from runtime.summary import Stall
 from runtime.time import lockstep
 from runtime.time.lockstep import LockstepLoop, Starvation
+from runtime.time.stepping import Stepping
 
 _LONGEST_PAUSE = 0.05  # seconds between two looks at most; a run's end waits for the last of them
 

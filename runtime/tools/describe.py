@@ -23,9 +23,9 @@ from typing import Any, Literal, NamedTuple, get_args
 import msgspec
 from msgspec import inspect as types
 
+from runtime.changeable import is_marked
 from runtime.channels.sender import LinkConfig
 from runtime.config.model import NetworkConfig, OnError, RunConfig
-from runtime.config.parameters import is_marked
 from runtime.config.reading import by_name_alone, presets_in
 from runtime.node import Node
 from runtime.run.graph import input_types

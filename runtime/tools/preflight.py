@@ -30,6 +30,7 @@ from typing import Any, NoReturn
 import msgspec
 
 from events import Announcement, EstimatorAnnouncement, Shutdown, WindowClosed
+from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.sender import Listener, Voices
 from runtime.config.model import Config, NodeSpec
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
@@ -43,6 +44,7 @@ from runtime.run.graph import circles, edges_of, input_types, unconnected
 from runtime.run.node_runner import Announced, NodeRunner, Phase, start_up
 from runtime.run.run_state import siblings
 from runtime.time.clock import Clock, Tick, Ticker
+from runtime.time.stepping import Stepping
 
 RUN_FILES = ("config.toml", "log.txt", "summary.json")
 """Files written by the run itself into its folder."""
@@ -173,6 +175,7 @@ class _DryHost(Host):
     def __init__(self, config: Config, clock: Clock) -> None:
         here = {spec.name for spec in config.nodes}
         super().__init__(clock, config.run.seed, siblings(config, here))
+        self.stepping = Stepping(clock)
         self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
         )
@@ -183,6 +186,15 @@ class _DryHost(Host):
         call: functools.partial[Any],
     ) -> concurrent.futures.Future[Any]:
         return self.executor.submit(call)
+
+    def hold(
+        self,
+        node: Node[Any],  # noqa: ARG002
+        name: str,
+        config: HoldConfig,
+        latency: float,
+    ) -> Hold[Any]:
+        return Hold(name, self.clock, config, latency)
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:  # noqa: ARG002
         coro.close()

@@ -27,7 +27,7 @@ from events.frames import (
     normalize,
     rotate,
 )
-from runtime.config.parameters import Changeable
+from runtime.changeable import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
 from sims.calibration import chosen

@@ -11,7 +11,7 @@ import msgspec
 
 from events import Event
 from runtime import Input, Node, NodeConfig, Output, Tick, every, on
-from runtime.config.parameters import Changeable
+from runtime.changeable import Changeable
 from runtime.workers.worker import Worker
 
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from events import Event, Image, ParameterChanged, PoseEstimate, VelocitySetpoint
 from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on
+from runtime.changeable import Changeable
 from runtime.channels.sender import Sender
 from runtime.channels.wire import Digest
 from runtime.config.model import Config, NodeSpec, RunConfig
-from runtime.config.parameters import Changeable
 from runtime.node import senders
 from runtime.run import event_loop as task_factory
 from runtime.run.execute import make_clock, make_loop

@@ -8,6 +8,7 @@ from events import Event
 from runtime.host import Host
 from runtime.node import Node, NodeConfig, make_node
 from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.stepping import Stepping
 
 N = TypeVar("N", bound=Node[Any])
 W = TypeVar("W")
@@ -41,6 +42,7 @@ class NoHost(Host):
     def __init__(self, seed: int = 0) -> None:
         with_loop = LockstepLoop()
         super().__init__(LockstepClock(with_loop), seed)
+        self.stepping = Stepping(self.clock)
         with_loop.close()
 
 

@@ -26,8 +26,8 @@ from nodes.calibration.formats import FORMATS, export_calibration, left_out, wri
 from nodes.calibration.room import READERS, ReadCamera, read
 from nodes.data.dataset.recording import Rig
 from runtime.config.reading import parse
+from runtime.json_values import plain
 from runtime.run.execute import execute
-from runtime.summary import plain
 from sims.sensors import calibration
 from tests.nodes.calibration.samples import IMU, LENSES, camera, stereo
 

@@ -9,7 +9,8 @@ import pytest
 
 from events import ParameterChanged, VelocitySetpoint
 from runtime import Duration, Node, NodeConfig
-from runtime.config.parameters import Changeable, change, changeable, settings
+from runtime.changeable import Changeable
+from runtime.config.parameters import change, changeable, settings
 from runtime.errors import ConfigError
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.errors import CommandError
-from runtime.host import Stepping
 from runtime.testing import run_in_lockstep
 from runtime.time.clock import Once, RealClock, Ticker
 from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.stepping import Stepping
 
 MS = 1_000_000
 

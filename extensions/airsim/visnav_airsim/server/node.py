@@ -16,10 +16,10 @@ import msgspec
 
 from events import Announcement, CameraAnnouncement, Command, PoseEstimate, Setpoint, VehicleEvent
 from runtime import Duration, NodeConfig, Output, Tick, every, on
-from runtime.host import Stepping
 from runtime.node import Node
 from runtime.paths import JsonOrPath, NameOrPath
 from runtime.time.clock import SECOND, Clock, Once
+from runtime.time.stepping import Stepping
 from sims.cameras.stage import RendererName
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
