@@ -31,7 +31,7 @@ from runtime.channels.wire import Digest
 from runtime.config.reading import parse
 from runtime.run.execute import execute
 from runtime.summary import Summary
-from runtime.workers.process import SharedPipe, anonymous_file
+from runtime.workers.shared_memory import SharedPipe, anonymous_file
 from sims.cameras import CameraSpec
 from sims.cameras.development import Development
 from sims.cameras.optics import generator

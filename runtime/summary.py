@@ -10,7 +10,7 @@ import msgspec
 
 from runtime.channels.answers import Answers, Outcome, Wrong
 from runtime.channels.wire import combined
-from runtime.workers.process import Costs
+from runtime.workers.costs import Costs
 
 
 class Stall(msgspec.Struct, frozen=True):

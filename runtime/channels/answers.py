@@ -22,7 +22,7 @@ from runtime.channels.wire import combined, fingerprint
 from runtime.errors import ConfigError
 from runtime.paths import source_file
 from runtime.time.clock import SECOND
-from runtime.workers.process import Costs
+from runtime.workers.costs import Costs
 
 Outcome = Literal["answered", "empty", "initialising", "skipped", "lost"]
 """Outcome of a frame: answered; answered without content; still initialising, as the system

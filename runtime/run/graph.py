@@ -28,7 +28,6 @@ from events import (
 from runtime.channels.sender import Deliver, Link, Listener, Tap, Voices
 from runtime.channels.tasks import Fault
 from runtime.config.model import NodeSpec
-from runtime.extras import is_ours
 from runtime.node import Node, senders
 
 Links = Mapping[str, Mapping[str, Link]]  # link before each port, by node and port
@@ -156,6 +155,8 @@ _OURS = frozenset({"nodes", "sims"})  # rooms whose bridges and replays are know
 
 def relays(cls: type[Node[Any]]) -> bool:
     """Return whether a node's estimates are those of others; see `Node.relays_estimates`."""
+    from runtime.extras import is_ours
+
     package = cls.__module__.partition(".")[0]
     return cls.relays_estimates and (package in _OURS or is_ours(package))
 

@@ -16,10 +16,9 @@ import inspect
 import logging
 import time
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from events import Announcement
-from runtime.channels.hold import Hold
 from runtime.channels.sender import Link, Voices
 from runtime.config.model import NodeSpec
 from runtime.errors import (
@@ -35,7 +34,10 @@ from runtime.node import Node, make_node, streams
 from runtime.run import event_loop
 from runtime.time.clock import Ticker
 from runtime.time.lockstep import ended
-from runtime.workers.worker import Worker
+
+if TYPE_CHECKING:
+    from runtime.channels.hold import Hold
+    from runtime.workers.worker import Worker
 
 log = logging.getLogger("visnav.runtime")
 

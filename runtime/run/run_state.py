@@ -20,19 +20,17 @@ import time
 from collections.abc import Callable, Container, Coroutine, Mapping
 from itertools import chain, count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from typing_extensions import TypeVar, override
 
 from events import Announcement, EstimatorAnnouncement, ParameterChanged
 from runtime.channels.answers import Answers
-from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.sender import Deliver, Link, Sender, Tap
 from runtime.channels.streams import Stream
 from runtime.channels.tasks import ResumableCoroutine
 from runtime.config.model import Config
-from runtime.config.parameters import change
 from runtime.errors import ConfigError
 from runtime.host import Host, Sibling
 from runtime.logs import executor
@@ -41,8 +39,11 @@ from runtime.run import graph
 from runtime.run.node_runner import Create, NodeRunner
 from runtime.time.clock import SECOND, Clock, Tick, Ticker
 from runtime.time.stepping import Stepping
-from runtime.workers.process import Costs
-from runtime.workers.worker import Worker
+from runtime.workers.costs import Costs
+
+if TYPE_CHECKING:
+    from runtime.channels.hold import Hold, HoldConfig
+    from runtime.workers.worker import Worker
 
 W = TypeVar("W")
 
@@ -72,7 +73,7 @@ class RunState(Host):
         code: Hash of the files of each node that may estimate.
         truth: What nodes announced otherwise than it is, by subject, for the summary alone.
         afterwards: Functions to call once the summary is written.
-        make_worker: The class of workers, or a function that makes one as that does.
+        make_worker: Makes workers in the place of their class.
         changes: Output for changes of settings; its listeners include the changed node.
     """
 
@@ -113,7 +114,7 @@ class RunState(Host):
         self.truth: dict[str, dict[str, Any]] = {}
         self.costs: dict[str, Costs] = {}
         self.outside: dict[str, Answers] = {}
-        self.make_worker: Callable[..., Worker[Any]] = Worker
+        self.make_worker: Callable[..., Worker[Any]] | None = None
         self.before_first_update: Callable[[], None] = lambda: None
         self.afterwards: list[Callable[[Path], Any]] = []
         self.changes = Sender("run.parameters", ParameterChanged)
@@ -176,6 +177,8 @@ class RunState(Host):
         Raises:
             ConfigError: It cannot be: the message says why, and all is as it was.
         """
+        from runtime.config.parameters import change
+
         runners = self.runners
         name, config, values = change(
             {n: (runner.node or runner.spec).config for n, runner in runners.items()}, text
@@ -249,6 +252,8 @@ class RunState(Host):
     async def worker(
         self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
     ) -> Worker[W]:
+        from runtime.workers.worker import Worker
+
         loop = asyncio.get_running_loop()
 
         def died(error: Exception) -> None:
@@ -256,7 +261,7 @@ class RunState(Host):
 
         kind = getattr(factory, "__name__", "worker")
         name = f"{node.name}.{kind}"
-        worker: Worker[W] = self.make_worker(
+        worker: Worker[W] = (self.make_worker or Worker)(
             name,
             self.clock,
             factory,
@@ -273,6 +278,8 @@ class RunState(Host):
 
     @override
     def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:
+        from runtime.channels.hold import Hold
+
         known = self.outside.get(name)
         answers = self.outside.setdefault(name, Answers())
         hold: Hold[Any] = Hold(

@@ -25,7 +25,6 @@ from events import Announcement, EstimatorAnnouncement, Event, Shutdown, WindowC
 from runtime.channels.sender import Deliver, Listener, Tap, Voices
 from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
-from runtime.extras import PROCESSES, extension
 from runtime.host import RunEnd
 from runtime.run import event_loop, graph
 from runtime.run.event_loop import RunTask
@@ -81,6 +80,8 @@ class Supervisor:
         self._voices = Voices([spec.name for spec in config.nodes], scripted)
         self.others = Others(clock)
         if self.state.several_processes:
+            from runtime.extras import PROCESSES, extension
+
             peers = extension(PROCESSES, "Peers")
             self.others = peers(config, only, clock, self.stop, self.connect)
         self._ended = asyncio.Event()

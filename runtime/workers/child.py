@@ -23,7 +23,8 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from runtime.workers.process import PortableError, SharedPipe
+from runtime.workers.output import PortableError
+from runtime.workers.shared_memory import SharedPipe
 
 _LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
 """Folders of libraries: code not of the worker's own."""

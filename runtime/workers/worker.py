@@ -31,14 +31,9 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.time.clock import SECOND, Clock, result_of
 from runtime.time.lockstep import Starvation
-from runtime.workers.process import (
-    Costs,
-    Output,
-    SharedPipe,
-    Throttle,
-    anonymous_file,
-    how_it_ended,
-)
+from runtime.workers.costs import Costs
+from runtime.workers.output import Output, Throttle, how_it_ended
+from runtime.workers.shared_memory import SharedPipe, anonymous_file
 
 W = TypeVar("W")
 R = TypeVar("R")

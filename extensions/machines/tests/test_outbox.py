@@ -17,7 +17,7 @@ from extensions.machines.tests.samples import apart, settings
 from extensions.machines.tests.test_runs import THREE
 from runtime.channels.wire import Packed, pack, unpack
 from runtime.errors import WireError
-from runtime.workers.process import anonymous_file
+from runtime.workers.shared_memory import anonymous_file
 from visnav_machines import member
 from visnav_machines.member import SMALL, Incoming, Outbox, Outgoing
 from visnav_machines.messages import EventMessage, MemoryMapped, Message, Ready, decode

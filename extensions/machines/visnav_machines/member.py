@@ -42,7 +42,7 @@ from runtime.channels.wire import Packed, pack, unpack
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
 from runtime.summary import ProcessSummary, Summary
 from runtime.time.clock import SECOND, RealClock
-from runtime.workers.process import Arena, MappedFile, anonymous_file
+from runtime.workers.shared_memory import Arena, MappedFile, anonymous_file
 from visnav_machines import messages
 from visnav_machines.session import Sealing
 

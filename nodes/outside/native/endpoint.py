@@ -32,7 +32,8 @@ from nodes.outside.native.answers import (
     read_order,
     read_pose,
 )
-from runtime.workers.process import anonymous_file, plain_lines
+from runtime.workers.output import plain_lines
+from runtime.workers.shared_memory import anonymous_file
 
 _AT_ONCE = 1 << 16  # size of the read buffer for a program's messages, bytes
 GREETING_TIME = 10.0  # real seconds for a connection to send HELLO

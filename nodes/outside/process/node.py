@@ -53,7 +53,7 @@ from runtime.channels.bundles import Field, Matcher, Slot
 from runtime.channels.hold import Hold, Owed
 from runtime.channels.streams import Stream
 from runtime.node import CommandLine
-from runtime.workers.process import Throttle
+from runtime.workers.output import Throttle
 
 _BEYOND = 64  # waiting frames beyond the slots, in lockstep with `on_missing = "continue"`
 _SLOTS = 256  # unanswered frames without images, at most

@@ -53,7 +53,7 @@ from nodes.outside.native import Endpoint, LinkAnswer, LinkError
 from nodes.outside.native.client import RECORDS
 from runtime.channels.hold import Hold
 from runtime.errors import suggest
-from runtime.workers.process import Output, how_it_ended
+from runtime.workers.output import Output, how_it_ended
 
 _AT_ONCE = 1 << 16  # bytes of a single read
 _REST = 1.0  # seconds to read the last output of an ended program, as others may still write

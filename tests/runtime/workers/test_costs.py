@@ -20,7 +20,7 @@ from runtime.summary import WORKER_COLUMNS, Summary, WorkerSummary
 from runtime.testing import spec
 from runtime.tools.cli.brief import run_tables
 from runtime.tools.sweep import write_tables
-from runtime.workers.process import Costs
+from runtime.workers.costs import Costs
 from tests.runtime.samples_workers import Plant
 from tests.runtime.tools.sweep.samples import plan_in, pretend
 from tests.runtime.workers.test_worker import worker

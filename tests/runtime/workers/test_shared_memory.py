@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.workers.process import INLINE, Arena, SharedPipe, anonymous_file
+from runtime.workers.shared_memory import INLINE, Arena, SharedPipe, anonymous_file
 from tests.runtime.samples_workers import Plant
 from tests.runtime.workers.test_worker import alive, worker
 

@@ -22,7 +22,7 @@ from runtime.run.node_runner import with_place, wrap
 from runtime.testing import run_in_lockstep
 from runtime.time.clock import RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.workers.process import LINES
+from runtime.workers.output import LINES
 from tests.runtime.samples_workers import Plant, plain
 
 pytestmark = pytest.mark.timeout(30)

@@ -15,7 +15,7 @@ import numpy as np
 
 from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
 from nodes.outside.native import Endpoint, LinkAnswer, describe
-from runtime.workers.process import plain_lines
+from runtime.workers.output import plain_lines
 
 HEADER_PATH = Path(__file__).parents[4] / "nodes" / "outside" / "native"
 LIMIT = 40.0

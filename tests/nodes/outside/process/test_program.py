@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nodes.outside.process.program import Program
-from runtime.workers.process import LINES, Output, Throttle, how_it_ended, plain_lines
+from runtime.workers.output import LINES, Output, Throttle, how_it_ended, plain_lines
 
 pytestmark = pytest.mark.timeout(60)
 
