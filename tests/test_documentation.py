@@ -20,6 +20,7 @@ from typing import NamedTuple
 import jsonschema
 import pytest
 
+from bench.estimators.plan import read_suite
 from runtime.config.reading import find_node, load
 from runtime.tools.cli.run import chosen
 from tests.runtime.tools.samples_cli import command_here, start, summary
@@ -153,6 +154,8 @@ def test_commands_name_what_there_is(words: str) -> None:
     changes += [value.split(",")[0] for option, value in pairs if option == "--vary"]
     if name == "demo":
         files = ["config.toml"]
+    if name == "suite":
+        files = [read_suite(ROOT / file).rig for file in files]
     for file in files:
         settings = load(ROOT / file, changes)
         if "--only" in arguments:

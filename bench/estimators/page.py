@@ -284,9 +284,9 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
 
     Args:
         plan: The runs; their folders are where they were made.
-        path: Of the page; its pictures go into a folder ``suite`` beside it.
+        path: Of the page; its pictures go into a folder of its name beside it.
     """
-    folder = path.parent / "suite"
+    folder = path.parent / path.stem.lower()
     folder.mkdir(parents=True, exist_ok=True)
     found = cells(plan, rows)
     there = {name for each in found.values() for name in each}

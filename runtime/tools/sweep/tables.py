@@ -36,7 +36,8 @@ class Row(TypedDict):
         repeat: Which of the runs with equal settings and seed it is.
         digest: Of all events; `None` if off, or if equal runs may differ in it.
         digests: Name of an estimator to the digest of all that it has sent.
-        crashes: Errors of the run's earlier tries; a run that has crashed is tried again.
+        crashes: Errors of the run's earlier tries, made from the same; a run that has crashed is
+            tried again.
         sim_seconds: Seconds of the run's clock.
         run_seconds: Real seconds from the first update to the end.
         wall_seconds: Real seconds of the whole process.
@@ -91,8 +92,13 @@ def decode_rows(text: bytes) -> dict[str, Row]:
 
 
 def _enter(rows: dict[str, Row], row: Row) -> Row:
-    """Let a row take the place of its job's earlier one, whose crash it remembers."""
-    if (earlier := rows.get(row["id"])) is not None:
+    """Let a row take the place of its job's earlier one, whose crash it remembers.
+
+    Crashes of other code than today's are none of its: what was mended has not crashed.
+    """
+    earlier = rows.get(row["id"])
+    keys = {each["made_from"] for each in (earlier, row) if each and "made_from" in each}
+    if earlier is not None and len(keys) < 2:
         crashes = earlier.get("crashes", []) + [earlier["error"]] * bool(earlier["error"])
         if crashes:
             row["crashes"] = crashes

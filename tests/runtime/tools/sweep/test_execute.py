@@ -11,6 +11,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
+import msgspec
 import pytest
 from rich.console import Console
 
@@ -18,7 +19,7 @@ from runtime.errors import ConfigError
 from runtime.run.made_from import made_from
 from runtime.tools.sweep import Children, Job, Plan, Row, Watch, make_plan, run_here, sweep
 from runtime.tools.sweep.console import Display, listed
-from runtime.tools.sweep.tables import Rows, crashed
+from runtime.tools.sweep.tables import Rows, crashed, decode_rows
 from tests.runtime.tools.sweep.samples import (
     BESIDE,
     die,
@@ -262,6 +263,24 @@ def test_finished_runs_are_run_again_if_what_they_were_made_from_has_changed(
     assert swept(more, refuse)[0].finished == 3
     (tmp_path / "unrelated.py").write_text("")
     assert swept(more, refuse)[0].finished == 3
+
+
+def test_a_crash_of_what_was_mended_since_is_forgotten(tmp_path: Path) -> None:
+    job = plan_in(tmp_path, "judge.rate=1").jobs[0]
+
+    def row(error: str, made_from: str = "") -> Row:
+        result = crashed(job, error)
+        if made_from:
+            result["made_from"] = made_from
+        return result
+
+    def crashes(*rows: Row) -> object:
+        return decode_rows(b"\n".join(map(msgspec.json.encode, rows)))[job.id].get("crashes")
+
+    assert crashes(row("a", "old"), row("", "old")) == ["a"]
+    assert crashes(row("a"), row("", "new")) == ["a"]  # it died before anybody could look
+    assert crashes(row("a", "old"), row("b", "new"), row("", "new")) == ["b"]
+    assert crashes(row("a", "old"), row("", "new")) is None
 
 
 def test_runs_of_which_nothing_says_what_they_were_made_from_are_run_again(tmp_path: Path) -> None:
