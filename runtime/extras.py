@@ -182,7 +182,7 @@ def extension(group: str, name: str) -> Any:
     """
     for offer in entry_points(group=group, name=name):
         return Offer(offer.dist.name if offer.dist else "?", name, offer.value).load()
-    raise CommandError(f"{name} is needed of {missing_extension(name)}")
+    raise CommandError(f"expected {missing_extension(name)}, found no {group} installed")
 
 
 def _declared(group: str) -> list[Offer]:

@@ -10,7 +10,7 @@ import pytest
 
 from runtime import extras
 from runtime.config import reading
-from runtime.errors import ConfigError
+from runtime.errors import CommandError, ConfigError
 
 ROOT = Path(__file__).parents[2]
 
@@ -60,6 +60,13 @@ def test_a_node_of_an_extension_that_is_missing_is_told(monkeypatch: pytest.Monk
     monkeypatch.setattr(reading, "offers", lambda _: ())
     with pytest.raises(ConfigError, match=f"settings.json: .json is read by {expected}"):
         reading.load_configuration(Path("settings.json"))
+
+
+def test_an_extension_that_a_run_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "entry_points", lambda **_: ())
+    expected = r"expected the extension visnav-machines: pip install \./extensions/machines"
+    with pytest.raises(CommandError, match=expected):
+        extras.extension(extras.PROCESSES, "Peers")
 
 
 def test_a_stranger_is_not_ours() -> None:
