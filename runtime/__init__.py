@@ -59,6 +59,6 @@ def __getattr__(name: str) -> Any:
     """Import a name of `__all__` when it is first asked for, and what it needs, no more."""
     for module, names in _PLACES.items():
         if name in names:
-            globals()[name] = found = getattr(import_module(f"{__name__}.{module}"), name)
-            return found
+            globals()[name] = value = getattr(import_module(f"{__name__}.{module}"), name)
+            return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
