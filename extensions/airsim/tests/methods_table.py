@@ -31,17 +31,19 @@ class Row(NamedTuple):
 
 def methods() -> dict[str, Method]:
     """Return all methods by name: those of the classes in this package, and constant ones."""
-    found = constant_methods()
+    table = constant_methods()
     for module in pkgutil.iter_modules(visnav_airsim.server.__path__, "visnav_airsim.server."):
         for _, group in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
-            found |= methods_of(group)
-    return found
+            table |= methods_of(group)
+    return table
 
 
 def rows() -> Iterator[Row]:
     """Yield all methods, by name."""
     for name, method in sorted(methods().items(), key=lambda item: item[0].lower()):
-        arguments = (f"{each}: {_type_name(hint)}" for each, hint in method.parameters.items())
+        arguments = (
+            f"{parameter}: {_type_name(hint)}" for parameter, hint in method.parameters.items()
+        )
         yield Row(name, ", ".join(arguments), method.description)
 
 

@@ -57,7 +57,7 @@ def test_the_first_script_flies(tmp_path: Path) -> None:
 
 
 def test_a_script_is_judged_and_judged_again(tmp_path: Path) -> None:
-    (_, first), (_, again) = (beside("airsim_odometry", tmp_path / each) for each in "ab")
+    (_, first), (_, again) = (beside("airsim_odometry", tmp_path / name) for name in "ab")
     assert first["digest"] == again["digest"]
     assert first["not_deterministic"] == []
     figures = first["verdict"]["estimators"]["odometry"]

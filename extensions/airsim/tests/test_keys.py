@@ -58,8 +58,8 @@ def test_comments_and_trailing_commas_are_accepted_and_the_first_is_named_by_lin
     ],
 )
 def test_what_is_odd_is_noted(text: str, table: object, note: str) -> None:
-    found, _, notes = parse(text, "settings.json")
-    assert found == table
+    parsed, _, notes = parse(text, "settings.json")
+    assert parsed == table
     assert notes[0].startswith(note)
 
 

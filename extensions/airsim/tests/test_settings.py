@@ -126,16 +126,16 @@ def test_sensors_are_mapped_with_units() -> None:
             "Z": -0.2,
         },
     }
-    found = node(drone(Sensors=sensors), "Drone1")
-    assert found.imu.gyroscope_noise_density == pytest.approx(2 * 8.7266e-5, rel=1e-4)
-    assert found.imu.position == (0.1, 0.0, 0.0)
-    assert found.barometer is None
-    assert (found.gnss.eph_time_constant, found.gnss.latency) == (2.0, 1.5)
-    assert (found.magnetometer.noise, found.magnetometer.rate) == (pytest.approx(1e-6), 20.0)
-    (down,) = found.range_finders
+    config = node(drone(Sensors=sensors), "Drone1")
+    assert config.imu.gyroscope_noise_density == pytest.approx(2 * 8.7266e-5, rel=1e-4)
+    assert config.imu.position == (0.1, 0.0, 0.0)
+    assert config.barometer is None
+    assert (config.gnss.eph_time_constant, config.gnss.latency) == (2.0, 1.5)
+    assert (config.magnetometer.noise, config.magnetometer.rate) == (pytest.approx(1e-6), 20.0)
+    (down,) = config.range_finders
     assert (down.name, down.orientation, down.noise) == ("Down", (0.0, -90.0, 0.0), 0.2)
     assert (down.min_range, down.max_range) == (0.2, 10.5)
-    (top,) = found.lidars
+    (top,) = config.lidars
     assert (top.channels, top.columns, top.rate, top.max_range) == (32, 400, 5.0, 50.0)
     assert (top.azimuths, top.elevations) == ((270.0, 450.0), (-45.0, 10.0))
     assert top.position == (0.0, 0.0, -0.2)
@@ -166,7 +166,7 @@ def test_cameras_keep_airsims_defaults_where_nothing_is_said() -> None:
             "front_right": {"X": 0.5, "CaptureSettings": []},
         }
     ) | {"CameraDefaults": {"CaptureSettings": captures}}
-    cameras = {each.name: each for each in node(settings, "airsim", 3).cameras}
+    cameras = {camera.name: camera for camera in node(settings, "airsim", 3).cameras}
     assert set(cameras) == {
         "eye",
         "front_center",
@@ -185,7 +185,7 @@ def test_cameras_keep_airsims_defaults_where_nothing_is_said() -> None:
     assert cameras["front_left"].captures[1].fov == 60.0
     assert cameras["back_center"].vehicle == "Drone1"
     settings["CameraDefaults"] = {"Y": 0.2, "Yaw": 5}
-    cameras = {each.name: each for each in node(settings, "airsim").cameras}
+    cameras = {camera.name: camera for camera in node(settings, "airsim").cameras}
     assert cameras["eye"].position == (0.5, 0.2, 0.0)
     assert cameras["eye"].orientation == (0.0, -10.0, 5.0)
     assert cameras["front_left"].position == (0.46, 0.2, 0.0)
@@ -212,11 +212,11 @@ def test_a_lidars_field_of_view_wraps_round(start: float, end: float, azimuths: 
 
 def test_default_sensors_replace_the_built_in_ones() -> None:
     settings = drone() | {"DefaultSensors": {"B": {"SensorType": 1, "Enabled": True}}}
-    found = node(settings, "Drone1")
-    assert found.barometer is not None
-    assert found.gnss is None
-    assert found.magnetometer is None
-    assert found.imu.gyroscope_noise_density == pytest.approx(8.7266e-5, rel=1e-4)
+    config = node(settings, "Drone1")
+    assert config.barometer is not None
+    assert config.gnss is None
+    assert config.magnetometer is None
+    assert config.imu.gyroscope_noise_density == pytest.approx(8.7266e-5, rel=1e-4)
 
 
 def test_cosys_imus_are_without_noise_unless_asked() -> None:
@@ -259,9 +259,9 @@ def test_cosys_imus_are_without_noise_unless_asked() -> None:
     ],
 )
 def test_what_is_not_honoured_is_named_once_with_its_path(settings: Any, note: str) -> None:
-    (found,) = table_of(settings, 1)[1]
-    assert note in found
-    assert found.startswith("settings.json: ")
+    (remark,) = table_of(settings, 1)[1]
+    assert note in remark
+    assert remark.startswith("settings.json: ")
 
 
 def test_what_asks_for_what_is_so_anyway_is_not_named() -> None:

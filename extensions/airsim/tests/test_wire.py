@@ -60,30 +60,30 @@ def test_the_first_bytes_of_airsims_client_are_a_ping() -> None:
     ],
 )
 def test_both_families_of_strings_and_all_numbers_are_read(packed: bytes, value: object) -> None:
-    (found,) = decoded([b"\x94\x00\x07\xa1m\x91" + packed])
-    assert found == wire.Request(7, "m", [value])
+    (request,) = decoded([b"\x94\x00\x07\xa1m\x91" + packed])
+    assert request == wire.Request(7, "m", [value])
 
 
 def test_numbers_that_are_none_pass() -> None:
-    (found,) = decoded([wire.request(1, "m", [math.nan, -math.inf])])
-    assert math.isnan(found.arguments[0])
-    assert found.arguments[1] == -math.inf
+    (request,) = decoded([wire.request(1, "m", [math.nan, -math.inf])])
+    assert math.isnan(request.arguments[0])
+    assert request.arguments[1] == -math.inf
 
 
 def test_replies_have_strings_bytes_and_maps_as_airsims_clients_expect() -> None:
     data = wire.reply(3, None, ImageResponse(image_data_uint8=b"\x01\x02", time_stamp=2**62))
-    found = msgpack.unpackb(data, raw=False)
-    assert found[:3] == [1, 3, None]
-    assert found[3]["image_data_uint8"] == b"\x01\x02"
-    assert found[3]["time_stamp"] == 2**62
-    assert found[3]["camera_position"] == {"x_val": 0.0, "y_val": 0.0, "z_val": 0.0}
+    message = msgpack.unpackb(data, raw=False)
+    assert message[:3] == [1, 3, None]
+    assert message[3]["image_data_uint8"] == b"\x01\x02"
+    assert message[3]["time_stamp"] == 2**62
+    assert message[3]["camera_position"] == {"x_val": 0.0, "y_val": 0.0, "z_val": 0.0}
     assert b"\xc4\x02\x01\x02" in data  # bin8, not str
 
 
 def test_floats_are_packed_in_five_bytes_each() -> None:
     numbers = np.array([[1.0, -2.5], [np.inf, 0.0]])
-    (found,) = decoded([wire.reply(7, None, {"data": wire.float_array(numbers)})])
-    assert found == wire.Reply(7, None, {"data": [1.0, -2.5, np.inf, 0.0]})
+    (reply,) = decoded([wire.reply(7, None, {"data": wire.float_array(numbers)})])
+    assert reply == wire.Reply(7, None, {"data": [1.0, -2.5, np.inf, 0.0]})
 
 
 def test_whole_numbers_are_taken_for_floats_but_not_the_reverse() -> None:

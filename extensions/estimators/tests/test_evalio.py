@@ -121,8 +121,8 @@ class Stub:
         self.estimates.append((scan.stamp, Matrix(np.eye(3), where)))
 
     def saved_estimates(self) -> list[tuple[Stamp, Matrix]]:
-        found, self.estimates = self.estimates, []
-        return found
+        estimates, self.estimates = self.estimates, []
+        return estimates
 
 
 @pytest.fixture
@@ -187,10 +187,12 @@ def test_the_body_goes_where_the_lidar_goes_at_the_pipelines_time_in_a_scan(
     assert said.method == f"{config['pipeline']} (evalio)"
     estimates = result.of(PoseEstimate)
     after = round(share * 93_750_000)
-    assert [each.stamp for each in estimates] == [k * PERIOD + after for k in (1, 2, 3)]
+    assert [estimate.stamp for estimate in estimates] == [k * PERIOD + after for k in (1, 2, 3)]
     # The library's x is the body's, which stands for the IMU.
-    np.testing.assert_allclose([each.position for each in estimates][-1], (2, 0, 0), atol=1e-9)
-    assert {each.frame_id for each in estimates} == {"odom"}
+    np.testing.assert_allclose(
+        [estimate.position for estimate in estimates][-1], (2, 0, 0), atol=1e-9
+    )
+    assert {estimate.frame_id for estimate in estimates} == {"odom"}
     assert not result.of(TrackedFeatures)
 
 
@@ -199,9 +201,9 @@ def test_a_scan_of_few_points_is_lost_and_none_is_said_before_the_first_good_one
     few, none = CLOUD[:20], CLOUD[:0]
     scans = [scan(k + 1, c) for k, c in enumerate([few, none, CLOUD, CLOUD, few, none, CLOUD])]
     result = fly(lidar(), *scans, min_points=60)
-    assert [each.stamp // PERIOD for each in result.of(PoseEstimate)] == [3, 4, 7]
-    assert [each.stamp // PERIOD for each in result.of(TrackingLost)] == [5]
-    assert [each.stamp // PERIOD for each in result.of(TrackingRegained)] == [7]
+    assert [event.stamp // PERIOD for event in result.of(PoseEstimate)] == [3, 4, 7]
+    assert [event.stamp // PERIOD for event in result.of(TrackingLost)] == [5]
+    assert [event.stamp // PERIOD for event in result.of(TrackingRegained)] == [7]
 
 
 @pytest.mark.usefixtures("library")
@@ -211,8 +213,8 @@ def test_a_pose_of_lio_sam_is_that_of_the_scan_two_before() -> None:
     scans = [scan(k, cloud) for k, cloud in enumerate(clouds, 1)]
     result = fly(lidar(), imu(), *scans, pipeline="liosam")
     estimates = result.of(PoseEstimate)
-    assert [each.stamp for each in estimates] == [k * PERIOD + 46_875_000 for k in (1, 2)]
-    np.testing.assert_allclose([each.position[0] for each in estimates], (0, 1), atol=1e-9)
+    assert [estimate.stamp for estimate in estimates] == [k * PERIOD + 46_875_000 for k in (1, 2)]
+    np.testing.assert_allclose([estimate.position[0] for estimate in estimates], (0, 1), atol=1e-9)
 
 
 @pytest.mark.usefixtures("library")
@@ -248,7 +250,7 @@ def test_an_inertial_pipeline_gets_each_sample_of_its_imu_once_and_in_its_axes()
     fly(*reversed(named.values()), lidar(), *script, pipeline="dlio")
     (made,) = Stub.made
     assert made.imu.rate == 200.0
-    stamps = [each.stamp for each in made.samples]
+    stamps = [sample.stamp for sample in made.samples]
     assert stamps == sorted(set(stamps))
     assert stamps[0] == PERIOD // 10
     assert stamps[-1] <= 3 * PERIOD + 93_750_000
@@ -363,7 +365,7 @@ def room(number: int, pose: Floats) -> LidarScan:
     angles = np.linspace(-np.pi, np.pi, 256, endpoint=False) + 1e-3  # along no wall
     rng = np.random.default_rng(number)
     heights = np.linspace(0.5, -0.51, 32) + rng.uniform(-0.016, 0.016)
-    rows, columns = (each.ravel() for each in np.meshgrid(heights, angles, indexing="ij"))
+    rows, columns = (grid.ravel() for grid in np.meshgrid(heights, angles, indexing="ij"))
     rays = np.stack([np.cos(rows) * np.cos(columns), np.cos(rows) * np.sin(columns), -np.sin(rows)])
     rays, start = pose[:3, :3] @ rays, pose[:3, 3:]
     walls = np.array([[4.0], [3.0], [2.0]])
@@ -432,8 +434,10 @@ def test_each_pipeline_of_the_library_follows_a_room_and_repeats_itself(pipeline
         for _ in range(2)
     )
     assert len(first) == len(truth) - (2 if pipeline == "liosam" else 0)
-    assert [each.position for each in first] == [each.position for each in second]
-    assert [each.orientation for each in first] == [each.orientation for each in second]
-    off = np.array([each.position for each in first]) - np.array(truth)[: len(first), :3, 3]
+    assert [estimate.position for estimate in first] == [estimate.position for estimate in second]
+    assert [estimate.orientation for estimate in first] == [
+        estimate.orientation for estimate in second
+    ]
+    off = np.array([estimate.position for estimate in first]) - np.array(truth)[: len(first), :3, 3]
     known = off[:, :2] if pipeline == "kiss" else off
     assert np.linalg.norm(known, axis=1).max() < 0.05

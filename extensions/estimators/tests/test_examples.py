@@ -30,10 +30,10 @@ def test_pipelines_of_evalio_answer_every_scan(tmp_path: Path) -> None:
     pytest.importorskip("evalio")
     figures = run("evalio", tmp_path, "report.figures=[]")["verdict"]["estimators"]
     assert figures.keys() == {"kiss", "ct", "dlio"}
-    for name, each in figures.items():
-        assert each["coverage_percent"] == 100.0
-        assert max(each["ate_north_rmse_m"], each["ate_east_rmse_m"]) < 0.05
-        assert each["ate_percent"] < (3.0 if name == "kiss" else 0.5)
+    for name, ratings in figures.items():
+        assert ratings["coverage_percent"] == 100.0
+        assert max(ratings["ate_north_rmse_m"], ratings["ate_east_rmse_m"]) < 0.05
+        assert ratings["ate_percent"] < (3.0 if name == "kiss" else 0.5)
 
 
 @pytest.mark.slow

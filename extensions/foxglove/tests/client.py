@@ -55,7 +55,7 @@ class Viewer:
         if isinstance(data, str):
             said = json.loads(data)
             if said["op"] == "advertise":
-                self.channels |= {each["topic"]: each for each in said["channels"]}
+                self.channels |= {channel["topic"]: channel for channel in said["channels"]}
         elif data[0] == 1:
             subscription, stamp = struct.unpack_from("<IQ", data, 1)
             self.messages[self._topics[subscription]].append((stamp, data[13:]))
@@ -87,7 +87,7 @@ Fields = dict[int, list[Any]]
 
 def fields(data: bytes) -> Fields:
     """Read a protobuf message, one level deep."""
-    found: Fields = defaultdict(list)
+    values: Fields = defaultdict(list)
     at = 0
     while at < len(data):
         key, at = _varint(data, at)
@@ -107,14 +107,14 @@ def fields(data: bytes) -> Fields:
                 at += 4
             case kind:
                 raise ValueError(f"expected a wire type, found {kind}")
-        found[key >> 3].append(value)
-    return found
+        values[key >> 3].append(value)
+    return values
 
 
 def doubles(data: bytes, count: int) -> list[float]:
     """Read a message of so many numbers; those that are 0 are not there."""
-    found = fields(data)
-    return [found[i + 1][0] if i + 1 in found else 0.0 for i in range(count)]
+    values = fields(data)
+    return [values[i + 1][0] if i + 1 in values else 0.0 for i in range(count)]
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:

@@ -59,8 +59,8 @@ class Stage:
     def __init__(self, server: Server, *more: Announcement, **settings: float) -> None:
         self.server = server
         self.publishing = Publishing(server, msgspec.convert(settings, FoxgloveConfig))
-        for each in (VEHICLE, CAMERA, ESTIMATOR, *more):
-            self.publishing.announced(each)
+        for announcement in (VEHICLE, CAMERA, ESTIMATOR, *more):
+            self.publishing.announced(announcement)
         self.publishing.begin()
 
     def put(self, *events: Event) -> None:
@@ -109,8 +109,11 @@ def xyz(vector: Any) -> tuple[float, ...]:
 
 def placed(message: Any) -> dict[str, tuple[str, Any]]:
     """Return parent and transform of each frame."""
-    found = message.transforms
-    return {each.child_frame_id: (each.header.frame_id, each.transform) for each in found}
+    transforms = message.transforms
+    return {
+        transform.child_frame_id: (transform.header.frame_id, transform.transform)
+        for transform in transforms
+    }
 
 
 def test_a_viewer_is_told_who_serves_and_what_there_is(server: Server, viewer: Viewer) -> None:
@@ -118,7 +121,7 @@ def test_a_viewer_is_told_who_serves_and_what_there_is(server: Server, viewer: V
     viewer.subscribe("/vo/pose", "/drone/odom", "/drone/camera/depth/image_raw", "/scene", "/tf")
     assert viewer.info["name"] == "test"
     assert viewer.info["capabilities"] == ["time"]
-    kinds = {topic: each["schemaName"] for topic, each in viewer.channels.items()}
+    kinds = {topic: channel["schemaName"] for topic, channel in viewer.channels.items()}
     assert kinds == {
         "/scene": "foxglove.SceneUpdate",
         "/log": "foxglove.Log",
@@ -180,12 +183,12 @@ def test_who_looks_late_gets_what_holds_for_the_whole_run(server: Server, viewer
         "camera_link": "base_link",
         "camera_optical_frame": "camera_link",
     }
-    entities = [fields(each) for each in fields(viewer.next("/scene"))[2]]
-    assert [each[3][0] for each in entities] == [
+    entities = [fields(entity) for entity in fields(viewer.next("/scene"))[2]]
+    assert [entity[3][0] for entity in entities] == [
         b"drone",
         *[b"truth/drone/%d" % i for i in range(3)],
     ]
-    assert [each[2][0] for each in entities] == [b"base_link", b"map", b"map", b"map"]
+    assert [entity[2][0] for entity in entities] == [b"base_link", b"map", b"map", b"map"]
     rotor = fields(fields(entities[0][8][2])[1][0])[1][0]
     assert doubles(rotor, 3) == pytest.approx([-0.14, 0.14, 0.03])  # forward, left, up
     last = fields(entities[3][11][0])[5][-1]
@@ -213,10 +216,10 @@ def test_images_are_what_the_camera_saw(server: Server, viewer: Viewer) -> None:
     topics = "/drone/camera/image_raw/compressed", "/drone/camera/depth/image_raw"
     stage.look(viewer, *topics, "/drone/camera/camera_info")
     stage.put(image(STAMP), depth(STAMP, 2.5))
-    found = read(viewer, topics[0])
-    pixels = decoded(found.data.tobytes(), cv2.IMREAD_COLOR_RGB)
+    received = read(viewer, topics[0])
+    pixels = decoded(received.data.tobytes(), cv2.IMREAD_COLOR_RGB)
     assert pixels[3, 4] == pytest.approx([200, 100, 50], abs=4)
-    assert found.header.frame_id == "camera_optical_frame"
+    assert received.header.frame_id == "camera_optical_frame"
     raw = read(viewer, topics[1])
     assert (raw.width, raw.height, raw.encoding, raw.step) == (8, 6, "16UC1", 16)
     assert set(raw.data.view("<u2").tolist()) == {2500}
@@ -280,7 +283,7 @@ def test_features_clouds_words_and_numbers_come_too(server: Server, viewer: View
         PointCloud(stamp=STAMP, source="mapping", points=points, colors=colours),
     )
     groups = fields(viewer.next(topics[0]))[2]
-    assert [doubles(fields(each)[3][0], 2) for each in groups] == [[1.0, 2.0], [3.0, 4.0]]
+    assert [doubles(fields(group)[3][0], 2) for group in groups] == [[1.0, 2.0], [3.0, 4.0]]
     assert fields(viewer.next("/log"))[3] == [b"TrackingLost (too dark)"]
     assert xyz(read(viewer, "/drone/imu").angular_velocity) == (0.1, -0.2, -0.3)
     assert read(viewer, topics[3]).data == 0.5
@@ -322,8 +325,8 @@ def test_each_of_two_vehicles_has_its_cameras_path_and_estimates(
     frames = placed(read(viewer, "/tf_static"))
     assert frames["drone/camera_link"][0] == "drone/base_link"
     assert frames["other/camera_link"][0] == "other/base_link"
-    bodies = [fields(each) for each in fields(viewer.next("/scene"))[2]]
-    assert [each[2][0] for each in bodies] == [
+    bodies = [fields(entity) for entity in fields(viewer.next("/scene"))[2]]
+    assert [body[2][0] for body in bodies] == [
         *(b"drone/base_link", b"other/base_link", b"world/person"),
     ]
     # The estimator's frame begins where the second vehicle was, not the first.

@@ -127,15 +127,15 @@ def test_of_one_machine_it_is_a_private_file(
 ) -> None:
     """The same for all, also if they begin at once."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    found: list[bytes] = []
-    threads = [threading.Thread(target=lambda: found.append(secret_of(""))) for _ in range(8)]
+    secrets: list[bytes] = []
+    threads = [threading.Thread(target=lambda: secrets.append(secret_of(""))) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(set(found)) == 1
-    assert len(found) == 8
-    assert len(found[0]) == 64
+    assert len(set(secrets)) == 1
+    assert len(secrets) == 8
+    assert len(secrets[0]) == 64
     (file,) = (tmp_path / "visnav").iterdir()
     assert file.stat().st_mode & 0o777 == 0o600
 

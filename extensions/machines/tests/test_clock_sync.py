@@ -102,7 +102,7 @@ def test_it_shows_what_the_other_does_and_knows_how_quick_that_is(
     """Also though the other began 2 ms before it, and though answers come as they like."""
     late, drift = followed(monkeypatch, ppm, behind=0.002)
     assert late[0] > 1e-3
-    assert all(abs(each) < 60 * MICRO for each in late[60:])
+    assert all(abs(offset) < 60 * MICRO for offset in late[60:])
     assert drift == pytest.approx(ppm, abs=5)
 
 
@@ -177,5 +177,5 @@ def test_a_machine_with_another_quartz_keeps_up(tmp_path: Path) -> None:
         for process in (here, there):
             process.kill()
             process.communicate()
-    drifts = [each.clock_drift_ppm for each in rig.summary("there").processes]
+    drifts = [row.clock_drift_ppm for row in rig.summary("there").processes]
     assert drifts == [pytest.approx(-180, abs=80), None]

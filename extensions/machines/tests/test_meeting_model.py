@@ -66,7 +66,7 @@ class Machine:
         await self.peers.meet()
         await self.steps.acquire()
         offer = samples.Offer(stamp=0, source=self.node, rate=1.0)
-        self.heard = [each.source for each in await self.peers.announce({self.node: [offer]})]
+        self.heard = [known.source for known in await self.peers.announce({self.node: [offer]})]
         await self.steps.acquire()
         self.connect()
         reference = await self.peers._start.begin()

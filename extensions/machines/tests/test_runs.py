@@ -41,7 +41,7 @@ def test_in_lockstep_the_digest_is_that_of_one_process(onlys: tuple[str, ...]) -
         assert summary.outputs == alone.outputs
         assert summary.sim_seconds == alone.sim_seconds
         assert {*summary.streams} == {*alone.streams}
-        assert [len(each.nodes) for each in summary.processes] == [
+        assert [len(process.nodes) for process in summary.processes] == [
             len(only.split(",")) for only in sorted(onlys, key=lambda only: "aot".index(only[0]))
         ]
 
@@ -66,7 +66,7 @@ def test_in_real_time_everything_crosses_too() -> None:
     for output in ("asker.questions", "asker.images", "one.answers", "other.answers"):
         assert one.outputs[output] > 0  # how many is up to the machine
     for summary in (one, other):
-        trips = [each.round_trip_ms for each in summary.processes]
+        trips = [process.round_trip_ms for process in summary.processes]
         assert trips.count(None) < len(trips) or summary.processes[0].clock_offset_ms is None
 
 

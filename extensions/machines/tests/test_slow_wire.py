@@ -103,9 +103,9 @@ def at(config: Config, port: int) -> Config:
 
 
 def port_of(config: Config) -> int:
-    found = re.search(r":(\d+)$", config.network.meet)
-    assert found is not None
-    return int(found[1])
+    match = re.search(r":(\d+)$", config.network.meet)
+    assert match is not None
+    return int(match[1])
 
 
 @pytest.mark.slow

@@ -56,7 +56,7 @@ def test_a_file_that_is_none_is_named(text: str | None, tmp_path: Path) -> None:
 
 def open_ports() -> set[tuple[str, str, int]]:
     """Return protocol, address and port of what this process listens to."""
-    mine, found = set(), set()
+    mine, ports = set(), set()
     for file in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):  # closed meanwhile
             mine.add(str(file.readlink()))
@@ -67,8 +67,8 @@ def open_ports() -> set[tuple[str, str, int]]:
             raw = bytes.fromhex(address)
             words = b"".join(raw[at : at + 4][::-1] for at in range(0, len(raw), 4))
             if f"socket:[{fields[9]}]" in mine and fields[2].endswith(":0000"):
-                found.add((table[:3], str(ipaddress.ip_address(words)), int(port, 16)))
-    return found
+                ports.add((table[:3], str(ipaddress.ip_address(words)), int(port, 16)))
+    return ports
 
 
 @pytest.mark.slow
@@ -77,12 +77,12 @@ def test_it_listens_at_the_named_address_only(host: str) -> None:
     """Where it is met, and at a port of the address by which that is reached; no datagrams."""
     before, port = open_ports(), free_port()
     session = Session("test", NetworkConfig(meet=f"tcp/{host}:{port}"), b"secret")
-    found = open_ports() - before
+    ports = open_ports() - before
     session.close()
     address = host.strip("[]")
-    assert ("tcp", address, port) in found
-    assert len(found) == 2
-    assert {each[:2] for each in found} <= {("tcp", ip) for ip in (address, "127.0.0.1")}
+    assert ("tcp", address, port) in ports
+    assert len(ports) == 2
+    assert {entry[:2] for entry in ports} <= {("tcp", ip) for ip in (address, "127.0.0.1")}
 
 
 @pytest.mark.slow

@@ -99,13 +99,13 @@ class Outside:
         return heard
 
     def hear(self) -> list[Any]:
-        found: list[Any] = []
+        messages: list[Any] = []
         while True:
             try:
                 data = self._socket.recv(65535)
             except BlockingIOError:
-                return found
-            found += self.parser.parse_buffer(data) or []
+                return messages
+            messages += self.parser.parse_buffer(data) or []
 
     def close(self) -> None:
         self.door.close()
@@ -145,15 +145,15 @@ def item(seq: int, number: int, z: float = 2.0, frame: int = 6, p1: float = 0) -
 
 
 def of(kind: str, messages: list[Any]) -> list[Any]:
-    return [each for each in messages if each.get_type() == kind]
+    return [message for message in messages if message.get_type() == kind]
 
 
 def results(answers: list[Any]) -> list[int]:
-    return [each.result for each in of("COMMAND_ACK", answers)]
+    return [message.result for message in of("COMMAND_ACK", answers)]
 
 
 async def test_it_is_seen_as_an_autopilot_that_can_fly(outside: Outside) -> None:
-    heard = {each.get_type(): each for each in outside.passes(2.0)}
+    heard = {message.get_type(): message for message in outside.passes(2.0)}
     assert (heard["HEARTBEAT"].get_srcSystem(), heard["HEARTBEAT"].get_srcComponent()) == (1, 1)
     assert heard["SYS_STATUS"].onboard_control_sensors_health & mav.MAV_SYS_STATUS_PREARM_CHECK
     assert heard["HOME_POSITION"].x == 1.0
@@ -210,7 +210,7 @@ async def test_offboard_needs_setpoints_and_ends_without(outside: Outside) -> No
     assert outside.acts[-1].frame_id == "heading"
     outside.say(mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], 0.1, 0, 0, 0.5))
     assert outside.acts[-1].angular_velocity == pytest.approx((0.1, 0.0, 0.0))
-    texts = [each.text for each in of("STATUSTEXT", outside.passes(1.0))]
+    texts = [message.text for message in of("STATUSTEXT", outside.passes(1.0))]
     assert "offboard: no set-point for 0.5 s: holding" in texts
     assert isinstance(outside.acts[-1], ev.Hover)
     assert outside.door.vehicle.mode == "hold"
@@ -232,11 +232,11 @@ async def test_a_place_is_approached_at_the_cruising_speed(outside: Outside) -> 
 
 async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> None:
     asked = outside.say(mav.MAVLink_mission_count_message(1, 1, 3, 0))
-    assert [each.get_type() for each in asked] == ["MISSION_REQUEST_INT"]
+    assert [message.get_type() for message in asked] == ["MISSION_REQUEST_INT"]
     assert len(of("MISSION_REQUEST_INT", outside.passes(1.1))) == 1
     outside.say(item(0, mav.MAV_CMD_NAV_WAYPOINT), item(1, mav.MAV_CMD_NAV_WAYPOINT, z=3.0))
     answers = outside.say(item(2, mav.MAV_CMD_NAV_LAND))
-    assert [each.type for each in of("MISSION_ACK", answers)] == [0]
+    assert [message.type for message in of("MISSION_ACK", answers)] == [0]
     (count,) = outside.say(mav.MAVLink_mission_request_list_message(1, 1, 0))
     assert count.count == 3
     (second,) = outside.say(mav.MAVLink_mission_request_int_message(1, 1, 1, 0))
@@ -245,7 +245,7 @@ async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> No
     assert results(outside.say(command(mav.MAV_CMD_MISSION_START, 0, 0))) == [0]
     reached = []
     for _ in range(60):
-        reached += [each.seq for each in of("MISSION_ITEM_REACHED", outside.passes(0.1))]
+        reached += [message.seq for message in of("MISSION_ITEM_REACHED", outside.passes(0.1))]
         if isinstance(outside.acts[-1], ev.PositionSetpoint):
             outside.at(outside.acts[-1].position)
     assert reached == [0, 1, 2]
@@ -254,7 +254,7 @@ async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> No
 
 async def test_what_cannot_be_flown_is_refused_at_its_upload(outside: Outside) -> None:
     def results_of(answers: list[Any]) -> list[int]:
-        return [each.type for each in of("MISSION_ACK", answers)]
+        return [message.type for message in of("MISSION_ACK", answers)]
 
     outside.say(mav.MAVLink_mission_count_message(1, 1, 1, 0))
     spline = outside.say(item(0, mav.MAV_CMD_NAV_SPLINE_WAYPOINT))
@@ -266,8 +266,8 @@ async def test_what_cannot_be_flown_is_refused_at_its_upload(outside: Outside) -
 
 
 async def test_parameters_are_listed_read_and_set(outside: Outside) -> None:
-    found = outside.say(mav.MAVLink_param_request_list_message(1, 1))
-    assert {each.param_id for each in found} == {
+    values = outside.say(mav.MAVLink_param_request_list_message(1, 1))
+    assert {value.param_id for value in values} == {
         "MIS_TAKEOFF_ALT",
         "MPC_XY_CRUISE",
         "RTL_RETURN_ALT",
@@ -276,7 +276,7 @@ async def test_parameters_are_listed_read_and_set(outside: Outside) -> None:
     (now,) = outside.say(mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", 4.0, real))
     assert now.param_value == 4.0
     kept = outside.say(mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", math.nan, real))
-    assert [each.param_value for each in of("PARAM_VALUE", kept)] == [4.0]
+    assert [message.param_value for message in of("PARAM_VALUE", kept)] == [4.0]
     assert outside.say(mav.MAVLink_param_request_read_message(1, 1, b"CAL_GYRO0_ID", -1)) == []
 
 
@@ -337,9 +337,9 @@ async def polled() -> None:
 
 async def test_streams_are_so_many_are_answered_and_end() -> None:
     heard: list[Any] = []
-    links = Links((1, 1), b"", lambda *each: heard.append(each), NodeLogger("mavlink"))
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        address = found.getsockname()
+    links = Links((1, 1), b"", lambda *arguments: heard.append(arguments), NodeLogger("mavlink"))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = server.getsockname()
     links.open("tcp://{}:{}".format(*address))
     ends = [socket.create_connection(address) for _ in range(MOST_PEERS + 1)]
     ping = mav.MAVLink_ping_message(0, 1, 0, 0)

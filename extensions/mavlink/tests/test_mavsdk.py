@@ -22,9 +22,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
-        found.bind(("127.0.0.1", 0))
-        port: int = found.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
         return port
 
 
@@ -73,10 +73,10 @@ def test_an_estimator_outside_is_judged(tmp_path: Path) -> None:
     assert figures["scale"] == pytest.approx(1 / 1.01, rel=1e-3)
 
 
-async def first(found: Any, ok: Callable[[Any], Any] = lambda _: True) -> Any:
-    async for each in found:
-        if ok(each):
-            return each
+async def first(stream: Any, ok: Callable[[Any], Any] = lambda _: True) -> Any:
+    async for sample in stream:
+        if ok(sample):
+            return sample
     raise AssertionError("expected more telemetry, found its end")
 
 
@@ -103,13 +103,15 @@ async def everything(address: str) -> None:
     await drone.offboard.set_velocity_body(VelocityBodyYawspeed(0.5, 0.0, 0.0, 0.0))
     await drone.offboard.start()
     place = drone.telemetry.position_velocity_ned()
-    await first(place, lambda each: each.position.north_m > 0.5)
+    await first(place, lambda sample: sample.position.north_m > 0.5)
     await drone.offboard.stop()
     home = await first(drone.telemetry.home())
     altitude, nan = home.absolute_altitude_m, float("nan")
     north = home.latitude_deg + 1.0 / 111_300
     await drone.action.goto_location(north, home.longitude_deg, altitude + 2.0, 0.0)
-    await first(drone.telemetry.position(), lambda each: abs(each.relative_altitude_m - 2) < 0.1)
+    await first(
+        drone.telemetry.position(), lambda position: abs(position.relative_altitude_m - 2) < 0.1
+    )
     none, nothing = MissionItem.CameraAction.NONE, MissionItem.VehicleAction.NONE
     items = [
         MissionItem(
@@ -122,7 +124,9 @@ async def everything(address: str) -> None:
     await drone.mission.upload_mission(MissionPlan(items))
     assert len((await drone.mission.download_mission()).mission_items) == 2
     await drone.mission.start_mission()
-    await first(drone.mission.mission_progress(), lambda each: each.current == each.total == 2)
+    await first(
+        drone.mission.mission_progress(), lambda progress: progress.current == progress.total == 2
+    )
     await first(drone.telemetry.armed(), lambda armed: not armed)
 
 
@@ -169,8 +173,8 @@ class Companion(Node[CompanionConfig]):
 def test_poses_by_mavlink_are_judged_as_those_inside(tmp_path: Path, monkeypatch: Any) -> None:
     """Within what their stamps and numbers resolve: microseconds, and 32-bit floats."""
     monkeypatch.chdir(tmp_path)
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        link = f"tcp://127.0.0.1:{found.getsockname()[1]}"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = f"tcp://127.0.0.1:{server.getsockname()[1]}"
     pilot = {"start_delay": "0s", "waypoints": [[0.0, 0.0, -1.0], [2.0, 0.0, -1.0]]}
     table = {
         "run": {"name": "vision", "duration": "40s", "speed": 1.0},
@@ -219,8 +223,8 @@ def test_two_vehicles_are_two_systems(tmp_path: Path, monkeypatch: Any) -> None:
                     heard += parser.parse_buffer(end.recv(65535)) or []
                 except BlockingIOError:
                     break
-        assert {each.get_srcSystem() for each in heard} == {number}
-        places = [each.x for each in heard if each.get_type() == "LOCAL_POSITION_NED"]
+        assert {message.get_srcSystem() for message in heard} == {number}
+        places = [message.x for message in heard if message.get_type() == "LOCAL_POSITION_NED"]
         assert places[-1] == pytest.approx(number - 1.0, abs=0.01)
 
 

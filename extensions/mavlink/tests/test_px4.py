@@ -74,19 +74,19 @@ class Counterpart(threading.Thread):
 class Heights(Node):
     """Notes how high the vehicle is, metres."""
 
-    found: ClassVar[list[float]] = []
+    heights: ClassVar[list[float]] = []
 
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
-        self.found.append(-event.position[2])
+        self.heights.append(-event.position[2])
 
 
 @pytest.fixture
 def flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """Flies with a counterpart; returns it, and the run."""
     monkeypatch.chdir(tmp_path)
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        port = found.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
 
     def fly(goes: int = 0) -> tuple[Counterpart, visnav.Run]:
         table = {
@@ -110,17 +110,17 @@ def flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_its_motors_lift_the_vehicle_and_no_sample_is_missed(flown: Callable[..., Any]) -> None:
-    Heights.found.clear()
+    Heights.heights.clear()
     px4, run = flown()
-    stamps = [each.time_usec for each in px4.heard if each.get_type() == "HIL_SENSOR"]
+    stamps = [message.time_usec for message in px4.heard if message.get_type() == "HIL_SENSOR"]
     assert {b - a for a, b in itertools.pairwise(stamps)} == {4000}
     assert len(stamps) >= 498
     assert "px4" in run.summary["not_deterministic"]
-    assert Heights.found[-1] > Heights.found[0] + 0.3
-    measured = next(each for each in px4.heard if each.fields_updated & 0b1000000000)
+    assert Heights.heights[-1] > Heights.heights[0] + 0.3
+    measured = next(message for message in px4.heard if message.fields_updated & 0b1000000000)
     assert measured.zacc == pytest.approx(-9.81, abs=0.5)
     assert 900 < measured.abs_pressure < 1100
-    fixes = {each.fix_type for each in px4.heard if each.get_type() == "HIL_GPS"}
+    fixes = {message.fix_type for message in px4.heard if message.get_type() == "HIL_GPS"}
     assert fixes == {1}  # no fix yet, two seconds after the start
 
 

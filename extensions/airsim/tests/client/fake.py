@@ -96,26 +96,26 @@ class FakeServer:
 
     def images(self, requests: list[dict[str, Any]], *_: Any) -> list[ImageResponse]:
         width, height = self.size
-        found: list[ImageResponse] = []
-        for each in requests:
+        responses: list[ImageResponse] = []
+        for request in requests:
             floats = np.arange(width * height, dtype=np.float32) + 1.0
             floats[-1] = 65504.0
             colours = np.zeros((height, width, 3), np.uint8)
-            colours[..., 0], colours[..., 2] = each["image_type"] + 1, 200
-            depth = each["image_type"] == 1
-            found.append(
+            colours[..., 0], colours[..., 2] = request["image_type"] + 1, 200
+            depth = request["image_type"] == 1
+            responses.append(
                 ImageResponse(
                     image_data_uint8=b"" if depth else colours.tobytes(),
                     image_data_float=wire.float_array(floats) if depth else (),
                     camera_position=Vector3r(0.5, 1.0, -0.25),
                     camera_orientation=Quaternionr(),
-                    time_stamp=self.time + len(found),
+                    time_stamp=self.time + len(responses),
                     width=width,
                     height=height,
-                    image_type=each["image_type"],
+                    image_type=request["image_type"],
                 )
             )
-        return found
+        return responses
 
     def made(self, method: str) -> list[list[Any]]:
         """Return the arguments of all calls of a method."""

@@ -50,14 +50,14 @@ def server() -> Any:
 @pytest.mark.slow
 def test_images_depth_pose_imu_and_truth_are_of_one_instant(server: FakeServer) -> None:
     server.velocity = Vector3r(1.0, 2.0, 3.0)
-    found = fly(server, image_rate=20, imu_rate=100)
+    result = fly(server, image_rate=20, imu_rate=100)
     frequent: tuple[type[Event], ...] = (Imu, Odometry)
     for kind in frequent:
-        assert [e.stamp for e in found.of(kind)] == [n * 10_000_000 for n in range(11)]
+        assert [e.stamp for e in result.of(kind)] == [n * 10_000_000 for n in range(11)]
     rare: tuple[type[Event], ...] = (Image, DepthImage, PoseStamped)
     for kind in rare:
-        assert [e.stamp for e in found.of(kind)] == [0, 50_000_000, 100_000_000]
-    image, depth, pose = found.of(Image)[0], found.of(DepthImage)[0], found.of(PoseStamped)[0]
+        assert [e.stamp for e in result.of(kind)] == [0, 50_000_000, 100_000_000]
+    image, depth, pose = result.of(Image)[0], result.of(DepthImage)[0], result.of(PoseStamped)[0]
     assert {image.source, depth.source, pose.source} == {"drone/0"}
     assert image.data.shape == (4, 8, 3)
     assert image.data[0, 0].tolist() == [200, 0, 1]  # the server's order is blue, green, red
@@ -66,7 +66,7 @@ def test_images_depth_pose_imu_and_truth_are_of_one_instant(server: FakeServer) 
     # The pawn is 10 m north in the world, and 1 m east of its start.
     assert pose.position == (10.5, 1.0, -0.25)
     assert pose.orientation == OPTICAL_TO_FRD
-    truth = found.of(Odometry)[0]
+    truth = result.of(Odometry)[0]
     assert truth.position == (10.0, 1.0, 0.0)
     assert truth.linear_velocity == (1.0, 2.0, 3.0)
     assert [call[0] for call in server.made("simContinueForTime")] == [0.01] * 10
@@ -74,17 +74,17 @@ def test_images_depth_pose_imu_and_truth_are_of_one_instant(server: FakeServer) 
 
 @pytest.mark.slow
 def test_what_a_simulator_announces_is_announced(server: FakeServer) -> None:
-    found = fly(server, imu_rate=200, image_rate=10)
-    (camera,) = found.of(CameraAnnouncement)
+    result = fly(server, imu_rate=200, image_rate=10)
+    (camera,) = result.of(CameraAnnouncement)
     assert camera.images == ("rgb", "depth")
     assert (camera.info.width, camera.info.height) == (8, 4)
     assert camera.info.fx == pytest.approx(4.0 / np.tan(np.radians(30.0)))
     assert (camera.info.cx, camera.info.cy) == (3.5, 1.5)
     assert camera.position == (0.5, 0.0, -0.25)  # less where the vehicle is
     assert camera.orientation == OPTICAL_TO_FRD
-    (vehicle,) = found.of(VehicleAnnouncement)
+    (vehicle,) = result.of(VehicleAnnouncement)
     assert vehicle.position == (10.0, 1.0, 0.0)
-    (imu,) = found.of(ImuAnnouncement)
+    (imu,) = result.of(ImuAnnouncement)
     assert imu.rate == 200
 
 
@@ -98,23 +98,23 @@ def test_cameras_and_noise_are_those_of_the_servers_settings(server: FakeServer)
         "Sensors": {"i": {"SensorType": 2, "Enabled": true, "AngularRandomWalk": 0.6}}}}}"""
     server.methods["getSettingsString"] = lambda: text
     del server.methods["simGetObjectPose"]
-    found = fly(server)
-    (camera,) = found.of(CameraAnnouncement)
+    result = fly(server)
+    (camera,) = result.of(CameraAnnouncement)
     assert camera.source == "drone/eye"
     assert camera.images == ("rgb", "segmentation")
     assert camera.info.fx == pytest.approx(4.0 / np.tan(np.radians(60.0)))
-    (imu,) = found.of(ImuAnnouncement)
+    (imu,) = result.of(ImuAnnouncement)
     assert imu.gyroscope_noise_density == pytest.approx(2 * 8.7266e-5, rel=1e-4)
     assert imu.accelerometer_random_walk == pytest.approx(1.2482e-5, rel=1e-4)
-    assert found.of(VehicleAnnouncement)[0].position == (3.0, -3.0, 0.0)
-    assert found.of(SegmentationImage)[0].data.tolist() == [[8] * 8] * 4
+    assert result.of(VehicleAnnouncement)[0].position == (3.0, -3.0, 0.0)
+    assert result.of(SegmentationImage)[0].data.tolist() == [[8] * 8] * 4
 
 
 @pytest.mark.slow
 def test_cosys_takes_other_arguments_and_sends_other_colours(server: FakeServer) -> None:
     server.methods["getServerVersion"] = lambda: 4
-    found = fly(server)
-    assert found.of(Image)[0].data[0, 0].tolist() == [1, 0, 200]
+    result = fly(server)
+    assert result.of(Image)[0].data[0, 0].tolist() == [1, 0, 200]
     assert {len(call) for call in server.made("simGetImages")} == {2}
     assert server.made("simGetCameraInfo") == [["0", "Alpha"]]
     assert server.made("simGetObjectPose") == [["Alpha", True]]
@@ -125,11 +125,11 @@ def test_depth_of_another_size_is_resampled(server: FakeServer) -> None:
     whole = server.images
 
     def images(requests: Any, *rest: Any) -> Any:
-        found = []
-        for each in requests:
-            server.size = (4, 2) if each["image_type"] == 1 else (8, 4)
-            found += whole([each], *rest)
-        return found
+        responses = []
+        for request in requests:
+            server.size = (4, 2) if request["image_type"] == 1 else (8, 4)
+            responses += whole([request], *rest)
+        return responses
 
     server.methods["simGetImages"] = images
     depth = fly(server).of(DepthImage)[0].data
@@ -146,8 +146,8 @@ def test_a_server_that_steps_inexactly_is_followed_and_no_digest_promised(
         server.time += round(seconds * 1e9) + 3_000_000
 
     server.methods["simContinueForTime"] = go_on
-    found = fly(server, 0.1, imu_rate=100)
-    assert [e.stamp for e in found.of(Odometry)] == [n * 13_000_000 for n in range(8)]
+    result = fly(server, 0.1, imu_rate=100)
+    assert [e.stamp for e in result.of(Odometry)] == [n * 13_000_000 for n in range(8)]
 
 
 @pytest.mark.slow
@@ -185,17 +185,17 @@ def test_bad_answers_are_survived(server: FakeServer) -> None:
         def answer(*arguments: Any) -> Any:
             nonlocal calls
             calls += 1
-            found = next(answers, "over") if calls > 3 else "over"
-            return good(*arguments) if found == "over" else found
+            behaviour = next(answers, "over") if calls > 3 else "over"
+            return good(*arguments) if behaviour == "over" else behaviour
 
         return answer
 
     server.methods |= {method: sometimes(method) for method in bad}
-    found = fly(server, 0.4, imu_rate=50, image_rate=50)
-    assert len(found.of(Odometry)) == 20  # of 21, as of images but 5
-    assert {e.data.shape for e in found.of(Image)} == {(4, 8, 3)}
-    assert len(found.of(Image)) == 16
-    assert len(found.of(Imu)) >= 18
+    result = fly(server, 0.4, imu_rate=50, image_rate=50)
+    assert len(result.of(Odometry)) == 20  # of 21, as of images but 5
+    assert {e.data.shape for e in result.of(Image)} == {(4, 8, 3)}
+    assert len(result.of(Image)) == 16
+    assert len(result.of(Imu)) >= 18
 
 
 def test_an_unknown_vehicle_is_refused_by_name(server: FakeServer) -> None:
@@ -239,8 +239,8 @@ def test_lost_connections_are_replaced(server: FakeServer, what: type[Exception]
         server.go_on(seconds)
 
     server.methods["simContinueForTime"] = go_on
-    found = fly(server, 0.1, imu_rate=100, on_loss="reconnect")
-    stamps = [e.stamp for e in found.of(Odometry)]
+    result = fly(server, 0.1, imu_rate=100, on_loss="reconnect")
+    stamps = [e.stamp for e in result.of(Odometry)]
     assert stamps == sorted(set(stamps))
     assert stamps[-1] >= 90_000_000
     assert len(server.made("enableApiControl")) == 3  # twice at a start, once at the end
@@ -261,10 +261,10 @@ def test_a_hung_request_for_images_costs_one_set_of_them(
         return server.images(*arguments)
 
     server.methods["simGetImages"] = images
-    found = fly(server, 0.1, imu_rate=100, image_rate=50)
+    result = fly(server, 0.1, imu_rate=100, image_rate=50)
     # The first request is of before the run.
-    assert [e.stamp for e in found.of(Image)] == [n * 10_000_000 for n in (0, 4, 6, 8, 10)]
-    assert len(found.of(Odometry)) == 11
+    assert [e.stamp for e in result.of(Image)] == [n * 10_000_000 for n in (0, 4, 6, 8, 10)]
+    assert len(result.of(Odometry)) == 11
 
 
 @pytest.mark.slow
@@ -276,8 +276,8 @@ def test_a_server_that_starts_anew_has_another_clock(server: FakeServer) -> None
         return server.state(name)
 
     server.methods["getMultirotorState"] = state
-    found = fly(server, 0.1, imu_rate=100, on_loss="reconnect")
-    stamps = [e.stamp for e in found.of(Odometry)]
+    result = fly(server, 0.1, imu_rate=100, on_loss="reconnect")
+    stamps = [e.stamp for e in result.of(Odometry)]
     assert stamps == sorted(set(stamps))
     assert stamps[-1] >= 90_000_000
 
@@ -290,8 +290,8 @@ def test_a_clock_that_leaps_moves_no_stamps(server: FakeServer) -> None:
         return server.state(name)
 
     server.methods["getMultirotorState"] = state
-    found = fly(server, 0.1, imu_rate=100, on_loss="reconnect")
-    stamps = [e.stamp for e in found.of(Odometry)]
+    result = fly(server, 0.1, imu_rate=100, on_loss="reconnect")
+    stamps = [e.stamp for e in result.of(Odometry)]
     assert stamps == sorted(set(stamps))
     assert 90_000_000 <= stamps[-1] <= 100_000_000
     server.time = START

@@ -56,9 +56,9 @@ waypoints = [[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]
 
 
 def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port: int = found.getsockname()[1]
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port: int = listener.getsockname()[1]
         return port
 
 
@@ -143,8 +143,8 @@ def fly(folder: Path, world: str, late: float, cut: int = 0) -> dict[str, Any]:
         text = CLIENT.format(port=line, on_loss="reconnect" if cut else "stop")
         command = program(folder, text, "client")
         subprocess.run(command, cwd=ROOT, check=True, timeout=300)
-    found: dict[str, Any] = json.loads((folder / "client" / "summary.json").read_text())
-    return found
+    summary: dict[str, Any] = json.loads((folder / "client" / "summary.json").read_text())
+    return summary
 
 
 @pytest.mark.slow
@@ -160,9 +160,9 @@ def test_runs_are_equal_however_late_the_replies_are(tmp_path: Path, tiny_world:
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_a_flight_goes_on_after_a_lost_connection(tmp_path: Path, tiny_world: str) -> None:
-    found = fly(tmp_path / "cut", tiny_world, 0.001, cut=350_000)
-    assert found["outputs"]["drone.odometry"] >= 890
-    assert found["outputs"]["drone.vehicle_events"] >= 2
+    summary = fly(tmp_path / "cut", tiny_world, 0.001, cut=350_000)
+    assert summary["outputs"]["drone.odometry"] >= 890
+    assert summary["outputs"]["drone.vehicle_events"] >= 2
     log = (tmp_path / "cut" / "client" / "log.txt").read_text()
     assert "a connection is lost" in log
     assert "a set of images is lost" in log
@@ -188,6 +188,6 @@ def test_the_example_flies_and_is_judged(tmp_path: Path) -> None:
             subprocess.run([*command, *change], cwd=ROOT, check=True, timeout=300)
         finally:
             process.terminate()
-    found = json.loads((tmp_path / "c" / "summary.json").read_text())
-    assert found["verdict"]["estimators"]["odometry"]["ate_percent"] < 1.0
+    summary = json.loads((tmp_path / "c" / "summary.json").read_text())
+    assert summary["verdict"]["estimators"]["odometry"]["ate_percent"] < 1.0
     assert (tmp_path / "c" / "report.html").is_file()

@@ -48,15 +48,15 @@ def run(folder: Path, **fields: Any) -> dict[str, Any]:
     file.write_text(RUN.format(**fields))
     command = [sys.executable, "-m", "runtime", "run", str(file), "--out", str(folder / "out")]
     subprocess.run(command, cwd=ROOT, check=True, timeout=120)
-    found: dict[str, Any] = json.loads((folder / "out" / "summary.json").read_text())
-    return found
+    summary: dict[str, Any] = json.loads((folder / "out" / "summary.json").read_text())
+    return summary
 
 
 @pytest.mark.slow
 def test_images_of_80_ms_come_as_they_can_and_delay_no_tick(tmp_path: Path) -> None:
     with slow_server(640, 480) as port:
-        found = run(tmp_path, port=port, image_rate=30, seconds=6)
-    sent, ticks = found["outputs"], found["ticks"]["ticker.control"]
+        summary = run(tmp_path, port=port, image_rate=30, seconds=6)
+    sent, ticks = summary["outputs"], summary["ticks"]["ticker.control"]
     assert 10 <= sent["drone.images"] <= 80  # 80 ms each, and then they are decoded
     assert sent["drone.imu"] >= 400
     # A loop that waited for images would be 40 ms late in the middle; a busy machine is not.

@@ -46,17 +46,17 @@ def handshake(port: int) -> Any:
 def hello(port: int) -> Any:
     """Fly as the first script of everybody does."""
     client = connect(port)
-    found: dict[str, Any] = {"start": position(client)}
-    found["landed"] = [client.getMultirotorState().landed_state]
+    readings: dict[str, Any] = {"start": position(client)}
+    readings["landed"] = [client.getMultirotorState().landed_state]
     client.takeoffAsync().join()
-    found["up"] = position(client)
-    found["landed"].append(client.getMultirotorState().landed_state)
+    readings["up"] = position(client)
+    readings["landed"].append(client.getMultirotorState().landed_state)
     client.moveToPositionAsync(2, 1, -2.5, 2).join()
-    found["there"] = position(client)
+    readings["there"] = position(client)
     client.rotateToYawAsync(90).join()
     orientation = client.getMultirotorState().kinematics_estimated.orientation
     angles = airsim.quaternion_to_euler_angles if IS_COSYS else airsim.to_eularian_angles
-    found["yaw"] = float(np.degrees(angles(orientation)[2]))
+    readings["yaw"] = float(np.degrees(angles(orientation)[2]))
     client.moveOnPathAsync(
         [airsim.Vector3r(2, -1, -2.5), airsim.Vector3r(0, 0, -1)],
         2,
@@ -64,14 +64,14 @@ def hello(port: int) -> Any:
         airsim.DrivetrainType.ForwardOnly,
         airsim.YawMode(False, 0),
     ).join()
-    found["back"] = position(client)
+    readings["back"] = position(client)
     client.hoverAsync().join()
     client.landAsync().join()
-    found["down"] = position(client)
-    found["landed"].append(client.getMultirotorState().landed_state)
+    readings["down"] = position(client)
+    readings["landed"].append(client.getMultirotorState().landed_state)
     client.armDisarm(False)
     client.enableApiControl(False)
-    return found
+    return readings
 
 
 def unjoined(port: int) -> Any:
@@ -152,12 +152,12 @@ def again(port: int) -> Any:
     client.takeoffAsync().join()
     client.moveToPositionAsync(2, 2, -3, 2)
     client.reset()
-    found = {"reset": position(client), "control": client.isApiControlEnabled()}
+    readings = {"reset": position(client), "control": client.isApiControlEnabled()}
     client.enableApiControl(True)
     client.armDisarm(True)
     client.takeoffAsync().join()
-    found["up"] = position(client)
-    return found
+    readings["up"] = position(client)
+    return readings
 
 
 def collision(port: int) -> Any:
@@ -242,15 +242,15 @@ def every_method(port: int) -> Any:
     called, errors = [], {}
     for name, method in sorted(inspect.getmembers(client, inspect.ismethod)):
         needed = [
-            each
-            for each, parameter in inspect.signature(method).parameters.items()
+            parameter_name
+            for parameter_name, parameter in inspect.signature(method).parameters.items()
             if parameter.default is inspect.Parameter.empty
         ]
         if name.startswith("_") or name == "reset" or not set(needed) <= given.keys():
             continue
         called.append(name)
         try:
-            result: Any = method(*[given[each] for each in needed])
+            result: Any = method(*[given[parameter] for parameter in needed])
             if name.endswith("Async"):
                 result.get()
         except Exception as error:  # as in `errors`
@@ -305,19 +305,19 @@ def images(port: int, folder: str) -> Any:
     import cv2  # of the client's environment
 
     stamps, sizes, poses = [], [], []
-    for number, each in enumerate(client.simGetImages(requests)):
-        if each.pixels_as_float:
-            array = airsim.get_pfm_array(each)
-        elif each.compress:
-            bytes_ = airsim.string_to_uint8_array(each.image_data_uint8)
+    for number, response in enumerate(client.simGetImages(requests)):
+        if response.pixels_as_float:
+            array = airsim.get_pfm_array(response)
+        elif response.compress:
+            bytes_ = airsim.string_to_uint8_array(response.image_data_uint8)
             array = cv2.imdecode(bytes_, cv2.IMREAD_UNCHANGED)
         else:
-            flat = np.frombuffer(each.image_data_uint8, np.uint8)
-            array = flat.reshape(each.height, each.width, 3)
+            flat = np.frombuffer(response.image_data_uint8, np.uint8)
+            array = flat.reshape(response.height, response.width, 3)
         np.save(Path(folder) / f"{number}.npy", array)
-        stamps.append(each.time_stamp)
-        sizes.append((each.width, each.height))
-        where, turn = each.camera_position, each.camera_orientation
+        stamps.append(response.time_stamp)
+        sizes.append((response.width, response.height))
+        where, turn = response.camera_position, response.camera_orientation
         poses.append([*where.to_numpy_array(), *turn.to_numpy_array()])
     png = client.simGetImage("0", airsim.ImageType.Scene)
     info = client.simGetCameraInfo("front_center")
@@ -336,7 +336,7 @@ def computer_vision(port: int, folder: str) -> Any:
     """Set poses of a camera without a vehicle, and take an image at each."""
     client = airsim.VehicleClient(port=port)
     client.confirmConnection()
-    found = []
+    views = []
     for number, x in enumerate((0.0, 1.0, 2.0)):
         turn = airsim.Quaternionr(0, 0, 0, 1)
         client.simSetVehiclePose(airsim.Pose(airsim.Vector3r(x, 0.5, -1.0), turn), True)
@@ -349,14 +349,14 @@ def computer_vision(port: int, folder: str) -> Any:
         pose = client.simGetVehiclePose()
         depth = airsim.get_pfm_array(responses[1])
         np.save(Path(folder) / f"depth{number}.npy", depth)
-        found.append(
+        views.append(
             {
-                "pose": [float(each) for each in pose.position.to_numpy_array()],
+                "pose": [float(coordinate) for coordinate in pose.position.to_numpy_array()],
                 "image": [float(r.camera_position.x_val) for r in responses],
                 "depth": float(depth[depth.shape[0] // 2, depth.shape[1] // 2]),
             }
         )
-    return found
+    return views
 
 
 def threads(port: int) -> Any:
@@ -373,10 +373,10 @@ def threads(port: int) -> Any:
         counts.append(20)
 
     pollers = [threading.Thread(target=poll) for _ in range(4)]
-    for each in pollers:
-        each.start()
-    for each in pollers:
-        each.join()
+    for poller in pollers:
+        poller.start()
+    for poller in pollers:
+        poller.join()
     return counts
 
 

@@ -71,8 +71,8 @@ def _old_python() -> str:
     if sys.version_info < TOO_NEW:
         return sys.executable
     for version in ("3.12", "3.11"):
-        if found := shutil.which(f"python{version}"):
-            return found
+        if interpreter := shutil.which(f"python{version}"):
+            return interpreter
     pytest.skip("AirSim's clients need numpy 1, and so a Python of 3.12 or before: there is none")
 
 

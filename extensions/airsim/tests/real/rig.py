@@ -103,8 +103,8 @@ class Rig:
         assert self._process.stderr is not None
         for line in self._process.stderr:
             self.said += line
-            if not self._port and (found := LISTENING.search(self.said)):
-                self._port = int(found[1])
+            if not self._port and (match := LISTENING.search(self.said)):
+                self._port = int(match[1])
                 self._listening.set()
         self._listening.set()
 
@@ -122,9 +122,9 @@ class Rig:
         done = subprocess.run(command, capture_output=True, text=True, timeout=limit, check=False)
         assert done.returncode == 0, f"{done.stdout}{done.stderr}\nthe run:\n{self.said}"
         *printed, result = done.stdout.splitlines()
-        found = json.loads(result)
+        report = json.loads(result)
         assert not [line for line in printed if "WARN" in line.upper()], printed
-        return found
+        return report
 
     def end(self, *, interrupt: bool = True) -> Any:
         """End the run as Ctrl-C does, or wait for its own end, and return its summary."""

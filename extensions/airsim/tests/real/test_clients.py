@@ -29,17 +29,17 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # the first one insta
 def test_a_real_client_connects_and_reads_errors(client: str, tmp_path: Path) -> None:
     with flown(tmp_path, drone="") as rig:
         assert rig.script(client, "handshake") == {"ping": True, "vehicles": ["drone"]}
-        found = rig.script(client, "errors")
+        report = rig.script(client, "errors")
         rig.end()
-    unknown, arity, vehicle, sensor, camera, control = found["refused"]
+    unknown, arity, vehicle, sensor, camera, control = report["refused"]
     assert unknown == "rpclib: server could not find function 'simNonsense' with argument count 1."
     assert arity.endswith("with an invalid number of arguments. Expected: 1, got: 0")
     assert "Vehicle API for 'nobody' is not available" in vehicle
     assert "No IMU with name nothing exist on vehicle" in sensor
     assert "nowhere" in camera
     assert "API control" in control or "enableApiControl" in control
-    assert all("threw an exception" in each for each in (vehicle, sensor, camera, control))
-    assert found["alive"]
+    assert all("threw an exception" in message for message in (vehicle, sensor, camera, control))
+    assert report["alive"]
     assert "takeoff" in rig.said, "what a future's join hides is logged"
 
 
@@ -47,12 +47,12 @@ def test_a_real_client_connects_and_reads_errors(client: str, tmp_path: Path) ->
 def test_every_method_of_a_client_is_answered(client: str, tmp_path: Path) -> None:
     """With as many arguments as it sends; what is refused is so with a reason."""
     with flown(tmp_path, drone=CAMERA + SENSORS) as rig:
-        found = rig.script(client, "every_method", limit=300)
+        report = rig.script(client, "every_method", limit=300)
         rig.end()
-    assert len(found["called"]) > 90
+    assert len(report["called"]) > 90
     without_reason = {
         name: error
-        for name, error in found["errors"].items()
+        for name, error in report["errors"].items()
         if "not supported by visnav-runtime" not in error
     }
     assert without_reason.keys() <= UNKNOWN | NOT_IN_ITS_WORLD, without_reason
@@ -64,36 +64,36 @@ BOTH = pytest.mark.parametrize("client", CLIENTS)
 def fly(client: str, script: str, folder: Path, *, drone: str = "", nodes: str = "") -> Any:
     """Fly a script in real time, and return what it returns."""
     with flown(folder, drone=drone, nodes=nodes) as rig:
-        found = rig.script(client, script)
+        report = rig.script(client, script)
         rig.end()
-    return found
+    return report
 
 
 @BOTH
 def test_the_first_script_of_everybody_flies(client: str, tmp_path: Path) -> None:
-    found = fly(client, "hello", tmp_path)
-    assert found["start"] == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
-    assert found["landed"] == [0, 1, 0]
-    assert found["up"] == pytest.approx([0.0, 0.0, -2.0], abs=0.5)
-    assert found["there"] == pytest.approx([2.0, 1.0, -2.5], abs=0.5)
-    assert found["yaw"] == pytest.approx(90.0, abs=6.0)
-    assert found["back"] == pytest.approx([0.0, 0.0, -1.0], abs=0.6)
-    assert found["down"][2] == pytest.approx(0.0, abs=0.05)
+    report = fly(client, "hello", tmp_path)
+    assert report["start"] == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
+    assert report["landed"] == [0, 1, 0]
+    assert report["up"] == pytest.approx([0.0, 0.0, -2.0], abs=0.5)
+    assert report["there"] == pytest.approx([2.0, 1.0, -2.5], abs=0.5)
+    assert report["yaw"] == pytest.approx(90.0, abs=6.0)
+    assert report["back"] == pytest.approx([0.0, 0.0, -1.0], abs=0.6)
+    assert report["down"][2] == pytest.approx(0.0, abs=0.05)
 
 
 @BOTH
 def test_a_velocity_goes_on_while_the_script_sleeps(client: str, tmp_path: Path) -> None:
-    found = fly(client, "unjoined", tmp_path)
-    assert found["moving"] > 0.3
-    assert found["still"] < 0.1, "it holds its place once the duration is over"
-    assert found["distance"] == pytest.approx(1.5, abs=0.6)
+    report = fly(client, "unjoined", tmp_path)
+    assert report["moving"] > 0.3
+    assert report["still"] < 0.1, "it holds its place once the duration is over"
+    assert report["distance"] == pytest.approx(1.5, abs=0.6)
 
 
 @BOTH
 def test_a_newer_task_ends_the_older_one(client: str, tmp_path: Path) -> None:
-    found = fly(client, "superseded", tmp_path)
-    assert (found["far"], found["near"]) == (False, True)
-    far, near = found["ended"]
+    report = fly(client, "superseded", tmp_path)
+    assert (report["far"], report["near"]) == (False, True)
+    far, near = report["ended"]
     assert far < 0.3
     assert near > 0.45
 
@@ -101,27 +101,27 @@ def test_a_newer_task_ends_the_older_one(client: str, tmp_path: Path) -> None:
 @BOTH
 def test_two_drones_fly_at_a_time(client: str, tmp_path: Path) -> None:
     other = "[[nodes]]\nname = 'another'\ntype = 'Multirotor'\nposition = [0, 3]\n"
-    found = fly(client, "two", tmp_path, nodes=other)
-    assert found["names"] == ["another", "drone"]
-    assert found["where"]["another"] == pytest.approx([1.0, 0.0, -2.0], abs=0.6)
-    assert found["where"]["drone"] == pytest.approx([2.0, 0.0, -2.0], abs=0.6)
+    report = fly(client, "two", tmp_path, nodes=other)
+    assert report["names"] == ["another", "drone"]
+    assert report["where"]["another"] == pytest.approx([1.0, 0.0, -2.0], abs=0.6)
+    assert report["where"]["drone"] == pytest.approx([2.0, 0.0, -2.0], abs=0.6)
 
 
 @BOTH
 def test_a_drone_flies_again_after_a_reset(client: str, tmp_path: Path) -> None:
-    found = fly(client, "again", tmp_path)
-    assert found["reset"] == pytest.approx([0.0, 0.0, 0.0], abs=0.05)
-    assert found["control"] is False
-    assert found["up"] == pytest.approx([0.0, 0.0, -2.0], abs=0.5)
+    report = fly(client, "again", tmp_path)
+    assert report["reset"] == pytest.approx([0.0, 0.0, 0.0], abs=0.05)
+    assert report["control"] is False
+    assert report["up"] == pytest.approx([0.0, 0.0, -2.0], abs=0.5)
 
 
 @BOTH
 def test_a_collision_is_told_once(client: str, tmp_path: Path) -> None:
-    found = fly(client, "collision", tmp_path)
-    assert not found["before"]
-    assert found["has"] == [True, False], "reading it clears it"
-    assert found["object"] == "crate"
-    assert found["normal"] == pytest.approx([-1.0, 0.0, 0.0], abs=0.2)
+    report = fly(client, "collision", tmp_path)
+    assert not report["before"]
+    assert report["has"] == [True, False], "reading it clears it"
+    assert report["object"] == "crate"
+    assert report["normal"] == pytest.approx([-1.0, 0.0, 0.0], abs=0.2)
 
 
 @BOTH
@@ -132,13 +132,13 @@ def test_clients_of_several_threads_poll_at_a_time(client: str, tmp_path: Path) 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_a_script_steps_time(client: str, tmp_path: Path) -> None:
     with flown(tmp_path, drone="") as rig:
-        found = rig.script(client, "stepped")
+        report = rig.script(client, "stepped")
         rig.end()
-    steps = np.diff(found["stamps"])
+    steps = np.diff(report["stamps"])
     assert np.all(steps == 250_000_000)
-    assert found["paused"]
-    assert found["where"][2] == pytest.approx(-2.0, abs=0.5)
-    assert found["later"] == found["where"], "nothing moves while time stands"
+    assert report["paused"]
+    assert report["where"][2] == pytest.approx(-2.0, abs=0.5)
+    assert report["later"] == report["where"], "nothing moves while time stands"
 
 
 @pytest.mark.parametrize(("time", "script"), [("paused", "stepped"), ("awaited", "hello")])
@@ -158,17 +158,17 @@ def test_equal_scripts_give_equal_runs(time: str, script: str, tmp_path: Path) -
 @pytest.mark.parametrize("client", CLIENTS)
 def test_sensors_are_read(client: str, tmp_path: Path) -> None:
     with flown(tmp_path, drone=SENSORS) as rig:
-        found = rig.script(client, "sensors")
+        report = rig.script(client, "sensors")
         rig.end()
-    assert found["imu"] == pytest.approx([0.0, 0.0, -9.807], abs=0.5)
-    assert 0 <= found["state_stamp"] - found["imu_stamp"] < 20_000_000
-    assert found["pressure"] == pytest.approx(found["environment"], abs=30.0)
-    assert 0.2 < np.linalg.norm(found["field"]) < 0.7, "Gauss"
-    assert found["fix"] == 3
-    assert found["latitude"] == pytest.approx(found["home"], abs=1e-4)
-    assert found["distance"] == pytest.approx(3.6, abs=0.3), "to the crate's side"
-    assert found["points"] > 200
-    assert found["lowest"] < 0.2, "the floor is below"
+    assert report["imu"] == pytest.approx([0.0, 0.0, -9.807], abs=0.5)
+    assert 0 <= report["state_stamp"] - report["imu_stamp"] < 20_000_000
+    assert report["pressure"] == pytest.approx(report["environment"], abs=30.0)
+    assert 0.2 < np.linalg.norm(report["field"]) < 0.7, "Gauss"
+    assert report["fix"] == 3
+    assert report["latitude"] == pytest.approx(report["home"], abs=1e-4)
+    assert report["distance"] == pytest.approx(3.6, abs=0.3), "to the crate's side"
+    assert report["points"] > 200
+    assert report["lowest"] < 0.2, "the floor is below"
 
 
 KEEP = "[[nodes]]\nname = 'keep'\ntype = 'extensions.airsim.tests.real.keep:Keep'\n"
@@ -179,14 +179,14 @@ SKY = 65504.0
 @BOTH
 def test_images_are_the_runs_own(client: str, tmp_path: Path) -> None:
     with flown(tmp_path, nodes=KEEP, settings='time = "paused"') as rig:
-        found = rig.script(client, "images", str(tmp_path))
+        report = rig.script(client, "images", str(tmp_path))
         rig.end()
 
     def own(kind: str) -> Any:
         return np.load(rig.folder / f"{kind}-{stamp}.npy")
 
-    (stamp,) = set(found["stamps"])
-    assert found["sizes"] == [[WIDTH, HEIGHT]] * 9
+    (stamp,) = set(report["stamps"])
+    assert report["sizes"] == [[WIDTH, HEIGHT]] * 9
     pixels, png, planar, along_ray, shown, disparity, objects, normals, infrared = (
         np.load(tmp_path / f"{number}.npy") for number in range(9)
     )
@@ -214,16 +214,16 @@ def test_images_are_the_runs_own(client: str, tmp_path: Path) -> None:
     colours = [objects[segmentation == kind].reshape(-1, 3) for kind in kinds]
     greys = [infrared[segmentation == kind].ravel() for kind in kinds]
     assert len(kinds) >= 4
-    assert all(len(np.unique(each, axis=0)) == 1 for each in [*colours, *greys])
-    assert len({tuple(each[0].tolist()) for each in colours}) == len(kinds)
+    assert all(len(np.unique(view, axis=0)) == 1 for view in [*colours, *greys])
+    assert len({tuple(view[0].tolist()) for view in colours}) == len(kinds)
     floor = normals[-1, WIDTH // 2]  # upwards: red and green in the middle, no blue
     assert sorted(floor.tolist()) == pytest.approx([0, 127, 127], abs=2)
 
-    assert all(pose == found["poses"][0] for pose in found["poses"])
-    east, down = found["vehicle"][1:]
-    assert found["poses"][0][:3] == pytest.approx([0.46, east, down], abs=1e-4)
-    assert found["fov"] == pytest.approx(90.0)
-    assert found["png"] > 100
+    assert all(pose == report["poses"][0] for pose in report["poses"])
+    east, down = report["vehicle"][1:]
+    assert report["poses"][0][:3] == pytest.approx([0.46, east, down], abs=1e-4)
+    assert report["fov"] == pytest.approx(90.0)
+    assert report["png"] > 100
 
 
 @BOTH
@@ -235,9 +235,9 @@ def test_a_camera_is_put_where_a_script_says(client: str, tmp_path: Path) -> Non
     free = camera.format(f"'{world}'") + "rate = 20\n"
     text = f"[run]\nname = 'free'\nspeed = 1.0\nduration = '300s'\n{free}{SERVER}"
     with flown(tmp_path, text=text.format(settings="")) as rig:
-        found = rig.script(client, "computer_vision", str(tmp_path))
+        views = rig.script(client, "computer_vision", str(tmp_path))
         rig.end()
-    for each, x in zip(found, (0.0, 1.0, 2.0), strict=True):
-        assert each["pose"] == pytest.approx([x, 0.5, -1.0], abs=1e-4)
-        assert each["image"] == pytest.approx([x, x], abs=1e-4), "of the pose that was set"
-        assert each["depth"] == pytest.approx(8.9 - x, abs=1e-3), "the wall is there"
+    for view, x in zip(views, (0.0, 1.0, 2.0), strict=True):
+        assert view["pose"] == pytest.approx([x, 0.5, -1.0], abs=1e-4)
+        assert view["image"] == pytest.approx([x, x], abs=1e-4), "of the pose that was set"
+        assert view["depth"] == pytest.approx(8.9 - x, abs=1e-3), "the wall is there"

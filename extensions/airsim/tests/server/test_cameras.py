@@ -25,8 +25,8 @@ from visnav_airsim.settings import default_mount
 NAMES = "front_center", "0", "", "fpv", "front_right", "1", "2", "bottom_center", "3", "4"
 
 
-def vector(found: dict[str, float]) -> tuple[float, float, float]:
-    return found["x_val"], found["y_val"], found["z_val"]
+def vector(fields: dict[str, float]) -> tuple[float, float, float]:
+    return fields["x_val"], fields["y_val"], fields["z_val"]
 
 
 def info(call: Caller, name: str, vehicle: str = "") -> Any:
@@ -34,22 +34,22 @@ def info(call: Caller, name: str, vehicle: str = "") -> Any:
 
 
 def test_a_vehicle_has_airsims_default_cameras(tiny_world: str) -> None:
-    found = {}
+    infos = {}
 
     def script(call: Caller) -> None:
-        found.update({name: info(call, name) for name in NAMES})
+        infos.update({name: info(call, name) for name in NAMES})
 
     with_script(script, [drone(world=tiny_world, yaw=90.0)])
     for name in NAMES:
         (x, y, z), (_, pitch, yaw) = default_mount(name, False)
-        assert vector(found[name]["pose"]["position"]) == pytest.approx((-y, x, z), abs=1e-6)
-        quaternion = found[name]["pose"]["orientation"]
+        assert vector(infos[name]["pose"]["position"]) == pytest.approx((-y, x, z), abs=1e-6)
+        quaternion = infos[name]["pose"]["orientation"]
         half = math.radians(90.0 + yaw) / 2.0
         expected = math.cos(half) * math.cos(math.radians(pitch) / 2.0)
         assert abs(quaternion["w_val"]) == pytest.approx(abs(expected), abs=1e-6)
-    assert found["0"] == found[""] == found["fpv"] == found["front_center"] != found["1"]
-    assert found["0"]["fov"] == 90.0
-    assert found["0"]["proj_mat"]["matrix"] == [
+    assert infos["0"] == infos[""] == infos["fpv"] == infos["front_center"] != infos["1"]
+    assert infos["0"]["fov"] == 90.0
+    assert infos["0"]["proj_mat"]["matrix"] == [
         pytest.approx(row)
         for row in ([0, 1, 0, 0], [0, 0, -256 / 144, 0], [0, 0, 0, 10], [-1, 0, 0, 0])
     ]
@@ -67,83 +67,83 @@ def test_cameras_of_the_settings_and_of_the_file_go_before_default_ones() -> Non
         CameraSpec(name="pair", stereo=Stereo(baseline=0.3)),
         CameraSpec(name="both"),
     ]
-    found = cameras_by_name(own, entries, 3, free=False)
-    assert found["0"] is found[""] is found["front_center"] is not found["fpv"]
-    assert found["0"].eye(5).spec.fov == 60.0
-    assert found["0"].eye(0).spec.fov == 90.0
-    assert found["0"].mount == ((0.46, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    assert found["fpv"].mount[1] == pytest.approx((0.5**0.5, 0.0, -(0.5**0.5), 0.0))
-    assert found["3"] is found["bottom_center"]
-    assert found["3"].mount[0] == (0.0, 0.0, 0.12)
-    assert found["3"].eye(0).spec.height == 200
-    assert found["3"].eye(1).spec.height == 144
-    assert found["1"] is found["front_right"]
-    assert {found["1"].eye(kind).spec.width for kind in ImageType} == {40}
-    assert found["pair_right"].mount[0] == pytest.approx((0.15, 0.3, 0.0))
-    assert found["both"].mount[0] == (1.0, 2.0, 3.0)
-    assert "pair" not in found
-    assert found["4"].eye(0).body == 3
+    cameras = cameras_by_name(own, entries, 3, free=False)
+    assert cameras["0"] is cameras[""] is cameras["front_center"] is not cameras["fpv"]
+    assert cameras["0"].eye(5).spec.fov == 60.0
+    assert cameras["0"].eye(0).spec.fov == 90.0
+    assert cameras["0"].mount == ((0.46, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    assert cameras["fpv"].mount[1] == pytest.approx((0.5**0.5, 0.0, -(0.5**0.5), 0.0))
+    assert cameras["3"] is cameras["bottom_center"]
+    assert cameras["3"].mount[0] == (0.0, 0.0, 0.12)
+    assert cameras["3"].eye(0).spec.height == 200
+    assert cameras["3"].eye(1).spec.height == 144
+    assert cameras["1"] is cameras["front_right"]
+    assert {cameras["1"].eye(kind).spec.width for kind in ImageType} == {40}
+    assert cameras["pair_right"].mount[0] == pytest.approx((0.15, 0.3, 0.0))
+    assert cameras["both"].mount[0] == (1.0, 2.0, 3.0)
+    assert "pair" not in cameras
+    assert cameras["4"].eye(0).body == 3
 
 
 @given(st.sets(st.sampled_from(NAMES)), st.sets(st.sampled_from(NAMES)))
 def test_default_names_are_always_there_and_given_ones_are_those_given(
     entries: set[str], own: set[str]
 ) -> None:
-    found = cameras_by_name(
+    cameras = cameras_by_name(
         [CameraSpec(name=name) for name in sorted(own)],
         [ServedCamera(name=name) for name in sorted(entries)],
         1,
         free=False,
     )
-    assert found.keys() >= {*NAMES, "front_left", "back_center"}
-    assert len({id(found[name]) for name in own | entries}) == len(own | entries)
-    unnamed = len({default_mount(name, False) for name in set(found) - own - entries})
-    assert len({id(camera) for camera in found.values()}) <= len(own | entries) + unnamed
+    assert cameras.keys() >= {*NAMES, "front_left", "back_center"}
+    assert len({id(cameras[name]) for name in own | entries}) == len(own | entries)
+    unnamed = len({default_mount(name, False) for name in set(cameras) - own - entries})
+    assert len({id(camera) for camera in cameras.values()}) <= len(own | entries) + unnamed
 
 
 @pytest.mark.slow
 def test_clients_are_told_the_announced_calibration(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
-        found["front"] = info(call, "front")
+        replies["front"] = info(call, "front")
         request = [{"camera_name": "front", "image_type": 0, "compress": False}]
-        (found["image"],) = call("simGetImages", request, "", False)
+        (replies["image"],) = call("simGetImages", request, "", False)
         settings = json.loads(call("getSettingsString"))
-        found["settings"] = settings["Vehicles"]["drone"]["Cameras"]["front"]
+        replies["settings"] = settings["Vehicles"]["drone"]["Cameras"]["front"]
         call("simSetCameraPose", "front", {"position": {"x_val": 1.0}}, "", False)
-        found["moved"] = info(call, "front")
+        replies["moved"] = info(call, "front")
 
     error = {"position": [0.0, 0.2, 0.0], "rotation": [0.0, 10.0, 0.0], "focal": [8.0, 8.0]}
     camera = {"name": "front", "width": 64, "height": 48, "images": ["grey"]}
     camera |= {"intrinsics": [32.0, 32.0, 31.5, 23.5], "calibration_error": error}
     with_script(script, [drone(world=tiny_world, cameras=[camera], camera_processes=1)])
     fov = 2.0 * math.degrees(math.atan(32.0 / 40.0))
-    place = vector(found["front"]["pose"]["position"])
+    place = vector(replies["front"]["pose"]["position"])
     assert place == pytest.approx((0.15, 0.2, 0.0), abs=2e-3)
-    assert found["front"]["fov"] == pytest.approx(fov)
+    assert replies["front"]["fov"] == pytest.approx(fov)
     half = math.radians(10.0) / 2.0  # about the optical y axis: down
-    assert found["front"]["pose"]["orientation"]["z_val"] == pytest.approx(math.sin(half))
-    assert vector(found["image"]["camera_position"]) == pytest.approx(place)
-    assert found["settings"]["Y"] == pytest.approx(0.2)
-    assert found["settings"]["Yaw"] == pytest.approx(10.0)
-    assert found["settings"]["CaptureSettings"][0]["FOV_Degrees"] == pytest.approx(fov)
-    assert vector(found["moved"]["pose"]["position"]) == pytest.approx((1.0, 0.0, 0.0), abs=2e-3)
+    assert replies["front"]["pose"]["orientation"]["z_val"] == pytest.approx(math.sin(half))
+    assert vector(replies["image"]["camera_position"]) == pytest.approx(place)
+    assert replies["settings"]["Y"] == pytest.approx(0.2)
+    assert replies["settings"]["Yaw"] == pytest.approx(10.0)
+    assert replies["settings"]["CaptureSettings"][0]["FOV_Degrees"] == pytest.approx(fov)
+    assert vector(replies["moved"]["pose"]["position"]) == pytest.approx((1.0, 0.0, 0.0), abs=2e-3)
 
 
 @pytest.mark.slow
 def test_in_computer_vision_mode_the_cameras_are_at_the_body(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    infos: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
-        found.update({name: info(call, name) for name in ("0", "1", "3", "any")})
+        infos.update({name: info(call, name) for name in ("0", "1", "3", "any")})
 
     settings = {"world": tiny_world, "camera_processes": 1, "position": [1, 2, -3]}
     with_script(script, [spec(FreeCamera, "free", settings | {"cameras": [{"name": "any"}]})])
-    assert vector(found["0"]["pose"]["position"]) == pytest.approx((0, 0, 0))
-    assert vector(found["1"]["pose"]["position"]) == pytest.approx((0, 0.125, 0))
-    assert vector(found["3"]["pose"]["position"]) == pytest.approx((0, 0, 0))
-    assert vector(found["any"]["pose"]["position"]) == pytest.approx((0.15, 0, 0))
+    assert vector(infos["0"]["pose"]["position"]) == pytest.approx((0, 0, 0))
+    assert vector(infos["1"]["pose"]["position"]) == pytest.approx((0, 0.125, 0))
+    assert vector(infos["3"]["pose"]["position"]) == pytest.approx((0, 0, 0))
+    assert vector(infos["any"]["pose"]["position"]) == pytest.approx((0.15, 0, 0))
 
 
 def test_a_camera_that_is_not_there_fails_the_whole_call(tiny_world: str) -> None:
@@ -165,12 +165,12 @@ def test_clients_move_cameras_and_change_their_view(tiny_world: str) -> None:
         "position": {"x_val": 0.5, "y_val": -0.25, "z_val": 1.0},
         "orientation": {"w_val": 1.0, "x_val": 0.0, "y_val": 0.0, "z_val": 1.0},
     }
-    found: dict[str, Any] = {}
+    infos: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
         call("simSetCameraPose", "fpv", pose, "", False)
         call("simSetCameraFov", "0", 60, "", False)
-        found.update({name: info(call, name) for name in ("0", "1")})
+        infos.update({name: info(call, name) for name in ("0", "1")})
         bad: dict[str, Any]
         for bad in (
             {"position": {"x_val": math.nan}},
@@ -199,13 +199,13 @@ def test_clients_move_cameras_and_change_their_view(tiny_world: str) -> None:
         call("simSetDistortionParam", "0", "K1", 0, "", False)
         with pytest.raises(RefusedError, match=r"not supported by visnav-runtime: .*K1 = 0\.1"):
             call("simSetDistortionParam", "0", "K1", 0.1, "", False)
-        assert info(call, "0") == found["0"]
+        assert info(call, "0") == infos["0"]
 
     with_script(script, [drone(world=tiny_world)])
-    assert vector(found["0"]["pose"]["position"]) == pytest.approx((0.5, -0.25, 1.0), abs=1e-5)
-    assert found["0"]["pose"]["orientation"]["z_val"] == pytest.approx(math.sqrt(0.5))
-    assert found["0"]["fov"] == 60.0
-    assert found["1"]["fov"] == 90.0
+    assert vector(infos["0"]["pose"]["position"]) == pytest.approx((0.5, -0.25, 1.0), abs=1e-5)
+    assert infos["0"]["pose"]["orientation"]["z_val"] == pytest.approx(math.sqrt(0.5))
+    assert infos["0"]["fov"] == 60.0
+    assert infos["1"]["fov"] == 90.0
 
 
 @pytest.mark.parametrize(
@@ -277,32 +277,32 @@ def pixels(response: Any) -> Any:
 
 @pytest.mark.slow
 def test_each_type_shows_what_is_there(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
-        found["info"] = call("simGetCameraInfo", "eye", "", False)
-        found["float"] = images(call, *(request("eye", k, floats=True) for k in range(8)))
-        found["bytes"] = images(call, *(request("eye", k) for k in range(8)))
-        found["png"] = images(call, *(request("eye", k, compress=True) for k in range(8)))
-        found["one"] = call("simGetImage", "eye", 5, "", False)
+        replies["info"] = call("simGetCameraInfo", "eye", "", False)
+        replies["float"] = images(call, *(request("eye", k, floats=True) for k in range(8)))
+        replies["bytes"] = images(call, *(request("eye", k) for k in range(8)))
+        replies["png"] = images(call, *(request("eye", k, compress=True) for k in range(8)))
+        replies["one"] = call("simGetImage", "eye", 5, "", False)
 
     with_script(script, [drone(world=tiny_world, position=[1.0, 0.0])], cameras=CAMERAS)
-    for response in found["float"] + found["bytes"] + found["png"]:
+    for response in replies["float"] + replies["bytes"] + replies["png"]:
         kind = response["image_type"]
         assert (response["width"], response["height"]) == (32 + kind, 24)
         assert response["time_stamp"] == 0
         assert response["camera_name"] == "eye"
-        assert response["camera_position"] == found["info"]["pose"]["position"]
-        assert response["camera_orientation"] == found["info"]["pose"]["orientation"]
+        assert response["camera_position"] == replies["info"]["pose"]["position"]
+        assert response["camera_orientation"] == replies["info"]["pose"]["orientation"]
         assert "annotation_name" not in response
-    middle = [pixels(each)[8, 16] for each in found["float"]]  # above the horizon: the wall
+    middle = [pixels(reply)[8, 16] for reply in replies["float"]]  # above the horizon: the wall
     assert middle[1] == pytest.approx(AHEAD - 1.0, abs=1e-4)
     assert middle[2] == pytest.approx(middle[1], rel=0.02)
     assert middle[2] > middle[1]
     assert middle[3] == pytest.approx(middle[1] / 100.0)
     assert middle[4] == pytest.approx(0.25 / (2.0 * math.tan(math.radians(30.0)) * middle[1]))
     wall = initial_id("wall")
-    colours = [pixels(each) for each in found["bytes"]]
+    colours = [pixels(reply) for reply in replies["bytes"]]
     assert (colours[1][8, 16] == 255).all()  # far beyond a metre
     assert (colours[3][8, 16] == round(2.55 * middle[1])).all()
     assert colours[5][8, 16].tolist() == palette()[wall][::-1].tolist()
@@ -311,46 +311,46 @@ def test_each_type_shows_what_is_there(tiny_world: str) -> None:
     assert colours[6][8, 16] == pytest.approx(south, abs=1)
     assert colours[6][-1, 16] == pytest.approx(up, abs=1)
     assert colours[7][8, 16].tolist() == [wall] * 3
-    for raw, png, floats in zip(colours, found["png"], found["float"], strict=True):
+    for raw, png, floats in zip(colours, replies["png"], replies["float"], strict=True):
         assert np.array_equal(raw, pixels(png))
         if floats["image_type"] in {0, 5, 6, 7}:
             assert pixels(floats) == pytest.approx(raw[..., 2] / 255.0)
-    assert found["one"] == found["png"][5]["image_data_uint8"]
+    assert replies["one"] == replies["png"][5]["image_data_uint8"]
 
 
 @pytest.mark.slow
 def test_cosys_gets_red_first_and_its_own_fields(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
         wanted = [request("eye", 5) | {"annotation_name": "mine"}]
-        (found["airsim"],) = call("simGetImages", wanted, "", False)
-        (found["cosys"],) = call("simGetImages", wanted, "")
-        found["one"] = call("simGetImage", "eye", 5, "", "")
+        (replies["airsim"],) = call("simGetImages", wanted, "", False)
+        (replies["cosys"],) = call("simGetImages", wanted, "")
+        replies["one"] = call("simGetImage", "eye", 5, "", "")
 
     with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
-    assert np.array_equal(pixels(found["airsim"])[..., ::-1], pixels(found["cosys"]))
-    assert found["cosys"].keys() - found["airsim"].keys() == {"annotation_name"}
-    assert found["cosys"]["annotation_name"] == "mine"
-    assert found["one"].startswith(b"\x89PNG")
+    assert np.array_equal(pixels(replies["airsim"])[..., ::-1], pixels(replies["cosys"]))
+    assert replies["cosys"].keys() - replies["airsim"].keys() == {"annotation_name"}
+    assert replies["cosys"]["annotation_name"] == "mine"
+    assert replies["one"].startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
 def test_vehicles_see_each_other_and_fly_on_unchanged(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
 
     def script(call: Caller, *, takes_images: bool = True) -> None:
         call("enableApiControl", True, "drone")
         takeoff = call.send("takeoff", 20.0, "drone")
         for second in range(2):
             if takes_images:
-                (found[f"seen {second}"],) = images(call, request("eye", 7))
-                found[f"pose {second}"] = call("simGetVehiclePose", "drone")
+                (replies[f"seen {second}"],) = images(call, request("eye", 7))
+                replies[f"pose {second}"] = call("simGetVehiclePose", "drone")
             call("simContinueForTime", 1.0)
         if takes_images:
             late = call.send("simGetImages", [request("eye", 1, floats=True)] * 2, "", False)
             call("simContinueForTime", 0.5)
-            found["late"] = call.join(late)
+            replies["late"] = call.join(late)
         else:
             call("simContinueForTime", 0.5)
         del takeoff
@@ -358,15 +358,15 @@ def test_vehicles_see_each_other_and_fly_on_unchanged(tiny_world: str) -> None:
     two = [drone(world=tiny_world), drone("other", position=[2.0, 0.0])]
     flown = with_script(script, two, cameras=CAMERAS)
     other = initial_id("other")
-    assert other in pixels(found["seen 0"])
+    assert other in pixels(replies["seen 0"])
     for second in range(2):
-        response, pose = found[f"seen {second}"], found[f"pose {second}"]
+        response, pose = replies[f"seen {second}"], replies[f"pose {second}"]
         assert response["time_stamp"] == second * 1_000_000_000
         assert response["camera_position"] == pose["position"] != {}
-    assert found["pose 1"]["position"]["z_val"] < -0.01
-    stamps = {each["time_stamp"] for each in found["late"]}
+    assert replies["pose 1"]["position"]["z_val"] < -0.01
+    stamps = {reply["time_stamp"] for reply in replies["late"]}
     assert stamps == {2_000_000_000}
-    assert found["late"][0] == found["late"][1]
+    assert replies["late"][0] == replies["late"][1]
 
     without = with_script(lambda call: script(call, takes_images=False), two, cameras=CAMERAS)
     assert flown.sent == without.sent
@@ -374,25 +374,25 @@ def test_vehicles_see_each_other_and_fly_on_unchanged(tiny_world: str) -> None:
 
 @pytest.mark.slow
 def test_a_free_camera_shows_at_once_where_it_has_been_put(tiny_world: str) -> None:
-    found: list[Any] = []
+    responses: list[Any] = []
 
     def script(call: Caller) -> None:
         for north in (0.0, 1.5, -2.0):
             position = {"x_val": north, "y_val": 0.0, "z_val": 0.0}
             call("simSetVehiclePose", {"position": position, "orientation": {}}, True, "")
-            found.extend(images(call, request("eye", 1, floats=True)))
+            responses.extend(images(call, request("eye", 1, floats=True)))
             assert call("simGetVehiclePose", "")["position"] == position
 
     settings = {"world": tiny_world, "camera_processes": 1, "cameras": [{"name": "any"}]}
     with_script(script, [spec(FreeCamera, "free", settings)], cameras=CAMERAS)
-    for response, north in zip(found, (0.0, 1.5, -2.0), strict=True):
+    for response, north in zip(responses, (0.0, 1.5, -2.0), strict=True):
         assert response["camera_position"]["x_val"] == pytest.approx(north)
         assert pixels(response)[10, 16] == pytest.approx(AHEAD - north, abs=1e-4)
 
 
 @pytest.mark.slow
 def test_segmentation_ids_are_set_and_told(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    identifiers: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
         def seen() -> set[int]:
@@ -405,21 +405,21 @@ def test_segmentation_ids_are_set_and_told(tiny_world: str) -> None:
         assert call("simSetSegmentationObjectID", "wall", 7, False) is True
         assert initial_id("wall") in pixels(call.join(before)[0])
         assert call("simSetSegmentationObjectID", "WALL", 8, False) is False
-        found["plain"] = seen()
+        identifiers["plain"] = seen()
         assert call("simSetSegmentationObjectID", "W.*", 300, True) is True
         assert call("simSetSegmentationObjectID", "w", 1, True) is False
         assert call("simGetSegmentationObjectID", "wall") == 255
-        found["regex"] = seen()
+        identifiers["regex"] = seen()
         assert call("simSetSegmentationObjectID", "wall", -1, False) is True
         assert call("simGetSegmentationObjectID", "wall") == -1
-        found["hidden"] = seen()
+        identifiers["hidden"] = seen()
         call.refuses("regular expression", "simSetSegmentationObjectID", "(", 1, True)
 
     with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
     floor = initial_id("floor")
-    assert found["plain"] - {0} == {floor, 7}
-    assert found["regex"] - {0} == {floor, 255}
-    assert found["hidden"] == {0, floor}
+    assert identifiers["plain"] - {0} == {floor, 7}
+    assert identifiers["regex"] - {0} == {floor, 255}
+    assert identifiers["hidden"] == {0, floor}
 
 
 @pytest.mark.slow
@@ -435,10 +435,10 @@ def test_any_list_of_requests_is_answered_in_order(tiny_world: str) -> None:
         def check(wanted: list[Any]) -> None:
             responses = images(call, *wanted)
             assert len(responses) == len(wanted)
-            for response, each in zip(responses, wanted, strict=True):
-                assert {key: response[key] for key in each} == each
-                eye = 32 + each["image_type"], 24
-                usual = {"eye": eye, "camera": (20, 10)}.get(each["camera_name"], (256, 144))
+            for response, request in zip(responses, wanted, strict=True):
+                assert {key: response[key] for key in request} == request
+                eye = 32 + request["image_type"], 24
+                usual = {"eye": eye, "camera": (20, 10)}.get(request["camera_name"], (256, 144))
                 assert (response["width"], response["height"]) == usual
                 pixels(response)
 
@@ -483,9 +483,9 @@ def test_clients_may_leave_and_the_next_one_is_served(tiny_world: str) -> None:
         served, refused = 0, 0
         while not served:
             waiting = [call.send("simGetImages", [request("eye", 0)], "", False) for _ in range(3)]
-            for each in waiting:
+            for pending in waiting:
                 try:
-                    served += len(call.join(each))
+                    served += len(call.join(pending))
                 except RefusedError as error:
                     refused += 1
                     assert f"at most {MOST} calls" in str(error)  # noqa: PT017  # either will do

@@ -105,13 +105,13 @@ class Client:
 
     async def messages(self, count: int) -> list[wire.Reply]:
         """Return the next replies."""
-        found: list[Any] = []
-        while len(found) < count:
+        replies: list[Any] = []
+        while len(replies) < count:
             data = await self.reader.read(1 << 16)
             assert data, "the server closed the connection"
-            found += self._decoder.feed(data)
-        assert len(found) == count
-        return found
+            replies += self._decoder.feed(data)
+        assert len(replies) == count
+        return replies
 
     async def call(self, method: str, *arguments: Any) -> wire.Reply:
         self.send((0, method, [*arguments]))

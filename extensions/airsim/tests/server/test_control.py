@@ -28,8 +28,8 @@ def pose(x: float, y: float, z: float, orientation: dict[str, float] = QUARTER) 
     return {"position": vector(x, y, z), "orientation": orientation}
 
 
-def numbers(found: dict[str, float]) -> tuple[float, ...]:
-    return tuple(found.values())
+def numbers(fields: dict[str, float]) -> tuple[float, ...]:
+    return tuple(fields.values())
 
 
 def free_camera(world: str, name: str = "camera", **config: Any) -> NodeSpec:
@@ -39,7 +39,7 @@ def free_camera(world: str, name: str = "camera", **config: Any) -> NodeSpec:
 
 @pytest.mark.slow
 def test_a_drone_is_put_where_it_is_said_and_held_there_if_it_flies(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
         call("enableApiControl", True, "")
@@ -47,12 +47,12 @@ def test_a_drone_is_put_where_it_is_said_and_held_there_if_it_flies(tiny_world: 
         call("simContinueForTime", 8.0)
         call.join(flying)
         call("simSetVehiclePose", pose(-3.0, 4.0, -10.0), True, "")
-        found["at once"] = call("simGetGroundTruthKinematics", "")
+        replies["at once"] = call("simGetGroundTruthKinematics", "")
         call("simContinueForTime", 3.0)
-        found["later"] = call("simGetGroundTruthKinematics", "")
+        replies["later"] = call("simGetGroundTruthKinematics", "")
 
     with_script(script, [drone(world=tiny_world)])
-    at_once, later = found["at once"], found["later"]
+    at_once, later = replies["at once"], replies["later"]
     assert numbers(at_once["position"]) == pytest.approx((-3.0, 4.0, -10.0), abs=1e-12)
     assert numbers(at_once["orientation"]) == pytest.approx(numbers(QUARTER), abs=1e-12)
     assert numbers(at_once["linear_velocity"]) == pytest.approx((0.0,) * 3, abs=1e-6)
@@ -61,25 +61,25 @@ def test_a_drone_is_put_where_it_is_said_and_held_there_if_it_flies(tiny_world: 
 
 
 def test_what_is_nan_is_kept_and_velocities_can_be_given(tiny_world: str) -> None:
-    found: list[Any] = []
+    replies: list[Any] = []
     unknown = dict.fromkeys(QUARTER, NAN)
 
     def script(call: Caller) -> None:
         call("simSetVehiclePose", pose(1.0, 2.0, -20.0), True, "")
         call("simSetVehiclePose", pose(NAN, 3.0, NAN, unknown), True, "")
-        found.append(call("simGetVehiclePose", ""))
+        replies.append(call("simGetVehiclePose", ""))
         moving = pose(NAN, NAN, NAN, unknown)
         moving |= {"linear_velocity": vector(1.0, -2.0, 3.0)}
         moving |= {"angular_velocity": vector(0.1, 0.2, NAN)}
         call("simSetKinematics", moving, True, "")
-        found.append(call("simGetGroundTruthKinematics", ""))
+        replies.append(call("simGetGroundTruthKinematics", ""))
 
     with_script(script, [drone(world=tiny_world)])
-    assert numbers(found[0]["position"]) == pytest.approx((1.0, 3.0, -20.0), abs=1e-12)
-    assert numbers(found[0]["orientation"]) == pytest.approx(numbers(QUARTER), abs=1e-12)
-    assert found[1]["position"] == found[0]["position"]
-    assert numbers(found[1]["linear_velocity"]) == pytest.approx((1.0, -2.0, 3.0), abs=1e-6)
-    assert numbers(found[1]["angular_velocity"]) == pytest.approx((0.1, 0.2, 0.0), abs=1e-6)
+    assert numbers(replies[0]["position"]) == pytest.approx((1.0, 3.0, -20.0), abs=1e-12)
+    assert numbers(replies[0]["orientation"]) == pytest.approx(numbers(QUARTER), abs=1e-12)
+    assert replies[1]["position"] == replies[0]["position"]
+    assert numbers(replies[1]["linear_velocity"]) == pytest.approx((1.0, -2.0, 3.0), abs=1e-6)
+    assert numbers(replies[1]["angular_velocity"]) == pytest.approx((0.1, 0.2, 0.0), abs=1e-6)
 
 
 def test_where_no_drone_can_be_is_refused_and_it_stays(tiny_world: str) -> None:
@@ -98,37 +98,37 @@ def test_where_no_drone_can_be_is_refused_and_it_stays(tiny_world: str) -> None:
             call.refuses(why, "simSetVehiclePose", asked, True, "")
             assert call("simGetVehiclePose", "") == before
             call("simContinueForTime", 0.1)
-            found = call("simGetVehiclePose", "")
-            assert numbers(found["position"]) == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)
+            pose = call("simGetVehiclePose", "")
+            assert numbers(pose["position"]) == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)
 
     with_script(script, [drone(world=tiny_world)])
 
 
 @pytest.mark.slow
 def test_reset_brings_the_start_back_and_the_drone_flies_again(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
         for turn in ("first", "second"):
             call("enableApiControl", True, "")
             flying = call.send("takeoff", 20.0, "")
             call("simContinueForTime", 8.0)
-            found[turn] = call.join(flying), call("simGetVehiclePose", "")
+            replies[turn] = call.join(flying), call("simGetVehiclePose", "")
             moving = call.send("moveToPosition", 9.0, 9.0, -9.0, 3.0, 3e38, 0, {}, -1.0, 1.0, "")
             call("simContinueForTime", 1.0)
             call("reset")
-            found["cancelled"] = call.join(moving)
-            found["control"] = call("isApiControlEnabled", "")
-            found["start"] = call("getMultirotorState", "")
+            replies["cancelled"] = call.join(moving)
+            replies["control"] = call("isApiControlEnabled", "")
+            replies["start"] = call("getMultirotorState", "")
 
     with_script(script, [drone(world=tiny_world, position=[-3.0, 1.0], yaw=30.0)])
-    first, second = found["first"], found["second"]
+    first, second = replies["first"], replies["second"]
     assert first[0]
     assert second[0]
     assert numbers(second[1]["position"]) == pytest.approx(numbers(first[1]["position"]), abs=0.01)
-    assert found["cancelled"] is False
-    assert found["control"] is False
-    start = found["start"]
+    assert replies["cancelled"] is False
+    assert replies["control"] is False
+    start = replies["start"]
     assert start["timestamp"] == 18_000_000_000
     assert start["landed_state"] == 0
     kinematics = start["kinematics_estimated"]
@@ -163,22 +163,22 @@ def test_reset_resets_every_vehicle_and_its_sensors(tiny_world: str) -> None:
 def test_a_script_flies_at_the_instant_at_which_another_one_has_disarmed(
     between: str, tiny_world: str
 ) -> None:
-    found: list[Any] = []
+    replies: list[Any] = []
 
     def script(call: Caller) -> None:
         for _ in range(2):
             call("enableApiControl", True, "")
             call("armDisarm", True, "")
-            found.append(call("takeoff", 20.0, ""))
-            found.append(call("simGetVehiclePose", "")["position"]["z_val"])
+            replies.append(call("takeoff", 20.0, ""))
+            replies.append(call("simGetVehiclePose", "")["position"]["z_val"])
             call("simSetVehiclePose", pose(0.0, 0.0, 0.0), True, "")
             call("armDisarm", False, "")
             if between == "reset":
                 call("reset")
 
     with_script(script, [drone(world=tiny_world)], time="awaited")
-    assert found[::2] == [True, True]
-    assert found[1::2] == pytest.approx([-2.0, -2.0], abs=0.5)
+    assert replies[::2] == [True, True]
+    assert replies[1::2] == pytest.approx([-2.0, -2.0], abs=0.5)
 
 
 def test_reset_calms_the_wind_of_a_client(tiny_world: str) -> None:
@@ -204,27 +204,27 @@ def test_reset_calms_the_wind_of_a_client(tiny_world: str) -> None:
 
 @pytest.mark.slow
 def test_a_free_camera_is_where_it_is_put_at_once(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
-        found["vehicles"] = call("listVehicles")
+        replies["vehicles"] = call("listVehicles")
         call("simSetVehiclePose", pose(2.0, 3.0, -1.0), True, "")
-        found["pose"] = call("simGetVehiclePose", "camera")
-        found["truth"] = call("getComputerVisionState", "")
+        replies["pose"] = call("simGetVehiclePose", "camera")
+        replies["truth"] = call("getComputerVisionState", "")
         call.refuses("cannot be put there", "simSetVehiclePose", pose(1e30, 0.0, 0.0), True, "")
         call.refuses("Vehicle API for '' is not available", "getMultirotorState", "")
         call("simContinueForTime", 0.1)
-        found["later"] = call("simGetVehiclePose", "")
+        replies["later"] = call("simGetVehiclePose", "")
         call("reset")
-        found["start"] = call("simGetVehiclePose", "")
+        replies["start"] = call("simGetVehiclePose", "")
 
     result = with_script(script, [free_camera(tiny_world, position=[1.0, 1.0, -2.0])])
-    assert found["vehicles"] == ["camera"]
+    assert replies["vehicles"] == ["camera"]
     for name in ("pose", "later"):
-        assert numbers(found[name]["position"]) == (2.0, 3.0, -1.0)
-        assert numbers(found[name]["orientation"]) == pytest.approx(numbers(QUARTER), abs=1e-12)
-    assert found["truth"]["kinematics_estimated"]["position"] == found["pose"]["position"]
-    assert numbers(found["start"]["position"]) == (0.0, 0.0, 0.0)
+        assert numbers(replies[name]["position"]) == (2.0, 3.0, -1.0)
+        assert numbers(replies[name]["orientation"]) == pytest.approx(numbers(QUARTER), abs=1e-12)
+    assert replies["truth"]["kinematics_estimated"]["position"] == replies["pose"]["position"]
+    assert numbers(replies["start"]["position"]) == (0.0, 0.0, 0.0)
     assert result.of(Odometry)[-1].position == (3.0, 4.0, -3.0)
 
 
@@ -248,16 +248,16 @@ def test_unknown_vehicles_are_errors_with_airsims_texts(tiny_world: str) -> None
 
 
 def test_an_empty_name_is_the_default_vehicle_or_the_first_by_name(tiny_world: str) -> None:
-    found: list[float] = []
+    heights: list[float] = []
 
     def script(call: Caller) -> None:
         call("simSetVehiclePose", pose(0.0, 0.0, -7.0), True, "")
-        found.append(call("simGetVehiclePose", "a")["position"]["z_val"])
+        heights.append(call("simGetVehiclePose", "a")["position"]["z_val"])
 
     nodes = [drone("b", world=tiny_world, position=[0.0, 3.0]), drone("a", world=tiny_world)]
     with_script(script, nodes)
     with_script(script, nodes, default_vehicle="b")
-    assert found == pytest.approx([-7.0, 0.0], abs=1e-3)
+    assert heights == pytest.approx([-7.0, 0.0], abs=1e-3)
 
 
 def test_a_default_vehicle_that_is_not_there_is_refused(tiny_world: str) -> None:
@@ -267,16 +267,16 @@ def test_a_default_vehicle_that_is_not_there_is_refused(tiny_world: str) -> None
 
 @pytest.mark.slow
 def test_beside_a_free_camera_an_empty_name_still_flies_the_drone(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
         call("simSetVehiclePose", pose(5.0, 0.0, 0.0), True, "camera")
-        found["camera"] = call("simGetVehiclePose", "")["position"]["x_val"]
-        found["drone"] = call("getMultirotorState", "")["landed_state"]
+        replies["camera"] = call("simGetVehiclePose", "")["position"]["x_val"]
+        replies["drone"] = call("getMultirotorState", "")["landed_state"]
         call("reset")
 
     with_script(script, [free_camera(tiny_world), drone(world=tiny_world)])
-    assert found == {"camera": 5.0, "drone": 0}
+    assert replies == {"camera": 5.0, "drone": 0}
 
 
 POSITIONS = st.tuples(*[st.floats(-9e3, 9e3)] * 2, st.floats(-9e3, 50.0))
@@ -299,14 +299,14 @@ def test_wherever_a_drone_is_put_it_is_there_and_what_follows_is_the_same_twice(
                 "angular_velocity": vector(*rates),
             }
             call("simSetKinematics", state, True, "")
-            found = call("simGetGroundTruthKinematics", "")
-            assert numbers(found["position"]) == pytest.approx(position, abs=1e-11)
+            kinematics = call("simGetGroundTruthKinematics", "")
+            assert numbers(kinematics["position"]) == pytest.approx(position, abs=1e-11)
             if position[2] < -1.0:  # what it is in pushes it at once
-                assert numbers(found["linear_velocity"]) == pytest.approx(velocity, abs=1e-6)
-                assert numbers(found["angular_velocity"]) == pytest.approx(rates, abs=1e-6)
+                assert numbers(kinematics["linear_velocity"]) == pytest.approx(velocity, abs=1e-6)
+                assert numbers(kinematics["angular_velocity"]) == pytest.approx(rates, abs=1e-6)
             norm = math.hypot(*turn)
             unit = tuple(x / norm for x in turn)
-            assert numbers(found["orientation"]) == pytest.approx(unit, abs=1e-12)
+            assert numbers(kinematics["orientation"]) == pytest.approx(unit, abs=1e-12)
             call("simContinueForTime", 0.0123)
 
     def flown() -> list[Event]:

@@ -35,19 +35,19 @@ def fly(world: str, script: Script, *names: str, **server: Any) -> list[Event]:
 
 
 def place(caller: Caller, vehicle: str = "") -> tuple[float, float, float]:
-    found = caller("simGetVehiclePose", vehicle)["position"]
-    return found["x_val"], found["y_val"], found["z_val"]
+    position = caller("simGetVehiclePose", vehicle)["position"]
+    return position["x_val"], position["y_val"], position["z_val"]
 
 
 def speed(caller: Caller) -> tuple[float, float, float]:
-    found = caller("simGetGroundTruthKinematics", "")["linear_velocity"]
-    return found["x_val"], found["y_val"], found["z_val"]
+    velocity = caller("simGetGroundTruthKinematics", "")["linear_velocity"]
+    return velocity["x_val"], velocity["y_val"], velocity["z_val"]
 
 
 def heading(caller: Caller) -> float:
     """Return the heading in degrees."""
-    found = caller("simGetVehiclePose", "")["orientation"]
-    w, x, y, z = (found[f"{axis}_val"] for axis in "wxyz")
+    orientation = caller("simGetVehiclePose", "")["orientation"]
+    w, x, y, z = (orientation[f"{axis}_val"] for axis in "wxyz")
     return math.degrees(yaw_of((w, x, y, z)))
 
 
@@ -82,7 +82,7 @@ def test_the_usual_flight(tiny_world: str) -> None:
         assert caller("goHome", FOREVER, "") is True
 
     sent = fly(tiny_world, script)
-    assert sum(isinstance(each, Disarmed) for each in sent) == 1
+    assert sum(isinstance(event, Disarmed) for event in sent) == 1
 
 
 @pytest.mark.slow
@@ -178,7 +178,7 @@ def test_paths_and_places_on_the_earth(tiny_world: str) -> None:
         home = caller("getMultirotorState", "")["gps_location"]
         caller("takeoff", 20, "")
         corners = [(-4, 0, -2), (-4, 4, -3), (0, 4, -2)]
-        path = [dict(zip(("x_val", "y_val", "z_val"), each, strict=True)) for each in corners]
+        path = [dict(zip(("x_val", "y_val", "z_val"), corner, strict=True)) for corner in corners]
         assert caller("moveOnPath", path, 2, FOREVER, 0, NO_TURN, -1, 1, "") is True
         assert math.dist(place(caller), corners[-1]) < 0.4
         begin = now(caller)
@@ -270,9 +270,9 @@ def test_sixty_milliseconds_after_its_last_order_a_vehicle_hovers(tiny_world: st
         assert caller.join(id_) is True
 
     sent = fly(tiny_world, script, time="paused")
-    setpoints = [each.stamp for each in sent if isinstance(each, Setpoint)]
+    setpoints = [event.stamp for event in sent if isinstance(event, Setpoint)]
     assert setpoints == list(range(520_000_000, 1_501_000_000, 20_000_000))
-    (hover,) = (each.stamp for each in sent if isinstance(each, Hover))
+    (hover,) = (event.stamp for event in sent if isinstance(event, Hover))
     assert hover == setpoints[-1] + 60_000_000
 
 
@@ -280,7 +280,7 @@ def test_sixty_milliseconds_after_its_last_order_a_vehicle_hovers(tiny_world: st
 def test_two_vehicles_fly_at_once(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         both = [caller.send("takeoff", 20, name) for name in ("a", "b")]
-        assert [caller.join(each) for each in both] == [True, True]
+        assert [caller.join(call) for call in both] == [True, True]
         assert now(caller) < 6.0
         for name in ("a", "b"):
             assert place(caller, name) == pytest.approx((0.0, 0.0, -2.0), abs=0.05)
@@ -370,7 +370,7 @@ def test_no_number_that_is_none_reaches_a_vehicle(tiny_world: str) -> None:
 
     sent = fly(tiny_world, script)
     assert all(
-        math.isfinite(n) for each in sent if isinstance(each, Odometry) for n in each.position
+        math.isfinite(n) for event in sent if isinstance(event, Odometry) for n in event.position
     )
 
 

@@ -166,19 +166,19 @@ def test_points_of_a_lidar_in_motion_lie_on_the_walls(
 
 @pytest.mark.slow
 def test_points_of_a_lidar_lie_where_its_announced_mounting_puts_them(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    reply: dict[str, Any] = {}
 
     def script(airsim: Caller) -> None:
         airsim("simContinueForTime", 0.3)
-        found.update(airsim("getLidarData", "lidar", ""))
+        reply.update(airsim("getLidarData", "lidar", ""))
 
     lidar = {"name": "lidar", "channels": 4, "columns": 64, "elevations": (-45.0, -15.0)}
     lidar |= {"calibration_error": {"position": [0.0, 0.0, 0.25]}}
     with_script(
         script, [drone(world=tiny_world, lidars=[lidar])], lidar_frame="VehicleInertialFrame"
     )
-    assert found["pose"]["position"]["z_val"] == pytest.approx(0.25, abs=0.02)
-    heights = np.array(found["point_cloud"]).reshape(-1, 3)[:, 2]
+    assert reply["pose"]["position"]["z_val"] == pytest.approx(0.25, abs=0.02)
+    heights = np.array(reply["point_cloud"]).reshape(-1, 3)[:, 2]
     assert np.median(heights) == pytest.approx(0.1 + 0.25, abs=0.02)  # the floor
 
 

@@ -143,8 +143,8 @@ def test_names_stay_unique_and_poses_exact(steps: list[Any], tiny_world: str) ->
                 spawned.add(used)
             listed = airsim("simListSceneObjects", ".*")
             assert listed == sorted({*known, "ball", "drone", "floor"})
-            for each, pose in known.items():
-                assert numbers(airsim("simGetObjectPose", each)) == pytest.approx(pose, abs=1e-9)
+            for body, pose in known.items():
+                assert numbers(airsim("simGetObjectPose", body)) == pytest.approx(pose, abs=1e-9)
 
     with_script(script, [drone(world=tiny_world)], **CUBES)
 

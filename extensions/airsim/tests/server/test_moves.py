@@ -202,7 +202,7 @@ def test_moves_end_where_they_should_and_stay_there(speed: float, goal: Vector3)
 def test_what_is_stuck_has_failed_after_five_seconds() -> None:
     task = moves.along_path([(0.0, 0.0, 0.0), (9.0, 0.0, 0.0)], 1.0, 1.0, Heading(), math.inf)
     results = [steered(task, count * STEP, at((0.0, 0.0, 0.0))) for count in range(5 * RATE + 1)]
-    assert [each for each in results if isinstance(each, bool)] == [False]
+    assert [result for result in results if isinstance(result, bool)] == [False]
 
 
 def test_a_landing_waits_until_nothing_moves_for_more_than_ten_updates() -> None:
@@ -219,5 +219,5 @@ def test_a_place_is_reached_when_the_vehicle_is_slow_too(speed: float, ends: boo
     task = moves.along_path([(0.0, 0.0, -2.0), (9.0, 0.0, -2.0)], 12.0, -1.0, Heading(), 60.0)
     there = at((9.0, 0.0, -2.0), (speed, 0.0, 0.0))
     orders = [steered(task, count * STEP, there) for count in range(20)]
-    found = next((each for each in orders if isinstance(each, bool)), None)
-    assert found is ends
+    outcome = next((order for order in orders if isinstance(order, bool)), None)
+    assert outcome is ends

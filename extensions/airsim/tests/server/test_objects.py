@@ -166,7 +166,7 @@ def test_messages_are_logged_by_their_severity(
     with caplog.at_level(logging.INFO, "visnav.airsim"):
         with_script(script, [drone(world=tiny_world)])
     records = [(record.levelno, record.getMessage()) for record in caplog.records]
-    said = [each for each in records if "a client says" in each[1]]
+    said = [record for record in records if "a client says" in record[1]]
     assert said[:2] == [
         (logging.INFO, "a client says: hello all"),
         (logging.WARNING, r"a client says: 'be\ncareful'"),

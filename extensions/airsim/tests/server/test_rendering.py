@@ -150,15 +150,17 @@ def test_what_is_drawn_together_is_what_is_drawn_alone(
     formats: st.SearchStrategy[Form] = st.sampled_from(["float", "rgb", "bgr", "png"])
     specs = st.sampled_from(CAMERAS)
     chosen = data.draw(st.lists(st.tuples(specs, kinds, formats), max_size=6))
-    images = [each for spec, *what in chosen for each in wanted(model, spec, (what[0], what[1]))]
+    images = [
+        requested for spec, *what in chosen for requested in wanted(model, spec, (what[0], what[1]))
+    ]
     ids = np.arange(model.ngeom + 1, dtype=np.uint8)
     together = renderer.take(0, model.qpos0, ids, images)
     assert len(together) == len(images)
-    for image, each in zip(together, images, strict=True):
-        pixels = each.eye.spec.width * each.eye.spec.height
-        if each.form != "png":
-            assert image.size == (5 * pixels + 5 if each.form == "float" else 3 * pixels)
-        (alone,) = renderer.take(0, model.qpos0, ids, [each])
+    for image, request in zip(together, images, strict=True):
+        pixels = request.eye.spec.width * request.eye.spec.height
+        if request.form != "png":
+            assert image.size == (5 * pixels + 5 if request.form == "float" else 3 * pixels)
+        (alone,) = renderer.take(0, model.qpos0, ids, [request])
         assert np.array_equal(image, alone)
 
 
@@ -206,23 +208,23 @@ def test_ids_have_colours_of_their_own_and_none_is_black() -> None:
 )
 def test_numbers_of_depth(kind: ImageType, expected: float) -> None:
     depth = np.full((12, 16), 4.0, np.float32)
-    found = as_numbers(kind, seen(depth))
-    assert found.dtype == np.float32
-    assert found == pytest.approx(np.full((12, 16), expected))
+    numbers = as_numbers(kind, seen(depth))
+    assert numbers.dtype == np.float32
+    assert numbers == pytest.approx(np.full((12, 16), expected))
     grey = min(round(expected * 255), 255)
     assert (as_colours(kind, seen(depth)) == grey).all()
 
 
 def test_perspective_depth_is_measured_along_the_ray() -> None:
-    found = as_numbers(ImageType.DEPTH_PERSPECTIVE, seen(np.full((12, 16), 4.0, np.float32)))
-    assert found[..., None] * RAYS[..., 2:] == pytest.approx(4.0, rel=1e-6)
+    depths = as_numbers(ImageType.DEPTH_PERSPECTIVE, seen(np.full((12, 16), 4.0, np.float32)))
+    assert depths[..., None] * RAYS[..., 2:] == pytest.approx(4.0, rel=1e-6)
 
 
 def test_the_sky_is_far_white_and_has_neither_disparity_nor_normal() -> None:
     sky = seen(np.full((12, 16), np.inf, np.float32), numbers=np.full((12, 16), -1, np.int32))
     for kind, number in {1: SKY, 2: SKY, 3: 1.0, 4: 0.0, 5: 0.0, 6: 0.0, 7: 0.0}.items():
-        found = as_numbers(ImageType(kind), sky)
-        assert found == pytest.approx(np.full((12, 16), number), abs=1e-5), kind
+        numbers = as_numbers(ImageType(kind), sky)
+        assert numbers == pytest.approx(np.full((12, 16), number), abs=1e-5), kind
     assert (as_colours(ImageType.DEPTH_VIS, sky) == 255).all()
     assert not as_colours(ImageType.SURFACE_NORMALS, sky).any()
 
@@ -243,23 +245,23 @@ def test_a_plane_has_one_normal(tilt: float, turn: float, distance: float) -> No
     depth = plane(normal, distance)
     whole = np.isfinite(depth)
     whole &= cv2.erode(whole.astype(np.uint8), np.ones((5, 5)), borderValue=1) > 0
-    found = surface_normals(depth, INFO)[whole]
-    assert np.abs(found - normal).max(initial=0.0) < 1e-3
+    normals = surface_normals(depth, INFO)[whole]
+    assert np.abs(normals - normal).max(initial=0.0) < 1e-3
 
 
 def test_at_a_crease_each_pixel_has_the_normal_of_its_own_surface() -> None:
     floor, wall = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
     below, ahead = plane(floor, 1.5), plane(wall, 4.0)
-    found = surface_normals(np.minimum(below, ahead), INFO)
+    normals = surface_normals(np.minimum(below, ahead), INFO)
     expected = np.where((below < ahead)[..., None], floor, wall)
-    assert found == pytest.approx(expected, abs=1e-4)
+    assert normals == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 5), (5, 1), (2, 2)])
 def test_the_smallest_images_have_normals_too(width: int, height: int) -> None:
     info = CameraInfo.from_fov(width, height, 1.0)
-    found = surface_normals(np.full((height, width), 3.0, np.float32), info)
-    assert found == pytest.approx(np.broadcast_to([0.0, 0.0, -1.0], (height, width, 3)))
+    normals = surface_normals(np.full((height, width), 3.0, np.float32), info)
+    assert normals == pytest.approx(np.broadcast_to([0.0, 0.0, -1.0], (height, width, 3)))
 
 
 def test_normals_are_coloured_by_their_axes_in_the_map() -> None:
@@ -272,17 +274,17 @@ def test_normals_are_coloured_by_their_axes_in_the_map() -> None:
 @pytest.mark.parametrize("form", ["rgb", "bgr", "png", "float"])
 def test_an_image_can_be_unpacked(form: Form) -> None:
     colours = np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8)
-    found = packed(ImageType.SCENE, seen(colours=colours), form)
+    buffer = packed(ImageType.SCENE, seen(colours=colours), form)
     if form == "float":
-        (reply,) = wire.Decoder().feed(b"\x94\x01\x00\xc0" + found.tobytes())
+        (reply,) = wire.Decoder().feed(b"\x94\x01\x00\xc0" + buffer.tobytes())
         assert isinstance(reply, wire.Reply)
         assert reply.result == pytest.approx(colours[..., 0].ravel() / 255.0)
         return
     if form == "png":
-        image = cv2.imdecode(found, cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
         assert image is not None
         assert (image[..., 3] == 255).all()
         bgr = image[..., :3]
     else:
-        bgr = found.reshape(12, 16, 3)
+        bgr = buffer.reshape(12, 16, 3)
     assert np.array_equal(bgr, colours if form == "rgb" else colours[..., ::-1])

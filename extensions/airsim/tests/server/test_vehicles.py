@@ -47,9 +47,9 @@ def test_settings_are_handed_out_as_given_or_say_what_runs(tiny_world: str, tmp_
     camera = {"name": "eye", "width": 320, "height": 200, "fov": 60.0}
 
     def described(airsim: Caller) -> None:
-        found = json.loads(airsim("getSettingsString"))
-        assert found["SimMode"] == "Multirotor"
-        vehicle = found["Vehicles"]["drone"]
+        settings = json.loads(airsim("getSettingsString"))
+        assert settings["SimMode"] == "Multirotor"
+        vehicle = settings["Vehicles"]["drone"]
         assert (vehicle["VehicleType"], vehicle["X"]) == ("SimpleFlight", 2.0)
         scene = vehicle["Cameras"]["eye"]["CaptureSettings"][0]
         assert (scene["ImageType"], scene["Width"]) == (0, 320)
@@ -70,107 +70,107 @@ def test_settings_are_handed_out_as_given_or_say_what_runs(tiny_world: str, tmp_
     with_script(missing, [drone(world=tiny_world)], settings=str(tmp_path / "other.json"))
 
 
-def vector(found: dict[str, float]) -> tuple[float, float, float]:
-    return found["x_val"], found["y_val"], found["z_val"]
+def vector(fields: dict[str, float]) -> tuple[float, float, float]:
+    return fields["x_val"], fields["y_val"], fields["z_val"]
 
 
 def test_at_rest_a_drone_is_at_the_origin_of_its_local_frame(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    state: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
-        found.update(call("getMultirotorState", ""))
-        found["truth"] = call("simGetGroundTruthKinematics", "drone")
-        found["pose"] = call("simGetVehiclePose", "")
+        state.update(call("getMultirotorState", ""))
+        state["truth"] = call("simGetGroundTruthKinematics", "drone")
+        state["pose"] = call("simGetVehiclePose", "")
 
     with_script(script, [drone(world=tiny_world, position=[-3.0, 4.0], yaw=90.0)])
-    kinematics = found["kinematics_estimated"]
-    assert kinematics == found["truth"]
-    assert found["pose"]["position"] == kinematics["position"]
+    kinematics = state["kinematics_estimated"]
+    assert kinematics == state["truth"]
+    assert state["pose"]["position"] == kinematics["position"]
     assert vector(kinematics["position"]) == pytest.approx((0, 0, 0), abs=1e-5)
     assert kinematics["orientation"]["w_val"] == pytest.approx(0.5**0.5)
     assert kinematics["orientation"]["z_val"] == pytest.approx(0.5**0.5)
     for name in ("linear_velocity", "linear_acceleration", "angular_acceleration"):
         assert vector(kinematics[name]) == pytest.approx((0, 0, 0), abs=1e-2), name
-    assert found["timestamp"] == 0
-    assert found["landed_state"] == 0
-    assert found["gps_location"]["latitude"] == pytest.approx(47.641468 - 3 / 111_200, abs=1e-6)
-    assert found["gps_location"]["altitude"] == pytest.approx(122.0 + STANDING_HEIGHT, abs=1e-3)
+    assert state["timestamp"] == 0
+    assert state["landed_state"] == 0
+    assert state["gps_location"]["latitude"] == pytest.approx(47.641468 - 3 / 111_200, abs=1e-6)
+    assert state["gps_location"]["altitude"] == pytest.approx(122.0 + STANDING_HEIGHT, abs=1e-3)
 
 
 def test_control_is_taken_and_given_back(tiny_world: str) -> None:
-    found: list[Any] = []
+    replies: list[Any] = []
 
     def script(call: Caller) -> None:
-        found.append(call("isApiControlEnabled", ""))
-        found.append(call("armDisarm", True, ""))
+        replies.append(call("isApiControlEnabled", ""))
+        replies.append(call("armDisarm", True, ""))
         call("enableApiControl", True, "")
-        found.append(call("isApiControlEnabled", ""))
-        found.append(call("armDisarm", False, ""))
+        replies.append(call("isApiControlEnabled", ""))
+        replies.append(call("armDisarm", False, ""))
         call("enableApiControl", False, "")
-        found.append(call("armDisarm", True, ""))
+        replies.append(call("armDisarm", True, ""))
 
     with_script(script, [drone(world=tiny_world)])
-    assert found == [False, False, True, True, False]
+    assert replies == [False, False, True, True, False]
 
 
 def test_the_air_is_that_of_the_standard_atmosphere_at_its_altitude(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    air: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
-        found.update(call("simGetGroundTruthEnvironment", ""))
-        found["home"] = call("getHomeGeoPoint", "")
+        air.update(call("simGetGroundTruthEnvironment", ""))
+        air["home"] = call("getHomeGeoPoint", "")
 
     origin = (47.641468, -122.140165, 122.0 - STANDING_HEIGHT)
     with_script(script, [drone(world=tiny_world, origin=origin)])
-    assert found["temperature"] == pytest.approx(287.357, abs=1e-3)
-    assert found["air_pressure"] == pytest.approx(99867.98, abs=0.05)
-    assert found["air_density"] == pytest.approx(99867.98 / (287.053 * 287.357), rel=1e-5)
-    assert vector(found["gravity"]) == pytest.approx((0.0, 0.0, 9.81))
-    assert found["geo_point"] == found["home"]
-    assert found["home"]["altitude"] == pytest.approx(122.0, abs=1e-3)
+    assert air["temperature"] == pytest.approx(287.357, abs=1e-3)
+    assert air["air_pressure"] == pytest.approx(99867.98, abs=0.05)
+    assert air["air_density"] == pytest.approx(99867.98 / (287.053 * 287.357), rel=1e-5)
+    assert vector(air["gravity"]) == pytest.approx((0.0, 0.0, 9.81))
+    assert air["geo_point"] == air["home"]
+    assert air["home"]["altitude"] == pytest.approx(122.0, abs=1e-3)
 
 
 @pytest.mark.slow
 def test_rotors_carry_the_weight_of_what_hovers(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    states: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
-        found["still"] = call("getRotorStates", "")["rotors"]
+        states["still"] = call("getRotorStates", "")["rotors"]
         call("enableApiControl", True, "")
         task = call.send("takeoff", 20.0, "")
         call("simContinueForTime", 8.0)
         call.join(task)
-        found.update(call("getRotorStates", ""))
+        states.update(call("getRotorStates", ""))
 
     with_script(script, [drone(world=tiny_world)])
-    assert found["timestamp"] == 8_000_000_000
-    assert [rotor["thrust"] for rotor in found["still"]] == [0.0] * 4
-    assert sum(rotor["thrust"] for rotor in found["rotors"]) == pytest.approx(1.2 * 9.81, rel=0.02)
-    turns = [rotor["torque_scaler"] > 0.0 for rotor in found["rotors"]]
+    assert states["timestamp"] == 8_000_000_000
+    assert [rotor["thrust"] for rotor in states["still"]] == [0.0] * 4
+    assert sum(rotor["thrust"] for rotor in states["rotors"]) == pytest.approx(1.2 * 9.81, rel=0.02)
+    turns = [rotor["torque_scaler"] > 0.0 for rotor in states["rotors"]]
     assert turns == [True, True, False, False], "front right and rear left turn the same way"
 
 
 def test_acceleration_is_that_of_the_physics(tiny_world: str) -> None:
-    found: list[Any] = []
+    kinematics: list[Any] = []
 
     def script(call: Caller) -> None:
         high = {"position": {"x_val": 0.0, "y_val": 0.0, "z_val": -30.0}}
         call("simSetVehiclePose", high, True, "")
-        found.append(call("simGetGroundTruthKinematics", ""))
+        kinematics.append(call("simGetGroundTruthKinematics", ""))
         call("simContinueForTime", 0.5)
-        found.append(call("simGetGroundTruthKinematics", ""))
+        kinematics.append(call("simGetGroundTruthKinematics", ""))
 
     with_script(script, [drone(world=tiny_world)])
-    assert vector(found[0]["linear_acceleration"]) == pytest.approx((0.0, 0.0, 9.81), abs=1e-5)
-    assert 4.5 < found[1]["linear_velocity"]["z_val"] < 4.905
-    assert 8.5 < found[1]["linear_acceleration"]["z_val"] < 9.81, "air slows it down"
+    assert vector(kinematics[0]["linear_acceleration"]) == pytest.approx((0.0, 0.0, 9.81), abs=1e-5)
+    assert 4.5 < kinematics[1]["linear_velocity"]["z_val"] < 4.905
+    assert 8.5 < kinematics[1]["linear_acceleration"]["z_val"] < 9.81, "air slows it down"
 
 
 NORTH = {"is_rate": True, "yaw_or_rate": 0.0}
 
 
-def numbers(found: dict[str, float]) -> tuple[float, ...]:
-    return tuple(found.values())
+def numbers(fields: dict[str, float]) -> tuple[float, ...]:
+    return tuple(fields.values())
 
 
 def fly(call: Caller, seconds: float, method: str, *arguments: Any) -> None:
@@ -181,19 +181,19 @@ def fly(call: Caller, seconds: float, method: str, *arguments: Any) -> None:
 
 @pytest.mark.slow
 def test_a_wall_is_hit_and_reading_it_clears_it(tiny_world: str) -> None:
-    found: list[Any] = []
+    collisions: list[Any] = []
 
     def script(call: Caller) -> None:
         call("enableApiControl", True, "")
-        found.append(call("simGetCollisionInfo", ""))
+        collisions.append(call("simGetCollisionInfo", ""))
         fly(call, 8.0, "takeoff", 20.0, "")
-        found.append(call("simGetCollisionInfo", ""))
+        collisions.append(call("simGetCollisionInfo", ""))
         fly(call, 4.0, "moveByVelocity", 3.0, 0.0, 0.0, 4.0, 0, NORTH, "")
-        found.extend(call("getMultirotorState", "")["collision"] for _ in range(2))
-        found.extend(call("simGetCollisionInfo", "") for _ in range(2))
+        collisions.extend(call("getMultirotorState", "")["collision"] for _ in range(2))
+        collisions.extend(call("simGetCollisionInfo", "") for _ in range(2))
 
     with_script(script, [drone(world=tiny_world, position=[0.0, 1.0])])
-    standing, taken_off, told, told_again, read, read_again = found
+    standing, taken_off, told, told_again, read, read_again = collisions
     assert not standing["has_collided"]
     assert standing["object_id"] == -1
     assert not taken_off["has_collided"], "taking off is no collision"
@@ -212,21 +212,21 @@ def test_a_wall_is_hit_and_reading_it_clears_it(tiny_world: str) -> None:
 
 @pytest.mark.slow
 def test_landing_counts_since_the_ground_does_with_airsim(tiny_world: str) -> None:
-    found: list[Any] = []
+    states: list[Any] = []
 
     def script(call: Caller) -> None:
         call("enableApiControl", True, "")
         fly(call, 8.0, "takeoff", 20.0, "")
-        found.append(call("getMultirotorState", ""))
+        states.append(call("getMultirotorState", ""))
         fly(call, 20.0, "land", 60.0, "")
-        found.append(call("getMultirotorState", ""))
+        states.append(call("getMultirotorState", ""))
         call("reset")
-        found.append(call("getMultirotorState", ""))
+        states.append(call("getMultirotorState", ""))
         call("simContinueForTime", 1.0)
-        found.append(call("getMultirotorState", ""))
+        states.append(call("getMultirotorState", ""))
 
     with_script(script, [drone(world=tiny_world)])
-    flying, landed, reset, later = found
+    flying, landed, reset, later = states
     assert (flying["landed_state"], flying["collision"]["has_collided"]) == (1, False)
     assert (landed["landed_state"], landed["collision"]["has_collided"]) == (0, True)
     assert landed["collision"]["object_name"] == "floor"
@@ -236,34 +236,34 @@ def test_landing_counts_since_the_ground_does_with_airsim(tiny_world: str) -> No
 
 
 def test_a_fall_without_motors_is_a_collision_and_being_put_down_is_none(tiny_world: str) -> None:
-    found: list[Any] = []
+    replies: list[Any] = []
     place = {"position": {"x_val": 1.0, "y_val": 2.0, "z_val": -2.0}}
 
     def script(call: Caller) -> None:
         for down in (-2.0, 0.0):
             place["position"]["z_val"] = down
             call("simSetVehiclePose", place, True, "")
-            found.append(call("getMultirotorState", "")["landed_state"])
+            replies.append(call("getMultirotorState", "")["landed_state"])
             call("simContinueForTime", 1.5)
-            found.append(call("simGetCollisionInfo", "")["has_collided"])
+            replies.append(call("simGetCollisionInfo", "")["has_collided"])
 
     with_script(script, [drone(world=tiny_world)])
-    assert found == [1, True, 0, False]
+    assert replies == [1, True, 0, False]
 
 
 def test_each_of_two_drones_names_the_other(tiny_world: str) -> None:
-    found: dict[str, Any] = {}
+    collisions: dict[str, Any] = {}
 
     def script(call: Caller) -> None:
         above = {"position": {"x_val": 0.0, "y_val": 3.0, "z_val": -1.0}}
         call("simSetVehiclePose", above, True, "a")
         call("simContinueForTime", 1.0)
-        found.update({name: call("simGetCollisionInfo", name) for name in ("a", "b")})
+        collisions.update({name: call("simGetCollisionInfo", name) for name in ("a", "b")})
 
     nodes = [drone("a", world=tiny_world), drone("b", world=tiny_world, position=[0.0, 3.0])]
     with_script(script, nodes)
-    assert found["a"]["has_collided"]
-    assert found["a"]["object_name"] in {"b", "floor"}
+    assert collisions["a"]["has_collided"]
+    assert collisions["a"]["object_name"] in {"b", "floor"}
 
 
 class Touching(ServedMultirotor):
@@ -288,7 +288,7 @@ class Touching(ServedMultirotor):
 
     def contacts(self) -> list[Contact]:
         """Return one contact with each thing."""
-        return [Contact(each, (0.0,) * 3, (0.0,) * 3, 0.0) for each in sorted(self.now)]
+        return [Contact(other, (0.0,) * 3, (0.0,) * 3, 0.0) for other in sorted(self.now)]
 
 
 @pytest.mark.parametrize(
@@ -304,11 +304,11 @@ class Touching(ServedMultirotor):
 def test_a_contact_that_begins_while_another_lasts_is_told(
     looks: list[str], told: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found: list[str] = []
+    others: list[str] = []
     vehicle = Touching()
     collisions = Collisions({"drone": vehicle}, lambda name: (name, 0))
-    monkeypatch.setattr(collisions, "_take", lambda _, new: found.extend(c.other for c in new))
+    monkeypatch.setattr(collisions, "_take", lambda _, new: others.extend(c.other for c in new))
     for look in looks:
         vehicle.now = {*look.split()}
         collisions.watch()
-    assert found == told
+    assert others == told

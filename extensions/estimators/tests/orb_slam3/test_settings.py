@@ -81,9 +81,9 @@ def test_the_imu_is_that_announced_and_the_camera_sits_on_it_as_mounted() -> Non
     # Optical (right, down, forward) in FRD (forward, right, down), 15 cm ahead, 2 cm up.
     expected = np.array([[0, 0, 1, 0.15], [1, 0, 0, 0], [0, 1, 0, -0.02], [0, 0, 0, 1]])
     stored = read(text)
-    found = stored.getNode("Tbc").mat()
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found.astype(np.float64), expected, atol=1e-7)
+    transform = stored.getNode("Tbc").mat()
+    assert transform.dtype == np.float32
+    np.testing.assert_allclose(transform.astype(np.float64), expected, atol=1e-7)
 
 
 def test_an_ideal_imu_gets_some_noise() -> None:
@@ -105,8 +105,8 @@ def test_an_ideal_imu_gets_some_noise() -> None:
 def test_distortion_is_that_announced(distortion: tuple[float, ...]) -> None:
     info = msgspec.structs.replace(INFO, distortion=distortion)
     text = make_settings("monocular", [msgspec.structs.replace(CAMERA, info=info)]).text
-    found = [number(text, f"Camera.{name}") for name in ("k1", "k2", "p1", "p2", "k3")]
-    assert found == pytest.approx(distortion)
+    coefficients = [number(text, f"Camera.{name}") for name in ("k1", "k2", "p1", "p2", "k3")]
+    assert coefficients == pytest.approx(distortion)
 
 
 def test_distortion_without_its_first_term_is_not_overlooked() -> None:
@@ -164,5 +164,5 @@ def test_a_fisheye_is_kannala_brandts() -> None:
     )
     text = make_settings("monocular", [msgspec.structs.replace(CAMERA, info=info)]).text
     assert read(text).getNode("Camera.type").string() == "KannalaBrandt8"
-    found = tuple(number(text, f"Camera.k{k}") for k in (1, 2, 3, 4))
-    assert found == pytest.approx(info.distortion)
+    coefficients = tuple(number(text, f"Camera.k{k}") for k in (1, 2, 3, 4))
+    assert coefficients == pytest.approx(info.distortion)

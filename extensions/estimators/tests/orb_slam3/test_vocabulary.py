@@ -28,14 +28,14 @@ def bits_between(a: Bytes, b: Bytes) -> int:
 
 def words_of(tree: Vocabulary, descriptors: Bytes) -> list[int]:
     """Return the word of each descriptor: from the root down, to the nearest child each time."""
-    found = []
-    for each in descriptors:
+    words = []
+    for descriptor in descriptors:
         node = 0
         while not tree.leaves[node]:
             below = np.flatnonzero(tree.parents == node)
-            node = below[np.argmin([bits_between(each, tree.descriptors[b]) for b in below])]
-        found.append(node)
-    return found
+            node = below[np.argmin([bits_between(descriptor, tree.descriptors[b]) for b in below])]
+        words.append(node)
+    return words
 
 
 def clusters(count: int, of: int, flips: int, seed: int = 0) -> tuple[Bytes, Bytes]:
@@ -86,8 +86,8 @@ def test_the_tree_is_complete_where_there_are_descriptors_enough() -> None:
 def test_clusters_are_found_and_a_centre_has_the_bits_that_most_members_have() -> None:
     centres, descriptors = clusters(4, of=60, flips=8)
     tree = train([descriptors], TreeShape(branching=4, depth=1))
-    found = tree.descriptors[1:]
-    assert {row.tobytes() for row in found} == {row.tobytes() for row in centres}
+    learned = tree.descriptors[1:]
+    assert {row.tobytes() for row in learned} == {row.tobytes() for row in centres}
     words = np.reshape(words_of(tree, descriptors), (4, 60))
     assert (words == words[:, :1]).all()
     assert len(set(words[:, 0])) == 4

@@ -78,11 +78,11 @@ def test_it_says_where_the_body_went_and_when_it_was_lost() -> None:
     (said,) = result.of(EstimatorAnnouncement)
     assert (said.method, said.scale_free, said.lenses) == ("SVO", True, ())
     estimates = result.of(PoseEstimate)
-    assert [each.stamp // FRAME for each in estimates] == [3, 4, 6, 7]
-    assert {each.frame_id for each in estimates} == {"odom"}
+    assert [estimate.stamp // FRAME for estimate in estimates] == [3, 4, 6, 7]
+    assert {estimate.frame_id for estimate in estimates} == {"odom"}
     np.testing.assert_allclose(estimates[1].position, (0.0, 0.2, 0.0), atol=1e-12)  # right
-    assert [each.stamp // FRAME for each in result.of(TrackingLost)] == [5]
-    assert [each.stamp // FRAME for each in result.of(TrackingRegained)] == [6]
+    assert [event.stamp // FRAME for event in result.of(TrackingLost)] == [5]
+    assert [event.stamp // FRAME for event in result.of(TrackingRegained)] == [6]
 
 
 @pytest.mark.slow
@@ -130,26 +130,26 @@ def track(svo: SvoProcess, images: list[npt.NDArray[np.uint8]], first: int = 0) 
 def test_nothing_is_said_before_there_is_a_map_and_then_poses_in_the_first_frame(
     library: Any,
 ) -> None:
-    found = track(SvoProcess(INFO, SvoSettings()), [GREY] * 4)
-    assert found[0] is None
-    assert [each.lost for each in found[1:]] == [False] * 3
-    x = [each.pose[:3, 3].tolist() for each in found[1:]]
+    results = track(SvoProcess(INFO, SvoSettings()), [GREY] * 4)
+    assert results[0] is None
+    assert [result.lost for result in results[1:]] == [False] * 3
+    x = [result.pose[:3, 3].tolist() for result in results[1:]]
     np.testing.assert_allclose(x, [[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]], atol=1e-12)
-    turned = Rotation.from_matrix(found[-1].pose[:3, :3]).as_rotvec()
+    turned = Rotation.from_matrix(results[-1].pose[:3, :3]).as_rotvec()
     np.testing.assert_allclose(turned, [0, 0, -0.03], atol=1e-12)
 
 
 def test_it_is_started_again_when_it_stops_for_want_of_corners(library: Any) -> None:
     svo = SvoProcess(INFO, SvoSettings())
     assert track(svo, [BLACK] * 5) == [None] * 5
-    assert [each is None for each in track(svo, [GREY] * 3, first=5)] == [True, False, False]
+    assert [result is None for result in track(svo, [GREY] * 3, first=5)] == [True, False, False]
 
 
 def test_a_relocalizing_one_is_lost_and_keeps_its_last_pose(library: Any) -> None:
-    found = track(SvoProcess(INFO, SvoSettings()), [GREY] * 3 + [BLACK] * 2 + [GREY])
-    assert [each.lost for each in found[1:]] == [False, False, True, True, False]
-    assert "nearest key frame" in found[3].reason
-    np.testing.assert_array_equal(found[4].pose, found[2].pose)
+    results = track(SvoProcess(INFO, SvoSettings()), [GREY] * 3 + [BLACK] * 2 + [GREY])
+    assert [result.lost for result in results[1:]] == [False, False, True, True, False]
+    assert "nearest key frame" in results[3].reason
+    np.testing.assert_array_equal(results[4].pose, results[2].pose)
     assert "reset" not in library.CALLS
 
 
@@ -157,10 +157,10 @@ def test_after_its_time_a_new_map_goes_on_from_the_last_pose(library: Any) -> No
     svo = SvoProcess(INFO, SvoSettings(reset_timeout=0.25))
     before = track(svo, [GREY] * 4)[-1]
     lost = track(svo, [BLACK] * 6, first=4)
-    assert all(each.lost for each in lost)
+    assert all(result.lost for result in lost)
     assert library.CALLS.count("reset") == 1
     after = track(svo, [GREY] * 3, first=10)
-    assert [each.lost for each in after] == [True, False, False]
+    assert [result.lost for result in after] == [True, False, False]
     assert "where the camera was last known to be" in after[1].reason
     assert (after[2].reason, after[2].map) == ("", 1)
     step = np.linalg.inv(before.pose) @ after[1].pose
@@ -175,10 +175,10 @@ def test_a_pose_that_is_no_number_is_never_said(
     bad = library.Frame(1)
     bad.T_f_w = SE3d.of(Rotation.identity(), np.full(3, np.nan))
     monkeypatch.setattr(library.SVO, "lastFrame", lambda self: bad)
-    found = svo.track(3 * PERIOD, GREY)
-    assert found is not None
-    assert found.lost
-    assert np.isfinite(found.pose).all()
+    result = svo.track(3 * PERIOD, GREY)
+    assert result is not None
+    assert result.lost
+    assert np.isfinite(result.pose).all()
 
 
 def test_settings_reach_the_library_by_its_own_names(library: Any) -> None:

@@ -43,17 +43,17 @@ def poses(record: Record) -> list[PoseEstimate]:
 def test_samples_come_before_images_and_each_image_gets_its_pose(eyes: int, tmp_path: Path) -> None:
     """The stub refuses any other order; it answers from its IMU, some time after the image."""
     record = fly_stub(case("delay 2", eyes))
-    found = poses(record)
-    assert [each.stamp for each in found] == [*record.flight.kinds]
-    assert {each.frame_id for each in found} == {"map"}
-    for pose, heard in zip(found, record.heard_at, strict=True):
+    estimates = poses(record)
+    assert [estimate.stamp for estimate in estimates] == [*record.flight.kinds]
+    assert {estimate.frame_id for estimate in estimates} == {"map"}
+    for pose, heard in zip(estimates, record.heard_at, strict=True):
         assert heard - pose.stamp == 15_000_000
         truth = record.flight.truth[pose.stamp]
         assert math.dist(pose.position, truth[:3, 3]) < 0.02
         assert pose.velocity is not None
-    speed = found[-1].velocity
+    speed = estimates[-1].velocity
     assert speed is not None
-    before, now = (record.flight.truth[each.stamp][:3, 3] for each in found[-2:])
+    before, now = (record.flight.truth[estimate.stamp][:3, 3] for estimate in estimates[-2:])
     for axis in range(3):
         mean = (now - before)[axis] / 0.05
         assert speed[axis] == pytest.approx(mean, abs=0.05)
@@ -99,8 +99,8 @@ def test_or_by_files_or_not_at_all(calibration: str, tmp_path: Path) -> None:
 
 def test_before_the_first_pose_nothing_is_owed(tmp_path: Path) -> None:
     record = fly_stub(case("starts 5 delay 1"))
-    assert [each.stamp for each in poses(record)] == [*record.flight.kinds][5:]
-    assert {each.frame_id for each in poses(record)} == {"odom"}  # it had taken off by then
+    assert [estimate.stamp for estimate in poses(record)] == [*record.flight.kinds][5:]
+    assert {estimate.frame_id for estimate in poses(record)} == {"odom"}  # it had taken off by then
     assert not record.of(TrackingLost)
 
 
@@ -120,15 +120,15 @@ def test_an_image_without_a_pose_is_lost_by_the_policy_of_the_hold(tmp_path: Pat
     hold = {"initialise": 1.0, "max_wait": 0.3, "on_missing": "lost", "lost_allowed": 9}
     record = fly_stub(case("skips 8", hold=hold))
     stamps = [*record.flight.kinds]
-    assert [each.stamp for each in poses(record)] == stamps[:8] + stamps[9:]
-    assert [each.stamp for each in record.of(TrackingLost)] == [stamps[8]]
-    assert [each.stamp for each in record.of(TrackingRegained)] == [stamps[9]]
+    assert [estimate.stamp for estimate in poses(record)] == stamps[:8] + stamps[9:]
+    assert [event.stamp for event in record.of(TrackingLost)] == [stamps[8]]
+    assert [event.stamp for event in record.of(TrackingRegained)] == [stamps[9]]
 
 
 def test_a_pose_that_is_none_has_it_begin_anew_where_it_was(tmp_path: Path) -> None:
     record = fly_stub(case("nan 8"))
     stamps = [*record.flight.kinds]
-    assert [each.stamp for each in record.of(TrackingLost)] == [stamps[8]]
+    assert [event.stamp for event in record.of(TrackingLost)] == [stamps[8]]
     before, after = (next(e for e in poses(record) if e.stamp == stamps[k]) for k in (7, 9))
     assert before.position == pytest.approx(after.position)
 
@@ -200,7 +200,7 @@ def test_images_are_on_the_clock_of_the_imu_for_the_library(offset: float) -> No
             sent.append(event)
     sent.sort(key=lambda event: (event.stamp, isinstance(event, Image)))
     record = run(given, fly(READS, 2, given.width, given.script)._replace(events=tuple(sent)))
-    stamps = [each.stamp for each in poses(record)]
+    stamps = [estimate.stamp for estimate in poses(record)]
     assert stamps == [*record.flight.kinds][: len(stamps)]
     assert len(stamps) >= 14  # for the last one the IMU has ended too early
     for pose in poses(record):
