@@ -59,7 +59,7 @@ class Block(NamedTuple):
 
 def blocks(*languages: str) -> list[Block]:
     """Return the fenced blocks of all pages in these languages."""
-    found = []
+    result = []
     for page in PAGES:
         for match in re.finditer(
             r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$',
@@ -68,8 +68,8 @@ def blocks(*languages: str) -> list[Block]:
         ):
             language, title, text = match.groups()
             if language in languages:
-                found.append(Block(page, language, title or "", text))
-    return found
+                result.append(Block(page, language, title or "", text))
+    return result
 
 
 def commands() -> list[str]:
@@ -98,7 +98,11 @@ def test_every_block_says_its_language() -> None:
 
 @pytest.mark.parametrize(
     "block",
-    [each for each in blocks("python") if ELSEWHERE not in each.text and each.page.name != SESSION],
+    [
+        block
+        for block in blocks("python")
+        if ELSEWHERE not in block.text and block.page.name != SESSION
+    ],
     ids=str,
 )
 def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,9 +128,11 @@ def test_a_file_is_shown_as_it_is() -> None:
     """But for the schema's path, true in its folder only; pages are also read as plain files."""
     languages = ("python", "toml", "xml")
     shown = [
-        each
-        for each in blocks(*languages)
-        if each.title and each.title not in ABOUT_FILES and (ROOT / each.title).is_file()
+        candidate
+        for candidate in blocks(*languages)
+        if candidate.title
+        and candidate.title not in ABOUT_FILES
+        and (ROOT / candidate.title).is_file()
     ]
     assert len(shown) >= 5
     for block in shown:
@@ -146,9 +152,9 @@ def test_commands_name_what_there_is(words: str) -> None:
     name, *arguments = shlex.split(words)
     help_ = help_of(name)
     assert help_.returncode == 0, help_.stderr
-    for option in (each for each in arguments if each.startswith("--")):
+    for option in (word for word in arguments if word.startswith("--")):
         assert option in help_.stdout, option
-    files = [each for each in arguments if each.endswith(".toml")]
+    files = [word for word in arguments if word.endswith(".toml")]
     pairs = list(itertools.pairwise(arguments))
     changes = [value for option, value in pairs if option == "--set"]
     changes += [value.split(",")[0] for option, value in pairs if option == "--vary"]
@@ -241,7 +247,7 @@ def test_the_site_builds_and_needs_no_network(tmp_path: Path) -> None:
         text = page.read_text(encoding="utf-8")
         loaded = re.findall(r"<(?:script|img|iframe)[^>]+src=\"([^\"]+)", text)
         loaded += re.findall(r"<link[^>]+rel=\"(?:stylesheet|preconnect|icon)\"[^>]*>", text)
-        assert [each for each in loaded if "http" in each.split("?")[0]] == [], page
+        assert [tag for tag in loaded if "http" in tag.split("?")[0]] == [], page
     nodes = (tmp_path / "reference" / "nodes.html").read_text(encoding="utf-8")
     assert "VisualOdometry" in nodes
     assert "How many are tracked at most" not in nodes, "examples are no nodes of the project"

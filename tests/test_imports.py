@@ -65,15 +65,15 @@ def imported_in_a_run(source: str, package: str = "") -> set[str]:
 
 
 def _imported(tree: ast.Module, package: str) -> set[str]:
-    found: set[str] = set()
+    names: set[str] = set()
     for node in _statements(tree):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             parents = package.split(".")[: len(package.split(".")) + 1 - node.level]
             base = ".".join(parents) + "." if node.level else ""
-            found |= {f"{base}{node.module or ''}.{alias.name}".strip(".") for alias in node.names}
-    return found
+            names |= {f"{base}{node.module or ''}.{alias.name}".strip(".") for alias in node.names}
+    return names
 
 
 def _statements(tree: ast.AST) -> Iterator[ast.AST]:
@@ -120,13 +120,13 @@ def room(name: str) -> str:
 @cache
 def module_names() -> dict[str, Path]:
     """Return the path of each module of ours, by its name."""
-    found = {}
+    paths = {}
     for package in PACKAGES:
         parent = EXTENSIONS.get(package, ROOT)
         for path in sorted((parent / package).rglob("*.py")):
             parts = path.relative_to(parent).with_suffix("").parts
-            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return found
+            paths[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return paths
 
 
 def module_of(name: str) -> str | None:
@@ -140,34 +140,34 @@ def module_of(name: str) -> str | None:
 @cache
 def imports(reader: Callable[[str, str], set[str]] = imported) -> dict[str, set[str]]:
     """Return what each module of ours imports: modules, or attributes of them."""
-    found = {}
+    table = {}
     for name, path in module_names().items():
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        found[name] = reader(path.read_text(encoding="utf-8"), package)
-    return found
+        table[name] = reader(path.read_text(encoding="utf-8"), package)
+    return table
 
 
 def of_room(where: str) -> Iterator[tuple[str, set[str]]]:
-    return ((name, found) for name, found in imports().items() if room(name) == where)
+    return ((name, targets) for name, targets in imports().items() if room(name) == where)
 
 
 def circles(graph: Mapping[str, Iterable[str]]) -> list[set[str]]:
     """Return the groups of modules each of which is reached from each other of its group."""
 
     def reached(start: str) -> set[str]:
-        found: set[str] = set()
+        seen: set[str] = set()
         ahead = [start]
         while ahead:
-            new = set(graph[ahead.pop()]) - found
-            found |= new
+            new = set(graph[ahead.pop()]) - seen
+            seen |= new
             ahead += new
-        return found
+        return seen
 
     reach = {name: reached(name) for name in graph}
     groups: list[set[str]] = []
-    for name, found in reach.items():
-        if name in found and not any(name in group for group in groups):
-            groups.append({name} | {other for other in found if name in reach[other]})
+    for name, targets in reach.items():
+        if name in targets and not any(name in group for group in groups):
+            groups.append({name} | {other for other in targets if name in reach[other]})
     return groups
 
 
@@ -176,7 +176,9 @@ def circles(graph: Mapping[str, Iterable[str]]) -> list[set[str]]:
 def test_no_arrow_points_up(where: str) -> None:
     others = {*MAY_IMPORT, "tests", "examples"} - MAY_IMPORT[where]
     upwards = {
-        name: wrong for name, found in of_room(where) if (wrong := set(map(room, found)) & others)
+        name: wrong
+        for name, targets in of_room(where)
+        if (wrong := set(map(room, targets)) & others)
     }
     assert upwards == {}
 
@@ -196,8 +198,8 @@ def test_no_string_points_up(where: str) -> None:
 @pytest.mark.slow
 def test_no_circle_closes() -> None:
     graph = {
-        name: {each for target in found if (each := module_of(target))} - {name}
-        for name, found in imports(imported_in_a_run).items()
+        name: {module for target in targets if (module := module_of(target))} - {name}
+        for name, targets in imports(imported_in_a_run).items()
     }
     assert circles(graph) == []
 
@@ -213,9 +215,9 @@ def folder(module: str) -> str:
 def test_no_circle_closes_between_folders() -> None:
     """Those of types only count, too; the face of the runtime, which shows all, does not."""
     graph: dict[str, set[str]] = defaultdict(set)
-    for name, found in imports().items():
+    for name, imported_names in imports().items():
         if name not in {"runtime", "runtime.__main__"}:
-            targets = {module_of(target) for target in found} - {None, "runtime"}
+            targets = {module_of(target) for target in imported_names} - {None, "runtime"}
             graph[folder(name)] |= {folder(str(target)) for target in targets} - {folder(name)}
     assert circles({name: graph[name] for name in list(graph)}) == []
 
@@ -235,8 +237,8 @@ def test_an_extension_imports_only_what_is_promised(package: str) -> None:
     rows = re.findall(r"^\| `([\w.]+)` \| (.*) \|$", PROMISED, re.MULTILINE)
     promised = {f"{module}.{name}" for module, row in rows for name in re.findall(r"\w+", row)}
     promised |= {module for module, _ in rows}
-    found = {name for _, names in of_room(package) for name in names if room(name) in MAY_IMPORT}
-    assert {name for name in found if room(name) not in EXTENSIONS} - promised == set()
+    used = {name for _, names in of_room(package) for name in names if room(name) in MAY_IMPORT}
+    assert {name for name in used if room(name) not in EXTENSIONS} - promised == set()
 
 
 def test_events_import_nothing_that_waits_or_talks() -> None:
@@ -249,14 +251,14 @@ def test_a_bridge_is_imported_in_one_module_of_a_room_only(where: str) -> None:
     """Zenoh carries both a run's own events and ROS's, in a room each. (Each system that the
     benchmarks measure has a module of its own.)"""
     users = defaultdict(set)
-    for name, found in of_room(where):
-        for bridge in set(map(room, found)) & BRIDGES:
+    for name, targets in of_room(where):
+        for bridge in set(map(room, targets)) & BRIDGES:
             users[bridge].add(name)
     assert {bridge: names for bridge, names in users.items() if len(names) > 1} == {}
 
 
 @pytest.mark.parametrize(
-    ("source", "found"),
+    ("source", "expected"),
     [
         ("import nodes.viewers.window as w", {"nodes"}),
         ("from nodes import window", {"nodes"}),
@@ -268,12 +270,12 @@ def test_a_bridge_is_imported_in_one_module_of_a_room_only(where: str) -> None:
         ("text = 'import sims'", set()),
     ],
 )
-def test_imports_are_found_wherever_they_stand(source: str, found: set[str]) -> None:
-    assert set(map(room, imported(source, "runtime"))) == found
+def test_imports_are_found_wherever_they_stand(source: str, expected: set[str]) -> None:
+    assert set(map(room, imported(source, "runtime"))) == expected
 
 
 @pytest.mark.parametrize(
-    ("source", "found"),
+    ("source", "expected"),
     [
         ("f('nodes.judging.evaluation')", {"nodes.judging.evaluation"}),
         ("f('sims.multirotor:Multirotor')", {"sims.multirotor"}),
@@ -282,12 +284,12 @@ def test_imports_are_found_wherever_they_stand(source: str, found: set[str]) -> 
         ("'''nodes.judging.evaluation'''", set()),
     ],
 )
-def test_modules_are_found_in_strings(source: str, found: set[str]) -> None:
-    assert named(source) == found
+def test_modules_are_found_in_strings(source: str, expected: set[str]) -> None:
+    assert named(source) == expected
 
 
 @pytest.mark.parametrize(
-    ("graph", "found"),
+    ("graph", "expected"),
     [
         ({"a": ["b"], "b": ["c"], "c": []}, []),
         ({"a": ["b", "c"], "b": ["c"], "c": []}, []),
@@ -298,8 +300,8 @@ def test_modules_are_found_in_strings(source: str, found: set[str]) -> None:
         ),
     ],
 )
-def test_circles_are_found(graph: dict[str, list[str]], found: list[set[str]]) -> None:
-    assert circles(graph) == found
+def test_circles_are_found(graph: dict[str, list[str]], expected: list[set[str]]) -> None:
+    assert circles(graph) == expected
 
 
 def test_every_room_has_modules_to_look_at() -> None:

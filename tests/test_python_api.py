@@ -98,19 +98,19 @@ def test_a_table_may_have_classes_paths_and_arrays(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_threads_run_side_by_side() -> None:
-    found: dict[int, visnav.Run] = {}
+    runs: dict[int, visnav.Run] = {}
 
     def fly(seed: int) -> None:
-        found[seed] = visnav.run(TABLE, seed=seed, out=f"seed{seed}", quiet=True)
+        runs[seed] = visnav.run(TABLE, seed=seed, out=f"seed{seed}", quiet=True)
 
     threads = [threading.Thread(target=fly, args=(seed,)) for seed in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len({run.summary["digest"] for run in found.values()}) == 3
-    assert not any("no monitor" in Path(f"seed{n}/log.txt").read_text() for n in found)
-    assert found[1].summary["digest"] == visnav.run(TABLE, seed=1, quiet=True).summary["digest"]
+    assert len({run.summary["digest"] for run in runs.values()}) == 3
+    assert not any("no monitor" in Path(f"seed{n}/log.txt").read_text() for n in runs)
+    assert runs[1].summary["digest"] == visnav.run(TABLE, seed=1, quiet=True).summary["digest"]
 
 
 def test_what_is_wrong_is_raised_here(tmp_path: Path) -> None:

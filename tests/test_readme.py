@@ -51,8 +51,8 @@ def test_the_demo_has_the_inputs_of_the_readme(tmp_path: Path) -> None:
         pytest.skip("the README's digest is that of another architecture or other versions")
     options = ["--set", "report.figures=[]", "--quiet", "--out", str(tmp_path)]
     assert command("run", "config.toml", *options, folder=ROOT, limit=200).returncode == 0
-    found = summary(tmp_path)["inputs_digest"]
-    assert re.findall(r"`([0-9a-f]{32})`", README) == [found]
+    digest = summary(tmp_path)["inputs_digest"]
+    assert re.findall(r"`([0-9a-f]{32})`", README) == [digest]
 
 
 def test_there_are_commands_to_check() -> None:
@@ -159,7 +159,7 @@ def test_the_table_is_the_suites() -> None:
     rows = [[cell.strip() for cell in row] for row in rows if len(row) == 9][1:]
     assert len(rows) >= 12
     for name, reads, _, *cells in rows:
-        (line,) = (each for each in README.splitlines() if each.startswith(f"| {name} |"))
+        (line,) = (text for text in README.splitlines() if text.startswith(f"| {name} |"))
         here = line.strip("| ").split(" | ")
         assert here[1] == reads
         for cell, short in zip(cells, here[2:], strict=True):

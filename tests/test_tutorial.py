@@ -39,15 +39,15 @@ def of_any_machine(line: str) -> str:
 
 def assert_shows(printed: str, shown: str) -> None:
     """Assert that each shown line is printed, in order; numbers may differ by half."""
-    rest = iter([each for line in printed.splitlines() if (each := of_any_machine(line))])
+    rest = iter([text for line in printed.splitlines() if (text := of_any_machine(line))])
     for line in filter(None, map(of_any_machine, shown.splitlines())):
         plain = re.escape(line).replace(r"\.", ".").replace(r"\-", "-")
         pattern = re.sub(NUMBER, lambda _: f"({NUMBER})", plain)
-        for found in rest:
-            if match := re.fullmatch(pattern, found):
-                numbers = [float(each) for each in re.findall(NUMBER, line)]
-                found_numbers = [float(each) for each in match.groups()]
-                assert found_numbers == pytest.approx(numbers, rel=0.5), f"{line}: {found}"
+        for output in rest:
+            if match := re.fullmatch(pattern, output):
+                numbers = [float(number) for number in re.findall(NUMBER, line)]
+                printed_numbers = [float(number) for number in match.groups()]
+                assert printed_numbers == pytest.approx(numbers, rel=0.5), f"{line}: {output}"
                 break
         else:
             raise AssertionError(f"expected {line!r} in:\n{printed}")

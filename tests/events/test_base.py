@@ -74,8 +74,8 @@ def test_each_event_has_a_category() -> None:
 
 
 def test_announcements_are_one_category() -> None:
-    found = {cls for cls in CLASSES if cls.category is Category.ANNOUNCEMENT}
-    assert found == {cls for cls in CLASSES if issubclass(cls, Announcement)}
+    announcements = {cls for cls in CLASSES if cls.category is Category.ANNOUNCEMENT}
+    assert announcements == {cls for cls in CLASSES if issubclass(cls, Announcement)}
 
 
 def test_events_exports_exactly_what_its_modules_define() -> None:
@@ -129,6 +129,6 @@ def test_an_event_has_the_category_of_its_class_line_or_of_its_base() -> None:
     class Plain(Event):
         """Of a user."""
 
-    found = [cls.category for cls in (Fog, Mist, Plain)]
-    assert found == [Category.SENSOR, Category.SENSOR, Category.USER]
+    categories = [cls.category for cls in (Fog, Mist, Plain)]
+    assert categories == [Category.SENSOR, Category.SENSOR, Category.USER]
     assert Fog(stamp=1, source="a") == Fog(stamp=1, source="a")

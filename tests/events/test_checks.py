@@ -130,10 +130,10 @@ def test_the_message_says_what_was_found() -> None:
 def test_a_pose_is_made_exactly_if_it_is_one(position: Vector3, orientation: Quaternion) -> None:
     norm = sum(n * n for n in orientation) ** 0.5
     scaled = tuple(n / norm for n in orientation) if norm > 1e-6 else (1.0, 0.0, 0.0, 0.0)
-    for each in (orientation, scaled):
-        right = abs(sum(n * n for n in each) ** 0.5 - 1.0) <= 1e-3
+    for quaternion in (orientation, scaled):
+        right = abs(sum(n * n for n in quaternion) ** 0.5 - 1.0) <= 1e-3
         try:
-            made = PoseEstimate(stamp=0, source="a", position=position, orientation=each)
+            made = PoseEstimate(stamp=0, source="a", position=position, orientation=quaternion)
         except ValueError:
             assert not right
         else:
@@ -142,8 +142,8 @@ def test_a_pose_is_made_exactly_if_it_is_one(position: Vector3, orientation: Qua
 
 
 def test_a_range_without_an_end_and_numbers_of_numpy_are_right() -> None:
-    found = events.Range(stamp=0, source="a", range=inf, min_range=0.1, max_range=9.0)
-    assert found.range == inf
+    event = events.Range(stamp=0, source="a", range=inf, min_range=0.1, max_range=9.0)
+    assert event.range == inf
     position = tuple(np.array([1.0, 2.0, 3.0]))
     turn = tuple(np.array([1.0, 0.0, 0.0, 0.0], np.float32))
     assert PoseStamped(stamp=0, source="a", position=position, orientation=turn).position[1] == 2.0

@@ -115,8 +115,8 @@ def test_rotating_and_flipping_commute(vector: Vector3, rotation: Quaternion) ->
 
 @given(vectors, rotations())
 def test_the_world_is_flipped_and_the_child_is_not(vector: Vector3, rotation: Quaternion) -> None:
-    found = rotate(rotation_to_nwu(rotation), vector)
-    assert found == pytest.approx(flip_yz(rotate(rotation, vector)), abs=1e-9)
+    rotated = rotate(rotation_to_nwu(rotation), vector)
+    assert rotated == pytest.approx(flip_yz(rotate(rotation, vector)), abs=1e-9)
 
 
 @pytest.mark.parametrize(

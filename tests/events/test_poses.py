@@ -21,8 +21,8 @@ def test_a_matrix_takes_points_where_the_quaternion_does(
     position: Vector3, orientation: Quaternion, point: Vector3
 ) -> None:
     expected = np.add(rotate(orientation, point), position)
-    found = pose_matrix(position, orientation) @ [*point, 1.0]
-    np.testing.assert_allclose(found[:3], expected, atol=1e-8)
+    moved = pose_matrix(position, orientation) @ [*point, 1.0]
+    np.testing.assert_allclose(moved[:3], expected, atol=1e-8)
 
 
 @given(vectors, orientations)
@@ -39,6 +39,6 @@ def test_tuples_come_back_from_the_matrix(position: Vector3, orientation: Quater
 def test_a_relative_pose_is_what_leads_from_its_base_to_the_pose(
     base: Vector3, turned: Quaternion, place: Vector3, rotation: Quaternion
 ) -> None:
-    found = pose_matrix(*relative((base, turned), (place, rotation)))
+    offset = pose_matrix(*relative((base, turned), (place, rotation)))
     expected = pose_matrix(place, rotation)
-    np.testing.assert_allclose(pose_matrix(base, turned) @ found, expected, atol=1e-8)
+    np.testing.assert_allclose(pose_matrix(base, turned) @ offset, expected, atol=1e-8)

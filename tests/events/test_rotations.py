@@ -98,9 +98,9 @@ def test_slerp_is_scipys_on_the_shorter_arc(
     assume(rotations.angle_between(a, b) < 3.1)  # at half a turn both arcs are as short
     expected = Slerp([0.0, 1.0], Rotation.from_quat([a, b], scalar_first=True))(share)
     w, x, y, z = b
-    found = rotations.slerp(a, (-w, -x, -y, -z) if other_sign else b, share)
-    assert sum(c * c for c in found) == pytest.approx(1.0, abs=1e-12)
-    np.testing.assert_allclose(matrix_of(found), expected.as_matrix(), atol=1e-9)
+    turned = rotations.slerp(a, (-w, -x, -y, -z) if other_sign else b, share)
+    assert sum(c * c for c in turned) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(matrix_of(turned), expected.as_matrix(), atol=1e-9)
 
 
 @given(orientations, st.floats(0.0, 1.0))

@@ -52,9 +52,9 @@ def test_a_wrong_array_is_refused_with_what_was_expected_and_found(
         (right[..., None, None], rf"{right.dtype} of shape .*1, 1\)"),
         (right.tolist(), "list"),
     ]
-    for array, found in wrong:
+    for array, wrong_type in wrong:
         with pytest.raises(
-            TypeError, match=rf"{event.__name__}\.{name}: expected .* found {found}"
+            TypeError, match=rf"{event.__name__}\.{name}: expected .* found {wrong_type}"
         ):
             event(stamp=0, source="c", **(fields | {name: array}))
 

@@ -25,7 +25,7 @@ SYSTEMS = ("openvins", "basalt", "dso", "ekf2")
 
 def process(name: str) -> ProcessConfig:
     """Return the settings of a system's program."""
-    (node,) = (each for each in load(FOLDER / f"{name}.toml").nodes if each.name == name)
+    (node,) = (spec for spec in load(FOLDER / f"{name}.toml").nodes if spec.name == name)
     assert isinstance(node.config, ProcessConfig)
     return node.config
 
@@ -55,17 +55,17 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str
     configure = ["cmake", "-S", str(FOLDER), "-B", str(folder)]
     done = subprocess.run(configure, capture_output=True, text=True, check=True)
     lines = (line.removeprefix("-- ").partition(": ") for line in done.stdout.splitlines())
-    found = {name: text for name, _, text in lines if name in SYSTEMS}
+    reports = {name: text for name, _, text in lines if name in SYSTEMS}
     subprocess.run(["cmake", "--build", str(folder)], check=True)
-    return folder, found
+    return folder, reports
 
 
 def command(name: str, built: tuple[Path, dict[str, str]]) -> str:
     """Return the setting of a system's program; skip the test if that was left out."""
-    folder, found = built
-    if found[name].startswith("left out"):
+    folder, reports = built
+    if reports[name].startswith("left out"):
         assert not (folder / name).exists()
-        pytest.skip(found[name])
+        pytest.skip(reports[name])
     return f"{name}.command={json.dumps([str(folder / name), *process(name).command[1:]])}"
 
 

@@ -104,7 +104,7 @@ def test_a_right_file_is_right_from_anywhere(room: Path) -> None:
         done = command_here("check", room, folder=folder)
         assert (done.returncode, done.stderr) == (0, "")
         assert done.stdout.endswith("4 nodes, 10 connections: right\n")
-    assert sorted(each.name for each in room.parent.iterdir()) == ["room.toml", "room.xml"]
+    assert sorted(path.name for path in room.parent.iterdir()) == ["room.toml", "room.xml"]
 
 
 TYPE = "tests.runs.test_check:Log"
@@ -137,8 +137,8 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("change", "expected", "found"), MISTAKES, ids=lambda text: str(text)[:40])
-def test_each_mistake_is_one_line(room: Path, change: str, expected: str, found: str) -> None:
+@pytest.mark.parametrize(("change", "expected", "rest"), MISTAKES, ids=lambda text: str(text)[:40])
+def test_each_mistake_is_one_line(room: Path, change: str, expected: str, rest: str) -> None:
     if change.startswith("log.plot=trajectory"):
         room.write_text(f'{room.read_text()}\n[[nodes]]\nname="more"\ntype="{TYPE}"\n')
         change, expected = "log.plot=more.png", "more: expected files of its own"
@@ -148,7 +148,7 @@ def test_each_mistake_is_one_line(room: Path, change: str, expected: str, found:
     assert errors == [line for line in lines if not line.startswith("warning: ")]
     assert len(errors) == 1 or "more" in expected
     assert expected in errors[0]
-    assert found in errors[0]
+    assert rest in errors[0]
 
 
 def test_a_library_that_its_system_lacks_is_missing(

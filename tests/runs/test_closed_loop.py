@@ -93,11 +93,11 @@ def test_a_restarted_estimator_speaks_in_a_frame_that_begins_where_it_is(
     flight: NodeResult,
 ) -> None:
     estimates = flight.of(PoseEstimate)
-    assert list(dict.fromkeys(each.frame_id for each in estimates)) == ["map", "odom_1"]
-    first = next(each for each in estimates if each.frame_id == "odom_1")
+    assert list(dict.fromkeys(estimate.frame_id for estimate in estimates)) == ["map", "odom_1"]
+    first = next(estimate for estimate in estimates if estimate.frame_id == "odom_1")
     assert math.dist(first.position, (0, 0, 0)) < 1e-9
-    assert [each.stamp for each in flight.of(TrackingLost)] == [first.stamp]
-    assert [each.stamp for each in flight.of(TrackingRegained)] == [first.stamp]
+    assert [event.stamp for event in flight.of(TrackingLost)] == [first.stamp]
+    assert [event.stamp for event in flight.of(TrackingRegained)] == [first.stamp]
 
 
 @pytest.mark.slow

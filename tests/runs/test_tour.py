@@ -60,13 +60,13 @@ def test_a_short_flight_leaves_everything(tmp_path: Path) -> None:
         *("summary.json", "config.toml", "log.txt", ".visnav-run"),
         *("trajectories", "evaluation", "frames"),
     }
-    found = summary(out)
-    assert (found["sim_seconds"], found["reason"], found["error"]) == (2.0, "duration", None)
-    assert found["events"]["Imu"] == 400
-    assert set(found["drops"].values()) <= {0}
+    totals = summary(out)
+    assert (totals["sim_seconds"], totals["reason"], totals["error"]) == (2.0, "duration", None)
+    assert totals["events"]["Imu"] == 400
+    assert set(totals["drops"].values()) <= {0}
     rows = (out / "trajectories" / "truth.tum").read_text().splitlines()
-    assert len(rows) == 1 + found["events"]["Odometry"]
-    cameras = [a for a in found["announcements"] if a["type"] == "CameraAnnouncement"]
+    assert len(rows) == 1 + totals["events"]["Odometry"]
+    cameras = [a for a in totals["announcements"] if a["type"] == "CameraAnnouncement"]
     assert [(c["source"], c["rate"]) for c in cameras] == [("drone/camera", 30.0)]
 
 
@@ -115,11 +115,11 @@ def test_another_seed_or_number_of_renderers(tmp_path: Path) -> None:
 def test_the_tour_flies_round_the_hall_and_lands(tmp_path: Path) -> None:
     """Without cameras a minute's flight takes seconds."""
     fly(tmp_path, "out", "drone.cameras=[]")
-    found = summary(tmp_path / "out")
-    assert found["reason"] == "pilot: flight completed"
-    assert (found["events"]["TakenOff"], found["events"]["Landed"]) == (1, 1)
-    assert found["events"].get("Collision", 0) == 0
-    assert 40 < found["sim_seconds"] < 75
+    totals = summary(tmp_path / "out")
+    assert totals["reason"] == "pilot: flight completed"
+    assert (totals["events"]["TakenOff"], totals["events"]["Landed"]) == (1, 1)
+    assert totals["events"].get("Collision", 0) == 0
+    assert 40 < totals["sim_seconds"] < 75
     rows = (tmp_path / "out" / "trajectories" / "truth.tum").read_text().splitlines()
     last = rows[-1].split()
     x, y, z = map(float, last[1:4])
@@ -131,10 +131,10 @@ def test_the_tour_flies_round_the_hall_and_lands(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_whole_tour_with_images(tmp_path: Path) -> None:
     fly(tmp_path, "out", *SMALL)
-    found = summary(tmp_path / "out")
-    assert found["reason"] == "pilot: flight completed"
-    assert found["events"].get("Collision", 0) == 0
-    assert abs(found["events"]["Image"] - 30 * found["sim_seconds"]) < 4
+    totals = summary(tmp_path / "out")
+    assert totals["reason"] == "pilot: flight completed"
+    assert totals["events"].get("Collision", 0) == 0
+    assert abs(totals["events"]["Image"] - 30 * totals["sim_seconds"]) < 4
 
 
 @pytest.mark.slow
@@ -152,10 +152,10 @@ def test_ctrl_c_in_mid_flight_leaves_whole_files(clock: str, tmp_path: Path) -> 
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=20)
     assert process.returncode == 0, err
-    found = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (found["reason"], found["error"]) == ("Ctrl-C", None)
+    totals = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (totals["reason"], totals["error"]) == ("Ctrl-C", None)
     text = trajectory.read_text()
     assert text.endswith("\n")
-    assert len(text.splitlines()) == 1 + found["events"]["Odometry"]
+    assert len(text.splitlines()) == 1 + totals["events"]["Odometry"]
     assert all(len(line.split()) == 8 for line in text.splitlines()[1:])
     assert (tmp_path / "out" / "evaluation" / "verdict.json").exists()

@@ -25,8 +25,8 @@ def fly(folder: Path, config: Path, *settings: str, code: int | None = 0) -> dic
     changes = [word for setting in settings for word in ("--set", setting)]
     done = command("run", config, "-q", "--out", "out", *changes, folder=folder, limit=280)
     assert done.returncode in ({0, 1} if code is None else {code}), done.stderr
-    found: dict[str, Any] = json.loads((folder / "out" / "summary.json").read_text())
-    return found
+    summary: dict[str, Any] = json.loads((folder / "out" / "summary.json").read_text())
+    return summary
 
 
 @pytest.mark.parametrize("world", ["config.toml", "examples/yard.toml"])
@@ -48,14 +48,14 @@ def test_a_scene_too_heavy_for_the_machine_gives_the_same_estimates(tmp_path: Pa
     """Two real seconds an image, or as fast as it goes: the same events, to the byte."""
     short = ["run.duration=5s", "camera.rate=5", "camera.width=256", "camera.height=256"]
     short.append("report.figures=[]")
-    found = []
+    outcomes = []
     for render_time in ("0s", "2s"):
         folder = tmp_path / render_time
         folder.mkdir()
         summary = fly(folder, CONFIG, *short, f"camera.render_time={render_time}", code=None)
-        found.append((summary["digest"], summary["verdict"]))
+        outcomes.append((summary["digest"], summary["verdict"]))
         assert summary["verdict"]["estimators"]["odometry"]["estimates"] == 25
-    assert found[0] == found[1]
+    assert outcomes[0] == outcomes[1]
 
 
 def test_a_threshold_that_is_missed_is_the_exit_code(tmp_path: Path) -> None:
@@ -167,22 +167,22 @@ def flown(folder: Path, *kinds: type[Node[Any]]) -> dict[str, Any]:
 
 
 def test_bad_estimators_fail_beside_a_good_one(tmp_path: Path) -> None:
-    found = flown(tmp_path, NeverTurns, StampsItsArrival, SaysToFly)
-    assert found["good"]["passed"], found["good"]["failed"]
-    assert found["good"]["camera"] == "drone/camera"
+    figures = flown(tmp_path, NeverTurns, StampsItsArrival, SaysToFly)
+    assert figures["good"]["passed"], figures["good"]["failed"]
+    assert figures["good"]["camera"] == "drone/camera"
     expected = {
         "NeverTurns": "rot_rmse_deg: expected at most 15, found",
         "StampsItsArrival": "stamped_at_images_percent: expected at least 90, found",
         "SaysToFly": "reads_truth: expected it to announce that it reads the truth",
     }
     for name, reason in expected.items():
-        assert found[name]["ate_percent"] < 2.0
-        assert any(text.startswith(reason) for text in found[name]["failed"]), found[name]
+        assert figures[name]["ate_percent"] < 2.0
+        assert any(text.startswith(reason) for text in figures[name]["failed"]), figures[name]
 
 
 def test_who_lands_the_vehicle_before_its_pilot_does_fails(tmp_path: Path) -> None:
-    found = flown(tmp_path, Lands)
-    assert found["Lands"]["commands"] == "land at 3.5 s"
+    figures = flown(tmp_path, Lands)
+    assert figures["Lands"]["commands"] == "land at 3.5 s"
     reason = "commands: expected it not to end the flight, found land at 3.5 s"
-    assert reason in found["Lands"]["failed"]
-    assert "commands" not in found["good"]
+    assert reason in figures["Lands"]["failed"]
+    assert "commands" not in figures["good"]

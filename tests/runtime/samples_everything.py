@@ -114,8 +114,8 @@ class Doubler(Node):
 
     async def run(self) -> None:
         async for word in self.heard:
-            found = await self.worker_.call(Slow.double, word.lot)
-            text = await self.offload_for(0.004, str, found)
+            doubled = await self.worker_.call(Slow.double, word.lot)
+            text = await self.offload_for(0.004, str, doubled)
             self.words.send(Word(stamp=self.clock.now(), source=self.name, text=text))
 
 

@@ -28,10 +28,10 @@ def repository(folder: Path, *files: str) -> None:
 def test_a_file_has_the_commit_of_its_own_repository(tmp_path: Path) -> None:
     repository(tmp_path / "own", "package/a.py")
     file = tmp_path / "own" / "package" / "a.py"
-    found = of_repository(file)
-    assert re.fullmatch(HASH, found)
+    revision = of_repository(file)
+    assert re.fullmatch(HASH, revision)
     file.write_text("y")
-    assert of_repository(file) == f"{found}-dirty"
+    assert of_repository(file) == f"{revision}-dirty"
     assert of_repository(tmp_path / "none.py") == ""
 
 

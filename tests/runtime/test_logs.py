@@ -251,7 +251,7 @@ def test_runs_of_one_process_have_logs_of_their_own(worker: bool, tmp_path: Path
     for word, level in words.items():
         text = (tmp_path / word / "log.txt").read_text()
         others = words.keys() - {word}
-        assert not [line for line in text.splitlines() if any(each in line for each in others)]
+        assert not [line for line in text.splitlines() if any(other in line for other in others)]
         # In three threads and the loop; in all of them by node, runtime and library.
         assert text.count(f"{word} by a library in") == 4 * 20
         told = level != "warning"

@@ -55,14 +55,14 @@ def test_all_is_there_before_an_init_that_calls_no_super() -> None:
         told = Output(Said)
 
         def __init__(self) -> None:
-            self.found = (self.name, self.config.speed, self.clock.now(), self.heard.name)
+            self.attributes = (self.name, self.config.speed, self.clock.now(), self.heard.name)
             try:
                 self.told.send(said())
             except ChannelClosedError as error:
                 self.refusal = str(error)
 
     node = make(Eager, "eager", Speed(speed=3.0))
-    assert node.found == ("eager", 3.0, 0, "eager.heard")
+    assert node.attributes == ("eager", 3.0, 0, "eager.heard")
     assert "eager.told" in node.refusal
 
 

@@ -81,9 +81,9 @@ def write(folder: Path, text: str) -> Path:
 
 
 def settings(path: Path, *changes: str) -> ReadingConfig:
-    found = load(path, changes).nodes[0].config
-    assert isinstance(found, ReadingConfig)
-    return found
+    config = load(path, changes).nodes[0].config
+    assert isinstance(config, ReadingConfig)
+    return config
 
 
 def test_paths_start_at_the_file_wherever_the_command_runs(
@@ -93,15 +93,15 @@ def test_paths_start_at_the_file_wherever_the_command_runs(
     path = write(folder, TEXT + SETTINGS)
     for place in (tmp_path, folder):
         monkeypatch.chdir(place)
-        found = settings(path.relative_to(place))
-        assert found.file == str(folder / "a.txt")
-        assert found.maybe == str(folder / "b.txt")
-        assert found.changing == str(folder / "../c.txt")
-        assert found.files == ("/d.txt", str(folder / "e/f.txt"))
-        assert found.named == {"g": str(folder / "g.txt")}
-        assert found.parts == (Part(str(folder / "h.txt"), "h.txt"),)
-        assert found.world == str(folder / "worlds/room.xml")
-        assert (found.plot, found.word) == ("plot.png", "a.txt")
+        config = settings(path.relative_to(place))
+        assert config.file == str(folder / "a.txt")
+        assert config.maybe == str(folder / "b.txt")
+        assert config.changing == str(folder / "../c.txt")
+        assert config.files == ("/d.txt", str(folder / "e/f.txt"))
+        assert config.named == {"g": str(folder / "g.txt")}
+        assert config.parts == (Part(str(folder / "h.txt"), "h.txt"),)
+        assert config.world == str(folder / "worlds/room.xml")
+        assert (config.plot, config.word) == ("plot.png", "a.txt")
         network = load(path).network
         assert network.zenoh == str(folder / "net/zenoh.json5")
         assert network.secret == f"file:{folder / 'net/secret'}"
@@ -118,14 +118,14 @@ def test_paths_of_the_command_line_start_where_it_runs(
     assert settings(path, "reading.file=").file == ""
     assert settings(path, "reading.word=a.txt").word == "a.txt"
     assert settings(path, "reading.world=yard").world == "yard"
-    for secret, found in (
+    for secret, resolved in (
         ("file:s", f"file:{tmp_path / 's'}"),
         ("file:/s", "file:/s"),
         ("env:S", "env:S"),
         ("sixteen letters/.", "sixteen letters/."),
         ("file:", "file:"),
     ):
-        assert load(path, [f"network.secret={secret}"]).network.secret == found
+        assert load(path, [f"network.secret={secret}"]).network.secret == resolved
 
 
 def test_what_a_run_writes_down_reads_the_same_files_from_anywhere(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_what_a_run_writes_down_reads_the_same_files_from_anywhere(tmp_path: Pat
 def test_two_machines_compare_names_of_files_and_not_folders(tmp_path: Path) -> None:
     one, other = (settings(write(tmp_path / where, TEXT + SETTINGS)) for where in ("a", "b/c"))
     assert one != other
-    tables = [file_names(msgspec.to_builtins(each), ReadingConfig) for each in (one, other)]
+    tables = [file_names(msgspec.to_builtins(config), ReadingConfig) for config in (one, other)]
     assert tables[0] == tables[1]
     assert tables[0]["files"] == ["d.txt", "f.txt"]
 
@@ -173,6 +173,6 @@ def test_each_source_has_files_of_its_own_and_is_known_by_them(sources: list[str
 
 
 def test_usual_names_stay_as_they_are() -> None:
-    assert [source_file(each) for each in ("orb-slam_3", "drone/slam", "a_b", "v1.2")] == [
+    assert [source_file(name) for name in ("orb-slam_3", "drone/slam", "a_b", "v1.2")] == [
         *("orb-slam_3", "drone+slam", "a_b", "v1~2E2")
     ]

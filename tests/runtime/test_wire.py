@@ -33,9 +33,9 @@ class Measured(Event, eq=False):
 
 
 def digest(event: Event) -> str:
-    found = Digest()
-    found(None, event)
-    return found.hexdigest()
+    hasher = Digest()
+    hasher(None, event)
+    return hasher.hexdigest()
 
 
 @given(

@@ -90,7 +90,7 @@ def moved(right: float) -> Any:
 
 
 def every(kind: type[Any]) -> list[type[Any]]:
-    return [kind, *(found for each in kind.__subclasses__() for found in every(each))]
+    return [kind, *(below for child in kind.__subclasses__() for below in every(child))]
 
 
 @pytest.mark.parametrize("kind", every(Mount))

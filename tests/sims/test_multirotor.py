@@ -99,10 +99,10 @@ def test_imu_and_odometry_come_together_at_their_rate() -> None:
 
 def test_at_rest_the_imu_feels_gravity_from_its_first_sample_on() -> None:
     result = fly(duration=1.0)
-    found = np.array([e.linear_acceleration for e in result.of(Imu)])
+    accelerations = np.array([e.linear_acceleration for e in result.of(Imu)])
     density = result.of(ImuAnnouncement)[0].accelerometer_noise_density
     np.testing.assert_allclose(
-        found, np.tile((0.0, 0.0, -9.81), (200, 1)), atol=6 * density * 200**0.5
+        accelerations, np.tile((0.0, 0.0, -9.81), (200, 1)), atol=6 * density * 200**0.5
     )
 
 
@@ -162,9 +162,9 @@ def test_the_truth_between_imu_samples_is_the_one_that_a_fast_imu_tells() -> Non
     camera = CAMERA | {"rate": 70, "loss": 1.0}
     grid = np.array([e.stamp for e in fine])
     places = np.array([e.position for e in fine])
-    found = moves(20, cameras=[camera], camera_processes=1)
-    assert len(found) > 90
-    for event in found:
+    samples = moves(20, cameras=[camera], camera_processes=1)
+    assert len(samples) > 90
+    for event in samples:
         if event.stamp <= grid[-1]:
             straight = [np.interp(event.stamp, grid, places[:, axis]) for axis in range(3)]
             assert event.position == pytest.approx(straight, abs=1e-6)
@@ -353,10 +353,10 @@ def test_whoever_is_teleported_in_the_air_holds_the_new_place(before: float) -> 
         teleport(at, *place),
         duration=before + 3.0,
     )
-    poses = [each for each in result.of(Odometry) if each.stamp > at * SECOND]
+    poses = [pose for pose in result.of(Odometry) if pose.stamp > at * SECOND]
     assert apart(poses[0].position, place) < 1e-3
     assert apart(poses[-1].position, place) < 0.1
-    assert max(apart(each.position, place) for each in poses) < 0.5
+    assert max(apart(pose.position, place) for pose in poses) < 0.5
     assert rotations.yaw_of(poses[-1].orientation) == pytest.approx(1.0, abs=0.02)
 
 
@@ -411,7 +411,7 @@ def test_where_physics_would_break_it_refuses_to_be(caplog: pytest.LogCaptureFix
             teleport(0.4, 0.0, 0.0, -1.0, angular_velocity=(0.0, 1e4, 0.0)),
             duration=0.5,
         )
-    assert sum("Teleport refused" in each.message for each in caplog.records) == 4
+    assert sum("Teleport refused" in record.message for record in caplog.records) == 4
     assert apart(result.of(Odometry)[-1].position, (0.0, 0.0, -0.1)) < 1e-3
 
 
@@ -425,7 +425,7 @@ def test_a_reset_in_the_air_brings_it_to_the_start_and_it_takes_off_as_before() 
         duration=9.0,
         position=[1.0, 2.0],
     )
-    poses = {each.stamp: each for each in result.of(Odometry)}
+    poses = {pose.stamp: pose for pose in result.of(Odometry)}
     first = result.of(Odometry)[0]
     for seconds in (4.405, 4.9):
         rested = poses[round(seconds * SECOND)]
@@ -453,6 +453,6 @@ def test_a_reset_forgets_the_heading_of_the_last_velocity() -> None:
         VelocitySetpoint(stamp=round(4.6 * SECOND), source="test", velocity=(0.0, 0.0, -1.0)),
         duration=5.5,
     )
-    yaws = {each.stamp: rotations.yaw_of(each.orientation) for each in result.of(Odometry)}
+    yaws = {pose.stamp: rotations.yaw_of(pose.orientation) for pose in result.of(Odometry)}
     assert yaws[round(4.395 * SECOND)] > 0.4
     assert max(abs(yaw) for stamp, yaw in yaws.items() if stamp > 4.4 * SECOND) < 0.02

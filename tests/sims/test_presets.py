@@ -59,12 +59,12 @@ def test_a_preset_is_a_valid_sensor_with_its_figures(kind: str, name: str) -> No
     """None of its figures is lost or repeats a default, and the results name them all."""
     made = settings(kind, name)
     for key, value in KINDS[kind][name].items():
-        found = getattr(made, key)
-        expected = type(found)(**value) if isinstance(value, dict) and key != "lens" else value
+        actual = getattr(made, key)
+        expected = type(actual)(**value) if isinstance(value, dict) and key != "lens" else value
         if key == "lens":
             expected = (value["model"], value["coefficients"])
-            found = (found.model, found.coefficients)
-        assert found == expected, key
+            actual = (actual.model, actual.coefficients)
+        assert actual == expected, key
     assert made.preset is None
 
 
@@ -93,7 +93,7 @@ def test_the_rules_of_lint_object_to_no_preset() -> None:
         announcement(spec, source=f"drone/{spec.name}", prefix="", parent_frame_id="base_link")
         for spec in cast("MultirotorConfig", config.nodes[0].config).cameras
     ]
-    assert {each.rule for each in lint(config, said)} <= {"no-end", "idle"}
+    assert {finding.rule for finding in lint(config, said)} <= {"no-end", "idle"}
 
 
 def test_keys_beside_a_preset_override_it_at_any_depth() -> None:
@@ -157,18 +157,18 @@ def test_settings_of_the_results_are_those_of_the_run_without_a_preset() -> None
 
 
 def test_the_names_are_listed_with_the_settings() -> None:
-    listed = {each.name: each for each in describe_settings(MultirotorConfig)}
+    listed = {setting.name: setting for setting in describe_settings(MultirotorConfig)}
     for kind in ("imu", "cameras", "lidars"):
-        (preset,) = [each for each in listed[kind].settings if each.name == "preset"]
+        (preset,) = [setting for setting in listed[kind].settings if setting.name == "preset"]
         assert preset.type == " or ".join(f'"{name}"' for name in KINDS[kind])
 
 
 @pytest.mark.slow
 def test_the_rig_of_euroc_is_the_one_of_its_files() -> None:
     """Its announcements give T_BS of cam0 and cam1, and the noise of imu0/sensor.yaml."""
-    found = of_nodes(load(ROOT / "examples" / "euroc_rig.toml"))
-    assert found.errors == []
-    imu = next(each for each in found.announcements if isinstance(each, ImuAnnouncement))
+    findings = of_nodes(load(ROOT / "examples" / "euroc_rig.toml"))
+    assert findings.errors == []
+    imu = next(a for a in findings.announcements if isinstance(a, ImuAnnouncement))
     body = pose_matrix(imu.position, imu.orientation)
     for name, rows in {
         "cam0": [
@@ -182,9 +182,9 @@ def test_the_rig_of_euroc_is_the_one_of_its_files() -> None:
             [-0.0253898008918, 0.0179005838253, 0.999517347078, 0.00786212447038],
         ],
     }.items():
-        (camera,) = [each for each in found.announcements if each.source == f"drone/{name}"]
+        (camera,) = [a for a in findings.announcements if a.source == f"drone/{name}"]
         assert isinstance(camera, CameraAnnouncement)
         across = np.linalg.inv(body) @ pose_matrix(camera.position, camera.orientation)
         assert across[:3] == pytest.approx(np.array(rows), abs=1e-9)
     assert imu.gyroscope_noise_density == 1.6968e-4
-    assert not any(isinstance(each, LidarAnnouncement) for each in found.announcements)
+    assert not any(isinstance(a, LidarAnnouncement) for a in findings.announcements)

@@ -38,10 +38,10 @@ def test_proj_sees_the_place_where_a_receiver_is(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart "
         f"+ellps=WGS84 +step +proj=topocentric +ellps=WGS84 {place}"
     )
-    found = to_geodetic(position, origin)
-    east, north, up = to_enu.transform(found[1], found[0], found[2])
+    geodetic = to_geodetic(position, origin)
+    east, north, up = to_enu.transform(geodetic[1], geodetic[0], geodetic[2])
     assert (north, east, -up) == pytest.approx(position, abs=1e-5)
-    assert from_geodetic(found, origin) == pytest.approx(position, abs=1e-5)
+    assert from_geodetic(geodetic, origin) == pytest.approx(position, abs=1e-5)
 
 
 class Keeper(Node[NodeConfig]):
@@ -91,9 +91,9 @@ def test_colmap_finds_lens_and_places_from_images_alone(tmp_path: Path) -> None:
     pycolmap.extract_features(tmp_path / "d.db", folder, **single)
     pycolmap.match_exhaustive(tmp_path / "d.db")
     maps = pycolmap.incremental_mapping(tmp_path / "d.db", folder, tmp_path / "map").values()
-    found = max(maps, key=lambda each: each.num_reg_images())  # its threads may begin a second
-    assert found.num_reg_images() >= 20
-    (camera,) = found.cameras.values()
+    model = max(maps, key=lambda map_: map_.num_reg_images())  # its threads may begin a second
+    assert model.num_reg_images() >= 20
+    (camera,) = model.cameras.values()
     fx, fy, cx, cy, *lens = camera.params
     info = Keeper.cameras[0].info
     # Its threads race: from run to run a focal length is 0.05 to 0.2 % off.
@@ -101,8 +101,8 @@ def test_colmap_finds_lens_and_places_from_images_alone(tmp_path: Path) -> None:
     # COLMAP's pixels have their centres at halves; it leaves the principal point in the middle.
     assert (cx - 0.5, cy - 0.5) == pytest.approx((info.cx, info.cy), abs=0.5)
     assert lens == pytest.approx(info.distortion[:4], abs=3e-3)
-    images = [Keeper.images[int(Path(each.name).stem)] for each in found.images.values()]
-    centres = np.array([each.projection_center() for each in found.images.values()])
+    images = [Keeper.images[int(Path(view.name).stem)] for view in model.images.values()]
+    centres = np.array([view.projection_center() for view in model.images.values()])
     body_from_camera = np.array(Keeper.cameras[0].position)
     truth = np.array(
         [

@@ -119,15 +119,15 @@ def test_what_is_for_nobody_is_logged_once(world: str, caplog: pytest.LogCapture
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "found"), [("", "found none"), ("bb", "found \"bb\" (did you mean 'b'?)")]
+    ("vehicle", "actual"), [("", "found none"), ("bb", "found \"bb\" (did you mean 'b'?)")]
 )
 def test_a_check_refuses_pilots_that_name_no_vehicle_that_is_there(
-    world: str, vehicle: str, found: str
+    world: str, vehicle: str, actual: str
 ) -> None:
     pilot = PilotAnnouncement(stamp=0, source="tour", vehicle=vehicle)
     with pytest.raises(RefusedError) as refusal:
         fly(drone("a", 0.0, world), drone("b", 4.0, world), inputs=[pilot], duration=0.01)
-    assert f"tour: vehicle: expected one of a, b, {found}" in str(refusal.value)
+    assert f"tour: vehicle: expected one of a, b, {actual}" in str(refusal.value)
 
 
 def test_a_path_is_checked_by_the_vehicle_that_is_to_fly_it(world: str) -> None:
@@ -188,8 +188,8 @@ def test_a_world_in_which_nobody_sees_is_not_painted(
 
 def test_a_check_goes_through_all_of_it(world: str) -> None:
     nodes = (drone("a", 0.0, world), drone("b", 4.0, world))
-    found = of_nodes(Config(run=RunConfig(duration=Duration(1.0)), nodes=nodes))
-    assert found.errors == []
+    findings = of_nodes(Config(run=RunConfig(duration=Duration(1.0)), nodes=nodes))
+    assert findings.errors == []
 
 
 @pytest.mark.slow
@@ -269,7 +269,7 @@ def test_all_of_one_world_are_in_one_process(world: str) -> None:
     host = NoHost()
     nodes = (drone("a", 0.0, world), drone("b", 4.0, world))
     host.siblings = tuple(
-        Sibling(each.name, each.node, each.config, {}, each.name == "a") for each in nodes
+        Sibling(spec.name, spec.node, spec.config, {}, spec.name == "a") for spec in nodes
     )
     node = make_node(Multirotor, "a", nodes[0].config, host)
     with pytest.raises(ValueError, match="in one process, found b in another one: name them"):
@@ -288,12 +288,12 @@ def test_bodies_are_announced_and_their_poses_are_sent(world: str) -> None:
     walker = {"name": "p", "kind": "person", "waypoints": [(2, 0, 0), (2, 4, 0)], "speed": 2.0}
     nodes = (surroundings(world, bodies=[walker, STILL], rate=20), drone("a", 0.0, world))
     result = fly(*nodes, duration=1.0)
-    bodies = {each.source: each for each in result.of(BodyAnnouncement)}
-    assert {name: each.kind for name, each in bodies.items()} == {
+    bodies = {body.source: body for body in result.of(BodyAnnouncement)}
+    assert {name: body.kind for name, body in bodies.items()} == {
         "world/p": "person",
         "world/crate": "box",
     }
-    ids = [number for each in bodies.values() for number in each.object_ids]
+    ids = [number for body in bodies.values() for number in body.object_ids]
     assert len(set(ids)) == len(ids) > 10
     poses = [e for e in result.of(PoseStamped) if e.source == "world/p"]
     assert [e.stamp for e in poses] == [k * SECOND // 20 for k in range(20)]

@@ -85,7 +85,7 @@ def test_the_projects_own_suite_is_right(monkeypatch: pytest.MonkeyPatch) -> Non
     assert [s.name for s in flown if s.calibration == "exact"] == ["hall", "evening_exact"]
     assert len(plan.jobs) == (3 * len(flown) + 1) * len(suite.estimators)
     assert len({job.flight for job in plan.jobs}) == 3 * len(flown)
-    levels = [LEVELS.index(each.level) for each in suite.scenarios]
+    levels = [LEVELS.index(scenario.level) for scenario in suite.scenarios]
     assert levels == sorted(levels)
     assert {*levels} == {*range(len(LEVELS))}
     assert (FOLDER / "rig.toml").is_file()
@@ -94,7 +94,7 @@ def test_the_projects_own_suite_is_right(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_runs_of_one_flight_follow_each_other(small: Path) -> None:
     plan = make_plan(read_suite(small), out=Path("out"), seeds=2, repeats=2)
     order = [(dict(j.settings)["scenario"], j.seed) for j in plan.jobs]
-    assert order == sorted(order, key=lambda each: (each[0] != "slow", each[1]))
+    assert order == sorted(order, key=lambda run: (run[0] != "slow", run[1]))
     assert len({job.id for job in plan.jobs}) == len(plan.jobs) == 10
     twice = [(dict(j.settings)["scenario"], j.seed) for j in plan.jobs if j.repeat == 2]
     assert twice == [("slow", 1)] * 2
@@ -241,7 +241,7 @@ def test_a_flaw_of_the_flight_is_told_and_is_not_the_estimators(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("scenario", read_suite().scenarios, ids=lambda each: each.name)
+@pytest.mark.parametrize("scenario", read_suite().scenarios, ids=lambda scenario: scenario.name)
 def test_every_scenario_is_flown_to_its_end_and_meets_nothing(
     scenario: Scenario, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -291,12 +291,12 @@ def test_flights_that_differ_are_refused(small: Path, tmp_path: Path) -> None:
         sent = {"drone.images": "a", "pilot.setpoints": "b", f"{job.id}.estimates": job.id}
         Path(job.out).mkdir(parents=True)
         (Path(job.out) / "summary.json").write_text(json.dumps({"digests": sent}))
-    found = flights(suite, plan)
-    assert {name: [*each] for name, each in found.items()} == {"slow": [1], "quick": [1]}
-    assert len({digest for each in found.values() for digest in each.values()}) == 1
+    digests = flights(suite, plan)
+    assert {name: [*by_seed] for name, by_seed in digests.items()} == {"slow": [1], "quick": [1]}
+    assert len({digest for by_seed in digests.values() for digest in by_seed.values()}) == 1
     part: dict[str, Any] = {"digests": {"drone.x": "c"}, "error": "its worker died"}
     (Path(plan.jobs[1].out) / "summary.json").write_text(json.dumps(part))
-    assert flights(suite, plan) == found
+    assert flights(suite, plan) == digests
     part["error"] = ""
     (Path(plan.jobs[1].out) / "summary.json").write_text(json.dumps(part))
     with pytest.raises(ConfigError, match="bad seed=1: expected the flight of the others"):

@@ -55,15 +55,15 @@ def imu_axes(form: str, points: Any) -> Any:
     return np.array([convert_vector("body", tuple(p)) for p in points]) if on_topics else points
 
 
-def difference(rig: Rig, form: str, found: list[ReadCamera]) -> float:
+def difference(rig: Rig, form: str, cameras: list[ReadCamera]) -> float:
     """Return by how many pixels the same points of the IMU's frame fall elsewhere, at most."""
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (300, 3)) + np.array([0, 0, 2])
     worst = 0.0
-    for announced, each in zip(rig.cameras, found, strict=True):
+    for announced, other in zip(rig.cameras, cameras, strict=True):
         pose = pose_matrix(announced.position, announced.orientation)
         pixels = announced.info.project(points)
         assert np.isfinite(pixels).all()
-        off = each.project(imu_axes(form, points @ pose[:3, :3].T + pose[:3, 3])) - pixels
+        off = other.project(imu_axes(form, points @ pose[:3, :3].T + pose[:3, 3])) - pixels
         worst = max(worst, float(np.abs(off).max()))
     return worst
 
@@ -83,9 +83,9 @@ def test_a_stereo_pair_projects_the_same_or_is_refused(
         with pytest.raises(ValueError, match=f"{form} has no word for its lens.*basalt has one"):
             write_files(rig, form)
         return
-    found = exported(rig, form, tmp_path)
-    assert difference(rig, form, found) < 1e-6
-    assert {each.time_offset for each in found} <= {-0.005, None}
+    cameras = exported(rig, form, tmp_path)
+    assert difference(rig, form, cameras) < 1e-6
+    assert {camera.time_offset for camera in cameras} <= {-0.005, None}
 
 
 @pytest.mark.slow
@@ -113,12 +113,12 @@ def test_any_radtan_camera_projects_the_same(
         distortion=(*k, 1e-3, -1e-3, 0.0),
     )
     rig = Rig("drone", (msgspec.structs.replace(camera(), info=info, position=place),), IMU)
-    found = exported(rig, form, tmp_path_factory.mktemp(form))
+    cameras = exported(rig, form, tmp_path_factory.mktemp(form))
     rays = np.random.default_rng(2).uniform(-0.25, 0.25, (100, 3)) + np.array([0, 0, 2])
     pose = pose_matrix(place, rig.cameras[0].orientation)
     moved = rays @ pose[:3, :3].T + pose[:3, 3]
     np.testing.assert_allclose(
-        found[0].project(imu_axes(form, moved)), info.project(rays), atol=1e-6
+        cameras[0].project(imu_axes(form, moved)), info.project(rays), atol=1e-6
     )
 
 
@@ -202,8 +202,8 @@ def test_an_imu_that_is_turned_and_moved_is_what_transforms_speak_of(tmp_path: P
     in_body = points @ seen[:3, :3].T + seen[:3, 3]
     in_imu = (in_body - pose[:3, 3]) @ pose[:3, :3]
     for form in FORMATS:
-        found = exported(rig, form, tmp_path / form)[0].project(imu_axes(form, in_imu))
-        np.testing.assert_allclose(found, rig.cameras[0].info.project(points), atol=1e-6)
+        pixels = exported(rig, form, tmp_path / form)[0].project(imu_axes(form, in_imu))
+        np.testing.assert_allclose(pixels, rig.cameras[0].info.project(points), atol=1e-6)
 
 
 @given(
@@ -217,7 +217,7 @@ def test_what_a_calibration_says_of_an_imu_undoes_its_errors(
 ) -> None:
     """By the equations of OpenVINS (``Propagator.cpp``) and Basalt (``calib_bias.hpp``)."""
     yaml: Any = importlib.import_module("yaml")  # without types
-    m_g, m_a = (np.eye(3) + np.reshape(each, (3, 3)) for each in (gyroscope, accelerometer))
+    m_g, m_a = (np.eye(3) + np.reshape(matrix, (3, 3)) for matrix in (gyroscope, accelerometer))
     rates, force = np.array([0.3, -0.2, 0.7]), np.array([1.0, 2.0, -9.0])
     seen_rates, seen_force = m_g @ rates + feigned * force, m_a @ force
 
@@ -297,7 +297,7 @@ def test_openvins_initializes_at_the_rest_of_our_examples(example: str) -> None:
     at_rest = 3**0.5 * IMU.accelerometer_noise_density * IMU.rate**0.5
     assert 3 * at_rest < float(says["init_imu_thresh"]) < 0.62  # of a gentle take-off
     path = Path(__file__).parents[3] / "examples" / f"{example}.toml"
-    nodes = {each["name"]: each for each in tomllib.loads(path.read_text())["nodes"]}
+    nodes = {node["name"]: node for node in tomllib.loads(path.read_text())["nodes"]}
     rests = float(nodes["pilot"]["start_delay"].removesuffix("s"))
     assert rests >= float(says["init_window_time"]) + 0.5
     assert nodes["drone"]["imu"]["vibration"]["amplitude"] > 1.0
@@ -325,8 +325,11 @@ RECORDED = {
 def summary(run: Path, announced: tuple[Announcement, ...]) -> Path:
     """Write what an export needs of a run."""
     run.mkdir()
-    found = [{"type": type(each).__name__, **plain(each, "test")} for each in announced]
-    (run / "summary.json").write_bytes(msgspec.json.encode({"announcements": found}))
+    rows = [
+        {"type": type(announcement).__name__, **plain(announcement, "test")}
+        for announcement in announced
+    ]
+    (run / "summary.json").write_bytes(msgspec.json.encode({"announcements": rows}))
     return run
 
 

@@ -52,12 +52,12 @@ def test_a_published_chain_is_read(tmp_path: Path) -> None:
 def test_what_we_export_is_read_back(lens: str) -> None:
     rig = stereo(lens, time_offset=0.005)
     chain = parse_chain("\n".join(write_files(rig, "kalibr").values()), "kalibr")
-    for announced, found in zip(rig.cameras, chain.cameras, strict=True):
-        assert found.info == announced.info
-        assert found.time_offset == 0.005
-        assert found.in_imu is not None
+    for announced, read in zip(rig.cameras, chain.cameras, strict=True):
+        assert read.info == announced.info
+        assert read.time_offset == 0.005
+        assert read.in_imu is not None
         expected = imu_axes(rig, ros=True) @ camera_in_imu(rig, announced)
-        np.testing.assert_allclose(found.in_imu, expected, atol=1e-12)
+        np.testing.assert_allclose(read.in_imu, expected, atol=1e-12)
     assert chain.imu is not None
     assert chain.imu.gyroscope_noise_density == ANNOUNCED.gyroscope_noise_density
     assert chain.imu.rate == ANNOUNCED.rate
@@ -94,9 +94,9 @@ def test_a_chain_without_all_transforms_is_closed_from_camera_to_camera(
     np.testing.assert_allclose(third.in_imu, on_imu @ step @ step, atol=1e-9)
     back = on_imu @ inverse(step)
     last = f"cam1: {{{common}, {rows}, T_cam_imu: {inverse(on_imu).tolist()}}}"
-    found = parse_chain(f"cam0: {{{common}}}\n{last}", "chain").cameras[0].in_imu
-    assert found is not None
-    np.testing.assert_allclose(found, back, atol=1e-9)
+    in_imu = parse_chain(f"cam0: {{{common}}}\n{last}", "chain").cameras[0].in_imu
+    assert in_imu is not None
+    np.testing.assert_allclose(in_imu, back, atol=1e-9)
     third = parse_chain(f"cam0: {{{common}}}\n{rest}", "chain").cameras[2]
     assert third.in_imu is None
     np.testing.assert_allclose(third.in_first, step @ step, atol=1e-9)

@@ -104,11 +104,11 @@ def remarks(kept: _Collector, announced: CameraAnnouncement, number: int) -> str
 @pytest.mark.parametrize("readout", [0.0, 0.02])
 def test_a_true_camera_passes(lens: str, readout: float) -> None:
     announced = seen(lens, readout=readout, time_offset=0.004)
-    found = judged(flown(announced), announced)
-    assert [f for figures in found.values() for f in figures if not f.passed] == []
-    assert found[3][0].value < 0.06
-    assert found[4][0].value < 1e-6
-    assert int(found[3][0].name.split()[2]) > 8
+    judgement = judged(flown(announced), announced)
+    assert [f for figures in judgement.values() for f in figures if not f.passed] == []
+    assert judgement[3][0].value < 0.06
+    assert judgement[4][0].value < 1e-6
+    assert int(judgement[3][0].name.split()[2]) > 8
 
 
 def test_a_wrong_focal_length_is_named(kept: _Collector) -> None:
@@ -135,7 +135,7 @@ def test_a_shifted_stamp_is_named_with_its_time(kept: _Collector) -> None:
     stores: tuple[dict[str, Any], ...] = (kept.images, kept.depths, kept.own, kept.poses)
     for store in stores:
         for source, rows in list(store.items()):
-            store[source] = {s + late: each for s, each in rows.items()}
+            store[source] = {s + late: image for s, image in rows.items()}
     said = remarks(kept, announced, 6)
     assert "drone/left: images show what was 5." in said or "what was 4.9" in said
     assert "ms before the time that their stamps say" in said
@@ -156,7 +156,7 @@ def test_scaled_depth_is_named(kept: _Collector) -> None:
 
 
 def test_images_of_nothing_prove_nothing(kept: _Collector) -> None:
-    black = {s: np.zeros_like(each) for s, each in kept.images["drone/left"].items()}
+    black = {s: np.zeros_like(image) for s, image in kept.images["drone/left"].items()}
     kept.images.update({"drone/left": black})
     figure = judged(kept, kept.cameras["drone/left"])[3][0]
     assert not figure.passed
@@ -233,8 +233,8 @@ def test_noise_where_none_is_announced_is_named() -> None:
 
 
 def test_the_fit_finds_what_was_put_in() -> None:
-    found = np.median(trials(2e-3, 3e-3, 0.0, 200.0, 40_000), axis=0)
-    assert found == pytest.approx([2e-3, 3e-3], rel=0.1)
+    fit = np.median(trials(2e-3, 3e-3, 0.0, 200.0, 40_000), axis=0)
+    assert fit == pytest.approx([2e-3, 3e-3], rel=0.1)
     seconds, values = variances(standing(2e-3, 0.0, 100.0), 200.0)
     assert np.sqrt(values[0] * seconds[0]) == pytest.approx(2e-3, rel=0.02)
 
@@ -247,9 +247,9 @@ def test_rays_meet_what_the_world_file_says() -> None:
     origin = np.array([[0.1, -0.2, -1.4]] * len(radii))
     rays = centres - origin
     distance = np.linalg.norm(rays, axis=1)
-    found, what = hits(ANGLE, origin, rays / distance[:, None])
+    distances, what = hits(ANGLE, origin, rays / distance[:, None])
     assert what.tolist() == list(range(len(radii)))
-    np.testing.assert_allclose(found, distance - radii, atol=1e-9)
+    np.testing.assert_allclose(distances, distance - radii, atol=1e-9)
     down, wall = hits(ANGLE, np.array([[0.0, 0.0, -1.0]]), np.array([[0.002, 0.001, 1.0]]))
     assert wall[0] == -6
     assert down[0] == pytest.approx(1.0)

@@ -32,7 +32,7 @@ def file(mode: str = "rgbd_inertial", latency: str = "15ms", accept: Sequence[st
 
 def nodes_of(*types: str, duration: float = 1.0, **settings: Any) -> Config:
     """Return a file with nodes called a, b, …, the last with settings."""
-    nodes = [{"name": name, "type": each} for name, each in zip("abc", types, strict=False)]
+    nodes = [{"name": name, "type": kind} for name, kind in zip("abc", types, strict=False)]
     nodes[-1] |= settings
     return parse({"run": {"duration": duration}, "nodes": nodes}, "test")
 
@@ -129,21 +129,23 @@ def test_every_rule_is_offered_and_has_an_odd_case() -> None:
 def test_a_rule_says_what_is_odd(
     name: str, config: Config, announced: list[Announcement], said: str
 ) -> None:
-    found = [each for each in lint(config, announced) if each.rule == name]
-    assert len(found) == 1
-    assert said in str(found[0])
-    assert found[0].change
-    subject = found[0].subject
+    findings = [finding for finding in lint(config, announced) if finding.rule == name]
+    assert len(findings) == 1
+    assert said in str(findings[0])
+    assert findings[0].change
+    subject = findings[0].subject
     for accepted in (name, f"{name}:{subject}"):
-        assert not [each for each in lint(config, announced, [accepted]) if each.rule == name]
+        assert not [
+            finding for finding in lint(config, announced, [accepted]) if finding.rule == name
+        ]
 
 
 def test_nothing_is_said_of_a_sound_rig() -> None:
     assert lint(file(), [square(), IMU, ESTIMATES]) == []
     assert lint(file("rgbd"), [square(rate=30.0), IMU, ESTIMATES]) == []  # nobody fuses the IMU
-    pair = [msgspec.structs.replace(each, info=square().info) for each in (LEFT, RIGHT)]
+    pair = [msgspec.structs.replace(camera, info=square().info) for camera in (LEFT, RIGHT)]
     near = msgspec.structs.replace(pair[1], position=(0.15, 0.12, -0.03), rate=30.0)
-    assert [each.rule for each in lint(file("rgbd"), [pair[0], near])] == []
+    assert [finding.rule for finding in lint(file("rgbd"), [pair[0], near])] == []
     assert lint(ON_A_LIDAR, [lidar()]) == []
     on_a_lidar = msgspec.structs.replace(ESTIMATES, source="a", reads=("imu", "lidar"))
     assert lint(ON_A_LIDAR, [lidar(), square(rate=40.0), IMU, on_a_lidar]) == []
@@ -166,11 +168,11 @@ def test_of_a_recording_no_noise_is_known() -> None:
 def test_what_a_file_accepts_is_left_out_and_a_wrong_name_is_said() -> None:
     announced = [square(rate=40.0), IMU, ESTIMATES]
     assert lint(file(accept=["imu-rate:drone/left"]), announced) == []
-    (found,) = lint(file(accept=["imu-rate", "imu-rat"]), announced)
-    assert isinstance(found, Finding)
-    assert found.rule == "accept"
-    assert "accept names no rule: imu-rat" in found.found
-    assert "imu-rate" in found.change
+    (finding,) = lint(file(accept=["imu-rate", "imu-rat"]), announced)
+    assert isinstance(finding, Finding)
+    assert finding.rule == "accept"
+    assert "accept names no rule: imu-rat" in finding.found
+    assert "imu-rate" in finding.change
 
 
 @pytest.mark.slow

@@ -45,14 +45,16 @@ class WrongFocal(Multirotor):
     """Announces a focal length that is not the one it draws with."""
 
     def announce(self) -> Iterable[Announcement]:
-        for each in super().announce():
-            if isinstance(each, CameraAnnouncement):
-                info = msgspec.structs.replace(each.info, fx=1.03 * each.info.fx)
-                each = msgspec.structs.replace(each, info=info)
-            if isinstance(each, ImuAnnouncement):
-                noise = 1.5 * each.accelerometer_noise_density
-                each = msgspec.structs.replace(each, accelerometer_noise_density=noise)
-            yield each
+        for announcement in super().announce():
+            if isinstance(announcement, CameraAnnouncement):
+                info = msgspec.structs.replace(announcement.info, fx=1.03 * announcement.info.fx)
+                announcement = msgspec.structs.replace(announcement, info=info)
+            if isinstance(announcement, ImuAnnouncement):
+                noise = 1.5 * announcement.accelerometer_noise_density
+                announcement = msgspec.structs.replace(
+                    announcement, accelerometer_noise_density=noise
+                )
+            yield announcement
 
 
 def proven(node: dict[str, Any], folder: Path, standing: float = 30.0) -> Result:
@@ -64,11 +66,11 @@ def proven(node: dict[str, Any], folder: Path, standing: float = 30.0) -> Result
 
 def missed(result: Result) -> dict[int, list[str]]:
     """Return the sentences of what is not as announced."""
-    found = {
+    remarks_of = {
         number: [figure.remark for figure in figures if not figure.passed]
         for number, figures in result.figures.items()
     }
-    return {number: remarks for number, remarks in found.items() if remarks}
+    return {number: remarks for number, remarks in remarks_of.items() if remarks}
 
 
 @pytest.mark.slow

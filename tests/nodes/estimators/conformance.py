@@ -182,24 +182,24 @@ def lacks(case: Case) -> list[Lack]:
     """Return the rigs that an estimator must refuse."""
     said = case.announced()
     kinds = [kind for kind in said.reads if kind != "imu"]
-    found = [Lack("any camera", announcements(said.reads, 0))]
+    lacking = [Lack("any camera", announcements(said.reads, 0))]
     for kind in kinds:
-        others = tuple(each for each in said.reads if each != kind)
+        others = tuple(other for other in said.reads if other != kind)
         if {*others} - {"imu"}:
-            found.append(Lack(kind, announcements(others, said.eyes)))
+            lacking.append(Lack(kind, announcements(others, said.eyes)))
         else:
-            found.append(Lack(kind, announcements(("segmentation", *others), said.eyes)))
+            lacking.append(Lack(kind, announcements(("segmentation", *others), said.eyes)))
     if said.eyes == 2:
-        found.append(Lack("the right eye", announcements(said.reads, 1)))
+        lacking.append(Lack("the right eye", announcements(said.reads, 1)))
     if "imu" in said.reads:
-        found.append(Lack("the IMU", announcements(tuple(kinds), said.eyes)))
+        lacking.append(Lack("the IMU", announcements(tuple(kinds), said.eyes)))
     for model, count in COEFFICIENTS.items():
         if model not in said.lenses:
             lens = model, (-0.1, 0.01, *(0.0,) * (count - 2))
-            found.append(
+            lacking.append(
                 Lack(f"a lens without {model}", announcements(said.reads, said.eyes, lens=lens))
             )
-    return found
+    return lacking
 
 
 def refusal_faults(case: Case, lack: Lack) -> Iterator[str]:

@@ -154,13 +154,13 @@ def fly(reads: tuple[str, ...], eyes: int, width: int = 240, script: str = SCRIP
         stamp = (number + 1) * PERIOD
         kinds[stamp], truth[stamp] = letter, _body(stamp, takes_off)
         seen = [_view(stamp, takes_off, eye, width) for eye in range(eyes)]
-        seen = frozen if letter == "z" else [_spoil(letter, *each, random) for each in seen]
+        seen = frozen if letter == "z" else [_spoil(letter, *view, random) for view in seen]
         frozen = seen
         for _ in range(2 if letter == "t" else 1):
             sent = [
-                each
+                event
                 for eye, (image, depth) in enumerate(seen)
-                for each in _images(stamp, eye, reads, image, depth)
+                for event in _images(stamp, eye, reads, image, depth)
             ]
             events += sent[:-1] if letter == "m" else sent
         if stamp == takes_off:

@@ -59,8 +59,8 @@ class Early(Good):
             self.publish(image, self.track(image.stamp))
 
     def track(self, stamp: int) -> TrackingResult:
-        found = super().track(stamp)
-        return TrackingResult(found.pose) if stamp < 200_000_000 else found
+        result = super().track(stamp)
+        return TrackingResult(result.pose) if stamp < 200_000_000 else result
 
 
 class NeverLost(Good):
@@ -72,9 +72,9 @@ class Liar(Good):
     """Is off by 20 cm after the loss."""
 
     def track(self, stamp: int) -> TrackingResult:
-        found = super().track(stamp)
-        found.pose[0, 3] += 0.2 * (stamp > 1_700_000_000)
-        return found
+        result = super().track(stamp)
+        result.pose[0, 3] += 0.2 * (stamp > 1_700_000_000)
+        return result
 
 
 class Late(Good):
@@ -202,16 +202,16 @@ def test_a_good_one_passes(node: type[Good]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("node", BAD)
 def test_a_bad_one_is_found_out(node: type[Good]) -> None:
-    found = faults(run(Case(node), flight()), Case(node))
-    assert BAD[node] in {fault.partition(":")[0] for fault in found}
+    reported = faults(run(Case(node), flight()), Case(node))
+    assert BAD[node] in {fault.partition(":")[0] for fault in reported}
 
 
 def test_equal_outcomes_are_equal_to_the_last_bit() -> None:
     class Random(Good):
         def track(self, stamp: int) -> TrackingResult:
-            found = super().track(stamp)
-            found.pose[0, 3] += 1e-15 * next(COUNT)
-            return found
+            result = super().track(stamp)
+            result.pose[0, 3] += 1e-15 * next(COUNT)
+            return result
 
     first, second = (run(Case(Random), flight()).outcome() for _ in range(2))
     assert first != second

@@ -135,7 +135,7 @@ def begin(*events: Event, control_rate: float = 400) -> list[str]:
     """Return the frames in which a vehicle's estimator speaks."""
     seen = camera("drone/front", "rgb", "depth", latency=0.04)
     result = track(vehicle(control_rate=control_rate), seen, *events)
-    return [each.frame_id for each in result.of(PoseEstimate)]
+    return [estimate.frame_id for estimate in result.of(PoseEstimate)]
 
 
 def test_the_bodys_pose_is_in_map_from_where_the_vehicle_said_it_stands() -> None:
@@ -181,8 +181,8 @@ def test_the_cameras_that_a_file_names_are_announced() -> None:
 
 def test_an_image_that_shows_too_little_is_no_beginning() -> None:
     """The tracker's poses begin later, when the vehicle is elsewhere."""
-    found = begin(*rgbd(0, dark=True), armed(100 * MS), *rgbd(300 * MS), *rgbd(400 * MS))
-    assert found == ["odom", "odom"]
+    frames = begin(*rgbd(0, dark=True), armed(100 * MS), *rgbd(300 * MS), *rgbd(400 * MS))
+    assert frames == ["odom", "odom"]
 
 
 def test_a_frame_once_chosen_stays() -> None:
@@ -198,7 +198,7 @@ def test_of_a_recorded_vehicle_the_first_exposure_is_known_only(late: int, frame
 def test_who_does_not_know_the_metre_is_not_in_map() -> None:
     seen = camera("drone/front", "rgb", "depth")
     result = run_nodes([spec(ScaleFree, "est")], inputs=[vehicle(), seen, *rgbd(1)])
-    assert [each.frame_id for each in result.of(PoseEstimate)] == ["odom"]
+    assert [estimate.frame_id for estimate in result.of(PoseEstimate)] == ["odom"]
 
 
 def test_after_a_restart_it_is_in_a_frame_of_its_own_and_says_so() -> None:
@@ -246,14 +246,14 @@ def test_each_map_at_a_guessed_pose_has_a_frame_of_its_own_and_counts_as_a_resta
     result = run_nodes([spec(Mapping, "est")], inputs=[vehicle(), seen, *frames], duration=1.0)
     estimates = result.of(PoseEstimate)
     expected = ["map", "map", "odom_1", "map", "odom_1", "odom_2"]
-    assert [each.frame_id for each in estimates] == expected
+    assert [estimate.frame_id for estimate in estimates] == expected
     changes = [3, 4, 5, 6]
-    assert [each.stamp for each in result.of(TrackingLost)] == changes
-    assert [each.stamp for each in result.of(TrackingRegained)] == changes
+    assert [event.stamp for event in result.of(TrackingLost)] == changes
+    assert [event.stamp for event in result.of(TrackingRegained)] == changes
     record = EstimatorRecord()
-    assert [record.add(each, None) for each in estimates] == [f == "map" for f in expected]
+    assert [record.add(estimate, None) for estimate in estimates] == [f == "map" for f in expected]
     assert record.restarts == 3
-    assert [each.frame_id for each in result.of(TrajectoryEstimate)] == ["odom_1"]
+    assert [trajectory.frame_id for trajectory in result.of(TrajectoryEstimate)] == ["odom_1"]
 
 
 def test_a_frame_of_before_a_restart_is_no_frame_of_another_map() -> None:
@@ -269,15 +269,15 @@ def test_a_frame_of_before_a_restart_is_no_frame_of_another_map() -> None:
         inputs=[vehicle(), camera("drone/front", "rgb", "depth"), *frames],
         duration=1.0,
     )
-    assert [each.frame_id for each in result.of(PoseEstimate)] == ["map", "odom_1", "odom_2"]
+    assert [e.frame_id for e in result.of(PoseEstimate)] == ["map", "odom_1", "odom_2"]
 
 
 def pose(change: tuple[Any, Any] | None = None, factor: float = 1.0) -> Any:
-    found = np.eye(4)
-    found[:3, :3] *= factor
+    matrix = np.eye(4)
+    matrix[:3, :3] *= factor
     if change is not None:
-        found[change[0]] = change[1]
-    return found
+        matrix[change[0]] = change[1]
+    return matrix
 
 
 class Giving(Scripted):
@@ -320,10 +320,10 @@ NOT_FINITE = TrackingResult(pose(((0, 3), math.nan)))
 )
 def test_what_is_no_pose_is_said_in_a_line(bad: Any, says: str) -> None:
     try:
-        found = check_result(bad)
+        message = check_result(bad)
     except ValueError as error:
-        found = str(error)
-    assert re.fullmatch(re.escape(says).replace(r"\*", ".*"), found), found
+        message = str(error)
+    assert re.fullmatch(re.escape(says).replace(r"\*", ".*"), message), message
 
 
 @pytest.mark.parametrize(
@@ -342,7 +342,7 @@ def test_what_is_no_pose_ends_the_run_with_its_time(bad: Any, says: str) -> None
 
 def test_a_pose_that_is_not_finite_may_count_as_lost() -> None:
     result = giving(NOT_FINITE, not_finite="lost")
-    assert [each.stamp // MS for each in result.of(PoseEstimate)] == [1, 3]
+    assert [estimate.stamp // MS for estimate in result.of(PoseEstimate)] == [1, 3]
     (lost,) = result.of(TrackingLost)
     assert (lost.stamp, lost.reason) == (2 * MS, "pose: expected finite numbers, found nan")
 
@@ -450,6 +450,6 @@ def test_estimates_are_on_the_clock_of_the_imu() -> None:
     """The announced offset of the camera's clock is taken off; features keep the image's stamp."""
     seen = camera("drone/front", "rgb", "depth", time_offset=0.03)
     result = track(vehicle(), seen, *rgbd(100 * MS), *rgbd(200 * MS, dark=True))
-    assert [each.stamp for each in result.of(PoseEstimate)] == [70 * MS]
-    assert [each.stamp for each in result.of(TrackingLost)] == [170 * MS]
-    assert [each.stamp for each in result.of(TrackedFeatures)] == [100 * MS, 200 * MS]
+    assert [estimate.stamp for estimate in result.of(PoseEstimate)] == [70 * MS]
+    assert [event.stamp for event in result.of(TrackingLost)] == [170 * MS]
+    assert [features.stamp for features in result.of(TrackedFeatures)] == [100 * MS, 200 * MS]

@@ -172,8 +172,8 @@ class Batches(InRun):
 
 
 def test_results_keep_their_order() -> None:
-    found = track(Batches, 0.05, [0, 100, 200, 300])
-    assert found == [(100, 150, 1), (0, 150, 2), (300, 350, 3), (200, 350, 4)]
+    results = track(Batches, 0.05, [0, 100, 200, 300])
+    assert results == [(100, 150, 1), (0, 150, 2), (300, 350, 3), (200, 350, 4)]
 
 
 class OfScans(Estimator):

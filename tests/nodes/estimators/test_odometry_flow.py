@@ -17,9 +17,11 @@ def test_corners_are_followed_to_where_the_floor_has_moved() -> None:
     corners = new_corners(HERE, np.empty((0, 2)), 60)
     corners = corners[corners[:, 0] > 40]
     for guess, levels in ((corners, 3), (corners + np.array([SHIFT + 2, 1.0]), 1)):
-        found, good = follow_both_ways(HERE, THERE, corners, guess, 15, levels)
+        followed, good = follow_both_ways(HERE, THERE, corners, guess, 15, levels)
         assert good.mean() > 0.9
-        np.testing.assert_allclose(found[good] - corners[good], [[SHIFT, 0]] * good.sum(), atol=0.2)
+        np.testing.assert_allclose(
+            followed[good] - corners[good], [[SHIFT, 0]] * good.sum(), atol=0.2
+        )
 
 
 def test_a_corner_that_does_not_come_back_is_not_good() -> None:

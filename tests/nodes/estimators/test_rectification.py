@@ -132,7 +132,7 @@ def test_both_eyes_show_a_point_on_one_row(
     rectified = made(*cameras)
     assert misalignment(*rectified.cameras) < 1e-6
     points = np.random.default_rng(1).uniform((1, -1, -1), (9, 1, 1), (40, 3)) * (1, 4, 3)  # FRD
-    found = []
+    rows = []
     for own, new, eye in zip(cameras, rectified.cameras, rectified.eyes, strict=True):
         optical = [np.linalg.inv(pose_matrix(c.position, c.orientation)) for c in (own, new)]
         own_pixels, pixels = (
@@ -141,9 +141,9 @@ def test_both_eyes_show_a_point_on_one_row(
         )
         in_view = np.isfinite(own_pixels).all(axis=1)
         np.testing.assert_allclose(eye.original(pixels)[in_view], own_pixels[in_view], atol=1e-5)
-        found.append(pixels)
-    np.testing.assert_allclose(found[0][:, 1], found[1][:, 1], atol=1e-6)
-    assert (found[0][:, 0] > found[1][:, 0]).all()
+        rows.append(pixels)
+    np.testing.assert_allclose(rows[0][:, 1], rows[1][:, 1], atol=1e-6)
+    assert (rows[0][:, 0] > rows[1][:, 0]).all()
 
 
 @pytest.mark.parametrize(

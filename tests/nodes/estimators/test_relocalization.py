@@ -32,9 +32,9 @@ def find(there: Floats) -> Floats | None:
 
 @pytest.mark.parametrize("there", [pose(), pose(x=-0.15, yaw=3.0), pose(z=0.4)])
 def test_a_key_frame_is_recognized_from_elsewhere(there: Floats) -> None:
-    found = find(there)
-    assert found is not None
-    np.testing.assert_allclose(np.linalg.inv(found)[:3, 3], there[:3, 3], atol=0.12)
+    pose = find(there)
+    assert pose is not None
+    np.testing.assert_allclose(np.linalg.inv(pose)[:3, 3], there[:3, 3], atol=0.12)
 
 
 def test_what_is_not_in_the_image_is_not_recognized() -> None:
@@ -64,5 +64,5 @@ def test_landmarks_in_one_column_of_pixels_leave_open_what_they_do_not_tell() ->
             pixels[:] = pixels[0]
         matrix = INFO.matrix()
         landmarks = depth * rays(pixels, matrix)
-        found, _ = solve_pose(landmarks, pixels, np.eye(4), matrix, 0.3)
-        assert np.allclose(found, np.eye(4), atol=1e-6)
+        view, _ = solve_pose(landmarks, pixels, np.eye(4), matrix, 0.3)
+        assert np.allclose(view, np.eye(4), atol=1e-6)

@@ -94,19 +94,19 @@ FISHEYE = CameraInfo(
 
 
 @pytest.mark.parametrize(
-    ("info", "found", "inputs"),
+    ("info", "message", "inputs"),
     [
         (BARREL, "plumb_bob with -0.2, 0.05, 0", None),
         (FISHEYE, "equidistant with 0, 0, 0, 0", {"frames": "drone/front"}),
     ],
 )
 def test_a_lens_that_it_cannot_compute_with_is_refused(
-    info: CameraInfo, found: str, inputs: dict[str, str] | None
+    info: CameraInfo, message: str, inputs: dict[str, str] | None
 ) -> None:
     """In a sentence, with what was found and how to help; the file may name the camera or not."""
     seen = camera("drone/front", "rgb", "depth", info=info)
     refused = [spec(PinholeOnly, "est", {"rectify": False}, inputs=inputs)]
-    with pytest.raises(NodeError, match=rf"drone/front: expected images without.*{found}"):
+    with pytest.raises(NodeError, match=rf"drone/front: expected images without.*{message}"):
         run_nodes(refused, inputs=[seen], duration=1.0)
     assert track(vehicle(), seen, *rgbd(1)).of(PoseEstimate)  # others can
 
@@ -156,7 +156,7 @@ def test_a_stereo_rig_and_the_imu_of_its_vehicle_are_chosen() -> None:
         for event in (
             sample(k * MS, "other/imu"),
             sample(k * MS),
-            *(rgbd(k * MS, f"drone/{each}")[0] for each in ("mono", "eye_left", "eye_right")),
+            *(rgbd(k * MS, f"drone/{eye}")[0] for eye in ("mono", "eye_left", "eye_right")),
         )
     ]
     result = run_nodes(
@@ -187,9 +187,9 @@ def test_a_stereo_rig_and_the_imu_of_its_vehicle_are_chosen() -> None:
 )
 def test_what_is_missing_of_a_rig_is_named(announced: list[Event], expected: str) -> None:
     choice = SensorChoice({"grey"}, 2, True, {}, lambda _, __: {})
-    for each in announced:
-        assert isinstance(each, Announcement)
-        choice.announced(each)
+    for announcement in announced:
+        assert isinstance(announcement, Announcement)
+        choice.announced(announcement)
     assert expected in choice.missing()
 
 

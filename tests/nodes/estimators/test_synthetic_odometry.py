@@ -36,7 +36,7 @@ def flight(seconds: float = 1.0) -> list[Odometry]:
 def estimates(seed: int = 0, **config: Any) -> list[tuple[PoseEstimate, Odometry]]:
     truth = {event.stamp: event for event in flight()}
     result = run_node(SyntheticOdometry, inputs=truth.values(), config=config, seed=seed)
-    return [(each, truth[each.stamp]) for each in result.of(PoseEstimate)]
+    return [(estimate, truth[estimate.stamp]) for estimate in result.of(PoseEstimate)]
 
 
 def result(**config: Any) -> NodeResult:
@@ -44,9 +44,9 @@ def result(**config: Any) -> NodeResult:
 
 
 def test_without_errors_it_is_the_truth_at_its_rate() -> None:
-    found = estimates(rate=20, latency="0ms")
-    assert len(found) == 20
-    for said, truth in found:
+    pairs = estimates(rate=20, latency="0ms")
+    assert len(pairs) == 20
+    for said, truth in pairs:
         assert (said.frame_id, said.child_frame_id) == ("map", "base_link")
         np.testing.assert_allclose(said.position, truth.position, atol=1e-12)
         np.testing.assert_allclose(said.orientation, truth.orientation, atol=1e-12)
@@ -99,13 +99,13 @@ def test_its_announcement_says_what_it_is() -> None:
 
 def test_it_sends_a_velocity_if_it_is_told_to() -> None:
     assert all(said.velocity is None for said, _ in estimates())
-    found = estimates(velocity_noise=0.0, heading_drift=10.0)
-    for said, _ in found:
+    pairs = estimates(velocity_noise=0.0, heading_drift=10.0)
+    for said, _ in pairs:
         assert said.velocity is not None
         yaw = yaw_of(said.orientation)
         ahead = (2.0 * math.cos(yaw), 2.0 * math.sin(yaw), 0.0)
         np.testing.assert_allclose(said.velocity, ahead, atol=1e-12)
-    last, truth = found[-1]
+    last, truth = pairs[-1]
     assert yaw_of(last.orientation) != pytest.approx(yaw_of(truth.orientation), abs=0.1)
     noisy = [said.velocity for said, _ in estimates(velocity_noise=0.1)]
-    assert 0.05 < np.std([each[2] for each in noisy if each]) < 0.2
+    assert 0.05 < np.std([velocity[2] for velocity in noisy if velocity]) < 0.2

@@ -50,11 +50,11 @@ def distances(name: str, points: npt.NDArray[Any]) -> Array:
     model, data = world(name)
     rays = all_round(DIRECTIONS)
     flat, geoms, reach = rays.ravel(), np.empty(len(rays), np.int32), np.empty(len(rays))
-    found = np.empty(len(points))
+    ranges = np.empty(len(points))
     for row, point in enumerate(np.asarray(points, np.float64) * (1.0, -1.0, -1.0)):
         mujoco.mj_multiRay(
             model, data, point, flat, LOOKS, True, -1, geoms, reach, None, len(rays), 1e6
         )
         hits = reach[reach >= 0.0]
-        found[row] = hits.min() if len(hits) else math.inf
-    return found
+        ranges[row] = hits.min() if len(hits) else math.inf
+    return ranges

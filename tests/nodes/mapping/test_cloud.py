@@ -180,7 +180,7 @@ def test_a_cloud_comes_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cloud.points, POINTS)
     np.testing.assert_array_equal(cloud.colors, COLOURS)
     assert cloud.total == 3
-    assert [each.name for each in path.parent.iterdir()] == ["a.ply"]
+    assert [file.name for file in path.parent.iterdir()] == ["a.ply"]
 
 
 def test_the_name_of_a_frame_stays_in_its_line(tmp_path: Path) -> None:

@@ -174,13 +174,13 @@ def test_one_camera_is_chosen_and_grey_will_do() -> None:
         camera("drone/front"),
     ]
     frames = [*exposure(0, 0.0, "drone/grey", grey=True), *exposure(0, 5.0)]
-    found = []
+    clouds = []
     for inputs in ({}, {"frames": "drone/front"}):
         node = spec(Mapping, "m", inputs=inputs)
         result = run_nodes([node], inputs=[*cameras, *frames], duration=0.5)
-        found += result.of(PointCloud)
-    assert [planes(cloud) for cloud in found] == [[2.0], [7.0]]
-    assert (found[0].colors[:, 0] == found[0].colors[:, 2]).all()
+        clouds += result.of(PointCloud)
+    assert [planes(cloud) for cloud in clouds] == [[2.0], [7.0]]
+    assert (clouds[0].colors[:, 0] == clouds[0].colors[:, 2]).all()
 
 
 @pytest.mark.usefixtures("in_process")

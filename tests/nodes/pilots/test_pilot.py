@@ -222,7 +222,7 @@ class Oracle(Node[OracleConfig]):
         anew = self.config.anew[0] < seconds < self.config.anew[1]
         if anew:
             self._begin = getattr(self, "_begin", event.position)
-            dx, dy, dz = (-each for each in self._begin)
+            dx, dy, dz = (-coordinate for coordinate in self._begin)
         self.estimates.send(
             PoseEstimate(
                 stamp=event.stamp,

@@ -71,10 +71,10 @@ def test_what_is_written_is_read(
     with TemporaryDirectory() as folder:
         path = Path(folder) / "file"
         write(path, trajectory)
-        found = read(path, trajectory.stamps)
-    assert (found.stamps == trajectory.stamps).all()
-    assert abs(found.positions - trajectory.positions).max() <= 0.6e-9
-    assert angle(found, trajectory) < 1e-9
+        back = read(path, trajectory.stamps)
+    assert (back.stamps == trajectory.stamps).all()
+    assert abs(back.positions - trajectory.positions).max() <= 0.6e-9
+    assert angle(back, trajectory) < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -90,20 +90,20 @@ def test_evo_reads_it_as_it_is(
 ) -> None:
     path = walk(50, start=1_403_636_579_758_555_392)
     write(tmp_path / "file", path)
-    found, expected = read(str(tmp_path / "file")), as_evo(path)
-    assert found.check()[0], found.check()
-    assert found.positions_xyz == pytest.approx(expected.positions_xyz, abs=1e-9)
-    assert np.array(found.poses_se3) == pytest.approx(np.array(expected.poses_se3), abs=1e-9)
-    if hasattr(found, "timestamps"):
-        assert found.timestamps == pytest.approx(expected.timestamps, rel=1e-15)
+    by_evo, expected = read(str(tmp_path / "file")), as_evo(path)
+    assert by_evo.check()[0], by_evo.check()
+    assert by_evo.positions_xyz == pytest.approx(expected.positions_xyz, abs=1e-9)
+    assert np.array(by_evo.poses_se3) == pytest.approx(np.array(expected.poses_se3), abs=1e-9)
+    if hasattr(by_evo, "timestamps"):
+        assert by_evo.timestamps == pytest.approx(expected.timestamps, rel=1e-15)
 
 
 def test_evos_own_tum_file_is_read(tmp_path: Path) -> None:
     path = walk(20, start=123_456_789)
     file_interface.write_tum_trajectory_file(str(tmp_path / "t"), as_evo(path))
-    found = read_tum(tmp_path / "t")
-    assert abs(found.stamps - path.stamps).max() <= 1  # theirs are floats
-    assert found.positions == pytest.approx(path.positions)
+    back = read_tum(tmp_path / "t")
+    assert abs(back.stamps - path.stamps).max() <= 1  # theirs are floats
+    assert back.positions == pytest.approx(path.positions)
 
 
 def test_a_tum_file_has_exact_stamps_and_comments(tmp_path: Path) -> None:

@@ -24,13 +24,13 @@ ONE = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
 
 def test_arrays_are_copied_checked_and_read_only() -> None:
     stamps, positions = np.array([0, 1, 2]), np.zeros((3, 3))
-    found = Trajectory(stamps, positions, ONE)
+    trajectory = Trajectory(stamps, positions, ONE)
     positions[0] = 9.0
     stamps[0] = -9
-    assert found.positions[0].tolist() == [0.0, 0.0, 0.0]
-    assert found.stamps.dtype == np.int64
-    assert found.stamps[0] == 0
-    for array in (found.stamps, found.positions, found.orientations):
+    assert trajectory.positions[0].tolist() == [0.0, 0.0, 0.0]
+    assert trajectory.stamps.dtype == np.int64
+    assert trajectory.stamps[0] == 0
+    for array in (trajectory.stamps, trajectory.positions, trajectory.orientations):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
 
@@ -60,8 +60,8 @@ def test_what_is_no_trajectory_is_refused(
 
 def test_quaternions_of_few_decimals_are_made_unit() -> None:
     rough = np.round(walk(50).orientations, 4)
-    found = Trajectory(np.arange(50), np.zeros((50, 3)), rough)
-    assert np.linalg.norm(found.orientations, axis=1) == pytest.approx(1.0, abs=1e-15)
+    trajectory = Trajectory(np.arange(50), np.zeros((50, 3)), rough)
+    assert np.linalg.norm(trajectory.orientations, axis=1) == pytest.approx(1.0, abs=1e-15)
 
 
 def test_unit_quaternions_keep_their_bits() -> None:
@@ -117,9 +117,9 @@ def test_poses_between_poses_are_evos(seed: int, data: st.DataObject) -> None:
 
 def test_a_stamp_that_there_is_gives_that_very_row() -> None:
     path = walk(50)
-    found = path.at(path.stamps[[0, 7, 8, 49]])
-    assert (found.positions == path.positions[[0, 7, 8, 49]]).all()
-    assert (found.orientations == path.orientations[[0, 7, 8, 49]]).all()
+    rows = path.at(path.stamps[[0, 7, 8, 49]])
+    assert (rows.positions == path.positions[[0, 7, 8, 49]]).all()
+    assert (rows.orientations == path.orientations[[0, 7, 8, 49]]).all()
     assert walk(1).at(np.array([0])).stamps.tolist() == [0]
 
 
@@ -127,8 +127,8 @@ def test_interpolation_takes_the_shorter_arc_whatever_the_signs_of_the_quaternio
     turn = Rotation.from_rotvec([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]]).as_quat(scalar_first=True)
     turn[1] *= -1.0
     path = Trajectory(np.array([0, 100]), np.zeros((2, 3)), turn)
-    found = path.at(np.array([50])).rotations().as_euler("zyx", degrees=True)
-    assert found[0] == pytest.approx([45.0, 0.0, 0.0])
+    angles = path.at(np.array([50])).rotations().as_euler("zyx", degrees=True)
+    assert angles[0] == pytest.approx([45.0, 0.0, 0.0])
 
 
 def test_late_stamps_are_told_apart_to_the_nanosecond() -> None:
@@ -158,10 +158,10 @@ def test_rows_come_in_any_order_and_the_last_word_on_a_stamp_holds() -> None:
     rows = PoseRows()
     for stamp, x in ((10, 1.0), (0, 0.0), (20, 9.0), (20, 2.0)):
         rows.add(stamp, (x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    found = rows.trajectory()
-    assert found.stamps.tolist() == [0, 10, 20]
-    assert found.positions[:, 0].tolist() == [0.0, 1.0, 2.0]
-    assert found.seconds == 2e-8
+    trajectory = rows.trajectory()
+    assert trajectory.stamps.tolist() == [0, 10, 20]
+    assert trajectory.positions[:, 0].tolist() == [0.0, 1.0, 2.0]
+    assert trajectory.seconds == 2e-8
 
 
 def test_no_rows_are_no_trajectory() -> None:
@@ -203,14 +203,14 @@ def test_poses_between_two_are_those_of_a_trajectory(stamp: int) -> None:
         position, orientation = truth.positions[row].tolist(), truth.orientations[row].tolist()
         recent.add(int(truth.stamps[row]), tuple(position), tuple(orientation))
     first, last = int(truth.stamps[0]), int(truth.stamps[-1])
-    found = recent.at(stamp)
+    pose = recent.at(stamp)
     if not first <= stamp <= last:
-        assert found is None
+        assert pose is None
         return
-    assert found is not None
+    assert pose is not None
     expected = truth.at(np.array([stamp]))
-    turn = Rotation.from_quat(found[1], scalar_first=True).inv() * expected.rotations()[0]
-    assert found[0] == pytest.approx(expected.positions[0], abs=1e-12)
+    turn = Rotation.from_quat(pose[1], scalar_first=True).inv() * expected.rotations()[0]
+    assert pose[0] == pytest.approx(expected.positions[0], abs=1e-12)
     assert turn.magnitude() < 1e-9
 
 

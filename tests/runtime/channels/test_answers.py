@@ -11,7 +11,7 @@ from runtime.errors import ConfigError
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
+    ("text", "message"),
     [
         ("", "columns stamp_ns,outcome,latency_ms"),
         ("stamp_ns,outcome,latency_ms\n1,answered,-4\n", "line 2: expected a latency ≥ 0"),
@@ -20,10 +20,10 @@ from runtime.errors import ConfigError
         ("stamp_ns,outcome,latency_ms\n1,2\n", "line 2"),
     ],
 )
-def test_a_wrong_file_is_refused(tmp_path: Path, text: str, found: str) -> None:
+def test_a_wrong_file_is_refused(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "slam.csv"
     file.write_text(text)
-    with pytest.raises(ConfigError, match=found):
+    with pytest.raises(ConfigError, match=message):
         read_latencies(file)
 
 

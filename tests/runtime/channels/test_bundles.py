@@ -42,7 +42,7 @@ class Three(NamedTuple):
     c: tuple[C, ...]
 
 
-class Found(Event):
+class Matched(Event):
     """What the reader got, as stamps."""
 
     stamps: tuple[Any, ...]
@@ -56,12 +56,12 @@ class Reader(Node):
     """Tells what it reads."""
 
     sets = Bundle(Two)
-    found = Output(Found)
+    matched = Output(Matched)
 
     async def run(self) -> None:
-        async for each in self.sets:
-            parts = tuple(stamps(part) for part in each)
-            self.found.send(Found(stamp=self.clock.now(), source=self.name, stamps=parts))
+        async for bundle in self.sets:
+            parts = tuple(stamps(part) for part in bundle)
+            self.matched.send(Matched(stamp=self.clock.now(), source=self.name, stamps=parts))
 
 
 class Loose(Reader):
@@ -95,60 +95,60 @@ def read(node: type[Node], *events: list[Event], **options: Any) -> NodeResult:
     return run_nodes([spec(node, "n", **options)], inputs=script, duration=1.0)
 
 
-def found(result: NodeResult) -> list[Any]:
-    return [each.stamps for each in result.of(Found)]
+def matched_stamps(result: NodeResult) -> list[Any]:
+    return [event.stamps for event in result.of(Matched)]
 
 
 def test_what_is_of_one_stamp_comes_together_whoever_comes_first() -> None:
     result = run_nodes(
         [spec(Reader, "n")], inputs=at(A, 1) + at(B, 1) + at(B, 2) + at(A, 2), duration=0.1
     )
-    assert found(result) == [(1 * MS, 1 * MS), (2 * MS, 2 * MS)]
+    assert matched_stamps(result) == [(1 * MS, 1 * MS), (2 * MS, 2 * MS)]
 
 
 def test_a_set_that_lacks_something_is_left_out_and_counted() -> None:
     result = read(Reader, at(A, 1, 2, 3), at(B, 1, 3))
-    assert found(result) == [(1 * MS, 1 * MS), (3 * MS, 3 * MS)]
+    assert matched_stamps(result) == [(1 * MS, 1 * MS), (3 * MS, 3 * MS)]
     assert result.drops["n.sets"].missed == {"b": 1}
 
 
 def test_without_tolerance_near_is_not_enough() -> None:
     result = read(Reader, at(A, 1, 5), at(B, 2, 5))
-    assert found(result) == [(5 * MS, 5 * MS)]
+    assert matched_stamps(result) == [(5 * MS, 5 * MS)]
 
 
 def test_with_tolerance_the_nearest_is_taken() -> None:
     result = read(Loose, at(A, 10, 20, 30), at(B, 8, 11, 21, 27, 34))
-    assert found(result) == [(10 * MS, 11 * MS), (20 * MS, 21 * MS), (30 * MS, 27 * MS)]
+    assert matched_stamps(result) == [(10 * MS, 11 * MS), (20 * MS, 21 * MS), (30 * MS, 27 * MS)]
 
 
 def test_beyond_the_tolerance_nothing_is_taken() -> None:
     result = read(Loose, at(A, 10, 20), at(B, 14, 20))
-    assert found(result) == [(20 * MS, 20 * MS)]
+    assert matched_stamps(result) == [(20 * MS, 20 * MS)]
     assert result.drops["n.sets"].missed == {"b": 1}
 
 
 def test_a_tuple_gathers_all_since_the_set_before_up_to_the_stamp() -> None:
     result = read(Rich, at(A, 10, 20), at(C, 2, 6, 10, 14, 18, 22))
-    ms = [(a // MS, b, tuple(c // MS for c in cs)) for a, b, cs in found(result)]
+    ms = [(a // MS, b, tuple(c // MS for c in cs)) for a, b, cs in matched_stamps(result)]
     assert ms == [(10, None, (2, 6, 10)), (20, None, (14, 18))]
 
 
 def test_what_comes_twice_or_late_makes_no_set_and_is_counted() -> None:
-    sent = [each for ms in (10, 10, 20, 15, 30) for each in (*at(A, ms), *at(B, ms))]
+    sent = [event for ms in (10, 10, 20, 15, 30) for event in (*at(A, ms), *at(B, ms))]
     result = run_nodes([spec(Reader, "n")], inputs=sent)
-    assert found(result) == [(ms * MS, ms * MS) for ms in (10, 20, 30)]
+    assert matched_stamps(result) == [(ms * MS, ms * MS) for ms in (10, 20, 30)]
     assert result.drops["n.sets"].missed == {"a": 2}
 
 
 def test_what_may_be_missing_is_taken_if_it_is_there() -> None:
     result = read(Rich, at(A, 10, 20), at(B, 10), at(C, 10, 20))
-    assert [b for _, b, _ in found(result)] == [10 * MS, None]
+    assert [b for _, b, _ in matched_stamps(result)] == [10 * MS, None]
 
 
 def test_a_reader_of_the_latest_skips_sets_and_counts_them() -> None:
     result = read(Newest, at(A, 1, 2, 3), at(B, 1, 2, 3))
-    assert found(result) == [(3 * MS, 3 * MS)]
+    assert matched_stamps(result) == [(3 * MS, 3 * MS)]
     assert result.drops["n.sets"].dropped == 2
 
 
@@ -167,15 +167,15 @@ def test_of_a_source_and_one_below_it_the_upper_counts() -> None:
     got = []
     while matcher.statistics().buffered:
         got.append(matcher.receive_nowait())
-    assert [each.a.stamp for each in got] == [1 * MS, 2 * MS, 3 * MS]
-    assert {each.a.source for each in got[1:]} == {"x"}
+    assert [bundle.a.stamp for bundle in got] == [1 * MS, 2 * MS, 3 * MS]
+    assert {bundle.a.source for bundle in got[1:]} == {"x"}
 
 
 def test_the_file_narrows_a_bundle_and_its_fields() -> None:
     twice = at(A, 1), at(B, 1, 9), at(A, 2, source="y"), at(B, 2, source="y")
-    assert found(read(Reader, *twice, inputs={"sets": "y"})) == [(2 * MS, 2 * MS)]
+    assert matched_stamps(read(Reader, *twice, inputs={"sets": "y"})) == [(2 * MS, 2 * MS)]
     mixed = {"sets": "y", "sets.b": "x"}
-    assert found(read(Loose, *twice, inputs=mixed)) == [(2 * MS, 1 * MS)]
+    assert matched_stamps(read(Loose, *twice, inputs=mixed)) == [(2 * MS, 1 * MS)]
 
 
 def test_events_without_partners_do_not_pile_up() -> None:
@@ -201,8 +201,8 @@ def test_each_common_stamp_gives_one_set_however_the_two_are_interleaved(
     got = []
     while matcher.statistics().buffered:
         got.append(matcher.receive_nowait())
-    assert [each.a.stamp for each in got] == sorted(a & b)
-    assert all(each.a.stamp == each.b.stamp for each in got)
+    assert [bundle.a.stamp for bundle in got] == sorted(a & b)
+    assert all(bundle.a.stamp == bundle.b.stamp for bundle in got)
 
 
 class Wrong(NamedTuple):
@@ -241,7 +241,7 @@ def test_an_input_of_the_same_node_is_served_as_before() -> None:
     class Both(Reader):
         plain = Input(A)
 
-    assert found(read(Both, at(A, 1), at(B, 1))) == [(1 * MS, 1 * MS)]
+    assert matched_stamps(read(Both, at(A, 1), at(B, 1))) == [(1 * MS, 1 * MS)]
 
 
 def test_the_file_cannot_name_a_field_that_there_is_not() -> None:
@@ -271,7 +271,7 @@ class Strict(Reader):
 
 
 def gathered(result: NodeResult) -> list[tuple[int, ...]]:
-    return [tuple(c // MS for c in cs) for _, _, cs in found(result)]
+    return [tuple(c // MS for c in cs) for _, _, cs in matched_stamps(result)]
 
 
 def test_a_set_that_does_not_come_about_leaves_its_tuples_to_the_next() -> None:
@@ -295,7 +295,7 @@ def test_each_event_of_a_tuple_is_read_once_whatever_is_lost_or_skipped(
 ) -> None:
     matcher: Matcher[Four] = Bundle(Four, bound=2, overflow="drop_oldest").make("n")
     stamps_of = {"a": a, "b": b, "c": c}
-    events = sorted((stamp, kind) for kind, each in stamps_of.items() for stamp in each)
+    events = sorted((stamp, kind) for kind, numbers in stamps_of.items() for stamp in numbers)
     kinds: dict[str, type[Event]] = {"a": A, "b": B, "c": C}
     got: list[Four] = []
     for stamp, kind in events:
@@ -304,8 +304,8 @@ def test_each_event_of_a_tuple_is_read_once_whatever_is_lost_or_skipped(
             got.append(matcher.receive_nowait())
     while matcher.statistics().buffered:
         got.append(matcher.receive_nowait())
-    read_ = [each.stamp for every in got for each in every.c]
-    last = max((each.a.stamp for each in got), default=0)
+    read_ = [event.stamp for every in got for event in every.c]
+    last = max((bundle.a.stamp for bundle in got), default=0)
     assert read_ == sorted(stamp for stamp in c if stamp <= last)
 
 

@@ -135,13 +135,13 @@ import numpy as np
 from tests.runtime.channels.test_digest import digest, measured, said
 print(digest(said("x"), measured(np.arange(5), {"a", "b", "c", "d", "e"})))
 """
-    found = {
+    digests = {
         subprocess.run(
             [sys.executable, "-c", code], check=True, capture_output=True, text=True
         ).stdout
         for _ in range(2)
     }
-    assert found == {digest(said("x"), measured(np.arange(5), set("abcde"))) + "\n"}
+    assert digests == {digest(said("x"), measured(np.arange(5), set("abcde"))) + "\n"}
 
 
 def test_many_small_events_and_one_large_are_taken_in_alike() -> None:

@@ -43,11 +43,11 @@ class Numpy(Node):
 
 
 def test_numbers_and_arrays_of_numpy_are_written_as_numbers_and_lists(tmp_path: Path) -> None:
-    found = run(tmp_path, Numpy)
+    summary = run(tmp_path, Numpy)
     written = json.loads((tmp_path / "summary.json").read_text())
     expected = {"passed": True, "rmse": 0.5, "count": 3, "all": [0, 1, 2], "at": {"1": 2}}
     assert written["verdict"] == {"passed": True, "estimators": {"vo": expected}, "flights": {}}
-    assert found.announcements[0]["values"] == [[1.0, 0.0], [0.0, 1.0]]
+    assert summary.announcements[0]["values"] == [[1.0, 0.0], [0.0, 1.0]]
 
 
 @pytest.mark.slow
@@ -144,9 +144,9 @@ def test_what_links_lost_before_a_restart_is_counted(tmp_path: Path) -> None:
     link = LinkConfig(loss=1.0)
     weak = spec(Weak, "weak", on_error="restart", links={"pings": {"loss": 1.0}})
     assert weak.links["pings"] == link
-    found = run(tmp_path, Speaker, weak, seconds=6.0)
+    summary = run(tmp_path, Speaker, weak, seconds=6.0)
     # It is there four times for half a second; while it is away, nothing is on its way to it.
-    assert 20 <= found.links["weak.pings"].lost <= 24
+    assert 20 <= summary.links["weak.pings"].lost <= 24
 
 
 @pytest.mark.slow
@@ -155,9 +155,9 @@ def test_a_run_in_real_time_takes_as_long_on_both_clocks(tmp_path: Path) -> None
         async def on_shutdown(self) -> None:
             await self.clock.sleep(0.4)
 
-    found = run(tmp_path, Speaker, Lingering, clock="real", seconds=0.3)
-    assert found.sim_seconds == pytest.approx(found.wall_seconds, abs=0.05)
-    assert found.outputs["speaker.pings"] / found.sim_seconds == pytest.approx(10.0, rel=0.5)
+    summary = run(tmp_path, Speaker, Lingering, clock="real", seconds=0.3)
+    assert summary.sim_seconds == pytest.approx(summary.wall_seconds, abs=0.05)
+    assert summary.outputs["speaker.pings"] / summary.sim_seconds == pytest.approx(10.0, rel=0.5)
 
 
 @pytest.mark.parametrize(

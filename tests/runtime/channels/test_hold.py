@@ -107,8 +107,8 @@ class TestDelivery:
             dice = random.Random(seed + number)
             if number % 2:
                 dice.shuffle(later)
-                for each in [*later, *later[: dice.randrange(3)]]:
-                    hold.answer(each * PERIOD + dice.randrange(-900, 900), str(each))
+                for frame in [*later, *later[: dice.randrange(3)]]:
+                    hold.answer(frame * PERIOD + dice.randrange(-900, 900), str(frame))
                 later.clear()
 
         came, hold = fly(act, frames=len(numbers))
@@ -244,7 +244,7 @@ class TestMissing:
                 wall.seconds += 9.0
                 hold.look()
                 hold.answer(n * PERIOD, str(n))
-            assert [await each for each in owed] == ["0", "1", "2", "3", "4"]
+            assert [await future for future in owed] == ["0", "1", "2", "3", "4"]
             hold.close()
 
         run_async(main())
@@ -280,17 +280,17 @@ class TestGone:
         async def main() -> list[str | None]:
             loop = asyncio.get_running_loop()
             hold = hold_in(loop, wall, 0.01, on_missing=policy)
-            found = []
+            answers = []
             for number in range(6):
                 owed = hold.owe(number * PERIOD)
                 if number == 0:
                     answer_all(hold, wall, number)
                 act(hold, wall, number)
-                found.append(await owed)
+                answers.append(await owed)
             assert hold.answers.counts == {"answered": 3, "lost": 3}
             assert "when it came back was up to real time" in hold.answers.why_not
             hold.close()
-            return found
+            return answers
 
         assert run_in_lockstep(main()) == ["0", None, None, None, "4", "5"]
 
@@ -462,12 +462,12 @@ class TestSums:
             hold.close()
             return hold
 
-        found = OutsideSummary.of(run_in_lockstep(main()).answers)
-        parts = (found.answered, found.empty, found.initialising, found.skipped, found.lost)
-        assert found.sent == sum(parts) + found.open
-        assert min(*parts, found.open) >= 0
-        assert found.says_lost <= found.answered + found.empty
-        shown = dict(zip(OUTSIDE_COLUMNS, found.row(), strict=True))
+        counts = OutsideSummary.of(run_in_lockstep(main()).answers)
+        parts = (counts.answered, counts.empty, counts.initialising, counts.skipped, counts.lost)
+        assert counts.sent == sum(parts) + counts.open
+        assert min(*parts, counts.open) >= 0
+        assert counts.says_lost <= counts.answered + counts.empty
+        shown = dict(zip(OUTSIDE_COLUMNS, counts.row(), strict=True))
         columns = ("answered", "empty", "initialising", "skipped", "no answer", "open")
         assert int(shown["sent"]) == sum(int(shown[column]) for column in columns)
 
@@ -495,7 +495,7 @@ class TestTwoAnswers:
         assert {value for _, value in came} == {"0"}
         kind = "contradicting" if why else "repeated"
         assert hold.answers.counts == {"answered": 5, kind: 5}
-        assert [each.partition(",")[0] for each in hold.answers.why_not] == why
+        assert [reason.partition(",")[0] for reason in hold.answers.why_not] == why
         assert OutsideSummary.of(hold.answers).reproducible is not bool(why)
 
     def test_one_that_says_that_no_more_is_to_come_contradicts_nothing(self) -> None:

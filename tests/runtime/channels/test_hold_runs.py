@@ -86,17 +86,17 @@ def test_a_run_has_the_same_digest_whatever_its_answers_take(tmp_path: Path) -> 
     slow = run(tmp_path / "slow", pause=0.02)
     assert quick.digest == slow.digest
     assert quick.not_deterministic == []
-    found, other = quick.outside["slam"], slow.outside["slam"]
-    assert (found.sent, found.received, found.answered, found.lost, found.open) == (
+    summary, other = quick.outside["slam"], slow.outside["slam"]
+    assert (summary.sent, summary.received, summary.answered, summary.lost, summary.open) == (
         10,
         10,
         10,
         0,
         0,
     )
-    assert found.latency_ms == 30.0
-    assert found.reproducible
-    assert found.inputs == other.inputs
+    assert summary.latency_ms == 30.0
+    assert summary.reproducible
+    assert summary.inputs == other.inputs
     assert other.wall_p50_ms is not None
     assert other.wall_p50_ms >= 20.0
 
@@ -122,24 +122,24 @@ def test_what_became_of_each_frame_stands_in_a_file_that_can_be_replayed(tmp_pat
 def test_a_missing_answer_ends_the_run_by_name(tmp_path: Path) -> None:
     with pytest.raises(VisnavError, match=r"outside: .*the frame of 0\.400000 s within 0\.2 s"):
         run(tmp_path, silent=(4,), hold={"max_wait": "200ms"})
-    found = msgspec.json.decode((tmp_path / "summary.json").read_bytes(), type=Summary)
-    assert found.outside["slam"].answered == 4
+    summary = msgspec.json.decode((tmp_path / "summary.json").read_bytes(), type=Summary)
+    assert summary.outside["slam"].answered == 4
 
 
 @pytest.mark.parametrize(("allowed", "passed"), [(0, False), (1, None)])
 def test_a_lost_frame_is_in_the_verdict(tmp_path: Path, allowed: int, passed: bool | None) -> None:
     hold = {"max_wait": "200ms", "on_missing": "lost", "lost_allowed": allowed}
-    found = run(tmp_path, silent=(4,), hold=hold)
-    assert (found.outside["slam"].answered, found.outside["slam"].lost) == (9, 1)
-    assert found.not_deterministic == ["slam"]
+    summary = run(tmp_path, silent=(4,), hold=hold)
+    assert (summary.outside["slam"].answered, summary.outside["slam"].lost) == (9, 1)
+    assert summary.not_deterministic == ["slam"]
     if passed is None:
-        assert found.verdict is None
+        assert summary.verdict is None
     else:
-        assert found.verdict is not None
-        assert found.verdict.passed is passed
-        (failed,) = found.verdict.estimators["slam (answers)"]["failed"]
+        assert summary.verdict is not None
+        assert summary.verdict.passed is passed
+        (failed,) = summary.verdict.estimators["slam (answers)"]["failed"]
         assert failed == "lost_frames: expected at most 0, found 1"
-    titles = [str(table.title) for table in run_tables(found)]
+    titles = [str(table.title) for table in run_tables(summary)]
     assert "systems outside the process: frames" in titles
 
 
@@ -149,18 +149,18 @@ def test_a_system_that_ends_is_an_error_at_once(tmp_path: Path) -> None:
 
 
 def test_a_restarted_one_goes_on_with_the_counts_of_the_first(tmp_path: Path) -> None:
-    found = run(tmp_path, "restart", dies_at=2)
-    counts = found.outside["slam"]
+    summary = run(tmp_path, "restart", dies_at=2)
+    counts = summary.outside["slam"]
     assert counts.answered >= 2
     assert counts.sent >= counts.answered + 1
 
 
 def test_going_on_without_answers_is_said(tmp_path: Path) -> None:
     hold = {"max_wait": "200ms", "on_missing": "continue"}
-    found = run(tmp_path, silent=(4, 5, 6, 7, 8, 9), hold=hold)
-    counts = found.outside["slam"]
+    summary = run(tmp_path, silent=(4, 5, 6, 7, 8, 9), hold=hold)
+    counts = summary.outside["slam"]
     assert (counts.answered, counts.open, counts.reproducible) == (4, 6, False)
-    assert found.not_deterministic == ["slam"]
+    assert summary.not_deterministic == ["slam"]
 
 
 class Absent(Node):
@@ -182,8 +182,8 @@ class Careful(Node):
 
     async def on_shutdown(self) -> None:
         assert self.out is not None
-        found = await self.offload(sum, (1, 2))
-        await asyncio.to_thread((self.out / f"results_{found}.csv").touch)
+        total = await self.offload(sum, (1, 2))
+        await asyncio.to_thread((self.out / f"results_{total}.csv").touch)
 
 
 def test_nobody_waits_at_the_end_for_what_does_not_come(tmp_path: Path) -> None:

@@ -57,8 +57,8 @@ class Bundled(Ear):
     sets = Bundle(Single)
 
     async def run(self) -> None:
-        async for each in self.sets:
-            self.tell(each.said)
+        async for bundle in self.sets:
+            self.tell(bundle.said)
 
 
 EVENTS = [Said(stamp=ms * MS, source="x") for ms in range(0, 1000, 5)]

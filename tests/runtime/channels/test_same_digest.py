@@ -70,8 +70,10 @@ def test_equal_runs_have_equal_digests(tmp_path: Path, runs: int) -> None:
     file = tmp_path / "all.toml"
     file.write_text(FILE.format(samples="tests.runtime.samples_everything"), encoding="utf-8")
     with ThreadPoolExecutor(4) as several:  # at a time, so that each has a busy machine
-        found = list(several.map(lambda seed: digest(file, seed), seeds))
-    assert {each for each, _ in found} == {found[0][0]}, list(zip(seeds, found, strict=True))
-    sent = found[0][1]
+        digests = list(several.map(lambda seed: digest(file, seed), seeds))
+    assert {value for value, _ in digests} == {digests[0][0]}, list(
+        zip(seeds, digests, strict=True)
+    )
+    sent = digests[0][1]
     assert sent["crowd.words"] == 36  # all have spoken
     assert min(sent[name] for name in ("talker.words", "doubler.words", "listener.words")) > 20

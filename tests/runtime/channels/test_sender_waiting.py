@@ -29,11 +29,11 @@ async def send_all(sender: Sender[Shouted], texts: str) -> None:
 
 
 async def read(stream: Stream[Said], count: int) -> str:
-    found = ""
+    text = ""
     for _ in range(count):
-        found += (await stream.receive()).text
+        text += (await stream.receive()).text
         await asyncio.sleep(0)
-    return found
+    return text
 
 
 def test_a_sender_waits_for_room_and_keeps_its_order(run: Run) -> None:

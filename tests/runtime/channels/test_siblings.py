@@ -21,7 +21,9 @@ class Counter(Node[CountConfig]):
     """Adds its name to what all of its class share."""
 
     async def on_startup(self) -> None:
-        known = [(each.name, each.config.count, each.here) for each in self.siblings(Counter)]
+        known = [
+            (sibling.name, sibling.config.count, sibling.here) for sibling in self.siblings(Counter)
+        ]
         together = self.share("names", list[str])
         together.append(self.name)
         FOUND.append((self.name, known, together))
@@ -42,7 +44,7 @@ def test_nodes_know_and_share_before_the_first_of_them_starts(checked: bool) -> 
     else:
         run_nodes(NODES, duration=0.01)
     known = [("a", 1, True), ("b", 2, True)]
-    assert [(name, each) for name, each, _ in FOUND] == [("a", known), ("b", known)]
+    assert [(name, siblings) for name, siblings, _ in FOUND] == [("a", known), ("b", known)]
     (_, _, first), (_, _, second) = FOUND
     assert first is second
     assert first == ["a", "b"]

@@ -35,7 +35,7 @@ class Speaker(Node[NamesConfig]):
     anything = Output(Event)
 
     def announce(self) -> Iterable[Announcement]:
-        return [Announcement(stamp=0, source=each) for each in self.config.announced]
+        return [Announcement(stamp=0, source=source) for source in self.config.announced]
 
     async def run(self) -> None:
         for source in self.config.sources:
@@ -50,14 +50,14 @@ class Speaker(Node[NamesConfig]):
 
 def said(*sources: str, announced: tuple[str, ...] = (), kind: str = "estimate") -> list[str]:
     """Return the sources of what a node ``cheat`` sends beside ``drone`` and ``tracker``."""
-    found = run_nodes(
+    result = run_nodes(
         [
             spec(Speaker, "drone", {"announced": ["drone/imu", "rig"]}),
             spec(Speaker, "tracker"),
             spec(Speaker, "cheat", {"sources": sources, "announced": announced, "kind": kind}),
         ]
     )
-    return [each.source for each in found.sent if not isinstance(each, Announcement)]
+    return [event.source for event in result.sent if not isinstance(event, Announcement)]
 
 
 @pytest.mark.slow
@@ -114,10 +114,10 @@ def test_it_is_noticed_with_and_without_a_digest_after_events_that_were_right(
     clock: str, kind: str
 ) -> None:
     cheat = spec(Speaker, "cheat", {"sources": ["cheat", "cheat", "drone"], "kind": kind})
-    found = supervise([spec(Speaker, "drone"), cheat], clock=clock, duration=0.2)
-    assert found.supervisor.state.run_end is not None
-    assert found.supervisor.state.run_end.by == "cheat"
-    assert "'drone', which is drone's" in str(found.error)
+    outcome = supervise([spec(Speaker, "drone"), cheat], clock=clock, duration=0.2)
+    assert outcome.supervisor.state.run_end is not None
+    assert outcome.supervisor.state.run_end.by == "cheat"
+    assert "'drone', which is drone's" in str(outcome.error)
 
 
 @pytest.mark.parametrize(
@@ -151,4 +151,4 @@ def test_a_script_of_a_test_may_speak_for_anybody() -> None:
         angular_velocity=(0.0, 0.0, 0.0),
         linear_acceleration=(0.0, 0.0, 0.0),
     )
-    assert [each.source for each in run_nodes(nodes, inputs=[imu]).sent] == ["drone", "y"]
+    assert [event.source for event in run_nodes(nodes, inputs=[imu]).sent] == ["drone", "y"]

@@ -98,14 +98,14 @@ def test_a_group_cancels_its_tasks_in_the_same_order_each_time() -> None:
 
 def test_tasks_that_somebody_else_makes_do_not_change_that_order() -> None:
     def order(lookers: int) -> list[str]:
-        found: list[str] = []
+        names: list[str] = []
 
         async def look() -> None:
             await asyncio.sleep(5.0)
 
         async def own() -> None:
             pending = {asyncio.create_task(look(), name=str(n)) for n in range(12)}
-            found.extend(task.get_name() for task in pending)
+            names.extend(task.get_name() for task in pending)
             await asyncio.wait(pending)
 
         async def main() -> None:
@@ -114,7 +114,7 @@ def test_tasks_that_somebody_else_makes_do_not_change_that_order() -> None:
             await asyncio.wait([*looking, owner])
 
         run_in_lockstep(main())
-        return found
+        return names
 
     assert order(0) == order(1) == order(7)
 

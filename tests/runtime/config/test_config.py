@@ -55,11 +55,11 @@ IN_RUN = [
 ]
 
 
-@pytest.mark.parametrize(("line", "expected", "found"), IN_RUN)
-def test_mistakes_in_the_run(tmp_path: Path, line: str, expected: str, found: str) -> None:
+@pytest.mark.parametrize(("line", "expected", "rest"), IN_RUN)
+def test_mistakes_in_the_run(tmp_path: Path, line: str, expected: str, rest: str) -> None:
     text = message(tmp_path, f"[run]\n{line}\n{SPEAKER}")
     assert text.startswith(f"c.toml: {expected}")
-    assert found in text
+    assert rest in text
 
 
 IN_DRONE = [
@@ -90,11 +90,11 @@ IN_DRONE = [
 ]
 
 
-@pytest.mark.parametrize(("line", "expected", "found"), IN_DRONE)
-def test_mistakes_in_a_node(tmp_path: Path, line: str, expected: str, found: str) -> None:
+@pytest.mark.parametrize(("line", "expected", "rest"), IN_DRONE)
+def test_mistakes_in_a_node(tmp_path: Path, line: str, expected: str, rest: str) -> None:
     text = message(tmp_path, SPEAKER + DRONE + line)
     assert text.startswith(f"c.toml: nodes[1] (drone): {expected}")
-    assert found in text
+    assert rest in text
 
 
 OF_NODES = [
@@ -140,9 +140,9 @@ OF_FILES = [
 
 @pytest.mark.parametrize(("text", "expected"), OF_FILES)
 def test_mistakes_in_the_file(tmp_path: Path, text: str, expected: str) -> None:
-    found = message(tmp_path, text)
-    assert "c.toml: " in found
-    assert expected in found
+    error = message(tmp_path, text)
+    assert "c.toml: " in error
+    assert expected in error
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:

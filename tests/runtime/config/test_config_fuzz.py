@@ -59,14 +59,14 @@ def read(data: bytes) -> None:
         path = Path(folder) / "c.toml"
         path.write_bytes(data)
         try:
-            found = load(path)
+            config = load(path)
         except ConfigError as error:
             message = str(error)
             assert "c.toml" in message
             assert len(message.splitlines()) == 1, message
             assert len(message) < 2000
         else:
-            to_builtins(found)
+            to_builtins(config)
 
 
 FUZZ = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow], deadline=None)

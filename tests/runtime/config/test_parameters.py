@@ -50,15 +50,15 @@ NODES = {"rig": RIG, "other": Rig()}
     ],
 )
 def test_a_change_is_what_the_file_would_say(text: str, values: dict[str, str]) -> None:
-    found = change(NODES, text)
-    assert found.values == values
-    assert found.node == ("rig" if values else "")
+    result = change(NODES, text)
+    assert result.values == values
+    assert result.node == ("rig" if values else "")
 
 
 def test_all_else_stays_and_the_old_settings_too() -> None:
-    found = change(NODES, "rear.loss=0.5").config
-    assert isinstance(found, Rig)
-    assert found.lenses == (RIG.lenses[0], Lens(name="rear", loss=0.5))
+    changed = change(NODES, "rear.loss=0.5").config
+    assert isinstance(changed, Rig)
+    assert changed.lenses == (RIG.lenses[0], Lens(name="rear", loss=0.5))
     assert RIG.lenses[1].loss == 0.0
 
 
@@ -89,10 +89,10 @@ def test_what_cannot_be_is_refused_as_in_the_file(text: str, message: str) -> No
 
 def test_what_can_change_is_listed_with_its_values() -> None:
     assert changeable(Rig) == ["lenses.*.loss", "speed", "wait", "limit", "place"]
-    found = settings(RIG)
-    assert found["lenses.rear.loss"] == "0.0"
-    assert found["speed"] == "1.0"
-    assert "height" not in found
+    values = settings(RIG)
+    assert values["lenses.rear.loss"] == "0.0"
+    assert values["speed"] == "1.0"
+    assert "height" not in values
 
 
 @pytest.mark.parametrize("clock", ["lockstep", "real"])

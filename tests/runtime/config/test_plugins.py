@@ -80,24 +80,24 @@ def folder(tmp_path: Path) -> Path:
 
 def node_classes() -> set[type[Node[Any]]]:
     """Return all classes of `sims` and `nodes` that a file may name."""
-    found = set()
+    classes = set()
     for room in ("sims", "nodes"):
         package = importlib.import_module(room)
-        for each in pkgutil.walk_packages(package.__path__, f"{room}."):
+        for info in pkgutil.walk_packages(package.__path__, f"{room}."):
             try:
-                module = importlib.import_module(each.name)
+                module = importlib.import_module(info.name)
             except (ImportError, MissingDependencyError):  # an extra that is not installed
                 continue
-            found |= {
+            classes |= {
                 value
                 for value in vars(module).values()
                 if isinstance(value, type)
                 and issubclass(value, Node)
                 and not is_base(value)
                 and not value.__name__.startswith("_")
-                and value.__module__ == each.name
+                and value.__module__ == info.name
             }
-    return found
+    return classes
 
 
 def test_every_node_is_an_entry_point() -> None:

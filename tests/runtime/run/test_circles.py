@@ -67,13 +67,13 @@ def test_two_that_answer_each_other_end_the_run_with_one_error(
     clock: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING):
-        found = supervise([spec(Begins, "a"), spec(Answers, "b")], clock=clock)
-    assert str(found.error) == (
+        outcome = supervise([spec(Begins, "a"), spec(Answers, "b")], clock=clock)
+    assert str(outcome.error) == (
         "b: expected handlers that come to an end, found some that answer one another: " + CIRCLE
     )
     assert len(caplog.records) == 1
-    assert found.supervisor.state.run_end is not None
-    assert found.supervisor.state.run_end.by == "b"
+    assert outcome.supervisor.state.run_end is not None
+    assert outcome.supervisor.state.run_end.by == "b"
 
 
 def test_a_node_that_calls_itself_for_ever_is_named_alone() -> None:

@@ -35,9 +35,9 @@ class Lacks(Node):
 
 class AnnouncesSlowly(Announces):
     def announce(self) -> Iterator[Announcement]:
-        for each in super().announce():
+        for announcement in super().announce():
             time.sleep(0.01)  # real: a start is limited in real time
-            yield each
+            yield announcement
 
 
 class LacksSlowly(Node):
@@ -57,8 +57,8 @@ def test_an_endless_list_is_its_nodes_error(node: type[Node], phase: str) -> Non
     says = f"endless: {phase}(): expected an end after at most 300 values, found more"
     outcome = supervise([spec(node, "endless")])
     assert str(outcome.error) == says
-    found = of_nodes(Config(run=RunConfig(), nodes=(spec(node, "endless"),)))
-    assert found.errors == [says]
+    findings = of_nodes(Config(run=RunConfig(), nodes=(spec(node, "endless"),)))
+    assert findings.errors == [says]
 
 
 @pytest.mark.parametrize(("node", "phase"), [(AnnouncesSlowly, "announce"), (LacksSlowly, "check")])

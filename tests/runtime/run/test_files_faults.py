@@ -50,7 +50,7 @@ def test_a_file_is_written_as_a_whole_or_not_at_all(
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
         write(file, b"new and longer")
-    assert [each.name for each in tmp_path.iterdir()] == ["summary.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
     assert file.read_bytes() == b"old"
 
 

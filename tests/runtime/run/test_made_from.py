@@ -289,15 +289,15 @@ def test_after_the_first_time_the_key_costs_well_under_a_second() -> None:
 
 
 def test_the_key_is_the_same_in_another_folder(tmp_path: Path) -> None:
-    found: list[Parts] = []
+    parts: list[Parts] = []
     for name in ("here", "there/deeper"):
         folder = tmp_path / name
         folder.mkdir(parents=True)
         for file, text in (("slam.py", "import helper"), ("helper.py", ""), ("x.yaml", "a: 1")):
             (folder / file).write_text(text, encoding="utf-8")
-        found.append(made_from(program(folder, sys.executable, "slam.py", "--settings", "x.yaml")))
-    assert {"slam.py", "helper.py", "x.yaml"} <= found[0].keys()
-    assert found[0] == found[1]
+        parts.append(made_from(program(folder, sys.executable, "slam.py", "--settings", "x.yaml")))
+    assert {"slam.py", "helper.py", "x.yaml"} <= parts[0].keys()
+    assert parts[0] == parts[1]
 
 
 @pytest.mark.parametrize(
@@ -566,19 +566,19 @@ def test_the_code_of_an_estimator_is_its_class_with_local_imports_and_its_progra
     config, roots = of_file(tmp_path, "own_with_code")
     assert (roots.folder, roots.modules) == (str(tmp_path), ("own_with_code",))
     (own_spec,) = config.nodes
-    found = [code_of(own_spec, tmp_path)]
+    hashes = [code_of(own_spec, tmp_path)]
     edit(tmp_path / "helper_of_own.py")
-    found.append(code_of(own_spec, tmp_path))
-    assert len({*found}) == 2
+    hashes.append(code_of(own_spec, tmp_path))
+    assert len({*hashes}) == 2
     (tmp_path / "slam.py").write_text("")
     text = (
         '[[nodes]]\nname = "slam"\ntype = "Process"\ncommand = ["python", "slam.py"]\nfolder = "."'
     )
     (tmp_path / "p.toml").write_text(text)
     (slam,) = load(tmp_path / "p.toml").nodes
-    found = [code_of(slam)]
+    hashes = [code_of(slam)]
     edit(tmp_path / "slam.py")
-    assert code_of(slam) not in found
+    assert code_of(slam) not in hashes
 
 
 def test_a_class_of_a_notebook_has_the_hash_of_its_text(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,11 +92,11 @@ def wrong_with(here: Path, place: str, way: str, rule: str) -> list[str]:
         reason = "start-up failed"
     elif fails and place not in {"on_shutdown", "after_run"}:
         reason = "faulty failed"
-    found = []
+    wrong = []
 
     def expect(what: str, given: Any, wanted: Any) -> None:
         if given != wanted:
-            found.append(f"{what}: {given!r}, not {wanted!r}")
+            wrong.append(f"{what}: {given!r}, not {wanted!r}")
 
     expect("exit code", told["code"], 2 if fails else 0)
     if fails:
@@ -105,7 +105,7 @@ def wrong_with(here: Path, place: str, way: str, rule: str) -> list[str]:
     try:
         summary = summary_of(out := results(here))
     except (OSError, ValueError) as error:
-        return [*found, str(error), told["err"]]
+        return [*wrong, str(error), told["err"]]
     expect(
         "named in the summary", "faulty" in (summary["error"] or ""), fails and place != "after_run"
     )
@@ -115,7 +115,7 @@ def wrong_with(here: Path, place: str, way: str, rule: str) -> list[str]:
         count = int((out / f"{name}.txt").read_text(encoding="utf-8"))
         expect(f"{name} kept", count > 0, place not in EARLY)
         expect(f"{name} called", (out / f"{name}.after").exists(), True)
-    return found
+    return wrong
 
 
 def check(folder: Path, modes: list[tuple[str, str, str, str]]) -> None:
@@ -135,9 +135,9 @@ def check(folder: Path, modes: list[tuple[str, str, str, str]]) -> None:
     )
     assert (done.returncode, done.stderr) == (0, "")
     wrong = {
-        (place, way, clock, rule): found
+        (place, way, clock, rule): faults
         for number, (place, way, clock, rule) in enumerate(modes)
-        if (found := wrong_with(folder / f"{number}", place, way, rule))
+        if (faults := wrong_with(folder / f"{number}", place, way, rule))
     }
     assert wrong == {}
 
@@ -175,7 +175,7 @@ def test_the_page_of_what_happens_when_names_tests_and_messages_that_there_are()
         assert len(row) == 5, row
         tests = row[4].strip().strip("`")
         assert any(
-            found for room in ("tests", "extensions") for found in (ROOT / room).rglob(tests)
+            path for room in ("tests", "extensions") for path in (ROOT / room).rglob(tests)
         ), row
         assert row[3].strip() in {"0", "1", "2", "130", "137", "signal", "as else", ""}, row
         for quoted in re.findall(r"expected [a-z' ]+", row[2]):

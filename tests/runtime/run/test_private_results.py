@@ -35,13 +35,13 @@ class Starter(Node[NodeConfig]):
     """Looks for the truth where a program that it starts is."""
 
     starts_programs: ClassVar[bool] = True
-    found: ClassVar[list[Path]] = []
+    truth_files: ClassVar[list[Path]] = []
     fails: ClassVar[bool] = False
 
     @every(hz=10)
     def look(self, tick: Tick) -> None:
         assert self.out is not None
-        type(self).found += self.out.parent.rglob("truth*")
+        type(self).truth_files += self.out.parent.rglob("truth*")
         if self.fails and tick.index == 3:
             raise ValueError("it failed")
 
@@ -56,7 +56,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_truth_is_not_there_before_the_end_and_then_it_is(
     fails: bool, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Starter.found.clear()
+    Starter.truth_files.clear()
     monkeypatch.setattr(Starter, "fails", fails)
     settings = RunConfig(duration=Duration(1.0))
     config = Config(run=settings, nodes=(spec(Judge, "judge"), spec(Starter, "starter")))
@@ -64,7 +64,7 @@ def test_the_truth_is_not_there_before_the_end_and_then_it_is(
         execute(config, tmp_path / "runs" / "one")
     except VisnavError:
         assert fails
-    assert Starter.found == []
+    assert Starter.truth_files == []
     rows = (tmp_path / "runs" / "one" / "trajectories" / "truth.tum").read_text().split()
     assert rows == [str(n) for n in range(4 if fails else 10)]
     assert [*home.iterdir()] == []

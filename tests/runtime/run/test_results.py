@@ -59,8 +59,8 @@ def fly(out: Path, seed: int = 0, cls: type[Node[Any]] = Speaker, *, by_time: bo
 
 def flights(folder: Path) -> list[int]:
     """Return the seeds of the runs in a folder, in the order of their names and numbers."""
-    places = [each for each in folder.iterdir() if not each.is_symlink()]
-    return [summary(each)["seed"] for each in sorted(places, key=time_of)]
+    places = [place for place in folder.iterdir() if not place.is_symlink()]
+    return [summary(place)["seed"] for place in sorted(places, key=time_of)]
 
 
 def test_each_run_has_a_folder_and_latest_is_the_last_that_flew(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_runs_of_one_second_do_not_meet(tmp_path: Path, monkeypatch: pytest.Monk
     for thread in threads:
         thread.join()
     third = fly(home, 3, by_time=True)
-    names = [each.name for each in home.iterdir() if each.name != "latest"]
+    names = [path.name for path in home.iterdir() if path.name != "latest"]
     (base,) = {name[:15] for name in names}
     assert sorted(names) == [base, f"{base}-2", f"{base}-3"]
     assert third.name == f"{base}-3"
@@ -114,7 +114,7 @@ def test_what_a_killed_run_leaves_takes_nothing_away(when: str, tmp_path: Path) 
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, cwd=tmp_path, env=environment, check=False)
     assert done.returncode == -signal.SIGKILL
-    (killed,) = {each for each in (tmp_path / "tour").glob("2*") if each != flown}
+    (killed,) = {path for path in (tmp_path / "tour").glob("2*") if path != flown}
     assert run_folder(tmp_path / "tour") == (flown if when == "start" else killed)
     assert summary(flown)["seed"] == 1
     assert fly(killed, 2) == killed  # nobody uses it any more
@@ -160,7 +160,7 @@ def test_an_earlier_run_in_the_way_is_renamed(tmp_path: Path) -> None:
     run = fly(out, 4, by_time=True)
     assert summary(run_folder(out)) == summary(run)
     assert flights(out) == [4]
-    assert sorted(summary(each)["seed"] for each in tmp_path.glob("tour.2*")) == [1, 2, 3]
+    assert sorted(summary(path)["seed"] for path in tmp_path.glob("tour.2*")) == [1, 2, 3]
     with pytest.raises(ResultsError, match=r"expected a new or empty folder.*found '20"):
         fly(out, 5)
     assert flights(out) == [4]
@@ -172,7 +172,7 @@ def test_what_no_run_has_made_is_never_removed(tmp_path: Path) -> None:
     for number in range(3):
         fly(out)
         (out / "notes.txt").write_text(f"{number}")
-    assert sorted(each.read_text() for each in tmp_path.glob("run*/notes.txt")) == ["0", "1", "2"]
+    assert sorted(path.read_text() for path in tmp_path.glob("run*/notes.txt")) == ["0", "1", "2"]
 
 
 def test_a_link_given_as_the_folder_stays_one(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_two_runs_never_share_a_folder(tmp_path: Path) -> None:
     with Folder(out), pytest.raises(ResultsError, match="no other run uses"):
         clear(out)
     clear(out)
-    assert [each.name for each in out.iterdir()] == [MARKER]
+    assert [path.name for path in out.iterdir()] == [MARKER]
 
 
 def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path: Path) 
     with pytest.raises(ResultsError, match=r"expected a new or empty folder.*found 'config\.toml'"):
         fly(tmp_path)
     assert [file.read_text(encoding="utf-8") for file in mine] == ["mine", "mine"]
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["config.toml", "plots"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["config.toml", "plots"]
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])

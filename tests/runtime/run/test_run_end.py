@@ -96,22 +96,22 @@ def claiming(node: type[Ends], **claims: Any) -> type[Ends]:
 class Reader(Node):
     """Keeps how the run ended."""
 
-    found: list[Any]
+    ends: list[Any]
 
     async def on_startup(self) -> None:
-        Reader.found = [self.run_end]
+        Reader.ends = [self.run_end]
 
     async def on_end(self) -> None:
-        Reader.found.append(self.run_end)
+        Reader.ends.append(self.run_end)
 
     async def on_shutdown(self) -> None:
-        Reader.found.append(self.run_end)
+        Reader.ends.append(self.run_end)
 
 
 def ended(*nodes: NodeSpec, **run: Any) -> RunEnd:
     """Run nodes after a reader, and return how the reader says that the run ended."""
     supervise([spec(Reader, "reader"), *nodes], **run)
-    before, end, again = Reader.found
+    before, end, again = Reader.ends
     assert before is None
     assert end is again
     assert isinstance(end, RunEnd)
@@ -201,27 +201,27 @@ class Busy(Node):
 
     read = Input(Ping)
     paired = Bundle(Pair)
-    found: list[Any]
+    counts: list[Any]
 
     async def run(self) -> None:
-        Busy.found = []
+        Busy.counts = []
         self._let_speak(1)
         self.stop("enough")
 
     @on(Ping)
     def hear(self, event: Ping) -> None:
-        Busy.found.append(event.count)
+        Busy.counts.append(event.count)
 
     @on(Ping)
     def hear_late(self, event: Ping) -> None:
-        Busy.found.append(f"late {event.count}")
+        Busy.counts.append(f"late {event.count}")
 
     async def on_shutdown(self) -> None:
         self._let_speak(2)
         if self.clock.kind == "real":
             await self.clock.sleep(0.03)  # what was under way would have come by then
-        Busy.found += [self.read.receive_nowait().count, self.paired.receive_nowait().ping.count]
-        Busy.found += [self.read.statistics().buffered, self.paired.statistics().buffered]
+        Busy.counts += [self.read.receive_nowait().count, self.paired.receive_nowait().ping.count]
+        Busy.counts += [self.read.statistics().buffered, self.paired.statistics().buffered]
 
     def _let_speak(self, count: int) -> None:
         speak: Callable[[int], None] = self.share("speak", lambda: lambda _: None)
@@ -234,8 +234,8 @@ def test_a_node_receives_nothing_while_it_shuts_down(clock: str) -> None:
     busy = spec(Busy, "busy", links={"hear_late": {"delay": "10ms"}})
     outcome = supervise([spec(Chatterbox, "box"), busy], clock=clock)
     assert outcome.error is None
-    assert [each.count for each in outcome.sent if isinstance(each, Ping)] == [1, 2]
-    assert Busy.found == [1, 1, 1, 0, 0]  # by the handler, the stream and the bundle; no more
+    assert [ping.count for ping in outcome.sent if isinstance(ping, Ping)] == [1, 2]
+    assert Busy.counts == [1, 1, 1, 0, 0]  # by the handler, the stream and the bundle; no more
 
 
 class Vehicle(Node):

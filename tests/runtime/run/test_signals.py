@@ -56,11 +56,11 @@ def test_a_signal_ends_a_run_in_order(
         process.send_signal(number)
         code, err = ends(process)
     assert (code, err) == (0, "")
-    found = summary(results(tmp_path))
-    assert (found["reason"], found["error"]) == (reason, None)
-    assert found["sim_seconds"] >= 0.2
+    totals = summary(results(tmp_path))
+    assert (totals["reason"], totals["error"]) == (reason, None)
+    assert totals["sim_seconds"] >= 0.2
     lines = (results(tmp_path) / "pings.txt").read_text().splitlines(keepends=True)
-    assert len(lines) == found["events"]["Ping"]
+    assert len(lines) == totals["events"]["Ping"]
     assert all(line.endswith("\n") for line in lines)
 
 
@@ -80,8 +80,8 @@ def test_ctrl_c_during_a_slow_start_ends_in_order(clock: str, tmp_path: Path) ->
     with running(tmp_path, path, "starting") as process:
         process.send_signal(signal.SIGINT)
         assert ends(process) == (0, "")
-    found = summary(results(tmp_path))
-    assert (found["reason"], found["sim_seconds"]) == ("Ctrl-C", 0.0)
+    totals = summary(results(tmp_path))
+    assert (totals["reason"], totals["sim_seconds"]) == ("Ctrl-C", 0.0)
 
 
 @pytest.mark.slow

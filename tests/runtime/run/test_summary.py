@@ -50,46 +50,46 @@ def run(
 
 
 def test_everything_is_counted(tmp_path: Path) -> None:
-    found = run(tmp_path, Speaker, Lazy, Painter)
-    assert found.events == {"Image": 1, "Ping": 10}
-    assert found.outputs == {"speaker.pings": 10, "painter.images": 1}
-    assert found.drops == {"lazy.newest": 9, "lazy.some": 6}
-    assert (found.streams["lazy.some"].bound, found.streams["lazy.some"].peak) == (4, 4)
-    assert found.ticks["speaker.speak"].calls == 10
-    assert (found.seed, found.reason, found.sim_seconds) == (3, "duration", 1.0)
-    assert found.environment["python"]
+    summary = run(tmp_path, Speaker, Lazy, Painter)
+    assert summary.events == {"Image": 1, "Ping": 10}
+    assert summary.outputs == {"speaker.pings": 10, "painter.images": 1}
+    assert summary.drops == {"lazy.newest": 9, "lazy.some": 6}
+    assert (summary.streams["lazy.some"].bound, summary.streams["lazy.some"].peak) == (4, 4)
+    assert summary.ticks["speaker.speak"].calls == 10
+    assert (summary.seed, summary.reason, summary.sim_seconds) == (3, "duration", 1.0)
+    assert summary.environment["python"]
 
 
 def test_the_written_summary_is_the_returned_one(tmp_path: Path) -> None:
-    found = run(tmp_path, Speaker, Reader)
+    summary = run(tmp_path, Speaker, Reader)
     written = (tmp_path / "summary.json").read_bytes()
-    assert msgspec.json.decode(written, type=Summary) == found
+    assert msgspec.json.decode(written, type=Summary) == summary
 
 
 def test_announcements_are_kept(tmp_path: Path) -> None:
-    found = run(tmp_path, Diarist)
-    assert found.announcements == [{"type": "Offer", "stamp": 0, "source": "diarist"}]
+    summary = run(tmp_path, Diarist)
+    assert summary.announcements == [{"type": "Offer", "stamp": 0, "source": "diarist"}]
 
 
 def test_a_failed_run_leaves_its_summary(tmp_path: Path) -> None:
     with pytest.raises(Exception, match="out of order"):
         run(tmp_path, Speaker, Failing)
-    found = msgspec.json.decode((tmp_path / "summary.json").read_bytes(), type=Summary)
-    assert found.error == "failing: RuntimeError: out of order"
-    assert found.events["Ping"] in {5, 6}  # one is due as it fails
+    summary = msgspec.json.decode((tmp_path / "summary.json").read_bytes(), type=Summary)
+    assert summary.error == "failing: RuntimeError: out of order"
+    assert summary.events["Ping"] in {5, 6}  # one is due as it fails
 
 
 def test_real_time_is_measured(tmp_path: Path) -> None:
-    found = run(tmp_path, Speaker, clock="real", seconds=0.2)
-    assert 0.2 <= found.sim_seconds < 30  # at which a busy machine may get round to it
-    assert 0.2 <= found.wall_seconds < 30
-    tick = found.ticks["speaker.speak"]
+    summary = run(tmp_path, Speaker, clock="real", seconds=0.2)
+    assert 0.2 <= summary.sim_seconds < 30  # at which a busy machine may get round to it
+    assert 0.2 <= summary.wall_seconds < 30
+    tick = summary.ticks["speaker.speak"]
     assert 0 < tick.late_p50_us <= tick.late_p99_us <= tick.late_max_us
 
 
 def test_the_tables_show_every_output_input_and_tick(tmp_path: Path) -> None:
-    found = run(tmp_path, Speaker, Lazy)
-    cells = {cell for t in run_tables(found) for c in t.columns for cell in c.cells}
+    summary = run(tmp_path, Speaker, Lazy)
+    cells = {cell for t in run_tables(summary) for c in t.columns for cell in c.cells}
     assert {"speaker.pings", "10.0", "lazy.some", "6", "speaker.speak"} <= cells
 
 
@@ -186,15 +186,15 @@ def rigged(gain: float = 1.0, digest: bool | None = None, **rig: float) -> Summa
 
 
 def test_the_inputs_are_what_estimators_are_fed_and_not_what_they_answer() -> None:
-    found = rigged()
-    assert set(found.inputs) == {
+    summary = rigged()
+    assert set(summary.inputs) == {
         *("rig Announcement", "rig/imu ImuAnnouncement"),
         *("rig.images", "rig.imu", "rig.odometry"),
     }
     other = rigged(gain=2.0)
-    assert found.digests["tracker.views"] != other.digests["tracker.views"]
-    assert (found.inputs_digest, found.inputs) == (other.inputs_digest, other.inputs)
-    assert found.digest != other.digest
+    assert summary.digests["tracker.views"] != other.digests["tracker.views"]
+    assert (summary.inputs_digest, summary.inputs) == (other.inputs_digest, other.inputs)
+    assert summary.digest != other.digest
 
 
 @pytest.mark.slow
@@ -204,18 +204,18 @@ def test_a_changed_sensor_changes_the_digest_of_the_inputs(rig: dict[str, Any]) 
 
 
 def test_without_a_digest_the_inputs_have_none() -> None:
-    found = rigged(digest=False)
-    assert (found.digest, found.inputs_digest, found.inputs) == (None, None, {})
+    summary = rigged(digest=False)
+    assert (summary.digest, summary.inputs_digest, summary.inputs) == (None, None, {})
 
 
 def test_joined_runs_have_the_inputs_of_one() -> None:
-    found = rigged()
-    announced = {name: each for name, each in found.inputs.items() if "." not in name}
-    there = {name: each for name, each in found.inputs.items() if name == "rig.imu"}
-    here = {name: each for name, each in found.inputs.items() if name not in there}
-    parts = [replace(found, inputs=here), replace(found, inputs=announced | there)]
-    assert merged(parts, []).inputs_digest == found.inputs_digest
-    assert merged([found, replace(found, digest=None)], []).inputs_digest is None
+    summary = rigged()
+    announced = {name: value for name, value in summary.inputs.items() if "." not in name}
+    there = {name: value for name, value in summary.inputs.items() if name == "rig.imu"}
+    here = {name: value for name, value in summary.inputs.items() if name not in there}
+    parts = [replace(summary, inputs=here), replace(summary, inputs=announced | there)]
+    assert merged(parts, []).inputs_digest == summary.inputs_digest
+    assert merged([summary, replace(summary, digest=None)], []).inputs_digest is None
 
 
 def test_a_result_for_tests_counts_drops_too() -> None:
@@ -235,9 +235,9 @@ def test_the_command_line_is_kept_without_secrets(monkeypatch: pytest.MonkeyPatc
 def test_the_code_of_estimators_is_told_as_it_was_when_the_run_began(tmp_path: Path) -> None:
     nodes = (spec(Rig, "rig"), spec(Tracker, "tracker"))
     settings = RunConfig(duration=Duration(0.1), clock="lockstep")
-    found = execute(Config(run=settings, nodes=nodes), tmp_path / "run")
-    assert found.code == {"tracker": code_of(nodes[1])}
-    assert found.environment["commit"] == commit()
-    assert merged([found, replace(found, code={"other": "1"})], []).code.keys() == {
+    summary = execute(Config(run=settings, nodes=nodes), tmp_path / "run")
+    assert summary.code == {"tracker": code_of(nodes[1])}
+    assert summary.environment["commit"] == commit()
+    assert merged([summary, replace(summary, code={"other": "1"})], []).code.keys() == {
         *("tracker", "other")
     }

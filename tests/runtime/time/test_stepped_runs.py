@@ -83,13 +83,13 @@ def test_a_stepped_run_has_the_digest_of_one_that_was_never_paused(tmp_path: Pat
     quiet = execute(config)
     busy = [burn() for _ in range(os.cpu_count() or 1)]
     try:
-        found = [execute(stepped) for _ in range(3)]
+        summaries = [execute(stepped) for _ in range(3)]
     finally:
-        for each in busy:
-            each.kill()
-            each.wait()
-    assert {each.digest for each in found} == {quiet.digest}
-    assert {each.sim_seconds for each in found} == {quiet.sim_seconds}
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert {summary.digest for summary in summaries} == {quiet.digest}
+    assert {summary.sim_seconds for summary in summaries} == {quiet.sim_seconds}
 
 
 class Lines(logging.Handler):

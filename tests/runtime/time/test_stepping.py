@@ -92,7 +92,7 @@ def test_time_stands_until_it_may_go_on() -> None:
     run_in_lockstep(main())
     ticks = [time for what, time in seen if what == "tick"]
     assert ticks == [n * 10 for n in range(100)]  # nothing was lost
-    others = [each for each in seen if each[0] != "tick" or each[1] <= 40]
+    others = [row for row in seen if row[0] != "tick" or row[1] <= 40]
     assert others[:2] == [("tick", 0), ("paused", 0)]
     assert [time for what, time in others if what == "stepped"] == [25, 35, 40]
 
@@ -146,18 +146,18 @@ def test_all_that_is_due_when_time_comes_to_stand_is_done_and_nothing_after() ->
                 "sleep": clock.sleep(ms / 1000),
                 "work": clock.beside(finished(), ms * MS),
             }
-            tasks += [asyncio.create_task(at(ms, *each)) for each in waits.items()]
+            tasks += [asyncio.create_task(at(ms, *arguments)) for arguments in waits.items()]
         await asyncio.sleep(0)
         assert await stepping.step(10 * MS) == 10 * MS
         assert (loop.now, stepping.state) == (10 * MS, "paused")
-        found = list(done)
+        results = list(done)
         stepping.resume()
         await asyncio.gather(*tasks)
-        assert len(done) == 2 * len(found)
-        return found
+        assert len(done) == 2 * len(results)
+        return results
 
     words = ["timer", "work", "sleep"]  # timers first, then work, then the schedule in its order
-    assert [each for each in run_in_lockstep(main()) if each.endswith(" at 10")] == [
+    assert [line for line in run_in_lockstep(main()) if line.endswith(" at 10")] == [
         f"{word} at 10" for word in words
     ]
 
@@ -199,16 +199,16 @@ def test_a_step_that_is_cut_short_says_how_far_it_went() -> None:
         loop, clock = running_loop()
         stepping, over = Stepping(clock), False
         stepping = Stepping(clock, lambda: over)
-        found = []
+        results = []
         for end in (stepping.pause, stepping.resume):
             loop.call_at((loop.now + 3 * MS) / 1e9, end)
-            found.append(await stepping.step(10 * MS))
+            results.append(await stepping.step(10 * MS))
         step = stepping.step(10 * MS)
         await clock.sleep(0.004)
         over = True
-        found.append(await step)
+        results.append(await step)
         assert stepping.state == "running"  # what ends cannot be paused
-        return found
+        return results
 
     assert run_in_lockstep(main()) == [3 * MS, 3 * MS, 4 * MS]
 
@@ -321,11 +321,11 @@ def test_real_seconds_are_not_counted_while_time_stands() -> None:
     async def main() -> None:
         loop, clock = running_loop()
         stepping = Stepping(clock, wall=lambda: wall[0])
-        found: list[float] = []
+        seconds: list[float] = []
 
         def note(later: float) -> None:
             wall[0] += later
-            found.append(stepping.real_seconds())
+            seconds.append(stepping.real_seconds())
 
         def then(call: Callable[[], object]) -> Callable[[], None]:
             def noted() -> None:
@@ -340,6 +340,6 @@ def test_real_seconds_are_not_counted_while_time_stands() -> None:
         stepping.pause()
         note(1.0)  # it is still on its way to where it stands
         await clock.sleep(0.01)
-        assert found == [101.0, 102.0, 102.0, 103.0, 103.0, 104.0]
+        assert seconds == [101.0, 102.0, 102.0, 103.0, 103.0, 104.0]
 
     run_in_lockstep(main())

@@ -105,10 +105,10 @@ def test_a_node_that_fails_is_one_line_and_a_summary(tmp_path: Path) -> None:
     line = done.stderr.splitlines()[-1]
     assert line.startswith("error: failing: RuntimeError: out of order (runtime/samples.py:")
     assert "Traceback" not in done.stderr
-    found = summary(out := results(tmp_path))
+    totals = summary(out := results(tmp_path))
     assert done.stderr.splitlines()[-2] == f"{out.relative_to(tmp_path)}/log.txt says more"
-    assert (found["reason"], found["sim_seconds"]) == ("failing failed", 0.5)
-    assert found["error"] == "failing: RuntimeError: out of order"
+    assert (totals["reason"], totals["sim_seconds"]) == ("failing failed", 0.5)
+    assert totals["error"] == "failing: RuntimeError: out of order"
     log = (results(tmp_path) / "log.txt").read_text()
     assert "0.500000 ERROR    runtime: failing: RuntimeError: out of order" in log
     assert "Traceback" in log

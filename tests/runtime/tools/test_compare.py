@@ -45,8 +45,8 @@ def ate(pairs: Pairs, **options: Any) -> Comparison:
 
 @pytest.mark.slow
 def test_equal_sides_differ_in_at_most_one_of_twenty_comparisons() -> None:
-    found = [ate(flights(12, 1.0, seed)).verdict for seed in range(400)]
-    wrong = sum(each in {"better", "worse"} for each in found)
+    verdicts = [ate(flights(12, 1.0, seed)).verdict for seed in range(400)]
+    wrong = sum(verdict in {"better", "worse"} for verdict in verdicts)
     assert wrong <= 400 * 0.05 + 2 * math.sqrt(400 * 0.05 * 0.95)
     assert wrong > 0  # as many as asked for: it is not blind either
 
@@ -56,17 +56,17 @@ def test_several_figures_together_err_no_more_often() -> None:
     def rows(values: np.ndarray) -> dict[Key, list[Row]]:
         names = ("flight_ate_percent", "rpe_1m_trans_percent", "rot_rmse_deg")
         return {
-            ("tour", n): [row(seed=n, **dict(zip(names, each, strict=True)))]
-            for n, each in enumerate(values.tolist())
+            ("tour", n): [row(seed=n, **dict(zip(names, figures, strict=True)))]
+            for n, figures in enumerate(values.tolist())
         }
 
     rng = np.random.default_rng(1)
     wrong = 0
     for _ in range(200):
         a, b = np.exp(rng.normal(0, 0.1, (2, 12, 3)))
-        found = compare_rows(rows(a), rows(b))
-        assert len(found) == 3
-        wrong += any(each.verdict in {"better", "worse"} for each in found)
+        comparisons = compare_rows(rows(a), rows(b))
+        assert len(comparisons) == 3
+        wrong += any(comparison.verdict in {"better", "worse"} for comparison in comparisons)
     assert wrong <= 200 * 0.05 + 2 * math.sqrt(200 * 0.05 * 0.95)
 
 
@@ -79,9 +79,9 @@ def sequential(seed: int, calls: list[int], shares: bool = True) -> bool:
         pairs = {key: pair for key, pair in whole.items() if key[1] < count}
         return [ate(pairs, error=error if shares else 0.05)]
 
-    found = [compare_until_sure(compare, most, looked)[0].verdict for most in calls]
+    verdicts = [compare_until_sure(compare, most, looked)[0].verdict for most in calls]
     assert looked == sorted(set(looked))
-    return any(each in {"better", "worse"} for each in found)
+    return any(verdict in {"better", "worse"} for verdict in verdicts)
 
 
 @pytest.mark.slow
@@ -151,26 +151,30 @@ def test_within_the_margin_there_is_no_difference() -> None:
 def test_a_margin_forgives_what_is_within_it_however_sure() -> None:
     pairs = {("tour", n): (1.0, 1.02 + n / 1e4) for n in range(20)}
     assert (ate(pairs).verdict, ate(pairs).fails(0)) == ("worse", True)
-    found = ate(pairs, margin=5)
-    assert (found.verdict, found.fails(5), found.fails(1)) == ("no difference", False, True)
+    comparison = ate(pairs, margin=5)
+    assert (comparison.verdict, comparison.fails(5), comparison.fails(1)) == (
+        "no difference",
+        False,
+        True,
+    )
 
 
 def test_errors_after_different_alignments_are_not_comparable() -> None:
     def rows(factor: float, alignment: str) -> dict[Key, list[Row]]:
-        found = {("t", n): [row(n, ate_percent=factor + n / 100)] for n in range(12)}
-        for (each,) in found.values():
-            each["estimators"]["vo"] |= {
+        flown = {("t", n): [row(n, ate_percent=factor + n / 100)] for n in range(12)}
+        for (judged,) in flown.values():
+            judged["estimators"]["vo"] |= {
                 "alignment": alignment,
                 "frame_coverage_percent": 90 + factor,
             }
-        return found
+        return flown
 
     names = ["ate_percent", "frame_coverage_percent"]
     error, share = compare_rows(rows(2, "origin"), rows(1, "sim3"), figures=names)
     assert (error.verdict, share.verdict) == ("not comparable", "worse")
     assert error.words == "not comparable: after origin and sim3"
     assert (error.fails(0), error.fails(5)) == (False, True)
-    assert [each.state for each in of_comparison(error, 0)] == ["not judged"]
+    assert [outcome.state for outcome in of_comparison(error, 0)] == ["not judged"]
     error, _ = compare_rows(rows(2, "origin"), rows(1, "origin"), figures=names)
     assert error.verdict == "better"
 
@@ -180,18 +184,18 @@ def test_a_scenario_fails_where_the_figure_does_and_most_of_its_flights_are_wors
     for n in range(12):
         pairs["hall", n], pairs["yard", n] = (1.0, 2.0 + n / 10), (1.0, 0.99)
     pairs["hall", 3] = (1.0, None)
-    found = ate(pairs)
-    assert (found.verdict, found.by_scenario()) == (
+    comparison = ate(pairs)
+    assert (comparison.verdict, comparison.by_scenario()) == (
         "worse",
         {"hall": (12, 0, 12), "yard": (0, 12, 12)},
     )
-    hall, yard = of_comparison(found, 0)
+    hall, yard = of_comparison(comparison, 0)
     assert (hall.run, hall.estimator, hall.state) == ("hall", "vo ate_percent", "failed")
     assert (yard.state, yard.reasons) == ("passed", [])
     assert hall.reasons[0].endswith("in all; worse in 12 of 12 flights here")
     doubtful = ate({("hall", n): (1.0, 1.0) for n in range(3)}, margin=5)
-    assert [each.state for each in of_comparison(doubtful, 5)] == ["failed"]  # as the command does
-    assert [each.state for each in of_comparison(doubtful, 0)] == ["not judged"]
+    assert [case.state for case in of_comparison(doubtful, 5)] == ["failed"]  # as the command does
+    assert [case.state for case in of_comparison(doubtful, 0)] == ["not judged"]
 
 
 def test_a_failure_is_worse_than_any_error_and_never_left_out() -> None:
@@ -199,9 +203,9 @@ def test_a_failure_is_worse_than_any_error_and_never_left_out() -> None:
     assert ate(pairs).verdict == "better"
     for n in range(9):
         pairs["tour", n] = (pairs["tour", n][0], None)
-    found = ate(pairs)
-    assert (found.failures, found.change, found.pairs) == ((0, 9), math.inf, 12)
-    assert found.verdict != "better"
+    comparison = ate(pairs)
+    assert (comparison.failures, comparison.change, comparison.pairs) == ((0, 9), math.inf, 12)
+    assert comparison.verdict != "better"
     assert ate({("tour", n): (1.0, None) for n in range(8)}).verdict == "worse"
     assert ate({("tour", n): (None, 1.0) for n in range(8)}).verdict == "better"
     both = ate({("tour", n): (None, None) for n in range(8)})
@@ -210,15 +214,15 @@ def test_a_failure_is_worse_than_any_error_and_never_left_out() -> None:
 
 def test_where_more_is_better_less_is_worse() -> None:
     pairs = {("tour", n): (99.0 - n, 90.0 - n) for n in range(10)}
-    found = compare_values("vo", "frame_coverage_percent", pairs)
-    assert (found.verdict, found.inferior(1.0)) == ("worse", True)
+    comparison = compare_values("vo", "frame_coverage_percent", pairs)
+    assert (comparison.verdict, comparison.inferior(1.0)) == ("worse", True)
     lost: Pairs = {("tour", n): (99.0, None) for n in range(10)}
     assert compare_values("vo", "frame_coverage_percent", lost).verdict == "worse"
 
 
 def test_zeros_are_compared_by_difference() -> None:
-    found = compare_values("vo", "lost_seconds", {("t", n): (0.0, n / 2) for n in range(10)})
-    assert (found.relative, found.unit, found.verdict) == (False, "s", "worse")
+    comparison = compare_values("vo", "lost_seconds", {("t", n): (0.0, n / 2) for n in range(10)})
+    assert (comparison.relative, comparison.unit, comparison.verdict) == (False, "s", "worse")
     same = compare_values("vo", "lost_seconds", {("t", n): (0.0, 0.0) for n in range(10)}, margin=1)
     assert (same.verdict, same.p) == ("no difference", 1.0)
 
@@ -244,8 +248,8 @@ def test_with_ties_it_is_the_share_of_random_signs(values: list[int]) -> None:
     ranks = wilcoxon_ranks(differences)
     signs = np.array([*itertools.product([0, 1], repeat=len(ranks))])
     sums = signs @ ranks
-    found = ranks[differences[differences != 0] > 0].sum()
-    expected = min(2 * min((sums <= found).mean(), (sums >= found).mean()), 1.0)
+    statistic = ranks[differences[differences != 0] > 0].sum()
+    expected = min(2 * min((sums <= statistic).mean(), (sums >= statistic).mean()), 1.0)
     assert p == pytest.approx(expected)
     assert low <= change <= high
 
@@ -276,9 +280,9 @@ def test_crashed_runs_repeats_and_other_names() -> None:
     a = {("t", n): [row(n, ate_percent=1.0), row(n, ate_percent=3.0)] for n in range(8)}
     b = {("t", n): [row(n, name="other", ate_percent=1.0)] for n in range(8)}
     b["t", 3] = [row(3, "out of order")]
-    (found,) = compare_rows(a, b, figures=["ate_percent"])
-    assert (found.estimator, found.a, found.b) == ("vo / other", 2.0, 1.0)
-    assert (found.failures, found.pairs) == ((0, 1), 8)
+    (comparison,) = compare_rows(a, b, figures=["ate_percent"])
+    assert (comparison.estimator, comparison.a, comparison.b) == ("vo / other", 2.0, 1.0)
+    assert (comparison.failures, comparison.pairs) == ((0, 1), 8)
     with pytest.raises(ConfigError, match="found none in common: t 0; u 0"):
         compare_rows({("t", 0): [row(0)]}, {("u", 0): [row(0)]})
     with pytest.raises(ConfigError, match="expected ate_max_m, found none of them in any run"):
@@ -289,9 +293,9 @@ def test_crashed_runs_repeats_and_other_names() -> None:
 
 def test_an_estimator_that_one_side_lacks_is_a_row_and_worse_there() -> None:
     def both(n: int) -> Row:
-        found = row(n, ate_percent=1.0 + n)
-        found["estimators"]["slam"] = {"ate_percent": 2.0 + n}
-        return found
+        line = row(n, ate_percent=1.0 + n)
+        line["estimators"]["slam"] = {"ate_percent": 2.0 + n}
+        return line
 
     a = {("t", n): [both(n)] for n in range(3)}
     b = {("t", n): [row(n, ate_percent=1.0)] for n in range(3)}
@@ -302,7 +306,7 @@ def test_an_estimator_that_one_side_lacks_is_a_row_and_worse_there() -> None:
     assert (slam.verdict, slam.words, slam.missing) == ("worse", "worse: not there in B", "B")
     assert (slam.medians, slam.failures) == (["3 %", "– (3 failed)"], (0, 3))
     assert (slam.fails(0), slam.fails(5)) == (True, True)
-    assert [each.state for each in of_comparison(slam, 0)] == ["failed"]
+    assert [outcome.state for outcome in of_comparison(slam, 0)] == ["failed"]
     _, slam = compare_rows(b, a, figures=["ate_percent"])
     assert (slam.words, slam.fails(0), slam.fails(5)) == ("better: not there in A", False, False)
     (vo,) = compare_rows(b, {key: [row(0, "crashed")] for key in b}, figures=["ate_percent"])
@@ -312,9 +316,9 @@ def test_an_estimator_that_one_side_lacks_is_a_row_and_worse_there() -> None:
 def test_identical_values_are_said_to_be_identical() -> None:
     same = {("t", n): (1.0 + n, 1.0 + n) for n in range(12)}
     for margin, words in ((0.0, "identical"), (5.0, "no difference: identical")):
-        found = ate(same, margin=margin)
-        assert (found.words, found.fails(margin)) == (words, False)
-        assert [each.state for each in of_comparison(found, margin)] == ["passed"]
+        comparison = ate(same, margin=margin)
+        assert (comparison.words, comparison.fails(margin)) == (words, False)
+        assert [outcome.state for outcome in of_comparison(comparison, margin)] == ["passed"]
     few = ate({key: pair for key, pair in same.items() if key[1] < 2}, margin=5)
     assert few.words == "identical so far: 4 more may tell"
     assert (few.fails(0), few.fails(5)) == (False, True)  # with a margin it has to be shown
@@ -330,8 +334,8 @@ def test_what_is_identical_in_half_of_the_flights_is_looked_at_in_all() -> None:
         asked.append(count)
         return [ate({("t", n): (1.0, 1.0) for n in range(count)}, error=error)]
 
-    (found,) = compare_until_sure(compare, 24, [])
-    assert (asked, found.words) == ([12, 24], "identical")
+    (comparison,) = compare_until_sure(compare, 24, [])
+    assert (asked, comparison.words) == ([12, 24], "identical")
 
 
 def fed(key: Key, name: str = "tour", **inputs: str) -> Row:
@@ -364,7 +368,7 @@ def test_runs_during_which_files_were_edited_are_told(tmp_path: Path) -> None:
         if side == "b":
             rows[0]["edited"] = ["vo.py changed"]
         (tmp_path / side).mkdir()
-        lines = b"\n".join(msgspec.json.encode(each) for each in rows)
+        lines = b"\n".join(msgspec.json.encode(row) for row in rows)
         (tmp_path / side / "rows.jsonl").write_bytes(lines)
     with pytest.warns(UserWarning, match="1 runs of B are of a mixture: vo.py changed while they"):
         compared = visnav.compare(
@@ -420,12 +424,16 @@ def test_settings_are_flown_and_compared(
     change = ["--b", "judge.error=2"]
     done = command_here("compare", file, *change, *options, folder=tmp_path)
     assert (done.returncode, "worse" in done.stdout) == (1, True), done.stderr
-    (found,) = json.loads((tmp_path / "c.json").read_bytes())
-    assert (found["verdict"], found["pairs"], found["figure"]) == ("worse", 8, "ate_percent")
-    assert found["change"] == pytest.approx(100, abs=40)
+    (comparison,) = json.loads((tmp_path / "c.json").read_bytes())
+    assert (comparison["verdict"], comparison["pairs"], comparison["figure"]) == (
+        "worse",
+        8,
+        "ate_percent",
+    )
+    assert comparison["change"] == pytest.approx(100, abs=40)
     (case,) = ET.parse(tmp_path / "c.xml").getroot().iter("testcase")
     assert (case.attrib["classname"], case.attrib["name"]) == ("c", "vo ate_percent")
-    assert [each.tag for each in case] == ["failure"]
+    assert [element.tag for element in case] == ["failure"]
     page = (tmp_path / "compared" / "compare.html").read_text(encoding="utf-8")
     assert '<td class="bad"><b>worse</b></td>' in page
     assert "judge.error=2" in page
@@ -440,7 +448,7 @@ def test_settings_are_flown_and_compared(
     )
     (one,) = compared.rows
     assert (one.words, one.pairs) == ("worse", 8)
-    assert one.change == pytest.approx(found["change"])
+    assert one.change == pytest.approx(comparison["change"])
     assert 5 < one.low <= one.change <= one.high
     assert compared.worse
     assert compared.page.samefile(tmp_path / "compared" / "compare.html")
@@ -473,16 +481,16 @@ def test_after_an_edit_of_an_estimator_its_figures_are_new(file: Path, tmp_path:
     def compared() -> tuple[dict[str, Any], str]:
         done = command_here("compare", file, *options, "--json", "c.json", folder=tmp_path)
         assert done.returncode == 0, done.stderr
-        (found,) = json.loads((tmp_path / "c.json").read_bytes())
-        return found, done.stderr
+        (comparison,) = json.loads((tmp_path / "c.json").read_bytes())
+        return comparison, done.stderr
 
-    found, _ = compared()
-    assert (found["a"], found["b"]) == (1.0, 2.0)
+    row, _ = compared()
+    assert (row["a"], row["b"]) == (1.0, 2.0)
     _, said = compared()
     assert said == "2 runs are finished already, 0 to do\n4 runs are finished already, 0 to do\n"
     (tmp_path / "edited_tracker.py").write_text("FACTOR = 3.0\n", encoding="utf-8")
-    found, said = compared()
-    assert (found["a"], found["b"]) == (3.0, 6.0)
+    row, said = compared()
+    assert (row["a"], row["b"]) == (3.0, 6.0)
     assert "0 runs are finished already, 2 are run again: edited_tracker.py changed\n" in said
     assert "2 runs are finished already, 2 are run again: edited_tracker.py changed\n" in said
 
@@ -535,14 +543,14 @@ def test_two_builds_of_a_program_are_compared(
     words = [word for pair in sides.items() for word in pair]
     done = command_here("compare", file, *words, *options, folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    (found,) = json.loads((tmp_path / "c.json").read_bytes())
-    assert (found["failures"], found["b"]) == ([0, 0], 100)
-    assert found["a"] == pytest.approx(75, abs=5)
+    (comparison,) = json.loads((tmp_path / "c.json").read_bytes())
+    assert (comparison["failures"], comparison["b"]) == ([0, 0], 100)
+    assert comparison["a"] == pytest.approx(75, abs=5)
     shutil.copy(tmp_path / "builds" / "old", tmp_path / "builds" / "new")
     done = command_here("compare", file, *words, *options, folder=tmp_path)
     assert "1 runs are finished already, 1 is run again: new changed\n" in done.stderr
-    (found,) = json.loads((tmp_path / "c.json").read_bytes())
-    assert found["b"] == found["a"]
+    (comparison,) = json.loads((tmp_path / "c.json").read_bytes())
+    assert comparison["b"] == comparison["a"]
 
 
 @pytest.mark.slow

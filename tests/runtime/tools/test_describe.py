@@ -113,8 +113,8 @@ def test_ticks_have_rates(sample: NodeDescription) -> None:
 
 
 def test_settings_have_types_ranges_and_defaults(sample: NodeDescription) -> None:
-    found = {s.name: (s.type, s.default, s.constraint) for s in sample.settings}
-    assert found == {
+    settings = {s.name: (s.type, s.default, s.constraint) for s in sample.settings}
+    assert settings == {
         "mode": ('"a" or "b"', "", ""),
         "rate": ("float", "10.0", "> 0"),
         "latency": ("duration", "0.04", "≥ 0 s; above 1 s with a unit"),

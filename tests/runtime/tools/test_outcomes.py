@@ -58,11 +58,11 @@ def cases(path: Path) -> list[tuple[str, str, str]]:
     """Return run, estimator, and what stands in each test case."""
     suite = ET.parse(path).getroot().find("testsuite")
     assert suite is not None
-    found = [
-        (case.attrib["classname"], case.attrib["name"], "".join(each.tag for each in case))
+    results = [
+        (case.attrib["classname"], case.attrib["name"], "".join(element.tag for element in case))
         for case in suite
     ]
-    tags = [tag for _, _, tag in found]
+    tags = [tag for _, _, tag in results]
     counted = {key: int(suite.attrib[key]) for key in ("tests", "failures", "errors", "skipped")}
     assert counted == {
         "tests": len(tags),
@@ -70,7 +70,7 @@ def cases(path: Path) -> list[tuple[str, str, str]]:
         "errors": tags.count("error"),
         "skipped": tags.count("skipped"),
     }
-    return found
+    return results
 
 
 @pytest.mark.parametrize(
@@ -91,8 +91,8 @@ def test_a_run_says_who_passed(
     (outcome,) = json.loads((tmp_path / "ci/j.json").read_text(encoding="utf-8"))
     assert outcome["state"] == state
     ended = code < 2
-    ((run, estimator, found),) = cases(tmp_path / "ci/j.xml")
-    assert (run, estimator, found) == (*(("tour", "vo") if ended else ("c", "run")), tag)
+    ((run, estimator, element),) = cases(tmp_path / "ci/j.xml")
+    assert (run, estimator, element) == (*(("tour", "vo") if ended else ("c", "run")), tag)
     assert outcome.get("figures", {}).get("ate_percent") == ({0: 0.5, 1: 7.0}.get(code))
     # Quiet: nothing, or the reason in one line.
     said = "vo FAILED: ate_percent: expected at most 1\n"
@@ -124,13 +124,13 @@ def test_nobody_judged_is_skipped_and_nobody_to_judge_has_failed() -> None:
     (nobody,) = of_verdict("tour", Verdict(False, {}))
     assert (nobody.state, nobody.reasons) == ("failed", [NOBODY])
     unasked = Verdict(None, {"vo": {"passed": None}})
-    assert [each.state for each in of_verdict("tour", unasked)] == ["not judged"]
+    assert [outcome.state for outcome in of_verdict("tour", unasked)] == ["not judged"]
 
 
 @pytest.mark.parametrize("text", ["a\x1b[31mb", "\x00", "<&\"'>", "é\ud800", "]]>"])
 def test_whatever_an_error_says_the_xml_can_be_read(text: str) -> None:
-    found = ET.fromstring(to_junit(text, [Outcome(run=text, state="crashed", reasons=[text])]))
-    assert found[0][0][0].tag == "error"
+    element = ET.fromstring(to_junit(text, [Outcome(run=text, state="crashed", reasons=[text])]))
+    assert element[0][0][0].tag == "error"
 
 
 def test_an_interrupted_run_leaves_what_there_is(tmp_path: Path) -> None:

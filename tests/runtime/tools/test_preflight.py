@@ -146,14 +146,14 @@ def config(
 
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 def test_nodes_go_through_all_phases_but_the_run(clock: str) -> None:
-    found = preflight.of_nodes(config((Journal, "j"), clock=clock))
-    assert found == Findings([], ["j: in start-up"])
+    findings = preflight.of_nodes(config((Journal, "j"), clock=clock))
+    assert findings == Findings([], ["j: in start-up"])
     assert Journal.phases == ["on_startup, checking: True, out: None", "announce", "on_shutdown"]
 
 
 def test_all_that_fail_in_start_up_are_told_and_nothing_that_follows_from_it() -> None:
-    found = preflight.of_nodes(config((Broken, "b"), (Broken, "c"), (Lacking, "l")))
-    assert found.errors == ["b: RuntimeError: out of order", "c: RuntimeError: out of order"]
+    findings = preflight.of_nodes(config((Broken, "b"), (Broken, "c"), (Lacking, "l")))
+    assert findings.errors == ["b: RuntimeError: out of order", "c: RuntimeError: out of order"]
 
 
 def test_what_a_node_lacks_is_told_by_the_check_and_refused_by_the_run() -> None:
@@ -168,9 +168,9 @@ def test_a_node_that_asks_its_worker_is_looked_at_as_far_as_that_goes() -> None:
 
 
 def test_what_may_yet_come_from_outside_is_no_error() -> None:
-    found = preflight.of_nodes(config((Outside, "o"), (Lacking, "l")))
-    assert found.errors == []
-    reason, lacks = found.warnings
+    findings = preflight.of_nodes(config((Outside, "o"), (Lacking, "l")))
+    assert findings.errors == []
+    reason, lacks = findings.warnings
     assert reason == "o: not now: not all can be checked"
     assert "l: expected a camera, found none" in lacks
 

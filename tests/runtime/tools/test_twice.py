@@ -59,20 +59,20 @@ def twice(out: Path, *nodes: Any, clock: Any = "lockstep") -> Summary:
 
 
 def test_what_repeats_is_said_to(tmp_path: Path) -> None:
-    found = twice(tmp_path, spec(Drift, "drone")).twice
-    assert found is not None
-    assert (found.repeats, found.first, found.outputs) == (True, "", [])
+    comparison = twice(tmp_path, spec(Drift, "drone")).twice
+    assert comparison is not None
+    assert (comparison.repeats, comparison.first, comparison.outputs) == (True, "", [])
 
 
 @pytest.mark.slow
 def test_the_rig_that_differs_is_named_with_when_and_by_how_much(tmp_path: Path) -> None:
     vehicles = spec(Drift, "a", {"differs_at": 3}), spec(Drift, "b", {"differs_at": 2})
-    found = twice(tmp_path, *vehicles).twice
-    assert found is not None
-    assert not found.repeats
-    assert found.first.startswith("the rig, b, in b.poses: Odometry of b, 0.200000 s, ")
-    assert 0.0 <= float(found.first.split()[-3]) < 2e-6
-    assert found.outputs == ["a.poses", "b.poses"]
+    comparison = twice(tmp_path, *vehicles).twice
+    assert comparison is not None
+    assert not comparison.repeats
+    assert comparison.first.startswith("the rig, b, in b.poses: Odometry of b, 0.200000 s, ")
+    assert 0.0 <= float(comparison.first.split()[-3]) < 2e-6
+    assert comparison.outputs == ["a.poses", "b.poses"]
 
 
 @pytest.mark.slow
@@ -81,16 +81,16 @@ def test_a_system_is_unknown_until_it_was_run_twice(unsteady: bool, tmp_path: Pa
     node = program(*(["unsteady"] if unsteady else []))
     assert node.node is Process
     summary = twice(tmp_path, spec(Eyes, "drone"), node)
-    slam, found = summary.outside["slam"], summary.twice
-    assert found is not None
+    slam, comparison = summary.outside["slam"], summary.twice
+    assert comparison is not None
     assert slam.reproducible  # its inputs: those are the run's to promise
-    assert (slam.repeats, found.repeats) == (not unsteady, not unsteady)
+    assert (slam.repeats, comparison.repeats) == (not unsteady, not unsteady)
     if unsteady:
-        assert found.first.startswith(
+        assert comparison.first.startswith(
             "the system slam, in slam.estimates: PoseEstimate of slam, 0.1"
         )
-        assert 0.0 < float(found.first.split()[-3]) < 1e-6
-        assert found.outputs == ["slam.estimates"]
+        assert 0.0 < float(comparison.first.split()[-3]) < 1e-6
+        assert comparison.outputs == ["slam.estimates"]
 
 
 def test_in_real_time_nothing_can_be_compared(tmp_path: Path) -> None:

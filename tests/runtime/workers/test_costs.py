@@ -74,12 +74,12 @@ def test_whatever_the_costs_the_percentiles_are_in_order(calls: list[tuple[int, 
     costs = Costs()
     for wall, cpu in calls:
         costs.add(wall, cpu)
-    found = WorkerSummary.of(costs)
-    assert found.calls == len(calls)
-    assert 0 <= found.wall_p50_ms <= found.wall_p95_ms <= found.wall_max_ms
-    assert found.wall_max_ms == max((wall for wall, _ in calls), default=0) / MS
-    assert 0 <= found.cpu_p50_ms <= found.cpu_p95_ms <= found.cpu_max_ms
-    assert len(found.row()) == len(WORKER_COLUMNS)
+    summary = WorkerSummary.of(costs)
+    assert summary.calls == len(calls)
+    assert 0 <= summary.wall_p50_ms <= summary.wall_p95_ms <= summary.wall_max_ms
+    assert summary.wall_max_ms == max((wall for wall, _ in calls), default=0) / MS
+    assert 0 <= summary.cpu_p50_ms <= summary.cpu_p95_ms <= summary.cpu_max_ms
+    assert len(summary.row()) == len(WORKER_COLUMNS)
 
 
 class Gardener(Node):
@@ -104,18 +104,18 @@ def test_a_runs_summary_and_tables_say_what_each_worker_has_cost(tmp_path: Path)
     Gardener.lives = 0
     settings = RunConfig(duration=Duration(2.0), seed=3)
     config = Config(run=settings, nodes=(spec(Gardener, "g", on_error="restart"),))
-    found = execute(config, tmp_path)
-    assert set(found.workers) == {"g.Plant", "g.again"}
-    plant, other = found.workers["g.Plant"], found.workers["g.again"]
+    summary = execute(config, tmp_path)
+    assert set(summary.workers) == {"g.Plant", "g.again"}
+    plant, other = summary.workers["g.Plant"], summary.workers["g.again"]
     assert (plant.latency_ms, plant.calls, plant.processes) == (80.0, 6, 1)  # of both lives
     assert (other.latency_ms, other.calls) == (None, 4)
     assert plant.cpu_p50_ms >= 10
     assert plant.peak_rss_mb is not None
     assert plant.peak_rss_mb > 5
     written = (tmp_path / "summary.json").read_bytes()
-    assert msgspec.json.decode(written, type=Summary).workers == found.workers
-    assert msgspec.json.decode(written, type=Facts).workers == found.workers
-    (table,) = (t for t in run_tables(found) if str(t.title).startswith("calls of workers"))
+    assert msgspec.json.decode(written, type=Summary).workers == summary.workers
+    assert msgspec.json.decode(written, type=Facts).workers == summary.workers
+    (table,) = (t for t in run_tables(summary) if str(t.title).startswith("calls of workers"))
     assert list(table.columns[0].cells) == ["g.Plant", "g.again"]
     assert list(table.columns[1].cells) == ["80", "varies"]
 

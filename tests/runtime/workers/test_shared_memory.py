@@ -72,10 +72,10 @@ def test_an_array_arrives_unchanged(name: str, ends: tuple[SharedPipe, SharedPip
     before = array.copy()
     near.send({"array": array, "twice": array})
     got = far.receive()
-    for each in got.values():
-        assert each.dtype == array.dtype
-        assert each.shape == array.shape
-        assert np.array_equal(each, before)
+    for received in got.values():
+        assert received.dtype == array.dtype
+        assert received.shape == array.shape
+        assert np.array_equal(received, before)
     assert np.array_equal(array, before)
 
 

@@ -46,12 +46,12 @@ def off(said: Calibration) -> dict[str, np.ndarray]:
 def test_errors_have_the_deviations_of_the_settings() -> None:
     errors = [off(drawn(USUAL, seed)) for seed in range(600)]
     for name in ("focal", "centre", "rotation", "position", "time"):
-        values = np.array([each[name] for each in errors])
+        values = np.array([error[name] for error in errors])
         assert values.std(axis=0) == pytest.approx(float(getattr(USUAL, name)), rel=0.1), name
         assert abs(values.mean(axis=0)).max() < 0.15 * float(getattr(USUAL, name))
-    lens = np.array([each["distortion"] for each in errors]).std(axis=0)
+    lens = np.array([error["distortion"] for error in errors]).std(axis=0)
     assert lens == pytest.approx(3e-4 * np.array([1.0, 1.0, 0.1, 0.1, 0.0]), rel=0.1)
-    first, second = np.array([each["focal"] for each in errors]).T
+    first, second = np.array([error["focal"] for error in errors]).T
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.15
 
 
@@ -105,10 +105,10 @@ def test_lists_are_the_errors_themselves_the_left_eyes_first() -> None:
     error = CalibrationError(
         focal=(1.0, -2.0), distortion=(0.1, 0.0, 0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.5)
     )
-    found = off(drawn(error, 1))
-    assert found["focal"] == pytest.approx([1.0, -2.0])
-    assert found["distortion"].tolist() == [0.1, 0.0, 0.0, 0.0, 0.0]
-    assert found["rotation"] == pytest.approx([0.0, 0.0, 0.5])
+    errors = off(drawn(error, 1))
+    assert errors["focal"] == pytest.approx([1.0, -2.0])
+    assert errors["distortion"].tolist() == [0.1, 0.0, 0.0, 0.0, 0.0]
+    assert errors["rotation"] == pytest.approx([0.0, 0.0, 0.5])
     both = msgspec.convert(
         {
             "name": "s",

@@ -91,10 +91,10 @@ def test_exposure_and_gain_are_factors_on_the_light(factor: float) -> None:
 def test_a_vignette_darkens_as_announced(grey: bool) -> None:
     """In linear light, of every channel."""
     image = np.full((48, 64) if grey else (48, 64, 3), 200, np.uint8)
-    found = developed([image], vignette=(-0.5, 0.1))
+    result = developed([image], vignette=(-0.5, 0.1))
     light = LIGHT[200] * vignette_map(camera_info(spec()), (-0.5, 0.1))
     expected = np.interp(light if grey else light[..., None].repeat(3, 2), LIGHT, np.arange(256))
-    np.testing.assert_allclose(found, expected, atol=0.6)
+    np.testing.assert_allclose(result, expected, atol=0.6)
 
 
 @pytest.mark.parametrize("level", [30, 128, 220])
@@ -103,7 +103,7 @@ def test_a_vignette_darkens_as_announced(grey: bool) -> None:
 def test_shot_noise_is_that_of_the_electrons(level: int, gain: float, full_well: float) -> None:
     """Variance = mean, in electrons: found back by undoing the response, quantisation apart."""
     factor = 1.0 / gain  # the same light, of a shorter exposure
-    found = developed(
+    result = developed(
         [flat(level)],
         (0.001 * factor, gain),
         full_well=full_well,
@@ -111,7 +111,7 @@ def test_shot_noise_is_that_of_the_electrons(level: int, gain: float, full_well:
         exposure="1ms",
         reference_exposure="1ms",
     )
-    electrons = found / 255.0 * full_well / gain
+    electrons = result / 255.0 * full_well / gain
     expected = LIGHT[level] * full_well / gain
     step = full_well / gain / 255.0
     assert electrons.mean() == pytest.approx(expected, rel=0.01, abs=0.5 * step)
@@ -127,8 +127,8 @@ def test_announced_noise_is_the_one_at_middle_grey() -> None:
     """Shot noise and the other together."""
     settings = spec(noise=2.0, full_well=3000.0)
     announced = announcement(settings, source="d/c", prefix="d/", parent_frame_id="base_link")
-    found = developed([flat(128)], noise=2.0, full_well=3000.0)
-    assert announced.noise == pytest.approx(found.std(), rel=0.03)
+    result = developed([flat(128)], noise=2.0, full_well=3000.0)
+    assert announced.noise == pytest.approx(result.std(), rel=0.03)
     assert announced.noise > 2.5
     plain = announcement(spec(noise=2.0), source="d/c", prefix="", parent_frame_id="b")
     assert plain.noise == 2.0
@@ -140,14 +140,14 @@ def test_a_response_is_undone_by_what_is_announced(tmp_path: Path) -> None:
     file.write_text(" ".join(f"{255 * (k / 255) ** 1.7:.9g}" for k in range(256)), "utf-8")
     ramp = np.arange(256, dtype=np.uint8)[None]
     for response in ("linear", "gamma", str(file)):
-        found = developed([ramp], response=response)
+        result = developed([ramp], response=response)
         announced = announcement(
             spec(response=response), source="c", prefix="", parent_frame_id="b"
         )
         light = response_light(announced.response)
         levels = np.arange(256)
-        np.testing.assert_array_equal(found[0], np.rint(np.interp(LIGHT, light, levels)))
-        assert found[0, -1] == 255
+        np.testing.assert_array_equal(result[0], np.rint(np.interp(LIGHT, light, levels)))
+        assert result[0, -1] == 255
 
 
 def test_a_response_that_cannot_be_read_is_named(tmp_path: Path) -> None:
@@ -199,9 +199,9 @@ def test_defocus_is_in_linear_light() -> None:
     """A white line that blurs keeps its light."""
     image = np.zeros((41, 41), np.uint8)
     image[:, 20] = 255
-    found = developed([image], blur=2.0)
-    assert LIGHT[found[20]].sum() == pytest.approx(1.0, rel=0.02)
-    assert cv2.minMaxLoc(found)[1] > 60
+    result = developed([image], blur=2.0)
+    assert LIGHT[result[20]].sum() == pytest.approx(1.0, rel=0.02)
+    assert cv2.minMaxLoc(result)[1] > 60
 
 
 @pytest.mark.parametrize(
@@ -254,10 +254,10 @@ def wall(z: float) -> Depths:
 @pytest.mark.parametrize("focal", [0.0, 580.0])
 def test_noise_is_that_of_the_disparity(z: float, focal: float) -> None:
     """sigma_z = z² / (f b) sigma_d, within 10 %; without a bias."""
-    found = measured(wall(z), **PURE | {"disparity_noise": 0.1, "focal": focal})
+    depth = measured(wall(z), **PURE | {"disparity_noise": 0.1, "focal": focal})
     expected = z * z / ((focal or INFO.fx) * 0.075) * 0.1
-    inside = found[np.isfinite(found)].astype(np.float64)
-    assert len(inside) > 0.99 * found.size
+    inside = depth[np.isfinite(depth)].astype(np.float64)
+    assert len(inside) > 0.99 * depth.size
     assert inside.std() == pytest.approx(expected, rel=0.1)
     assert inside.mean() == pytest.approx(z, abs=0.3 * expected)
 
@@ -265,8 +265,8 @@ def test_noise_is_that_of_the_disparity(z: float, focal: float) -> None:
 @pytest.mark.parametrize("z", [0.8, 2.0, 6.0])
 def test_noise_and_steps_together(z: float) -> None:
     """Rounding adds a twelfth of the step's square: in disparity, where both are the same."""
-    found = measured(wall(z), **PURE | {"disparity_noise": 0.1, "disparity_step": 0.125})
-    disparity = INFO.fx * 0.075 / found[np.isfinite(found)].astype(np.float64)
+    depth = measured(wall(z), **PURE | {"disparity_noise": 0.1, "disparity_step": 0.125})
+    disparity = INFO.fx * 0.075 / depth[np.isfinite(depth)].astype(np.float64)
     np.testing.assert_allclose(disparity / 0.125, np.rint(disparity / 0.125), atol=1e-3)
     assert disparity.std() == pytest.approx((0.1**2 + 0.125**2 / 12) ** 0.5, rel=0.1)
 
@@ -274,9 +274,9 @@ def test_noise_and_steps_together(z: float) -> None:
 def test_steps_grow_with_the_square_of_depth() -> None:
     """A slope has as many values as there are steps, z² / (f b) · step apart."""
     slope = np.linspace(1.5, 4.0, 240, dtype=np.float32)[:, None].repeat(320, axis=1)
-    found = np.unique(measured(slope, **PURE | {"disparity_step": 0.125}))
-    found = found[np.isfinite(found)].astype(np.float64)
-    steps, middles = np.diff(found), (found[1:] + found[:-1]) / 2
+    depths = np.unique(measured(slope, **PURE | {"disparity_step": 0.125}))
+    depths = depths[np.isfinite(depths)].astype(np.float64)
+    steps, middles = np.diff(depths), (depths[1:] + depths[:-1]) / 2
     np.testing.assert_allclose(steps, middles**2 / (INFO.fx * 0.075) * 0.125, rtol=0.02)
 
 
@@ -286,26 +286,26 @@ def test_what_is_near_throws_a_shadow_to_its_left(model: str, near: float, far: 
     """As wide as the disparities differ; and a stereo camera loses the band at the left, too."""
     depth = wall(far)
     depth[:, 150:200] = near
-    found = np.isinf(measured(depth, **PURE | {"model": model, "max_slant": 90.0}))
+    lost = np.isinf(measured(depth, **PURE | {"model": model, "max_slant": 90.0}))
     reach = INFO.fx * 0.075
     shadow = reach / near - reach / far
-    np.testing.assert_allclose(found[:, 100:150].sum(axis=1), shadow, atol=0.51)
-    assert found[:, 150 - int(shadow) + 1 : 150].all()
-    assert not found[:, 150:].any()
+    np.testing.assert_allclose(lost[:, 100:150].sum(axis=1), shadow, atol=0.51)
+    assert lost[:, 150 - int(shadow) + 1 : 150].all()
+    assert not lost[:, 150:].any()
     band = reach / far if model == "stereo" else 0.0
-    np.testing.assert_allclose(found[:, :100].sum(axis=1), band, atol=0.51)
+    np.testing.assert_allclose(lost[:, :100].sum(axis=1), band, atol=0.51)
 
 
 def test_edges_are_lost_on_both_sides() -> None:
     """A pixel each: the square of 3×3 straddles the edge."""
     depth = wall(4.0)
     depth[100:150, 100:200] = 1.0
-    found = np.isinf(measured(depth, **PURE))
+    lost = np.isinf(measured(depth, **PURE))
     for row in (99, 100, 149, 150):
-        assert found[row, 120:180].all()
-    assert found[120, [199, 200]].all()
-    assert not found[98, 50:].any()
-    assert not found[102:148, 102:198].any()
+        assert lost[row, 120:180].all()
+    assert lost[120, [199, 200]].all()
+    assert not lost[98, 50:].any()
+    assert not lost[102:148, 102:198].any()
 
 
 @pytest.mark.parametrize("angle", [40.0, 60.0, 75.0])
@@ -320,13 +320,13 @@ def test_a_slanted_plane_is_lost_beyond_the_angle(angle: float) -> None:
     rays = np.stack(np.broadcast_arrays(u, v, 1.0), axis=-1)
     cosine = (rays @ normal) / np.linalg.norm(rays, axis=-1)
     settings = PURE | {"max_slant": 60.0, "min_depth": 0.0, "max_depth": 1e4}
-    found = np.isfinite(measured(depth, **settings))
-    inner = np.zeros_like(found)
+    hit = np.isfinite(measured(depth, **settings))
+    inner = np.zeros_like(hit)
     inner[2:-2, 2:-2] = True
     inner &= inverse > 0.02
     degrees = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    assert found[inner & (degrees < 59.5)].all()
-    assert not found[inner & (degrees > 60.5)].any()
+    assert hit[inner & (degrees < 59.5)].all()
+    assert not hit[inner & (degrees > 60.5)].any()
 
 
 def test_dark_surfaces_are_lost_to_structured_light_and_plain_ones_to_stereo() -> None:
@@ -340,8 +340,8 @@ def test_dark_surfaces_are_lost_to_structured_light_and_plain_ones_to_stereo() -
     assert not dark[:, 200:].any()
     dim = (colour / 2).astype(np.uint8)  # the projector has a light of its own
     meter = DepthMeter(DepthSensor(**settings), INFO, light=0.5)
-    found = np.isinf(meter.measure(wall(2.0), dim, generator(1, "c", 7)))
-    np.testing.assert_array_equal(found, dark)
+    lost = np.isinf(meter.measure(wall(2.0), dim, generator(1, "c", 7)))
+    np.testing.assert_array_equal(lost, dark)
     plain = np.isinf(measured(wall(2.0), colour, **settings | {"model": "stereo"}))
     assert plain[:, 110:190].all()
     assert not plain[:, 224:].any()

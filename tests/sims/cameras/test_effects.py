@@ -119,11 +119,11 @@ def test_an_open_shutter_sees_the_mean_of_the_motion(
     seen = [rgb(take(renderer, "plain", pose(t))) for t in moments(EXPOSURE, pixels)]
     light = np.mean([srgb_light()[image] for image in seen], axis=0)
     expected = np.rint(np.interp(light, srgb_light(), np.arange(256)))
-    found = rgb(take(renderer, "open", qvel=qvel))
+    blurred = rgb(take(renderer, "open", qvel=qvel))
     # The states differ in the last bits, and so may a pixel at an edge.
-    assert (np.abs(found.astype(int) - expected) > 1).mean() < 0.002
+    assert (np.abs(blurred.astype(int) - expected) > 1).mean() < 0.002
     if pixels > 1.0:
-        assert (np.abs(found.astype(int) - rgb(take(renderer, "plain"))) > 5).mean() > 0.1
+        assert (np.abs(blurred.astype(int) - rgb(take(renderer, "plain"))) > 5).mean() > 0.1
 
 
 def test_an_edge_becomes_as_wide_as_the_motion(renderer: CameraRenderer) -> None:
@@ -228,8 +228,8 @@ def test_velocity_between_two_poses() -> None:
     """Along north, west and up; turning about the body's own axes, in MuJoCo's."""
     before = pose_to_qpos((1.0, 2.0, 3.0), from_rpy(0.0, 0.0, 0.4))
     after = pose_to_qpos((1.2, 2.0, 2.9), from_rpy(0.0, 0.0, 0.5))
-    found = qvel_between(before, after, 0.1)
-    np.testing.assert_allclose(found, [2.0, 0.0, 1.0, 0.0, 0.0, -1.0], atol=1e-9)
+    velocity = qvel_between(before, after, 0.1)
+    np.testing.assert_allclose(velocity, [2.0, 0.0, 1.0, 0.0, 0.0, -1.0], atol=1e-9)
     nose_up = from_rpy(0.0, 0.1, math.pi / 2)
     before, after = (
         pose_to_qpos((0.0, 0.0, 0.0), q) for q in (from_rpy(0, 0, math.pi / 2), nose_up)

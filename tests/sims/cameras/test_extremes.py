@@ -265,8 +265,8 @@ def test_colours_of_fog_and_lights_beyond_white_are_white() -> None:
     fog = '<rgba fog="{}"/><map fogstart="0" fogend=".6"/>'
     for beyond, within in (("2 -1 .5 1", "1 0 .5 1"), ("1e30 65536 -1e30 1", "1 1 0 1")):
         one, other = (
-            seen(floor(ambient=".5 .5 .5", visual=fog.format(each)), fog=True)
-            for each in (beyond, within)
+            seen(floor(ambient=".5 .5 .5", visual=fog.format(colour)), fog=True)
+            for colour in (beyond, within)
         )
         np.testing.assert_array_equal(one, other)
     assert (seen(floor(lamp(colour="1e30 1e30 -1e30")))[80:100, 110:130] == [255, 255, 0]).all()
@@ -380,7 +380,7 @@ def test_a_camera_that_turns_about_between_two_rows_draws_the_same_bytes_anywher
         for turn in ((1, 0, 0, 0), (0.6, 0.8, 0, 0), (0, 0.6, 0.8, 0), (0, 0, 0, 1)):
             raster.keep(camera, np.array([0.0, 0.0, 1.0, *turn]), 0.0)
         raster.look(camera, np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
-        found = raster.draw(View(camera_info(PINHOLE)), True, True, True)
-        images.add(b"".join(each.tobytes() for each in found if each is not None))
+        parts = raster.draw(View(camera_info(PINHOLE)), True, True, True)
+        images.add(b"".join(part.tobytes() for part in parts if part is not None))
         raster.close()
     assert len(images) == 1

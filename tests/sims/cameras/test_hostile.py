@@ -31,7 +31,7 @@ def test_hostile_scenes_are_drawn_without_a_report_of_the_sanitizers(tmp_path: P
         ).stdout.strip()
         for name in ("libasan.so", "libubsan.so", "libstdc++.so")
     ]
-    if not all(Path(each).is_absolute() for each in runtimes):
+    if not all(Path(path).is_absolute() for path in runtimes):
         pytest.skip(f"needs the sanitizers' runtimes of {COMPILER}")
     library, everything = tmp_path / "checked.so", tmp_path / "everything.cpp"
     includes = [f'#include "{source}"\n' for source in sorted(SOURCES.glob("*.cpp"))]

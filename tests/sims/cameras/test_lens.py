@@ -88,8 +88,8 @@ def outline(info: CameraInfo, centre: Array, radius: float) -> Array:
     if info.distortion_model == "equidistant":
         distortion = np.array(info.distortion, np.float64)
         points = ring[:, None] / ring[:, None, 2:]
-        found = cv2.fisheye.projectPoints(points, zero, zero, info.matrix(), distortion)[0]
-        return np.asarray(found[:, 0], np.float64)
+        projected = cv2.fisheye.projectPoints(points, zero, zero, info.matrix(), distortion)[0]
+        return np.asarray(projected[:, 0], np.float64)
     return np.asarray(
         cv2.projectPoints(ring, zero, zero, info.matrix(), np.array(info.distortion))[0][:, 0]
     )
@@ -261,13 +261,13 @@ def test_every_ray_is_looked_up_in_one_face(
     )  # fmt: skip
     rays = pixel_rays(info)
     seen = np.isfinite(rays[..., 0])
-    found = np.zeros(seen.shape, int)
+    count = np.zeros(seen.shape, int)
     for face in faces(info):
         if face.columns is None or face.rows is None or face.mask is None:
             assert info.is_pinhole
             return
         assert max(face.width, face.height) <= LARGEST
-        found += face.mask
+        count += face.mask
         columns, rows = face.columns[face.mask], face.rows[face.mask]
         assert columns.min() >= 1.0
         assert rows.min() >= 1.0
@@ -278,7 +278,7 @@ def test_every_ray_is_looked_up_in_one_face(
         back = np.column_stack([x, y, np.ones(len(x))]) @ face.turn
         back /= np.linalg.norm(back, axis=1)[:, None]
         assert np.linalg.norm(back - rays[face.mask], axis=1).max() < 2e-3 * max(face.pitch) + 1e-6
-    np.testing.assert_array_equal(found, seen)
+    np.testing.assert_array_equal(count, seen)
 
 
 @pytest.mark.slow
@@ -302,7 +302,7 @@ def test_the_undistorted_twin_shows_the_same_world() -> None:
     info = camera_info(spec)
     ideal = camera("ideal", intrinsics=(info.fx, info.fy, info.cx, info.cy))
     frames = []
-    for each in (spec, ideal):
+    for lens in (spec, ideal):
         world = mujoco.MjSpec()
         for k in range(-6, 7):
             world.worldbody.add_geom(
@@ -311,7 +311,7 @@ def test_the_undistorted_twin_shows_the_same_world() -> None:
                 pos=[3 + 0.1 * k, 0.8 * k, 0.4 * (k % 3 - 1)],
                 rgba=[0.9, 0.1 * (k % 7), 0.4, 1],
             )
-        frames.append(render(each, world))
+        frames.append(render(lens, world))
     twin, expected = frames[0].undistorted, frames[1]
     assert twin is not None
     assert twin.rgb is not None

@@ -122,14 +122,14 @@ def residuals(spec: CameraSpec, info: CameraInfo) -> Array:
     np.testing.assert_allclose(
         frame.position, rotation(ORIENTATION) @ said.position + POSITION, atol=1e-9
     )
-    found = []
+    errors = []
     for number, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
         rows, columns = np.nonzero(frame.segmentation == number)
         assert len(rows) > 900, f"ball {number} is hidden"
-        found.append([columns.mean(), rows.mean()] - outline_centre(centre, radius, info))
+        errors.append([columns.mean(), rows.mean()] - outline_centre(centre, radius, info))
         nearest = float(frame.depth[frame.segmentation == number].min())
         assert centre[2] - radius - 0.002 < nearest < centre[2] - 0.5 * radius
-    return np.array(found)
+    return np.array(errors)
 
 
 @pytest.mark.slow
@@ -159,8 +159,8 @@ def test_a_point_out_of_focus_is_a_gaussian(sigma: float) -> None:
     """Of the spread that is asked for, about where the point was."""
     point = np.zeros((61, 61), np.uint16)
     point[28:33, 28:33] = 65535  # five pixels wide, so that rounding doesn't eat the flanks
-    found = defocused(point, sigma).astype(np.float64)
-    weight = found.sum(0) / found.sum()
+    blurred = defocused(point, sigma).astype(np.float64)
+    weight = blurred.sum(0) / blurred.sum()
     place = np.arange(61)
     assert weight @ place == pytest.approx(30.0, abs=1e-6)
     variance = weight @ (place - 30.0) ** 2
@@ -177,12 +177,12 @@ def test_no_blur_costs_nothing() -> None:
 )
 def test_moments_are_a_pixel_apart_at_most(shift: float, count: int) -> None:
     """As many as the motion needs, odd in number, up to a limit; centred on the exposure."""
-    found = moments(0.02, shift)
-    assert len(found) == count
-    assert found[count // 2] == 0.0
-    np.testing.assert_allclose(found, -np.array(found[::-1]), atol=1e-15)
-    np.testing.assert_allclose(np.diff(found), 0.02 / count, rtol=1e-9)
-    assert found[-1] + 0.02 / count / 2 == pytest.approx(0.01)
+    times = moments(0.02, shift)
+    assert len(times) == count
+    assert times[count // 2] == 0.0
+    np.testing.assert_allclose(times, -np.array(times[::-1]), atol=1e-15)
+    np.testing.assert_allclose(np.diff(times), 0.02 / count, rtol=1e-9)
+    assert times[-1] + 0.02 / count / 2 == pytest.approx(0.01)
 
 
 @pytest.mark.slow
@@ -193,9 +193,9 @@ def test_the_mean_is_rounded_and_does_not_overflow(instructions: str) -> None:
     codes[253:] = 0, 65534, 65535
     values = np.array([[255, 255, 0], [255, 254, 0], [255, 254, 2]], np.uint8)
     passes = Passes(instructions)
-    found = passes.mean([row[None] for row in values], codes)
-    assert found.dtype == np.uint16
-    np.testing.assert_array_equal(found, [[65535, 65534, 1]])
+    mean = passes.mean([row[None] for row in values], codes)
+    assert mean.dtype == np.uint16
+    np.testing.assert_array_equal(mean, [[65535, 65534, 1]])
     for count in range(1, 128):
         for light in range(0, count, 7):
             images = [np.full((1, 1), int(k < light), np.uint8) for k in range(count)]

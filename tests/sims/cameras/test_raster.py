@@ -187,13 +187,13 @@ def shaped(body: str, ambient: str = "1 1 1", shine: str = "0 0 0", **material: 
 def compare(model: Any, levels: float, numbers: float = 0.99) -> None:
     raster, reference = Raster(model), OpenGL(model, (camera_info(PINHOLE),), 1)
     for place, turn in AROUND:
-        found = difference(
+        differences = difference(
             drawn(reference, PINHOLE, place, from_rpy(*turn)),
             drawn(raster, PINHOLE, place, from_rpy(*turn)),
         )
-        assert found[0] >= numbers
-        assert found[1] <= levels
-        assert found[2] < 1e-3  # MuJoCo's depth buffer, close by
+        assert differences[0] >= numbers
+        assert differences[1] <= levels
+        assert differences[2] < 1e-3  # MuJoCo's depth buffer, close by
     raster.close()
     reference.close()
 
@@ -289,7 +289,7 @@ PLATE = """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
+@pytest.mark.parametrize("spec", SPECS, ids=lambda camera: camera.name)
 @pytest.mark.parametrize("roll", [0.0, 0.2, 0.7])
 def test_a_plate_gives_the_light_of_its_area(spec: CameraSpec, roll: float) -> None:
     """Wherever between the pixels its outline runs."""
@@ -336,7 +336,7 @@ def test_textures_of_any_size_stay_in_place_in_the_distance(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
+@pytest.mark.parametrize("spec", SPECS, ids=lambda camera: camera.name)
 def test_outlines_and_textures_are_near_the_mean_of_many_samples(spec: CameraSpec) -> None:
     info, samples = camera_info(spec), 4
     raster = Raster(model_of("hall"))
@@ -434,7 +434,7 @@ def test_no_pixel_of_small_triangles_is_missed_by_any_lens(
     assert (depth.ravel()[ahead] <= (distance * rays[:, 2])[ahead] + 1e-4).all()
 
 
-@pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
+@pytest.mark.parametrize("spec", SPECS, ids=lambda camera: camera.name)
 def test_some_rows_are_those_of_the_whole_image(spec: CameraSpec) -> None:
     raster = Raster(model_of("hall"))
     place, turn = next(places("hall"))
@@ -452,8 +452,8 @@ def test_each_image_is_the_same_alone() -> None:
     whole = drawn(raster, PINHOLE, *next(places("hall")))
     for wanted in itertools.product((False, True), repeat=3):
         colour, depth, numbers = wanted
-        found = raster.draw(View(camera_info(PINHOLE)), colour, depth, numbers)
-        for alone, image, asked in zip(found, whole, wanted, strict=True):
+        drawn_alone = raster.draw(View(camera_info(PINHOLE)), colour, depth, numbers)
+        for alone, image, asked in zip(drawn_alone, whole, wanted, strict=True):
             assert (alone is not None) == asked
             if alone is not None and image is not None:
                 np.testing.assert_array_equal(alone, image)
@@ -477,10 +477,10 @@ def hash_of(name: str, instructions: str, threads: int = 1) -> str:
 def test_the_bytes_are_those_of_every_machine(name: str) -> None:
     """With each instruction set that this one has, and by any number of threads."""
     saved = json.loads(HASHES.read_text(encoding="utf-8"))
-    found = {hash_of(name, each) for each in libraries()} | {
+    hashes = {hash_of(name, library) for library in libraries()} | {
         hash_of(name, "", k) for k in (2, 5, 99)
     }
-    assert found == {saved[name]}
+    assert hashes == {saved[name]}
 
 
 def test_what_it_cannot_draw_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

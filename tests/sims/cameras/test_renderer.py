@@ -75,8 +75,8 @@ def test_same_bits_in_other_processes(renderer: CameraRenderer, draws: RendererN
     built = scene("hall")
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         jobs = [pool.apply_async(elsewhere, (built.packed, built.prefix, draws)) for _ in range(2)]
-        found = {job.get(timeout=50) for job in jobs}
-    assert found == {digest(frames_of(renderer, 7, QPOS, NAMES))}
+        digests = {job.get(timeout=50) for job in jobs}
+    assert digests == {digest(frames_of(renderer, 7, QPOS, NAMES))}
 
 
 def test_one_camera_is_drawn_the_same_alone_and_among_others(renderer: CameraRenderer) -> None:
@@ -91,11 +91,11 @@ def test_a_frame_holds_what_the_spec_asks_for(renderer: CameraRenderer) -> None:
     """Shapes and types are the announced ones, and what wasn't asked for is None."""
     frames = frames_of(renderer, 7, QPOS, NAMES)
     everything, plain = frames["all"], frames["wide"]
-    found = [
+    shapes = [
         None if image is None else (image.dtype, image.shape, image.flags.c_contiguous)
         for image in (everything.rgb, everything.grey, everything.depth, everything.segmentation)
     ]
-    assert found == [
+    assert shapes == [
         (np.dtype(np.uint8), (240, 320, 3), True),
         (np.dtype(np.uint8), (240, 320), True),
         (np.dtype(np.float32), (240, 320), True),

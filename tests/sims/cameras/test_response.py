@@ -59,8 +59,8 @@ def depth_noise(coefficient: float, stamp: int = 7) -> Array:
 def shot_noise() -> Array:
     """Of a linear image sensor, 32 electrons a grey level."""
     spec = CameraSpec(name="c", response="linear", full_well=8160.0, gain=2.0)
-    found = Development(spec).develop([GREY], generator(1, "c", 7), gain=2.0)
-    return found.astype(np.float64)
+    image = Development(spec).develop([GREY], generator(1, "c", 7), gain=2.0)
+    return image.astype(np.float64)
 
 
 def correlation(a: Array, b: Array) -> float:
@@ -70,17 +70,17 @@ def correlation(a: Array, b: Array) -> float:
 @pytest.mark.parametrize("sigma", [0.5, 2.0, 10.0, 40.0])
 def test_grey_levels_have_mean_and_deviation(sigma: float) -> None:
     """Of the rounded noise: a whole number of levels adds a variance of 1/12."""
-    found = image_noise(sigma)
-    assert found.mean() == pytest.approx(0.0, abs=0.015 * sigma)
-    assert found.std() == pytest.approx((sigma**2 + 1 / 12) ** 0.5, rel=0.02)
+    noise = image_noise(sigma)
+    assert noise.mean() == pytest.approx(0.0, abs=0.015 * sigma)
+    assert noise.std() == pytest.approx((sigma**2 + 1 / 12) ** 0.5, rel=0.02)
 
 
 def test_noise_is_distributed_normally() -> None:
     """As much as there should be lies beyond one, two, three and four deviations."""
-    found = np.abs(depth_noise(0.002)) / 0.008
+    deviations = np.abs(depth_noise(0.002)) / 0.008
     for border, share in ((1, 0.3173), (2, 0.0455), (3, 0.0027), (4, 6.3e-5)):
-        beyond = float((found > border).mean())
-        assert beyond == pytest.approx(share, abs=5 * (share / found.size) ** 0.5)
+        beyond = float((deviations > border).mean())
+        assert beyond == pytest.approx(share, abs=5 * (share / deviations.size) ** 0.5)
 
 
 def test_depth_noise_grows_with_the_square_of_depth() -> None:
@@ -93,20 +93,20 @@ def test_depth_noise_grows_with_the_square_of_depth() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "found",
+    "noise",
     [image_noise(10.0), shot_noise(), depth_noise(0.002)],
     ids=["image", "shot", "depth"],
 )
-def test_noise_is_white(found: Array) -> None:
+def test_noise_is_white(noise: Array) -> None:
     """No pixel says anything of its neighbours, and no channel of the others."""
     for shift in range(1, 5):
-        assert abs(correlation(found[:, :-shift], found[:, shift:])) < ENOUGH
-        assert abs(correlation(found[:-shift], found[shift:])) < ENOUGH
-    if found.ndim == 3:
-        assert abs(correlation(found[..., 0], found[..., 1])) < ENOUGH
-        assert abs(correlation(found[..., 0], found[..., 2])) < ENOUGH
-        assert abs(correlation(found[..., 1], found[..., 2])) < ENOUGH
-    flat = found.ravel()  # random numbers are made in blocks of 8, groups of 64 and chunks of 512
+        assert abs(correlation(noise[:, :-shift], noise[:, shift:])) < ENOUGH
+        assert abs(correlation(noise[:-shift], noise[shift:])) < ENOUGH
+    if noise.ndim == 3:
+        assert abs(correlation(noise[..., 0], noise[..., 1])) < ENOUGH
+        assert abs(correlation(noise[..., 0], noise[..., 2])) < ENOUGH
+        assert abs(correlation(noise[..., 1], noise[..., 2])) < ENOUGH
+    flat = noise.ravel()  # random numbers are made in blocks of 8, groups of 64 and chunks of 512
     for shift in (5, 6, 8, 16, 32, 48, 64, 128, 512, 1200):
         assert abs(correlation(flat[:-shift], flat[shift:])) < ENOUGH
         size = np.square(flat - flat.mean())
@@ -134,7 +134,7 @@ def test_a_pixel_says_nothing_of_the_next_exposures() -> None:
     small = Development(CameraSpec(name="c", width=8, height=8, noise=10.0))
     grey = np.full((8, 8, 3), 128, np.uint8)
     for step in ((0, 0, 1), (0, 0, 33_333_333), (0, 1, 0), (1, 0, 0)):
-        found = np.array(
+        levels = np.array(
             [
                 small.develop([grey], generator(k * step[0], f"c{k * step[1]}", k * step[2]))
                 for k in range(800)
@@ -142,8 +142,8 @@ def test_a_pixel_says_nothing_of_the_next_exposures() -> None:
             np.float64,
         )
         for lag in (1, 2, 7):
-            assert abs(correlation(found[:-lag], found[lag:])) < 5.0 / found[lag:].size ** 0.5
-        assert found.mean() == pytest.approx(128.0, abs=5 * 10.0 / found.size**0.5)
+            assert abs(correlation(levels[:-lag], levels[lag:])) < 5.0 / levels[lag:].size ** 0.5
+        assert levels.mean() == pytest.approx(128.0, abs=5 * 10.0 / levels.size**0.5)
 
 
 def test_the_same_exposure_has_the_same_noise() -> None:
@@ -156,21 +156,21 @@ def test_grey_levels_are_clipped_not_wrapped() -> None:
     for sigma in (10.0, 1e6):
         for level in (0, 255):
             flat = np.full((100, 100), level, np.uint8)
-            found = noisy_image(flat, sigma, generator(1, "c", 7)).astype(int)
-            assert (found == level).mean() == pytest.approx(0.5, abs=0.06)
+            levels = noisy_image(flat, sigma, generator(1, "c", 7)).astype(int)
+            assert (levels == level).mean() == pytest.approx(0.5, abs=0.06)
             if sigma == 10.0:
-                assert np.abs(found - level).max() < 60
+                assert np.abs(levels - level).max() < 60
 
 
 def test_what_was_not_hit_stays_so() -> None:
     """Infinite depth has no noise, and finite depth never becomes infinite or negative."""
     depth = np.array([[np.inf, 0.02, 3.0, 499.0]] * 500, np.float32)
-    found = noisy_depth(depth, 0.05, generator(1, "c", 7))
-    assert np.isinf(found[:, 0]).all()
-    assert (found[:, 0] > 0).all()
-    assert np.isfinite(found[:, 1:]).all()
-    assert found.min() == 0.0
-    assert found.dtype == np.float32
+    noisy = noisy_depth(depth, 0.05, generator(1, "c", 7))
+    assert np.isinf(noisy[:, 0]).all()
+    assert (noisy[:, 0] > 0).all()
+    assert np.isfinite(noisy[:, 1:]).all()
+    assert noisy.min() == 0.0
+    assert noisy.dtype == np.float32
 
 
 def test_no_noise_costs_nothing() -> None:
@@ -237,7 +237,7 @@ def test_bytes_are_the_same_with_all_instructions(settings: dict[str, Any], expe
         try:
             development = Development(spec, instructions)
             random = generator(1, "c", 7)
-            found = (
+            developed = (
                 development.develop(images, random),
                 development.develop(images[:1], random),
                 development.develop([image[..., 1] for image in images], random),
@@ -245,7 +245,7 @@ def test_bytes_are_the_same_with_all_instructions(settings: dict[str, Any], expe
             )
         finally:
             cv2.setUseOptimized(True)
-        hashes.add(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest()[:16])
+        hashes.add(hashlib.sha256(b"".join(part.tobytes() for part in developed)).hexdigest()[:16])
     assert hashes == {expected}
 
 
@@ -350,10 +350,10 @@ def test_who_renders_makes_no_difference(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_an_image_has_no_effect_before_it_is_delivered(tmp_path: Path) -> None:
     """With a latency of three periods, the first four are exposed alike."""
-    found = shutters(run(tmp_path, 1.6, latency="110ms"))
-    assert found[0] == pytest.approx((4e-3, 1.0))
-    assert len(set(found[:4])) == 1
-    assert found[4] != found[0]
+    exposures = shutters(run(tmp_path, 1.6, latency="110ms"))
+    assert exposures[0] == pytest.approx((4e-3, 1.0))
+    assert len(set(exposures[:4])) == 1
+    assert exposures[4] != exposures[0]
 
 
 @pytest.mark.slow

@@ -93,15 +93,15 @@ def arrivals(result: NodeResult, what: str = "Image") -> dict[int, int]:
 
 def test_delays_are_spread_evenly_over_the_jitter() -> None:
     """As many exposures are lost as is asked for; the same seed loses the same."""
-    found = [delay_of(SPOILT, 1, k * 33 * MS) for k in range(4000)]
-    delays = [delay for delay in found if delay is not None]
-    assert 1.0 - len(delays) / len(found) == pytest.approx(0.3, abs=0.03)
+    drawn = [delay_of(SPOILT, 1, k * 33 * MS) for k in range(4000)]
+    delays = [delay for delay in drawn if delay is not None]
+    assert 1.0 - len(delays) / len(drawn) == pytest.approx(0.3, abs=0.03)
     assert 0.04 <= min(delays) < 0.041
     assert 0.129 < max(delays) <= 0.13
     assert np.mean(delays) == pytest.approx(0.085, abs=0.002)
     assert np.std(delays) == pytest.approx(0.09 / 12**0.5, rel=0.03)
-    assert found == [delay_of(SPOILT, 1, k * 33 * MS) for k in range(4000)]
-    assert found != [delay_of(SPOILT, 2, k * 33 * MS) for k in range(4000)]
+    assert drawn == [delay_of(SPOILT, 1, k * 33 * MS) for k in range(4000)]
+    assert drawn != [delay_of(SPOILT, 2, k * 33 * MS) for k in range(4000)]
 
 
 def test_loss_and_jitter_do_not_depend_on_each_other() -> None:
@@ -190,8 +190,8 @@ def vehicle(world: str) -> NodeResult:
 @pytest.mark.slow
 def test_a_free_camera_smears_while_it_moves(free: NodeResult) -> None:
     """With a velocity, and not when it is put elsewhere at once."""
-    found = [stamp // (100 * MS) for stamp, is_smeared in smeared(free).items() if is_smeared]
-    assert found == [5, 6, 7, 8, 9]
+    stamps = [stamp // (100 * MS) for stamp, is_smeared in smeared(free).items() if is_smeared]
+    assert stamps == [5, 6, 7, 8, 9]
 
 
 @pytest.mark.slow
@@ -204,9 +204,9 @@ def test_a_trajectory_smears(world: str, tmp_path: Path) -> None:
 
 
 def test_a_vehicle_smears_while_it_moves(vehicle: NodeResult) -> None:
-    found = smeared(vehicle)
-    assert [stamp for stamp, is_smeared in found.items() if is_smeared and stamp < 600 * MS] == []
-    assert sum(found.values()) >= 8
+    images = smeared(vehicle)
+    assert [stamp for stamp, is_smeared in images.items() if is_smeared and stamp < 600 * MS] == []
+    assert sum(images.values()) >= 8
 
 
 def test_mountings_are_said_once_at_the_start(free: NodeResult, vehicle: NodeResult) -> None:
@@ -268,8 +268,8 @@ def test_a_rolling_shutter_sees_the_true_states_of_a_vehicle(world: str) -> None
         expected = pose_matrix(state.position, state.orientation) @ pose_matrix(
             mount.translation, mount.rotation
         )
-        found = pose_matrix(pose.position, pose.orientation)
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+        matrix = pose_matrix(pose.position, pose.orientation)
+        np.testing.assert_allclose(matrix, expected, atol=1e-9)
         compared += 1
     assert compared > 60
     assert result.of(Image)[-1].stamp > 1500 * MS
@@ -290,7 +290,7 @@ def test_the_eyes_of_a_stereo_rig_expose_together(world: str) -> None:
         assert one.stamp == other.stamp
         assert not np.array_equal(one.data, other.data)
     poses = result.of(PoseStamped)
-    by_eye = [[p for p in poses if p.source == each.source] for each in (left, right)]
+    by_eye = [[p for p in poses if p.source == eye.source] for eye in (left, right)]
     for one_pose, other_pose in zip(*by_eye, strict=True):
         assert math.dist(one_pose.position, other_pose.position) == pytest.approx(0.2)
         assert one_pose.stamp == other_pose.stamp
@@ -370,7 +370,8 @@ def test_images_without_distortion_come_beside_the_others(world: str) -> None:
     assert twin.info.is_pinhole
     for kind in (Image, DepthImage, PoseStamped):
         stamps = [
-            [e.stamp for e in result.of(kind) if e.source == each.source] for each in (own, twin)
+            [e.stamp for e in result.of(kind) if e.source == camera.source]
+            for camera in (own, twin)
         ]
         assert stamps[0] == stamps[1]
         assert len(stamps[0]) >= 6

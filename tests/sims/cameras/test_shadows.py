@@ -44,7 +44,7 @@ def shadowed(spec: CameraSpec, kind: str, casts: bool = True, size: int = 4096) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spec", SPECS, ids=lambda each: each.name)
+@pytest.mark.parametrize("spec", SPECS, ids=lambda camera: camera.name)
 @pytest.mark.parametrize("kind", ["spot", "directional"])
 def test_shadows_lie_where_the_light_does_not_arrive(kind: str, spec: CameraSpec) -> None:
     """On the floor and on the bodies, which throw none on the sides that face the light."""

@@ -118,7 +118,7 @@ def test_rows_and_bands_look_like_one_drawing_for_each_row(
     (by_row,) = renderer.expose((moving(name),))
     rolls = renderer._stage.keeps_rows
     monkeypatch.setattr(renderer._stage, "keeps_rows", False)
-    (found,) = renderer.expose((moving(name),))
+    (exposed,) = renderer.expose((moving(name),))
     monkeypatch.setattr("sims.cameras.renderer.row_bands", each_row)
     (expected,) = renderer.expose((moving(name),))
     monkeypatch.setattr("sims.cameras.renderer.row_bands", lambda height, _: [(0, height)])
@@ -130,7 +130,7 @@ def test_rows_and_bands_look_like_one_drawing_for_each_row(
         colours = np.abs(one.rgb.astype(float) - other.rgb).mean()
         return float(colours), float(np.mean(np.not_equal(one.segmentation, other.segmentation)))  # type: ignore[arg-type]
 
-    near, far = unlike(found, expected), unlike(at_once, expected)
+    near, far = unlike(exposed, expected), unlike(at_once, expected)
     nearest = unlike(by_row, expected)
     if rolls:
         assert nearest[1] < 0.0015
@@ -138,10 +138,10 @@ def test_rows_and_bands_look_like_one_drawing_for_each_row(
     assert near[1] < 0.015
     assert near[0] < 0.2 * far[0]
     assert near[1] < 0.2 * far[1]
-    assert found.depth is not None
+    assert exposed.depth is not None
     assert expected.depth is not None
-    same = np.isfinite(found.depth) & np.isfinite(expected.depth)
-    assert np.quantile(np.abs(found.depth[same] - expected.depth[same]), 0.95) < 0.02
+    same = np.isfinite(exposed.depth) & np.isfinite(expected.depth)
+    assert np.quantile(np.abs(exposed.depth[same] - expected.depth[same]), 0.95) < 0.02
 
 
 @pytest.mark.slow
@@ -164,12 +164,12 @@ def test_known_points_fall_on_their_pixels_in_the_row_that_sees_them(
             continue
         ring = outline(model.geom_pos[number] * (1, -1, -1), 0.17)
         at_once = [falls(info, point, 0.0) for point in ring]
-        found = []
+        places = []
         for point, place in zip(ring, at_once, strict=True):
             for _ in range(6):
                 place = falls(info, point, row_time(READOUT, float(place[1]), info.height))
-            found.append(place)
-        middle, area = centroid(np.array(found))
+            places.append(place)
+        middle, area = centroid(np.array(places))
         if len(rows) > 0.97 * area:  # nothing hides it
             errors.append(np.array([columns.mean(), rows.mean()]) - middle)
             skews.append(middle - centroid(np.array(at_once))[0])

@@ -91,14 +91,14 @@ def test_what_is_out_of_view_is_not_missed(
         if aimed:
             turn = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
             stage.aim(turn, -0.3, 1.1, -0.9, 0.2)
-        found = *stage.colour_and_depth(SIZE, True, True), stage.segmentation(SIZE)
+        images = *stage.colour_and_depth(SIZE, True, True), stage.segmentation(SIZE)
         left_out += int((~stage._in_view(SIZE)).sum())
         with monkeypatch.context() as all_of_it:
             all_of_it.setattr(
                 stage, "_in_view", lambda _, stage=stage: stage.model.geom_rbound > -1
             )
             whole = *stage.colour_and_depth(SIZE, True, True), stage.segmentation(SIZE)
-        for a, b in zip(found, whole, strict=True):
+        for a, b in zip(images, whole, strict=True):
             np.testing.assert_array_equal(a, b)
     assert left_out > 0
 

@@ -61,10 +61,10 @@ def drawn() -> dict[str, npt.NDArray[Any]]:
 
 def test_images_are_those_of_before() -> None:
     """Of every kind, with noise, blur and light, at odd sizes; none more and none less."""
-    found = drawn()
+    images = drawn()
     with np.load(SAVED) as saved:
-        assert set(found) == set(saved)
-        for name, image in found.items():
+        assert set(images) == set(saved)
+        for name, image in images.items():
             np.testing.assert_array_equal(image, saved[name], err_msg=name)
 
 

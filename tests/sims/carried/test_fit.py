@@ -295,7 +295,9 @@ def test_a_placement_keeps_the_motion() -> None:
     rows = wandering(np.arange(0.0, 5.0, 0.01))
     moved = placed(rows, Placement(position=(1.0, 2.0, -3.0), heading=90.0, scale=0.5))
     np.testing.assert_allclose(moved[0, 1:4], (1.0, 2.0, -3.0))
-    steps = [np.linalg.norm(np.diff(each[:, 1:4], axis=0), axis=1) for each in (rows, moved)]
+    steps = [
+        np.linalg.norm(np.diff(trajectory[:, 1:4], axis=0), axis=1) for trajectory in (rows, moved)
+    ]
     np.testing.assert_allclose(steps[1], steps[0] / 2.0)
     about = turn(moved[:, 4:]) * turn(rows[:, 4:]).inv()
     np.testing.assert_allclose(about.as_rotvec(), np.tile((0, 0, math.pi / 2), (500, 1)), atol=1e-9)

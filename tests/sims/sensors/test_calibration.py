@@ -60,7 +60,7 @@ def off(said: Any, true: Any) -> dict[str, np.ndarray]:
     """Return the errors of an announcement."""
     turn = Rotation.from_quat(true.orientation, scalar_first=True).inv()
     turn *= Rotation.from_quat(said.orientation, scalar_first=True)
-    found = {
+    errors = {
         "rotation": np.degrees(turn.as_rotvec()),
         "position": np.subtract(said.position, true.position),
     }
@@ -69,12 +69,12 @@ def off(said: Any, true: Any) -> dict[str, np.ndarray]:
             np.subtract(getattr(said, name), getattr(true, name)).reshape(3, 3)
             for name in ("gyroscope_matrix", "accelerometer_matrix")
         ]
-        found["scale"] = np.ravel([np.diag(matrix) for matrix in matrices])
+        errors["scale"] = np.ravel([np.diag(matrix) for matrix in matrices])
         rest = [matrix - np.diag(np.diag(matrix)) for matrix in matrices]
         assert not np.triu(rest[1]).any()  # it would be a rotation of the mounting
         aside = [rest[0][~np.eye(3, dtype=bool)], rest[1][np.tril_indices(3, -1)]]
-        found["misalignment"] = np.concatenate(aside)
-    return found
+        errors["misalignment"] = np.concatenate(aside)
+    return errors
 
 
 def drawn(true: Any, error: Any, name: str) -> Any:
@@ -85,7 +85,7 @@ def drawn(true: Any, error: Any, name: str) -> Any:
 def test_errors_have_the_deviations_of_the_settings(true: Any, usual: Any) -> None:
     errors = [off(drawn(true, usual, f"sensor{k}"), true) for k in range(500)]
     for name in usual.__struct_fields__:
-        values = np.array([each[name] for each in errors])
+        values = np.array([error[name] for error in errors])
         deviation = getattr(usual, name)
         assert values.std(axis=0) == pytest.approx(deviation, rel=0.15), name
         assert abs(values.mean(axis=0)).max() < 0.2 * deviation
@@ -196,5 +196,5 @@ def test_the_true_calibration_stands_in_the_summary_alone(tmp_path: Any) -> None
     first = [truth[name]["gyroscope_matrix"][0] for name in ("announced", "true")]
     assert first == [1.0625, 1.0]
     said = run.summary["announcements"]
-    (imu,) = (each for each in said if each["source"] == "drone/imu")
+    (imu,) = (announcement for announcement in said if announcement["source"] == "drone/imu")
     assert imu["gyroscope_matrix"][0] == 1.0625

@@ -77,15 +77,15 @@ def test_the_drift_tends_to_its_standard_deviation_and_airsims_does_not() -> Non
     """With a time constant of 1 s: 0.001825 of the pressure, and √(dt/2τ) = 0.1 of that."""
     base = pressure_at(ORIGIN[2])
     for model, expected in (("gauss_markov", 0.001825), ("airsim", 0.0001825)):
-        found = errors(barometer(noise=0.0, drift_time=1.0, model=model), 60_000)[500:]
-        assert found.std() / base == pytest.approx(expected, rel=0.1)
+        pressures = errors(barometer(noise=0.0, drift_time=1.0, model=model), 60_000)[500:]
+        assert pressures.std() / base == pytest.approx(expected, rel=0.1)
 
 
 @pytest.mark.slow
 def test_the_drift_keeps_its_value_over_its_time_constant() -> None:
     """Autocorrelation e^-1 after one time constant of 0.2 s: ten samples."""
-    found = errors(barometer(noise=0.0, drift_time=0.2), 60_000)[500:]
-    correlation = float(np.corrcoef(found[:-10], found[10:])[0, 1])
+    drift = errors(barometer(noise=0.0, drift_time=0.2), 60_000)[500:]
+    correlation = float(np.corrcoef(drift[:-10], drift[10:])[0, 1])
     assert correlation == pytest.approx(np.exp(-1.0), abs=0.05)
 
 
@@ -126,16 +126,16 @@ def test_near_seattle_it_points_15_degrees_east_of_north_and_69_down() -> None:
 def test_the_field_is_in_the_sensors_own_axes() -> None:
     """Heading east and mounted upside down: ahead is east, right is north, down is up."""
     sensor = magnetometer(noise=0.0, orientation=(180.0, 0.0, 0.0))
-    found = sensor.measure(truth(orientation=from_rpy(0.0, 0.0, np.pi / 2)))
+    measurement = sensor.measure(truth(orientation=from_rpy(0.0, 0.0, np.pi / 2)))
     north, east, down = sensor.field
-    assert found.magnetic_field == pytest.approx((east, north, -down), rel=1e-6)
+    assert measurement.magnetic_field == pytest.approx((east, north, -down), rel=1e-6)
 
 
 def test_noise_bias_and_scale_are_those_of_its_settings() -> None:
     sensor = magnetometer(scale_factor=2.0)
-    found = np.array([sensor.measure(truth()).magnetic_field for _ in range(3000)])
-    np.testing.assert_allclose(found.std(axis=0), sensor.announcement().noise, rtol=0.05)
-    np.testing.assert_allclose(found.mean(axis=0), np.multiply(sensor.field, 2.0), atol=5e-8)
+    fields = np.array([sensor.measure(truth()).magnetic_field for _ in range(3000)])
+    np.testing.assert_allclose(fields.std(axis=0), sensor.announcement().noise, rtol=0.05)
+    np.testing.assert_allclose(fields.mean(axis=0), np.multiply(sensor.field, 2.0), atol=5e-8)
     biases = [
         np.subtract(s.measure(truth()).magnetic_field, s.field)
         for s in (magnetometer(seed, noise=0.0, bias=1e-6) for seed in range(200))
@@ -150,15 +150,15 @@ def gnss(seed: int = 0, **settings: Any) -> Gnss:
 
 def misplacements(sensor: Gnss, count: int) -> npt.NDArray[np.float64]:
     fixes = (sensor.measure(truth((10.0, 20.0, -30.0))) for _ in range(count))
-    found = [from_geodetic((f.latitude, f.longitude, f.altitude), ORIGIN) for f in fixes]
-    return np.array(found) - (10.0, 20.0, -30.0)
+    positions = [from_geodetic((f.latitude, f.longitude, f.altitude), ORIGIN) for f in fixes]
+    return np.array(positions) - (10.0, 20.0, -30.0)
 
 
 def test_by_default_it_tells_the_truth_of_its_antenna() -> None:
     sensor = gnss(position=(0.0, 0.0, -0.1))
     fix = sensor.measure(truth((5.0, -6.0, -7.0), velocity=(1.0, 2.0, 3.0), seconds=10.0))
-    found = from_geodetic((fix.latitude, fix.longitude, fix.altitude), ORIGIN)
-    assert found == pytest.approx((5.0, -6.0, -7.1), abs=1e-6)
+    position = from_geodetic((fix.latitude, fix.longitude, fix.altitude), ORIGIN)
+    assert position == pytest.approx((5.0, -6.0, -7.1), abs=1e-6)
     assert fix.velocity == (1.0, 2.0, 3.0)
 
 
@@ -174,9 +174,9 @@ def test_its_velocity_is_the_rate_of_change_of_its_position(
         axis = np.multiply(rates, np.sin(half) / (turning or 1.0)).tolist()
         turn = multiply(from_rpy(*angles), (float(np.cos(half)), *axis))
         place = tuple(np.multiply(velocity, seconds).tolist())
-        found = sensor.measure(truth(place, turn, velocity, rates))
-        where = (found.latitude, found.longitude, found.altitude)
-        return from_geodetic(where, ORIGIN), found.velocity
+        measurement = sensor.measure(truth(place, turn, velocity, rates))
+        where = (measurement.latitude, measurement.longitude, measurement.altitude)
+        return from_geodetic(where, ORIGIN), measurement.velocity
 
     (before, _), (_, said), (after, _) = fix(-1e-3), fix(0.0), fix(1e-3)
     np.testing.assert_allclose(said, np.subtract(after, before) / 2e-3, atol=1e-3)
@@ -187,9 +187,9 @@ def test_its_velocity_is_the_rate_of_change_of_its_position(
 def test_at_the_centre_of_mass_turning_changes_no_bit_of_its_velocity(
     velocity: Vector3, rates: Vector3
 ) -> None:
-    found = gnss().measure(truth(velocity=velocity, angular_velocity=rates)).velocity
+    measured = gnss().measure(truth(velocity=velocity, angular_velocity=rates)).velocity
     no_noise = 0.0 * random().standard_normal((2, 3))[1]  # zeros of either sign
-    assert np.array(found).tobytes() == (np.array(velocity) + no_noise).tobytes()
+    assert np.array(measured).tobytes() == (np.array(velocity) + no_noise).tobytes()
 
 
 @pytest.mark.parametrize(
@@ -209,9 +209,9 @@ def test_white_noise_is_the_announced_one() -> None:
     sensor = gnss(horizontal_noise=1.5, vertical_noise=3.0, velocity_noise=0.1)
     announced = sensor.announcement()
     assert (announced.horizontal_noise, announced.vertical_noise) == (1.5, 3.0)
-    found = misplacements(sensor, 3000)
-    np.testing.assert_allclose(found.std(axis=0), [1.5, 1.5, 3.0], rtol=0.05)
-    np.testing.assert_allclose(np.corrcoef(found.T), np.eye(3), atol=0.06)
+    offsets = misplacements(sensor, 3000)
+    np.testing.assert_allclose(offsets.std(axis=0), [1.5, 1.5, 3.0], rtol=0.05)
+    np.testing.assert_allclose(np.corrcoef(offsets.T), np.eye(3), atol=0.06)
     speeds = [sensor.measure(truth(velocity=(1.0, 0.0, 0.0))).velocity for _ in range(2000)]
     np.testing.assert_allclose(np.std(speeds, axis=0), 0.1, rtol=0.06)
 
@@ -219,9 +219,9 @@ def test_white_noise_is_the_announced_one() -> None:
 @pytest.mark.slow
 def test_the_slow_error_is_slow_and_as_large_as_announced() -> None:
     sensor = gnss(horizontal_drift=2.0, vertical_drift=4.0, drift_time=0.2)
-    found = misplacements(sensor, 20_000)[200:]
-    np.testing.assert_allclose(found.std(axis=0), [2.0, 2.0, 4.0], rtol=0.1)
-    correlation = [np.corrcoef(found[:-10, i], found[10:, i])[0, 1] for i in range(3)]
+    offsets = misplacements(sensor, 20_000)[200:]
+    np.testing.assert_allclose(offsets.std(axis=0), [2.0, 2.0, 4.0], rtol=0.1)
+    correlation = [np.corrcoef(offsets[:-10, i], offsets[10:, i])[0, 1] for i in range(3)]
     np.testing.assert_allclose(correlation, np.exp(-1.0), atol=0.08)
 
 

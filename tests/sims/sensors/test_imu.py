@@ -121,11 +121,11 @@ def allan_variances(
 ) -> npt.NDArray[np.float64]:
     """Return overlapping Allan variances, shape (sizes, 6), of samples, shape (n, 6)."""
     total = np.vstack([np.zeros(6), np.cumsum(values, axis=0)])
-    found = []
+    variances = []
     for size in sizes:
         means = (total[size:] - total[:-size]) / size
-        found.append(0.5 * np.mean((means[size:] - means[:-size]) ** 2, axis=0))
-    return np.array(found)
+        variances.append(0.5 * np.mean((means[size:] - means[:-size]) ** 2, axis=0))
+    return np.array(variances)
 
 
 def errors_of(noise: ImuNoise, count: int) -> Any:
@@ -163,15 +163,17 @@ def test_the_allan_deviation_gives_the_announced_numbers(seed: int) -> None:
         [announced.gyroscope_noise_density, announced.gyroscope_random_walk],
         [announced.accelerometer_noise_density, announced.accelerometer_random_walk],
     ]
-    found = densities_of(errors_of(noise, int(4 * 3600 * rate)), rate)
-    np.testing.assert_allclose(found, expected, rtol=0.1)
+    densities = densities_of(errors_of(noise, int(4 * 3600 * rate)), rate)
+    np.testing.assert_allclose(densities, expected, rtol=0.1)
 
 
 @pytest.mark.slow
 def test_an_imu_that_is_worse_than_announced_is_found_by_its_allan_deviation() -> None:
     worse = ImuParameters(gyroscope_noise_density=2.1e-4)
-    found = densities_of(errors_of(ImuNoise(worse, 50.0, np.random.default_rng(1)), 360_000), 50.0)
-    assert found[0, 0] > 1.1 * ImuParameters().gyroscope_noise_density
+    densities = densities_of(
+        errors_of(ImuNoise(worse, 50.0, np.random.default_rng(1)), 360_000), 50.0
+    )
+    assert densities[0, 0] > 1.1 * ImuParameters().gyroscope_noise_density
 
 
 def _noise_fields(parameters: ImuParameters) -> dict[str, Any]:

@@ -87,6 +87,6 @@ def test_in_a_cone_the_nearest_counts() -> None:
 
 def test_the_noise_is_the_announced_one() -> None:
     sensor = finder(noise=0.05)
-    found = np.array([measured(sensor) for _ in range(2000)])
-    assert found.std() == pytest.approx(sensor.announcement().noise, rel=0.06)
-    assert found.mean() == pytest.approx(4.0, abs=0.005)
+    ranges = np.array([measured(sensor) for _ in range(2000)])
+    assert ranges.std() == pytest.approx(sensor.announcement().noise, rel=0.06)
+    assert ranges.mean() == pytest.approx(4.0, abs=0.005)

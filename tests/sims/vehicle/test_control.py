@@ -199,8 +199,8 @@ def test_motors_are_front_right_rear_left_front_left_rear_right(
     flight = airborne()
     flight.fly(0.1)
     share = flight.physics.parameters.hover_thrust
-    motors = [share + 0.02 * each for each in change]
-    values: dict[str, Any] = {f"motor{i + 1}": each for i, each in enumerate(motors)}
+    motors = [share + 0.02 * difference for difference in change]
+    values: dict[str, Any] = {f"motor{i + 1}": value for i, value in enumerate(motors)}
     flight.fly(0.2, lambda stamp: MotorSetpoint(stamp=stamp, source="test", **values))
     rates = flight.physics.state().angular_velocity
     assert sign * rates[axis] > 0.05

@@ -98,9 +98,9 @@ MIXER = Mixer(PARAMETERS)
 def wrench(motors: tuple[float, ...]) -> tuple[float, tuple[float, float, float]]:
     """Return thrust (N) and torque (N m, FRD): a thrust F along -z at (x, y) has (-y F, x F)."""
     pairs = list(zip(motors, PARAMETERS.motors, strict=True))
-    thrusts = [(share * each.max_thrust, each.position) for share, each in pairs]
+    thrusts = [(share * motor.max_thrust, motor.position) for share, motor in pairs]
     roll, pitch = sum(-y * f for f, (_, y, _) in thrusts), sum(x * f for f, (x, _, _) in thrusts)
-    yaw = sum(share * each.max_torque for share, each in pairs)
+    yaw = sum(share * motor.max_torque for share, motor in pairs)
     return sum(f for f, _ in thrusts), (roll, pitch, yaw)
 
 

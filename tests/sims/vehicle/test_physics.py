@@ -124,9 +124,9 @@ def test_between_two_steps_the_state_is_on_the_way_from_one_to_the_other(
     """In flight and in contact; a whole step later it is that of the step; and looking changes
     nothing."""
     physics, plain = (Physics(compiled(height), "drone") for _ in range(2))
-    for each in (physics, plain):
-        each.set_motors(*motors)
-        each.advance_to(steps * MS)
+    for body in (physics, plain):
+        body.set_motors(*motors)
+        body.advance_to(steps * MS)
     now, qvel_before = physics.state(), plain.data.qvel.copy()
     asked = {offset: physics.state_at(steps * MS + offset) for offset in [0, MS, *offsets]}
     assert asked[0][0] == now
@@ -210,7 +210,7 @@ def test_what_moves_is_told_of_its_instant_and_not_of_half_a_step_before() -> No
         late.append(physics.data.qvel[6:].copy())
     for k in range(1, 399):
         before, now, after = states[k - 1 : k + 2]
-        a, b, c = (np.array(each.position) for each in (before, now, after))
+        a, b, c = (np.array(state.position) for state in (before, now, after))
         assert now.velocity == pytest.approx((c - a) / 2e-3, abs=1e-8)
         force = rotations.rotate(now.orientation, felt[k][1])
         assert np.add(force, (0, 0, 9.81)) == pytest.approx((a - 2 * b + c) / 1e-6, abs=1e-6)
@@ -337,7 +337,7 @@ def windy(spec: WindSpec, height: float = UP, seed: int = 1) -> tuple[Physics, A
 def test_our_drag_is_that_of_mujoco(
     wind: Vector3, speed: Vector3, turn: tuple[float, float, float, float]
 ) -> None:
-    if sum(each * each for each in turn) < 1e-2:
+    if sum(component * component for component in turn) < 1e-2:
         return
     model: Any = compiled(UP)
     data: Any = mujoco.MjData(model)
@@ -436,5 +436,5 @@ def test_the_strongest_wind_carries_nothing_through_a_wall_unseen() -> None:
     touched = set()
     for millisecond in range(1000):
         physics.advance_to(millisecond * MS)
-        touched |= {each.other for each in physics.contacts()}
+        touched |= {contact.other for contact in physics.contacts()}
     assert "wall" in touched

@@ -32,8 +32,8 @@ def made(**config: Any) -> tuple[Any, Any, Dynamics]:
 
 
 def body(**fields: Any) -> BodyMotion:
-    found = convert({"name": "b", "kind": "box"} | fields, BodySpec, "body")
-    return motion_of(found, "world/b")
+    spec = convert({"name": "b", "kind": "box"} | fields, BodySpec, "body")
+    return motion_of(spec, "world/b")
 
 
 @pytest.mark.slow

@@ -29,12 +29,12 @@ def hash_of(array: Any) -> str:
 
 def hashes(model: Any) -> dict[str, str]:
     """Return hashes of each texture, and of all else but where MuJoCo keeps these."""
-    found = {}
+    digests = {}
     for number in range(model.ntex):
         begin = int(model.tex_adr[number])
         size = int(model.tex_height[number] * model.tex_width[number]) * 3
-        found[model.tex(number).name] = hash_of(model.tex_data[begin : begin + size])
-    return found | {"model": hash_of(np.concatenate(places(model)))}
+        digests[model.tex(number).name] = hash_of(model.tex_data[begin : begin + size])
+    return digests | {"model": hash_of(np.concatenate(places(model)))}
 
 
 def places(model: Any) -> list[Any]:
@@ -52,8 +52,8 @@ def test_neither_pixels_nor_places_have_changed(name: str) -> None:
     model, bare = (load_world(name, bare=bare).compile() for bare in (False, True))
     assert hashes(model) == SAVED[name]
     assert set(SAVED) == set(WORLDS)
-    for found, expected in zip(places(bare), places(model), strict=True):
-        np.testing.assert_array_equal(found, expected)
+    for actual, expected in zip(places(bare), places(model), strict=True):
+        np.testing.assert_array_equal(actual, expected)
 
 
 class Drawings:

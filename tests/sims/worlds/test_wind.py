@@ -23,7 +23,7 @@ def spectrum(axis: int, omega: float, speed: float, height: float, w20: float) -
         height: Above the ground, metres.
         w20: Wind at a height of 20 feet, m/s.
     """
-    sigma, length = (each[axis] for each in scales(height, w20))
+    sigma, length = (pair[axis] for pair in scales(height, w20))
     x = (length * omega / speed) ** 2
     if axis == 0:
         return 2 * sigma**2 * length / (math.pi * speed) / (1 + x)
@@ -37,7 +37,7 @@ def series(
     random = np.random.default_rng(5)
     air = Turbulence(random.standard_normal(Turbulence.NUMBERS).tolist())
     noise = random.standard_normal((round(seconds / step), Turbulence.NUMBERS)).tolist()
-    return np.array([air.step(step, speed, height, w20, each) for each in noise])
+    return np.array([air.step(step, speed, height, w20, numbers) for numbers in noise])
 
 
 def test_intensities_and_lengths_are_those_of_the_standard() -> None:
@@ -77,7 +77,7 @@ def test_the_spectrum_is_that_of_the_formula() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_integral_of_the_spectrum_is_the_variance(axis: int) -> None:
     omega = np.geomspace(1e-6, 1e5, 20001)
-    density = [spectrum(axis, each, 8.0, 50.0, 15.4) for each in omega]
+    density = [spectrum(axis, frequency, 8.0, 50.0, 15.4) for frequency in omega]
     assert np.trapezoid(density, omega) == pytest.approx(scales(50.0, 15.4)[0][axis] ** 2, rel=2e-3)
 
 
@@ -91,8 +91,8 @@ def test_it_is_as_strong_at_any_step_speed_and_height(
     ends = []
     for _ in range(200):
         air = Turbulence(random.standard_normal(Turbulence.NUMBERS).tolist())
-        for each in random.standard_normal((8, Turbulence.NUMBERS)).tolist():
-            felt = air.step(step, speed, height, 10.0, each)
+        for numbers in random.standard_normal((8, Turbulence.NUMBERS)).tolist():
+            felt = air.step(step, speed, height, 10.0, numbers)
         ends.append(felt)
     expected = scales(height, 10.0)[0]
     assert np.std(ends, axis=0) == pytest.approx(expected, rel=0.25)
@@ -105,7 +105,7 @@ def test_ten_small_steps_are_as_one_large_one() -> None:
     for axis in range(3):
         for lag in (1, 4, 10):
             one, other = (
-                np.corrcoef(each[:-lag, axis], each[lag:, axis])[0, 1] for each in (fine, coarse)
+                np.corrcoef(felt[:-lag, axis], felt[lag:, axis])[0, 1] for felt in (fine, coarse)
             )
             assert one == pytest.approx(other, abs=0.08), (axis, lag)
 

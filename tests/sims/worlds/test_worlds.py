@@ -207,8 +207,8 @@ def test_there_are_corners_everywhere(name: str) -> None:
         image = frames_of(renderer, 0, qpos, ("wide",))["wide"].rgb
         assert image is not None
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        found: Any = cv2.goodFeaturesToTrack(grey, 1000, 0.01, 7)
-        corners = np.zeros((0, 2)) if found is None else found.reshape(-1, 2)
+        points: Any = cv2.goodFeaturesToTrack(grey, 1000, 0.01, 7)
+        corners = np.zeros((0, 2)) if points is None else points.reshape(-1, 2)
         parts = {(int(x) // 128, int(y) // 128) for x, y in corners}
         good.append(len(corners) >= 200 and len(parts) >= 12)
     renderer.close()
@@ -241,13 +241,13 @@ HARD = ("corridor", "office", "night", "forest")
 def places(name: str, count: int) -> list[tuple[Any, float]]:
     """Places on a world's tour, and the direction of flight there."""
     points = np.array(TOURS[name])
-    found = []
+    poses = []
     for share in np.arange(count) / count * len(points):
         start, end = points[int(share)], points[(int(share) + 1) % len(points)]
         way = end - start
         place = start + (share % 1.0) * way
-        found.append((place, math.atan2(way[1], way[0])))
-    return found
+        poses.append((place, math.atan2(way[1], way[0])))
+    return poses
 
 
 def qpos(built: Scene, place: Any, heading: float) -> Any:
@@ -320,8 +320,8 @@ def test_they_cost_at_most_twice_as_much_as_the_others() -> None:
     """Processor time of colour and depth at 512 x 512, outdoors against the yard, else the hall."""
     built = {name: scene(name) for name in ("hall", "yard", *HARD)}
     renderers = {
-        name: CameraRenderer(each.packed, CAMERAS, each.prefix, seed=0)
-        for name, each in built.items()
+        name: CameraRenderer(world.packed, CAMERAS, world.prefix, seed=0)
+        for name, world in built.items()
     }
     times: dict[str, list[float]] = {name: [] for name in built}
     for number in range(16):
@@ -334,7 +334,7 @@ def test_they_cost_at_most_twice_as_much_as_the_others() -> None:
                 frames_of(renderer, number, state, ("wide",))
                 tries.append(time.process_time() - start)
             times[name].append(min(tries))
-    medians = {name: statistics.median(each) for name, each in times.items()}
+    medians = {name: statistics.median(values) for name, values in times.items()}
     print({name: f"{1e3 * seconds:.1f} ms" for name, seconds in medians.items()})
     for name in HARD:
         usual = "yard" if name in ("night", "forest") else "hall"

@@ -86,9 +86,9 @@ def test_tum_rgbd_has_what_the_events_said(tmp_path: Path) -> None:
         "0.000000000",
         "-9.810000000",
     ]
-    found = yaml(data / "camera.yaml")
-    assert (found["width"], found["height"], found["depth_factor"]) == (4, 3, 5000.0)
-    assert [found[key] for key in ("fx", "fy", "cx", "cy")] == [5.0, 5.5, 1.5, 1.0]
+    lens = yaml(data / "camera.yaml")
+    assert (lens["width"], lens["height"], lens["depth_factor"]) == (4, 3, 5000.0)
+    assert [lens[key] for key in ("fx", "fy", "cx", "cy")] == [5.0, 5.5, 1.5, 1.0]
 
 
 def test_heads_of_tum_files_are_three_lines_and_name_the_world(tmp_path: Path) -> None:
@@ -255,20 +255,20 @@ def test_a_replay_announces_the_lens_and_the_mounting_that_were_recorded(
     )
     events = [e for e in flight() if not isinstance(e, Announcement)]
     data = record(tmp_path, [*sensors, twin, *events], form)
-    found = {
-        type(each): each
-        for each in open_reader(
+    announced = {
+        type(announcement): announcement
+        for announcement in open_reader(
             ReplayConfig(file=str(data / "mav0" if form == "euroc" else data)), "drone"
         ).announcements()
     }
-    seen = found[CameraAnnouncement]
+    seen = announced[CameraAnnouncement]
     assert isinstance(seen, CameraAnnouncement)
     assert seen.info == info
     # The true poses of TUM's are those of the images' stamps.
     assert (seen.time_offset, seen.readout) == (0.06 if form == "euroc" else 0.0, 0.02)
     assert (seen.noise, seen.vignette, seen.exposure) == (2.0, (-0.5, 0.1), 0.0)
     if form == "euroc":
-        inertial = found[ImuAnnouncement]
+        inertial = announced[ImuAnnouncement]
         assert isinstance(inertial, ImuAnnouncement)
         assert inertial.position == pytest.approx((0.1, 0.0, -0.02))
         assert inertial.orientation == pytest.approx(TURNED)
@@ -316,7 +316,7 @@ def test_what_is_not_written_when_the_run_ends_is_written_then(tmp_path: Path) -
         listed = [row[1] for row in table(data / "data.csv")]
         assert len(listed) == 40
         assert {p.name for p in (data / "data").iterdir()} == {*listed}
-        assert all(png(data / "data" / each).shape == (3, 4) for each in listed)
+        assert all(png(data / "data" / listed_name).shape == (3, 4) for listed_name in listed)
 
 
 def test_of_a_killed_run_the_rows_are_there_but_those_of_the_last_moment(tmp_path: Path) -> None:
@@ -324,7 +324,7 @@ def test_of_a_killed_run_the_rows_are_there_but_those_of_the_last_moment(tmp_pat
     for stamp in range(0, 1_000 * 10**6, 7 * 10**6):
         rows.add(stamp, f"{stamp}\n")
         seen = (tmp_path / "rows.txt").read_text().splitlines()[1:]
-        assert seen == [str(each) for each in range(0, int(seen[-1]) + 1, 7 * 10**6)]
+        assert seen == [str(nanoseconds) for nanoseconds in range(0, int(seen[-1]) + 1, 7 * 10**6)]
         assert stamp - int(seen[-1]) < 100 * 10**6
     rows.close()
 
@@ -336,10 +336,13 @@ def test_a_stereo_rig_is_found_among_other_cameras(tmp_path: Path, front: bool) 
         for name, y in (("left", 0.0), ("right", 0.1), ("more", 0.2))
     ]
     others = [camera(images=("rgb",))] if front else []
-    seen = [image(0, each.source, grey="grey" in each.images) for each in (*others, *pair)]
+    seen = [
+        image(0, announcement.source, grey="grey" in announcement.images)
+        for announcement in (*others, *pair)
+    ]
     data = record(tmp_path, [*others, *pair, *seen, odometry(0)], "euroc")
     announced = open_reader(ReplayConfig(file=str(data)), "drone").announcements()
-    stereo = [each.stereo for each in announced if isinstance(each, CameraAnnouncement)]
+    stereo = [a.stereo for a in announced if isinstance(a, CameraAnnouncement)]
     assert stereo == (["", "", "drone/cam1", ""] if front else ["", "drone/cam0", ""])
 
 
@@ -457,10 +460,12 @@ def test_a_velocity_that_nobody_says_is_not_called_true(
     assert "as the vehicle sent" in yaml(record(said, flight(), "euroc") / path)["comment"]
     still = (0.0, 0.0, 0.0)
     events = [
-        msgspec.structs.replace(each, linear_velocity=still, position=(each.stamp / 1e9, 0.0, 0.0))
-        if isinstance(each, Odometry)
-        else each
-        for each in flight()
+        msgspec.structs.replace(
+            event, linear_velocity=still, position=(event.stamp / 1e9, 0.0, 0.0)
+        )
+        if isinstance(event, Odometry)
+        else event
+        for event in flight()
     ]
     assert "velocities unknown" in yaml(record(unsaid, events, "euroc") / path)["comment"]
     assert "sent no velocity: those of the ground truth are zeros" in caplog.text

@@ -16,9 +16,9 @@ from tests.nodes.data.dataset.samples import camera, image, imu_announcement, pn
 
 def test_depth_that_16_bits_cannot_hold_is_none() -> None:
     depth = np.array([[0.0, 1.0, 1.23456, np.inf, np.nan, -1.0, 13.107, 13.1072]], np.float32)
-    found = depth_in_steps(depth, 5000.0)
-    assert found.dtype == np.uint16
-    assert found.tolist() == [[0, 5000, 6173, 0, 0, 0, 65535, 0]]
+    steps = depth_in_steps(depth, 5000.0)
+    assert steps.dtype == np.uint16
+    assert steps.tolist() == [[0, 5000, 6173, 0, 0, 0, 65535, 0]]
 
 
 def test_colours_and_greys() -> None:

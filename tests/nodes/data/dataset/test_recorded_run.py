@@ -50,13 +50,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tum(folder: Path) -> tuple[list[Any], list[Any], Floats, Floats]:
     """Return images, depths (m), K, and the camera's poses."""
     pairs = table(folder / "associations.txt")
-    found = yaml(folder / "camera.yaml")
+    lens = yaml(folder / "camera.yaml")
     truth = read_tum(folder / "groundtruth.txt")
     assert [row[0] for row in pairs] == [row[0] for row in table(folder / "groundtruth.txt")]
     return (
         [cv2.cvtColor(png(folder / row[1]), cv2.COLOR_RGB2GRAY) for row in pairs],
-        [png(folder / row[3]) / found["depth_factor"] for row in pairs],
-        np.array([[found["fx"], 0, found["cx"]], [0, found["fy"], found["cy"]], [0, 0, 1]]),
+        [png(folder / row[3]) / lens["depth_factor"] for row in pairs],
+        np.array([[lens["fx"], 0, lens["cx"]], [0, lens["fy"], lens["cy"]], [0, 0, 1]]),
         truth.matrices(),
     )
 
@@ -66,8 +66,8 @@ def euroc(folder: Path) -> tuple[list[Any], list[Any], Floats, Floats]:
     mav = folder / "mav0"
     frames = table(mav / "cam0" / "data.csv")
     assert frames == table(mav / "depth0" / "data.csv")
-    found = yaml(mav / "cam0" / "sensor.yaml")
-    fx, fy, cx, cy = found["intrinsics"]
+    lens = yaml(mav / "cam0" / "sensor.yaml")
+    fx, fy, cx, cy = lens["intrinsics"]
     factor = yaml(mav / "depth0" / "sensor.yaml")["depth_factor"]
     body = read_euroc(mav / "state_groundtruth_estimate0" / "data.csv")
     poses = body.at(np.array([int(row[0]) for row in frames])).matrices()
@@ -75,7 +75,7 @@ def euroc(folder: Path) -> tuple[list[Any], list[Any], Floats, Floats]:
         [png(mav / "cam0" / "data" / row[1]) for row in frames],
         [png(mav / "depth0" / "data" / row[1]) / factor for row in frames],
         np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
-        poses @ np.reshape(found["T_BS"]["data"], (4, 4)),
+        poses @ np.reshape(lens["T_BS"]["data"], (4, 4)),
     )
 
 

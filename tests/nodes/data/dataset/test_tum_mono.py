@@ -76,9 +76,9 @@ def test_read_back_it_gives_the_light_of_the_scene(response: str, tmp_path: Path
     times = np.loadtxt(data / "times.txt")
     for number, _ in enumerate(shutters):
         seen = png(data / "images" / f"{number:05d}.png")
-        found = table[seen] / (map_ / map_.max()) / times[number, 2] / 255.0
+        light_read = table[seen] / (map_ / map_.max()) / times[number, 2] / 255.0
         known = (seen > 20) & (seen < 254)
-        np.testing.assert_allclose(found[known], light[known], rtol=0.06)
+        np.testing.assert_allclose(light_read[known], light[known], rtol=0.06)
         assert known.mean() > 0.7
     np.testing.assert_allclose(times[:, 2], [1.0, 2.0, 2.5])
     assert times[:, 0].tolist() == [0, 1, 2]

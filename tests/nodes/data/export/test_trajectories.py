@@ -124,9 +124,9 @@ def test_poses_stay_where_they_were_and_stamps_are_of_the_epoch(
             if form == "tum" or name != "truth":
                 files[f"{name}.tum"] = read_tum
             for file, read in files.items():
-                found = read(out / form / file)
-                assert (found.stamps == expected.stamps + zero).all()
-                assert abs(found.matrices() - world @ expected.matrices()).max() < 1e-9
+                trajectory = read(out / form / file)
+                assert (trajectory.stamps == expected.stamps + zero).all()
+                assert abs(trajectory.matrices() - world @ expected.matrices()).max() < 1e-9
                 assert f"time 0 is {zero} ns" in (out / form / file).read_text()
 
 
@@ -150,10 +150,10 @@ def test_kittis_poses_are_the_left_cameras_from_identity_line_by_line(run: Path)
         export_trajectories(run, "kitti")
         true = read_kitti(run / "export" / "kitti" / "slam.truth.kitti.txt")
         said = read_kitti(run / "export" / "kitti" / "slam.kitti.txt")
-        for found, body in ((true, truth.at(estimates["slam"].stamps)), (said, estimates["slam"])):
+        for kitti, body in ((true, truth.at(estimates["slam"].stamps)), (said, estimates["slam"])):
             poses = body.matrices() @ mounted
-            assert abs(found[0] - np.eye(4)).max() < 1e-9
-            assert abs(poses[0] @ found - poses).max() < 1e-9
+            assert abs(kitti[0] - np.eye(4)).max() < 1e-9
+            assert abs(poses[0] @ kitti - poses).max() < 1e-9
     (run / "summary.json").write_text("{")
     with pytest.raises(ValueError, match=r"summary\.json: expected the run's summary, found: "):
         export_trajectories(run, "kitti")
@@ -224,11 +224,11 @@ def test_evos_commands_take_the_files_as_they_are_and_find_our_figures(run: Path
     }
     pairs = ["--delta", "1", "--delta_unit", "m", "--all_pairs", "--pairs_from_reference"]
     for form, names in files.items():
-        found = evo(run / "export" / form, "ape", form, *names, "--align")
-        assert found["rmse"] == pytest.approx(ape["ate_rmse_m"], abs=2e-6)  # it prints six decimals
-        assert found["max"] == pytest.approx(ape["ate_max_m"], abs=2e-6)
-        found = evo(run / "export" / form, "rpe", form, *names, *pairs)
-        assert found["rmse"] * 100 == pytest.approx(rpe["rpe_1m_trans_percent"], abs=2e-4)
+        stats = evo(run / "export" / form, "ape", form, *names, "--align")
+        assert stats["rmse"] == pytest.approx(ape["ate_rmse_m"], abs=2e-6)  # it prints six decimals
+        assert stats["max"] == pytest.approx(ape["ate_max_m"], abs=2e-6)
+        stats = evo(run / "export" / form, "rpe", form, *names, *pairs)
+        assert stats["rmse"] * 100 == pytest.approx(rpe["rpe_1m_trans_percent"], abs=2e-4)
 
 
 @pytest.mark.slow
@@ -247,8 +247,8 @@ def test_of_several_vehicles_each_estimate_goes_with_its_own(run: Path) -> None:
     export_trajectories(run, "kitti")
     for name, true in (("vo", second), ("slam", truths["truth"])):
         there = true.at(estimates[name].stamps).matrices() @ OPTICAL
-        found = read_kitti(run / "export" / "kitti" / f"{name}.truth.kitti.txt")
-        assert abs(there[0] @ found - there).max() < 1e-9
+        poses = read_kitti(run / "export" / "kitti" / f"{name}.truth.kitti.txt")
+        assert abs(there[0] @ poses - there).max() < 1e-9
 
 
 @pytest.mark.slow
@@ -258,6 +258,6 @@ def test_evo_reads_an_estimate_in_a_frame_of_its_own(run: Path) -> None:
     truth = truths["truth"]
     true, said = associate(truth, estimates["slam"])
     files = ["slam.truth.kitti.txt", "slam.kitti.txt"]
-    found = evo(run / "export" / "kitti", "ape", "kitti", *files, "--align")
+    stats = evo(run / "export" / "kitti", "ape", "kitti", *files, "--align")
     ours = absolute_errors(true, align(said, true, "se3").trajectory)
-    assert found["rmse"] == pytest.approx(ours["ate_rmse_m"], abs=2e-6)
+    assert stats["rmse"] == pytest.approx(ours["ate_rmse_m"], abs=2e-6)

@@ -53,10 +53,10 @@ def test_no_byte_of_a_file_matters_to_the_rest(tmp_path: Path, index: bool) -> N
         damaged[place] ^= 0xFF
         path.write_bytes(damaged)
         trouble: list[str] = []
-        found = [tuple(record) for record in read(path, damaged=trouble.append)]
+        records = [tuple(record) for record in read(path, damaged=trouble.append)]
         rest = iter(whole)
-        assert all(record in rest for record in found), place  # in order
-        assert len(found) == len(whole) or trouble, place
+        assert all(record in rest for record in records), place  # in order
+        assert len(records) == len(whole) or trouble, place
 
 
 @pytest.mark.parametrize("index", [True, False])
@@ -70,12 +70,12 @@ def test_a_hole_is_told(tmp_path: Path, index: bool, after: int) -> None:
     data[begin + after : end] = bytes(end - begin - after)
     path.write_bytes(data)
     trouble: list[str] = []
-    found = [record.sequence for record in read(path, damaged=trouble.append)]
+    sequences = [record.sequence for record in read(path, damaged=trouble.append)]
     if index or after:  # else nothing tells where the next chunk begins
-        assert found == [0, 1, 4, 5, 6, 7]
+        assert sequences == [0, 1, 4, 5, 6, 7]
         assert "a damaged chunk is left out" in trouble[0]
     else:
-        assert found == [0, 1]
+        assert sequences == [0, 1]
         assert trouble == [CLOSED]
 
 
@@ -113,9 +113,9 @@ def test_what_mending_cannot_help_is_told_and_left_alone(tmp_path: Path) -> None
     data = bytearray(path.read_bytes())
     data[chunks(path)[1][1] - 5] ^= 0xFF
     path.write_bytes(data)
-    found = recover_file(path)
-    assert (found.mended, found.messages) == (False, 6)
-    assert "a damaged chunk is left out" in found.trouble[0]
+    report = recover_file(path)
+    assert (report.mended, report.messages) == (False, 6)
+    assert "a damaged chunk is left out" in report.trouble[0]
     assert path.read_bytes() == data
 
 
@@ -228,4 +228,4 @@ def test_no_file_raises_anything_but_our_own_error(
             call()
         except (RecordingError, ReplayError) as error:
             errors.append(str(error))
-    assert not any("\n" in each for each in errors)
+    assert not any("\n" in message for message in errors)

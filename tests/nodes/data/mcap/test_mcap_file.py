@@ -55,16 +55,16 @@ def test_what_is_written_is_read(tmp_path: Path, compression: Compression) -> No
     """By us and by mcap's own reader, which checks all checksums."""
     path = tmp_path / "a.mcap"
     write(path, compression=compression)
-    found = list(read(path))
-    assert [(r.time, r.sequence, r.topic, r.type) for r in found[:2]] == [
+    records = list(read(path))
+    assert [(r.time, r.sequence, r.topic, r.type) for r in records[:2]] == [
         (0, 0, "/chatter", TYPE),
         (500_000_000, 1, "/chatter", TYPE),
     ]
-    assert found[0].metadata == {"kind": "test"}
+    assert records[0].metadata == {"kind": "test"}
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
-        assert [m.data for _, _, m in reader.iter_messages()] == [r.data for r in found]
+        assert [m.data for _, _, m in reader.iter_messages()] == [r.data for r in records]
     said = contents(path)
     assert said.complete
     assert said.metadata == {"visnav": {"end": "5000000000"}}
@@ -160,8 +160,8 @@ def test_a_full_disk_is_told_and_what_was_written_is_valid(tmp_path: Path) -> No
     with pytest.raises(RecordingError, match=r"a\.mcap cannot be written: No space.*MB free"):
         fill(writer)
     writer.abandon()
-    with path.open("rb") as found:
-        assert [m.sequence for _, _, m in make_reader(found).iter_messages()] == [0, 1, 2, 3]
+    with path.open("rb") as stream:
+        assert [m.sequence for _, _, m in make_reader(stream).iter_messages()] == [0, 1, 2, 3]
 
 
 def test_a_disk_with_no_room_for_the_index_leaves_all_messages(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_what_is_no_recording_is_an_error(tmp_path: Path, content: bytes | None)
         path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"a\.mcap: expected"):
         recover_file(path)
-    assert [each.name for each in tmp_path.iterdir()] == ([] if content is None else ["a.mcap"])
+    assert [file.name for file in tmp_path.iterdir()] == ([] if content is None else ["a.mcap"])
 
 
 def test_a_file_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def test_a_message_without_its_arrays_takes_them_from_elsewhere(event: Event) ->
     packed = pack(event)
     message = native.message(packed.frame(), arrays=False)
     assert len(message) < 300
-    assert [each.shape for each in native.lacking(message)] == [a.shape for a in packed.arrays]
+    assert [array.shape for array in native.lacking(message)] == [a.shape for a in packed.arrays]
     assert same(native.event(message, packed.arrays), event)
 
 
@@ -41,7 +41,7 @@ def test_arrays_of_nothing_are_lacking_or_not() -> None:
     empty = cloud(1, "map", 0, colours=True)
     for arrays in (True, False):
         message = native.message(pack(empty).frame(), arrays)
-        missing = [np.zeros(each.shape, each.dtype) for each in native.lacking(message)]
+        missing = [np.zeros(array.shape, array.dtype) for array in native.lacking(message)]
         assert same(native.event(message, missing), empty)
 
 

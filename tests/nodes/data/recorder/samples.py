@@ -240,6 +240,6 @@ def said(stamp: int) -> list[Event]:
     ]
 
 
-def same(found: Event, expected: Event) -> bool:
+def same(event: Event, expected: Event) -> bool:
     """Tell whether two events are equal to the byte, arrays included."""
-    return pack(found).frame() == pack(expected).frame()
+    return pack(event).frame() == pack(expected).frame()

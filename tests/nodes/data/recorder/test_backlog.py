@@ -23,11 +23,11 @@ def large(stamp: int) -> Image:
 
 
 def taken(queue: Backlog) -> list[int]:
-    found = []
+    stamps = []
     while (waiting := queue.take()) is not None:
-        found.append(waiting.event.stamp)
+        stamps.append(waiting.event.stamp)
         queue.done(waiting)
-    return found
+    return stamps
 
 
 def test_events_are_references_in_order_with_their_times() -> None:

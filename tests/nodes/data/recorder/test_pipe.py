@@ -27,25 +27,27 @@ def through(data: list[Event], cut: int = 0) -> list[writer_process.Piece]:
 
     sender = threading.Thread(target=send)
     sender.start()
-    found = list(writer_process.read_all(there, 10.0, lambda: None))
+    records = list(writer_process.read_all(there, 10.0, lambda: None))
     sender.join()
     os.close(there)
-    return found
+    return records
 
 
 def test_events_come_out_as_they_went_in() -> None:
     """All kinds, with their times, at alignments of their arrays."""
     events = [*announcements(), *said(3)]
-    found = through(events)
-    assert [each.time for each in found] == [each.stamp + 1 for each in events]
-    assert all(same(unpack(each.frame), event) for each, event in zip(found, events, strict=True))
+    records = through(events)
+    assert [record.time for record in records] == [event.stamp + 1 for event in events]
+    assert all(
+        same(unpack(record.frame), event) for record, event in zip(records, events, strict=True)
+    )
 
 
 @pytest.mark.parametrize("cut", [1, 40, 200])
 def test_half_an_event_at_the_end_is_left_out(cut: int) -> None:
     """The other side was killed: what came whole counts."""
-    found = through([imu(1), image(2)], cut)
-    assert [each.time for each in found] == [2]
+    records = through([imu(1), image(2)], cut)
+    assert [record.time for record in records] == [2]
 
 
 def test_silence_is_noticed() -> None:
@@ -59,7 +61,7 @@ def test_silence_is_noticed() -> None:
             with os.fdopen(here, "wb") as file:
                 writer_process.write(file, 9, writer_process.END)
 
-    assert [each.what for each in writer_process.read_all(there, 0.001, while_idle)] == [
+    assert [record.what for record in writer_process.read_all(there, 0.001, while_idle)] == [
         writer_process.END
     ]
     assert len(calls) == 2

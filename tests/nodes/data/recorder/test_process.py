@@ -38,18 +38,18 @@ def record(path: Path, events: list[Event], **settings: Any) -> list[str]:
 
 def replayed(path: Path) -> list[Event]:
     reader = Recorded(path)
-    found = [each.event for each in reader.events(0, None, lambda _, __: True)]
+    events = [record.event for record in reader.events(0, None, lambda _, __: True)]
     assert reader.trouble == []
-    return [*reader.announcements(), *found]
+    return [*reader.announcements(), *events]
 
 
 def messages(path: Path) -> dict[str, list[Any]]:
     with AnyReader([path]) as reader:
-        found: dict[str, list[Any]] = {}
+        by_topic: dict[str, list[Any]] = {}
         for connection, _, data in reader.messages():
             message = reader.deserialize(data, connection.msgtype)
-            found.setdefault(connection.topic, []).append(message)
-        return found
+            by_topic.setdefault(connection.topic, []).append(message)
+        return by_topic
 
 
 @pytest.mark.parametrize(
@@ -60,9 +60,9 @@ def test_all_events_come_back_as_they_were(tmp_path: Path, settings: dict[str, A
     events = [*announcements(), *said(SECOND), *said(2 * SECOND)]
     path = tmp_path / "a.mcap"
     assert record(path, events, **settings) == []
-    found = replayed(path)
-    assert [type(e) for e in found] == [type(e) for e in events]
-    assert all(same(*pair) for pair in zip(found, events, strict=True))
+    received = replayed(path)
+    assert [type(e) for e in received] == [type(e) for e in events]
+    assert all(same(*pair) for pair in zip(received, events, strict=True))
 
 
 @pytest.mark.slow
@@ -70,20 +70,20 @@ def test_ros_reads_the_topics_that_the_bridge_has(tmp_path: Path) -> None:
     """All messages can be read; images, poses and transforms are in ROS's names and axes."""
     path = tmp_path / "a.mcap"
     record(path, [*announcements(), *said(SECOND)])
-    found = messages(path)
+    by_topic = messages(path)
     assert {
         "/drone/front/image_raw", "/drone/front/camera_info", "/drone/front/depth/image_raw",
         "/drone/front/segmentation/image_raw", "/drone/front/pose", "/drone/imu", "/drone/odom",
         "/odometry/pose", "/drone/down/range", "/scores/odometry/ate", "/tf", "/tf_static",
         "/map/points",
-    } <= {*found}  # fmt: skip
-    received = found["/drone/front/image_raw"][0]
+    } <= {*by_topic}  # fmt: skip
+    received = by_topic["/drone/front/image_raw"][0]
     assert received.data.tobytes() == image(SECOND).data.tobytes()
     assert (received.encoding, received.header.stamp.sec) == ("rgb8", 1)
     x, y, z = odometry(SECOND).position
-    place = found["/drone/odom"][0].pose.pose.position
+    place = by_topic["/drone/odom"][0].pose.pose.position
     assert (place.x, place.y, place.z) == (y, x, -z)
-    own = [name for name in found if name.startswith("/visnav/")]
+    own = [name for name in by_topic if name.startswith("/visnav/")]
     assert len(own) == len(announcements()) + len(said(0))
 
 
@@ -103,9 +103,9 @@ def test_times_are_those_of_publication(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     record(path, [image(stamp) for stamp in range(0, 10 * SECOND, SECOND)])
     reader = Recorded(path)
-    found = list(reader.events(3 * SECOND, 5 * SECOND, lambda _, __: True))
-    assert [each.time for each in found] == [3 * SECOND + 40_000_000, 4 * SECOND + 40_000_000]
-    assert [each.event.stamp for each in found] == [3 * SECOND, 4 * SECOND]
+    records = list(reader.events(3 * SECOND, 5 * SECOND, lambda _, __: True))
+    assert [record.time for record in records] == [3 * SECOND + 40_000_000, 4 * SECOND + 40_000_000]
+    assert [record.event.stamp for record in records] == [3 * SECOND, 4 * SECOND]
 
 
 def test_jpeg_and_millimetres_lose_what_they_must(tmp_path: Path) -> None:
@@ -115,10 +115,10 @@ def test_jpeg_and_millimetres_lose_what_they_must(tmp_path: Path) -> None:
     smooth = np.broadcast_to(column, (125, 40, 3)).copy()
     sent = Image(stamp=1, source="drone/front", frame_id="f", data=smooth)
     record(path, [*announcements(), sent, depth(2)], image_format="jpeg", depth_format="png")
-    *_, found, far = replayed(path)
-    assert isinstance(found, Image)
-    assert found.frame_id == "f"
-    assert abs(found.data.astype(int) - smooth).max() <= 4
+    *_, near, far = replayed(path)
+    assert isinstance(near, Image)
+    assert near.frame_id == "f"
+    assert abs(near.data.astype(int) - smooth).max() <= 4
     assert isinstance(far, DepthImage)
     expected = depth(2).data.copy()
     there = (expected > 0.0) & (expected <= 65.535)

@@ -57,18 +57,20 @@ def test_a_run_is_recorded_to_its_end(tmp_path: Path) -> None:
     assert result.drops["recorder.events"].dropped == 0
     path = tmp_path / "recording.mcap"
     reader = Recorded(path)
-    found = list(reader.events(0, None, lambda _, __: True))
+    records = list(reader.events(0, None, lambda _, __: True))
     assert all(same(*pair) for pair in zip(reader.announcements(), announcements(), strict=True))
-    assert all(same(a.event, b) for a, b in zip(found, events[len(announcements()) :], strict=True))
-    assert [each.time for each in found] == [
+    assert all(
+        same(a.event, b) for a, b in zip(records, events[len(announcements()) :], strict=True)
+    )
+    assert [record.time for record in records] == [
         event.stamp for event in events[len(announcements()) :]
     ]
     assert reader.end() == 3 * SECOND
     assert contents(path).metadata["visnav"]["events"] == str(len(events))
     with Reader(tmp_path) as bag:  # the folder is one of ROS 2, for evo among others
         assert (bag.start_time, bag.message_count) == (0, sum(1 for _ in bag.messages()))
-        counts = {each.topic: each.msgcount for each in bag.connections}
-        assert counts["/drone/odom"] == sum(isinstance(each, Odometry) for each in events)
+        counts = {connection.topic: connection.msgcount for connection in bag.connections}
+        assert counts["/drone/odom"] == sum(isinstance(event, Odometry) for event in events)
 
 
 @pytest.mark.slow
@@ -78,8 +80,8 @@ def test_simulated_time_waits_for_a_slow_disk(tmp_path: Path) -> None:
     result = record(events, tmp_path, memory=1 << 19, image_format="png")
     assert result.drops["recorder.events"].dropped == 0
     assert result.seconds == 3.0
-    found = Recorded(tmp_path / "recording.mcap").events(0, None, lambda _, __: True)
-    assert [each.event.stamp for each in found] == [event.stamp for event in events]
+    records = Recorded(tmp_path / "recording.mcap").events(0, None, lambda _, __: True)
+    assert [record.event.stamp for record in records] == [event.stamp for event in events]
 
 
 @pytest.mark.slow
@@ -159,8 +161,8 @@ def test_a_recorder_that_is_restarted_keeps_what_it_had(tmp_path: Path) -> None:
     for path in sorted(tmp_path.glob("*.mcap")):
         reader = Recorded(path)
         assert len(reader.announcements()) == len(announcements())
-        found = reader.events(0, None, lambda _, __: True)
-        stamps[path.name] = [each.event.stamp for each in found]
+        records = reader.events(0, None, lambda _, __: True)
+        stamps[path.name] = [record.event.stamp for record in records]
     assert stamps == {"recording-2.mcap": [2 * SECOND], "recording.mcap": [0, SECOND]}
 
 
@@ -202,7 +204,7 @@ def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> 
     assert "the process that writes it ended with -9" in str(failures)
     assert process.unwritten >= 6
     trouble: list[str] = []
-    assert {each.time for each in read(path, damaged=trouble.append)} == {1}
+    assert {record.time for record in read(path, damaged=trouble.append)} == {1}
     assert trouble == ["the end is missing: the file was not closed"]
 
 
@@ -246,8 +248,8 @@ def test_a_recorder_that_is_stopped_ends_the_run_and_loses_nothing(
     assert time.monotonic() - begin < 30.0
     path = tmp_path / "recording.mcap"
     assert contents(path).complete
-    found = [e.event.stamp for e in Recorded(path).events(0, None, lambda _, __: True)]
-    assert found[:3] == [20_000_000, 40_000_000, 60_000_000]
+    stamps = [e.event.stamp for e in Recorded(path).events(0, None, lambda _, __: True)]
+    assert stamps[:3] == [20_000_000, 40_000_000, 60_000_000]
 
 
 @pytest.mark.slow
@@ -276,4 +278,4 @@ def test_a_process_that_cannot_be_woken_is_ended_and_what_it_had_written_is_kept
     assert str(process._child.pid) in str(error)
     assert "has taken nothing for 0.3 s; what it had taken is kept" in str(error)
     trouble: list[str] = []
-    assert {each.time for each in read(path, damaged=trouble.append)} == {1}
+    assert {record.time for record in read(path, damaged=trouble.append)} == {1}

@@ -24,10 +24,10 @@ def timed_images(count: int, made: list[int]) -> Iterator[Timed]:
 
 
 def drain(ahead: ReadAhead) -> list[Batch]:
-    found = []
+    batches = []
     while (batch := ahead.take()) is not None:
-        found.append(batch)
-    return found
+        batches.append(batch)
+    return batches
 
 
 def test_all_comes_in_order_and_batches_are_the_same_every_time() -> None:
@@ -35,7 +35,7 @@ def test_all_comes_in_order_and_batches_are_the_same_every_time() -> None:
 
     def read() -> list[list[int]]:
         ahead = ReadAhead(iter([Timed(n, imu(n)) for n in range(150)]), 1 << 20)
-        return [[each.time for each in batch] for batch in drain(ahead)]
+        return [[timed.time for timed in batch] for batch in drain(ahead)]
 
     batches = read()
     assert [len(batch) for batch in batches] == [MOST, MOST, 150 - 2 * MOST]

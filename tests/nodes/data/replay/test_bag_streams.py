@@ -39,7 +39,7 @@ INFRA = "camera_infra1_optical_frame"
 
 def realsense(space: str = "/camera") -> dict[str, list[Any]]:
     """Return the topics of realsense2_camera with align_depth, colour, depth and both infrareds."""
-    found = {
+    topics = {
         f"{space}/color/image_raw": images(COLOUR),
         f"{space}/color/camera_info": infos(COLOUR),
         f"{space}/depth/image_rect_raw": images(DEPTH, "16UC1"),
@@ -50,9 +50,9 @@ def realsense(space: str = "/camera") -> dict[str, list[Any]]:
     }
     for number in (1, 2):
         frame = f"camera_infra{number}_optical_frame"
-        found[f"{space}/infra{number}/image_rect_raw"] = images(frame, "mono8")
-        found[f"{space}/infra{number}/camera_info"] = infos(frame, DEPTH_K)
-    return found
+        topics[f"{space}/infra{number}/image_rect_raw"] = images(frame, "mono8")
+        topics[f"{space}/infra{number}/camera_info"] = infos(frame, DEPTH_K)
+    return topics
 
 
 def cameras(reader: Reader) -> dict[str, CameraAnnouncement]:
@@ -61,26 +61,26 @@ def cameras(reader: Reader) -> dict[str, CameraAnnouncement]:
 
 
 def events(reader: Reader) -> list[Event]:
-    return [each.event for each in reader.events(0, None, lambda *_: True)]
+    return [record.event for record in reader.events(0, None, lambda *_: True)]
 
 
 def without(topics: dict[str, list[Any]], *names: str) -> dict[str, list[Any]]:
-    return {name: each for name, each in topics.items() if name not in names}
+    return {name: messages for name, messages in topics.items() if name not in names}
 
 
 @pytest.mark.parametrize("space", ["/camera", "/camera/camera"])
 def test_realsenses_colour_gets_the_depth_that_is_aligned_to_it(tmp_path: Path, space: str) -> None:
     """With ROS 1's topics and with ROS 2's. Depth of its own frame is a camera of its own."""
     reader = sets.reader(bags.write(tmp_path, realsense(space)))
-    found, source = cameras(reader), f"drone{space}"
-    assert {name: camera.images for name, camera in found.items()} == {
+    by_source, source = cameras(reader), f"drone{space}"
+    assert {name: camera.images for name, camera in by_source.items()} == {
         source: ("rgb", "depth"),
         f"{source}/infra1": ("grey",),
         f"{source}/infra2": ("grey",),
         f"{source}/depth": ("depth",),
     }
-    assert [found[source].info.fx, found[source].info.fy] == [600.0, 601.0]
-    assert found[f"{source}/depth"].info.fx == found[f"{source}/infra1"].info.fx == 420.0
+    assert [by_source[source].info.fx, by_source[source].info.fy] == [600.0, 601.0]
+    assert by_source[f"{source}/depth"].info.fx == by_source[f"{source}/infra1"].info.fx == 420.0
     assert reader.trouble == []
     stamps = [e.stamp for e in events(reader) if isinstance(e, DepthImage) and e.source == source]
     assert len(stamps) == len(set(stamps)) == bags.FRAMES
@@ -233,8 +233,8 @@ def test_zeds_and_oaks_depth_is_that_of_the_camera_in_its_frame(tmp_path: Path) 
         "/oak/stereo/camera_info": infos(oak, DEPTH_K),
     }
     reader = sets.reader(bags.write(tmp_path, topics))
-    found = {name: camera.images for name, camera in cameras(reader).items()}
-    assert found == {"drone/zed/zed_node": ("rgb", "depth"), "drone/oak": ("rgb", "depth")}
+    kinds = {name: camera.images for name, camera in cameras(reader).items()}
+    assert kinds == {"drone/zed/zed_node": ("rgb", "depth"), "drone/oak": ("rgb", "depth")}
     reader.close()
 
 
@@ -247,9 +247,9 @@ def test_one_camera_that_cannot_be_read_leaves_the_others(tmp_path: Path) -> Non
         "/raw/camera_info": infos("raw", (0.0, 0.0, 0.0, 0.0)),
     }
     reader = sets.reader(bags.write(tmp_path, topics))
-    found = cameras(reader)
-    assert "drone/camera" in found
-    assert not {"drone/usb", "drone/raw"} & set(found)
+    by_source = cameras(reader)
+    assert "drone/camera" in by_source
+    assert not {"drone/usb", "drone/raw"} & set(by_source)
     trouble = "\n".join(reader.trouble)
     assert re.search(r"/usb/image_raw: left out: its encoding 'yuv422' .* convert it to", trouble)
     assert re.search(
@@ -293,7 +293,7 @@ def test_of_raw_images_that_cannot_be_read_the_compressed_ones_are(tmp_path: Pat
     reader = sets.reader(bags.write(tmp_path, topics))
     assert cameras(reader)["drone/cam"].images == ("grey",)
     assert len(events(reader)) == bags.FRAMES
-    assert any(each.startswith("/cam/image_raw: left out") for each in reader.trouble)
+    assert any(message.startswith("/cam/image_raw: left out") for message in reader.trouble)
     reader.close()
 
 
@@ -353,8 +353,8 @@ def test_bayer_and_grey_of_sixteen_bits_are_images(tmp_path: Path) -> None:
         "/dark/camera_info": infos("dark"),
     }
     reader = sets.reader(bags.write(tmp_path, topics))
-    found = {name: camera.images for name, camera in cameras(reader).items()}
-    assert found == {"drone/bayer": ("rgb",), "drone/deep": ("grey",), "drone/dark": ("grey",)}
+    kinds = {name: camera.images for name, camera in cameras(reader).items()}
+    assert kinds == {"drone/bayer": ("rgb",), "drone/deep": ("grey",), "drone/dark": ("grey",)}
     data = {event.source: event.data for event in events(reader) if isinstance(event, Image)}
     assert (data["drone/bayer"][2:-2, 2:-2] == (200, 100, 50)).all()
     assert (data["drone/deep"] == 0x40).all()
@@ -401,8 +401,8 @@ def test_topics_are_named_with_or_without_the_slash(
     messages = images("cam0", "mono8", store=bags.ROS_1)
     path = bags.write_ros1(tmp_path / "a.bag", {written: messages})
     reader = sets.reader(path, topics=[{"topic": named, "as": "image"}])
-    found = events(reader)
-    assert [event.source for event in found] == ["drone/cam0"] * bags.FRAMES
+    received = events(reader)
+    assert [event.source for event in received] == ["drone/cam0"] * bags.FRAMES
     reader.close()
 
 

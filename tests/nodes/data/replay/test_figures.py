@@ -47,13 +47,13 @@ E = TypeVar("E", bound=Event)
 ALL = Choice(("Event",))
 
 
-def of(found: Reader, kind: type[E]) -> list[E]:
-    events = [each.event for each in found.events(0, None, ALL)]
+def of(reader: Reader, kind: type[E]) -> list[E]:
+    events = [record.event for record in reader.events(0, None, ALL)]
     return [event for event in events if isinstance(event, kind)]
 
 
-def announced(found: Reader, kind: type[E]) -> E:
-    (only,) = (a for a in found.announcements() if isinstance(a, kind))
+def announced(reader: Reader, kind: type[E]) -> E:
+    (only,) = (a for a in reader.announcements() if isinstance(a, kind))
     return only
 
 
@@ -74,12 +74,12 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_eurocs_camera_is_calibrated_and_mounted(euroc: Reader) -> None:
     """Its figures are those of the published sensor.yaml."""
-    found = announced(euroc, CameraAnnouncement)
-    assert (found.source, found.images, found.rate) == ("drone/cam0", ("grey",), 20.0)
-    info = found.info
+    camera = announced(euroc, CameraAnnouncement)
+    assert (camera.source, camera.images, camera.rate) == ("drone/cam0", ("grey",), 20.0)
+    info = camera.info
     assert (info.width, info.height, info.fx, info.cy) == (752, 480, 458.654, 248.375)
     assert info.distortion == (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0)
-    matrix = pose_matrix(found.position, found.orientation)
+    matrix = pose_matrix(camera.position, camera.orientation)
     assert matrix[:3, 3].tolist() == [-0.0216401454975, -0.064676986768, 0.00981073058949]
     assert matrix[0, :3] == pytest.approx([0.0148655429818, -0.999880929698, 0.00414029679422])
 
@@ -92,7 +92,7 @@ def test_eurocs_imu_has_its_noise_and_figures(euroc: Reader) -> None:
     assert (first.stamp, second.stamp) == (0, 5_000_192)
     assert first.angular_velocity[0] == -0.099134701513277898
     assert second.linear_acceleration[1] == -0.40861041666666664
-    assert [each.stamp for each in of(euroc, Image)] == [5_000_192, 55_000_192]
+    assert [image.stamp for image in of(euroc, Image)] == [5_000_192, 55_000_192]
 
 
 def test_eurocs_truth_is_in_ned(euroc: Reader) -> None:
@@ -126,9 +126,9 @@ def test_tums_camera_is_as_said_and_never_guessed(tum: Reader, tmp_path: Path) -
     with pytest.raises(ReplayError, match=r"xyz: expected a camera\.yaml .* write camera = \{ fx"):
         open_reader(ReplayConfig(file=str(path)), "replay")
     pinhole = {"fx": 517.3, "fy": 516.5, "cx": 318.6, "cy": 255.3}
-    found = sets.reader(path, camera=pinhole, depth_factor=1000.0)
-    assert announced(found, CameraAnnouncement).info.fx == 517.3
-    assert of(found, DepthImage)[0].data[0, 1] == 5.0
+    reader = sets.reader(path, camera=pinhole, depth_factor=1000.0)
+    assert announced(reader, CameraAnnouncement).info.fx == 517.3
+    assert of(reader, DepthImage)[0].data[0, 1] == 5.0
 
 
 def test_tums_truth_is_in_ned(tum: Reader) -> None:
@@ -145,65 +145,65 @@ def test_tums_truth_is_in_ned(tum: Reader) -> None:
 
 def test_our_own_euroc_comes_back(tmp_path: Path) -> None:
     """Truth to the nanometre, images in grey, depth to its step."""
-    found = sets.reader(sets.euroc(tmp_path))
+    reader = sets.reader(sets.euroc(tmp_path))
     stamp = 2 * sets.STEP
-    truth, expected = of(found, Odometry)[2], odometry(stamp)
+    truth, expected = of(reader, Odometry)[2], odometry(stamp)
     assert truth.stamp == stamp
     assert truth.position == pytest.approx(expected.position, abs=1e-9)
     assert truth.orientation == pytest.approx(expected.orientation, abs=1e-9)
     assert truth.linear_velocity == pytest.approx(expected.linear_velocity, abs=1e-8)
-    assert of(found, Imu)[2].linear_acceleration == imu(stamp).linear_acceleration
-    assert (of(found, Image)[2].data == in_grey(image(stamp).data)).all()
-    steps = of(found, DepthImage)[2].data
+    assert of(reader, Imu)[2].linear_acceleration == imu(stamp).linear_acceleration
+    assert (of(reader, Image)[2].data == in_grey(image(stamp).data)).all()
+    steps = of(reader, DepthImage)[2].data
     far = depth(stamp).data > 13.107
     assert np.isinf(steps[far]).all()
     assert steps[~far] == pytest.approx(depth(stamp).data[~far], abs=1.01e-4)
-    mounted = announced(found, CameraAnnouncement)
+    mounted = announced(reader, CameraAnnouncement)
     assert mounted.position == camera().position
     assert mounted.orientation == pytest.approx(camera().orientation)
 
 
 def test_our_own_tum_comes_back(tmp_path: Path) -> None:
     """Colours to the bit, and the camera that took them."""
-    found = sets.reader(sets.tum_rgbd(tmp_path))
-    assert (of(found, Image)[1].data == image(sets.STEP).data).all()
-    assert announced(found, CameraAnnouncement).info == camera().info
-    assert of(found, PoseStamped)[0].position == pytest.approx((1.0, 2.0, -3.0), abs=1e-9)
-    assert of(found, PoseStamped)[0].orientation == pytest.approx((0.5, 0.5, 0.5, 0.5))
+    reader = sets.reader(sets.tum_rgbd(tmp_path))
+    assert (of(reader, Image)[1].data == image(sets.STEP).data).all()
+    assert announced(reader, CameraAnnouncement).info == camera().info
+    assert of(reader, PoseStamped)[0].position == pytest.approx((1.0, 2.0, -3.0), abs=1e-9)
+    assert of(reader, PoseStamped)[0].orientation == pytest.approx((0.5, 0.5, 0.5, 0.5))
 
 
 def test_a_bag_comes_back(bag: Path) -> None:
     """In NED and FRD, from 0 on; cameras where /tf_static has them."""
-    found = sets.reader(bag)
+    reader = sets.reader(bag)
     stamp = 2 * sets.STEP
-    truth, expected = of(found, Odometry)[2], odometry(stamp)
+    truth, expected = of(reader, Odometry)[2], odometry(stamp)
     assert truth.stamp == stamp
     assert truth.position == pytest.approx(expected.position)
     same = abs(np.dot(truth.orientation, expected.orientation))
     assert same == pytest.approx(1.0)
     assert truth.linear_velocity == pytest.approx(expected.linear_velocity)
-    assert of(found, Imu)[2].linear_acceleration == imu(stamp).linear_acceleration
-    assert (of(found, Image)[2].data == image(stamp).data).all()
-    assert (of(found, DepthImage)[2].data == depth(stamp).data).all()
-    mounted = announced(found, CameraAnnouncement)
+    assert of(reader, Imu)[2].linear_acceleration == imu(stamp).linear_acceleration
+    assert (of(reader, Image)[2].data == image(stamp).data).all()
+    assert (of(reader, DepthImage)[2].data == depth(stamp).data).all()
+    mounted = announced(reader, CameraAnnouncement)
     assert mounted.source == "drone/front"
     assert mounted.position == pytest.approx(camera().position)
     turn = abs(np.dot(mounted.orientation, camera().orientation))
     assert turn == pytest.approx(1.0)
-    found.close()
+    reader.close()
 
 
 @pytest.mark.slow
 def test_compressed_images_of_a_bag_come_back(tmp_path: Path) -> None:
     """PNG to the bit, and depth to the millimetre."""
-    found = sets.reader(sets.compressed_bag(tmp_path))
-    assert (of(found, Image)[2].data == image(2 * sets.STEP).data).all()
+    reader = sets.reader(sets.compressed_bag(tmp_path))
+    assert (of(reader, Image)[2].data == image(2 * sets.STEP).data).all()
     expected = depth(0).data
     there = np.isfinite(expected)
-    metres = of(found, DepthImage)[0].data
+    metres = of(reader, DepthImage)[0].data
     assert np.isinf(metres[~there]).all()
     assert metres[there] == pytest.approx(expected[there], abs=5.1e-4)
-    found.close()
+    reader.close()
 
 
 def test_a_bags_topics_can_be_chosen(bag: Path) -> None:
@@ -212,9 +212,9 @@ def test_a_bags_topics_can_be_chosen(bag: Path) -> None:
         {"topic": "/drone/front/pose", "as": "truth", "source": "rig"},
         {"topic": "/drone/imu", "as": "imu", "source": "rig/imu", "frame_id": "body"},
     ]
-    found = sets.reader(bag, topics=topics)
-    events = [each.event for each in found.events(0, None, ALL)]
-    found.close()
+    reader = sets.reader(bag, topics=topics)
+    events = [record.event for record in reader.events(0, None, ALL)]
+    reader.close()
     assert {(type(e), e.source) for e in events} == {(Odometry, "rig"), (Imu, "rig/imu")}
     assert {e.frame_id for e in events if isinstance(e, Imu)} == {"body"}
 
@@ -269,9 +269,9 @@ def test_a_missing_image_is_an_error_when_its_turn_comes(tmp_path: Path) -> None
     folder = sets.euroc_as_published(tmp_path)
     last = sorted((folder / "mav0" / "cam0" / "data").iterdir())[-1]
     last.write_bytes(b"no image")
-    found = sets.reader(folder)
+    reader = sets.reader(folder)
     with pytest.raises(ReplayError, match=rf"{last.name}: expected an image"):
-        of(found, Image)
+        of(reader, Image)
 
 
 def cut(path: Path, count: int) -> None:
@@ -296,10 +296,10 @@ def test_rows_that_a_killed_run_cut_off_are_left_out_and_told(
     cut(root / index, count)
     cut(root / truth, count)
     sorted((root / images).iterdir())[1].unlink()
-    found = sets.reader(folder)
-    assert [each.stamp for each in of(found, Image)] == [0]
-    assert max(each.stamp for each in of(found, Odometry)) < 2 * sets.STEP
-    assert {*found.trouble} >= {
+    reader = sets.reader(folder)
+    assert [image.stamp for image in of(reader, Image)] == [0]
+    assert max(pose.stamp for pose in of(reader, Odometry)) < 2 * sets.STEP
+    assert {*reader.trouble} >= {
         f"{root / index}: the last line is cut off, and left out",
         f"{root / images}: 1 listed images are missing, and left out",
         f"{root / truth}: the last line is cut off, and left out",
@@ -310,9 +310,9 @@ def test_a_last_line_of_others_needs_no_end(tmp_path: Path) -> None:
     folder = sets.euroc_as_published(tmp_path)
     path = folder / "mav0" / "imu0" / "data.csv"
     path.write_text(path.read_text().rstrip())
-    found = sets.reader(folder)
-    assert len(of(found, Imu)) == 2
-    assert not found.trouble
+    reader = sets.reader(folder)
+    assert len(of(reader, Imu)) == 2
+    assert not reader.trouble
 
 
 @pytest.mark.slow
@@ -344,9 +344,9 @@ def test_every_stamp_of_a_data_set_comes_back(
         recording.odometry(odometry(stamp))
         recording.pose(pose(stamp))
     recording.close()
-    found = sets.reader(folder)
+    reader = sets.reader(folder)
     for kind in (Image, DepthImage, Odometry):
-        assert [event.stamp for event in of(found, kind)] == stamps
+        assert [event.stamp for event in of(reader, kind)] == stamps
 
 
 @pytest.mark.slow
@@ -367,8 +367,8 @@ def test_truth_beyond_the_sensors_is_no_part_of_a_flight(build: Any, tmp_path: P
         separator = " " if path.name.startswith("rgbd") else ","
         rows.append(separator.join([text, *pose_row.split(separator)[1:]]))
     truth.write_text("\n".join([first, *rows]) + "\n")
-    found = sets.reader(path)
-    images, poses = of(found, Image), of(found, Odometry)
+    reader = sets.reader(path)
+    images, poses = of(reader, Image), of(reader, Odometry)
     assert len(images) == len(sensors)
     assert poses[0].stamp <= images[0].stamp
     assert images[-1].stamp <= poses[-1].stamp < images[-1].stamp + 50_000_000
@@ -386,7 +386,7 @@ def test_damaged_texts_are_errors_of_one_line(
     path = tmp_path_factory.getbasetemp() / f"fuzzed_{build.__name__}"
     if not path.exists():
         build(path)
-    files = sorted(each for each in path.rglob("*") if each.is_file())
+    files = sorted(entry for entry in path.rglob("*") if entry.is_file())
     file = data.draw(st.sampled_from(files))
     whole = file.read_bytes()
     content = bytearray(whole)
@@ -396,8 +396,8 @@ def test_damaged_texts_are_errors_of_one_line(
     file.write_bytes(content)
     wrong = ""
     try:
-        found = sets.reader(path / "dataset")
-        list(found.events(0, None, Choice()))
+        reader = sets.reader(path / "dataset")
+        list(reader.events(0, None, Choice()))
     except ReplayError as error:
         wrong = str(error)
     finally:

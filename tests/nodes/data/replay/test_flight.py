@@ -86,10 +86,10 @@ def test_a_flight_that_is_killed_is_read_but_for_its_last_second(tmp_path: Path)
         os.kill(pid, signal.SIGKILL)
     flight.wait()
     last = float(truth.read_text().splitlines()[-1].split()[0])
-    found = [record.time for record in read(path, damaged=lambda _: None)]
-    assert found[-1] / 1e9 > last - 1.0
+    times = [record.time for record in read(path, damaged=lambda _: None)]
+    assert times[-1] / 1e9 > last - 1.0
     done = subprocess.run(command("recover", str(path)), cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert f"{len(found)} messages, now with an index" in done.stdout
+    assert f"{len(times)} messages, now with an index" in done.stdout
     assert contents(path).complete
-    assert [record.time for record in read(path)] == found
+    assert [record.time for record in read(path)] == times

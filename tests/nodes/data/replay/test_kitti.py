@@ -27,8 +27,8 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return downloads.kitti(tmp_path_factory.mktemp("kitti"))
 
 
-def cameras(found: Reader) -> list[CameraAnnouncement]:
-    return [each for each in found.announcements() if isinstance(each, CameraAnnouncement)]
+def cameras(reader: Reader) -> list[CameraAnnouncement]:
+    return [a for a in reader.announcements() if isinstance(a, CameraAnnouncement)]
 
 
 def test_the_cameras_stand_where_the_projections_say(sequence: Path) -> None:
@@ -45,13 +45,13 @@ def test_the_cameras_stand_where_the_projections_say(sequence: Path) -> None:
 
 
 def test_images_and_truth_come_at_their_times(sequence: Path) -> None:
-    found = sets.reader(sequence)
-    events = [each.event for each in found.events(0, None, ALL)]
-    stamps = [each.stamp for each in events if isinstance(each, Image)]
+    reader = sets.reader(sequence)
+    events = [record.event for record in reader.events(0, None, ALL)]
+    stamps = [event.stamp for event in events if isinstance(event, Image)]
     assert stamps == [0, 0, 50_000_000, 50_000_000, 100_000_000, 100_000_000]
-    truth = [each for each in events if isinstance(each, Odometry)]
-    assert [each.stamp for each in truth] == stamps[::2]
-    vehicle = next(a for a in found.announcements() if isinstance(a, VehicleAnnouncement))
+    truth = [event for event in events if isinstance(event, Odometry)]
+    assert [pose.stamp for pose in truth] == stamps[::2]
+    vehicle = next(a for a in reader.announcements() if isinstance(a, VehicleAnnouncement))
     assert vehicle.position == truth[0].position == (0.0, 0.0, 0.0)
     axes = pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
     with pytest.MonkeyPatch.context() as patch:
@@ -81,8 +81,8 @@ def test_what_is_not_as_published_is_said(
 ) -> None:
     copy = tmp_path / "sequences" / "07"
     copy.mkdir(parents=True)
-    for each in sequence.iterdir():
-        (copy / each.name).symlink_to(each)
+    for path in sequence.iterdir():
+        (copy / path.name).symlink_to(path)
     (copy / name).unlink()
     (copy / name).write_text(text)
     with pytest.raises(ReplayError, match=wrong):
@@ -92,11 +92,11 @@ def test_what_is_not_as_published_is_said(
 def test_without_true_poses_there_are_images(sequence: Path, tmp_path: Path) -> None:
     copy = tmp_path / "sequences" / "11"
     copy.mkdir(parents=True)
-    for each in sequence.iterdir():
-        (copy / each.name).symlink_to(each)
-    found = sets.reader(copy)
-    assert len(cameras(found)) == 2
-    (trouble,) = found.trouble
+    for path in sequence.iterdir():
+        (copy / path.name).symlink_to(path)
+    reader = sets.reader(copy)
+    assert len(cameras(reader)) == 2
+    (trouble,) = reader.trouble
     assert trouble.startswith("expected true poses in")
 
 

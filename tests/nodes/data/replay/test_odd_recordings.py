@@ -48,9 +48,11 @@ def imus(folder: Path, *rows: tuple[int, int]) -> Path:
 def stamps(path: Path) -> tuple[list[tuple[int, int]], list[str], int]:
     """Return times and stamps of all events, and what could not be read."""
     reader = sets.reader(path)
-    found = [(each.time, each.event.stamp) for each in reader.events(0, None, lambda *_: True)]
+    times = [
+        (record.time, record.event.stamp) for record in reader.events(0, None, lambda *_: True)
+    ]
     reader.close()
-    return found, reader.trouble, reader.left_out
+    return times, reader.trouble, reader.left_out
 
 
 @pytest.mark.parametrize("first", [0, S])
@@ -63,8 +65,8 @@ def test_a_message_without_a_stamp_has_that_of_its_receipt(tmp_path: Path, first
 def test_messages_of_before_the_beginning_are_counted_and_told_once(tmp_path: Path) -> None:
     """However many there are."""
     path = imus(tmp_path, (S, S), *((S + n * MS, S - n * MS) for n in range(1, 50)))
-    found, trouble, left_out = stamps(path)
-    assert (found, left_out) == ([(0, 0)], 49)
+    times, trouble, left_out = stamps(path)
+    assert (times, left_out) == ([(0, 0)], 49)
     assert trouble == ["/imu: expected no stamp before the first, found one 0.001 s before it"]
 
 
@@ -168,7 +170,11 @@ def test_a_bag_with_wrong_bytes_is_read_or_an_error_of_one_line(
     if not folder.exists():
         folder.mkdir()
         sets.bag(folder, plugin)
-    files = [each for each in folder.rglob("*") if each.is_file() and "wrong" not in each.name]
+    files = [
+        candidate
+        for candidate in folder.rglob("*")
+        if candidate.is_file() and "wrong" not in candidate.name
+    ]
     whole = next(file for file in files if file.suffix in {".db3", ".mcap"})
     content = bytearray(whole.read_bytes())
     for place in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=1, max_size=8)):

@@ -38,12 +38,12 @@ def read(path: Path, start: int = 0, end: int | None = None, choice: Choice = AL
 @pytest.mark.slow
 def test_events_come_in_order_of_time(path: Path) -> None:
     """Times begin near 0; stamps are of the same clock, and not ahead."""
-    found = read(path)
-    times = [each.time for each in found]
+    records = read(path)
+    times = [record.time for record in records]
     assert times == sorted(times)
     assert 0 <= times[0] < 4_000_000_000
-    assert all(0 <= each.event.stamp <= each.time for each in found)
-    assert not [each for each in found if isinstance(each.event, Announcement)]
+    assert all(0 <= record.event.stamp <= record.time for record in records)
+    assert not [record for record in records if isinstance(record.event, Announcement)]
 
 
 @pytest.mark.slow
@@ -51,12 +51,12 @@ def test_reading_again_gives_the_same(path: Path) -> None:
     """To the byte, with a reader of its own or the same one."""
     opened = reader(path)
     twice = [
-        [(each.time, pack(each.event).frame()) for each in opened.events(0, None, ALL)]
+        [(record.time, pack(record.event).frame()) for record in opened.events(0, None, ALL)]
         for _ in range(2)
     ]
     opened.close()
     assert twice[0] == twice[1]
-    assert twice[0] == [(each.time, pack(each.event).frame()) for each in read(path)]
+    assert twice[0] == [(record.time, pack(record.event).frame()) for record in read(path)]
 
 
 @pytest.mark.slow
@@ -64,19 +64,19 @@ def test_a_range_is_that_part_of_the_whole(path: Path) -> None:
     """From its start to before its end."""
     whole = read(path)
     start, end = whole[len(whole) // 3].time, whole[-1].time
-    expected = [each for each in whole if start <= each.time < end]
-    found = read(path, start, end)
-    assert [pack(e.event).frame() for e in found] == [pack(e.event).frame() for e in expected]
+    expected = [record for record in whole if start <= record.time < end]
+    part = read(path, start, end)
+    assert [pack(e.event).frame() for e in part] == [pack(e.event).frame() for e in expected]
 
 
 @pytest.mark.slow
 def test_only_what_is_wanted_is_read(path: Path) -> None:
     """By type and by source."""
     whole = read(path)
-    images = [each.event for each in whole if isinstance(each.event, Image)]
+    images = [record.event for record in whole if isinstance(record.event, Image)]
     assert images
-    found = read(path, choice=Choice(("Image",)))
-    assert [pack(e.event).frame() for e in found] == [pack(e).frame() for e in images]
+    chosen = read(path, choice=Choice(("Image",)))
+    assert [pack(e.event).frame() for e in chosen] == [pack(e).frame() for e in images]
     assert read(path, choice=Choice(("nobody",))) == []
 
 
@@ -87,8 +87,8 @@ def test_images_are_of_announced_cameras(path: Path) -> None:
     cameras = {a.source: a for a in opened.announcements() if isinstance(a, CameraAnnouncement)}
     opened.close()
     kinds: dict[str, set[str]] = {source: set() for source in cameras}
-    for each in read(path):
-        event: Event = each.event
+    for record in read(path):
+        event: Event = record.event
         if isinstance(event, Image | DepthImage):
             camera = cameras[event.source]
             assert event.data.shape[:2] == (camera.info.height, camera.info.width)
@@ -106,7 +106,7 @@ def test_truth_and_vehicle_agree(path: Path) -> None:
     opened = reader(path)
     vehicle, *_ = opened.announcements()
     opened.close()
-    truth = [each.event for each in read(path) if isinstance(each.event, Odometry)]
+    truth = [record.event for record in read(path) if isinstance(record.event, Odometry)]
     assert truth
     assert {event.source for event in truth} == {vehicle.source} == {"drone"}
     assert all(np.isclose(np.linalg.norm(event.orientation), 1.0, atol=1e-3) for event in truth)

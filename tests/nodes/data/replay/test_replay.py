@@ -66,7 +66,7 @@ def test_everything_is_said_when_it_was(path: Path) -> None:
     """Announcements and events are equal to the byte, in order, and the end ends the run."""
     result = replay(path)
     expected = [pack(event).frame() for event in sets.events()]
-    sent = [each for each in result.sent if each.source != "*"]  # by which it speaks for all others
+    sent = [e for e in result.sent if e.source != "*"]  # by which it speaks for all others
     assert [pack(event).frame() for event in sent] == expected
     assert [time for time, _ in Witness.heard] == [e.stamp for _, e in Witness.heard]
     assert result.reason == "the recording ended"
@@ -139,9 +139,9 @@ def test_each_pose_of_a_trajectory_is_when_it_was_played(
         positions=np.array([(float(t), 0.0, 0.0) for t in recorded]),
         orientations=np.array([(1.0, 0.0, 0.0, 0.0)] * 4),
     )
-    found = timeline.moved(sent)
-    assert isinstance(found, TrajectoryEstimate)
-    assert dict(zip(found.positions[:, 0].tolist(), found.stamps.tolist(), strict=True)) == stamps
+    moved = timeline.moved(sent)
+    assert isinstance(moved, TrajectoryEstimate)
+    assert dict(zip(moved.positions[:, 0].tolist(), moved.stamps.tolist(), strict=True)) == stamps
     for recorded_at in stamps if len(played) < 2 or played[1][2:] else ():  # and single events
         event = timeline.moved(TrackingLost(stamp=recorded_at, source="slam"))
         assert event is not None

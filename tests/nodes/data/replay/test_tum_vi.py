@@ -61,8 +61,8 @@ def cameras(reader: Reader) -> list[CameraAnnouncement]:
 
 
 def truth(reader: Reader) -> list[Odometry]:
-    found = (each.event for each in reader.events(0, None, lambda kind, _: kind is Odometry))
-    return [event for event in found if isinstance(event, Odometry)]
+    events = (record.event for record in reader.events(0, None, lambda kind, _: kind is Odometry))
+    return [event for event in events if isinstance(event, Odometry)]
 
 
 def test_a_sequence_as_published_is_read(tmp_path: Path) -> None:
@@ -73,11 +73,11 @@ def test_a_sequence_as_published_is_read(tmp_path: Path) -> None:
     assert left.position == pytest.approx(IN_IMU, abs=1e-8)
     assert (left.rate, left.images) == (20.0, ("grey",))
     assert (right.stereo, right.source) == (left.source, "drone/cam1")
-    one, other = (pose_matrix(each.position, each.orientation) for each in (left, right))
+    one, other = (pose_matrix(camera.position, camera.orientation) for camera in (left, right))
     np.testing.assert_allclose(inverse(one) @ other, chain.cameras[1].in_first, atol=1e-8)
     (imu,) = (a for a in reader.announcements() if isinstance(a, ImuAnnouncement))
     assert (imu.rate, imu.accelerometer_noise_density) == (200.0, 0.0014)
-    images = [each.event for each in reader.events(0, None, lambda kind, _: kind is Image)]
+    images = [record.event for record in reader.events(0, None, lambda kind, _: kind is Image)]
     assert [event.data[0, 0] for event in images if isinstance(event, Image)][::2] == [32, 33, 34]
     assert any("dso/camchain.yaml" in note for note in reader.notes)
     assert any(note.endswith("mav0/mocap0/data.csv") for note in reader.notes)
@@ -92,16 +92,16 @@ def test_a_sequence_is_the_same_in_both_layouts(
     monkeypatch.setattr(downloads, "IMAGES", 3)
     one = sets.reader(downloads.euroc(tmp_path / "euroc"))
     other = sets.reader(downloads.tum_vi(tmp_path / "tum_vi"))
-    for announced, found in zip(cameras(one), cameras(other), strict=True):
-        assert (found.info, found.stereo) == (announced.info, announced.stereo)
-        assert found.position == pytest.approx(announced.position, abs=1e-12)
-        assert found.orientation == pytest.approx(announced.orientation, abs=1e-12)
-        assert found.rate == pytest.approx(announced.rate, rel=1e-3)
+    for announced, camera in zip(cameras(one), cameras(other), strict=True):
+        assert (camera.info, camera.stereo) == (announced.info, announced.stereo)
+        assert camera.position == pytest.approx(announced.position, abs=1e-12)
+        assert camera.orientation == pytest.approx(announced.orientation, abs=1e-12)
+        assert camera.rate == pytest.approx(announced.rate, rel=1e-3)
     for pose, same in zip(truth(one), truth(other), strict=True):
         assert (same.stamp, same.position) == (pose.stamp, pose.position)
         assert same.orientation == pose.orientation
     both = [
-        [each.event for each in reader.events(0, None, lambda kind, _: kind is Image)]
+        [record.event for record in reader.events(0, None, lambda kind, _: kind is Image)]
         for reader in (one, other)
     ]
     assert len(both[0]) == 6
@@ -118,8 +118,8 @@ def test_its_truth_is_that_of_the_imu_in_a_world_with_z_down(tmp_path: Path) -> 
     assert (first.position, second.position) == ((0.1, -0.2, -1.3), (0.2, -0.2, -1.3))
     world = np.diag([1.0, -1.0, -1.0])
     expected = world @ pose_matrix((0, 0, 0), (0.5, 0.5, -0.5, 0.5))[:3, :3]
-    found = pose_matrix(first.position, first.orientation)[:3, :3]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    rotation = pose_matrix(first.position, first.orientation)[:3, :3]
+    np.testing.assert_allclose(rotation, expected, atol=1e-12)
 
 
 def test_bad_rows_of_the_truth_are_counted_and_no_end(tmp_path: Path) -> None:

@@ -148,10 +148,10 @@ def test_rows_of_a_turning_and_moving_camera_are_made_straight() -> None:
     depth = np.stack([shown[at][1][row] for row, at in enumerate(nearest)])
     straight, true = look(pose())
     rows = Rows(INFO, readout, np.array([0.0, turn, 0.0]), np.array([speed, 0.0, 0.0]))
-    found, near = rows.image_and_depth(image, depth)
+    straightened, near = rows.image_and_depth(image, depth)
     inner = np.s_[10:-10, 20:-20]
     before = np.abs(image[inner].astype(float) - straight[inner]).mean()
-    assert np.abs(found[inner].astype(float) - straight[inner]).mean() < 0.35 * before
+    assert np.abs(straightened[inner].astype(float) - straight[inner]).mean() < 0.35 * before
     assert np.median(np.abs(near - true)[inner]) < 0.01
 
 

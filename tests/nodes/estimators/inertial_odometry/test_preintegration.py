@@ -68,11 +68,11 @@ def test_samples_at_200_hz_give_the_motion_that_fine_steps_give(motion: Floats) 
 @given(motions, biases)
 def test_derivatives_by_the_bias_are_those_of_differences(motion: Floats, bias: Floats) -> None:
     samples = felt(motion, np.linspace(0, 0.1, 21))
-    found = MODEL.preintegrate(samples, bias)
+    preintegrated = MODEL.preintegrate(samples, bias)
     for axis, step in enumerate(1e-5 * np.eye(6)):
-        ahead = difference(found, MODEL.preintegrate(samples, bias + step))
-        behind = difference(found, MODEL.preintegrate(samples, bias - step))
-        assert np.abs((ahead - behind) / 2e-5 - found.by_bias[:, axis]).max() < 2e-4
+        ahead = difference(preintegrated, MODEL.preintegrate(samples, bias + step))
+        behind = difference(preintegrated, MODEL.preintegrate(samples, bias - step))
+        assert np.abs((ahead - behind) / 2e-5 - preintegrated.by_bias[:, axis]).max() < 2e-4
 
 
 @pytest.mark.slow

@@ -55,16 +55,16 @@ def test_the_covariance_has_the_uncertainty_of_the_baseline_along_the_way() -> N
 
 
 def test_images_that_contradict_the_imu_are_lost_and_begin_a_frame_of_their_own() -> None:
-    tracker, found = started(0.0), list[TrackingResult]()
+    tracker, results = started(0.0), list[TrackingResult]()
     for number in range(40):
         time = number / 20
         rest = [[(time - 0.05 + k / 200) * 1e9, 0, 0, 0, 0, 0, -9.81] for k in range(1, 11)]
         # From 1 s on, the camera speeds up by 3 m/s², of which the IMU feels nothing.
         image, depth = look(pose(x=1.5 * max(time - 1.0, 0.0) ** 2))
-        found.append(tracker.fuse(int(time * 1e9), image, depth, np.array(rest)))
-    assert not any(result.lost or result.map for result in found[:20])
-    assert any(result.lost for result in found[20:35])
-    assert found[-1].map > 0
+        results.append(tracker.fuse(int(time * 1e9), image, depth, np.array(rest)))
+    assert not any(result.lost or result.map for result in results[:20])
+    assert any(result.lost for result in results[20:35])
+    assert results[-1].map > 0
 
 
 @pytest.mark.slow

@@ -46,11 +46,11 @@ class Scene:
     def perturbed(self, fixed: int) -> tuple[Floats, Floats]:
         random = np.random.default_rng(4)
         poses = self.poses.copy()
-        for each in poses[fixed:]:
-            each[:3, :3] = (
-                Rotation.from_rotvec(random.normal(0, 0.01, 3)).as_matrix() @ each[:3, :3]
+        for view in poses[fixed:]:
+            view[:3, :3] = (
+                Rotation.from_rotvec(random.normal(0, 0.01, 3)).as_matrix() @ view[:3, :3]
             )
-            each[:3, 3] += random.normal(0, 0.02, 3)
+            view[:3, 3] += random.normal(0, 0.02, 3)
         return poses, self.points + random.normal(0, 0.03, self.points.shape)
 
     def adjust(self, fixed: int, pixels: Floats, steps: int) -> tuple[Floats, Floats, Floats]:
@@ -160,8 +160,8 @@ def project(view: Floats, points: Floats) -> Floats:
 
 
 def test_rays_by_hand() -> None:
-    found = rays(np.array([[50.0, 40.0], [150.0, 0.0]]), K)
-    np.testing.assert_allclose(found, [[0.0, 0.0, 1.0], [1.0, -0.2, 1.0]])
+    directions = rays(np.array([[50.0, 40.0], [150.0, 0.0]]), K)
+    np.testing.assert_allclose(directions, [[0.0, 0.0, 1.0], [1.0, -0.2, 1.0]])
 
 
 def test_a_centre_is_where_the_camera_is() -> None:
@@ -211,10 +211,10 @@ def test_what_two_cameras_see_is_triangulated_where_it_is(
     points = np.resize(numbers, (len(numbers) // 3, 3)) + np.array([0.0, 0.0, 6.0])
     first, second = inverse(pose(-1.5, pitch=5)), inverse(pose(*motion))
     pixels = project(first, points), project(second, points)
-    a, b = (rays(each, MATRIX) for each in pixels)
+    a, b = (rays(observed, MATRIX) for observed in pixels)
     np.testing.assert_allclose(triangulate(first, second, a, b), points, atol=1e-6)
-    for view, each in zip((first, second), pixels, strict=True):
-        assert reprojection_errors(view, points, each, MATRIX).max() < 1e-8
+    for view, observed in zip((first, second), pixels, strict=True):
+        assert reprojection_errors(view, points, observed, MATRIX).max() < 1e-8
     to = points - centre(first), points - centre(second)
     cosine = np.sum(to[0] * to[1], axis=1) / np.prod(np.linalg.norm(to, axis=2), axis=0)
     expected = np.degrees(np.arccos(np.minimum(cosine, 1.0)))
@@ -230,10 +230,10 @@ def test_the_true_motion_is_among_the_hypotheses(relief: float) -> None:
     last[:4] += 30.0  # followed wrongly
     length = np.linalg.norm(second[:3, 3])
     misses = []
-    for found in hypotheses(first, last, MATRIX):
-        assert np.linalg.norm(found[:3, 3]) == pytest.approx(1.0)
-        assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
-        again = found.copy()
+    for motion in hypotheses(first, last, MATRIX):
+        assert np.linalg.norm(motion[:3, 3]) == pytest.approx(1.0)
+        assert np.linalg.det(motion[:3, :3]) == pytest.approx(1.0)
+        again = motion.copy()
         again[:3, 3] *= length
         misses.append(np.abs(again - second).max())
     assert min(misses) < 2e-3

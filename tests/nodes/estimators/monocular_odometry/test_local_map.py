@@ -43,8 +43,8 @@ PLACES = [pose(0.2 * i, 0.02 * i, 0.01 * i, yaw=i) for i in range(14)]
 def begin() -> LocalMap:
     """Return a map of the first two places, in which half of the corners have no place yet."""
     pixels = np.stack([project(PLACES[0]), project(PLACES[1])])
-    found = InitialMap(BLANK, inverse(PLACES[1]), pixels, POINTS)
-    made = LocalMap.first(found, BLANK, np.eye(4), 1.0, MATRIX, SETTINGS)
+    initial = InitialMap(BLANK, inverse(PLACES[1]), pixels, POINTS)
+    made = LocalMap.first(initial, BLANK, np.eye(4), 1.0, MATRIX, SETTINGS)
     made.tracks.points[40:] = np.nan
     return made
 
@@ -52,8 +52,8 @@ def begin() -> LocalMap:
 def test_the_first_map_is_put_where_it_begins_and_in_the_worlds_unit() -> None:
     start = pose(3.0, 1.0, -2.0, yaw=30, pitch=10)
     pixels = np.stack([project(PLACES[0]), project(PLACES[1])])
-    found = InitialMap(BLANK, inverse(PLACES[1]), pixels, POINTS)
-    made = LocalMap.first(found, BLANK, start, 2.0, MATRIX, SETTINGS)
+    initial = InitialMap(BLANK, inverse(PLACES[1]), pixels, POINTS)
+    made = LocalMap.first(initial, BLANK, start, 2.0, MATRIX, SETTINGS)
     second = PLACES[1].copy()
     second[:3, 3] *= 2.0
     np.testing.assert_allclose(made.pose, inverse(start @ second), atol=1e-12)
@@ -61,7 +61,7 @@ def test_the_first_map_is_put_where_it_begins_and_in_the_worlds_unit() -> None:
     np.testing.assert_allclose(made.tracks.points, expected)
     seen = 2.0 * (POINTS @ inverse(PLACES[1])[:3, :3].T + inverse(PLACES[1])[:3, 3])
     assert made.depth == pytest.approx(np.median(seen[:, 2]))
-    np.testing.assert_array_equal(found.second, inverse(PLACES[1]))  # left alone
+    np.testing.assert_array_equal(initial.second, inverse(PLACES[1]))  # left alone
 
 
 def test_corners_of_no_known_place_are_supposed_at_the_median_depth() -> None:
@@ -135,9 +135,9 @@ def initialized(path: list[Floats], tiles: tuple[Tile, ...]) -> tuple[InitialMap
     """Return the first map and the number of its second image."""
     initialization = Initialization(MATRIX, MonocularSettings())
     for number, place in enumerate(path):
-        found = initialization.add(look(place, tiles))
-        if found is not None:
-            return found, number
+        initial = initialization.add(look(place, tiles))
+        if initial is not None:
+            return initial, number
     pytest.fail("no map")
 
 
@@ -146,24 +146,24 @@ WAY = [pose(0.05 * i, 0.01 * i, 0.0, yaw=0.2 * i) for i in range(20)]
 
 @pytest.mark.parametrize("tiles", [FLAT, STEPPED, RELIEF], ids=["flat", "stepped", "relief"])
 def test_motion_and_landmarks_are_those_of_the_world(tiles: tuple[Tile, ...]) -> None:
-    found, number = initialized(WAY, tiles)
-    np.testing.assert_array_equal(found.first, look(WAY[0], tiles))
-    assert np.median(found.points[:, 2]) == pytest.approx(1.0)
+    initial, number = initialized(WAY, tiles)
+    np.testing.assert_array_equal(initial.first, look(WAY[0], tiles))
+    assert np.median(initial.points[:, 2]) == pytest.approx(1.0)
     true = inverse(WAY[number])
-    unit = np.linalg.norm(true[:3, 3]) / np.linalg.norm(found.second[:3, 3])
-    np.testing.assert_allclose(found.second[:3, :3], true[:3, :3], atol=5e-3)
-    np.testing.assert_allclose(unit * found.second[:3, 3], true[:3, 3], atol=5e-3)
+    unit = np.linalg.norm(true[:3, 3]) / np.linalg.norm(initial.second[:3, 3])
+    np.testing.assert_allclose(initial.second[:3, :3], true[:3, :3], atol=5e-3)
+    np.testing.assert_allclose(unit * initial.second[:3, 3], true[:3, 3], atol=5e-3)
     depths = np.array([tile[0] for tile in tiles])
-    off = np.abs(unit * found.points[:, 2, None] - depths).min(axis=1)
+    off = np.abs(unit * initial.points[:, 2, None] - depths).min(axis=1)
     assert np.median(off) < 0.02
-    nearest = np.abs(unit * found.points[:, 2, None] - depths).argmin(axis=1)
+    nearest = np.abs(unit * initial.points[:, 2, None] - depths).argmin(axis=1)
     assert len(set(nearest.tolist())) >= min(3, len(tiles))  # not of one depth only
 
 
 def test_landmarks_are_seen_where_the_map_says() -> None:
-    found, _ = initialized(WAY, RELIEF)
-    for view, pixels in zip((np.eye(4), found.second), found.pixels, strict=True):
-        seen = found.points @ view[:3, :3].T + view[:3, 3]
+    initial, _ = initialized(WAY, RELIEF)
+    for view, pixels in zip((np.eye(4), initial.second), initial.pixels, strict=True):
+        seen = initial.points @ view[:3, :3].T + view[:3, 3]
         again = (seen @ MATRIX.T)[:, :2] / seen[:, 2:]
         assert np.linalg.norm(again - pixels, axis=1).max() < 2.0
 
@@ -184,11 +184,11 @@ def test_too_few_corners_begin_anew_with_the_next_image() -> None:
     initialization = Initialization(MATRIX, MonocularSettings())
     assert initialization.add(look(WAY[0])) is None
     assert initialization.add(dark) is None
-    found = None
+    initial = None
     for place in WAY[4:]:
-        found = found or initialization.add(look(place))
-    assert found is not None
-    np.testing.assert_array_equal(found.first, look(WAY[4]))
+        initial = initial or initialization.add(look(place))
+    assert initial is not None
+    np.testing.assert_array_equal(initial.first, look(WAY[4]))
 
 
 HERE = look(pose(), FLAT)

@@ -98,11 +98,11 @@ def test_a_motion_has_its_direction_and_its_turn(path: list[Place]) -> None:
 def test_the_unit_of_length_stays(tiles: tuple[Tile, ...]) -> None:
     path: list[Place] = [(0.07 * i, 0.005 * i, 0.004 * i, 0.2 * i) for i in range(34)]
     said = follow(MonocularTracker(INFO), render(path, tiles))
-    known = [i for i, each in enumerate(said) if each is not NO_MAP]
+    known = [i for i, result in enumerate(said) if result is not NO_MAP]
     assert known[0] < 14
     units = [unit(said[i], path[i]) for i in known]
     np.testing.assert_allclose(units, units[-1], rtol=0.02)
-    assert not any(each.lost for each in said)
+    assert not any(result.lost for result in said)
 
 
 def test_the_unit_is_the_median_depth_of_the_first_image() -> None:
@@ -116,7 +116,7 @@ def test_a_camera_that_hurries_is_followed() -> None:
     follow(odometry, render(RIGHT, FLAT))
     hurry: list[Place] = [(1.15 + 0.35 * i, 0.1 * i) for i in range(1, 7)]  # 28 pixels an image
     said = follow(odometry, render(hurry, FLAT), 24)
-    assert not any(each.lost for each in said)
+    assert not any(result.lost for result in said)
     assert unit(said[-1], hurry[-1]) == pytest.approx(2.0, rel=0.02)
 
 
@@ -124,8 +124,8 @@ def test_a_camera_that_hurries_is_followed() -> None:
 def test_landmarks_that_leave_are_replaced_by_far_ones_in_time() -> None:
     path: list[Place] = [(0.06 * i,) for i in range(50)]
     said = follow(MonocularTracker(INFO), render(path, BOARD))
-    known = [each for each in said if each is not NO_MAP]
-    assert not any(each.lost for each in known)
+    known = [result for result in said if result is not NO_MAP]
+    assert not any(result.lost for result in known)
     assert unit(known[-1], path[-1]) == pytest.approx(
         unit(known[20], path[-len(known) + 20]), rel=0.05
     )
@@ -142,23 +142,23 @@ def test_what_moves_by_itself_does_not_agree() -> None:
         row = 60 + (2 * (i - 22) if i > 22 else 0)
         column = 150 - round(3.8 * i)
         moving[row : row + 80, column : column + 80] = thing  # at first as if it lay on the floor
-        found = odometry.track(i * FRAME, moving)
-    assert found is not None
-    (x, y), agree = found.points.T, found.inliers
+        result = odometry.track(i * FRAME, moving)
+    assert result is not None
+    (x, y), agree = result.points.T, result.inliers
     on_it = (x > column + 8) & (x < column + 72) & (y > row + 8) & (y < row + 72)
-    assert not found.lost
+    assert not result.lost
     assert on_it.sum() > 5
     assert agree[on_it].mean() < 0.2
     assert agree[~on_it].mean() > 0.8
-    assert unit(found, on[-1]) == pytest.approx(2.0, rel=0.02)
+    assert unit(result, on[-1]) == pytest.approx(2.0, rel=0.02)
 
 
 def test_nothing_is_known_before_there_is_a_map() -> None:
     said = follow(MonocularTracker(INFO), [DARK, DARK, *render(RIGHT)])
-    first = next(i for i, each in enumerate(said) if each is not NO_MAP)
+    first = next(i for i, result in enumerate(said) if result is not NO_MAP)
     assert first > 5
-    assert not any(each.lost for each in said[first:])
-    assert {each.reason for each in said[first:]} == {""}
+    assert not any(result.lost for result in said[first:])
+    assert {result.reason for result in said[first:]} == {""}
 
 
 @pytest.mark.slow
@@ -166,7 +166,7 @@ def test_nothing_is_known_before_there_is_a_map() -> None:
     "path", [[(0.0,)] * 12, [(0.0, 0.0, 0.0, 3.0 * i) for i in range(12)]], ids=["rest", "turning"]
 )
 def test_without_a_way_there_is_no_map(path: list[Place]) -> None:
-    assert all(each is NO_MAP for each in follow(MonocularTracker(INFO), render(path)))
+    assert all(result is NO_MAP for result in follow(MonocularTracker(INFO), render(path)))
 
 
 @pytest.mark.slow
@@ -206,12 +206,12 @@ def test_a_dark_moment_is_lost_and_regained_with_the_same_unit() -> None:
     odometry = MonocularTracker(INFO)
     *_, before = follow(odometry, render(RIGHT))
     dark = follow(odometry, [DARK] * 3, 24)
-    assert all(each.lost and each is not NO_MAP and each.reason for each in dark)
+    assert all(result.lost and result is not NO_MAP and result.reason for result in dark)
     np.testing.assert_array_equal(dark[-1].pose, before.pose)
     on: list[Place] = [(1.15 + 0.05 * i,) for i in range(1, 12)]
     after = follow(odometry, render(on), 27)
-    assert [each.lost for each in after[2:]] == [False] * 9
-    assert {each.reason for each in after if not each.lost} == {"against a key frame", ""}
+    assert [result.lost for result in after[2:]] == [False] * 9
+    assert {result.reason for result in after if not result.lost} == {"against a key frame", ""}
     assert unit(after[-1], on[-1]) == pytest.approx(unit(before, RIGHT[-1]), rel=0.01)
 
 
@@ -233,17 +233,17 @@ def test_a_new_map_waits_for_the_timeout_says_so_and_goes_on_from_the_last_pose(
     *_, before = follow(odometry, render(DOWN_AND_ASIDE, FLAT))
     assert not before.lost
     said = follow(odometry, elsewhere(20), len(DOWN_AND_ASIDE))
-    new = next(i for i, each in enumerate(said) if not each.lost)
+    new = next(i for i, result in enumerate(said) if not result.lost)
     assert new * FRAME > 0.15e9
     assert "new map" in said[new].reason
-    assert (before.map, {each.map for each in said[new:]}) == (0, {1})
+    assert (before.map, {result.map for result in said[new:]}) == (0, {1})
     assert NO_MAP not in said
-    assert not any(each.lost or each.reason for each in said[new + 1 :])
-    relative = [np.linalg.inv(before.pose) @ each.pose for each in said[new:]]
+    assert not any(result.lost or result.reason for result in said[new + 1 :])
+    relative = [np.linalg.inv(before.pose) @ result.pose for result in said[new:]]
     assert np.linalg.norm(relative[0][:3, 3]) < 0.3  # it moved during initialization
-    for each in relative:
-        assert angle(each[:3, 3], np.array([1.0, 0.0, 0.0])) < 1.5
-        assert turned(each, np.eye(4)) < 0.5
+    for motion in relative:
+        assert angle(motion[:3, 3], np.array([1.0, 0.0, 0.0])) < 1.5
+        assert turned(motion, np.eye(4)) < 0.5
     metres = 0.04 * (len(relative) - 1)
     units = np.linalg.norm(relative[-1][:3, 3] - relative[0][:3, 3])
     assert metres / units == pytest.approx(2.0, rel=0.15)  # about as deep as the last
@@ -253,14 +253,14 @@ def test_a_new_map_waits_for_the_timeout_says_so_and_goes_on_from_the_last_pose(
 def test_before_the_timeout_there_is_no_new_map() -> None:
     odometry = MonocularTracker(INFO, MonocularSettings(reset_timeout=10.0))
     follow(odometry, render(RIGHT, FLAT))
-    assert all(each.lost for each in follow(odometry, elsewhere(8), 24))
+    assert all(result.lost for result in follow(odometry, elsewhere(8), 24))
 
 
 @pytest.mark.slow
 def test_a_known_place_is_better_than_a_new_map_even_after_the_timeout() -> None:
     odometry = MonocularTracker(INFO, MonocularSettings(reset_timeout=0.1))
     *_, before = follow(odometry, render(RIGHT))
-    assert all(each.lost for each in follow(odometry, [DARK] * 20, 24))
+    assert all(result.lost for result in follow(odometry, [DARK] * 20, 24))
     *_, after = follow(odometry, render(RIGHT[-1:] * 3), 44)
     assert not after.lost
     assert unit(after, RIGHT[-1]) == pytest.approx(unit(before, RIGHT[-1]), rel=0.01)
@@ -328,9 +328,9 @@ def test_it_says_that_its_scale_is_free_and_nothing_before_it_has_a_map() -> Non
     estimates, features = result.of(PoseEstimate), result.of(TrackedFeatures)
     assert 4 < len(estimates) < 14
     last = events[-1].stamp
-    assert [each.stamp for each in features] == [each.stamp for each in estimates] + [last]
+    assert [f.stamp for f in features] == [e.stamp for e in estimates] + [last]
     assert estimates[0].stamp == events[18 - len(estimates)].stamp
-    assert [each.stamp for each in result.of(TrackingLost)] == [last]
+    assert [event.stamp for event in result.of(TrackingLost)] == [last]
     assert estimates[0].frame_id == "odom"  # no vehicle said where it stands
     x, y, z = estimates[-1].position
     assert y > 0.2  # to the right of the image, which is to the body's right

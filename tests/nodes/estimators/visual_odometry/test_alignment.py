@@ -59,8 +59,8 @@ def follow(
     tracker = FeatureTracker(INFO)
     gains = np.ones(len(path)) if gains is None else gains
     return [
-        tracker.track(i * FRAME, *draw(planes, each, float(gains[i]), seed=i))
-        for i, each in enumerate(path)
+        tracker.track(i * FRAME, *draw(planes, place, float(gains[i]), seed=i))
+        for i, place in enumerate(path)
     ]
 
 
@@ -71,26 +71,26 @@ def off(result: TrackingResult, true: Floats) -> float:
 @pytest.mark.slow
 def test_a_room_without_corners_of_its_own_is_enough() -> None:
     said = follow(ROOM, PATH)
-    assert not any(each.lost for each in said)
-    assert max(off(each, true) for each, true in zip(said, PATH, strict=True)) < 0.02
+    assert not any(result.lost for result in said)
+    assert max(off(result, true) for result, true in zip(said, PATH, strict=True)) < 0.02
 
 
 def test_outlines_in_front_of_a_flat_wall_belong_to_what_is_nearer() -> None:
     path = [pose(x=0.02 * i) for i in range(12)]
     said = follow((WALL, BOX, POST), path)
-    assert not any(each.lost for each in said)
+    assert not any(result.lost for result in said)
     assert off(said[-1], path[-1]) < 0.02
 
 
 def test_a_change_of_exposure_is_no_motion() -> None:
     gains = 1.0 + 0.3 * np.sin(np.arange(15) / 3.0)
     said = follow(ROOM, [pose()] * 15, gains)
-    assert not any(each.lost for each in said)
-    assert max(off(each, pose()) for each in said) < 0.01
+    assert not any(result.lost for result in said)
+    assert max(off(result, pose()) for result in said) < 0.01
 
 
 def test_a_flat_wall_alone_says_too_little() -> None:
-    assert all(each.lost for each in follow((WALL,), [pose(x=0.02 * i) for i in range(3)]))
+    assert all(result.lost for result in follow((WALL,), [pose(x=0.02 * i) for i in range(3)]))
 
 
 @pytest.mark.slow
@@ -98,10 +98,10 @@ def test_the_motion_during_a_loss_is_found_again() -> None:
     tracker = FeatureTracker(INFO)
     dark = np.zeros((240, 320), np.uint8), np.full((240, 320), np.inf, np.float32)
     said = [
-        tracker.track(i * FRAME, *(dark if 10 <= i < 25 else draw(ROOM, each, seed=i)))
-        for i, each in enumerate(PATH)
+        tracker.track(i * FRAME, *(dark if 10 <= i < 25 else draw(ROOM, view, seed=i)))
+        for i, view in enumerate(PATH)
     ]
-    assert [each.lost for each in said] == [10 <= i < 25 for i in range(len(PATH))]
+    assert [result.lost for result in said] == [10 <= i < 25 for i in range(len(PATH))]
     assert max(off(said[i], PATH[i]) for i in (25, 39)) < 0.03
 
 

@@ -35,11 +35,11 @@ def mapped(number: int = 0, seen_from: Floats | None = None) -> Landmarks:
 def test_each_square_has_one_corner_where_none_is_taken() -> None:
     image, _ = look(pose())
     taken = np.array([[100.0, 100.0]])
-    found = find_corners(image, 28, taken)
-    numbers = squares(found, 28)
-    assert len(np.unique(numbers)) == len(found) > 60
+    corners = find_corners(image, 28, taken)
+    numbers = squares(corners, 28)
+    assert len(np.unique(numbers)) == len(corners) > 60
     assert squares(taken, 28)[0] not in numbers
-    assert np.abs(found - taken).max(axis=1).min() > 10
+    assert np.abs(corners - taken).max(axis=1).min() > 10
 
 
 def test_noise_of_two_grey_levels_has_no_corners() -> None:
@@ -105,10 +105,10 @@ def test_patches_are_found_to_a_tenth_of_a_pixel_where_they_look_otherwise(there
     rows, patches = landmarks.patches(camera, rows)
     shifted = patches.take(np.arange(len(rows)))
     shifted.expected[:] += (1.5, -1.0)  # as a pose that is a little off would have it
-    pixels, found = find_patches(shifted, {0: look(pose())[0]}, image, 11)
-    assert found.sum() > max(0.6 * len(rows), 12)
+    pixels, matched = find_patches(shifted, {0: look(pose())[0]}, image, 11)
+    assert matched.sum() > max(0.6 * len(rows), 12)
     true, _ = landmarks.project(camera, rows)
-    assert np.median(np.linalg.norm(pixels - true, axis=1)[found]) < 0.1
+    assert np.median(np.linalg.norm(pixels - true, axis=1)[matched]) < 0.1
 
 
 def test_what_stands_behind_the_box_is_hidden() -> None:

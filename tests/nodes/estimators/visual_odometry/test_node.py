@@ -31,10 +31,10 @@ def frame(stamp: int, image: Any, depth: Any) -> list[Event]:
 @functools.cache
 def views() -> list[Any]:
     """Return what a camera sees that goes 1 m/s to the right, at 30 Hz."""
-    found = [look(pose(x=k / 30)) for k in range(30)]
-    for image, depth in found:
+    frames = [look(pose(x=k / 30)) for k in range(30)]
+    for image, depth in frames:
         image.flags.writeable = depth.flags.writeable = False
-    return found
+    return frames
 
 
 class Eyes(Node):
@@ -61,12 +61,12 @@ def test_the_first_image_is_tracked_on_either_clock(clock: str) -> None:
         [spec(Eyes, "eyes"), spec(VisualOdometry, "odometry")], clock=clock, duration=1.0
     )
     assert outcome.error is None
-    estimates = [each for each in outcome.sent if isinstance(each, PoseEstimate)]
+    estimates = [event for event in outcome.sent if isinstance(event, PoseEstimate)]
     assert (estimates[0].stamp, estimates[0].frame_id) == (0, "map")
-    [start] = [each for each in outcome.sent if isinstance(each, VehicleAnnouncement)]
+    [start] = [event for event in outcome.sent if isinstance(event, VehicleAnnouncement)]
     # It looks ahead, and east is ahead: what is on its right is south.
-    flown = np.array([np.subtract(each.position, start.position) for each in estimates])
-    meant = np.array([[-each.stamp / (33 * MS) / 30, 0.0, 0.0] for each in estimates])
+    flown = np.array([np.subtract(estimate.position, start.position) for estimate in estimates])
+    meant = np.array([[-estimate.stamp / (33 * MS) / 30, 0.0, 0.0] for estimate in estimates])
     assert len(estimates) > (3 if clock == "lockstep" else 0)  # a busy machine skips images
     np.testing.assert_allclose(flown, meant, atol=0.02)
 
@@ -81,7 +81,7 @@ def test_whatever_it_is_shown_the_run_goes_on(node: type[Node[Any]]) -> None:
     random = np.random.default_rng(1)
     noise = [(random.integers(0, 255, BLACK.shape, np.uint8), NOWHERE) for _ in range(3)]
     shown = [*[(BLACK, NOWHERE)] * 3, *[views()[0]] * 4, *noise, (BLACK, NOWHERE)]
-    frames = [event for k, each in enumerate(shown) for event in frame(k * 33 * MS, *each)]
+    frames = [event for k, pair in enumerate(shown) for event in frame(k * 33 * MS, *pair)]
     seen = camera("drone/front", "grey", "depth", info=INFO, rate=30.0, orientation=LOOKING_AHEAD)
     result = run_nodes([spec(node, "est")], inputs=[vehicle(), seen, *frames], duration=1.0)
     assert result.reason == "duration"
@@ -89,11 +89,11 @@ def test_whatever_it_is_shown_the_run_goes_on(node: type[Node[Any]]) -> None:
     if node is MonocularOdometry:
         assert not estimates, "it has never moved"
     else:
-        assert [each.stamp // MS // 33 for each in estimates] == [3, 4, 5, 6]
-        assert {each.frame_id for each in estimates} == {"map"}  # it was not armed
-        for each in estimates:
-            np.testing.assert_allclose(each.position, (1, 2, -0.1), atol=0.01)
-        assert [each.stamp // MS // 33 for each in result.of(TrackingLost)] == [0, 7]
+        assert [estimate.stamp // MS // 33 for estimate in estimates] == [3, 4, 5, 6]
+        assert {estimate.frame_id for estimate in estimates} == {"map"}  # it was not armed
+        for estimate in estimates:
+            np.testing.assert_allclose(estimate.position, (1, 2, -0.1), atol=0.01)
+        assert [event.stamp // MS // 33 for event in result.of(TrackingLost)] == [0, 7]
 
 
 @pytest.mark.slow

@@ -33,10 +33,10 @@ def test_depth_at_corners_is_within_the_stated_noise(gain: float) -> None:
     coarse = inverse_depth(matcher.depth(left, right))
     columns, rows = np.meshgrid(np.arange(90, 300, 10), np.arange(20, 220, 10))
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    found = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
-    assert found.continuous.mean() > 0.5
+    surfaces = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
+    assert surfaces.continuous.mean() > 0.5
     true = 1.0 / truth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-    errors = (found.inverse - true)[found.continuous]
+    errors = (surfaces.inverse - true)[surfaces.continuous]
     assert np.median(np.abs(errors)) < matcher.depth_noise
     assert np.abs(np.median(errors)) < 0.5 * matcher.depth_noise
 
@@ -50,9 +50,9 @@ def test_corners_on_a_surface_of_one_colour_have_depth() -> None:
     matcher = StereoMatcher(INFO, BASELINE)
     coarse = inverse_depth(matcher.depth(left, right))
     assert not surfaces_at(coarse, pixels, matcher.depth_noise).continuous.any()
-    found = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
-    assert found.continuous.mean() > 0.8
-    assert np.allclose(INFO.fx * BASELINE * found.inverse[found.continuous], 11.0, atol=0.1)
+    surfaces = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
+    assert surfaces.continuous.mean() > 0.8
+    assert np.allclose(INFO.fx * BASELINE * surfaces.inverse[surfaces.continuous], 11.0, atol=0.1)
 
 
 @pytest.mark.slow
@@ -65,8 +65,8 @@ def test_a_level_edge_in_noise_has_no_depth() -> None:
     coarse = inverse_depth(matcher.depth(left, right))
     columns, rows = np.meshgrid(np.arange(90.0, 300.0), np.arange(114.0, 126.0))
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    found = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
-    assert not found.continuous.any()
+    surfaces = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
+    assert not surfaces.continuous.any()
 
 
 @pytest.mark.parametrize("other", ["black", "unrelated", "swapped"])
@@ -104,9 +104,9 @@ def test_the_trajectory_is_metric_and_the_same_twice() -> None:
         poses = []
         for step in range(12):
             left, right, _ = pair(pose(x=0.03 * step, z=0.02 * step, yaw=0.5 * step))
-            found = tracker.track(step * 50_000_000, left, right)
-            assert not found.lost
-            poses.append(found.pose)
+            result = tracker.track(step * 50_000_000, left, right)
+            assert not result.lost
+            poses.append(result.pose)
         return poses
 
     poses = fly()

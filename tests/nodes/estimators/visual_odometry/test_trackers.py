@@ -22,7 +22,7 @@ FRAME = 33_000_000
 
 
 def follow(tracker: Tracker, path: list[Floats], start: int = 0) -> list[TrackingResult]:
-    return [tracker.track((start + i) * FRAME, *look(each)) for i, each in enumerate(path)]
+    return [tracker.track((start + i) * FRAME, *look(place)) for i, place in enumerate(path)]
 
 
 def off(said: TrackingResult, true: Floats) -> tuple[float, float]:
@@ -57,7 +57,7 @@ def test_follows_a_motion_with_its_signs_and_in_metres(make: Make, path: list[Fl
 @METHODS
 def test_a_camera_at_rest_stays(make: Make) -> None:
     said = follow(make(INFO), [pose()] * 5)
-    assert max(off(each, pose())[0] for each in said) < 1e-3
+    assert max(off(result, pose())[0] for result in said) < 1e-3
 
 
 @pytest.mark.slow
@@ -73,8 +73,8 @@ def test_equal_images_give_equal_bits(make: Make) -> None:
 @METHODS
 def test_colour_and_grey_are_the_same(make: Make) -> None:
     grey, coloured = make(INFO), make(INFO)
-    for index, each in enumerate(MOTIONS["forward"]):
-        image, depth = look(each)
+    for index, place in enumerate(MOTIONS["forward"]):
+        image, depth = look(place)
         a = grey.track(index, image, depth)
         b = coloured.track(index, np.repeat(image[..., None], 3, axis=2), depth)
     np.testing.assert_allclose(a.pose, b.pose, atol=1e-4)
@@ -87,7 +87,7 @@ def test_a_dark_moment_is_lost_and_regained_at_the_same_place(make: Make) -> Non
     follow(tracker, path)
     dark = np.zeros((240, 320), np.uint8), np.full((240, 320), np.inf, np.float32)
     said = [tracker.track((20 + i) * FRAME, *dark) for i in range(3)]
-    assert all(each.lost and each.reason for each in said)
+    assert all(result.lost and result.reason for result in said)
     assert off(said[-1], path[-1])[0] < 0.02  # the last pose that was known
     after = follow(tracker, [path[-1], pose(x=0.23), pose(x=0.24)], 23)
     assert not after[-1].lost
@@ -138,8 +138,8 @@ def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
     far = pose(x=-6.0, y=6.0)  # another part of the wall
     follow(tracker, [strange], 20)
     said = follow(tracker, [far] * 6, 21)
-    assert [each.lost for each in said][-1] is False
-    assert any("new map" in each.reason for each in said)
+    assert [result.lost for result in said][-1] is False
+    assert any("new map" in result.reason for result in said)
     assert said[-1].map == 1
     x, y, z = said[-1].pose[:3, 3]
     assert abs(y) < 0.01

@@ -22,7 +22,7 @@ WALL, BOX = 3.0, 2.0
 @cache
 def _textures() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     random = np.random.default_rng(5)
-    found = []
+    textures = []
     for _ in range(2):
         coarse = cv2.resize(
             random.random((64, 64), np.float32), (1024, 1024), interpolation=cv2.INTER_CUBIC
@@ -30,8 +30,8 @@ def _textures() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         fine = cv2.resize(
             random.random((256, 256), np.float32), (1024, 1024), interpolation=cv2.INTER_CUBIC
         )
-        found.append(np.clip(40 + 90 * coarse + 90 * fine, 0, 255).astype(np.float32))
-    return found[0], found[1]
+        textures.append(np.clip(40 + 90 * coarse + 90 * fine, 0, 255).astype(np.float32))
+    return textures[0], textures[1]
 
 
 def pose(

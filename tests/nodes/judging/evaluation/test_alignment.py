@@ -43,9 +43,9 @@ def test_an_estimate_that_is_the_truth_in_another_frame_has_no_error(
     how: AlignmentMethod, scale: float
 ) -> None:
     truth = walk()
-    found = align(moved(truth, scale), truth, how)
-    assert found.scale == pytest.approx(1 / scale)
-    error = absolute_errors(truth, found.trajectory)
+    aligned = align(moved(truth, scale), truth, how)
+    assert aligned.scale == pytest.approx(1 / scale)
+    error = absolute_errors(truth, aligned.trajectory)
     assert error["ate_max_m"] < 1e-9
     assert error["rot_rmse_deg"] < 1e-9
 
@@ -53,10 +53,10 @@ def test_an_estimate_that_is_the_truth_in_another_frame_has_no_error(
 def test_without_alignment_the_estimate_stays_as_it_is() -> None:
     truth = walk()
     estimate = noisy(truth)
-    found = align(estimate, truth, "none")
-    assert found.trajectory is estimate
-    assert (found.rotation == np.eye(3)).all()
-    assert (found.translation.tolist(), found.scale) == ([0.0, 0.0, 0.0], 1.0)
+    aligned = align(estimate, truth, "none")
+    assert aligned.trajectory is estimate
+    assert (aligned.rotation == np.eye(3)).all()
+    assert (aligned.translation.tolist(), aligned.scale) == ([0.0, 0.0, 0.0], 1.0)
 
 
 def test_a_mirror_image_is_not_turned_into_the_truth() -> None:
@@ -113,16 +113,16 @@ def test_heading_and_translation_are_aligned_and_nothing_else(degrees: float) ->
         frame.apply(truth.positions.copy()) + np.array([1.0, 2.0, 3.0]),
         (frame * truth.rotations()).as_quat(scalar_first=True),
     )
-    found = align(estimate, truth, "posyaw")
-    assert found.rotation[2].tolist() == [0.0, 0.0, 1.0]
+    aligned = align(estimate, truth, "posyaw")
+    assert aligned.rotation[2].tolist() == [0.0, 0.0, 1.0]
     # No heading fits better.
-    least = absolute_errors(truth, found.trajectory)["ate_rmse_m"]
+    least = absolute_errors(truth, aligned.trajectory)["ate_rmse_m"]
     for beside in (-0.5, 0.5):
         other = Rotation.from_euler("z", beside, degrees=True)
-        positions = other.apply(found.trajectory.positions.copy())
+        positions = other.apply(aligned.trajectory.positions.copy())
         positions += (truth.positions - positions).mean(axis=0)
         assert np.sqrt(((positions - truth.positions) ** 2).sum(axis=1).mean()) > least
-    assert angle(found.trajectory, truth) == pytest.approx(np.radians(2.0), rel=0.2)
+    assert angle(aligned.trajectory, truth) == pytest.approx(np.radians(2.0), rel=0.2)
 
 
 def test_one_pose_is_enough_for_heading_and_translation() -> None:
@@ -133,8 +133,8 @@ def test_one_pose_is_enough_for_heading_and_translation() -> None:
         turn.apply(truth.positions.copy()) + np.array([5.0, 0.0, 0.0]),
         (turn * truth.rotations()).as_quat(scalar_first=True),
     )
-    found = align(estimate, truth, "posyaw", 1)
-    assert absolute_errors(truth, found.trajectory)["ate_max_m"] < 1e-9
+    aligned = align(estimate, truth, "posyaw", 1)
+    assert absolute_errors(truth, aligned.trajectory)["ate_max_m"] < 1e-9
 
 
 @pytest.mark.parametrize("method", ["origin", "posyaw", "se3", "sim3"])
@@ -143,14 +143,14 @@ def test_an_alignment_of_the_first_poses_is_evos(method: AlignmentMethod, first:
     """100 poses, or 4.95 s of them at 20 Hz."""
     truth = walk()
     estimate = noisy(moved(truth), seed=3)
-    found = align(estimate, truth, method, first)
+    aligned = align(estimate, truth, method, first)
     beginning = align(estimate.take(slice(100)), truth.take(slice(100)), method)
-    assert found.rotation.tolist() == beginning.rotation.tolist()
-    assert len(found.trajectory) == len(truth)
+    assert aligned.rotation.tolist() == beginning.rotation.tolist()
+    assert len(aligned.trajectory) == len(truth)
     if method in {"se3", "sim3"}:
         theirs = as_evo(estimate)
         theirs.align(as_evo(truth), correct_scale=method == "sim3", n=100)
-        assert found.trajectory.positions == pytest.approx(theirs.positions_xyz, abs=1e-9)
+        assert aligned.trajectory.positions == pytest.approx(theirs.positions_xyz, abs=1e-9)
 
 
 def test_heading_needs_positions_beside_the_vertical() -> None:

@@ -48,12 +48,12 @@ def repeated(p: Floats, count: int) -> Floats:
 @settings(max_examples=15, deadline=None)
 def test_a_true_covariance_is_consistent(seed: int) -> None:
     truth, p = walk(3000), covariance(seed)
-    found = consistency(truth, drawn(truth, p, seed + 1), repeated(p, 3000))
-    assert found["covariance_invalid"] == 0
-    assert found["nees_position"] == pytest.approx(3.0, abs=0.35)
-    assert found["nees_pose"] == pytest.approx(6.0, abs=0.5)
-    assert found["nees_position_inside_percent"] == pytest.approx(95.0, abs=2.5)
-    assert found["nees_pose_inside_percent"] == pytest.approx(95.0, abs=2.5)
+    figures = consistency(truth, drawn(truth, p, seed + 1), repeated(p, 3000))
+    assert figures["covariance_invalid"] == 0
+    assert figures["nees_position"] == pytest.approx(3.0, abs=0.35)
+    assert figures["nees_pose"] == pytest.approx(6.0, abs=0.5)
+    assert figures["nees_position_inside_percent"] == pytest.approx(95.0, abs=2.5)
+    assert figures["nees_pose_inside_percent"] == pytest.approx(95.0, abs=2.5)
 
 
 @pytest.mark.slow
@@ -67,17 +67,17 @@ def test_one_pose_is_the_quadratic_form_and_the_bounds_are_those_of_chi_squared(
         moved = Trajectory(
             truth.stamps, truth.positions + np.array([0.0, size, 0.0]), truth.orientations
         )
-        found = consistency(truth, moved, p)
-        assert found["nees_position"] == pytest.approx(size**2 / 0.04)
-        assert found["nees_position_inside_percent"] == (100.0 if 0.025 < share < 0.975 else 0.0)
+        figures = consistency(truth, moved, p)
+        assert figures["nees_position"] == pytest.approx(size**2 / 0.04)
+        assert figures["nees_position_inside_percent"] == (100.0 if 0.025 < share < 0.975 else 0.0)
 
 
 @pytest.mark.parametrize(("factor", "mean"), [(0.01, 300.0), (100.0, 0.03)])
 def test_overconfidence_and_caution_show(factor: float, mean: float) -> None:
     truth, p = walk(2000), covariance(4)
-    found = consistency(truth, drawn(truth, p, 5), repeated(factor * p, 2000))
-    assert found["nees_position"] == pytest.approx(mean, rel=0.1)
-    inside = found["nees_position_inside_percent"]
+    figures = consistency(truth, drawn(truth, p, 5), repeated(factor * p, 2000))
+    assert figures["nees_position"] == pytest.approx(mean, rel=0.1)
+    inside = figures["nees_position_inside_percent"]
     assert inside is not None
     assert inside < 15.0
 
@@ -100,15 +100,15 @@ def test_what_is_no_covariance_is_counted_and_outside(kind: str) -> None:
     estimate, all_true = drawn(truth, p, 2), repeated(p, 400)
     wrong = all_true.copy()
     wrong[::2] = NONE[kind](p)
-    found = consistency(truth, estimate, wrong)
-    assert found["covariance_invalid"] == 200
-    inside = found["nees_pose_inside_percent"]
+    figures = consistency(truth, estimate, wrong)
+    assert figures["covariance_invalid"] == 200
+    inside = figures["nees_pose_inside_percent"]
     assert inside is not None
     assert inside < 50.0
-    assert found["nees_pose"] == pytest.approx(6.0, abs=1.0)
-    found = consistency(truth, estimate, repeated(NONE[kind](p), 400))
-    assert found["nees_pose"] is None
-    assert found["nees_pose_inside_percent"] == 0.0
+    assert figures["nees_pose"] == pytest.approx(6.0, abs=1.0)
+    figures = consistency(truth, estimate, repeated(NONE[kind](p), 400))
+    assert figures["nees_pose"] is None
+    assert figures["nees_pose_inside_percent"] == 0.0
 
 
 @given(seed=SEEDS, scales=st.lists(st.floats(1e-6, 1e3), min_size=6, max_size=6))

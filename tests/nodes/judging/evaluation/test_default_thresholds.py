@@ -216,8 +216,8 @@ def test_orientations_of_no_body_fail_and_in_files_may_be_missing() -> None:
     left_out = figures | {"why_no_rotations": why, "orientations": "inverse"}
 
     def failed(figures: dict[str, Any], **limits: float) -> list[str]:
-        found = conclude({"est": figures}, Thresholds(**limits), (), ended())
-        texts: list[str] = found["estimators"]["est"]["failed"]
+        verdict = conclude({"est": figures}, Thresholds(**limits), (), ended())
+        texts: list[str] = verdict["estimators"]["est"]["failed"]
         return texts
 
     assert failed(figures) == []
@@ -228,8 +228,8 @@ def test_orientations_of_no_body_fail_and_in_files_may_be_missing() -> None:
     none = left_out | {"orientations": "estimate without"}
     assert len(failed(none)) == 1
     # Many files have positions only, and may; none has to have what is wrong.
-    for found, count in ((none, 0), (left_out, 1)):
-        of_file = conclude({"est": found}, Thresholds())["estimators"]["est"]
+    for est, count in ((none, 0), (left_out, 1)):
+        of_file = conclude({"est": est}, Thresholds())["estimators"]["est"]
         assert len(of_file["failed"]) == count
 
 

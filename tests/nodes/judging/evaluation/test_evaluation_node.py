@@ -116,13 +116,13 @@ def test_scores_come_with_each_estimate(tmp_path: Path) -> None:
 def test_the_pose_there_was_is_worse_by_its_age(tmp_path: Path) -> None:
     estimates: list[Event] = [estimate(s) for s in FRAMES]
     figures = judged(tmp_path, announced(), truth(10), estimates, late=80 * MS)
-    found = figures["estimators"]["est"]
-    assert found["ate_rmse_m"] < 1e-9
-    assert found["latency_p50_ms"] == pytest.approx(80.0)
+    score = figures["estimators"]["est"]
+    assert score["ate_rmse_m"] < 1e-9
+    assert score["latency_p50_ms"] == pytest.approx(80.0)
     # The pose is 80 to 180 ms old, at 4π m in 10 s: the root mean square of a uniform age.
     age = math.sqrt((0.18**3 - 0.08**3) / (3 * 0.1))
-    assert found["newest_pose_rmse_m"] == pytest.approx(4 * math.pi / 10 * age, rel=0.02)
-    assert found["newest_pose_age_ms"] == pytest.approx(130.0, rel=0.03)
+    assert score["newest_pose_rmse_m"] == pytest.approx(4 * math.pi / 10 * age, rel=0.02)
+    assert score["newest_pose_age_ms"] == pytest.approx(130.0, rel=0.03)
 
 
 def test_lost_time_is_by_word_and_by_silence(tmp_path: Path) -> None:
@@ -131,16 +131,16 @@ def test_lost_time_is_by_word_and_by_silence(tmp_path: Path) -> None:
     ]
     said: list[Event] = [lost(2100 * MS), regained(3 * SECOND)]
     estimates: list[Event] = [estimate(s) for s in kept]
-    found = judged(tmp_path, announced(), truth(10), estimates, said)["estimators"]["est"]
-    assert found["lost_count"] == 2
-    assert found["lost_seconds"] == pytest.approx(1.0 + 2.0)
+    figures = judged(tmp_path, announced(), truth(10), estimates, said)["estimators"]["est"]
+    assert figures["lost_count"] == 2
+    assert figures["lost_seconds"] == pytest.approx(1.0 + 2.0)
 
 
 @pytest.mark.slow
 def test_an_estimator_that_falls_silent_is_lost_until_the_end(tmp_path: Path) -> None:
     estimates: list[Event] = [estimate(s) for s in FRAMES if s <= 4 * SECOND]
-    found = judged(tmp_path, announced(), truth(10), estimates)["estimators"]["est"]
-    assert found["lost_seconds"] == pytest.approx(6.0)
+    figures = judged(tmp_path, announced(), truth(10), estimates)["estimators"]["est"]
+    assert figures["lost_seconds"] == pytest.approx(6.0)
 
 
 @pytest.mark.parametrize(("limit", "passed"), [(0.6, True), (0.4, False)])

@@ -28,21 +28,21 @@ def test_every_figure_is_in_the_table_and_on_the_page() -> None:
 
 
 def test_thresholds_are_those_of_the_table_with_the_defaults_that_the_page_names() -> None:
-    asked = [each for each in FIGURES.values() if each.limit]
-    assert list(Thresholds.__struct_fields__) == [each.name for each in asked]
-    assert [getattr(Thresholds(), each.name) for each in asked] == [e.default for e in asked]
+    asked = [entry for entry in FIGURES.values() if entry.limit]
+    assert list(Thresholds.__struct_fields__) == [entry.name for entry in asked]
+    assert [getattr(Thresholds(), entry.name) for entry in asked] == [e.default for e in asked]
     assert "`coverage_percent` at least 90;" in PAGE
-    counts = {each.name for each in asked if each.default == 0}
+    counts = {entry.name for entry in asked if entry.default == 0}
     (sentence,) = re.findall(r"at least 90;(.*?)at most 0;", PAGE, re.DOTALL)
     assert {*re.findall(r"`(\w+)`", sentence)} == counts
     assert FIGURES["velocities_percent"].all_or_none == 95.0
     table = PAGE.partition("### Defaults")[2].partition("## How the run ended")[0]
-    for each in asked:
-        if each.default and each.name not in {"coverage_percent", "compared_percent"}:
-            assert f"| `{each.name}` | at {each.limit} {each.default:g} |" in table
+    for entry in asked:
+        if entry.default and entry.name not in {"coverage_percent", "compared_percent"}:
+            assert f"| `{entry.name}` | at {entry.limit} {entry.default:g} |" in table
 
 
 def test_units_are_the_ends_of_names_and_an_unknown_figure_has_words() -> None:
-    assert {each.name for each in FIGURES.values() if not each.unit} >= {"restarts", "nees_pose"}
+    assert {entry.name for entry in FIGURES.values() if not entry.unit} >= {"restarts", "nees_pose"}
     assert (figure("late_p50_ms").unit, figure("late_p50_ms").meaning) == ("ms", "late p50 ms")
-    assert len(IN_SWEEPS) == len({*IN_SWEEPS}) == max(each.sweep for each in FIGURES.values())
+    assert len(IN_SWEEPS) == len({*IN_SWEEPS}) == max(entry.sweep for entry in FIGURES.values())

@@ -45,8 +45,8 @@ def judged(
     poses = said or Trajectory(TRUTH.stamps, TRUTH.positions + drift, TRUTH.orientations)
     record.rows = EstimatorRecord.of(poses).rows
     record.frame_id = "map"
-    for each in finals:
-        record.add_final(each)
+    for trajectory in finals:
+        record.add_final(trajectory)
     return judge(record, TRUTH, cameras={"c": TRUTH.stamps})
 
 
@@ -69,9 +69,9 @@ def test_a_wrong_loop_closure_makes_the_final_one_worse() -> None:
 
 def test_who_sends_none_or_an_empty_one_has_no_such_figures() -> None:
     for finals in ((), (final(None),)):
-        found = judged(*finals)
-        assert found.final is None
-        assert not [name for name in found.figures if name.startswith("final")]
+        judgement = judged(*finals)
+        assert judgement.final is None
+        assert not [name for name in judgement.figures if name.startswith("final")]
 
 
 def test_the_last_one_counts() -> None:
@@ -111,11 +111,11 @@ def test_another_frame_is_aligned_by_its_own_first_pose() -> None:
 
 def test_stamps_of_another_clock_are_a_reason_and_the_said_poses_are_judged() -> None:
     late = Trajectory(TRUTH.stamps + 10**18, TRUTH.positions, TRUTH.orientations)
-    found = judged(final(late))
-    assert "Unix time" in found.figures["why_not_final"]
-    assert found.figures["ate_rmse_m"] > 0.3
-    assert "final_ate_rmse_m" not in found.figures
-    assert "why" not in found.figures
+    judgement = judged(final(late))
+    assert "Unix time" in judgement.figures["why_not_final"]
+    assert judgement.figures["ate_rmse_m"] > 0.3
+    assert "final_ate_rmse_m" not in judgement.figures
+    assert "why" not in judgement.figures
 
 
 def test_a_final_trajectory_without_a_single_pose_said_is_judged_alone() -> None:
@@ -137,8 +137,8 @@ def flown(out: Path, *more: Event, reads: tuple[str, ...] = ()) -> dict[str, Any
     node = spec(Evaluation, "evaluation", {})
     run_nodes([node], inputs=[vehicle, estimator, *script], duration=11.0, out=out)
     verdict = json.loads((out / "evaluation" / "verdict.json").read_text())
-    found: dict[str, Any] = verdict["estimators"]["est"]
-    return found
+    figures: dict[str, Any] = verdict["estimators"]["est"]
+    return figures
 
 
 @pytest.mark.slow
@@ -186,8 +186,8 @@ def test_of_many_ticks_the_figures_are_those_of_all_and_a_few_rows_are_kept() ->
     """A pose that is never replaced, of a body that moves along x at 1 m/s for 800 s."""
     ends = np.array([0, 800 * SECOND])
     there = Trajectory(ends, np.array([[0.0, 0, 0], [800.0, 0, 0]]), np.eye(4)[[0, 0]])
-    rows, found = errors_at_ticks(there, there.take(slice(1)), np.array([0]), 400.0, 801 * SECOND)
+    rows, figures = errors_at_ticks(there, there.take(slice(1)), np.array([0]), 400.0, 801 * SECOND)
     assert rows is not None
     assert len(rows.stamps) == 80_001  # every fourth
-    assert found["newest_pose_rmse_m"] == pytest.approx(800 / np.sqrt(3), rel=1e-4)
-    assert found["newest_pose_age_ms"] == pytest.approx(400e3, rel=1e-6)
+    assert figures["newest_pose_rmse_m"] == pytest.approx(800 / np.sqrt(3), rel=1e-4)
+    assert figures["newest_pose_age_ms"] == pytest.approx(400e3, rel=1e-6)

@@ -72,8 +72,8 @@ def test_relative_errors_are_evos(seed: int, n: int, delta: float) -> None:
     options = (delta, Unit.meters, 0.1, True, True)
     shifts = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
     turns = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
-    found = ours[f"rpe_{delta:g}m_trans_percent"] / 100, ours[f"rpe_{delta:g}m_rot_deg_per_m"]
-    for metric, rmse in zip((shifts, turns), found, strict=True):
+    values = ours[f"rpe_{delta:g}m_trans_percent"] / 100, ours[f"rpe_{delta:g}m_rot_deg_per_m"]
+    for metric, rmse in zip((shifts, turns), values, strict=True):
         assert rmse * delta == pytest.approx(metric.get_all_statistics()["rmse"], abs=1e-9)
 
 
@@ -107,14 +107,14 @@ def test_a_real_flights_errors_are_evos() -> None:
     shifts = ape(truth, estimate, evo.PoseRelation.translation_part)
     assert absolute_errors(truth, estimate)["ate_rmse_m"] == pytest.approx(shifts["rmse"], abs=1e-9)
     options = (1.0, Unit.meters, 0.1, True, True)
-    found = path_errors(truth, estimate)
+    errors = path_errors(truth, estimate)
     relative = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
     assert len(relative.error) > 300
     rmse = relative.get_all_statistics()["rmse"]
-    assert found["rpe_1m_trans_percent"] / 100 == pytest.approx(rmse, abs=1e-9)
+    assert errors["rpe_1m_trans_percent"] / 100 == pytest.approx(rmse, abs=1e-9)
     relative = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
     rmse = relative.get_all_statistics()["rmse"]
-    assert found["rpe_1m_rot_deg_per_m"] == pytest.approx(rmse, abs=1e-9)
+    assert errors["rpe_1m_rot_deg_per_m"] == pytest.approx(rmse, abs=1e-9)
 
 
 steps = st.lists(st.sampled_from([0.0, 0.0, 0.1, 0.25, 0.5, 2.0]), min_size=1, max_size=40)
@@ -173,9 +173,9 @@ def test_drift_is_the_error_at_the_end_over_the_true_path() -> None:
 
 def test_a_perfect_estimate_has_no_errors() -> None:
     truth = walk()
-    found = absolute_errors(truth, truth)
-    assert found["ate_max_m"] == 0.0
-    assert found["rot_rmse_deg"] < 1e-12
+    errors = absolute_errors(truth, truth)
+    assert errors["ate_max_m"] == 0.0
+    assert errors["rot_rmse_deg"] < 1e-12
     assert path_errors(truth, truth)["rpe_1m_trans_percent"] < 1e-12
     assert end_error_percent(truth, truth) < 1e-12
 
@@ -196,10 +196,10 @@ def test_errors_by_axis_are_those_of_the_axis_that_is_off() -> None:
     truth = walk(50)
     off = np.where(np.arange(50)[:, None] % 2, 1.0, -1.0) * [0.0, 0.2, 0.1]
     estimate = Trajectory(truth.stamps, truth.positions + off, truth.orientations)
-    found = absolute_errors(truth, estimate)
-    axes = [found[f"ate_{axis}_rmse_m"] for axis in ("north", "east", "down")]
+    errors = absolute_errors(truth, estimate)
+    axes = [errors[f"ate_{axis}_rmse_m"] for axis in ("north", "east", "down")]
     assert axes == pytest.approx([0.0, 0.2, 0.1], abs=1e-12)
-    assert sum(value**2 for value in axes) == pytest.approx(found["ate_rmse_m"] ** 2)
+    assert sum(value**2 for value in axes) == pytest.approx(errors["ate_rmse_m"] ** 2)
 
 
 @pytest.mark.parametrize("function", [absolute_errors, path_errors, end_error_percent])
@@ -219,7 +219,7 @@ def test_errors_over_shares_of_the_path_are_the_means_of_evos(seed: int) -> None
     truth = walk(300, seed)
     estimate = noisy(truth, metres=0.005, seed=seed + 1)
     path = truth.length()
-    found = segment_errors(truth, estimate, path)
+    errors = segment_errors(truth, estimate, path)
     sums, count = 0.0, 0
     for share in SHARES:
         length = share / 100 * path
@@ -227,11 +227,11 @@ def test_errors_over_shares_of_the_path_are_the_means_of_evos(seed: int) -> None
         shifts = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
         turns = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
         mean = 100 * shifts.get_all_statistics()["mean"] / length
-        assert found[f"rpe_{share}pct_trans_percent"] == pytest.approx(mean)
+        assert errors[f"rpe_{share}pct_trans_percent"] == pytest.approx(mean)
         mean = turns.get_all_statistics()["mean"] / length
-        assert found[f"rpe_{share}pct_rot_deg_per_m"] == pytest.approx(mean)
+        assert errors[f"rpe_{share}pct_rot_deg_per_m"] == pytest.approx(mean)
         sums, count = sums + 100 * shifts.error.sum() / length, count + len(shifts.error)
-    assert found["rpe_mean_trans_percent"] == pytest.approx(sums / count)
+    assert errors["rpe_mean_trans_percent"] == pytest.approx(sums / count)
 
 
 def as_kitti_has_it(truth: Trajectory, estimate: Trajectory, lengths: list[float]) -> float:
@@ -257,34 +257,34 @@ def test_the_mean_over_shares_is_about_kittis() -> None:
     estimate = noisy(truth, metres=0.002)
     lengths = [share / 100 * truth.length() for share in SHARES]
     expected = as_kitti_has_it(truth, estimate, lengths)
-    found = segment_errors(truth, estimate, truth.length())
-    assert found["rpe_mean_trans_percent"] == pytest.approx(expected, rel=0.02)
-    assert not {name for name in found if "kitti" in name or "0m" in name}  # the path is too short
+    errors = segment_errors(truth, estimate, truth.length())
+    assert errors["rpe_mean_trans_percent"] == pytest.approx(expected, rel=0.02)
+    assert not {name for name in errors if "kitti" in name or "0m" in name}  # the path is too short
 
 
 def test_the_errors_over_kittis_lengths_are_kittis() -> None:
     truth = walk(1200, step=0.3)
     estimate = noisy(truth, metres=0.02)
     assert 300.0 < truth.length() < 400.0
-    found = segment_errors(truth, estimate, truth.length())
+    errors = segment_errors(truth, estimate, truth.length())
     for length in KITTI_LENGTHS[:3]:
         expected = as_kitti_has_it(truth, estimate, [float(length)])
-        assert found[f"rpe_{length}m_trans_percent"] == pytest.approx(expected, rel=0.15)
+        assert errors[f"rpe_{length}m_trans_percent"] == pytest.approx(expected, rel=0.15)
     expected = as_kitti_has_it(truth, estimate, [100.0, 200.0, 300.0])
-    assert found["rpe_kitti_trans_percent"] == pytest.approx(expected, rel=0.15)
-    assert "rpe_400m_trans_percent" not in found
+    assert errors["rpe_kitti_trans_percent"] == pytest.approx(expected, rel=0.15)
+    assert "rpe_400m_trans_percent" not in errors
 
 
 def test_a_scale_that_is_wrong_is_as_wrong_over_every_share() -> None:
     truth = walk(600)
     large = Trajectory(truth.stamps, 1.1 * truth.positions, truth.orientations)
-    found = segment_errors(truth, large, truth.length())
+    errors = segment_errors(truth, large, truth.length())
     for share in SHARES:
-        value = found[f"rpe_{share}pct_trans_percent"]
+        value = errors[f"rpe_{share}pct_trans_percent"]
         assert value is not None
         # Of the chord, which is shorter than the path.
         assert (7.0 if share == 1 else 1.0) < value < 10.001
-        assert found[f"rpe_{share}pct_rot_deg_per_m"] == pytest.approx(0.0, abs=1e-9)
+        assert errors[f"rpe_{share}pct_rot_deg_per_m"] == pytest.approx(0.0, abs=1e-9)
     for how, scale_free in (("se3", False), ("sim3", True)):
         record = EstimatorRecord(scale_free)
         record.rows = EstimatorRecord.of(large).rows
@@ -299,9 +299,9 @@ def test_a_scale_that_is_wrong_is_as_wrong_over_every_share() -> None:
 def test_a_stretch_that_nobody_covers_has_no_error() -> None:
     truth = walk(600)
     start = slice(0, 30)
-    found = segment_errors(truth.take(start), truth.take(start), truth.length())
-    assert found["rpe_2pct_trans_percent"] == pytest.approx(0.0, abs=1e-9)
-    assert found["rpe_20pct_trans_percent"] is None
+    errors = segment_errors(truth.take(start), truth.take(start), truth.length())
+    assert errors["rpe_2pct_trans_percent"] == pytest.approx(0.0, abs=1e-9)
+    assert errors["rpe_20pct_trans_percent"] is None
 
 
 @given(degrees=st.floats(-179.0, 179.0), seed=SEEDS)
@@ -318,8 +318,8 @@ def test_a_heading_that_is_off_is_off_by_so_much(degrees: float, seed: int) -> N
     )
     turned = Rotation.from_euler("z", degrees, degrees=True) * flat.rotations()
     estimate = Trajectory(truth.stamps, truth.positions, turned.as_quat(scalar_first=True))
-    found = absolute_errors(flat, estimate)["heading_rmse_deg"]
-    assert found == pytest.approx(abs(degrees), abs=1e-6)
+    error = absolute_errors(flat, estimate)["heading_rmse_deg"]
+    assert error == pytest.approx(abs(degrees), abs=1e-6)
     rolled = flat.rotations() * Rotation.from_euler("x", degrees, degrees=True)
     estimate = Trajectory(truth.stamps, truth.positions, rolled.as_quat(scalar_first=True))
     assert absolute_errors(flat, estimate)["heading_rmse_deg"] < 1e-6

@@ -35,8 +35,8 @@ def test_a_constant_turn_between_bodies_is_found(seed: int, degrees: float, scal
     assert orientations.kind == "turned"
     assert orientations.degrees == pytest.approx(degrees)
     assert orientations.spread < 1e-6
-    found = Rotation.from_quat(orientations.turn, scalar_first=True)
-    assert (found * turn).magnitude() < 1e-9  # from its body to the truth's
+    rotation = Rotation.from_quat(orientations.turn, scalar_first=True)
+    assert (rotation * turn).magnitude() < 1e-9  # from its body to the truth's
 
 
 def test_a_turn_is_named_by_its_axis() -> None:

@@ -155,8 +155,8 @@ def flown(out: Path, node: type[Node[Any]], *more: Event, **config: Any) -> dict
     inputs = [announced()[0], *cameras, *script]
     run_nodes(nodes, inputs=inputs, duration=LENGTH, out=out)
     verdict = json.loads((out / "evaluation" / "verdict.json").read_text())
-    (found,) = verdict["estimators"].values()
-    return dict(found)
+    (figures,) = verdict["estimators"].values()
+    return dict(figures)
 
 
 @pytest.mark.parametrize(
@@ -225,12 +225,12 @@ def test_an_estimator_without_commands_has_none(tmp_path: Path) -> None:
 
 def test_who_alone_commands_a_vehicle_may_land_it() -> None:
     log = CommandLog()
-    for each in (
+    for command in (
         event(Takeoff, 0.0, "est"), event(Armed, 0.1), event(TakenOff, 1.0), event(Hover, 2.0, "x"),
         event(Land, 3.0, "est"), event(Collision, 3.5, other="wall", position=(0.0,) * 3,
         normal=(1.0, 0.0, 0.0), speed=1.0), event(Landed, 4.0), event(Reset, 5.0, "est"),
     ):  # fmt: skip
-        log.add(each)
+        log.add(command)
     assert log.text("est".__eq__) == "takeoff at 0 s, land at 3 s, reset at 5 s"
     assert log.ended("est".__eq__, "drone") == "land at 3 s"
     assert log.ended("x".__eq__, "drone") == ""

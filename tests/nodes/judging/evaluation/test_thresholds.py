@@ -46,7 +46,7 @@ def test_a_file_may_have_infinite_thresholds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("limit", [math.inf, -math.inf])
-@pytest.mark.parametrize("name", [each.name for each in FIGURES.values() if each.limit])
+@pytest.mark.parametrize("name", [figure.name for figure in FIGURES.values() if figure.limit])
 @pytest.mark.parametrize("value", [None, 0.0, 1e9])
 def test_no_value_and_no_missing_figure_misses_an_infinite_threshold(
     name: str, limit: float, value: float | None
@@ -58,7 +58,7 @@ def test_infinite_thresholds_turn_defaults_off() -> None:
     figures = {"coverage_percent": 10.0, "ate_percent": 99.0, "repeated_stamps": 3}
     names = {"coverage_percent", "repeated_stamps"}
     asked = Thresholds()
-    assert names <= {each.partition(":")[0] for each in asked.missed(figures)}
+    assert names <= {text.partition(":")[0] for text in asked.missed(figures)}
     off = Thresholds(ate_percent=math.inf, **dict.fromkeys(names, math.inf))
-    assert not names & {each.partition(":")[0] for each in off.missed(figures)}
+    assert not names & {text.partition(":")[0] for text in off.missed(figures)}
     assert not off.given()

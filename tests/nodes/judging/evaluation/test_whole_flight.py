@@ -239,8 +239,8 @@ def test_the_error_to_the_planned_end_is_that_of_the_images_one_by_one() -> None
     planned = int(frames[-1]) + 10 * 50 * MS
     lengths = errors[-1] + 19.0 * np.arange(1, 11) / 19  # 19 m in 19 periods so far
     every = np.concatenate([errors, lengths])
-    found = to_planned_end(errors, 19.0, frames, planned)
-    assert found == pytest.approx((np.sqrt(np.mean(every**2)), 29.0))
+    error = to_planned_end(errors, 19.0, frames, planned)
+    assert error == pytest.approx((np.sqrt(np.mean(every**2)), 29.0))
     usual = pytest.approx((np.sqrt(np.mean(errors**2)), 19.0))
     for end in (None, int(frames[-1]), int(frames[3])):
         assert to_planned_end(errors, 19.0, frames, end) == usual
@@ -274,10 +274,10 @@ def test_to_say_less_never_looks_better(said: list[int], percent: float) -> None
     def root(count: int) -> float:
         kept = poses[:count]
         gaps = cover(FRAMES, kept, GAP).lost
-        found = held_errors(TRUTH, FRAMES, kept, errors[:count], gaps)
-        assert len(found) == len(FRAMES)
-        assert (found >= 0.0).all()
-        return float(np.sqrt(np.mean(found**2)))
+        held = held_errors(TRUTH, FRAMES, kept, errors[:count], gaps)
+        assert len(held) == len(FRAMES)
+        assert (held >= 0.0).all()
+        return float(np.sqrt(np.mean(held**2)))
 
     every = [root(count) for count in range(len(poses) + 1)]
     assert (np.diff(every) <= 0.05 * PATH / 100).all()  # of an image within the gap at the end
@@ -315,17 +315,17 @@ def test_where_no_truth_is_known_nothing_is_held_against_anybody(
         drifts(2)(record, stamp, stamp / END)
     known = (TRUTH.stamps <= start * 100 * MS) | (TRUTH.stamps >= (start + length) * 100 * MS)
     rest, most = TRUTH.take(known), hole * 10 * MS
-    found = judge(record, rest, cameras={"c": FRAMES}, hole=most)
+    result = judge(record, rest, cameras={"c": FRAMES}, hole=most)
     compared = rest.covers(FRAMES, most)
-    assert found.figures["compared"] == compared.sum() == len(FRAMES) - (2 * length - 1)
+    assert result.figures["compared"] == compared.sum() == len(FRAMES) - (2 * length - 1)
     errors = 0.02 * PATH * FRAMES[compared] / END
-    assert found.figures["ate_rmse_m"] == pytest.approx(np.sqrt((errors**2).mean()))
-    assert found.figures["flight_ate_rmse_m"] == pytest.approx(
-        found.figures["ate_rmse_m"], rel=0.01
+    assert result.figures["ate_rmse_m"] == pytest.approx(np.sqrt((errors**2).mean()))
+    assert result.figures["flight_ate_rmse_m"] == pytest.approx(
+        result.figures["ate_rmse_m"], rel=0.01
     )
-    assert found.figures["newest_pose_rmse_m"] < 0.05 * PATH
-    assert (found.figures["lost_seconds"], found.figures["coverage_percent"]) == (0.0, 100.0)
-    assert f"{2 * length - 1} between true poses more than {hole / 100:g} s apart" in found.note
+    assert result.figures["newest_pose_rmse_m"] < 0.05 * PATH
+    assert (result.figures["lost_seconds"], result.figures["coverage_percent"]) == (0.0, 100.0)
+    assert f"{2 * length - 1} between true poses more than {hole / 100:g} s apart" in result.note
     made_up = judge(record, rest, cameras={"c": FRAMES}, hole=END)
     assert (made_up.figures["compared"], made_up.note) == (len(FRAMES), "")
-    assert made_up.figures["ate_rmse_m"] != found.figures["ate_rmse_m"]
+    assert made_up.figures["ate_rmse_m"] != result.figures["ate_rmse_m"]

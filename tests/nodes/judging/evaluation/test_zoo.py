@@ -53,8 +53,8 @@ ROOT = Path(__file__).parents[4]
 def standard() -> dict[str, Any]:
     """Return what `config.toml` asks for."""
     settings = tomllib.loads((ROOT / "config.toml").read_text(encoding="utf-8"))
-    (found,) = (n["thresholds"] for n in settings["nodes"] if n["name"] == "evaluation")
-    return dict(found)
+    (node,) = (n["thresholds"] for n in settings["nodes"] if n["name"] == "evaluation")
+    return dict(node)
 
 
 SETS: dict[str, dict[str, Any]] = {"default": {}, "standard": standard(), "strict": STRICT}
@@ -92,10 +92,10 @@ def test_which_figure_tells(name: str) -> None:
     for which, limits in SETS.items():
         thresholds = Thresholds(**limits, **((animal.asked or {}) if which == "strict" else {}))
         declared = ["est"] * ("truth" in animal.reads)
-        found = conclude({"est": figures}, thresholds, (), animal.end, declared)
-        failed, expected = found["estimators"]["est"]["failed"], getattr(animal, which)
+        verdict = conclude({"est": figures}, thresholds, (), animal.end, declared)
+        failed, expected = verdict["estimators"]["est"]["failed"], getattr(animal, which)
         assert any(reason.startswith(expected) for reason in failed) or not expected, which
-        assert found["passed"] is (False if expected else True if limits else None), failed
+        assert verdict["passed"] is (False if expected else True if limits else None), failed
 
 
 def images() -> list[Event]:
@@ -149,8 +149,8 @@ def flown(
     script = sorted([*truth(6), *images()[:180], *more], key=lambda e: e.stamp)
     with contextlib.suppress(NodeError):
         run_nodes([*nodes, evaluation], inputs=[announced()[0], *script], duration=6.1, out=out)
-    found: dict[str, Any] = json.loads((out / "evaluation" / "verdict.json").read_text())
-    return found
+    verdict: dict[str, Any] = json.loads((out / "evaluation" / "verdict.json").read_text())
+    return verdict
 
 
 def test_one_that_raises_fails_and_the_good_one_beside_it_is_judged_as_if_alone(
@@ -161,7 +161,7 @@ def test_one_that_raises_fails_and_the_good_one_beside_it_is_judged_as_if_alone(
     alone = flown(tmp_path / "alone", {"good": "good"})
     assert alone["passed"] is True
     assert both["passed"] is False
-    passed = {name: each["passed"] for name, each in both["estimators"].items()}
+    passed = {name: judgement["passed"] for name, judgement in both["estimators"].items()}
     assert passed.pop("good")
     assert not any(passed.values())
     assert both["estimators"]["good"] == alone["estimators"]["good"]
@@ -189,9 +189,9 @@ def test_one_that_raises_fails_and_the_good_one_beside_it_is_judged_as_if_alone(
 def test_who_ends_the_run_or_begins_anew_has_failed(
     tmp_path: Path, kind: str, on_error: Literal["stop", "restart"], figure: str, other: list[str]
 ) -> None:
-    found = flown(tmp_path, {"est": kind, "other": "good"}, on_error=on_error, limits={})
-    estimators = found["estimators"]
-    assert found["passed"] is False
+    verdict = flown(tmp_path, {"est": kind, "other": "good"}, on_error=on_error, limits={})
+    estimators = verdict["estimators"]
+    assert verdict["passed"] is False
     assert [reason for reason in estimators["est"]["failed"] if reason.startswith(figure)]
     failed = [reason.partition(":")[0] for reason in estimators["other"]["failed"]]
     assert [reason for reason in failed if reason != "coverage_percent"] == other
@@ -203,15 +203,15 @@ def test_who_ends_the_run_or_begins_anew_has_failed(
 def test_thresholds_that_nobody_is_there_to_meet_are_missed(
     tmp_path: Path, limits: dict[str, float], passed: bool | None
 ) -> None:
-    found = flown(tmp_path, {}, limits=limits)
-    assert found["passed"] is passed
-    assert ("expected an estimator" in str(found.get("failed"))) == (passed is False)
+    verdict = flown(tmp_path, {}, limits=limits)
+    assert verdict["passed"] is passed
+    assert ("expected an estimator" in str(verdict.get("failed"))) == (passed is False)
 
 
 def test_nobody_invents_by_how_much_an_end_was_early() -> None:
     animal = BAD["asks for it where no end is planned"]
-    found = conclude({"est": judged(animal)}, Thresholds(early_end_seconds=9.0), (), animal.end)
-    figures = found["estimators"]["est"]
+    verdict = conclude({"est": judged(animal)}, Thresholds(early_end_seconds=9.0), (), animal.end)
+    figures = verdict["estimators"]["est"]
     assert figures["early_end_seconds"] is None
     unknown = "early_end_seconds: ended early (by est: dark); the planned end is not known"
     assert figures["failed"] == [unknown]
@@ -220,25 +220,27 @@ def test_nobody_invents_by_how_much_an_end_was_early() -> None:
 def test_an_estimator_is_its_node_by_whatever_name_it_speaks() -> None:
     figures = {"est": judged(GOOD["exact"])}
 
-    def found(**how: Any) -> dict[str, Any]:
+    def judged_with(**how: Any) -> dict[str, Any]:
         end = ended(owners={"est": "node", "est/further": "other"}, **how)
         verdict = conclude(figures, Thresholds(), (), end)["estimators"]["est"]
         return dict(verdict)
 
-    assert found()["failed"] == []
-    reads = found(truth_readers=frozenset({"node"}))
+    assert judged_with()["failed"] == []
+    reads = judged_with(truth_readers=frozenset({"node"}))
     assert (reads["reads_truth"], len(reads["failed"])) == ("undeclared", 1)
-    offered = found(truth_relays=frozenset({"node"}))
+    offered = judged_with(truth_relays=frozenset({"node"}))
     assert (offered["reads_truth"], offered["failed"]) == ("offered", [])
-    assert found(restarts={"node": 2})["restarts"] == 2
-    assert "ended_by" in str(found(by="node", error="SVD did not converge", **EARLY)["failed"])
-    assert "reads_truth" not in found(truth_readers=frozenset({"other"}))
+    assert judged_with(restarts={"node": 2})["restarts"] == 2
+    assert "ended_by" in str(
+        judged_with(by="node", error="SVD did not converge", **EARLY)["failed"]
+    )
+    assert "reads_truth" not in judged_with(truth_readers=frozenset({"other"}))
 
 
 def test_what_the_user_ended_is_not_judged() -> None:
     end = ended(by="user", reason="Ctrl-C", planned=False, stamp=3 * SECOND)
-    for found in ({"est": judged(BAD["mute"])}, {}):
-        verdict = conclude(found, Thresholds(ate_percent=1.0), (), end)
+    for figures in ({"est": judged(BAD["mute"])}, {}):
+        verdict = conclude(figures, Thresholds(ate_percent=1.0), (), end)
         assert verdict["passed"] is None
         assert "the user ended the run" in str(verdict)
 
@@ -269,9 +271,9 @@ def test_a_flight_is_judged_without_an_estimator() -> None:
 
 def test_an_estimator_may_have_thresholds_of_its_own() -> None:
     figures = judged(next(iter(GOOD.values()))) | {"ate_percent": 3.0}
-    found = dict.fromkeys(("vo", "mono"), figures)
+    judged_figures = dict.fromkeys(("vo", "mono"), figures)
     limits = Thresholds(ate_percent=1.0)
-    verdict = conclude(found, limits, own={"mono": Thresholds(ate_percent=5.0)})
+    verdict = conclude(judged_figures, limits, own={"mono": Thresholds(ate_percent=5.0)})
     assert verdict["estimators"]["mono"]["passed"] is True
     assert verdict["estimators"]["vo"]["failed"] == ["ate_percent: expected at most 1, found 3"]
     assert verdict["own_thresholds"]["mono"]["ate_percent"] == 5.0

@@ -56,7 +56,7 @@ def says(change: Change = lambda _, pose: pose, stamps: list[int] = FRAMES) -> S
         if said is not None:
             late = said.pop("late")
             sent.append((stamp + late, PoseEstimate(source="est", **said)))
-    return sorted(sent, key=lambda each: each[0])
+    return sorted(sent, key=lambda event: event[0])
 
 
 def given(start: float, end: float = 99.0, **fields: Any) -> Change:
@@ -145,7 +145,7 @@ def said_lost(stamp: int, at: int, regained: int = 0) -> Sent:
 
 @later
 def merged(*parts: Later) -> Sent:
-    return sorted((each for part in parts for each in part()), key=lambda each: each[0])
+    return sorted((event for part in parts for event in part()), key=lambda event: event[0])
 
 
 @later

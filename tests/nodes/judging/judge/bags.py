@@ -76,12 +76,12 @@ def bag(
         for number, (stamp, position, quaternion) in enumerate(turned.poses(), start=1):
             where = pose(list(position), list(quaternion))
             head = header(stamp, frame_id if type_ != PATH else "")
-            each = message(POSE if type_ == PATH else type_, head, where, child)
-            each = change(number, each)
-            said.append(each)
+            content = message(POSE if type_ == PATH else type_, head, where, child)
+            content = change(number, content)
+            said.append(content)
             if type_ == PATH and (number % 50 == 0 or number == len(poses)):
-                each = make(PATH, header=header(stamp, frame_id), poses=list(said))
+                content = make(PATH, header=header(stamp, frame_id), poses=list(said))
             elif type_ == PATH:
                 continue
-            writer.write(connection, 7 + number, STORE.serialize_cdr(each, type_))
+            writer.write(connection, 7 + number, STORE.serialize_cdr(content, type_))
     return path

@@ -180,8 +180,8 @@ def test_columns_are_found_in_any_order_by_any_name(data: st.DataObject) -> None
         if kind == "t":
             return spelling["t"].lstrip("#")
         model, letter = ("qw", "w") if kind.startswith("q") else ("x", "x")
-        head, found, tail = spelling[model].rpartition(letter)
-        if not found:
+        head, letters, tail = spelling[model].rpartition(letter)
+        if not letters:
             head, _, tail = spelling[model].rpartition(letter.upper())
         return f"{head}{kind[-1]}{tail}"
 
@@ -394,7 +394,7 @@ def test_the_unit_of_a_stamp_is_seen_by_its_size(
     text: Sequence[str], stamps: Sequence[int], tmp_path: Path
 ) -> None:
     """In a table with commas, whose habit are nanoseconds."""
-    (tmp_path / "t").write_text("timestamp,x,y,z\n" + "".join(f"{each},0,0,0\n" for each in text))
+    (tmp_path / "t").write_text("timestamp,x,y,z\n" + "".join(f"{stamp},0,0,0\n" for stamp in text))
     source = read(str(tmp_path / "t"))
     assert source.poses.stamps.tolist() == list(stamps)
 
@@ -484,8 +484,8 @@ def test_kittis_truth_against_a_tum_file(containers: dict[str, str]) -> None:
     folder = Path(containers["TUM"]).parent
     true = judgement.read_truth(str(folder / "k.txt"), str(folder / "times"))
     source = judgement.read(containers["TUM"])
-    _, found, _, _ = judgement.judge_all(true, [source], None, judgement.JudgeConfig())
-    assert found["t"].figures["rot_rmse_deg"] == pytest.approx(0, abs=1e-6)
+    _, judgements, _, _ = judgement.judge_all(true, [source], None, judgement.JudgeConfig())
+    assert judgements["t"].figures["rot_rmse_deg"] == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("container", ["TUM", "EuRoC", "bag"])

@@ -42,8 +42,8 @@ def judge(folder: Path, *words: Any, code: int = 0) -> dict[str, Any]:
     done = said(folder, *words)
     assert done.returncode == code, done.stderr
     verdict = (folder / "judged" / "trajectories" / "evaluation" / "verdict.json").read_text()
-    found: dict[str, Any] = json.loads(verdict)["estimators"]
-    return found
+    estimators: dict[str, Any] = json.loads(verdict)["estimators"]
+    return estimators
 
 
 def said(folder: Path, *words: Any) -> subprocess.CompletedProcess[str]:
@@ -85,10 +85,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]
             )
     inputs.sort(key=lambda event: event.stamp)
     run_node(Evaluation, inputs=inputs, duration=8.0, out=folder)
-    found = json.loads((folder / "evaluation" / "verdict.json").read_text())["estimators"]
+    estimators = json.loads((folder / "evaluation" / "verdict.json").read_text())["estimators"]
     stamps = "".join(f"{k / 1000}\n" for k in range(0, 8000, 50))
     (folder / "times.txt").write_text(stamps)
-    return folder, found
+    return folder, estimators
 
 
 @pytest.mark.slow
@@ -97,9 +97,11 @@ def test_a_runs_own_trajectories_get_its_figures(
 ) -> None:
     folder, expected = run
     estimates = [f"--estimate={folder}/trajectories/{name}.tum" for name in expected]
-    found = judge(tmp_path, "--truth", folder, *estimates, "--frames", folder / "times.txt", code=1)
-    assert list(found) == ["est", "odo"]
-    for name, figures in found.items():
+    judged = judge(
+        tmp_path, "--truth", folder, *estimates, "--frames", folder / "times.txt", code=1
+    )
+    assert list(judged) == ["est", "odo"]
+    for name, figures in judged.items():
         assert UNKNOWN.isdisjoint(figures)
         same = figures.keys() - {"method", "failed", "compared", "passed"}
         assert {
@@ -110,11 +112,11 @@ def test_a_runs_own_trajectories_get_its_figures(
         } <= same
         for key in same:
             assert figures[key] == pytest.approx(expected[name][key], abs=1e-7), (name, key)
-        assert [each for each in expected[name]["failed"] if "coverage" in each] == figures[
+        assert [reason for reason in expected[name]["failed"] if "coverage" in reason] == figures[
             "failed"
         ]
-    assert [found[name]["alignment"] for name in found] == ["none", "origin"]
-    assert found["odo"]["failed"] == ["coverage_percent: expected at least 90, found 87.42"]
+    assert [judged[name]["alignment"] for name in judged] == ["none", "origin"]
+    assert judged["odo"]["failed"] == ["coverage_percent: expected at least 90, found 87.42"]
 
 
 @pytest.mark.slow
@@ -143,10 +145,10 @@ def test_every_exported_format_gives_the_same_figures(
         ("tum/truth.tum", "lab.csv", ()),
         ("kitti/est.truth.kitti.txt", "kitti/est.kitti.txt", ("--times", "times")),
     ):
-        found = only(judge(tmp_path, "--truth", truth, "--estimate", estimate, *more))
+        figures = only(judge(tmp_path, "--truth", truth, "--estimate", estimate, *more))
         for key in ("ate_rmse_m", "ate_max_m", "rpe_1m_rot_deg_per_m", "rot_rmse_deg"):
-            assert found[key] == pytest.approx(direct[key], abs=2e-6), (estimate, key)
-        assert found["rpe_1m_trans_percent"] == pytest.approx(
+            assert figures[key] == pytest.approx(direct[key], abs=2e-6), (estimate, key)
+        assert figures["rpe_1m_trans_percent"] == pytest.approx(
             expected["est"]["rpe_1m_trans_percent"], abs=1e-4 if more == () else 0.5
         )
 
@@ -159,8 +161,8 @@ def test_errors_are_evos(how: str, tmp_path: Path) -> None:
     write_tum(tmp_path / "truth.tum", truth)
     write_euroc(tmp_path / "vo.csv", estimate)
     words = ["--scale-free"] if how == "sim3" else []
-    found = only(judge(tmp_path, "--truth", "truth.tum", "--estimate", "vo.csv", *words))
-    assert found["alignment"] == how
+    figures = only(judge(tmp_path, "--truth", "truth.tum", "--estimate", "vo.csv", *words))
+    assert figures["alignment"] == how
     reference, other = as_evo(truth), as_evo(estimate)
     other.align(reference, correct_scale=how == "sim3")
     for relation, key in (
@@ -169,11 +171,11 @@ def test_errors_are_evos(how: str, tmp_path: Path) -> None:
     ):
         metric = evo.APE(relation)
         metric.process_data((reference, other))
-        assert found[key] == pytest.approx(metric.get_all_statistics()["rmse"], abs=1e-7)
+        assert figures[key] == pytest.approx(metric.get_all_statistics()["rmse"], abs=1e-7)
     metric = evo.RPE(evo.PoseRelation.translation_part, 1.0, Unit.meters, 0.1, True, True)
     metric.process_data((reference, other))
     expected = 100 * metric.get_all_statistics()["rmse"]
-    assert found["rpe_1m_trans_percent"] == pytest.approx(expected, abs=1e-5)
+    assert figures["rpe_1m_trans_percent"] == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.slow
@@ -185,10 +187,10 @@ def test_topics_of_bags_are_read_in_our_frames(type_: str, tmp_path: Path) -> No
     bags.bag(tmp_path / "bag", type_, truth)
     truths = ["truth.tum", "bag:/slam/poses"]
     for true in truths:
-        found = judge(tmp_path, "--truth", true, "--estimate", "bag:/slam/poses")["slam/poses"]
-        assert found["alignment"] == "none"
-        assert (found["ate_max_m"], found["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)
-        assert (found["restarts"], found["estimates"]) == (0, 200)
+        figures = judge(tmp_path, "--truth", true, "--estimate", "bag:/slam/poses")["slam/poses"]
+        assert figures["alignment"] == "none"
+        assert (figures["ate_max_m"], figures["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)
+        assert (figures["restarts"], figures["estimates"]) == (0, 200)
 
 
 def test_restarts_and_repeated_stamps_of_a_topic_are_counted_and_fail(tmp_path: Path) -> None:
@@ -202,9 +204,9 @@ def test_restarts_and_repeated_stamps_of_a_topic_are_counted_and_fail(tmp_path: 
     write_tum(tmp_path / "truth.tum", truth, FRAMES.format("map (NED)"))
     bags.bag(tmp_path / "bag", bags.POSE, truth, frame_id="odom", change=change)
     words = ["--truth", "truth.tum", "--estimate", "slam=bag:/slam/poses"]
-    found = judge(tmp_path, *words, code=1)["slam"]
-    assert (found["restarts"], found["repeated_stamps"], found["estimates"]) == (1, 1, 188)
-    assert [each.partition(":")[0] for each in found["failed"]] == ["restarts", "repeated_stamps"]
+    figures = judge(tmp_path, *words, code=1)["slam"]
+    assert (figures["restarts"], figures["repeated_stamps"], figures["estimates"]) == (1, 1, 188)
+    assert [text.partition(":")[0] for text in figures["failed"]] == ["restarts", "repeated_stamps"]
     done = said(tmp_path, "--truth", "bag:/slam/poses", "--estimate", "truth.tum")
     assert "expected a truth in one frame, found that it changes (1 times)" in done.stderr
 
@@ -238,13 +240,13 @@ def test_a_cameras_poses_are_judged_as_the_bodys(tmp_path: Path) -> None:
     assert plain["rot_rmse_deg"] > 100.0
     assert plain["failed"][0].startswith("rot_rmse_deg: expected at most 15, found 1")
     for given in (MOUNTED, "mounting.tum", "drone/front"):
-        found = only(judge(tmp_path, *words, "--body-from-camera", given))
-        assert (found["ate_max_m"], found["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)
+        figures = only(judge(tmp_path, *words, "--body-from-camera", given))
+        assert (figures["ate_max_m"], figures["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)
     for name in ("bag", "optical"):
         words = ["--truth", "run", "--estimate", f"{name}:/slam/poses"]
-        found = only(judge(tmp_path, *words, "--body-from-camera", MOUNTED))
-        assert found["alignment"] == "none"
-        assert (found["ate_max_m"], found["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)
+        figures = only(judge(tmp_path, *words, "--body-from-camera", MOUNTED))
+        assert figures["alignment"] == "none"
+        assert (figures["ate_max_m"], figures["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)
 
 
 @pytest.mark.parametrize("axes", ["nwu", "enu", "optical"])
@@ -261,29 +263,29 @@ def test_axes_are_turned_into_ours(axes: str, tmp_path: Path) -> None:
     poses = Trajectory.from_matrices(truth.stamps, world @ truth.matrices() @ body)
     write_tum(tmp_path / "vo.tum", poses)
     words = ["--truth", "truth.tum", "--estimate", "vo.tum", "--alignment", "none", "--axes", axes]
-    found = only(judge(tmp_path, *words, "--truth-axes", "ned"))
-    assert (found["ate_max_m"], found["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)
+    figures = only(judge(tmp_path, *words, "--truth-axes", "ned"))
+    assert (figures["ate_max_m"], figures["rot_rmse_deg"]) == pytest.approx((0, 0), abs=1e-6)
 
 
 def test_a_part_of_the_flight_fails_however_good_it_is(tmp_path: Path) -> None:
     truth = walk(400)
     write_tum(tmp_path / "truth.tum", truth)
     write_tum(tmp_path / "part.tum", truth.take(slice(0, 300)))
-    found = judge(tmp_path, "--truth", "truth.tum", "--estimate", "part.tum", code=1)["part"]
-    assert found["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
-    assert (found["passed"], found["coverage_percent"]) == (False, pytest.approx(74.9, abs=0.1))
+    figures = judge(tmp_path, "--truth", "truth.tum", "--estimate", "part.tum", code=1)["part"]
+    assert figures["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    assert (figures["passed"], figures["coverage_percent"]) == (False, pytest.approx(74.9, abs=0.1))
     words = ["--threshold", "coverage_percent=70", "--threshold", "ate_percent=1"]
-    found = judge(tmp_path, "--truth", "truth.tum", "--estimate", "part.tum", *words)["part"]
-    assert found["passed"] is True
+    figures = judge(tmp_path, "--truth", "truth.tum", "--estimate", "part.tum", *words)["part"]
+    assert figures["passed"] is True
 
 
 def test_a_threshold_of_what_nobody_knows_is_missed(
     pair: tuple[Trajectory, Trajectory], tmp_path: Path
 ) -> None:
     words = ["--truth", "truth.tum", "--estimate", "vo.tum", "--threshold", "latency_p99_ms=50"]
-    found = only(judge(tmp_path, *words, code=1))
-    assert found["failed"] == ["latency_p99_ms: expected at most 50, found none"]
-    assert found["frame_coverage_percent"] is None
+    figures = only(judge(tmp_path, *words, code=1))
+    assert figures["failed"] == ["latency_p99_ms: expected at most 50, found none"]
+    assert figures["frame_coverage_percent"] is None
 
 
 def test_what_is_not_compared_is_said(tmp_path: Path) -> None:
@@ -354,8 +356,8 @@ def test_the_summary_says_what_was_judged_and_by_which_version(
     pair: tuple[Trajectory, Trajectory], tmp_path: Path
 ) -> None:
     said(tmp_path, "--truth", "truth.tum", "--estimate", "vo=vo.tum")
-    found = json.loads((tmp_path / "judged" / "trajectories" / "summary.json").read_text())
-    assert found["environment"]["commit"] == commit()
-    assert found["judged"] == {"truth": "truth.tum", "vo": "vo.tum"}
-    hashes = {name: content_hash(tmp_path / file) for name, file in found["judged"].items()}
-    assert found["judged_hashes"] == hashes
+    summary = json.loads((tmp_path / "judged" / "trajectories" / "summary.json").read_text())
+    assert summary["environment"]["commit"] == commit()
+    assert summary["judged"] == {"truth": "truth.tum", "vo": "vo.tum"}
+    hashes = {name: content_hash(tmp_path / file) for name, file in summary["judged"].items()}
+    assert summary["judged_hashes"] == hashes

@@ -58,11 +58,11 @@ def test_each_format_is_recognized_and_read_as_it_was_written(
     with TemporaryDirectory() as folder:
         path = Path(folder) / "some.name"
         write(path, trajectory)
-        found = read(str(path), "ned", str(Path(folder) / "times"))
-    assert (found.name, found.file) == ("some", str(path))
-    assert (found.poses.stamps == trajectory.stamps).all()
-    assert abs(found.poses.positions - trajectory.positions).max() <= 0.6e-9
-    assert angle(found.poses, trajectory) < 1e-9
+        source = read(str(path), "ned", str(Path(folder) / "times"))
+    assert (source.name, source.file) == ("some", str(path))
+    assert (source.poses.stamps == trajectory.stamps).all()
+    assert abs(source.poses.positions - trajectory.positions).max() <= 0.6e-9
+    assert angle(source.poses, trajectory) < 1e-9
 
 
 @pytest.mark.slow
@@ -226,18 +226,18 @@ def test_a_lever_arm_needs_orientations(tmp_path: Path) -> None:
 def judged(tmp_path: Path, truth: Trajectory, estimate: Trajectory, **settings: Any) -> Judgement:
     write_tum(tmp_path / "truth", truth)
     write_tum(tmp_path / "vo", estimate)
-    true, found = read_truth(str(tmp_path / "truth"), ""), read(str(tmp_path / "vo"), None)
+    true, source = read_truth(str(tmp_path / "truth"), ""), read(str(tmp_path / "vo"), None)
     config = judgement.JudgeConfig(**settings)
-    _, judgements, _, _ = judgement.judge_all(true, [found], None, config)
+    _, judgements, _, _ = judgement.judge_all(true, [source], None, config)
     return judgements["vo"]
 
 
 def test_no_time_in_common_fails_and_says_why(tmp_path: Path) -> None:
     truth = walk(50)
     later = Trajectory(truth.stamps + 10**18, truth.positions, truth.orientations)
-    found = judged(tmp_path, truth, later).figures
-    assert "ate_rmse_m" not in found
-    assert "one is Unix time, the other counts from a beginning" in found["why"]
+    figures = judged(tmp_path, truth, later).figures
+    assert "ate_rmse_m" not in figures
+    assert "one is Unix time, the other counts from a beginning" in figures["why"]
 
 
 def test_a_truth_too_sparse_to_judge_by_is_an_error(tmp_path: Path) -> None:
@@ -292,13 +292,13 @@ def test_wrong_options_are_named(words: list[str], message: str, tmp_path: Path)
 def test_a_bad_topic_has_its_sentence(
     topic: str, change: tuple[float, float] | None, message: str, type_: str, tmp_path: Path
 ) -> None:
-    def wrong(number: int, each: Any) -> Any:
+    def wrong(number: int, message: Any) -> Any:
         if number == 3 and change is not None:
             turned, moved = change
             if turned != 1.0:
-                each.pose.orientation.w += turned
-            each.pose.position.x += moved
-        return each
+                message.pose.orientation.w += turned
+            message.pose.position.x += moved
+        return message
 
     bag = bags.bag(tmp_path / "bag", type_, walk(10), change=wrong)
     with pytest.raises(ValueError, match=message):

@@ -69,10 +69,10 @@ def rigid(seed: int) -> npt.NDArray[np.float64]:
     return matrix
 
 
-def assert_same(found: Trajectory, expected: Trajectory) -> None:
-    assert (found.stamps == expected.stamps).all()
-    assert found.positions == pytest.approx(expected.positions, abs=1e-9)
-    assert angle(found, expected) < 1e-9
+def assert_same(actual: Trajectory, expected: Trajectory) -> None:
+    assert (actual.stamps == expected.stamps).all()
+    assert actual.positions == pytest.approx(expected.positions, abs=1e-9)
+    assert angle(actual, expected) < 1e-9
 
 
 def test_one_link_of_the_tree(tmp_path: Path) -> None:

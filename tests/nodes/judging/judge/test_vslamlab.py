@@ -85,8 +85,8 @@ def judged(sequence: Path, behaviour: str, *words: str) -> tuple[Result, dict[st
         patch.setattr("nodes.judging.judgement.write_report", lambda out: out / "report.html")
         result = CliRunner().invoke(app, [str(sequence), "--out", str(out), *words, *stub])
     path = out / "evaluation" / "verdict.json"
-    found: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
-    return result, found
+    verdict: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    return result, verdict
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_runs_that_succeed_are_judged_with_their_spread(sequence: Path, style: l
     result, verdict = judged(sequence, "works", "--repeat", "3", *style)
     assert result.exit_code == 0, result.output
     assert [*verdict["estimators"]] == ["00000", "00001", "00002"]
-    errors = [each["ate_rmse_m"] for each in verdict["estimators"].values()]
+    errors = [estimator["ate_rmse_m"] for estimator in verdict["estimators"].values()]
     assert all(0.0 < error < 0.05 for error in errors)
     assert len({*errors}) == 3
     assert verdict["estimators"]["00000"]["alignment"] == "sim3"

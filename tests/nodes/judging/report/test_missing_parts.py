@@ -43,9 +43,12 @@ def test_a_killed_run_gives_a_page_of_what_it_left(tmp_path: Path) -> None:
     truth = walk(4)
     folder = tmp_path / "trajectories"
     folder.mkdir()
-    for name, each in (("truth", truth), ("vo", recorded(truth).rows.trajectory())):
+    for name, trajectory in (("truth", truth), ("vo", recorded(truth).rows.trajectory())):
         rows = zip(
-            each.stamps.tolist(), each.positions.tolist(), each.orientations.tolist(), strict=True
+            trajectory.stamps.tolist(),
+            trajectory.positions.tolist(),
+            trajectory.orientations.tolist(),
+            strict=True,
         )
         text = "".join(tum_row(*row) for row in rows)
         (folder / f"{name}.tum").write_text(text[:-30])
@@ -150,7 +153,7 @@ def test_estimators_that_said_nothing_are_named(tmp_path: Path) -> None:
     records = {"vo": recorded(truth), "mute": EstimatorRecord()}
     summary(tmp_path, evaluated(tmp_path, truth, records, Thresholds()))
     run = read_run(tmp_path)
-    assert [each.name for each in run.estimators] == ["vo", "mute"]
+    assert [estimator.name for estimator in run.estimators] == ["vo", "mute"]
     assert "mute: no curves: it left no poses" in run.missing
 
 

@@ -131,7 +131,7 @@ def test_clouds_are_read_whole_and_sampled(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "found"),
+    ("content", "message"),
     [
         (b"", "expected a PLY file"),
         (b"ply\nformat ascii 1.0\nend_header\n", "format ascii"),
@@ -149,9 +149,9 @@ def test_clouds_are_read_whole_and_sampled(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_is_no_such_cloud_is_said(tmp_path: Path, content: bytes, found: str) -> None:
+def test_what_is_no_such_cloud_is_said(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "a.ply").write_bytes(content)
-    with pytest.raises(ValueError, match=found):
+    with pytest.raises(ValueError, match=message):
         read_ply(tmp_path / "a.ply", 10)
 
 

@@ -137,7 +137,7 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
     assert sent[1] == struct.pack("<II", 1, 0)
     assert (frame.sequence, frame.stamp) == (0, 77)
     assert frame.image("mono8", camera=1).tolist() == [[0, 1, 2], [6, 7, 8]]
-    assert [(each.name, each.arrived) for each in frame.inputs] == [("imu", 9)]
+    assert [(batch.name, batch.arrived) for batch in frame.inputs] == [("imu", 9)]
     assert frame.rows("imu")["stamp"].tolist() == [3]
     assert frame.rows("imu")["angular_velocity"].tolist() == [[1, 2, 3]]
     assert frame.rows("imu")["linear_acceleration"].tolist() == [[4, 5, 6]]
@@ -294,10 +294,10 @@ def test_the_page_has_all_functions() -> None:
     public = set(re.findall(r"^    (?! |explicit D)[\w:<>&* ]*?\b(\w+)\(", header, re.MULTILINE))
     assert {"Link", "row", "from_quaternion", "pose", "done"} <= public
     for name in public:
-        assert any(f" {name}(" in each for each in functions), name
+        assert any(f" {name}(" in signature for signature in functions), name
     text = page.partition("```text\n")[2].partition("```")[0]
     for name, method in (*vars(Link).items(), ("image", Frame.image), ("rows", Frame.rows)):
         if inspect.isfunction(method) and not name.startswith("_"):
             named = list(inspect.signature(method).parameters.values())[1:]
-            plain = [each.replace(annotation=inspect.Parameter.empty) for each in named]
+            plain = [parameter.replace(annotation=inspect.Parameter.empty) for parameter in named]
             assert f".{name}{inspect.Signature(plain)}".replace("'", '"') in text, name

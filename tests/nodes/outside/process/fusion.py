@@ -25,8 +25,10 @@ def main() -> None:
         link.ready("camera" if "camera" in modes else "body")
         position = np.zeros(3)
         for frame in link:
-            for each in frame.inputs:
-                link.log(f"{frame.stamp} {each.name} {each.arrived} {each.rows['stamp'].tolist()}")
+            for batch in frame.inputs:
+                link.log(
+                    f"{frame.stamp} {batch.name} {batch.arrived} {batch.rows['stamp'].tolist()}"
+                )
             if "vio" in frame.kinds:
                 for row in frame.rows("vio"):
                     if np.isfinite(row["pose"]).all():

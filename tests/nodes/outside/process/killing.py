@@ -54,20 +54,20 @@ class Killer(Node[KillerConfig]):
         if event.source != self.config.source:
             return
         if self.seen == self.config.frame:
-            found = [pid for pid in below(os.getpid()) if runs(pid, self.config.victim)]
-            self.log.info("kill %s at frame %d", found, self.seen)
-            os.kill(found[-1], self.config.signal)  # its guard has its name, too, and is before it
+            pids = [pid for pid in below(os.getpid()) if runs(pid, self.config.victim)]
+            self.log.info("kill %s at frame %d", pids, self.seen)
+            os.kill(pids[-1], self.config.signal)  # its guard has its name, too, and is before it
         self.seen += 1
 
 
 def below(pid: int) -> list[int]:
     """Return a process's descendants, each after its parent."""
-    found = [pid]
-    for each in found:
-        for thread in Path(f"/proc/{each}/task").glob("*/children"):
+    pids = [pid]
+    for process in pids:
+        for thread in Path(f"/proc/{process}/task").glob("*/children"):
             with contextlib.suppress(OSError):
-                found += map(int, thread.read_text("ascii").split())
-    return found[1:]
+                pids += map(int, thread.read_text("ascii").split())
+    return pids[1:]
 
 
 def runs(pid: int, victim: str) -> bool:

@@ -54,10 +54,10 @@ def main() -> None:
             if "flood" in modes:
                 print("x" * 200 + "\n" * 500, flush=True)
             if "spies" in modes:  # wherever it was told of, and in the run's folder
-                told = [Path(each) for name, each in os.environ.items() if "VISNAV" in name]
+                told = [Path(value) for name, value in os.environ.items() if "VISNAV" in name]
                 places = {*told, Path(os.environ["VISNAV_FOLDER"]).parents[1]}
-                found = [str(file) for place in places for file in place.rglob("*.tum")]
-                link.log(f"spied: {found or 'nothing'}")
+                files = [str(file) for place in places for file in place.rglob("*.tum")]
+                link.log(f"spied: {files or 'nothing'}")
             if "logs" in modes and number == 5:
                 for n in range(int(modes["logs"])):
                     link.log(f"\x1b[31m{n}\nmore")
@@ -78,8 +78,8 @@ def main() -> None:
             if "reversed" in modes:  # of two
                 held.append(frame)
                 if len(held) == 2:
-                    for each in reversed(held):
-                        link.pose(each, pose_of(each))
+                    for stamp in reversed(held):
+                        link.pose(stamp, pose_of(stamp))
                     held.clear()
             elif "unsteady" in modes and number == 5:  # as threads make a system
                 pose = pose_of(frame)

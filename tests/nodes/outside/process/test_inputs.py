@@ -178,11 +178,11 @@ def test_a_filter_gets_all_that_came_and_answers_each_tenth_sample(tmp_path: Pat
     assert f"{150 * ms} vio {140 * ms} {[100 * ms]}" in lines  # stamped 0.1 s, came at 0.14 s
     assert f"{150 * ms} lidar {100 * ms} {[101 * ms, 102 * ms]}" in lines
     assert "estimates 424" in lines
-    estimates = [each for each in Ear.heard if isinstance(each, PoseEstimate)]
-    own = [each for each in estimates if each.source == "slam"]
-    raw = [each for each in estimates if each.source == "slam/raw"]
+    estimates = [event for event in Ear.heard if isinstance(event, PoseEstimate)]
+    own = [estimate for estimate in estimates if estimate.source == "slam"]
+    raw = [estimate for estimate in estimates if estimate.source == "slam/raw"]
     assert len(own) == 10
-    assert [each.stamp for each in own] == [n * 50 * ms for n in range(10)]
+    assert [estimate.stamp for estimate in own] == [n * 50 * ms for n in range(10)]
     # The first pose lies on the announced one; the estimate of 0.1 s goes a metre further.
     assert own[0].position == pytest.approx((1.0, 2.0, -0.1))
     assert own[-1].velocity == pytest.approx((1.0, 2.0, 3.0))
@@ -191,7 +191,9 @@ def test_a_filter_gets_all_that_came_and_answers_each_tenth_sample(tmp_path: Pat
         [*range(10)]
     )
     assert raw[-1].velocity == pytest.approx((0.0, 0.0, 5.0))
-    assert {"slam", "slam/raw"} <= {each["source"] for each in summary.announcements}
+    assert {"slam", "slam/raw"} <= {
+        announcement["source"] for announcement in summary.announcements
+    }
 
 
 @pytest.mark.slow
@@ -199,13 +201,13 @@ def test_each_scan_and_each_estimate_may_ask(tmp_path: Path) -> None:
     for name, stamps in {"lidar": [2, 102], "vio": [0, 100]}.items():
         Ear.heard.clear()
         fly(fusion(asks=name), tmp_path / name, 0.18, others=OTHERS)
-        assert [each.stamp // 1_000_000 for each in Ear.heard] == stamps
+        assert [event.stamp // 1_000_000 for event in Ear.heard] == stamps
 
 
 def test_a_lost_estimator_is_a_row_without_a_pose_and_a_new_map_another_frame() -> None:
     inputs = Inputs(["vio"])
-    for each in announced():
-        inputs.announced(each)
+    for announcement in announced():
+        inputs.announced(announcement)
     assert not [*inputs.choose("others", None)]
     where: dict[str, Any] = {"position": (1, 2, 3), "orientation": (1, 0, 0, 0)}
     for n, frame in enumerate(["odom", "odom", "", "odom_1"]):
@@ -225,8 +227,8 @@ def test_a_lost_estimator_is_a_row_without_a_pose_and_a_new_map_another_frame() 
 @pytest.mark.slow
 def test_what_no_frame_takes_along_is_dropped_and_counted() -> None:
     inputs = Inputs(["lidar"])
-    for each in announced():
-        inputs.announced(each)
+    for announcement in announced():
+        inputs.announced(announcement)
     assert not [*inputs.choose("", None)]
     count = MOST_BYTES // 32 // 3
     scan = LidarScan(
@@ -241,7 +243,7 @@ def test_what_no_frame_takes_along_is_dropped_and_counted() -> None:
     for n in range(5):
         assert inputs.take(scan, n) == "lidar"
     assert inputs.dropped == 2
-    assert [each.arrived for each in inputs.drain()] == [2, 3, 4]  # scans stay apart
+    assert [row.arrived for row in inputs.drain()] == [2, 3, 4]  # scans stay apart
 
 
 def test_a_program_flies(tmp_path: Path) -> None:

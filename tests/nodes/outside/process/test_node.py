@@ -58,7 +58,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Summary:
 
 def quick(known: Iterable[str], *names: str) -> list[Any]:
     """Return parameters of which all but these are slow."""
-    return [each if each in names else pytest.param(each, marks=pytest.mark.slow) for each in known]
+    return [name if name in names else pytest.param(name, marks=pytest.mark.slow) for name in known]
 
 
 @pytest.mark.slow
@@ -159,8 +159,8 @@ def test_what_a_program_costs_is_measured_from_outside(plain: Summary, tmp_path:
 def test_with_both_cores_busy_it_is_the_same(plain: Summary, tmp_path: Path) -> None:
     over = threading.Event()
     busy = [threading.Thread(target=lambda: [None for _ in iter(over.is_set, True)]) for _ in "ab"]
-    for each in busy:
-        each.start()
+    for process in busy:
+        process.start()
     try:
         assert fly(program("slow=0.01"), tmp_path).digest == plain.digest
     finally:

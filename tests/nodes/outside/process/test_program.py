@@ -86,8 +86,8 @@ def start() -> Iterator[type[Started]]:
             made.append(self)
 
     yield Kept
-    for each in made:
-        each.program.close()
+    for program in made:
+        program.program.close()
 
 
 def python(code: str, *words: str) -> tuple[str, ...]:
@@ -201,14 +201,14 @@ def test_a_run_that_is_killed_leaves_nothing_behind() -> None:
 
 
 def test_a_flood_is_counted_but_not_logged() -> None:
-    found: list[str] = []
+    lines: list[str] = []
     seconds = iter([*[5.0] * 150, *[6.9] * 20, *[7.0] * 101])
-    limited = Throttle(found.append, lambda: next(seconds))
+    limited = Throttle(lines.append, lambda: next(seconds))
     for _ in range(271):
         limited("x")
     limited.end()
     limited.end()
-    assert found == ["x"] * LINES + ["(50 more lines)"] + ["x"] * (20 + LINES) + ["(1 more lines)"]
+    assert lines == ["x"] * LINES + ["(50 more lines)"] + ["x"] * (20 + LINES) + ["(1 more lines)"]
 
 
 @pytest.mark.slow
@@ -237,44 +237,44 @@ def test_lines_come_when_they_are_printed(start: type[Started]) -> None:
     ],
 )
 def test_what_controls_a_terminal_is_left_out(printed: bytes, lines: list[str]) -> None:
-    found: list[str] = []
-    output = Output(found.append)
+    logged: list[str] = []
+    output = Output(logged.append)
     for byte in printed:
         output.take(bytes([byte]))
     output.end()
-    assert found == lines
+    assert logged == lines
     assert [*plain_lines(printed.removesuffix(b"\n"))] == lines
 
 
 @given(st.lists(st.binary(max_size=3000), max_size=20))
 def test_lines_are_the_same_however_they_arrive(pieces: list[bytes]) -> None:
     def lines(pieces: list[bytes]) -> list[str]:
-        found: list[str] = []
-        output = Output(found.append)
+        logged: list[str] = []
+        output = Output(logged.append)
         for piece in pieces:
             output.take(piece)
         output.end()
-        return found
+        return logged
 
     assert lines(pieces) == lines([b"".join(pieces)])
 
 
 @given(st.lists(st.text(st.characters(codec="ascii", exclude_categories=["C"]))))
 def test_what_controls_no_terminal_is_told_as_it_is(lines: list[str]) -> None:
-    found: list[str] = []
-    output = Output(found.append)
+    logged: list[str] = []
+    output = Output(logged.append)
     output.take("".join(f"{line}\n" for line in lines).encode())
-    assert found == [line.rstrip() for line in lines]
+    assert logged == [line.rstrip() for line in lines]
 
 
 @pytest.mark.slow
 def test_a_line_without_end_takes_no_more_memory_than_a_long_one() -> None:
-    found: list[str] = []
-    output = Output(found.append)
+    logged: list[str] = []
+    output = Output(logged.append)
     for _ in range(1000):
         output.take(b"x" * 65536)
     assert len(output._begun) <= 4096
-    assert {len(line) for line in found} == {4096}
+    assert {len(line) for line in logged} == {4096}
 
 
 def test_an_unknown_signal_is_told_by_its_number() -> None:

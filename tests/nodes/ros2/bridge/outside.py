@@ -101,8 +101,8 @@ def slowly(stub: Outside, stamp: int, x: float) -> None:
 def out_of_order(stub: Outside, stamp: int, x: float) -> None:
     stub.kept.append((stamp, x))
     if len(stub.kept) == 2:
-        for each in reversed(stub.kept):
-            stub.pose(*each)
+        for answer in reversed(stub.kept):
+            stub.pose(*answer)
         stub.kept.clear()
 
 
@@ -182,8 +182,8 @@ def comes_back(stub: Outside, stamp: int, x: float) -> None:
 
 
 BEHAVIOURS: dict[str, Callable[[Outside, int, float], None]] = {
-    each.__name__: each
-    for each in (
+    behaviour.__name__: behaviour
+    for behaviour in (
         *(
             at_once,
             in_turns,

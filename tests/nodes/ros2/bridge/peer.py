@@ -50,7 +50,7 @@ def main() -> None:
     locator, name, *tokens = sys.argv[1:]
     node = NodeName(name="peer", domain_id=DOMAIN)
     session = Session(node, connect=(locator,), listen=())
-    (topic,) = (each for each in (PLAIN, KEPT) if each.name == name)
+    (topic,) = (candidate for candidate in (PLAIN, KEPT) if candidate.name == name)
     session.subscribe(topic, ours)
     kept = [
         session._session.declare_subscriber(data_key(DOMAIN, topic), plain),

@@ -93,10 +93,10 @@ def main() -> None:
             "status",
             "action_msgs/msg/GoalStatusArray",
             "action_msgs/GoalStatus[] status_list",
-            lambda message: statuses.append([each.status for each in message.status_list]),
+            lambda message: statuses.append([status.status for status in message.status_list]),
         ),
     ]
-    results, steps = [], [int(each) for each in sys.argv[2:]]
+    results, steps = [], [int(word) for word in sys.argv[2:]]
     zero = make["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
     for number, count in enumerate(steps, 1):
         id_ = make["unique_identifier_msgs/msg/UUID"](uuid=np.full(16, number, np.uint8))
@@ -107,8 +107,8 @@ def main() -> None:
                 time.sleep(0.01)
             info = make["action_msgs/msg/GoalInfo"](goal_id=id_, stamp=zero)
             assert len(cancel.call(goal_info=info).goals_canceling) == 1
-        found = result.call(goal_id=id_)
-        results.append((found.status, found.result.result.result))
+        reply = result.call(goal_id=id_)
+        results.append((reply.status, reply.result.result.result))
     play.call(state=make["simulation_interfaces/msg/SimulationState"](state=1))
     print(json.dumps({"results": results, "feedback": feedback, "statuses": statuses}))
     del kept

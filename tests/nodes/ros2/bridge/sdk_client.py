@@ -39,7 +39,7 @@ def brief(value: Any) -> Any:
         return {name: brief(getattr(value, name)) for name in names}
     if hasattr(value, "tolist"):
         return {"size": len(value), "first": value[:4].tolist()}
-    return [brief(each) for each in value] if isinstance(value, list) else value
+    return [brief(element) for element in value] if isinstance(value, list) else value
 
 
 def main() -> None:

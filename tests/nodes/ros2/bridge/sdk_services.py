@@ -39,7 +39,7 @@ def made(session: Any, value: Any) -> Any:
     """Return a field of a request, made from JSON; a message names its type."""
     if not isinstance(value, dict):
         return value
-    fields = {name: made(session, each) for name, each in value.items() if name != "type"}
+    fields = {name: made(session, field) for name, field in value.items() if name != "type"}
     return session.store.types[value["type"]](**fields)
 
 

@@ -36,7 +36,7 @@ class Taken:
 
     def read(self) -> list[Any]:
         """Return the messages."""
-        return [samples.store().deserialize(each, self.topic.type) for each in self.messages]
+        return [samples.store().deserialize(data, self.topic.type) for data in self.messages]
 
 
 class TakingSession:
@@ -63,4 +63,4 @@ class TakingSession:
 
     def on(self, name: str) -> list[Taken]:
         """Return the publishers of a topic."""
-        return [each for each in self.taken if each.topic.name == name]
+        return [entry for entry in self.taken if entry.topic.name == name]

@@ -54,7 +54,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, str]:
     """Return what the client saw, what the run heard of it, and the run's log."""
     folder = tmp_path_factory.mktemp("run")
     with bridged_run(folder) as (run, port):
-        found = client(port, len(TOPICS))
+        listing = client(port, len(TOPICS))
         try:
             output, _ = run.communicate(timeout=30)
         except subprocess.TimeoutExpired:
@@ -62,13 +62,13 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, str]:
     assert run.returncode == 0, output
     (heard,) = folder.rglob("heard.json")
     (log,) = folder.rglob("log.txt")
-    return found, json.loads(heard.read_text()), log.read_text()
+    return listing, json.loads(heard.read_text()), log.read_text()
 
 
 def test_the_client_lists_the_node_and_all_topics(seen: tuple[Any, Any, str]) -> None:
-    found, _, _ = seen
-    assert {name: types for name, (types,) in found["topics"].items()} == TOPICS
-    assert [token.rsplit("/", 3)[1:] for token in found["nodes"]] == [["%", "%", "visnav"]]
+    listing, _, _ = seen
+    assert {name: types for name, (types,) in listing["topics"].items()} == TOPICS
+    assert [token.rsplit("/", 3)[1:] for token in listing["nodes"]] == [["%", "%", "visnav"]]
 
 
 def test_the_client_decodes_every_topic(seen: tuple[Any, Any, str]) -> None:

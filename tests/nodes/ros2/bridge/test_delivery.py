@@ -134,12 +134,16 @@ def test_who_joins_late_and_asks_for_the_topic_s_key_gets_what_is_kept() -> None
 
         def asked(topic: Topic) -> list[tuple[int, bytes]]:
             every = zenoh.ConsolidationMode.NONE
-            samples = [each.ok for each in other.get(data_key(DOMAIN, topic), consolidation=every)]
-            assert all(str(each.key_expr) == data_key(DOMAIN, topic) for each in samples if each)
+            samples = [
+                reply.ok for reply in other.get(data_key(DOMAIN, topic), consolidation=every)
+            ]
+            assert all(
+                str(sample.key_expr) == data_key(DOMAIN, topic) for sample in samples if sample
+            )
             return [
-                (unpack(each.attachment.to_bytes()).sequence, each.payload.to_bytes())
-                for each in samples
-                if each is not None and each.attachment is not None
+                (unpack(sample.attachment.to_bytes()).sequence, sample.payload.to_bytes())
+                for sample in samples
+                if sample is not None and sample.attachment is not None
             ]
 
         until(lambda: asked(KEPT))
@@ -209,15 +213,15 @@ def test_endpoints_are_told_of_when_they_appear_and_when_their_process_is_killed
             early = other.liveliness().declare_token(token)
             until(lambda: list(session._session.liveliness().get(token)))
             told = watch(session)
-            there, found = told.get(timeout=10)
-            assert (there, found.key, found.topic) == (True, token, PLAIN.name)
+            there, endpoint = told.get(timeout=10)
+            assert (there, endpoint.key, endpoint.topic) == (True, token, PLAIN.name)
             early.undeclare()  # type: ignore[no-untyped-call]
-            assert told.get(timeout=10) == (False, found)
+            assert told.get(timeout=10) == (False, endpoint)
         session.subscribe(PLAIN, lambda _: None)  # one's own are not told of
         with peer(locator, KEPT.name, token) as (process, _):
-            assert told.get(timeout=10) == (True, found)
+            assert told.get(timeout=10) == (True, endpoint)
             process.kill()
-            assert told.get(timeout=5) == (False, found)  # or else it would take 10 s
+            assert told.get(timeout=5) == (False, endpoint)  # or else it would take 10 s
         assert told.empty()
 
 
@@ -237,9 +241,9 @@ def test_tokens_of_two_hundred_peers_are_told_of_and_no_others() -> None:
             with zenoh_session(connect=locator) as other:
                 ours = [foreign_token("MS", PLAIN, f"{number:x}") for number in range(200)]
                 tokens = [other.liveliness().declare_token(key) for key in others + ours]
-                found = [told.get(timeout=10) for _ in ours]
-                assert sorted(token.key for there, token in found if there) == sorted(ours)
-            found = [told.get(timeout=10) for _ in ours]
-            assert sorted(token.key for there, token in found if not there) == sorted(ours)
+                changes = [told.get(timeout=10) for _ in ours]
+                assert sorted(token.key for there, token in changes if there) == sorted(ours)
+            changes = [told.get(timeout=10) for _ in ours]
+            assert sorted(token.key for there, token in changes if not there) == sorted(ours)
             del tokens
         assert told.empty()

@@ -49,9 +49,9 @@ def test_what_was_sent_is_what_was_heard_and_what_was_dropped(rate: float, tmp_p
     assert sent[0] == sent[2] == 0
     assert min(sent[1], sent[3]) > 0
     (log,) = tmp_path.rglob("log.txt")
-    found = re.search(r"(\d+) received, (\d+) refused or dropped", log.read_text())
-    assert found is not None
-    heard, refused = map(int, found.groups())
+    match = re.search(r"(\d+) received, (\d+) refused or dropped", log.read_text())
+    assert match is not None
+    heard, refused = map(int, match.groups())
     assert heard + refused == sum(sent) + 1
     assert 10 <= heard <= 10 + rate * seconds
 

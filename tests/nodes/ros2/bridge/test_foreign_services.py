@@ -80,14 +80,14 @@ class Client:
         return self.call(f"/drone/{name}", "std_srvs/srv/Trigger")
 
     def step(self, steps: int) -> None:
-        found = self.call("/step_simulation", f"{SIMULATION}/StepSimulation", steps=steps)
-        assert found["result"] == {"result": 1, "error_message": ""}
+        reply = self.call("/step_simulation", f"{SIMULATION}/StepSimulation", steps=steps)
+        assert reply["result"] == {"result": 1, "error_message": ""}
 
     def set_state(self, state: int) -> None:
         wanted = {"type": "simulation_interfaces/msg/SimulationState", "state": state}
         type_ = f"{SIMULATION}/SetSimulationState"
-        found = self.call("/set_simulation_state", type_, state=wanted)
-        assert found["result"] == {"result": 1, "error_message": ""}
+        reply = self.call("/set_simulation_state", type_, state=wanted)
+        assert reply["result"] == {"result": 1, "error_message": ""}
 
 
 def command(folder: Path, port: int, more: str, duration: float) -> list[str]:
@@ -169,9 +169,9 @@ def test_a_run_stepped_from_outside_has_the_digest_of_one_never_paused(tmp_path:
                 there.step(steps)
             there.set_state(1)
     finally:
-        for each in busy:
-            each.kill()
-            each.wait()
+        for process in busy:
+            process.kill()
+            process.wait()
     assert summary(stepped)["digest"] == summary(quiet)["digest"]
     assert summary(stepped)["sim_seconds"] == summary(quiet)["sim_seconds"] == 6.0
 
@@ -179,7 +179,7 @@ def test_a_run_stepped_from_outside_has_the_digest_of_one_never_paused(tmp_path:
 def test_a_run_stepped_by_the_action_has_the_digest_of_one_never_paused(tmp_path: Path) -> None:
     quiet, stepped, port = tmp_path / "quiet", tmp_path / "stepped", free_port()
     subprocess.run(command(quiet, free_port(), PILOT, 20.0), check=True, timeout=300)
-    steps = [str(each) for each in (1, 7, 1333, 100_000)]
+    steps = [str(count) for count in (1, 7, 1333, 100_000)]
     acts = [sys.executable, "-m", f"{__package__}.sdk_action", str(port), *steps]
     with subprocess.Popen(command(stepped, port, PAUSED + PILOT, 20.0)) as run:
         try:
@@ -189,10 +189,10 @@ def test_a_run_stepped_by_the_action_has_the_digest_of_one_never_paused(tmp_path
             run.kill()
     heard = json.loads(acted.stdout.splitlines()[-1])
     assert heard["results"] == [[4, 1], [4, 1], [4, 1], [5, 4]]
-    for each in ([1, 0], [7, 0], [1333, 0]):
-        assert each in heard["feedback"]
+    for progress in ([1, 0], [7, 0], [1333, 0]):
+        assert progress in heard["feedback"]
     assert sum(heard["feedback"][-1]) == 100_000
     assert heard["statuses"][0] == [2]
-    assert heard["statuses"][-3:] == [[4, 4, 4, each] for each in (2, 3, 5)]
+    assert heard["statuses"][-3:] == [[4, 4, 4, status] for status in (2, 3, 5)]
     assert summary(stepped)["digest"] == summary(quiet)["digest"]
     assert summary(stepped)["sim_seconds"] == summary(quiet)["sim_seconds"] < 20.0

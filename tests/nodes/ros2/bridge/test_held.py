@@ -94,11 +94,11 @@ def fly(
 
 def estimates(result: NodeResult) -> list[tuple[int, float]]:
     """Return stamp and content of each estimate: its x is what was said."""
-    return [(each.stamp, each.position[0]) for each in result.of(PoseEstimate)]
+    return [(estimate.stamp, estimate.position[0]) for estimate in result.of(PoseEstimate)]
 
 
 ALL = [(n * PERIOD, float(n)) for n in range(FRAMES)]
-SOME = [each for each in ALL if each[1] % 3 != 1]
+SOME = [row for row in ALL if row[1] % 3 != 1]
 WHY_NOT = {
     "twice": ["frames were answered twice, differently"],
     "in_turns": ["several publishers answer at /slam/pose"],

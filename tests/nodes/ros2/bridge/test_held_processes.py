@@ -56,7 +56,7 @@ def judged(
     folder.mkdir()
     (folder / "run.toml").write_text(text)
     endpoint = json.dumps([f"tcp/127.0.0.1:{free_port()}"])
-    settings = [word for each in (*SMALL, *changes) for word in ("--set", each)]
+    settings = [word for change in (*SMALL, *changes) for word in ("--set", change)]
     run = ["-m", "runtime", "run", str(folder / "run.toml"), "--out", str(folder / "out")]
     override = f"connect/endpoints={endpoint}"
     with (
@@ -81,11 +81,11 @@ def test_it_is_judged_to_the_same_digest_also_with_both_cores_busy(tmp_path: Pat
     quiet = fly(tmp_path / "quiet")
     with started("-c", "while True: pass"), started("-c", "while True: pass"):
         busy = fly(tmp_path / "busy")
-    found = quiet["outside"]["slam"]
-    assert found["answered"] + found["empty"] == found["sent"] > 100
-    assert found["answered"] > 100
-    assert found["reproducible"]
-    assert found["inputs"] == busy["outside"]["slam"]["inputs"]
+    answers = quiet["outside"]["slam"]
+    assert answers["answered"] + answers["empty"] == answers["sent"] > 100
+    assert answers["answered"] > 100
+    assert answers["reproducible"]
+    assert answers["inputs"] == busy["outside"]["slam"]["inputs"]
     assert quiet["digest"] == busy["digest"]
 
 
@@ -109,22 +109,22 @@ def test_killing_it_has_the_policy_s_result_within_a_second(
         assert run.wait(60) == code, output
     assert taken < 1.0
     if policy != "error":
-        found = summary(tmp_path / "run")["outside"]["slam"]
-        assert found["lost"] > 0
-        assert found["answered"] > 0
+        counts = summary(tmp_path / "run")["outside"]["slam"]
+        assert counts["lost"] > 0
+        assert counts["answered"] > 0
 
 
 def test_the_run_of_the_example_starts_it(tmp_path: Path) -> None:
     endpoint = json.dumps([f"tcp/127.0.0.1:{free_port()}"])
     command = json.dumps([sys.executable, "outside_ros2.py"])
     changes = (*SMALL, f"ros2.listen={endpoint}", f"estimator.command={command}")
-    settings = [word for each in (*changes, "run.duration=3s") for word in ("--set", each)]
+    settings = [word for change in (*changes, "run.duration=3s") for word in ("--set", change)]
     run = ["-m", "runtime", "run", "examples/outside_ros2.toml", "--out", str(tmp_path / "out")]
     with started(*run, *settings) as running:
         output, _ = running.communicate(timeout=400)
     assert running.returncode in {0, 1}, output
-    found = summary(tmp_path)["outside"]["slam"]
-    assert found["answered"] + found["empty"] == found["sent"] > 80
+    counts = summary(tmp_path)["outside"]["slam"]
+    assert counts["answered"] + counts["empty"] == counts["sent"] > 80
 
 
 REAL = """
@@ -147,8 +147,8 @@ def test_in_real_time_nothing_is_held_and_the_run_says_so(tmp_path: Path) -> Non
         finally:
             stub.leave()
     assert run.returncode == 0, output
-    found = json.loads((folder / "summary.json").read_text())["outside"]["slam"]
-    assert found["answered"] > 0
-    assert found["why_not"] == ["the clock is real"]
+    counts = json.loads((folder / "summary.json").read_text())["outside"]["slam"]
+    assert counts["answered"] > 0
+    assert counts["why_not"] == ["the clock is real"]
     heard = json.loads((folder / "heard.json").read_text())
     assert heard["PoseEstimate"]["source"] == "slam"

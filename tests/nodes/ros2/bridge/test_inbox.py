@@ -41,9 +41,9 @@ class Box:
         )
 
     def give(self, *data: bytes) -> None:
-        for each in data:
+        for payload in data:
             self.clock.now += 1e-3
-            self.inbox.take(Message(len(each), functools.partial(bytes, each)))
+            self.inbox.take(Message(len(payload), functools.partial(bytes, payload)))
 
 
 async def test_a_burst_wakes_the_loop_once_and_keeps_its_order() -> None:

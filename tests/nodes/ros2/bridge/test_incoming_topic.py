@@ -155,13 +155,13 @@ def test_a_mapping_of_the_user_s_own_makes_events() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "found"), [("broken", "KeyError"), ("no_event", "expected an event, found str")]
+    ("name", "message"), [("broken", "KeyError"), ("no_event", "expected an event, found str")]
 )
-def test_a_mapping_that_fails_is_left_out(name: str, found: str) -> None:
+def test_a_mapping_that_fails_is_left_out(name: str, message: str) -> None:
     ear = Ear("sensor_msgs/msg/BatteryState", mapping=f"{HERE}:{name}")
     assert ear.hear(battery(0.5)) is None
     assert ear.said[0].startswith("/t: mapping failed")
-    assert found in ear.said[0]
+    assert message in ear.said[0]
 
 
 @pytest.mark.parametrize("name", ["no.such:thing", f"{HERE}:nothing", f"{HERE}:HERE"])

@@ -184,8 +184,8 @@ def test_the_key_of_a_topic_s_endpoints_matches_theirs_only(
     for domain, kind in kinds:
         node = NodeName(name="eye", namespace="/fleet", domain_id=domain)
         token = endpoint_token(node, "1f", 0, 3, kind, topic)
-        found = zenoh.KeyExpr("/".join([token, *extra]))
-        assert watched.intersects(found) == (domain == 7 and kind == "MS")
+        key = zenoh.KeyExpr("/".join([token, *extra]))
+        assert watched.intersects(key) == (domain == 7 and kind == "MS")
 
 
 def test_the_key_of_a_topic_is_what_ros_puts_images_on() -> None:

@@ -54,12 +54,12 @@ class Listener:
 
     def collect(self, last: str) -> dict[str, list[Any]]:
         """Return the samples by key, up to the first whose key begins like `last`."""
-        found: dict[str, list[Any]] = {}
+        samples: dict[str, list[Any]] = {}
         while True:
             sample = self.samples.get(timeout=10)
-            found.setdefault(str(sample.key_expr), []).append(sample)
+            samples.setdefault(str(sample.key_expr), []).append(sample)
             if str(sample.key_expr).startswith(last):
-                return found
+                return samples
 
 
 @pytest.fixture
@@ -75,9 +75,9 @@ def test_a_bridge_of_zenoh_s_for_dds_gets_its_own_keys_and_no_attachment(
 ) -> None:
     config = listener.config | {"keys": "ros2dds", "namespace": "/fleet"}
     run_node(Ros2Bridge, inputs=[*ANNOUNCED, samples.odometry(1)], config=config, duration=0.1)
-    found = listener.collect("fleet/drone/odom")
-    assert found["fleet/drone/odom"][0].attachment is None
-    assert set(found) <= {"fleet/drone/odom", "tf", "tf_static", "clock"}
+    by_key = listener.collect("fleet/drone/odom")
+    assert by_key["fleet/drone/odom"][0].attachment is None
+    assert set(by_key) <= {"fleet/drone/odom", "tf", "tf_static", "clock"}
 
 
 def test_only_what_is_asked_for_is_published_under_the_name_that_is_asked_for(
@@ -91,8 +91,8 @@ def test_only_what_is_asked_for_is_published_under_the_name_that_is_asked_for(
     }
     inputs = [*ANNOUNCED, samples.image(10_000_000), samples.odometry(20_000_000)]
     run_node(Ros2Bridge, inputs=inputs, config=config, duration=0.1)
-    found = listener.collect("0/truth/")
-    topics = {"/".join(key.split("/")[1:-2]) for key in found}
+    keys = listener.collect("0/truth/")
+    topics = {"/".join(key.split("/")[1:-2]) for key in keys}
     assert topics == {"truth", "drone/camera/camera_info", "drone/camera/image_raw/compressed"}
 
 
@@ -136,8 +136,8 @@ def test_further_sensors_paths_and_mappings_of_the_users_own(listener: Listener)
         FluidPressure(stamp=300 * ms, source="last", fluid_pressure=1e5),
     ]
     run_node(Ros2Bridge, inputs=inputs, config=config, duration=0.4)
-    found = {k.rsplit("/", 2)[0]: v for k, v in listener.collect("0/last/pressure/").items()}
-    assert {name: len(samples) for name, samples in found.items()} == {
+    by_topic = {k.rsplit("/", 2)[0]: v for k, v in listener.collect("0/last/pressure/").items()}
+    assert {name: len(samples) for name, samples in by_topic.items()} == {
         "0/drone/pressure": 1,
         "0/drone/mag": 1,
         "0/drone/fix": 1,
@@ -152,7 +152,7 @@ def test_further_sensors_paths_and_mappings_of_the_users_own(listener: Listener)
     }
     paths: list[Any] = [
         samples.store().deserialize(sample.payload.to_bytes(), "nav_msgs/msg/Path")
-        for sample in found["0/drone/path"]
+        for sample in by_topic["0/drone/path"]
     ]
     assert [len(path.poses) for path in paths] == [1, 101, 201]
     last = paths[-1].poses[-1]
@@ -165,8 +165,8 @@ def test_subscriptions_in_lockstep_are_warned_of_and_announced(
     table = {"topic": "slam/pose", "type": POSE, "as": "estimate", "scale_free": True}
     config = listener.config | {"subscriptions": [table]}
     result = run_node(Ros2Bridge, config=config, duration=0.1, name="ros2")
-    (found,) = result.of(EstimatorAnnouncement)
-    assert (found.source, found.method, found.scale_free) == (
+    (announcement,) = result.of(EstimatorAnnouncement)
+    assert (announcement.source, announcement.method, announcement.scale_free) == (
         "ros2/slam/pose",
         "ROS 2: /slam/pose",
         True,
@@ -187,8 +187,8 @@ def test_a_camera_of_ros_is_waited_for_and_announced(
     def publish() -> None:
         while not done.wait(0.02):
             refused = "calibration refused" in caplog.text  # only then is there a right one
-            for each in (b"", b"garbage", bytes(200_000), *([bytes(data)] if refused else [])):
-                listener.session.put(data_key(0, topic), each)
+            for payload in (b"", b"garbage", bytes(200_000), *([bytes(data)] if refused else [])):
+                listener.session.put(data_key(0, topic), payload)
 
     common = {"source": "eye"}
     config = listener.config | {
@@ -228,9 +228,9 @@ def test_images_are_read_in_order_beside_the_loop(
     monkeypatch.setattr("nodes.ros2.bridge.node.Session", lambda *_, **__: session)
     monkeypatch.setattr("nodes.ros2.messages.incoming.image_pixels", read)
     table = {"topic": "/eye", "type": "sensor_msgs/msg/Image", "as": "image"}
-    found = run_node(Ros2Bridge, config={"subscriptions": [table]}, duration=0.1).of(Image)
-    assert [each.stamp for each in found] == [1, 2, 3, 4, 5]
-    np.testing.assert_array_equal(found[0].data, pixels[..., ::-1])
+    received = run_node(Ros2Bridge, config={"subscriptions": [table]}, duration=0.1).of(Image)
+    assert [event.stamp for event in received] == [1, 2, 3, 4, 5]
+    np.testing.assert_array_equal(received[0].data, pixels[..., ::-1])
     assert len(threads) == 5
     assert threading.current_thread() not in threads
     assert "5 received, 1 refused or dropped" in caplog.text

@@ -37,7 +37,7 @@ def bridge(monkeypatch: pytest.MonkeyPatch) -> Bridge:
 
 
 def stamps(messages: list[Any]) -> list[int]:
-    return [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in messages]
+    return [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in messages]
 
 
 def test_in_lockstep_every_image_is_published_in_order(bridge: Bridge) -> None:
@@ -46,9 +46,9 @@ def test_in_lockstep_every_image_is_published_in_order(bridge: Bridge) -> None:
     (images,), (info,), (clock,) = map(
         session.on, ("/drone/camera/image_raw", "/drone/camera/camera_info", "/clock")
     )
-    found = images.read()
-    assert stamps(found) == stamps(info.read()) == [each.stamp for each in sent]
-    assert found[0].data.tobytes() == sent[0].data.tobytes()
+    messages = images.read()
+    assert stamps(messages) == stamps(info.read()) == [image.stamp for image in sent]
+    assert messages[0].data.tobytes() == sent[0].data.tobytes()
     assert clock.sent >= 39
 
 
@@ -56,7 +56,7 @@ def test_sensors_are_best_effort_and_fixed_frames_are_kept(bridge: Bridge) -> No
     """As rclcpp's SensorDataQoS and tf2's broadcasters have it."""
     session = bridge([*ANNOUNCED, samples.odometry(1)])
     sensor, plain = "2::,5:,:,:,,", "::,10:,:,:,,"
-    assert {each.topic.name: each.topic.qos.text() for each in session.taken} == {
+    assert {publisher.topic.name: publisher.topic.qos.text() for publisher in session.taken} == {
         "/drone/camera/camera_info": sensor,
         "/drone/camera/image_raw": sensor,
         "/drone/camera/depth/camera_info": sensor,
@@ -105,7 +105,7 @@ def test_publications_of_one_topic_have_a_publisher_each(bridge: Bridge) -> None
         publications=[tell | {"source": "one"}, tell | {"source": "two"}, table | number],
     )
     one, two, three = session.on("/battery")
-    assert [each.sent for each in (one, two, three)] == [1, 1, 2]
+    assert [publisher.sent for publisher in (one, two, three)] == [1, 1, 2]
     assert three.topic.type == "std_msgs/msg/Float64"
     assert [message.data for message in three.read()] == [0.5, 0.5]
 
@@ -117,8 +117,8 @@ def test_points_of_a_camera_s_optical_frame_stay_as_they_are(bridge: Bridge) -> 
         PointCloud(stamp=1, source="c", frame_id=frame, points=points.copy(), colors=none)
         for frame in ("eye_optical_frame", "base_link", "map")
     ]
-    (found,) = bridge(clouds).on("/c/points")
-    rows = [message.data[:12].view(np.float32).tolist() for message in found.read()]
+    (publisher,) = bridge(clouds).on("/c/points")
+    rows = [message.data[:12].view(np.float32).tolist() for message in publisher.read()]
     assert rows == [[1.0, 2.0, 3.0], [1.0, -2.0, -3.0], [2.0, 1.0, -3.0]]
 
 

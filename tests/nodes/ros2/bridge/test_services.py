@@ -244,7 +244,7 @@ def test_a_step_ends_at_exactly_its_time() -> None:
         assert client.trigger("/drone/disarm") == (True, "Disarm is sent; time stands")
 
     result = driven(drive)
-    commands = [(type(each), each.stamp) for each in result.of(Command)]
+    commands = [(type(command), command.stamp) for command in result.of(Command)]
     assert commands == [(Arm, 0), (Disarm, 500_000_000)]
     assert result.seconds == 0.5
 
@@ -261,8 +261,8 @@ def test_vehicles_are_armed_take_off_and_land_and_the_reply_says_so() -> None:
         assert client.set_state(2) == 1
 
     commands = driven(drive).of(Command)
-    assert [type(each) for each in commands] == [Arm, Takeoff, Land]
-    assert {(each.vehicle, each.source) for each in commands} == {("drone", "ros2")}
+    assert [type(command) for command in commands] == [Arm, Takeoff, Land]
+    assert {(command.vehicle, command.source) for command in commands} == {("drone", "ros2")}
 
 
 @pytest.mark.slow
@@ -323,8 +323,8 @@ def test_a_flood_of_requests_is_refused_beyond_some_and_all_get_a_reply() -> Non
             )
             for n in range(4 * WAITING)
         ]
-        replies = [list(each) for each in asked]
-        assert {len(each) for each in replies} == {1}
+        replies = [list(query) for query in asked]
+        assert {len(answers) for answers in replies} == {1}
         sequences = [unpack(bytes(r.ok.attachment or b"")).sequence for (r,) in replies if r.ok]
         assert len(sequences) == len(set(sequences)) >= 1
         assert all(
@@ -366,7 +366,7 @@ def test_no_service_is_there_unless_it_is_wanted() -> None:
     with zenoh_session(listen=locator) as session:
         tokens: queue.SimpleQueue[str] = queue.SimpleQueue()
         session.liveliness().declare_subscriber(
-            "@ros2_lv/**", lambda each: tokens.put(str(each.key_expr))
+            "@ros2_lv/**", lambda sample: tokens.put(str(sample.key_expr))
         )
         result = run_node(
             Ros2Bridge,
@@ -374,11 +374,11 @@ def test_no_service_is_there_unless_it_is_wanted() -> None:
             config={"connect": [locator], "listen": []},
             duration=0.1,
         )
-        found = [tokens.get(timeout=10)]
+        keys = [tokens.get(timeout=10)]
     while not tokens.empty():
-        found.append(tokens.get())
+        keys.append(tokens.get())
     assert result.of(Command) == []
-    assert not [each for each in found if "/SS/" in each]
+    assert not [key for key in keys if "/SS/" in key]
 
 
 @pytest.mark.parametrize(

@@ -40,10 +40,10 @@ def test_tokens_and_messages_are_seen_from_outside_and_end_with_the_session() ->
             publisher.put(bytearray(message))
         first, second = samples.get(timeout=5), samples.get(timeout=5)
         assert str(first.key_expr) == data_key(3, TOPIC)
-        assert [each.payload.to_bytes() for each in (first, second)] == [b"one", b"two"]
-        said = [unpack(each.attachment.to_bytes()) for each in (first, second)]
-        assert [each.sequence for each in said] == [1, 2]
-        assert {each.gid for each in said} == {gid(published)}
+        assert [sample.payload.to_bytes() for sample in (first, second)] == [b"one", b"two"]
+        said = [unpack(sample.attachment.to_bytes()) for sample in (first, second)]
+        assert [attachment.sequence for attachment in said] == [1, 2]
+        assert {attachment.gid for attachment in said} == {gid(published)}
         assert session.close()
         gone = {str(tokens.get(timeout=5).key_expr) for _ in range(3)}
         assert gone == expected
@@ -62,8 +62,8 @@ def test_a_configuration_file_says_where_to_listen(tmp_path: Path) -> None:
     try:
         with zenoh_session(connect=f"tcp/127.0.0.1:{port}") as other:
             replies = list(other.liveliness().get("@ros2_lv/3/**"))
-            found = [str(each.ok.key_expr) for each in replies if each.ok is not None]
-            assert found == [node_token(NODE, session.zid, 0)]
+            keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+            assert keys == [node_token(NODE, session.zid, 0)]
     finally:
         session.close()
 
@@ -96,8 +96,8 @@ def test_what_a_file_leaves_out_is_as_without_it(tmp_path: Path) -> None:
         *("timestamping/enabled", "connect/exit_on_failure"),
     ]
     with_file, without = _configuration(None, None, str(file)), _configuration(None, None, "")
-    assert [with_file.get_json(each) for each in names] == [
-        without.get_json(each) for each in names
+    assert [with_file.get_json(name) for name in names] == [
+        without.get_json(name) for name in names
     ]
     assert without.get_json("listen/endpoints") == '["tcp/localhost:0"]'
     assert without.get_json("scouting/multicast/enabled") == "false"
@@ -105,8 +105,8 @@ def test_what_a_file_leaves_out_is_as_without_it(tmp_path: Path) -> None:
         '{ mode: "client", listen: { endpoints: ["tls/[::]:1"] }, '
         "scouting: { multicast: { enabled: true } }, timestamping: { enabled: false } }"
     )
-    found = _configuration((), None, str(file))
-    assert [found.get_json(each) for each in names[:5]] == [
+    configuration = _configuration((), None, str(file))
+    assert [configuration.get_json(name) for name in names[:5]] == [
         *('"client"', '["tls/[::]:1"]', "[]", "true"),
         "true",  # or there would be no /tf_static
     ]

@@ -61,16 +61,16 @@ class ActionClient:
         time = STORE.message("builtin_interfaces/msg/Time")(sec=stamp[0], nanosec=stamp[1])
         info = STORE.message("action_msgs/msg/GoalInfo")(goal_id=uuid(id_), stamp=time)
         response = self.client.call(f"{ACTION}/cancel_goal", CANCEL_GOAL, goal_info=info)
-        return response.return_code, [number(each) for each in response.goals_canceling]
+        return response.return_code, [number(goal) for goal in response.goals_canceling]
 
     def feedback(self) -> tuple[int, int, int]:
-        found = self.heard["feedback"].get(timeout=20)
-        counts = found.feedback
-        return number(found), counts.completed_steps, counts.remaining_steps
+        message = self.heard["feedback"].get(timeout=20)
+        counts = message.feedback
+        return number(message), counts.completed_steps, counts.remaining_steps
 
     def statuses(self) -> dict[int, int]:
-        found = self.heard["status"].get(timeout=20)
-        return {number(each.goal_info): each.status for each in found.status_list}
+        message = self.heard["status"].get(timeout=20)
+        return {number(status.goal_info): status.status for status in message.status_list}
 
 
 def uuid(id_: int) -> Any:
@@ -99,9 +99,9 @@ def test_parts_of_actions_have_the_hashes_that_ros_gives_them(type_: str, expect
     """The definitions are those of SimulateSteps, with another action's fields in their places."""
     name, store = "example_interfaces/action/Fibonacci", TypeStore()
     own = {"Goal": "int32 order", "Result": "int32[] sequence", "Feedback": "int32[] sequence"}
-    for each, definition in DEFINITIONS.items():
-        part = each.rpartition("_")[2]
-        if each.startswith(STEPS):
+    for type_name, definition in DEFINITIONS.items():
+        part = type_name.rpartition("_")[2]
+        if type_name.startswith(STEPS):
             text = own.get(part, definition.replace(STEPS, name))
             store.add(f"{name}_{part}", text)
     store.add(CANCEL_GOAL, DEFINITIONS[CANCEL_GOAL])
@@ -119,7 +119,7 @@ def test_a_goal_steps_time_and_tells_how_far_it_is() -> None:
             heard.append(action.feedback())
         assert heard == sorted(heard)
         assert heard[-1] == (7, 250, 0)
-        assert all(each[1] + each[2] == 250 for each in heard)
+        assert all(counts[1] + counts[2] == 250 for counts in heard)
         assert [action.statuses() for _ in range(2)] == [{7: EXECUTING}, {7: SUCCEEDED}]
         assert action.client.state() == 2
         assert action.client.step(1) == (1, "")

@@ -48,8 +48,8 @@ def message(
 ) -> Any:
     """Return what ROS reads in the message of an event; `sensors` are announced by kind."""
     out = Outgoing(store(), config, Stamps().out)
-    for each in announced:
-        out.announced(each)
+    for announcement in announced:
+        out.announced(announcement)
     for kind, sensor in sensors.items():
         out.sensors[kind, sensor.source] = sensor
     made = write(out, event)

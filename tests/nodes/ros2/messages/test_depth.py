@@ -36,26 +36,26 @@ def decoded(data: np.ndarray) -> np.ndarray:
 
 def test_depth_comes_back_within_its_step() -> None:
     depth = np.linspace(0.2, 9.99, 48 * 64, dtype=np.float32).reshape(48, 64)
-    found = decoded(message(depth).data)
-    np.testing.assert_array_less(np.abs(found - depth), 0.51 * depth**2 / 10_100 + 1e-4)
+    metres = decoded(message(depth).data)
+    np.testing.assert_array_less(np.abs(metres - depth), 0.51 * depth**2 / 10_100 + 1e-4)
 
 
 def test_what_is_unknown_or_too_far_stays_unknown_and_what_is_too_near_is_near() -> None:
     depth = np.array([[np.inf, 10.0, 25.0, 0.0, np.nan, 9.9, 0.05]], np.float32)
-    found = decoded(message(depth).data)[0]
-    assert np.isnan(found[:5]).all()
-    assert found[5] == pytest.approx(9.9, abs=0.006)
-    assert found[6] == pytest.approx(10_100 / (65_535 + 1009), rel=1e-4)
+    metres = decoded(message(depth).data)[0]
+    assert np.isnan(metres[:5]).all()
+    assert metres[5] == pytest.approx(9.9, abs=0.006)
+    assert metres[6] == pytest.approx(10_100 / (65_535 + 1009), rel=1e-4)
     assert decoded(message(depth, 30.0).data)[0, 2] == pytest.approx(25.0, abs=0.04)
 
 
 def test_its_header_and_format_are_those_of_the_plugin() -> None:
-    found = message(np.full((2, 2), 1.0, np.float32))
-    assert found.format == "32FC1; compressedDepth png"
-    assert (found.header.frame_id, found.header.stamp.sec) == ("eye", 3)
+    packed = message(np.full((2, 2), 1.0, np.float32))
+    assert packed.format == "32FC1; compressedDepth png"
+    assert (packed.header.frame_id, packed.header.stamp.sec) == ("eye", 3)
     # q (q + 1) and 1 - a / z_max as float32, as its encoder has them for 100 and 10 m.
-    assert bytes(found.data[:12]) == struct.pack("<iff", 0, 10_100.0, -1009.0)
-    assert bytes(found.data[12:20]) == b"\x89PNG\r\n\x1a\n"
+    assert bytes(packed.data[:12]) == struct.pack("<iff", 0, 10_100.0, -1009.0)
+    assert bytes(packed.data[12:20]) == b"\x89PNG\r\n\x1a\n"
 
 
 def test_inverse_depth_is_read() -> None:
@@ -67,9 +67,9 @@ def test_inverse_depth_is_read() -> None:
     _, png = cv2.imencode(".png", steps)
     data = np.frombuffer(HEAD.pack(0, a, b) + png.tobytes(), np.uint8)
     message = SimpleNamespace(format="32FC1; compressedDepth png", data=data)
-    found = decode_compressed(message)
-    assert found[0, :3] == pytest.approx(metres[0], rel=5e-3)
-    assert np.isinf(found[0, 3])
+    depth = decode_compressed(message)
+    assert depth[0, :3] == pytest.approx(metres[0], rel=5e-3)
+    assert np.isinf(depth[0, 3])
     for form, wrong in (("8UC1; compressedDepth", data), ("16UC1; compressedDepth", data[:12])):
         with pytest.raises(ValueError, match="expected"):
             decode_compressed(SimpleNamespace(format=form, data=wrong))

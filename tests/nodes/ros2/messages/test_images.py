@@ -148,9 +148,9 @@ def test_a_png_holds_the_image_and_names_it_as_image_transport_does(
     assert message.format == (
         "rgb8; png compressed bgr8" if colour else "mono8; png compressed mono8"
     )
-    found = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
-    assert found is not None
-    np.testing.assert_array_equal(found[..., ::-1] if colour else found, data)
+    image = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    np.testing.assert_array_equal(image[..., ::-1] if colour else image, data)
 
 
 def parsed(encoding: str, data: np.ndarray) -> Any:
@@ -196,12 +196,12 @@ def test_a_bayer_pattern_becomes_the_colour_that_it_is_of(
 ) -> None:
     """The name says the first two rows' first pixels (sensor_msgs/image_encodings.hpp)."""
     levels = {"R": 200, "G": 100, "B": 50}
-    cell = np.reshape([levels[each] for each in colours], (2, 2))
+    cell = np.reshape([levels[colour] for colour in colours], (2, 2))
     kind = np.uint16 if bits == 16 else np.uint8
     mosaic = (np.tile(cell, (4, 5)) * (257 if bits == 16 else 1)).astype(kind)
-    found = image_pixels(parsed(f"bayer_{pattern}{bits}", mosaic))
-    assert found.shape == (8, 10, 3)
-    assert (found[2:-2, 2:-2] == (200, 100, 50)).all()
+    image = image_pixels(parsed(f"bayer_{pattern}{bits}", mosaic))
+    assert image.shape == (8, 10, 3)
+    assert (image[2:-2, 2:-2] == (200, 100, 50)).all()
 
 
 @pytest.mark.parametrize("big", [0, 1])
@@ -237,12 +237,12 @@ def test_a_compressed_image_of_sixteen_bits_is_grey_or_millimetres() -> None:
 
 def test_depth_comes_in_metres_and_what_is_unknown_is_infinite() -> None:
     metres = np.array([[1.5, np.nan, np.inf], [0.0, -1.0, 2.0]], np.float32)
-    found = depth_pixels(parsed("32FC1", metres))
+    image = depth_pixels(parsed("32FC1", metres))
     inf = np.inf
-    np.testing.assert_array_equal(found, np.array([[1.5, inf, inf], [inf, inf, 2.0]], np.float32))
+    np.testing.assert_array_equal(image, np.array([[1.5, inf, inf], [inf, inf, 2.0]], np.float32))
     millimetres = np.array([[1500, 0, 2]], np.uint16)
-    found = depth_pixels(parsed("16UC1", millimetres))
-    np.testing.assert_allclose(found, [[1.5, inf, 0.002]], rtol=1e-6)
+    image = depth_pixels(parsed("16UC1", millimetres))
+    np.testing.assert_allclose(image, [[1.5, inf, 0.002]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

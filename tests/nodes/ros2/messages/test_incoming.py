@@ -218,10 +218,10 @@ def test_a_setpoint_is_for_the_vehicle_that_the_subscription_names() -> None:
 
 
 def test_a_calibration_becomes_an_announcement() -> None:
-    found = camera_announcement(samples.calibration(samples.camera()), "ros/eye", ("rgb",))
-    assert found.info == samples.camera().info
-    assert (found.source, found.images) == ("ros/eye", ("rgb",))
-    assert found.frame_id == "camera_optical_frame"
+    announcement = camera_announcement(samples.calibration(samples.camera()), "ros/eye", ("rgb",))
+    assert announcement.info == samples.camera().info
+    assert (announcement.source, announcement.images) == ("ros/eye", ("rgb",))
+    assert announcement.frame_id == "camera_optical_frame"
 
 
 LENSES = [
@@ -244,9 +244,9 @@ def test_each_distortion_goes_to_ros_and_back(info: CameraInfo) -> None:
     message = samples.calibration(camera)
     assert message.distortion_model == info.distortion_model
     assert message.p[3] == pytest.approx(-50.0 * 0.11)  # as stereo_image_proc reads it
-    found = camera_announcement(message, "eye", ("rgb",))
-    assert found.info == info
-    assert found.baseline == pytest.approx(0.11)
+    announcement = camera_announcement(message, "eye", ("rgb",))
+    assert announcement.info == info
+    assert announcement.baseline == pytest.approx(0.11)
 
 
 def test_coefficients_may_be_as_few_or_as_many_as_calibrators_write() -> None:

@@ -15,26 +15,29 @@ from tests.nodes.ros2.messages import samples
 
 
 def made(*announcements: object, body: str = "truth") -> Transforms:
-    found = Transforms(FrameNames(), "", body)
-    for each in announcements or (samples.vehicle(), samples.camera()):
-        found.announced(each)  # type: ignore[arg-type]
-    return found
+    transforms = Transforms(FrameNames(), "", body)
+    for announcement in announcements or (samples.vehicle(), samples.camera()):
+        transforms.announced(announcement)  # type: ignore[arg-type]
+    return transforms
 
 
 def lookup(transforms: Iterable[Transform], child: str) -> np.ndarray:
     """Return a frame in ``map``, shape (4, 4)."""
-    tree = {each.child: each for each in transforms}
+    tree = {transform.child: transform for transform in transforms}
     matrix = np.eye(4)
     while child != "map":
-        each = tree[child]
-        matrix = pose_matrix(each.translation, each.rotation) @ matrix
-        child = each.parent
+        step = tree[child]
+        matrix = pose_matrix(step.translation, step.rotation) @ matrix
+        child = step.parent
     return matrix
 
 
 def test_the_chain_is_that_of_rep_105() -> None:
     tree = made()
-    every = {each.child: each.parent for each in tree.static() + tree.odometry(samples.odometry())}
+    every = {
+        transform.child: transform.parent
+        for transform in tree.static() + tree.odometry(samples.odometry())
+    }
     assert every == {
         "odom": "map",
         "base_link": "odom",
@@ -84,7 +87,7 @@ def test_with_several_vehicles_each_has_its_name_before_its_frames() -> None:
     tree = made(samples.vehicle(), samples.camera(), other, samples.camera("other/camera"))
     moved = msgspec.structs.replace(samples.odometry(), source="other", position=(9.0, 0.0, -5.0))
     every = tree.static() + tree.odometry(samples.odometry()) + tree.odometry(moved)
-    assert {each.child: each.parent for each in every} == {
+    assert {transform.child: transform.parent for transform in every} == {
         f"{name}/{child}": parent if parent == "map" else f"{name}/{parent}"
         for name in ("drone", "other")
         for child, parent in {
@@ -103,13 +106,15 @@ def test_an_estimate_places_its_own_vehicle_and_the_truth_the_others() -> None:
     other = msgspec.structs.replace(samples.vehicle(), source="other")
     tree = made(samples.vehicle(), other, body="other/vo")
     moved = msgspec.structs.replace(samples.odometry(), source="other")
-    assert [each.child for each in tree.odometry(samples.odometry())] == ["drone/base_link"]
+    assert [transform.child for transform in tree.odometry(samples.odometry())] == [
+        "drone/base_link"
+    ]
     assert tree.odometry(moved) == []
     estimate = PoseEstimate(
         stamp=1, source="other/vo", position=(0.0, 0.0, 0.0), orientation=(1.0, 0.0, 0.0, 0.0)
     )
-    (found,) = tree.estimate(estimate)
-    assert (found.parent, found.child) == ("other/odom", "other/base_link")
+    (placed,) = tree.estimate(estimate)
+    assert (placed.parent, placed.child) == ("other/odom", "other/base_link")
 
 
 def test_a_vehicle_that_is_chosen_is_alone() -> None:
@@ -117,15 +122,15 @@ def test_a_vehicle_that_is_chosen_is_alone() -> None:
     tree = Transforms(FrameNames(), "other", "truth")
     tree.announced(samples.vehicle())
     tree.announced(other)
-    assert [each.child for each in tree.static()] == ["odom"]
+    assert [transform.child for transform in tree.static()] == ["odom"]
     assert tree.odometry(samples.odometry()) == []
     moved = msgspec.structs.replace(samples.odometry(), source="other")
-    assert [each.child for each in tree.odometry(moved)] == ["base_link"]
+    assert [transform.child for transform in tree.odometry(moved)] == ["base_link"]
 
 
 def test_two_cameras_of_one_name_have_frames_of_their_own() -> None:
     tree = made(samples.camera(), samples.camera("second/camera"))
-    assert {each.child for each in tree.static()} == {
+    assert {transform.child for transform in tree.static()} == {
         "camera_link",
         "camera_optical_frame",
         "second_camera_link",
@@ -177,13 +182,13 @@ def test_an_imu_is_where_it_is_mounted() -> None:
     tree = made(samples.vehicle(), imu)
     every = tree.static() + tree.odometry(samples.odometry())
     np.testing.assert_allclose(lookup(every, "imu")[:3, 3], (2.6, 0.8, 3.3), atol=1e-12)
-    assert not any(each.child == "base_link" for each in made(samples.imu()).static())
+    assert not any(transform.child == "base_link" for transform in made(samples.imu()).static())
 
 
 def test_a_sensor_is_where_it_is_mounted() -> None:
     tree = made(samples.vehicle(), lidar("drone/lidar"))
     every = tree.static() + tree.odometry(samples.odometry())
-    assert {"odom", "base_link", "lidar"} == {each.child for each in every}
+    assert {"odom", "base_link", "lidar"} == {transform.child for transform in every}
     np.testing.assert_allclose(lookup(every, "lidar")[:3, 3], (2.6, 0.8, 3.3), atol=1e-12)
     twice = TransformStamped(
         stamp=0,
@@ -197,7 +202,11 @@ def test_a_sensor_is_where_it_is_mounted() -> None:
     assert not tree.add_static(twice)
     other = msgspec.structs.replace(samples.vehicle(), source="other")
     tree = made(lidar("drone/lidar"), samples.vehicle(), other, lidar("other/lidar"))
-    assert {each.child: each.parent for each in tree.static() if "lidar" in each.child} == {
+    assert {
+        transform.child: transform.parent
+        for transform in tree.static()
+        if "lidar" in transform.child
+    } == {
         "drone/lidar": "drone/base_link",
         "other/lidar": "other/base_link",
     }
@@ -209,10 +218,10 @@ def test_a_body_that_moves_by_itself_has_a_frame_in_the_map() -> None:
     pose = PoseStamped(
         stamp=1, source="world/person", position=(1.0, 2.0, -3.0), orientation=samples.EAST
     )
-    (found,) = tree.pose(pose)
-    assert (found.parent, found.child) == ("map", "world/person")
-    assert found.translation == (2.0, 1.0, 3.0)
-    np.testing.assert_allclose(found.rotation, (1, 0, 0, 0), atol=1e-12)
+    (transform,) = tree.pose(pose)
+    assert (transform.parent, transform.child) == ("map", "world/person")
+    assert transform.translation == (2.0, 1.0, 3.0)
+    np.testing.assert_allclose(transform.rotation, (1, 0, 0, 0), atol=1e-12)
 
 
 def test_no_frame_gets_two_parents() -> None:
@@ -229,7 +238,7 @@ def test_no_frame_gets_two_parents() -> None:
     assert not tree.add_static(mounting)
     assert tree.add_static(msgspec.structs.replace(mounting, child_frame_id="lidar"))
     assert not tree.add_static(msgspec.structs.replace(mounting, child_frame_id="lidar"))
-    children = [each.child for each in tree.static()]
+    children = [transform.child for transform in tree.static()]
     assert len(children) == len(set(children)) == 4
     for taken in ("base_link", "odom", "lidar", "drone/camera_optical"):
         moving = msgspec.structs.replace(mounting, static=False, child_frame_id=taken)

@@ -120,9 +120,9 @@ def features(stamp: int) -> TrackedFeatures:
 def decoded(coded: bytes | list[int], mode: int) -> npt.NDArray[Any]:
     """Read a JPEG or PNG."""
     data = np.frombuffer(coded, np.uint8) if isinstance(coded, bytes) else np.array(coded, np.uint8)
-    found = cv2.imdecode(data, mode)
-    assert found is not None
-    return found
+    image = cv2.imdecode(data, mode)
+    assert image is not None
+    return image
 
 
 class Recorded:

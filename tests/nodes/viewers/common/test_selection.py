@@ -31,7 +31,7 @@ def test_set_points_are_the_plan_only_where_there_is_none() -> None:
         PositionSetpoint(stamp=0, source="tour", position=(0.0, 0.0, 0.0), yaw=0.0),
     )
     selection = PlanSelection()
-    assert [selection.select(each) for each in (point, plan, point, plan)] == [
+    assert [selection.select(event) for event in (point, plan, point, plan)] == [
         True,
         True,
         False,

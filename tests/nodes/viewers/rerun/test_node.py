@@ -52,15 +52,15 @@ def flight(seconds: float) -> list[Event]:
 def test_in_lockstep_all_is_recorded_and_as_many_images_as_asked_for(tmp_path: Path) -> None:
     inputs = [VEHICLE, CAMERA, ESTIMATOR, *flight(1.9)]
     run_node(RerunView, inputs=inputs, config={"image_rate": 4}, duration=1.9, out=tmp_path)
-    found = Recorded(tmp_path / "flight.rrd")
-    poses = found.stamps("map/drone", "Transform3D:translation")
+    recorded = Recorded(tmp_path / "flight.rrd")
+    poses = recorded.stamps("map/drone", "Transform3D:translation")
     assert poses == [i * 10 * MS for i in range(190)]
     entity = "map/drone/camera"
     expected = [i * 250 * MS for i in range(8)]
-    assert found.stamps(f"{entity}/rgb", "EncodedImage:blob") == expected
-    assert found.stamps(f"{entity}/depth", "EncodedDepthImage:blob") == expected
-    assert found.stamps(f"{entity}/rgb/features/vo", "Points2D:positions") == expected
-    numbers = [n or 0 for _, n, _ in found.of("map/drone", "Transform3D:translation")]
+    assert recorded.stamps(f"{entity}/rgb", "EncodedImage:blob") == expected
+    assert recorded.stamps(f"{entity}/depth", "EncodedDepthImage:blob") == expected
+    assert recorded.stamps(f"{entity}/rgb/features/vo", "Points2D:positions") == expected
+    numbers = [n or 0 for _, n, _ in recorded.of("map/drone", "Transform3D:translation")]
     assert numbers == sorted(set(numbers))
 
 
@@ -183,9 +183,9 @@ def test_the_file_is_complete_after_ctrl_c(tmp_path: Path) -> None:
         process.kill()
         process.wait()
     sent = json.loads((tmp_path / "summary.json").read_text())["events"]
-    found = Recorded(file)
-    assert len(found.of("map/drone", "Transform3D:translation")) == sent["Odometry"]
-    assert len(found.of("imu/angular_velocity/drone/imu", "Scalars:scalars")) == sent["Imu"]
+    recorded = Recorded(file)
+    assert len(recorded.of("map/drone", "Transform3D:translation")) == sent["Odometry"]
+    assert len(recorded.of("imu/angular_velocity/drone/imu", "Scalars:scalars")) == sent["Imu"]
 
 
 def free_port() -> int:

@@ -38,10 +38,10 @@ def test_what_is_high_above_the_camera_is_left_out() -> None:
 
 def test_points_need_one_exposure_and_their_time() -> None:
     shown = scene_points(rate=2.0)
-    found = []
+    clouds = []
     for stamp in range(0, 1000 * MS, 100 * MS):
         shown.take(camera_pose(stamp))
         shown.take(depth(stamp))
         assert shown.take(image(stamp + MS)) is None  # another exposure
-        found.append(shown.take(image(stamp)))
-    assert sum(each is not None for each in found) == 2
+        clouds.append(shown.take(image(stamp)))
+    assert sum(cloud is not None for cloud in clouds) == 2

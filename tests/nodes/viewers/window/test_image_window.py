@@ -226,16 +226,16 @@ def test_images_of_two_cameras_are_warned_of_once(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("settings", "found"),
+    ("settings", "message"),
     [({}, "DISPLAY is not set"), ({"DISPLAY": ":4711"}, "DISPLAY=:4711, X11: Failed to open")],
 )
-def test_without_a_display_one_line_says_what_to_do(settings: dict[str, str], found: str) -> None:
+def test_without_a_display_one_line_says_what_to_do(settings: dict[str, str], message: str) -> None:
     """No display is an error in one line, which says what was found and how to do without."""
     run = start(without_display() | settings, KEYBOARD)
     output, _ = run.communicate(timeout=30)
     error = json.loads(output.splitlines()[-1])["error"]
     assert run.returncode == 2
     assert "expected a display (X11 or Wayland), found none" in error
-    assert found in error
+    assert message in error
     assert "xvfb-run" in error
     assert "\n" not in error

@@ -218,7 +218,7 @@ class Guesser(Node[GuesserConfig]):
         """Guess."""
         total = 0.0
         async for pair in self.pairs:
-            total += pair.seen.number + sum(each.number for each in pair.felt)
+            total += pair.seen.number + sum(reading.number for reading in pair.felt)
             await self.offload_for(self.config.latency, float, total)
             self.guesses.send(Guess(stamp=self.clock.now(), source=self.name, number=total))
             if self.config.end and self.clock.now() > self.config.end * 1e9:

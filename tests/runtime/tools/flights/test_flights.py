@@ -63,8 +63,8 @@ def assert_equal_when_played(
     ):
         assert getattr(again, field) == getattr(summary, field), field
     assert again.environment["craft"] == "nothing to be seen"
-    ticks = {name: each.calls for name, each in summary.ticks.items()}
-    assert {name: each.calls for name, each in again.ticks.items()} == ticks
+    ticks = {name: tick.calls for name, tick in summary.ticks.items()}
+    assert {name: tick.calls for name, tick in again.ticks.items()} == ticks
 
 
 @pytest.mark.slow
@@ -136,7 +136,7 @@ def test_flights_are_told_apart_by_what_they_depend_on(tmp_path: Path) -> None:
         return settings_key(part), content_key(part)
 
     assert keys() == keys("guesser.latency=1ms", "run.log=error", "run.name=other")
-    different = [keys(each) for each in ("craft.rate=20", "run.seed=9", "run.duration=2s")]
+    different = [keys(changes) for changes in ("craft.rate=20", "run.seed=9", "run.duration=2s")]
     assert len({*different, keys()}) == 4
 
 
@@ -151,12 +151,12 @@ def test_the_key_knows_what_a_world_includes(tmp_path: Path) -> None:
     world = tmp_path / "world.xml"
     world.write_text('<mujoco><compiler meshdir="meshes"/><include file="part.xml"/></mujoco>')
     config = load(ROOT / "config.toml", [f"drone.world={world}"])
-    found = flight_of(config)
-    assert found is not None
-    keys = {content_key(found)}
+    flight = flight_of(config)
+    assert flight is not None
+    keys = {content_key(flight)}
     for file in (mesh, part, world):
         file.write_text(file.read_text() + "\n")
-        keys.add(content_key(found))
+        keys.add(content_key(flight))
     assert len(keys) == 4
 
 
@@ -299,16 +299,16 @@ def test_one_flies_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyP
         fly(config, path)
 
     monkeypatch.setattr("runtime.tools.flights.fly", counted)
-    found: list[bool] = []
+    answers: list[bool] = []
     threads = [
-        threading.Thread(target=lambda: found.append(recorded(config, record=True) is not None))
+        threading.Thread(target=lambda: answers.append(recorded(config, record=True) is not None))
         for _ in range(3)
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert found == [True] * 3
+    assert answers == [True] * 3
     assert len(flights) == 1
 
 
@@ -319,14 +319,14 @@ def test_those_not_used_for_longest_go_first(
     configs = [flown(tmp_path, "captain.end=0.2", f"run.seed={seed}") for seed in range(3)]
     for config in configs:
         recorded(config, record=True)
-    for age, each in enumerate(kept()):
-        os.utime(each.path, (1000 - age, 1000 - age))
+    for age, flight in enumerate(kept()):
+        os.utime(flight.path, (1000 - age, 1000 - age))
     newest, _, oldest = kept()
     used = next(c for c in configs if content_key(flight_of(c) or c) == oldest.path.stem)
     played = recorded(used, record=False)
     (removed,) = remove_beyond((oldest.size + newest.size + 9) / 1e9)
     assert removed.path not in {oldest.path, newest.path}
-    assert [each.path for each in kept()] == [oldest.path, newest.path]
+    assert [recording.path for recording in kept()] == [oldest.path, newest.path]
     remove_beyond(0)
     assert kept() == []
     summary, lines = events_of(used, watch=played)  # what is open stays

@@ -13,7 +13,7 @@ from runtime.tools.monitor.protocol import Answer, Command, LogLine, Snapshot
 
 def snapshot(**changes: Any) -> Snapshot:
     """Return a snapshot of a run with a drone, an estimator and a pilot."""
-    found = Snapshot(
+    default = Snapshot(
         headline="sample   1.500 of 60 s   2.00 × real time (as fast as it can)   runs",
         now=1.5,
         ended="",
@@ -36,7 +36,7 @@ def snapshot(**changes: Any) -> Snapshot:
         cameras=["drone.images: drone/front"],
         log=[LogLine(number=0, level="WARNING", text="     0.500 WARNING  pilot: [b]wind[/b]")],
     )
-    return msgspec.structs.replace(found, **changes)
+    return msgspec.structs.replace(default, **changes)
 
 
 class FakeClient:
@@ -45,13 +45,13 @@ class FakeClient:
     def __init__(self, *snapshots: Snapshot | None) -> None:
         self.asked: list[Command] = []
         self.coming: asyncio.Queue[Snapshot | None] = asyncio.Queue()
-        for each in snapshots:
-            self.coming.put_nowait(each)
+        for snapshot in snapshots:
+            self.coming.put_nowait(snapshot)
 
     async def snapshots(self) -> AsyncIterator[Snapshot]:
         """Yield snapshots until there is `None` instead."""
-        while (found := await self.coming.get()) is not None:
-            yield found
+        while (snapshot := await self.coming.get()) is not None:
+            yield snapshot
 
     async def ask(self, command: Command) -> Answer:
         """Remember a command."""

@@ -116,7 +116,7 @@ def _turned(x: float, y: float, yaw: float) -> tuple[float, float, float]:
     [
         (lambda *pose: pose, {}, "map"),
         (_turned, {}, "odom"),
-        (lambda *pose: [0.2 * each for each in _turned(*pose)], {"scale_free": True}, "odom"),
+        (lambda *pose: [0.2 * part for part in _turned(*pose)], {"scale_free": True}, "odom"),
     ],
 )
 def test_an_estimate_is_laid_on_the_truth(
@@ -170,8 +170,8 @@ def test_an_image_is_shown_with_the_features_of_its_own_time() -> None:
     for stamp in (1, 2):
         run.send(image(stamp), "drone.images")
     run.send(image(0, "drone/rear", "rear"), "drone.images")
-    shown, found = run.measured.image(camera)
-    assert (shown.stamp, [each.stamp for each in found]) == (0, [0])
+    shown, drawn = run.measured.image(camera)
+    assert (shown.stamp, [event.stamp for event in drawn]) == (0, [0])
     assert run.measured.image("drone.images: drone/rear")[1] == []
     for stamp in range(3, 9):
         run.send(image(stamp), "drone.images")

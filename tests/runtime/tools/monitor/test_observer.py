@@ -49,8 +49,8 @@ def observe(script: Script, **options: Any) -> Looked:
 
 def row(snapshot: Snapshot, table: str, name: str) -> dict[str, str]:
     """Return the cells of a row by the titles of its table's columns."""
-    assert {len(each) for each in snapshot.tables[table]} == {len(COLUMNS[table])}
-    cells = {each[0]: each for each in snapshot.tables[table]}[name]
+    assert {len(cells) for cells in snapshot.tables[table]} == {len(COLUMNS[table])}
+    cells = {row_cells[0]: row_cells for row_cells in snapshot.tables[table]}[name]
     return dict(zip(COLUMNS[table], cells, strict=True))
 
 
@@ -220,14 +220,14 @@ def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(observer, "time", types.SimpleNamespace(perf_counter_ns=lambda: now[0]))
     loop = LockstepLoop()
     try:
-        found = Meter(LockstepClock(loop), Measured(Mock()))
+        meter = Meter(LockstepClock(loop), Measured(Mock()))
 
         def fail(_: Any) -> None:
             work(5)
             raise RuntimeError
 
-        inner = found.wrap_call("b", "hear", work)
-        failing = found.wrap_call("c", "hear", fail)
+        inner = meter.wrap_call("b", "hear", work)
+        failing = meter.wrap_call("c", "hear", fail)
 
         def outer(_: Any) -> None:
             work(10)
@@ -237,9 +237,9 @@ def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) 
                 failing(None)
             work(20)
 
-        found.wrap_call("a", "tick", outer)(None)
-        found.wrap_call("a", "tick", work)(7)
+        meter.wrap_call("a", "tick", outer)(None)
+        meter.wrap_call("a", "tick", work)(7)
     finally:
         loop.close()
-    assert found.take() == {"a": Amount(2, 37, 30), "b": Amount(2, 300, 200), "c": Amount(1, 5, 5)}
-    assert found.take() == {}
+    assert meter.take() == {"a": Amount(2, 37, 30), "b": Amount(2, 300, 200), "c": Amount(1, 5, 5)}
+    assert meter.take() == {}

@@ -11,9 +11,9 @@ from tests.runtime.tools.monitor.samples import snapshot
 def test_every_table_has_its_columns_and_a_place() -> None:
     assert [*chain(*STACKS)] == [*COLUMNS]
     for name, columns in COLUMNS.items():
-        found = snapshot().tables[name]
-        assert found
-        assert {len(row) for row in found} == {len(columns)}
+        rows = snapshot().tables[name]
+        assert rows
+        assert {len(row) for row in rows} == {len(columns)}
 
 
 def test_columns_are_of_words_or_numbers() -> None:

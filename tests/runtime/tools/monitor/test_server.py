@@ -70,8 +70,8 @@ async def attached(*commands: Command) -> tuple[list[Snapshot], list[Any]]:
     async def ask_all() -> list[Any]:
         return [await connection.ask(command) for command in commands]
 
-    async for found in connection.snapshots():
-        seen.append(found)
+    async for snapshot in connection.snapshots():
+        seen.append(snapshot)
         asking = asking or asyncio.create_task(ask_all())
         if len(seen) >= 3 and asking.done():
             break
@@ -83,7 +83,7 @@ async def attached(*commands: Command) -> tuple[list[Snapshot], list[Any]]:
 def test_snapshots_come_and_commands_are_answered(clock: str) -> None:
     def outside() -> None:
         seen, answers = asyncio.run(attached(Set(text="pilot.gain=3"), Speed(factor=5.0)))
-        times = [each.now for each in seen]
+        times = [snapshot.now for snapshot in seen]
         assert times == sorted(times)
         assert [node[0] for node in seen[0].tables["nodes"]] == ["drone", "vo", "pilot"]
         changed, paced = answers
@@ -99,9 +99,9 @@ def test_images_come_to_those_who_watch_and_ask() -> None:
     async def looking() -> None:
         connection = Client(find("sample"))
         asked: asyncio.Task[Any] | None = None
-        async for found in connection.snapshots():
-            if asked is None and found.cameras:
-                asked = asyncio.create_task(_images(found.cameras))
+        async for snapshot in connection.snapshots():
+            if asked is None and snapshot.cameras:
+                asked = asyncio.create_task(_images(snapshot.cameras))
             elif asked is not None and asked.done():
                 break
         assert asked is not None
@@ -113,8 +113,8 @@ def test_images_come_to_those_who_watch_and_ask() -> None:
 
 async def _images(cameras: list[str]) -> None:
     assert cameras == ["drone.images: drone/front"]
-    found = await Client(find(None)).ask(Look(camera=cameras[0]))
-    assert found.jpeg[:2] == b"\xff\xd8"
+    answer = await Client(find(None)).ask(Look(camera=cameras[0]))
+    assert answer.jpeg[:2] == b"\xff\xd8"
     refused = await Client(find(None)).ask(Look(camera="drone.images: drone/rear"))
     assert not refused.done
     assert refused.text.startswith("expected a camera that has sent images")
@@ -154,8 +154,8 @@ def test_who_looks_sees_the_end() -> None:
         async def until_the_end() -> list[Snapshot]:
             connection = Client(find(None))
             seen = []
-            async for found in connection.snapshots():
-                seen.append(found)
+            async for snapshot in connection.snapshots():
+                seen.append(snapshot)
                 if len(seen) == 1:
                     asking.append(asyncio.create_task(connection.ask(Stop())))
             return seen
@@ -218,17 +218,17 @@ def test_those_who_read_nothing_do_not_hold_up_the_end(
     watching = [socket.socket(socket.AF_UNIX) for _ in range(8)]
 
     def outside() -> None:
-        for each in watching:
-            each.connect(str(find(None)))
-            each.sendall(b'{"do":"watch"}\n')
+        for client in watching:
+            client.connect(str(find(None)))
+            client.sendall(b'{"do":"watch"}\n')
         assert enough.wait(10)
 
     try:
         assert served(outside).supervisor.state.reason == "seen enough"
         assert list(sockets.iterdir()) == []  # its thread has come to its end
     finally:
-        for each in watching:
-            each.close()
+        for sock in watching:
+            sock.close()
 
 
 def test_who_reads_no_answers_is_asked_for_no_more() -> None:
@@ -258,10 +258,10 @@ def test_measuring_begins_and_ends_with_those_who_watch(monkeypatch: pytest.Monk
 
     def outside() -> None:
         watching = [socket.socket(socket.AF_UNIX) for _ in range(2)]
-        for each in watching:
-            each.connect(str(find(None)))
-            each.sendall(b'{"do":"watch"}\n')
-            assert each.makefile("rb").readline()
+        for client in watching:
+            client.connect(str(find(None)))
+            client.sendall(b'{"do":"watch"}\n')
+            assert client.makefile("rb").readline()
         one, other = watching
         one.close()
         other.makefile("rb").readline()

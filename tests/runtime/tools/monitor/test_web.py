@@ -51,8 +51,8 @@ class FakeRun:
                 return
             self.asked.append(request)
             if isinstance(request, Watch):
-                for each in self.snapshots:
-                    writer.write(encode(each) + b"\n" if each is not None else b"")
+                for snapshot in self.snapshots:
+                    writer.write(encode(snapshot) + b"\n" if snapshot is not None else b"")
                 if None not in self.snapshots:
                     await self.goes_on.wait()
             elif isinstance(request, Look) and request.camera != "drone.images: drone/front":
@@ -177,7 +177,7 @@ async def test_snapshots_come_as_events_and_so_does_the_end() -> None:
     async with serving(run) as port:
         head, _, body = (await say(port, get(f"/events?token={TOKEN}"))).partition("\r\n\r\n")
     assert "content-type: text/event-stream" in head
-    events = [json.loads(each.removeprefix("data: ")) for each in body.strip().split("\n\n")]
+    events = [json.loads(event.removeprefix("data: ")) for event in body.strip().split("\n\n")]
     assert events == [
         json.loads(encode(snapshot())),
         json.loads(encode(snapshot(ended="duration"))),

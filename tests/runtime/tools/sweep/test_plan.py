@@ -30,9 +30,9 @@ def test_every_combination_once_the_first_parameter_slowest(
     vary = [f"judge.rate={','.join(map(str, rates))}"]
     vary += [f"judge.latency={','.join(f'{ms}ms' for ms in latencies)}"]
     plan = plan_in(tmp_path, *vary, seeds=seeds)
-    found = [(*(text for _, text in job.settings), job.seed) for job in plan.jobs]
+    combinations = [(*(text for _, text in job.settings), job.seed) for job in plan.jobs]
     names = [str(rate) for rate in rates], [f"{ms}ms" for ms in latencies]
-    assert found == list(itertools.product(*names, range(3, 3 + seeds)))
+    assert combinations == list(itertools.product(*names, range(3, 3 + seeds)))
     assert len({job.id for job in plan.jobs}) == len(plan.jobs)
 
 

@@ -68,8 +68,8 @@ def test_a_summary_has_the_spread_over_the_seeds_and_counts_what_failed(tmp_path
     assert (last.passed, last.figures) == (None, {})
     write_tables(plan, rows)
     line = read(plan.out / "summary.csv")[0]
-    found = [float(line[f"ate_percent_{what}"]) for what in ("median", "q1", "q3", "min", "max")]
-    assert found == pytest.approx([1.05, 1.04, 1.055, 1.03, 1.06])
+    values = [float(line[f"ate_percent_{what}"]) for what in ("median", "q1", "q3", "min", "max")]
+    assert values == pytest.approx([1.05, 1.04, 1.055, 1.03, 1.06])
     assert line["ate_rmse_m_median"] == ""
 
 
@@ -135,8 +135,8 @@ def aligned(plan: Plan) -> list[Row]:
 def test_errors_after_different_alignments_are_marked_and_never_in_one_line(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.rate=1,2", seeds=2)
     rows = aligned(plan)
-    found = lines(plan, rows, plan.parameters[0], "ate_percent")
-    assert [line.label for line in found] == ["vo (origin)", "slam (sim3)"]
+    curves = lines(plan, rows, plan.parameters[0], "ate_percent")
+    assert [line.label for line in curves] == ["vo (origin)", "slam (sim3)"]
     assert "different alignments" in summary_text(plan, rows)
     write_tables(plan, rows)
     page = write_page(plan, rows).read_text(encoding="utf-8")
@@ -146,8 +146,8 @@ def test_errors_after_different_alignments_are_marked_and_never_in_one_line(tmp_
     rows[0]["estimators"]["vo"]["alignment"] = "se3"  # of one seed of two
     vo, *_ = summarise(plan, rows)
     assert vo.alignment == "origin or se3"
-    found = lines(plan, rows, plan.parameters[0], "ate_percent")
-    assert [len(line.texts) for line in found] == [1, 2, 2]
+    curves = lines(plan, rows, plan.parameters[0], "ate_percent")
+    assert [len(line.texts) for line in curves] == [1, 2, 2]
     write_tables(plan, rows)
     table = read(plan.out / "table.csv")
     assert list(table[0]).index("alignment") == list(table[0]).index("ate_percent") - 1
@@ -204,7 +204,7 @@ def test_missed_and_failed_runs_are_two_counts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("digests", "found"),
+    ("digests", "repeatable"),
     [
         (["a", "a", "a"], "3 of 3 equal"),
         (["a", "b", "a"], "differs: 1 to 1.2 %"),
@@ -213,7 +213,7 @@ def test_missed_and_failed_runs_are_two_counts(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_said_of_an_estimator_that_is_run_again(
-    tmp_path: Path, digests: list[str | None], found: str
+    tmp_path: Path, digests: list[str | None], repeatable: str
 ) -> None:
     plan = plan_in(tmp_path, repeats=3)
     rows = []
@@ -222,12 +222,12 @@ def test_what_is_said_of_an_estimator_that_is_run_again(
         row["digests"] = {"vo": digest} if digest else {}
         rows.append(row if digest else crashed(job, "out of order"))
     (vo,) = summarise(plan, rows)
-    assert (vo.repeatable, vo.runs) == (found, 3)
+    assert (vo.repeatable, vo.runs) == (repeatable, 3)
     write_tables(plan, rows)
     assert [line["repeat"] for line in read(plan.out / "table.csv")] == ["1", "2", "3"]
-    assert read(plan.out / "summary.csv")[0]["repeatable"] == found
+    assert read(plan.out / "summary.csv")[0]["repeatable"] == repeatable
     page = write_page(plan, rows).read_text(encoding="utf-8")
-    assert f"<td>{found}</td>" in page
+    assert f"<td>{repeatable}</td>" in page
 
 
 def test_other_seeds_are_not_expected_to_be_equal(tmp_path: Path) -> None:

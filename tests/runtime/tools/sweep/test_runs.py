@@ -207,7 +207,7 @@ def test_a_sweep_that_is_killed_leaves_nothing_running(tmp_path: Path) -> None:
     )
     config = judge_file(tmp_path, type_="own:Own", run="clock = 'real'")
     with started([config, "--out", "out"], tmp_path) as process:
-        numbers = [int(each) for each in sign.read_text().split()]
+        numbers = [int(number) for number in sign.read_text().split()]
         process.kill()
         process.wait()
         assert all(gone(number) for number in numbers)
@@ -268,8 +268,8 @@ def test_what_a_process_leaves_becomes_a_row(
     if results is not None:
         (out / "summary.json").write_text(json.dumps(results), encoding="utf-8")
     row = read_results(job, code, 2.0)
-    found = {key: value for key, value in row.items() if key in expected}
-    assert found == {
+    cells = {key: value for key, value in row.items() if key in expected}
+    assert cells == {
         key: value.replace("ID", job.id) if key == "error" else value
         for key, value in expected.items()
     }

@@ -55,8 +55,8 @@ def test_no_text_gives_an_empty_value_or_another_error(text: str) -> None:
 
 
 def test_a_path_with_values() -> None:
-    found = parameter('node.key = 1, [2, "a,]"],"x,y",it\'s,80ms, {a = 1, b = 2}')
-    assert found == Parameter(
+    result = parameter('node.key = 1, [2, "a,]"],"x,y",it\'s,80ms, {a = 1, b = 2}')
+    assert result == Parameter(
         "node.key", ("1", '[2, "a,]"]', '"x,y"', "it's", "80ms", "{a = 1, b = 2}")
     )
 
@@ -94,6 +94,6 @@ def test_mistakes(change: str, message: str) -> None:
     ],
 )
 def test_where_values_lie_on_an_axis(texts: tuple[str, ...], expected: Axis) -> None:
-    found = axis(texts)
-    assert found.places == pytest.approx(expected.places)
-    assert (found.unit, found.words) == (expected.unit, expected.words)
+    result = axis(texts)
+    assert result.places == pytest.approx(expected.places)
+    assert (result.unit, result.words) == (expected.unit, expected.words)

@@ -37,7 +37,7 @@ class Story:
 
 
 def path(sent: SentEvent) -> list[tuple[str, str]]:
-    return [(each.event, each.how) for each in sent.path()]
+    return [(step.event, step.how) for step in sent.path()]
 
 
 def test_an_estimate_follows_from_the_image_whose_stamp_it_bears() -> None:

@@ -75,11 +75,11 @@ def test_slices_nest_on_every_track_and_arrows_begin_and_end_in_slices(tmp_path:
             tracks[event.pid, event.tid].append(event)
     for slices in tracks.values():
         open_: list[TraceEvent] = []
-        for each in sorted(slices, key=lambda e: (e.ts, -e.dur)):
-            while open_ and open_[-1].ts + open_[-1].dur <= each.ts:
+        for span in sorted(slices, key=lambda e: (e.ts, -e.dur)):
+            while open_ and open_[-1].ts + open_[-1].dur <= span.ts:
                 open_.pop()
-            assert not open_ or each.ts + each.dur <= open_[-1].ts + open_[-1].dur + 1e-3
-            open_.append(each)
+            assert not open_ or span.ts + span.dur <= open_[-1].ts + open_[-1].dur + 1e-3
+            open_.append(span)
     arrows = [event for event in trace.events if event.ph in "stf"]
     assert [a.ph for a in arrows] == ["s", "t", "t", "f"] * 10
     assert all(a.ts <= b.ts for a, b in itertools.pairwise(arrows) if b.ph != "s")
@@ -98,7 +98,7 @@ def test_all_that_a_node_did_has_its_place(tmp_path: Path) -> None:
     assert names[LOOP, "vo"] == {"run", "send PoseEstimate"}
     assert names[LOOP, "pilot"] == {"fly", "send VelocitySetpoint"}
     assert names[SENSORS, "drone/front"] == {"Image exposed"}
-    offloaded = [n for (pid, _), found in names.items() if pid == THREADS for n in found]
+    offloaded = [n for (pid, _), spans in names.items() if pid == THREADS for n in spans]
     assert set(offloaded) == {"vo: mean"}
     assert [share.node for share in node_loads(trace)].count("vo") == 1
 
