@@ -29,8 +29,8 @@ $(CORE): pyproject.toml setup.py $(wildcard sims/cameras/rasteriser/*)
 	@touch $@
 
 # The tests compare with MuJoCo's renderer, through EGL; what it lacks is installed if we may.
-$(READY): $(CORE) $(wildcard extensions/*/pyproject.toml)
-	$(INSTALL) -e '.[dev,docs]' $(addprefix -e ,$(wildcard extensions/*/))
+$(READY): $(CORE) $(wildcard extensions/*/pyproject.toml) bench/pyproject.toml
+	$(INSTALL) -e '.[dev,docs]' $(addprefix -e ,$(wildcard extensions/*/)) -e ./bench
 	@sh tools/system_packages.sh gl $(BIN)/python
 	@touch $@
 
@@ -89,7 +89,7 @@ suite: $(READY)  ## Judge all estimators that are installed in all scenarios; wr
 	$(BIN)/python -m runtime suite --page bench/SUITE.md
 
 peers: $(READY)  ## Install what the benchmarks compare with (PyPI, and Debian's ROS 1 and C++).
-	$(INSTALL) -e '.[peers]'
+	$(INSTALL) -e './bench[peers]'
 	@sh tools/system_packages.sh peers
 
 bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (about 20 minutes).

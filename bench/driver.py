@@ -21,6 +21,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+import bench.systems
 from bench.benchmarks import Progress, Row
 from bench.harness import in_turns, silent
 from bench.system import Case, CaseName, Mode, Samples, System
@@ -41,16 +42,14 @@ class Outcome(msgspec.Struct, frozen=True):
     versions: dict[str, str]
 
 
-RIVALS = Path(__file__).with_name("systems")
-"""Folder of the systems to compare the runtime with; absent from wheels."""
-
-
 def systems() -> dict[str, tuple[System, ...]]:
-    """Return all systems by module, ours first; without a checkout, there are no others."""
+    """Return all systems by module, ours first."""
     modules = ["bench.ours"]
-    modules += [f"bench.systems.{module.name}" for module in pkgutil.iter_modules([str(RIVALS)])]
-    found = {name: getattr(importlib.import_module(name), "SYSTEMS", ()) for name in modules}
-    return {name: entries for name, entries in found.items() if entries}
+    modules += [
+        f"bench.systems.{module.name}" for module in pkgutil.iter_modules(bench.systems.__path__)
+    ]
+    measured = {name: getattr(importlib.import_module(name), "SYSTEMS", ()) for name in modules}
+    return {name: entries for name, entries in measured.items() if entries}
 
 
 def measure_all(
@@ -74,8 +73,6 @@ def measure_all(
     """
     wanted = tuple(part.lower() for part in only)
     missing: dict[str, str] = {}
-    if not RIVALS.is_dir():
-        missing["all other systems"] = "only a checkout of the project has what measures them"
     versions: dict[str, str] = {}
     jobs: list[tuple[str, System, Mode, int]] = []
     known = systems()

@@ -104,13 +104,14 @@ OURS = "visnav-runtime"
 
 EXTENSIONS = {
     "airsim": ("AirsimClient", "AirsimServer", ".json"),
-    "estimators": ("Evalio", "OrbSlam3", "Svo", "Vit", "VocabularyTrainer"),
+    "bench": ("bench",),
+    "estimators": ("Evalio", "OrbSlam3", "Svo", "Vit", "VocabularyTrainer", "vocabulary"),
     "foxglove": ("FoxgloveServer",),
     "machines": ("Peers",),
     "mavlink": ("Mavlink", "Px4"),
 }
-"""What the extensions of this repository offer: nodes, suffixes of configuration files, and the
-processes of a run beside this one."""
+"""What the extensions of this repository offer: nodes, suffixes of configuration files, commands,
+and the processes of a run beside this one."""
 
 
 def is_ours(package: str) -> bool:
@@ -120,10 +121,11 @@ def is_ours(package: str) -> bool:
 
 
 def missing_extension(offered: str) -> str:
-    """Return what offers a node or suffix and how to install it; empty if no extension does."""
+    """Return the extension that has a node, suffix or command, and what installs it; or ""."""
     for name, offer in EXTENSIONS.items():
         if offered in offer:
-            return f"the extension visnav-{name}: pip install ./extensions/{name}"
+            folder = name if name == "bench" else f"extensions/{name}"
+            return f"the extension visnav-{name}: pip install ./{folder}"
     return ""
 
 

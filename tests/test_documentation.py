@@ -20,9 +20,9 @@ from typing import NamedTuple
 import jsonschema
 import pytest
 
-from bench.estimators.plan import read_suite
 from runtime.config.reading import find_node, load
 from runtime.tools.cli.run import chosen
+from runtime.tools.suite.plan import read_suite
 from tests.runtime.tools.samples_cli import command_here, start, summary
 
 ROOT = Path(__file__).parents[1]

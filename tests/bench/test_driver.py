@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,17 +64,6 @@ def test_what_cannot_be_measured_is_named_with_the_reason(monkeypatch: pytest.Mo
     assert outcome.rows == []
     assert outcome.missing["absent"] == "pip install absent"
     assert "No module named 'no'" in outcome.missing["broken, handler, 2 nodes"]
-
-
-def test_without_a_checkout_nothing_else_is_measured(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """A wheel has no systems but ours, and one line says so."""
-    monkeypatch.setattr(driver, "RIVALS", tmp_path / "systems")
-    monkeypatch.setattr(driver, "_measure", lambda *_: np.arange(1, 31, dtype=np.int64))
-    outcome = measure_all("small", nodes=(2,), samples=30, warm_up=0, repeats=1)
-    assert {row["system"] for row in outcome.rows} == {"visnav", "visnav, fingerprinted"}
-    assert [*outcome.missing] == ["all other systems"]
 
 
 def test_a_system_is_not_measured_beyond_its_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,14 +37,17 @@ def test_every_extra_that_the_code_names_exists() -> None:
                 assert part.split("'")[0] in project["optional-dependencies"], path
 
 
+_OFFERED = extras.NODES, extras.PROCESSES, extras.COMMANDS
+
+
 def test_the_table_of_extensions_is_that_of_their_entry_points() -> None:
     offered = {}
-    for file in ROOT.glob("extensions/*/pyproject.toml"):
+    for file in (*ROOT.glob("extensions/*/pyproject.toml"), ROOT / "bench" / "pyproject.toml"):
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
         points = project["entry-points"]
         suffixes = [f".{name}" for name in points.get(extras.CONFIGURATIONS, ())]
-        classes = *points.get(extras.NODES, ()), *points.get(extras.PROCESSES, ())
-        offered[file.parent.name] = (*classes, *suffixes)
+        names = [name for group in _OFFERED for name in points.get(group, ())]
+        offered[file.parent.name] = (*names, *suffixes)
         assert project["name"] == f"visnav-{file.parent.name}"
         assert extras.is_ours(project["name"])
     assert offered == extras.EXTENSIONS

@@ -26,7 +26,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from runtime.errors import CommandError, ConfigError, expect_known
-from runtime.extras import COMMANDS, Offer, is_ours, offers
+from runtime.extras import COMMANDS, Offer, is_ours, missing_extension, offers
 
 if TYPE_CHECKING:
     from runtime.summary import Verdict
@@ -78,6 +78,8 @@ class Commands(TyperGroup):
         """
         name, *rest = args
         listed = ", ".join(_commands())
+        if name not in _commands() and (extension := missing_extension(name)):
+            raise ConfigError(f"{name} is a command of {extension}")
         expect_known(name, _commands(), f"expected a command ({listed}), found {name!r}")
         return name, load(_chosen(name)), rest
 

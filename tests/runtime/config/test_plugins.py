@@ -110,7 +110,7 @@ def test_every_node_is_an_entry_point() -> None:
 
 def test_every_command_is_one() -> None:
     ours = [offer for offer in offers(COMMANDS) if offer.package == OURS]
-    assert {"run", "check", "nodes", "report", "bench"} <= {offer.name for offer in ours}
+    assert {"run", "check", "nodes", "report", "suite"} <= {offer.name for offer in ours}
     assert [offer.name for offer in ours if not load(offer).help] == []
 
 

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 import typer
 
-from bench.estimators.plan import EXACT, FOLDER, Suite
 from runtime.channels.wire import combined
 from runtime.errors import ConfigError
 from runtime.run.results import write
 from runtime.tools.cli.commands import Json, JUnit, of_rows, writing
+from runtime.tools.suite.plan import EXACT, FOLDER, Suite
 from runtime.tools.sweep.plan import Job, Plan
 from runtime.tools.sweep.plots import template
 from runtime.tools.sweep.tables import Combination, Row, combine, crashed, in_order, summarise
@@ -58,9 +58,9 @@ def suite(
     and crashed runs. Exit codes: 2 after a crashed run, 130 after Ctrl-C, else 0, also if
     estimators failed: their failures are what the page is about.
     """
-    from bench.estimators.plan import make_plan, read_suite
     from runtime.run.summarise import command_line
     from runtime.tools.cli.sweep import carry_out, end
+    from runtime.tools.suite.plan import make_plan, read_suite
 
     with writing("suite", junit, json) as outcomes:
         chosen = (read_suite(file) if file else read_suite()).only(scenario or [], estimator or [])

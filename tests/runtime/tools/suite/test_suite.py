@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 import visnav
-from bench.estimators.page import cells, flights, write_page
-from bench.estimators.plan import FOLDER, LEVELS, Entrant, Scenario, Suite, make_plan, read_suite
 from runtime.config.model import override
 from runtime.errors import CommandError, ConfigError
+from runtime.tools.suite.page import cells, flights, write_page
+from runtime.tools.suite.plan import FOLDER, LEVELS, Entrant, Scenario, Suite, make_plan, read_suite
 from runtime.tools.sweep.tables import Row, crashed
 from tests.runtime.tools.samples_cli import command
 
