@@ -140,7 +140,7 @@ def mounting_of_kalibr(text: str) -> Floats | None:
     table = _parse(content, name)
     if "T_BS" in table and not camera:
         return transform(table["T_BS"], f"{name}: T_BS")
-    cameras = {each.name: each for each in parse_chain(content, name).cameras}
+    cameras = {entry.name: entry for entry in parse_chain(content, name).cameras}
     chosen = cameras.get(camera) if camera else next(iter(cameras.values()), None)
     if chosen is None:
         raise ValueError(
@@ -210,7 +210,7 @@ class _Keys:
         given = self._table.get(key)
         expected = f"{' or '.join(map(str, counts))} numbers"
         try:
-            values = [float(each) for each in given]  # type: ignore[union-attr]
+            values = [float(number) for number in given]  # type: ignore[union-attr]
         except (TypeError, ValueError, OverflowError):
             self.wrong(key, expected, given)
         if len(values) not in counts or not np.isfinite(values).all():
@@ -221,8 +221,8 @@ class _Keys:
         return transform(self._table[key], f"{self.where}: {key}") if key in self else None
 
     def wrong(self, key: str, expected: str, given: Any) -> NoReturn:
-        found = "nothing" if given is None else f"{given!r:.80}"
-        raise ValueError(f"{self.where}: {key}: expected {expected}, found {found}")
+        value = "nothing" if given is None else f"{given!r:.80}"
+        raise ValueError(f"{self.where}: {key}: expected {expected}, found {value}")
 
 
 def _parse(text: str, where: str) -> Mapping[str, Any]:
@@ -242,11 +242,11 @@ def _numbered(
     table: Mapping[str, Any], name: re.Pattern[str], where: str
 ) -> list[tuple[str, Mapping[str, Any]]]:
     """Return the tables of sensors in the order of their numbers."""
-    found = [(int(m[1]), key) for key in table if (m := name.fullmatch(str(key)))]
-    for _, key in found:
+    numbered = [(int(m[1]), key) for key in table if (m := name.fullmatch(str(key)))]
+    for _, key in numbered:
         if not isinstance(table[key], Mapping):
             raise ValueError(f"{where}: {key}: expected a table, found {table[key]!r:.80}")
-    return [(key, table[key]) for _, key in sorted(found)]
+    return [(key, table[key]) for _, key in sorted(numbered)]
 
 
 def _camera(keys: _Keys, name: str, before: Sequence[KalibrCamera]) -> KalibrCamera:

@@ -269,9 +269,9 @@ def read_ply(path: Path, most: int) -> Cloud:
         raise ValueError(f"expected a PLY file, found {head[:16]!r}")
     count, kind = _vertices(head[:end].decode("ascii", "replace").splitlines())
     start = end + len(b"end_header\n")
-    expected, found = start + count * kind.itemsize, path.stat().st_size
-    if found < expected:
-        raise ValueError(f"expected {count} points in {expected} bytes, found {found} bytes")
+    expected, size = start + count * kind.itemsize, path.stat().st_size
+    if size < expected:
+        raise ValueError(f"expected {count} points in {expected} bytes, found {size} bytes")
     if not count:
         return Cloud(np.zeros((0, 3), np.float32), None, 0)
     rows: np.ndarray[Any, np.dtype[np.void]] = np.memmap(path, kind, "r", start, (count,))

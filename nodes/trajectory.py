@@ -125,9 +125,9 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
             return np.zeros((len(self), 3))
         # As np.gradient, whose seconds since the start cannot tell stamps of nanoseconds apart.
         steps = np.diff(self.stamps)[:, None] / 1e9
-        each = np.diff(self.positions, axis=0) / steps
-        inner = (each[:-1] * steps[1:] + each[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
-        return np.concatenate([each[:1], inner, each[-1:]])
+        slopes = np.diff(self.positions, axis=0) / steps
+        inner = (slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
+        return np.concatenate([slopes[:1], inner, slopes[-1:]])
 
     def poses(self) -> Iterable[tuple[int, Vector3, Quaternion]]:
         """Return stamps (ns), positions (m) and orientations (w, x, y, z), pose by pose."""

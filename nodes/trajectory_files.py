@@ -233,9 +233,9 @@ class Row:
             self.wrong("a stamp in whole nanoseconds", self.fields[0])
         return stamp
 
-    def wrong(self, expected: str, found: str) -> NoReturn:
+    def wrong(self, expected: str, text: str) -> NoReturn:
         """Raise a `ValueError` with the file and the line."""
-        shown = found if len(found) <= _SHOWN else f"{found[:_SHOWN]}…"
+        shown = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
         raise ValueError(f"{self.where}: expected {expected}, found {shown!r}")
 
 

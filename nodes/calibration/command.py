@@ -69,16 +69,16 @@ class Result(msgspec.Struct, eq=False):
 
 def subjects(config: Config) -> list[NodeSpec]:
     """Return simulators of vehicles or cameras, by their ports; a `ConfigError` if none."""
-    found = [
+    specs = [
         spec
         for spec in config.nodes
         if {Image, Odometry} <= {output.event for output in spec.node.declared.outputs.values()}
         and "world" in spec.config.__struct_fields__
     ]
-    if not found:
+    if not specs:
         names = ", ".join(spec.type_name for spec in config.nodes)
         raise ConfigError(f"expected a node that simulates a vehicle or a camera, found {names}")
-    return found
+    return specs
 
 
 def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Result:
@@ -100,8 +100,8 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
     if brought_up.errors:
         raise ConfigError("; ".join(brought_up.errors))
     announced = brought_up.announcements
-    cameras = [each for each in announced if isinstance(each, CameraAnnouncement)]
-    focal = min((each.info.fx for each in cameras), default=256.0)
+    cameras = [a for a in announced if isinstance(a, CameraAnnouncement)]
+    focal = min((c.info.fx for c in cameras), default=256.0)
     angle = float(np.clip(13.0 / focal, 0.035, 0.08))
     world.write_text(mjcf(angle), encoding="utf-8")
     notes = [
@@ -116,7 +116,7 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
     motion = Motion(kept.odometry)
     result = Result(spec.name, {number: [] for number in TITLES}, notes, [], {})
     figures = result.figures
-    imu = next((each for each in announced if isinstance(each, ImuAnnouncement)), None)
+    imu = next((a for a in announced if isinstance(a, ImuAnnouncement)), None)
     if imu is None or kept.imu_announced is None:
         notes.append(f"{spec.name} has no IMU: proofs 1 and 2 do not apply.")
     else:
@@ -128,9 +128,9 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
             "gyroscope": np.array([sample.angular_velocity for sample in still.imu]),
             "accelerometer": np.array([sample.linear_acceleration for sample in still.imu]),
         }
-        for curve, found in noise(imu, samples):
+        for curve, curve_figures in noise(imu, samples):
             result.curves.append(curve)
-            figures[2] += found
+            figures[2] += curve_figures
     for camera in kept.cameras.values():
         points = None
         if kept.images[camera.source]:
@@ -154,7 +154,7 @@ def _is_carried(table: dict[str, Any]) -> bool:
 
 def _alone(config: Config, spec: NodeSpec, folder: Path) -> dict[str, Any]:
     """Return the vehicle's node table at the room's centre, without inputs and links."""
-    (table,) = (each for each in to_builtins(config)["nodes"] if each["name"] == spec.name)
+    (table,) = (node for node in to_builtins(config)["nodes"] if node["name"] == spec.name)
     for key in ("inputs", "links", "barometer", "gnss", "magnetometer", "range_finders", "lidars"):
         table.pop(key, None)
     table.get("imu", {}).pop("calibration_error", None)
@@ -230,8 +230,8 @@ def _run(nodes: list[dict[str, Any]], config: Config, seconds: float = _SECONDS)
         yield
 
     execute(_config(nodes, config, seconds), watch=watch)
-    (found,) = (node for node in kept[0].state.all_nodes if isinstance(node, _Collector))
-    return found
+    (collector,) = (node for node in kept[0].state.all_nodes if isinstance(node, _Collector))
+    return collector
 
 
 def selftest(
@@ -299,14 +299,14 @@ def lint(
     settings = load_configuration(config, overrides or [])
     brought_up = preflight.of_nodes(settings)
     errors = brought_up.errors
-    found = [] if errors else preflight.lint(settings, brought_up.announcements, ignore or [])
-    for finding in found:
+    findings = [] if errors else preflight.lint(settings, brought_up.announcements, ignore or [])
+    for finding in findings:
         print(finding)
     for error in errors:
         print(f"error: {config.name}: {error}", file=sys.stderr)
-    if not found and not errors:
+    if not findings and not errors:
         print(f"{config}: nothing to say")
-    leave_behind(2 if errors else 1 if found else 0)
+    leave_behind(2 if errors else 1 if findings else 0)
 
 
 def write_page(path: Path, name: str, results: Sequence[Result]) -> None:

@@ -103,7 +103,7 @@ def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
         raise ValueError(f"{name}: expected an IMU on {rig.body}, found none")
     chosen = pair(rig) if form.pair_only else rig.cameras
     ros = form.topics and topics
-    cameras = [_camera(rig, each, name, ros=ros) for each in chosen]
+    cameras = [_camera(rig, camera, name, ros=ros) for camera in chosen]
     for what in ("fisheye",) if name == "orbslam3" else ("time_offset",) * (name != "kalibr"):
         if len({camera[what] for camera in cameras}) > 1:
             raise ValueError(f"{name} has one {what} for all cameras, found several")
@@ -115,17 +115,17 @@ def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
         "imu_topic": _topic("imu", rig.imu.source) if ros and rig.imu else "",
     }
     environment = templates(Path(__file__).parent)
-    found = {
+    files = {
         file: environment.get_template(f"{name}.{file}.jinja").render(common)
         for file in form.files
         if rig.imu is not None or file != "imu.yaml"
     }
     if rig.imu is not None and not form.imu_errors:
-        found[form.files[-1]] += "".join(f"# {remark}\n" for remark in _imu_remarks(rig.imu))
+        files[form.files[-1]] += "".join(f"# {remark}\n" for remark in _imu_remarks(rig.imu))
     for number, camera in enumerate(cameras if form.camera_file else []):
         template = environment.get_template(f"{name}.{form.camera_file.format('')}.jinja")
-        found[form.camera_file.format(number)] = template.render(camera=camera)
-    return found
+        files[form.camera_file.format(number)] = template.render(camera=camera)
+    return files
 
 
 def left_out(rig: Rig, name: str) -> list[str]:
@@ -147,7 +147,7 @@ def variables(
         topics: Whether the IMU's axes are those on the topics of ROS.
     """
     if cameras is None:
-        cameras = [_camera(rig, each, "", ros=topics) for each in rig.cameras]
+        cameras = [_camera(rig, camera, "", ros=topics) for camera in rig.cameras]
     return {
         "cameras": cameras,
         "imu": rig.imu,
@@ -163,7 +163,7 @@ def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
     The first has L · Q, with a rotation Q; the second the inverse less the identity, column by
     column, of the accelerometer without the numbers above its diagonal.
     """
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     turn = imu_axes(rig, ros=ros)[:3, :3]
     feigned = rig.imu.g_sensitivity if rig.imu else 0.0
     names = ("gyroscope", "Tw", "R_IMUtoGYRO"), ("accelerometer", "Ta", "R_IMUtoACC")
@@ -176,7 +176,7 @@ def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
             )
         q, r = np.linalg.qr(matrix.T)
         signs = np.sign(np.diag(r))
-        found |= {lower: signs * r.T, rotation: (q * signs).T}
+        entries |= {lower: signs * r.T, rotation: (q * signs).T}
         error = np.linalg.inv(matrix) - np.eye(3)
         if sensor == "accelerometer":
             above = np.triu(np.ones((3, 3), np.bool_), 1)
@@ -187,9 +187,9 @@ def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
                     f"{feigned:g} and {given}"
                 )
             error = error.T[~above.T]
-        found[f"{sensor}_error"] = np.ravel(error, "F")
-    found["Tg"] = feigned * np.eye(3)
-    return {key: value + 0.0 for key, value in found.items()}  # without -0.0
+        entries[f"{sensor}_error"] = np.ravel(error, "F")
+    entries["Tg"] = feigned * np.eye(3)
+    return {key: value + 0.0 for key, value in entries.items()}  # without -0.0
 
 
 def _imu_remarks(imu: ImuAnnouncement) -> list[str]:
@@ -245,10 +245,10 @@ def _coefficients(camera: CameraAnnouncement, name: str) -> tuple[float, ...]:
     k = (0.0,) * 8 if info.is_pinhole else (*info.distortion, 0.0, 0.0, 0.0)[:8]
     if any(k[most:]):
         knows = ", ".join(("k1", "k2", "p1", "p2", "k3")[:most])
-        found = info.distortion_model + (" with k3" if len(info.distortion) == 5 else "")
+        lens = info.distortion_model + (" with k3" if len(info.distortion) == 5 else "")
         raise ValueError(
             f"{camera.source}: {name} has no word for its lens: expected radtan ({knows}) or "
-            f"equidistant, found {found}; the format basalt has one"
+            f"equidistant, found {lens}; the format basalt has one"
         )
     return k[:most]
 
@@ -277,8 +277,8 @@ def imu_axes(rig: Rig, *, ros: bool) -> Floats:
 
 
 def _topic(kind: TopicKind, source: str) -> str:
-    found = publication(kind, source, PublishingConfig())
-    return "" if found is None else found.name
+    topic = publication(kind, source, PublishingConfig())
+    return "" if topic is None else topic.name
 
 
 def pair(rig: Rig) -> tuple[CameraAnnouncement, ...]:
@@ -345,14 +345,14 @@ def announcements(run: Path) -> list[Announcement]:
     """Return a run's announced cameras and IMUs; a `ValueError` if it was killed before."""
     path = run / "summary.json"
     try:
-        found = msgspec.json.decode(path.read_bytes())["announcements"]
+        rows = msgspec.json.decode(path.read_bytes())["announcements"]
         return [
             msgspec.convert(
-                {key: value for key, value in each.items() if key != "type"},
-                getattr(events, each["type"]),
+                {key: value for key, value in row.items() if key != "type"},
+                getattr(events, row["type"]),
             )
-            for each in found
-            if each["type"] in {CameraAnnouncement.__name__, ImuAnnouncement.__name__}
+            for row in rows
+            if row["type"] in {CameraAnnouncement.__name__, ImuAnnouncement.__name__}
         ]
     except (OSError, KeyError, TypeError, msgspec.MsgspecError) as error:
         raise ValueError(

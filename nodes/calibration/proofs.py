@@ -73,7 +73,7 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
     seconds = (stamps - stamps[0]) / 1e9
     if not imu.averaged:
         fine = np.interp(np.arange(4 * len(stamps) - 3) / 4.0, np.arange(len(stamps)), seconds)
-        rates, forces = (CubicSpline(seconds, each)(fine) for each in (rates, forces))
+        rates, forces = (CubicSpline(seconds, values)(fine) for values in (rates, forces))
         seconds = fine
     for index, step in enumerate(np.diff(seconds), 1):
         rate = rates[index] if imu.averaged else (rates[index - 1] + rates[index]) / 2.0
@@ -97,7 +97,7 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
 
 def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Points:
     """Return measured and expected positions of all discs seen whole and separately."""
-    info, found = camera.info, []
+    info, points = camera.info, []
     grid = np.stack(np.meshgrid(np.arange(info.width), np.arange(info.height)), axis=-1)
     rays = info.unproject(grid.reshape(-1, 2)).reshape(*grid.shape[:2], 3)
     balls, radii = spheres(angle)
@@ -106,7 +106,7 @@ def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: f
             continue
         places, turns = motion.rows_of(camera, stamp)
         later, turned = motion.rows_of(camera, stamp + 1_000_000)
-        into, then = (each.as_matrix().transpose(0, 2, 1) for each in (turns, turned))
+        into, then = (rotations.as_matrix().transpose(0, 2, 1) for rotations in (turns, turned))
         own = kept.own[camera.source].get(stamp)
         boxes = list(_boxes(camera, balls, radii, places, into))
         for ball, (left, top, right, bottom) in boxes:
@@ -146,8 +146,8 @@ def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: f
                 info.project(back[row] @ (balls[ball] - where[row]))[0]
                 for where, back in ((places, into), (later, then))
             ]
-            found.append((should, centre - should, (ends[1] - ends[0]) / 1e-3))
-    columns: Floats = np.array(found, np.float64).reshape(-1, 3, 2)
+            points.append((should, centre - should, (ends[1] - ends[0]) / 1e-3))
+    columns: Floats = np.array(points, np.float64).reshape(-1, 3, 2)
     return Points(columns[:, 0], columns[:, 1], columns[:, 2])
 
 
@@ -226,7 +226,7 @@ def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator)
     worst = 0.0
     body = np.eye(4) if rig.imu is None else pose_matrix(rig.imu.position, rig.imu.orientation)
     axes = imu_axes(rig, ros=FORMATS[name].topics)
-    for camera, found in zip(rig.cameras, read(name, folder), strict=False):
+    for camera, read_camera in zip(rig.cameras, read(name, folder), strict=False):
         if rig.imu is None and name == "orbslam3":
             continue  # whose file has no transform without an IMU
         size = (camera.info.width - 1, camera.info.height - 1)
@@ -234,7 +234,7 @@ def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator)
         rays = rays[np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.05)]
         rays *= generator.uniform(1.0, 20.0, (len(rays), 1))
         pose = axes @ np.linalg.inv(body) @ pose_matrix(camera.position, camera.orientation)
-        pixels = found.project(rays @ pose[:3, :3].T + pose[:3, 3])
+        pixels = read_camera.project(rays @ pose[:3, :3].T + pose[:3, 3])
         off = float(np.abs(pixels - camera.info.project(rays)).max(initial=0.0))
         worst = max(worst, off if np.isfinite(off) else float("inf"))
     wrong = f"the files for {name} project up to {worst:.3g} px beside what is announced"
@@ -285,7 +285,7 @@ def lateness(imu: ImuAnnouncement, kept: _Collector, motion: Motion) -> Figure:
     rates = turn.apply([sample.angular_velocity for sample in kept.imu])[flying]
     # A mean belongs to the middle of its period.
     then = at[flying] - (0.5e9 / imu.rate if imu.averaged else 0.0)
-    true = np.column_stack([np.interp(then, motion.stamps, each) for each in motion.rates.T])
+    true = np.column_stack([np.interp(then, motion.stamps, axis) for axis in motion.rates.T])
     return _late(imu.source, "IMU samples", np.gradient(true, then / 1e9, axis=0), rates - true)
 
 
@@ -381,15 +381,15 @@ def variances(
     """Return averaging times (s) and overlapping Allan variances, mean of all axes."""
     sums = np.vstack([np.zeros(samples.shape[1]), np.cumsum(samples - samples.mean(0), axis=0)])
     steps = np.unique(np.geomspace(1, len(samples) // 6, 22).astype(int))
-    found = [((sums[2 * m :] - 2 * sums[m:-m] + sums[: -2 * m]) / m).var() / 2.0 for m in steps]
-    return steps / rate, np.array(found)
+    allan = [((sums[2 * m :] - 2 * sums[m:-m] + sums[: -2 * m]) / m).var() / 2.0 for m in steps]
+    return steps / rate, np.array(allan)
 
 
-def densities(seconds: Floats, found: Floats, white: float, walk: float) -> tuple[float, float]:
+def densities(seconds: Floats, allan: Floats, white: float, walk: float) -> tuple[float, float]:
     """Return N and K fitted to Allan variances, weighted by the announced densities."""
     terms = np.column_stack([1.0 / seconds, seconds / 3.0])
     spread = (terms @ [max(white, 1e-15) ** 2, walk**2]) * np.sqrt(seconds)
-    n2, k2 = nnls(terms / spread[:, None], found / spread)[0]
+    n2, k2 = nnls(terms / spread[:, None], allan / spread)[0]
     return float(np.sqrt(n2)), float(np.sqrt(k2))
 
 
@@ -398,14 +398,14 @@ def trials(
 ) -> Floats:
     """Return N and K fitted to simulated samples of given densities, shape (n, 2)."""
     generator = np.random.default_rng(seed)
-    found = []
+    fits = []
     for _ in range(_TRIALS):
         samples = np.cumsum(generator.standard_normal((count, 3)) * walk / rate**0.5, axis=0)
         samples += generator.standard_normal((count, 3)) * white * rate**0.5
         if step:
             samples = np.rint(samples / step) * step
-        found.append(densities(*variances(samples, rate), white, walk))
-    return np.array(found)
+        fits.append(densities(*variances(samples, rate), white, walk))
+    return np.array(fits)
 
 
 def needed(imu: ImuAnnouncement, most: float) -> float:
@@ -413,8 +413,8 @@ def needed(imu: ImuAnnouncement, most: float) -> float:
     seconds = 60.0
     for name in ("gyroscope", "accelerometer"):
         numbers = _announced(imu, name)
-        found = trials(*numbers, imu.rate, round(60.0 * imu.rate))
-        for value, spread in zip(numbers, found.std(axis=0), strict=False):
+        fits = trials(*numbers, imu.rate, round(60.0 * imu.rate))
+        for value, spread in zip(numbers, fits.std(axis=0), strict=False):
             if value:
                 seconds = max(seconds, 60.0 * (2.5 * spread / value / ALLOWED) ** 2)
     return min(seconds, most)
@@ -424,16 +424,16 @@ def noise(imu: ImuAnnouncement, samples: dict[str, Floats]) -> Iterator[tuple[Cu
     """Yield curve and figures of each sensor; its samples at rest have the shape (n, 3)."""
     for name, rows in samples.items():
         white, walk, step = _announced(imu, name)
-        seconds, found = variances(rows, imu.rate)
-        fitted = densities(seconds, found, white, walk)
+        seconds, allan = variances(rows, imu.rate)
+        fitted = densities(seconds, allan, white, walk)
         tried = trials(white, walk, step, imu.rate, len(rows))
         model = np.sqrt(white**2 / seconds + walk**2 * seconds / 3.0)
         names = f"{name}_noise_density", f"{name}_random_walk"
         figures = [
-            _figure(imu, *each, len(rows) / imu.rate)
-            for each in zip(names, (white, walk), fitted, tried.T, strict=True)
+            _figure(imu, *row, len(rows) / imu.rate)
+            for row in zip(names, (white, walk), fitted, tried.T, strict=True)
         ]
-        yield Curve(name, seconds, np.sqrt(found), model), figures
+        yield Curve(name, seconds, np.sqrt(allan), model), figures
 
 
 def _announced(imu: ImuAnnouncement, name: str) -> tuple[float, float, float]:

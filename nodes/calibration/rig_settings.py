@@ -66,10 +66,8 @@ def read(text: str, path: str, warn: Callable[[str], None], world: str = "hall")
         rate = {"rate": chain.imu.rate} if chain.imu.rate else {}
         drone["imu"] = {**drone.get("imu", {}), **rate, **noise}
     drone["cameras"] = [
-        _camera(
-            each, first @ each.in_first if each.in_imu is None else imu @ each.in_imu, warn, name
-        )
-        for each in chain.cameras
+        _camera(c, first @ c.in_first if c.in_imu is None else imu @ c.in_imu, warn, name)
+        for c in chain.cameras
     ]
     pilot = {"name": "pilot", "type": "WaypointFollower", "waypoints": _PATH}
     run = {"name": "rig", "clock": "lockstep", "seed": 1, "duration": "20s"}
@@ -78,7 +76,7 @@ def read(text: str, path: str, warn: Callable[[str], None], world: str = "hall")
 
 def _camera(camera: KalibrCamera, place: Floats, warn: Callable[[str], None], name: str) -> Table:
     info = camera.info
-    found: Table = {
+    table: Table = {
         "name": camera.name,
         "images": ["grey"],
         "width": info.width,
@@ -88,15 +86,15 @@ def _camera(camera: KalibrCamera, place: Floats, warn: Callable[[str], None], na
         "T_BS": _rows(place),
     }
     if not info.is_pinhole:
-        found["lens"] = {"model": info.distortion_model, "coefficients": list(info.distortion)}
+        table["lens"] = {"model": info.distortion_model, "coefficients": list(info.distortion)}
     if camera.time_offset > 0.0:
-        found["time_offset"] = f"{camera.time_offset!r}s"
+        table["time_offset"] = f"{camera.time_offset!r}s"
     elif camera.time_offset < 0.0:
         warn(
             f"{name}: {camera.name}: timeshift_cam_imu of {-camera.time_offset:g} s is left out: "
             "stamps before the exposure are not simulated"
         )
-    return found
+    return table
 
 
 def _rows(matrix: Floats) -> list[list[float]]:

@@ -250,9 +250,9 @@ def _kalibr(folder: Path, name: str = "camchain-imucam.yaml") -> list[ReadCamera
     text = (folder / name).read_text(encoding="utf-8")
     if not text.startswith("%YAML"):  # Kalibr reads plain YAML; OpenCV wants to be told
         text = f"%YAML:1.0\n---\n{text}"
-    found: list[ReadCamera] = []
+    cameras: list[ReadCamera] = []
     storage = _storage(text)
-    while not (node := storage.getNode(f"cam{len(found)}")).empty():
+    while not (node := storage.getNode(f"cam{len(cameras)}")).empty():
         into = node.getNode("T_cam_imu")
         matrix = np.array([_numbers(into.at(row)) for row in range(into.size())])
         if into.empty():  # OpenVINS's own name
@@ -264,14 +264,14 @@ def _kalibr(folder: Path, name: str = "camchain-imucam.yaml") -> list[ReadCamera
         k = _numbers(node.getNode("distortion_coeffs"))
         shift = node.getNode("timeshift_cam_imu").real()
         middle = _numbers(node.getNode("intrinsics"))
-        found.append(
+        cameras.append(
             ReadCamera(inverse(matrix), _k(*middle), np.array(k), model == "equidistant", shift)
         )
-    return found
+    return cameras
 
 
 def _vins(folder: Path) -> list[ReadCamera]:
-    found: list[ReadCamera] = []
+    cameras: list[ReadCamera] = []
     storage = _storage((folder / "vins.yaml").read_text(encoding="utf-8"))
     for number in range(int(storage.getNode("num_of_cam").real())):
         name = storage.getNode(f"cam{number}_calib").string()
@@ -286,13 +286,13 @@ def _vins(folder: Path) -> list[ReadCamera]:
         k = np.array([lens.getNode(key).real() for key in keys[1]])
         pose = storage.getNode(f"body_T_cam{number}").mat()
         shift = storage.getNode("td").real()
-        found.append(ReadCamera(np.asarray(pose, np.float64), _k(*middle), k, fisheye, shift))
-    return found
+        cameras.append(ReadCamera(np.asarray(pose, np.float64), _k(*middle), k, fisheye, shift))
+    return cameras
 
 
 def _basalt(folder: Path) -> list[ReadCamera]:
     value = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))["value0"]
-    found = []
+    cameras = []
     for pose, camera in zip(value["T_imu_cam"], value["intrinsics"], strict=True):
         in_imu = np.eye(4)
         quaternion = [pose[key] for key in ("qx", "qy", "qz", "qw")]
@@ -307,8 +307,8 @@ def _basalt(folder: Path) -> list[ReadCamera]:
         k = np.array([values[name] for name in names] or [0.0] * 4)
         matrix = _k(*(values[name] for name in ("fx", "fy", "cx", "cy")))
         shift = value["cam_time_offset_ns"] / 1e9
-        found.append(ReadCamera(in_imu, matrix, k, kind == "kb4", shift))
-    return found
+        cameras.append(ReadCamera(in_imu, matrix, k, kind == "kb4", shift))
+    return cameras
 
 
 def _orbslam3(folder: Path) -> list[ReadCamera]:
@@ -319,21 +319,21 @@ def _orbslam3(folder: Path) -> list[ReadCamera]:
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     pose = storage.getNode("IMU.T_b_c1").mat()
     in_imu = np.eye(4) if pose is None else np.asarray(pose, np.float64)
-    found: list[ReadCamera] = []
-    while not storage.getNode(f"Camera{len(found) + 1}.fx").empty():
-        if found:
+    cameras: list[ReadCamera] = []
+    while not storage.getNode(f"Camera{len(cameras) + 1}.fx").empty():
+        if cameras:
             in_imu = in_imu @ np.asarray(storage.getNode("Stereo.T_c1_c2").mat(), np.float64)
-        head = f"Camera{len(found) + 1}"
+        head = f"Camera{len(cameras) + 1}"
         middle = [storage.getNode(f"{head}.{name}").real() for name in ("fx", "fy", "cx", "cy")]
         k = np.array([storage.getNode(f"{head}.{name}").real() for name in names])
-        found.append(ReadCamera(in_imu, _k(*middle), k, fisheye))
-    return found
+        cameras.append(ReadCamera(in_imu, _k(*middle), k, fisheye))
+    return cameras
 
 
 def _vslamlab(folder: Path) -> list[ReadCamera]:
     text = (folder / "calibration.yaml").read_text(encoding="utf-8")
     storage = _storage(text.replace("%YAML 1.2", "%YAML:1.0", 1))  # its nodes need it alive
-    cameras, found = storage.getNode("cameras"), []
+    cameras, cameras_read = storage.getNode("cameras"), []
     for number in range(cameras.size()):
         camera = cameras.at(number)
         (fx, fy), (cx, cy) = (
@@ -342,8 +342,8 @@ def _vslamlab(folder: Path) -> list[ReadCamera]:
         pose = np.array(_numbers(camera.getNode("T_BS"))).reshape(4, 4)
         k = np.array(_numbers(camera.getNode("distortion_coefficients")))
         fisheye = camera.getNode("distortion_type").string() == "equid4"
-        found.append(ReadCamera(pose, _k(fx, fy, cx, cy), k, fisheye))
-    return found
+        cameras_read.append(ReadCamera(pose, _k(fx, fy, cx, cy), k, fisheye))
+    return cameras_read
 
 
 READERS: dict[str, Callable[[Path], list[ReadCamera]]] = {

@@ -25,7 +25,7 @@ Announced = Sequence[Announcement]
 
 
 def baseline(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
-    """Of a stereo pair too close together nothing has depth; too far apart, nothing is in both."""
+    """Check the baseline: too short gives no depth, too long no overlap."""
     for left, right in stereo_pairs(announced):
         apart = math.dist(left.position, right.position)
         if not 0.02 <= apart <= 1.0:
@@ -43,8 +43,8 @@ def square_pixels(config: Config, announced: Announced) -> Iterator[Finding]:  #
     for camera in cameras(announced):
         fx, fy = camera.info.fx, camera.info.fy
         if abs(fx / fy - 1.0) > 0.01:
-            found = f"fx is {fx:.4g} px and fy {fy:.4g} px"
-            yield Finding(camera.source, found, "take the same focal length for both")
+            fault = f"fx is {fx:.4g} px and fy {fy:.4g} px"
+            yield Finding(camera.source, fault, "take the same focal length for both")
 
 
 def exposure(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
@@ -52,8 +52,8 @@ def exposure(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa
     for camera in cameras(announced):
         period, taken = 1.0 / camera.rate, camera.exposure + camera.readout
         if taken > period * (1.0 + 1e-9):
-            found = f"exposure and readout take {1e3 * taken:.3g} ms of {1e3 * period:.3g} ms"
-            yield Finding(camera.source, found, "expose for a shorter time, or lower the rate")
+            fault = f"exposure and readout take {1e3 * taken:.3g} ms of {1e3 * period:.3g} ms"
+            yield Finding(camera.source, fault, "expose for a shorter time, or lower the rate")
 
 
 def imu_rate(config: Config, announced: Announced) -> Iterator[Finding]:
@@ -83,7 +83,7 @@ def rates_divide(config: Config, announced: Announced) -> Iterator[Finding]:
 def extrinsics(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
     """Sensor fusion requires known poses of both sensors, on the same body."""
     for camera in cameras(announced):
-        for imu in (each for each in announced if isinstance(each, ImuAnnouncement)):
+        for imu in (a for a in announced if isinstance(a, ImuAnnouncement)):
             if body_of(imu.source) != body_of(camera.source):
                 continue
             if imu.parent_frame_id != camera.parent_frame_id:
@@ -95,8 +95,8 @@ def extrinsics(config: Config, announced: Announced) -> Iterator[Finding]:  # no
                 )
         nowhere = camera.position == (0.0, 0.0, 0.0) and camera.parent_frame_id != "map"
         if nowhere and camera.orientation == (1.0, 0.0, 0.0, 0.0):
-            found = "its pose on the body is none, as if nobody had measured it"
-            yield Finding(camera.source, found, "give its position and orientation")
+            fault = "its pose on the body is none, as if nobody had measured it"
+            yield Finding(camera.source, fault, "give its position and orientation")
 
 
 def monotonic(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
@@ -122,8 +122,8 @@ def latency(config: Config, announced: Announced) -> Iterator[Finding]:
     for spec in estimators(config, announced):
         taken = float(getattr(spec.config, "latency", -1.0))
         if taken == 0.0 and config.run.clock == "lockstep":
-            found = "its estimates take no time on the run's clock"
-            yield Finding(spec.name, found, "give it the latency of the vehicle, as 15ms")
+            fault = "its estimates take no time on the run's clock"
+            yield Finding(spec.name, fault, "give it the latency of the vehicle, as 15ms")
         if rate and taken > 1.0 / rate * (1.0 + 1e-9):
             yield Finding(
                 spec.name,
@@ -136,7 +136,7 @@ def zero_noise(config: Config, announced: Announced) -> Iterator[Finding]:
     """Without noise in simulation an estimator is flattered; recordings are exempt."""
     if not any("thresholds" in spec.config.__struct_fields__ for spec in config.nodes):
         return  # nobody is judged
-    if any(isinstance(each, EstimatorAnnouncement) for each in announced):
+    if any(isinstance(announcement, EstimatorAnnouncement) for announcement in announced):
         for camera in cameras(announced):
             seen = not camera.undistorted and {"rgb", "grey"} & {*camera.images}
             if not camera.noise and seen and not _recorded(config, camera.source):
@@ -144,8 +144,8 @@ def zero_noise(config: Config, announced: Announced) -> Iterator[Finding]:
     for _, imu in inertial_pairs(config, announced):
         densities = imu.gyroscope_noise_density, imu.accelerometer_noise_density
         if not all(densities) and not _recorded(config, imu.source):
-            found = "a noise density of it is 0"
-            yield Finding(imu.source, found, "take the densities of a data sheet")
+            fault = "a noise density of it is 0"
+            yield Finding(imu.source, fault, "take the densities of a data sheet")
 
 
 def stamps(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
@@ -154,30 +154,30 @@ def stamps(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: 
         for name in ("rate", "time_offset"):
             one, other = getattr(left, name), getattr(right, name)
             if one != other:
-                found = f"its {name} is {other:g}, that of {left.source} {one:g}"
-                yield Finding(right.source, found, "take the same, or stamps cannot match")
+                fault = f"its {name} is {other:g}, that of {left.source} {one:g}"
+                yield Finding(right.source, fault, "take the same, or stamps cannot match")
         if left.time_jitter or right.time_jitter:
-            found = f"its stamps and those of {left.source} have a jitter"
-            yield Finding(right.source, found, "take it out, or match them by nearest stamps")
+            fault = f"its stamps and those of {left.source} have a jitter"
+            yield Finding(right.source, fault, "take it out, or match them by nearest stamps")
 
 
 def needs(config: Config, announced: Announced) -> Iterator[Finding]:
     """Kinds of data needed by an estimator, and its IMU, must come from some sensor."""
     given = {kind for camera in cameras(announced) for kind in camera.images}
     given |= {"grey"} if "rgb" in given else set()
-    given |= {"lidar"} if any(isinstance(each, LidarAnnouncement) for each in announced) else set()
+    given |= {"lidar"} if any(isinstance(a, LidarAnnouncement) for a in announced) else set()
     for spec in config.nodes:
         wants: Any = getattr(spec.node, "needs", frozenset())
         if lacking := sorted(wants - given if isinstance(wants, frozenset) else ()):
             what = "sensor" if "lidar" in lacking else "camera"
-            found = f"it needs {', '.join(lacking)}, which no {what} gives"
+            fault = f"it needs {', '.join(lacking)}, which no {what} gives"
             cure = "add one" if "lidar" in lacking else "add it to the camera's images"
-            yield Finding(spec.name, found, cure)
-        read = {each.event for each in spec.node.declared.inputs.values()}
+            yield Finding(spec.name, fault, cure)
+        read = {port.event for port in spec.node.declared.inputs.values()}
         if {Image, DepthImage} & read and not cameras(announced):
             yield Finding(spec.name, "it reads images, and no camera is announced", "add one")
         inertial = "inertial" in str(getattr(spec.config, "mode", ""))
-        if inertial and not any(isinstance(each, ImuAnnouncement) for each in announced):
+        if inertial and not any(isinstance(a, ImuAnnouncement) for a in announced):
             yield Finding(spec.name, "it needs an IMU, which nobody announces", "add one")
 
 
@@ -189,7 +189,7 @@ RULES = [
 
 def cameras(announced: Announced) -> list[CameraAnnouncement]:
     """Return the cameras."""
-    return [each for each in announced if isinstance(each, CameraAnnouncement)]
+    return [a for a in announced if isinstance(a, CameraAnnouncement)]
 
 
 def stereo_pairs(announced: Announced) -> Iterator[tuple[CameraAnnouncement, CameraAnnouncement]]:
@@ -213,7 +213,7 @@ def inertial_pairs(
         "inertial" in str(getattr(spec.config, "mode", "inertial")) and _reads_imu(spec)
         for spec in estimators(config, on_images)
     )
-    imus = [each for each in announced if isinstance(each, ImuAnnouncement) and fused]
+    imus = [a for a in announced if isinstance(a, ImuAnnouncement) and fused]
     for camera in cameras(announced):
         for imu in imus:
             if body_of(imu.source) == body_of(camera.source):

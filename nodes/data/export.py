@@ -144,14 +144,14 @@ def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
         announced = msgspec.json.decode(content, type=_Summary).announcements
     except (OSError, msgspec.DecodeError) as error:
         raise ValueError(f"{path}: expected the run's summary, found: {error}") from None
-    found = [
-        (each.source, pose_matrix(each.position, each.orientation))
-        for each in announced
-        if each.type == "CameraAnnouncement" and each.parent_frame_id != "map"
+    mounted_cameras = [
+        (announcement.source, pose_matrix(announcement.position, announcement.orientation))
+        for announcement in announced
+        if announcement.type == "CameraAnnouncement" and announcement.parent_frame_id != "map"
     ]
-    chosen = [mounted for source, mounted in found if camera in {"", source}]
+    chosen = [mounted for source, mounted in mounted_cameras if camera in {"", source}]
     if camera and not chosen:
-        there = ", ".join(source for source, _ in found) or "none"
+        there = ", ".join(source for source, _ in mounted_cameras) or "none"
         raise ValueError(f"{path}: expected {camera!r} among the cameras on a body, found {there}")
     return chosen[0] if chosen else pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
 
@@ -178,9 +178,9 @@ def load(run: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:
     """
     folder = run / "trajectories"
     if not (folder / f"{TRUTH}.tum").is_file():
-        found = ", ".join(sorted(p.name for p in folder.glob("*.tum"))) or "no trajectories"
+        names = ", ".join(sorted(p.name for p in folder.glob("*.tum"))) or "no trajectories"
         raise ValueError(
-            f"{folder / TRUTH}.tum: expected the run's true trajectory, found {found}: "
+            f"{folder / TRUTH}.tum: expected the run's true trajectory, found {names}: "
             "a run leaves its trajectories if a node of type Evaluation is in it"
         )
     truths, estimates = {TRUTH: read_tum(folder / f"{TRUTH}.tum")}, {}
@@ -198,8 +198,8 @@ def _truth_of(run: Path, estimate: str) -> str:
     path = run / "evaluation" / "verdict.json"
     if not path.is_file():
         return TRUTH
-    found = msgspec.json.decode(path.read_bytes(), type=_Verdict).estimators
-    vehicles = {source_file(name): each.get("vehicle", "") for name, each in found.items()}
+    estimators = msgspec.json.decode(path.read_bytes(), type=_Verdict).estimators
+    vehicles = {source_file(name): f.get("vehicle", "") for name, f in estimators.items()}
     return f"{TRUTH}.{source_file(vehicles.get(estimate, ''))}"
 
 
@@ -252,7 +252,7 @@ def _measurements(recording: Path) -> Iterator[Event]:
 
     reader = Recorded(recording)
     wanted = reader.events(0, None, lambda kind, _: bool(fields_of(kind)))
-    yield from (each.event for each in wanted)
+    yield from (recorded.event for recorded in wanted)
 
 
 def _header(event: Event) -> str:
@@ -317,8 +317,8 @@ def export(
             written = export_measurements(run, out, epoch)
         else:
             written = export_calibration(run, form.value, out, epoch, camera)
-            for each in left_out(choose(announcements(run), camera), form.value):
-                warn(each)
+            for warning in left_out(choose(announcements(run), camera), form.value):
+                warn(warning)
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None
     for path in written:

@@ -266,7 +266,7 @@ class Estimator(Node[C], ABC):
     def _frame_streams(self) -> list[Stream[Any]]:
         """Return the streams of images or scans."""
         inputs = self.declared.inputs.items()
-        ports = [port for port, each in inputs if issubclass(each.event, _FRAMES)]
+        ports = [port for port, declaration in inputs if issubclass(declaration.event, _FRAMES)]
         matched = [matcher.stream for matcher in matchers(self).values()]
         return [*matched, *(getattr(self, port) for port in ports)]
 
@@ -291,13 +291,15 @@ class Estimator(Node[C], ABC):
                 cameras = Rectification(cameras).cameras if self.config.rectify else cameras
             except ValueError as error:
                 return {cameras[0].source: str(error)}
-        found = {camera.source: why for camera in cameras if (why := self.refusal(camera))}
-        if len(cameras) < 2 or found or not self.aligned:
-            return found
+        reasons = {camera.source: why for camera in cameras if (why := self.refusal(camera))}
+        if len(cameras) < 2 or reasons or not self.aligned:
+            return reasons
         if (off := misalignment(*cameras)) > ALIGNED:
             left, right = (camera.source for camera in cameras)
-            found[right] = f"expected its rows aligned with those of {left}, found {off:.2g} px off"
-        return found
+            reasons[right] = (
+                f"expected its rows aligned with those of {left}, found {off:.2g} px off"
+            )
+        return reasons
 
     def refusal(self, camera: CameraAnnouncement) -> str:
         """Return why a camera's images are of no use here, in a sentence; empty if they are."""

@@ -66,8 +66,8 @@ class OdometryNode(Estimator[C]):
         async for frame in self.frames:
             image = frame[0]
             data = [
-                each.data if isinstance(each, Image | DepthImage) else sample_rows(each)
-                for each in frame
+                part.data if isinstance(part, Image | DepthImage) else sample_rows(part)
+                for part in frame
             ]
             result = await self._tracker.call(self.tracks, self.exposed_at(image), *data)
             if result is not None:  # there is a map
@@ -141,9 +141,9 @@ def follow_both_ways(
     )
     back, returned, _ = cv2.calcOpticalFlowPyrLK(other, image, there, start.copy(), **options)
     miss = np.abs(back - start).reshape(-1, 2).max(axis=1)
-    found = there.reshape(-1, 2).astype(np.float64)
+    points = there.reshape(-1, 2).astype(np.float64)
     good = (arrived.ravel() == 1) & (returned.ravel() == 1) & (miss < _ROUND_TRIP)
-    return found, good & inside(found, image.shape, 3)
+    return points, good & inside(points, image.shape, 3)
 
 
 REACH = 6  # radius of continuous surface required around a corner by optical flow, pixels
@@ -324,11 +324,11 @@ class DescribedPoints(msgspec.Struct, frozen=True, eq=False):
 def detect_and_describe(image: Grey, count: int) -> tuple[Floats, Descriptors]:
     """Return up to `count` points of an image (column, row), shape (n, 2), and descriptors."""
     no_mask: Any = None
-    found: Any  # there are none in a blank image
-    keys, found = cv2.ORB.create(count).detectAndCompute(image, no_mask)
-    if found is None:
+    descriptors: Any  # there are none in a blank image
+    keys, descriptors = cv2.ORB.create(count).detectAndCompute(image, no_mask)
+    if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 32), np.uint8)
-    return np.array([key.pt for key in keys], np.float64), found
+    return np.array([key.pt for key in keys], np.float64), descriptors
 
 
 def describe(image: Grey, pixels: Floats, points: Floats) -> DescribedPoints:
@@ -340,11 +340,11 @@ def describe(image: Grey, pixels: Floats, points: Floats) -> DescribedPoints:
             zip(pixels, _orientations(image, pixels), strict=True)
         )
     ]
-    found: Any  # there are none if all are near to the edge
-    kept, found = cv2.ORB.create().compute(image, keys)
-    if found is None:
+    descriptors: Any  # there are none if all are near to the edge
+    kept, descriptors = cv2.ORB.create().compute(image, keys)
+    if descriptors is None:
         return DescribedPoints(np.empty((0, 3)), np.empty((0, 32), np.uint8))
-    return DescribedPoints(points[[key.class_id for key in kept]], found)
+    return DescribedPoints(points[[key.class_id for key in kept]], descriptors)
 
 
 def relocalize(
@@ -363,7 +363,7 @@ def relocalize(
         return None
     cv2.setRNGSeed(1)
     inliers: Any  # there are none if nothing was found
-    found, rotation, translation, inliers = cv2.solvePnPRansac(
+    solved, rotation, translation, inliers = cv2.solvePnPRansac(
         known.points[[match.queryIdx for match in matches]],
         pixels[[match.trainIdx for match in matches]],
         matrix,
@@ -372,7 +372,7 @@ def relocalize(
         reprojectionError=_MAX_ERROR,
         flags=method,
     )
-    if not found or inliers is None or len(inliers) < _MIN_INLIERS:
+    if not solved or inliers is None or len(inliers) < _MIN_INLIERS:
         return None
     return transform(cv2.Rodrigues(rotation)[0], translation)
 

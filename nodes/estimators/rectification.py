@@ -83,14 +83,14 @@ class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
 
     def __str__(self) -> str:
         info, lens = self.pinhole, self.lens
-        found = "pinhole"
+        model = "pinhole"
         if not lens.is_pinhole:
             coefficients = ", ".join(f"{value:.3g}" for value in lens.distortion)
-            found = f"{lens.distortion_model} with {coefficients}"
+            model = f"{lens.distortion_model} with {coefficients}"
         across, down = (
             math.degrees(2 * math.atan(n / 2 / info.fx)) for n in (info.width, info.height)
         )
-        return f"{found} to pinhole, focal length {info.fx:.1f} px, {across:.0f}° × {down:.0f}°"
+        return f"{model} to pinhole, focal length {info.fx:.1f} px, {across:.0f}° × {down:.0f}°"
 
 
 class Rectification:
@@ -105,7 +105,7 @@ class Rectification:
 
     def __init__(self, cameras: Sequence[CameraAnnouncement]) -> None:
         first = cameras[0].info
-        own = [pose_matrix(each.position, each.orientation) for each in cameras]
+        own = [pose_matrix(camera.position, camera.orientation) for camera in cameras]
         common = own[0][:3, :3] if len(own) == 1 else _common_axes(cameras, own)
         turns = [matrix[:3, :3].T @ common for matrix in own]
         info = CameraInfo(
@@ -113,10 +113,10 @@ class Rectification:
             height=first.height,
             fx=1.0,
             fy=1.0,
-            cx=float(np.mean([each.info.cx for each in cameras])),
-            cy=float(np.mean([each.info.cy for each in cameras])),
+            cx=float(np.mean([camera.info.cx for camera in cameras])),
+            cy=float(np.mean([camera.info.cy for camera in cameras])),
         )
-        lenses = [each.info for each in cameras]
+        lenses = [camera.info for camera in cameras]
         focal = _focal(info, list(zip(lenses, turns, strict=True)))
         info = msgspec.structs.replace(info, fx=focal, fy=focal)
         self.eyes = tuple(Eye(lens, info, t) for lens, t in zip(lenses, turns, strict=True))
@@ -124,7 +124,7 @@ class Rectification:
         frame[:3, :3] = common
         orientation = pose_tuples(frame)[1]
         self.cameras = tuple(
-            msgspec.structs.replace(each, info=info, orientation=orientation) for each in cameras
+            msgspec.structs.replace(c, info=info, orientation=orientation) for c in cameras
         )  # the same with the pinhole cameras' intrinsics and orientations
 
     def frame(self, frame: F) -> F:
@@ -139,10 +139,10 @@ class Rectification:
             made = self.eyes[right].rectify(given)  # type: ignore[arg-type]
         else:
             made = type(given)._make(
-                self.eyes[name == "right"].rectify(each)
-                if isinstance(each, Image | DepthImage)
-                else each
-                for name, each in zip(given._fields, given, strict=True)
+                self.eyes[name == "right"].rectify(part)
+                if isinstance(part, Image | DepthImage)
+                else part
+                for name, part in zip(given._fields, given, strict=True)
             )
         result: F = made
         return result
@@ -157,11 +157,11 @@ def misalignment(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
     pixels = np.column_stack([u.ravel(), v.ravel()])
     rays = info.unproject(pixels)
     points = rays / rays[:, 2:] * z.reshape(-1, 1)
-    places = [pose_matrix(each.position, each.orientation) for each in (left, right)]
+    places = [pose_matrix(camera.position, camera.orientation) for camera in (left, right)]
     across = np.linalg.inv(places[1]) @ places[0]
-    found = right.info.project(points @ across[:3, :3].T + across[:3, 3])
+    projected = right.info.project(points @ across[:3, :3].T + across[:3, 3])
     shift = info.fx * math.dist(left.position, right.position) / z.ravel()
-    off = np.abs(found - np.column_stack([pixels[:, 0] - shift, pixels[:, 1]])).max()
+    off = np.abs(projected - np.column_stack([pixels[:, 0] - shift, pixels[:, 1]])).max()
     return float(off) if np.isfinite(off) else math.inf
 
 
@@ -170,7 +170,7 @@ def _common_axes(cameras: Sequence[CameraAnnouncement], own: Sequence[Floats]) -
     x = own[1][:3, 3] - own[0][:3, 3]
     length = float(np.linalg.norm(x))
     ahead = own[0][:3, 2] + own[1][:3, 2]
-    rights = min(float(x @ each[:3, 0]) for each in own)
+    rights = min(float(x @ pose[:3, 0]) for pose in own)
     if length == 0.0 or rights < 0.5 * length or own[0][:3, 2] @ own[1][:3, 2] < 0.5:
         raise ValueError(
             f"expected {cameras[1].source} to the right of {cameras[0].source}, and both to look "

@@ -91,8 +91,8 @@ class SensorChoice:
         else:
             lacks = "" if self.cameras else self._no_camera()
         if not lacks and self._inertial and self.imu is None:
-            found = ", ".join(imu.source for imu in self._imus) or "none"
-            return f"expected an IMU beside {self._beside()}, found {found}"
+            names = ", ".join(imu.source for imu in self._imus) or "none"
+            return f"expected an IMU beside {self._beside()}, found {names}"
         return lacks
 
     def _beside(self) -> str:
@@ -109,11 +109,11 @@ class SensorChoice:
         sets = list(self._candidates())
         for rectified in (False, True)[: 1 if self.cameras else 2]:
             for cameras in sets:
-                found = self._refused(cameras, rectified)
-                if not found:
+                refusals = self._refused(cameras, rectified)
+                if not refusals:
                     self.cameras, self.rectified, self.imu = cameras, rectified, None
                     return
-                self._refusals |= found
+                self._refusals |= refusals
 
     def _candidates(self) -> Iterator[tuple[CameraAnnouncement, ...]]:
         for camera in self._seen:
@@ -206,7 +206,7 @@ class StereoInertialFrame(NamedTuple):
 
 def sample_rows(samples: Iterable[Imu]) -> npt.NDArray[np.float64]:
     """Return samples of an IMU: stamp (ns), rad/s and m/s² in a row, shape (n, 7)."""
-    rows = [(each.stamp, *each.angular_velocity, *each.linear_acceleration) for each in samples]
+    rows = [(s.stamp, *s.angular_velocity, *s.linear_acceleration) for s in samples]
     return np.array(rows, np.float64).reshape(-1, 7)
 
 
@@ -403,8 +403,8 @@ def cross(vector: Floats) -> Floats:
 
 def crosses(vectors: Floats) -> Floats:
     """Return the matrices of cross products with vectors, shape (n, 3), from the left."""
-    found = np.zeros((len(vectors), 3, 3))
+    matrices = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
-    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
-    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
-    return found
+    matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2] = -z, y, -x
+    matrices[:, 1, 0], matrices[:, 2, 0], matrices[:, 2, 1] = z, -y, x
+    return matrices

@@ -221,7 +221,7 @@ def vslamlab(
     from runtime.tools.cli.brief import print_verdict, verdict_table
 
     sequence, runs = sequence.absolute(), out.absolute().with_name(f"{out.name}_runs")
-    found, failed = [], {}
+    estimates, failed = [], {}
     try:
         if shutil.which(command[0]) is None:
             raise ValueError(f"expected a program that can be executed, found none: {command[0]}")
@@ -239,16 +239,16 @@ def vslamlab(
                 path = run_once([*command, *given], run, limit)
                 source = judgement.read(f"{run.name}={path}", camera=camera)
                 judgement.judge_all(truth, [source], images, config)  # raises, of another flight
-                found.append(source)
+                estimates.append(source)
             except ValueError as error:
                 failed[run.name] = {"passed": False, "failure": str(error)}
-        truth, judgements, verdict, notes = judgement.judge_all(truth, found, images, config)
-        errors = [each.figures.get("ate_rmse_m", np.nan) for each in judgements.values()]
+        truth, judgements, verdict, notes = judgement.judge_all(truth, estimates, images, config)
+        errors = [judged.figures.get("ate_rmse_m", np.nan) for judged in judgements.values()]
         if np.isfinite(errors).any():  # of two key frames there is none
             least, middle, most = np.nanpercentile(errors, [0, 50, 100])
             spread = f"ate_rmse_m: median {middle:.4g}, {least:.4g} to {most:.4g}"
             notes.append(f"{len(errors)} of {repeat} runs left a trajectory; {spread}")
-        notes += [f"run {name} failed: {each['failure']}" for name, each in failed.items()]
+        notes += [f"run {name} failed: {row['failure']}" for name, row in failed.items()]
         rows = dict(sorted({**verdict.estimators, **failed}.items()))
         passed = False if failed else verdict.passed
         verdict = msgspec.structs.replace(verdict, passed=passed, estimators=rows)

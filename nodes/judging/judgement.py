@@ -263,8 +263,8 @@ def _conclude(judgements: dict[str, Judgement], config: JudgeConfig, *, known: b
         few = msgspec.structs.replace(config.thresholds, frame_coverage_percent=IMAGES_PERCENT)
         own = {
             name: few
-            for name, each in figures.items()
-            if each["frame_coverage_percent"] < IMAGES_PERCENT
+            for name, row in figures.items()
+            if row["frame_coverage_percent"] < IMAGES_PERCENT
         }
     verdict = conclude(figures, config.thresholds, own=own)
     hints = {
@@ -275,10 +275,10 @@ def _conclude(judgements: dict[str, Judgement], config: JudgeConfig, *, known: b
         hints["coverage_percent"] = (
             "of the truth's time; if the images cover less of it, name their stamps with --frames"
         )
-    for each in verdict["estimators"].values():
-        each["failed"] = [
+    for row in verdict["estimators"].values():
+        row["failed"] = [
             f"{text} ({hints[name]})" if (name := text.partition(":")[0]) in hints else text
-            for text in each["failed"]
+            for text in row["failed"]
         ]
     return msgspec.convert(verdict, Verdict)
 
@@ -371,8 +371,8 @@ def in_memory(
             color=COLORS[k % len(COLORS)],
             figures=verdict.estimators[name],
             aligned=judgement.aligned,
-            of_images=judgement.of_images,
-            of_ticks=judgement.of_ticks,
+            image_errors=judgement.image_errors,
+            tick_errors=judgement.tick_errors,
             lost=judgement.lost,
             final=judgement.final,
         )

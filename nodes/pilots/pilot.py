@@ -328,8 +328,8 @@ class VisualPilot(Pilot[VisualPilotConfig]):
         if event.frame_id != frame:
             if event.frame_id != self._refused:
                 self._refused = event.frame_id
-                said = "%s: expected estimates in %s, found %s: not followed"
-                self.log.warning(said, event.source, frame, event.frame_id)
+                text = "%s: expected estimates in %s, found %s: not followed"
+                self.log.warning(text, event.source, frame, event.frame_id)
             return
         self.update_pose(event)
 

@@ -71,7 +71,7 @@ class Keys(NodeConfig):
 
     def actions(self) -> dict[str, str]:
         """Return each key's action; a `ValueError` if a key is unknown, or has two."""
-        found: dict[str, str] = {}
+        by_key: dict[str, str] = {}
         for action in self.__struct_fields__:
             for key in getattr(self, action).split():
                 if key not in KEYS:
@@ -79,12 +79,12 @@ class Keys(NodeConfig):
                         f"expected names of keys, such as w, 7, space or page_up, for {action}; "
                         f"there is no {key!r}{suggest(key, KEYS)}"
                     )
-                if key in found:
+                if key in by_key:
                     raise ValueError(
-                        f"expected a key of its own for {action}; {key!r} is for {found[key]}"
+                        f"expected a key of its own for {action}; {key!r} is for {by_key[key]}"
                     )
-                found[key] = action
-        return found
+                by_key[key] = action
+        return by_key
 
 
 class TeleopConfig(VehicleControllerConfig):

@@ -113,11 +113,11 @@ def estimate_frame(
     event: PoseEstimate, truth: RecentPoses | None
 ) -> tuple[Vector3, Quaternion] | None:
     """Return an estimate's frame in ``map``: its first pose laid on the true one, or `None`."""
-    found = None if truth is None else truth.at(event.stamp)
-    if found is None:
+    true_pose = None if truth is None else truth.at(event.stamp)
+    if true_pose is None:
         return None
     estimated = pose_matrix(event.position, event.orientation)
-    return pose_tuples(pose_matrix(*found) @ np.linalg.inv(estimated))
+    return pose_tuples(pose_matrix(*true_pose) @ np.linalg.inv(estimated))
 
 
 _KEPT = 4000  # pieces of a path; older ones are forgotten. A piece covers a quarter of a second.

@@ -160,10 +160,10 @@ class Euroc(Recording):
         **more: Any,
     ) -> None:
         """Write a sensor.yaml: kind, pose on the body, and further fields by kind."""
-        pose, said = np.eye(4), {}
+        pose, fields = np.eye(4), {}
         if mounted is not None:
-            pose, said = pose_matrix(mounted.position, mounted.orientation), noted(mounted)
-        what = {"kind": kind, "comment": comment, "pose": pose.tolist(), "noted": said} | more
+            pose, fields = pose_matrix(mounted.position, mounted.orientation), noted(mounted)
+        what = {"kind": kind, "comment": comment, "pose": pose.tolist(), "noted": fields} | more
         self.describe(f"mav0/{name}/sensor.yaml", "euroc.sensor.yaml", **what)
 
     def _note(
@@ -319,10 +319,10 @@ class TumRgbd(Recording):
                 "timestamp ax ay az",
             )  # fmt: skip
         self._unpaired: dict[int, str] = {}  # by stamp: rgb or depth, whichever came
-        said = noted(camera)
-        said.pop("time_offset", None)  # the true poses are those of the images' own stamps
+        fields = noted(camera)
+        fields.pop("time_offset", None)  # the true poses are those of the images' own stamps
         self.describe(
-            "camera.yaml", "tum_rgbd.camera.yaml", camera=camera, factor=depth_factor, noted=said
+            "camera.yaml", "tum_rgbd.camera.yaml", camera=camera, factor=depth_factor, noted=fields
         )
 
     def image(self, event: Image) -> ImageFile | None:

@@ -58,7 +58,7 @@ class DatasetWriter(Node[DatasetConfig]):
     depth_images = Input(DepthImage, bound=_WAITING, overflow="drop_oldest")
 
     async def on_startup(self) -> None:
-        """Make room."""
+        """Create the output folder."""
         self._announcements: list[Announcement] = []
         self._recording: Recording | None = None
         self._unwritten: set[ImageFile] = set()
@@ -116,8 +116,8 @@ class DatasetWriter(Node[DatasetConfig]):
             for _ in range(images.statistics().buffered):
                 self._note(images.receive_nowait())
         await self.offload(_finish, self._recording, list(self._unwritten))
-        for each in self._recording.warnings():
-            self.log.warning("%s", each)
+        for warning in self._recording.warnings():
+            self.log.warning("%s", warning)
         dropped = self.images.statistics().dropped + self.depth_images.statistics().dropped
         if dropped:
             self.log.warning("%d images are missing: writing was too slow for them", dropped)

@@ -51,12 +51,12 @@ def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
     able = [a for a in announced if {"rgb", "grey"} & {*a.images}]
     cameras = [a for a in able if (_belongs(a, named) if named is not None else not a.undistorted)]
     if not cameras:
-        found = ", ".join(f"{a.source} ({', '.join(a.images)})" for a in announced) or "none"
+        names = ", ".join(f"{a.source} ({', '.join(a.images)})" for a in announced) or "none"
         called = f" called {named}" if named is not None else ""
-        raise ValueError(f"expected a camera with rgb or grey images{called}, found {found}")
+        raise ValueError(f"expected a camera with rgb or grey images{called}, found {names}")
     vehicles = Vehicles()
-    for each in announcements:
-        vehicles.announced(each)
+    for announcement in announcements:
+        vehicles.announced(announcement)
 
     def body_of(source: str) -> str:
         return vehicles.carrier(source) or source.rpartition("/")[0] or source
@@ -208,8 +208,8 @@ class Recording(ABC):
 
     def describe(self, name: str, template: str, **values: Any) -> None:
         """Write a file from a template beside this module, with variable ``epoch``."""
-        found = templates(Path(__file__).parent).get_template(f"{template}.jinja")
-        self.write(name, found.render(values, epoch=self.epoch))
+        jinja_template = templates(Path(__file__).parent).get_template(f"{template}.jinja")
+        self.write(name, jinja_template.render(values, epoch=self.epoch))
 
     def empty(self) -> list[str]:
         """Return the files without rows."""
@@ -238,13 +238,13 @@ def notable(kind: Any) -> list[msgspec.structs.FieldInfo]:
 
 def noted(announcement: CameraAnnouncement | ImuAnnouncement) -> dict[str, str]:
     """Return the `notable` fields that are not their defaults, as YAML."""
-    found = {}
+    fields = {}
     for field in notable(announcement):
         value = getattr(announcement, field.name)
         if value != field.default:
             text = _row(value) if isinstance(value, tuple) else str(value).lower()
-            found[field.name] = text if isinstance(value, bool | tuple) else real(value)
-    return found
+            fields[field.name] = text if isinstance(value, bool | tuple) else real(value)
+    return fields
 
 
 def real(value: float) -> str:

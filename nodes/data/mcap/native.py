@@ -54,8 +54,8 @@ def message(frame: bytes | bytearray | memoryview, arrays: bool = True) -> bytes
 
 def describe(frame: bytes | bytearray | memoryview) -> tuple[str, str]:
     """Return the kind and the source of a frame's event; a `WireError` if it is no frame."""
-    kind, _, found, _ = _head(memoryview(frame), _source)
-    return kind, found.source
+    kind, _, head, _ = _head(memoryview(frame), _source)
+    return kind, head.source
 
 
 def lacking(data: bytes) -> list[Shape]:
@@ -69,8 +69,8 @@ def lacking(data: bytes) -> list[Shape]:
 
 def fields(data: bytes) -> dict[str, Any]:
     """Return an event's fields as msgpack has them, arrays as numbers; may raise `WireError`."""
-    found: dict[str, Any] = _head(memoryview(data)[_HEAD.size :], msgspec.msgpack.decode)[2]
-    return found
+    values: dict[str, Any] = _head(memoryview(data)[_HEAD.size :], msgspec.msgpack.decode)[2]
+    return values
 
 
 def event(data: bytes, arrays: Sequence[npt.NDArray[Any]] = ()) -> Event:
@@ -79,8 +79,8 @@ def event(data: bytes, arrays: Sequence[npt.NDArray[Any]] = ()) -> Event:
         return unpack(memoryview(data)[_HEAD.size :])
     shapes, begin, end = _shapes(data)
     if [(np.dtype(d), tuple(s)) for d, s, _ in shapes] != [(a.dtype, a.shape) for a in arrays]:
-        found = ", ".join(f"{a.dtype}{list(a.shape)}" for a in arrays)
-        raise WireError(f"expected arrays of {[(d, s) for d, s, _ in shapes]}, found {found}")
+        given = ", ".join(f"{a.dtype}{list(a.shape)}" for a in arrays)
+        raise WireError(f"expected arrays of {[(d, s) for d, s, _ in shapes]}, found {given}")
     size = begin + max(at + a.nbytes for (_, _, at), a in zip(shapes, arrays, strict=True))
     frame = np.empty(size, np.uint8)
     frame[:end] = np.frombuffer(data, np.uint8, end, _HEAD.size)
@@ -113,8 +113,8 @@ def _head(
     try:
         (length,) = _LENGTH.unpack_from(frame)
         end = _LENGTH.size + length
-        kind, shapes, found = _decode(frame[_LENGTH.size : end])
-        return kind, shapes, decode(found), end
+        kind, shapes, content = _decode(frame[_LENGTH.size : end])
+        return kind, shapes, decode(content), end
     except (struct.error, msgspec.DecodeError) as error:
         raise WireError(f"expected an event, found something else: {error}") from error
 
@@ -138,12 +138,12 @@ def arrays(
             return _cloud(message, shapes, axes)
         (shape,) = shapes
         if type_ == COMPRESSED:
-            found = decode_compressed(message)
+            pixels = decode_compressed(message)
         else:
-            found = np.frombuffer(message.data, np.dtype(shape.dtype)).reshape(shape.shape)
+            pixels = np.frombuffer(message.data, np.dtype(shape.dtype)).reshape(shape.shape)
     except (ValueError, cv2.error) as error:
         raise ValueError(f"expected arrays of {shapes}, found others: {error}") from error
-    return [found]
+    return [pixels]
 
 
 def _cloud(message: Any, shapes: list[Shape], axes: Axes) -> list[Array]:
@@ -197,14 +197,14 @@ def writer(
     Raises:
         OSError: It cannot be written.
     """
-    found = Writer(
+    writer = Writer(
         file,
         chunk_size=chunk_size,
         compression=CompressionType[compression.upper()],
         use_summary_offsets=False,  # optional, and its writer makes them of empty groups too
     )
-    found.start(profile=profile, library=library)
-    return found
+    writer.start(profile=profile, library=library)
+    return writer
 
 
 def open_file(path: Path) -> IO[bytes]:
@@ -232,8 +232,8 @@ def header_of(file: IO[bytes]) -> Header:
     """Return a file's header, empty if damaged."""
     with contextlib.suppress(McapError, *_DAMAGED):
         for opcode, content in layout.pieces(file, {Opcode.HEADER}):
-            found: Header = _parsed(opcode, content)
-            return found
+            header: Header = _parsed(opcode, content)
+            return header
     return Header("", "")
 
 
@@ -250,12 +250,12 @@ def summary_of(file: IO[bytes]) -> Summary | None:
 
 def metadata_of(file: IO[bytes], summary: Summary) -> dict[str, dict[str, str]]:
     """Return a file's metadata by name, up to the first damaged record."""
-    found: dict[str, dict[str, str]] = {}
+    metadata: dict[str, dict[str, str]] = {}
     with contextlib.suppress(McapError, *_DAMAGED):
         for index in summary.metadata_indexes:
             content = layout.piece_at(file, index.offset, index.length)
-            found[index.name] = dict(_parsed(Opcode.METADATA, content).metadata)
-    return found
+            metadata[index.name] = dict(_parsed(Opcode.METADATA, content).metadata)
+    return metadata
 
 
 def records(
@@ -269,12 +269,12 @@ def records(
     with open_file(path) as file:
         summary = summary_of(file)
         if summary is not None and summary.chunk_indexes and summary.channels:
-            found = _by_index(file, summary, start, end, damaged, everything)
+            stored = _by_index(file, summary, start, end, damaged, everything)
         else:
-            found = _one_by_one(file, damaged, everything)
+            stored = _one_by_one(file, damaged, everything)
         known: set[int] = set()
         strange = False
-        for record in found:
+        for record in stored:
             if isinstance(record, Channel):
                 known.add(record.id)
             elif isinstance(record, Message) and record.channel_id not in known:
@@ -305,15 +305,15 @@ def _by_index(
             else:
                 yield from _broken_up(content, damaged)
     if everything:
-        for opcode, found in (
+        for opcode, indexes in (
             (Opcode.METADATA, summary.metadata_indexes),
             (Opcode.ATTACHMENT, summary.attachment_indexes),
         ):
-            for each in found:
+            for place in indexes:
                 try:
-                    yield _parsed(opcode, layout.piece_at(file, each.offset, each.length))
+                    yield _parsed(opcode, layout.piece_at(file, place.offset, place.length))
                 except (McapError, *_DAMAGED) as error:
-                    damaged(f"{each.name} is damaged and left out ({error})")
+                    damaged(f"{place.name} is damaged and left out ({error})")
 
 
 def _one_by_one(file: IO[bytes], damaged: Callable[[str], None], everything: bool) -> Iterator[Any]:

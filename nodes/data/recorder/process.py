@@ -248,8 +248,8 @@ def send(reply: Reply) -> None:
 
 def main(request: str) -> None:
     """Carry out a write request, and reply with the result."""
-    for each in (signal.SIGINT, signal.SIGHUP):  # the terminal is the run's business
-        signal.signal(each, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP):  # the terminal is the run's business
+        signal.signal(number, signal.SIG_IGN)
     wanted = msgspec.json.decode(request, type=WriteRequest)
     os.nice(wanted.niceness)
     if wanted.cores:

@@ -39,14 +39,14 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
         RecordingError: The file is no MCAP file, unreadable or being written, or the other cannot
             be written.
     """
-    found = contents(path)
+    recording = contents(path)
     with records.open_file(path) as file:
         if is_being_written(file):
             raise RecordingError(f"{path}: expected a file that is done, found one being written")
-    if found.complete and out is None:
+    if recording.complete and out is None:
         trouble: list[str] = []
         messages = sum(isinstance(r, records.Message) for r in _all_of(path, trouble))
-        trouble += found.metadata.get(MENDED, {}).values()
+        trouble += recording.metadata.get(MENDED, {}).values()
         return Recovery(path, messages, trouble, mended=False, partial=bool(trouble))
     if out is not None and out.exists():
         raise RecordingError(f"{out}: expected the name of a new file, found one that is there")
@@ -60,7 +60,7 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
         raise
     if out is None:
         place.replace(path)
-    partial = any(each != layout.NOT_CLOSED for each in trouble)
+    partial = any(problem != layout.NOT_CLOSED for problem in trouble)
     return Recovery(out or path, messages, trouble, mended=True, partial=partial)
 
 
@@ -105,9 +105,9 @@ def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
                         number = channels[record.channel_id]
                         writer.add_message(number, time, record.data, published, record.sequence)
                         messages += 1
-            lost = [each for each in trouble if each != layout.NOT_CLOSED]
+            lost = [problem for problem in trouble if problem != layout.NOT_CLOSED]
             if lost:  # so that nobody takes it for whole, now that it has an index
-                writer.add_metadata(MENDED, {str(n): each for n, each in enumerate(lost, 1)})
+                writer.add_metadata(MENDED, {str(n): problem for n, problem in enumerate(lost, 1)})
             writer.finish()  # type: ignore[no-untyped-call]
             file.flush()
             os.fsync(file.fileno())  # it may take the place of the only other one there is

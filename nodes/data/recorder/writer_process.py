@@ -299,13 +299,13 @@ class WriterProcess:
                 if (waiting := self.backlog.take()) is not None:
                     taken.append(waiting)
                     self._write(waiting)
-                    if sum(each.size for each in taken) < _AT_ONCE and len(taken) < _IN_A_ROW:
+                    if sum(entry.size for entry in taken) < _AT_ONCE and len(taken) < _IN_A_ROW:
                         continue
                 if taken:
                     self._events.flush()
                     self._handed += len(taken)
-                    for each in taken:
-                        self.backlog.done(each)
+                    for entry in taken:
+                        self.backlog.done(entry)
                     taken = []
                 elif closing:
                     return

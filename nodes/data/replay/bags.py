@@ -126,8 +126,8 @@ class Recorded(Reader):
         # All events with arrays and a message have a frame.
         frame = native.fields(record.data).get("frame_id", "map")
         axes = self._frames.axes(frame)
-        found = arrays(self._store, holder.data, holder.type, lacking, axes)
-        return native.event(record.data, found)
+        pixels = arrays(self._store, holder.data, holder.type, lacking, axes)
+        return native.event(record.data, pixels)
 
     def _read_announcements(self) -> Iterator[Announcement]:
         for record in read(self._path):
@@ -158,21 +158,21 @@ TYPES = {use: tuple(t for t, to in READERS if to == use) for use in get_args(Use
 
 
 def chosen(
-    found: Mapping[str, tuple[str, int]],  # type and number of messages, by topic
+    topics: Mapping[str, tuple[str, int]],  # type and number of messages, by topic
     wanted: tuple[BagTopic, ...],
     vehicle: str,
 ) -> dict[str, BagTopic]:
     """Return the topics to read, by name, with all sources; a `ReplayError` if one is missing."""
     taken: dict[str, BagTopic] = {}
     for topic in wanted:
-        name = topic_in(found, topic.topic)
-        if name not in found:
-            fit = [f"{k} ({v})" for k, (v, _) in sorted(found.items()) if v in TYPES[topic.use]]
+        name = topic_in(topics, topic.topic)
+        if name not in topics:
+            fit = [f"{k} ({v})" for k, (v, _) in sorted(topics.items()) if v in TYPES[topic.use]]
             raise ReplayError(
                 f"topics: expected one of the bag's, found {topic.topic!r}"
-                f"{suggest(topic.topic, found)}; {topic.use} can be: {', '.join(fit) or 'none'}"
+                f"{suggest(topic.topic, topics)}; {topic.use} can be: {', '.join(fit) or 'none'}"
             )
-        type_ = found[name][0]
+        type_ = topics[name][0]
         if type_ not in TYPES[topic.use]:
             raise ReplayError(
                 f"topics: {name}: expected {' or '.join(TYPES[topic.use])} "
@@ -197,17 +197,17 @@ class Mountings:
     def __init__(self, messages: Iterable[Any], complain: Callable[[str], None]) -> None:
         self._parents: dict[str, tuple[str, Pose]] = {}
         for message in messages:
-            for each in message.transforms:
-                t, r = each.transform.translation, each.transform.rotation
+            for stamped in message.transforms:
+                t, r = stamped.transform.translation, stamped.transform.rotation
                 position = (float(t.x), float(t.y), float(t.z))
                 try:
                     turn = normalize((float(r.w), float(r.x), float(r.y), float(r.z)))
                     if not all(map(isfinite, position)):
                         raise ValueError(f"expected a finite place, found {position}")
                 except ValueError as error:
-                    complain(f"/tf_static: {each.child_frame_id} is left out: {error}")
+                    complain(f"/tf_static: {stamped.child_frame_id} is left out: {error}")
                     continue
-                self._parents[each.child_frame_id] = each.header.frame_id, (position, turn)
+                self._parents[stamped.child_frame_id] = stamped.header.frame_id, (position, turn)
 
     def of(self, frame: str, axes: Axes = "optical", body: str = "base_link") -> Pose | None:
         """Return the pose of a frame, with such axes here, in the body, FRD; `None` if unknown."""
@@ -347,29 +347,29 @@ class RosBag(Reader):
         if not self._named:
             there = self._found.items()
             names = [name for name, (type_, count) in there if count and type_ in GUESSED]
-        found: dict[str, tuple[str, int, Any]] = {}
+        firsts: dict[str, tuple[str, int, Any]] = {}
         for name in sorted(names):
             try:
                 for _, type_, time, message in self._bag.messages([name]):
-                    found[name] = type_, time, message
+                    firsts[name] = type_, time, message
                     break
             except MessageError as error:
                 self._refuse(name, error)
-        if self._named and not found:
+        if self._named and not firsts:
             raise ReplayError(f"expected messages on {', '.join(names)}, found none")
-        return found
+        return firsts
 
     def _choose(self, topics: tuple[BagTopic, ...]) -> dict[str, BagTopic]:
         if self._named:
             return chosen(self._found, topics, self._vehicle)
         messages = {name: message for name, (_, _, message) in self._firsts.items()}
         given = self._chain.cameras if self._chain else ()
-        calibrated = {topic_in(self._found, each.topic): each.info for each in given}
+        calibrated = {topic_in(self._found, camera.topic): camera.info for camera in given}
         same_frame = self._mountings.same
         streams = guess(self._found, messages, self._vehicle, same_frame, calibrated)
         self.notes += streams.notes
-        for each in streams.left_out:
-            self.complain(each)
+        for reason in streams.left_out:
+            self.complain(reason)
         if not streams.topics:
             types = sorted((name, type_) for name, (type_, _) in self._found.items())
             there = ", ".join(f"{name} ({type_})" for name, type_ in types)
@@ -391,8 +391,8 @@ class RosBag(Reader):
     def _origins(self) -> tuple[int, Stamps]:
         """Return the time of receipt counted as 0, and the conversion of stamps."""
         times = [time for _, time, _ in self._firsts.values()]
-        found = ((time, _stamp(message)) for _, time, message in self._firsts.values())
-        stamped = [(time, at) for time, at in found if at]
+        pairs = ((time, _stamp(message)) for _, time, message in self._firsts.values())
+        stamped = [(time, at) for time, at in pairs if at]
         stamps = [at for _, at in stamped]
         if all(abs(time - at) < _SAME_CLOCK for time, at in stamped):
             origin = min(times + stamps)
@@ -419,7 +419,7 @@ class RosBag(Reader):
         for _, _, event in self._first_events("odometry", "truth"):
             assert isinstance(event, Odometry)
             yield vehicle_at(event)
-        imus = [self._imu(*each) for each in self._first_events("imu")]
+        imus = [self._imu(*event) for event in self._first_events("imu")]
         yield from self._cameras(imus)
         yield from imus
         for topic in self._topics.values():
@@ -515,7 +515,7 @@ class RosBag(Reader):
     ) -> Iterator[CameraAnnouncement]:
         """Yield the cameras of a calibration, whose images are taken away; note the IMU's."""
         topics = {
-            base_of(name): (source, name) for source, each in images.items() for name, _ in each
+            base_of(name): (source, name) for source, pairs in images.items() for name, _ in pairs
         }
         own = next((n for n, i in enumerate(imus) if _is_of(chain, self._topics, i)), None)
         body = imu_in_body(imus[own] if own is not None else None)
@@ -580,8 +580,8 @@ def _is_of(chain: Chain, topics: Mapping[str, BagTopic], imu: ImuAnnouncement) -
 
 def open_bag(path: Path) -> Bag:
     """Open a bag after a check of its chunks' claimed sizes; call within `readable`."""
-    for each in [path] if path.is_file() else sorted(path.glob("*.mcap")):
-        with each.open("rb") as file:
+    for mcap_path in [path] if path.is_file() else sorted(path.glob("*.mcap")):
+        with mcap_path.open("rb") as file:
             if file.read(len(layout.MAGIC)) == layout.MAGIC:
                 layout.check_chunks(file)  # rosbags would believe whatever they claim
     return Bag(path)

@@ -53,8 +53,8 @@ def mountings(chain: Chain, imu: Floats, first: Pose | None = None) -> list[Pose
     """
     ahead = pose_matrix(*(first or ((0.0, 0.0, 0.0), OPTICAL_TO_FRD)))
     return [
-        pose_tuples(ahead @ each.in_first if each.in_imu is None else imu @ each.in_imu)
-        for each in chain.cameras
+        pose_tuples(ahead @ camera.in_first if camera.in_imu is None else imu @ camera.in_imu)
+        for camera in chain.cameras
     ]
 
 

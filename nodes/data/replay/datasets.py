@@ -75,8 +75,8 @@ class Euroc(FolderReader):
     def find(cls, path: Path) -> Path | None:
         """Return the folder of cameras and IMU."""
         folders = (path, path / "mav0")
-        found = (f for f in folders if (f / "cam0").is_dir() or (f / "imu0").is_dir())
-        return next(found, None)
+        matches = (f for f in folders if (f / "cam0").is_dir() or (f / "imu0").is_dir())
+        return next(matches, None)
 
     def _read(self) -> None:
         folder = self._folder
@@ -98,7 +98,7 @@ class Euroc(FolderReader):
                 f"calibration: expected one of {', '.join(f.name for f in folders) or 'a camera'}, "
                 f"found {', '.join(mounted)}"
             )
-        self._announcements += as_pairs([self._camera(each, mounted) for each in folders])
+        self._announcements += as_pairs([self._camera(folder, mounted) for folder in folders])
         if imu is not None:
             self._announcements.append(imu)
         self._truth = self._poses()
@@ -111,7 +111,7 @@ class Euroc(FolderReader):
         """
         given = chain_of(self._config)
         sensors = [*self._folder.glob("cam[0-9]*"), *self._folder.glob("imu0")]
-        if given or all((each / "sensor.yaml").is_file() for each in sensors):
+        if given or all((sensor / "sensor.yaml").is_file() for sensor in sensors):
             return given
         paths = []
         for names in _CHAINS, _NOISES:
@@ -267,16 +267,16 @@ A = TypeVar("A", CameraAnnouncement, ImuAnnouncement)
 
 def _with_noted(announcement: A, sensor: Sensor) -> A:
     """Return an announcement with what our own data sets note beside the layout's words."""
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for field in notable(announcement):
         name = field.name
         if name in sensor.lists:
-            found[name] = tuple(sensor.lists[name])
+            fields[name] = tuple(sensor.lists[name])
         elif isinstance(field.default, bool):
-            found[name] = sensor.texts.get(name) == "true"
+            fields[name] = sensor.texts.get(name) == "true"
         elif name in sensor.texts:
-            found[name] = sensor.number(name)
-    return msgspec.structs.replace(announcement, **found)
+            fields[name] = sensor.number(name)
+    return msgspec.structs.replace(announcement, **fields)
 
 
 FARTHEST = 20_000_000  # nanoseconds between a depth image and its colour image
@@ -352,7 +352,7 @@ class TumRgbd(FolderReader):
         taken: dict[int, tuple[int, Path]] = {}
         for stamp, path in depth:
             at = bisect.bisect_left(stamps, stamp)
-            near = min(stamps[max(at - 1, 0) : at + 1], key=lambda each: abs(each - stamp))
+            near = min(stamps[max(at - 1, 0) : at + 1], key=lambda s: abs(s - stamp))
             distance = abs(near - stamp)
             if distance <= FARTHEST and (near not in taken or distance < taken[near][0]):
                 taken[near] = distance, path
@@ -439,11 +439,11 @@ class Kitti(FolderReader):
         bodies = _AXES @ poses @ np.linalg.inv(_AXES)
         return [(s, *pose_tuples(body)) for s, body in zip(self._stamps, bodies, strict=True)]
 
-    def _count(self, where: Path, what: str, found: int) -> None:
-        if found != len(self._stamps):
+    def _count(self, where: Path, what: str, count: int) -> None:
+        if count != len(self._stamps):
             raise ReplayError(
                 f"{where}: expected {len(self._stamps)} {what}, as many as times.txt has stamps, "
-                f"found {found}"
+                f"found {count}"
             )
 
 

@@ -79,11 +79,11 @@ def as_pair(left: CameraAnnouncement, right: CameraAnnouncement) -> CameraAnnoun
     A pair has one size and one rate, less than 60 degrees between its directions, and the right one
     at least half of their distance to the left one's right.
     """
-    one, other = (pose_matrix(each.position, each.orientation) for each in (left, right))
+    one, other = (pose_matrix(camera.position, camera.orientation) for camera in (left, right))
     apart = other[:3, 3] - one[:3, 3]
     distance = float(np.linalg.norm(apart))
     beside = apart @ one[:3, 0] > 0.5 * distance > 0.0 and one[:3, 2] @ other[:3, 2] > 0.5
-    alike = [(each.info.width, each.info.height, each.rate) for each in (left, right)]
+    alike = [(camera.info.width, camera.info.height, camera.rate) for camera in (left, right)]
     if not beside or alike[0] != alike[1]:
         return right
     return msgspec.structs.replace(right, stereo=left.source, baseline=distance)
@@ -146,13 +146,13 @@ class FolderReader(Reader):
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
         """Yield all events by stamp; at equal stamps, those of earlier `Rows` first."""
 
-        def made(each: Rows) -> Iterator[Event]:
-            for row in each.rows:
+        def made(table: Rows) -> Iterator[Event]:
+            for row in table.rows:
                 time = row[0] - self._origin
                 if start <= time and (end is None or time < end):
-                    yield each.make(*row)
+                    yield table.make(*row)
 
-        wanted = (made(each) for each in self._rows() if wants(each.kind, each.source))
+        wanted = (made(table) for table in self._rows() if wants(table.kind, table.source))
         merged = heapq.merge(*wanted, key=lambda event: event.stamp)
         return (Timed(event.stamp, event) for event in merged)
 
@@ -184,12 +184,12 @@ class FolderReader(Reader):
 
     def _written(self, files: Files) -> Files:
         """Return a camera's images without those that a killed run of ours listed, not wrote."""
-        found = [each for each in files if not self._epoch or each[1].is_file()]
-        if found and (missing := len(files) - len(found)):
+        existing = [entry for entry in files if not self._epoch or entry[1].is_file()]
+        if existing and (missing := len(files) - len(existing)):
             self.complain(
                 f"{files[0][1].parent}: {missing} listed images are missing, and left out"
             )
-        return found or files
+        return existing or files
 
     def _begin(self, others: Sequence[int] = ()) -> None:
         """Choose time 0, cut the truth to the sensors' time, and announce the vehicle.
@@ -308,16 +308,16 @@ class Sensor(msgspec.Struct, frozen=True):
         except (KeyError, ValueError):
             if default is not None and key not in self.texts:
                 return default
-            found = self.texts.get(key, "nothing")
-            raise ReplayError(f"{self.path}: {key}: expected a number, found {found}") from None
+            text = self.texts.get(key, "nothing")
+            raise ReplayError(f"{self.path}: {key}: expected a number, found {text}") from None
 
     def list(self, key: str, *lengths: int) -> list[float]:
         """Return a list of numbers; a `ReplayError` if there is none of such a length."""
-        found = self.lists.get(key, [])
-        if len(found) not in lengths:
+        numbers = self.lists.get(key, [])
+        if len(numbers) not in lengths:
             counts = " or ".join(map(str, lengths))
-            raise ReplayError(f"{self.path}: {key}: expected {counts} numbers, found {found}")
-        return found
+            raise ReplayError(f"{self.path}: {key}: expected {counts} numbers, found {numbers}")
+        return numbers
 
     def converted(self, values: dict[str, Any], kind: type[T]) -> T:
         """Return values as a struct; a `ReplayError` if they do not fit."""

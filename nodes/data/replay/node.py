@@ -78,9 +78,9 @@ class ReadAhead:
     def _read(self) -> None:
         batch: Batch = []
         size = 0
-        for each in self._events:
-            batch.append(each)
-            size += _size_of(each)
+        for event in self._events:
+            batch.append(event)
+            size += _size_of(event)
             if len(batch) >= MOST or size >= LARGEST:
                 if not self._put(batch, size):
                     return
@@ -204,14 +204,14 @@ class Timeline:
         self, times: npt.NDArray[np.int64]
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
         """Return a mask of the times played, and their last time on the run's clock."""
-        known, found = np.zeros(times.shape, np.bool_), times.copy()
+        known, stamps = np.zeros(times.shape, np.bool_), times.copy()
         first = last = np.iinfo(np.int64).max  # of what was played later: on recording and run
         for position, now, _ in reversed(self._stretches):
             here = (times >= position) & (times < min(first, last - now + position))
-            found[here] += now - position
+            stamps[here] += now - position
             known |= here
             first, last = min(first, position), now
-        return known, found
+        return known, stamps
 
 
 _SLICE = SECOND // 10  # in real time, how long a sleep may keep `seek` waiting (ns)
@@ -373,9 +373,9 @@ class Replay(Node[ReplayConfig]):
         self._reader = reader = open_reader(config, self.name)
         announced = reader.announcements()
         self._choice = Choice(config.only, config.skip, announced)
-        self._announcements = [each for each in announced if self._choice.announced(each)]
+        self._announcements = [a for a in announced if self._choice.announced(a)]
         if config.start:
-            self._announcements = [self._starting(reader, each) for each in self._announcements]
+            self._announcements = [self._starting(reader, a) for a in self._announcements]
 
     def _starting(self, reader: Reader, announcement: Announcement) -> Announcement:
         if not isinstance(announcement, VehicleAnnouncement):
@@ -384,8 +384,8 @@ class Replay(Node[ReplayConfig]):
         def wants(kind: type[Event], source: str) -> bool:
             return issubclass(kind, Odometry) and source == announcement.source
 
-        found = reader.events(round(self.config.start * SECOND), None, wants)
-        event = next((each.event for each in found), None)
+        events = reader.events(round(self.config.start * SECOND), None, wants)
+        event = next((recorded.event for recorded in events), None)
         if not isinstance(event, Odometry):
             return announcement
         return msgspec.structs.replace(
@@ -403,14 +403,14 @@ class Replay(Node[ReplayConfig]):
             + (f" from {config.start:g} s on" if config.start else "")
             + (f" to {config.end:g} s" if config.end else "")
             + (f" of {named}" if named else "")
-            + "".join(f"; {each}" for each in (self._reader.trouble if self._reader else []))
+            + "".join(f"; {problem}" for problem in (self._reader.trouble if self._reader else []))
         )
 
     def _log_trouble(self) -> None:
         if self._reader is None:
             return
-        for each in self._reader.trouble[self._logged :]:
-            self.log.warning("%s: %s", self.config.file, each)
+        for problem in self._reader.trouble[self._logged :]:
+            self.log.warning("%s: %s", self.config.file, problem)
         self._logged = len(self._reader.trouble)
         if (left_out := self._reader.left_out - self._logged_left_out) > 0:
             self.log.warning(

@@ -98,13 +98,11 @@ class Choice:
         skip: Sequence[str] = (),  # types and sources left out
         announcements: Iterable[Announcement] = (),
     ) -> None:
-        types = {each.__name__ for each in _types(Event)}
+        types = {kind.__name__ for kind in _types(Event)}
         self._types = [name for name in only if name in types]
         self._sources = [name for name in only if name not in types]
         self._skip = list(skip)
-        self._estimators = {
-            each.source for each in announcements if isinstance(each, EstimatorAnnouncement)
-        }
+        self._estimators = {a.source for a in announcements if isinstance(a, EstimatorAnnouncement)}
         self._known: dict[tuple[type[Event], str], bool] = {}
         self.unmatched = {*only, *skip}  # names without a matching event so far
 
@@ -136,18 +134,18 @@ class Choice:
         return bool(kind.category & USUAL) and source not in self._estimators
 
     def _matches(self, name: str, kind: type[Event], source: str) -> bool:
-        found = (
+        matched = (
             name in {base.__name__ for base in kind.__mro__}
             or source == name
             or source.startswith(f"{name}/")
         )
-        if found:
+        if matched:
             self.unmatched.discard(name)
-        return found
+        return matched
 
 
 def _types(cls: type[Event]) -> list[type[Event]]:
-    return [cls, *(found for each in cls.__subclasses__() for found in _types(each))]
+    return [cls, *(kind for subclass in cls.__subclasses__() for kind in _types(subclass))]
 
 
 Use = Literal["image", "depth", "imu", "odometry", "truth", "estimate", "camera"]

@@ -43,7 +43,7 @@ SameFrame = Callable[[str, str], bool]  # whether two frames are at one place, a
 def topic_in(bag: Iterable[str], name: str) -> str:
     """Return a bag's topic by its name with or without the leading slash, else `name`."""
     there = set(bag)
-    return next((each for each in (name, f"/{name}", name.lstrip("/")) if each in there), name)
+    return next((topic for topic in (name, f"/{name}", name.lstrip("/")) if topic in there), name)
 
 
 def source_of(topic: str, use: str, vehicle: str) -> str:
@@ -90,7 +90,7 @@ class _Images(NamedTuple):
     topic: str
     depth: bool
     camera: str  # what all topics of one camera share: a namespace, or the topic's own name
-    said: str  # encoding or format
+    encoding: str  # or format
     message: Any
     info_topic: str  # of its camera_info; empty if there is none
     info: CameraInfo | None  # None if there is none, or one without calibration
@@ -98,7 +98,7 @@ class _Images(NamedTuple):
 
     @property
     def grey(self) -> bool:
-        return self.said.startswith(("mono", "8UC1"))
+        return self.encoding.startswith(("mono", "8UC1"))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -109,13 +109,13 @@ class _Images(NamedTuple):
     def rank(self) -> tuple[bool, bool, bool, bool, str]:
         """Order of preference among topics of one camera: the least is taken."""
         last = base_of(self.topic).rpartition("/")[2]
-        mosaic = self.said.startswith("bayer")
+        mosaic = self.encoding.startswith("bayer")
         packed = self.topic != base_of(self.topic)
         return is_rectified(self.topic), "mono" in last or self.grey, mosaic, packed, self.topic
 
 
 def guess(
-    found: Mapping[str, tuple[str, int]],  # type and number of messages, by topic
+    topics: Mapping[str, tuple[str, int]],  # type and number of messages, by topic
     firsts: Mapping[str, Any],  # first message of each topic of `GUESSED`
     vehicle: str,
     same_frame: SameFrame,
@@ -125,12 +125,12 @@ def guess(
     result = Streams([], [], [])
     images: list[_Images] = []
     truth = ""
-    for name, (type_, _) in sorted(found.items()):
+    for name, (type_, _) in sorted(topics.items()):
         if name not in firsts or name.startswith("/visnav/") or "segmentation" in name:
             continue
         if type_ in {_IMAGE, _COMPRESSED}:
-            images += _images(name, type_, found, firsts, calibrated, result.left_out)
-        elif type_ == _IMU and (half := _other_half(name, found)):
+            images += _images(name, type_, topics, firsts, calibrated, result.left_out)
+        elif type_ == _IMU and (half := _other_half(name, topics)):
             result.left_out.append(
                 f"{name}: left out: with {half} it is half an IMU each, as of realsense2_camera "
                 "without unite_imu_method; record it united to have it"
@@ -151,7 +151,7 @@ def guess(
     return result
 
 
-def _other_half(name: str, found: Mapping[str, tuple[str, int]]) -> str:
+def _other_half(name: str, topics: Mapping[str, tuple[str, int]]) -> str:
     """Return the topic of the gyroscope beside an accelerometer's, or the reverse, else ''.
 
     Both have the type of a whole IMU, with zeros for what they do not measure.
@@ -159,7 +159,7 @@ def _other_half(name: str, found: Mapping[str, tuple[str, int]]) -> str:
     parts = name.split("/")
     for one, other in (("accel", "gyro"), ("gyro", "accel")):
         twin = "/".join(other if part == one else part for part in parts)
-        if one in parts and found.get(twin, ("", 0))[0] == _IMU:
+        if one in parts and topics.get(twin, ("", 0))[0] == _IMU:
             return twin
     return ""
 
@@ -167,7 +167,7 @@ def _other_half(name: str, found: Mapping[str, tuple[str, int]]) -> str:
 def _images(
     name: str,
     type_: str,
-    found: Mapping[str, tuple[str, int]],
+    topics: Mapping[str, tuple[str, int]],
     firsts: Mapping[str, Any],
     calibrated: Mapping[str, CameraInfo],
     left_out: list[str],
@@ -177,22 +177,22 @@ def _images(
     if type_ == _COMPRESSED:
         if getattr(firsts.get(base), "encoding", "") in (*COLOUR_ENCODINGS, *DEPTH_ENCODINGS):
             return []  # the same images
-        said = str(message.format)
-        depth = "compressedDepth" in said or said.startswith(DEPTH_ENCODINGS)
+        encoding = str(message.format)
+        depth = "compressedDepth" in encoding or encoding.startswith(DEPTH_ENCODINGS)
     else:
-        said = str(message.encoding)
-        depth = said in DEPTH_ENCODINGS
-        if not depth and said not in COLOUR_ENCODINGS:
+        encoding = str(message.encoding)
+        depth = encoding in DEPTH_ENCODINGS
+        if not depth and encoding not in COLOUR_ENCODINGS:
             left_out.append(
-                f"{name}: left out: its encoding {said!r:.40} cannot be read; convert it to rgb8, "
-                "mono8, a Bayer pattern, 16UC1 or 32FC1 to have it"
+                f"{name}: left out: its encoding {encoding!r:.40} cannot be read; convert it to "
+                "rgb8, mono8, a Bayer pattern, 16UC1 or 32FC1 to have it"
             )
             return []
     space, _, last = base.rpartition("/")
     own = f"{base}/camera_info"
     beside = f"{space}/camera_info"
     pipeline = _OF_PIPELINE.fullmatch(last) is not None
-    every = {base_of(other) for other, (t, n) in found.items() if t in {_IMAGE, _COMPRESSED} and n}
+    every = {base_of(other) for other, (t, n) in topics.items() if t in {_IMAGE, _COMPRESSED} and n}
     alone = pipeline or sum(other.rpartition("/")[0] == space for other in every) == 1
     info_topic = own if own in firsts else beside if beside in firsts and alone else ""
     info = calibrated.get(base)
@@ -210,7 +210,7 @@ def _images(
             topic=name,
             depth=depth,
             camera=space if pipeline else base,
-            said=said,
+            encoding=encoding,
             message=message,
             info_topic=info_topic if info and base not in calibrated else "",
             info=info,
@@ -222,11 +222,11 @@ def _images(
 def _one_a_camera(images: list[_Images], notes: list[str]) -> list[_Images]:
     """Return the preferred topic of each camera and kind; the others are noted."""
     groups: dict[tuple[str, bool], list[_Images]] = {}
-    for each in images:
-        groups.setdefault((each.camera, each.depth), []).append(each)
+    for image in images:
+        groups.setdefault((image.camera, image.depth), []).append(image)
     chosen = []
     for group in groups.values():
-        first, *others = sorted(group, key=lambda each: each.rank)
+        first, *others = sorted(group, key=lambda image: image.rank)
         chosen.append(first)
         for other in others:
             what = "rectified images" if is_rectified(other.topic) else "images"
@@ -234,7 +234,7 @@ def _one_a_camera(images: list[_Images], notes: list[str]) -> list[_Images]:
                 f"{other.topic}: not read: {what} of the same camera as {first.topic}, which is; "
                 "to have these instead, name them in topics"
             )
-    return sorted(chosen, key=lambda each: (each.depth, each.grey, each.topic))
+    return sorted(chosen, key=lambda image: (image.depth, image.grey, image.topic))
 
 
 def _add_cameras(
@@ -242,11 +242,11 @@ def _add_cameras(
 ) -> None:
     sources: dict[str, str] = {}  # of image topics
     depths: set[str] = set()  # sources that have depth
-    for each in chosen:
-        paired, why = (None, "") if not each.depth else _camera_of(each, chosen, same_frame)
+    for image in chosen:
+        paired, why = (None, "") if not image.depth else _camera_of(image, chosen, same_frame)
         if paired is not None and sources[paired.topic] in depths:
             result.notes.append(
-                f"{each.topic}: not read: {sources[paired.topic]} has depth already; to have this "
+                f"{image.topic}: not read: {sources[paired.topic]} has depth already; to have this "
                 "instead, name it in topics"
             )
             continue
@@ -254,24 +254,28 @@ def _add_cameras(
             source = sources[paired.topic]
             depths.add(source)
         else:
-            source = source_of(each.topic, "image", vehicle)
-            for longer in (each.camera, base_of(each.topic)):
+            source = source_of(image.topic, "image", vehicle)
+            for longer in (image.camera, base_of(image.topic)):
                 if source in sources.values():  # another camera's
                     source = source_of(longer, "imu", vehicle)
-            sources[each.topic] = source
-        use: Use = "depth" if each.depth else "image"
-        result.topics.append(BagTopic(topic=each.topic, use=use, source=source))
+            sources[image.topic] = source
+        use: Use = "depth" if image.depth else "image"
+        result.topics.append(BagTopic(topic=image.topic, use=use, source=source))
         if paired is not None:
-            result.notes.append(f"{each.topic}: depth of {source}, as {paired.topic}{why}")
+            result.notes.append(f"{image.topic}: depth of {source}, as {paired.topic}{why}")
             continue
-        told = f"calibration {each.info_topic}" if each.info_topic else "without a calibration"
-        if each.info and not each.info_topic:
-            told = "calibration of the settings"
-        if each.info_topic and is_rectified(each.topic):
-            told += " (P, rectified)"
-        result.notes.append(f"{each.topic}: {use} of {source} ({each.said}), {told}{why}")
-        if each.info_topic:
-            result.topics.append(BagTopic(topic=each.info_topic, use="camera", source=source))
+        calibration = (
+            f"calibration {image.info_topic}" if image.info_topic else "without a calibration"
+        )
+        if image.info and not image.info_topic:
+            calibration = "calibration of the settings"
+        if image.info_topic and is_rectified(image.topic):
+            calibration += " (P, rectified)"
+        result.notes.append(
+            f"{image.topic}: {use} of {source} ({image.encoding}), {calibration}{why}"
+        )
+        if image.info_topic:
+            result.topics.append(BagTopic(topic=image.info_topic, use="camera", source=source))
 
 
 def _camera_of(
@@ -279,17 +283,17 @@ def _camera_of(
 ) -> tuple[_Images | None, str]:
     """Return the camera whose pixels a depth image's are, and why it is so, or why none is."""
     reasons = []
-    for each in chosen:
-        if each.depth:
+    for camera in chosen:
+        if camera.depth:
             continue
-        if each.frame != depth.frame and not same_frame(each.frame, depth.frame):
-            reasons.append(f"{each.topic} is of the frame {each.frame!r}, not {depth.frame!r}")
-        elif (wrong := _difference(each, depth)) is not None:
-            reasons.append(f"{each.topic} {wrong}")
-        elif each.info and depth.info:
-            return each, ": one frame, size and K"
+        if camera.frame != depth.frame and not same_frame(camera.frame, depth.frame):
+            reasons.append(f"{camera.topic} is of the frame {camera.frame!r}, not {depth.frame!r}")
+        elif (wrong := _difference(camera, depth)) is not None:
+            reasons.append(f"{camera.topic} {wrong}")
+        elif camera.info and depth.info:
+            return camera, ": one frame, size and K"
         else:
-            return each, ": one frame and size; one of them has no K to compare"
+            return camera, ": one frame and size; one of them has no K to compare"
     return None, f"; no camera's own depth: {'; '.join(reasons)}" if reasons else ""
 
 

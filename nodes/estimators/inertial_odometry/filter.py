@@ -148,10 +148,10 @@ class InertialFilter:
         self._of_frames[depth], self._of_frames[:, depth] = 0.0, 0.0
         if placed is not None and len(placed.places):
             group, numbers = np.zeros(len(placed.places), np.intp), np.array([number])
-            found = self._by_landmarks(self.state, placed, group, numbers)
-            told = np.zeros((6, 6)) if found is None else found[0][POSE, POSE]
+            equations = self._by_landmarks(self.state, placed, group, numbers)
+            of_pose = np.zeros((6, 6)) if equations is None else equations[0][POSE, POSE]
             shared = 1.0 + self._common[1] * (len(placed.places) - 1)
-            self._of_frames[here, here] += np.linalg.inv(told / shared + np.eye(6) / _VAGUE**2)
+            self._of_frames[here, here] += np.linalg.inv(of_pose / shared + np.eye(6) / _VAGUE**2)
             self._of_frames[depth, depth] = shared / (placed.scale[:, 2] ** 2).sum() + deviation**2
         self._with_frames[:, here] = self.covariance[:, POSE]
         self._with_frames[:, depth] = 0.0
@@ -206,9 +206,9 @@ class InertialFilter:
                 in `nodes.estimators.odometry`, shape (6, 6).
             first: Whether this is the first pose by that key frame.
         """
-        found = camera @ inverse(self.camera)
+        body = camera @ inverse(self.camera)
         rotation, position = self._frames[number]
-        relative = rotation.T @ found[:3, :3], rotation.T @ (found[:3, 3] - position)
+        relative = rotation.T @ body[:3, :3], rotation.T @ (body[:3, 3] - position)
         by = np.zeros((6, 6 + _FRAME))
         by[:, :6] = np.eye(6)
         by[:3, 6:9], by[3:, 6:9] = -relative[0].T, rotation @ cross(relative[1])
@@ -217,16 +217,16 @@ class InertialFilter:
         small = np.zeros((6, 6))
         small[:3, :3], small[:3, 3:] = mounted @ cross(self.camera[:3, 3]), -camera[:3, :3].T
         small[3:, :3] = -mounted
-        told = small.T @ information @ small
+        of_body = small.T @ information @ small
         if first:
             here = self._slots(np.array([number]))[POSE]
-            lasting = np.linalg.inv(told + np.eye(6) / _VAGUE**2)
+            lasting = np.linalg.inv(of_body + np.eye(6) / _VAGUE**2)
             self._of_frames[np.ix_(here, here)] += lasting
-        weighted = by.T @ told
+        weighted = by.T @ of_body
 
         def measure(state: State) -> tuple[Floats, Floats]:
-            turn = Rotation.from_matrix(state.rotation.T @ found[:3, :3]).as_rotvec()
-            return weighted @ by, weighted @ np.concatenate([turn, found[:3, 3] - state.position])
+            turn = Rotation.from_matrix(state.rotation.T @ body[:3, :3]).as_rotvec()
+            return weighted @ by, weighted @ np.concatenate([turn, body[:3, 3] - state.position])
 
         return self._correct(np.array([number]), measure)
 

@@ -287,8 +287,8 @@ class InertialTracker(FeatureTracker):
 
     def _camera_pose(self) -> Floats:
         state = self._filter.state
-        found: Floats = transform(state.rotation, state.position) @ self._filter.camera
-        return found
+        pose: Floats = transform(state.rotation, state.position) @ self._filter.camera
+        return pose
 
     def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:
         rows, pixels = match.rows[match.agree], match.pixels[match.agree]
@@ -307,7 +307,7 @@ class InertialTracker(FeatureTracker):
         # A pixel that is off reads the depth beside it, which on a slanted surface is another.
         slant = pixel_noise * np.linalg.norm(read.slope, axis=1)
         noises = [noise[1] * _READING * self._settings.depth_noise, slant, _BENT * read.inverse]
-        variance = sum(np.square(each) for each in noises)
+        variance = sum(np.square(noise_part) for noise_part in noises)
         scale[:, 2] = np.where(read.continuous, 1.0 / np.sqrt(variance), 0.0)
         these = self._map.table[rows]
         return Sighting(these["place"], these["keyframe"], measured, scale)

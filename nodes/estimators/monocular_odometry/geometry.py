@@ -186,7 +186,7 @@ def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
     "An efficient solution to the five-point relative pose problem", PAMI 2004) are both fitted;
     further views tell the right one.
     """
-    found: list[Floats] = []
+    motions: list[Floats] = []
     cv2.setRNGSeed(1)
     plane: Any
     plane, _ = cv2.findHomography(first, second, cv2.RANSAC, _PLANE)
@@ -194,13 +194,13 @@ def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
         _, turns, shifts, _ = cv2.decomposeHomographyMat(plane, matrix)
         for turn, shift in zip(turns, shifts, strict=True):
             if (length := float(np.linalg.norm(shift))) > 1e-6:
-                found.append(transform(turn, shift / length))
+                motions.append(transform(turn, shift / length))
     essential: Any
     essential, _ = cv2.findEssentialMat(first, second, matrix, cv2.RANSAC, 0.999, _EPIPOLAR)
     if essential is not None and essential.shape == (3, 3):
         one, other, shift = cv2.decomposeEssentialMat(essential)
-        found += [transform(turn, sign * shift) for turn in (one, other) for sign in (1.0, -1.0)]
-    return found
+        motions += [transform(turn, sign * shift) for turn in (one, other) for sign in (1.0, -1.0)]
+    return motions
 
 
 class Keyframe(msgspec.Struct, frozen=True, eq=False):
@@ -223,8 +223,8 @@ def new_corners(image: Grey, taken: Floats, count: int) -> Floats:
     mask[BORDER:-BORDER, BORDER:-BORDER] = 255
     for column, row in np.rint(taken).astype(int).tolist():
         cv2.circle(mask, (column, row), SPACING, 0, -1)
-    found: Any = cv2.goodFeaturesToTrack(image, count, _QUALITY, SPACING, mask=mask, blockSize=5)
-    return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
+    corners: Any = cv2.goodFeaturesToTrack(image, count, _QUALITY, SPACING, mask=mask, blockSize=5)
+    return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
 class MonocularSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

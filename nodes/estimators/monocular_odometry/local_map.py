@@ -68,10 +68,10 @@ class Initialization:
         moved = _median_shift(self._views[0], newest)
         if moved < self._settings.keyframe_shift:
             return None
-        found = self._build()
-        if found is None and moved > 4 * self._settings.keyframe_shift:
+        built = self._build()
+        if built is None and moved > 4 * self._settings.keyframe_shift:
             self._restart(image)
-        return found
+        return built
 
     def _restart(self, image: Grey) -> None:
         corners = new_corners(image, np.empty((0, 2)), self._settings.corners)
@@ -221,7 +221,7 @@ class LocalMap:
     @classmethod
     def first(
         cls,
-        found: InitialMap,  # in a frame and a unit of its own
+        initial: InitialMap,  # in a frame and a unit of its own
         image: Grey,  # the second of its images, grey
         start: Floats,  # pose of its first camera: camera to world, shape (4, 4)
         unit: float,  # its unit of length in that of the world
@@ -229,11 +229,11 @@ class LocalMap:
         settings: MonocularSettings,
     ) -> LocalMap:
         """Make a map of its first two key frames."""
-        second = found.second.copy()
+        second = initial.second.copy()
         second[:3, 3] *= unit
-        tracks = Tracks(found.pixels[0], 0)
-        tracks.points = unit * found.points @ start[:3, :3].T + start[:3, 3]
-        tracks.add_view(1, found.pixels[1])
+        tracks = Tracks(initial.pixels[0], 0)
+        tracks.points = unit * initial.points @ start[:3, :3].T + start[:3, 3]
+        tracks.add_view(1, initial.pixels[1])
         before = inverse(start)
         made = cls(image, [before, second @ before], tracks, matrix, settings)
         made._add_corners()

@@ -68,12 +68,12 @@ class MonocularTracker:
         rows, pixels = self._follow(grey, self._map, expected)
         tracks = self._map.tracks
         known = tracks.known[rows]
-        found = self._solve(tracks.points[rows][known], pixels[known], expected)
-        if found is None:
+        solution = self._solve(tracks.points[rows][known], pixels[known], expected)
+        if solution is None:
             return self._lost(stamp, grey, pixels)
         reason = "" if self._lost_since is None else "against a key frame"
         self._lost_since = self._initialization = None
-        self._pose, errors = found
+        self._pose, errors = solution
         self._guess = self._pose
         agree = np.ones(len(rows), np.bool_)
         agree[known] = errors < _AGREES
@@ -104,23 +104,23 @@ class MonocularTracker:
         """
         if self._initialization is None:
             self._initialization = Initialization(self._matrix, self._settings)
-        found = self._initialization.add(grey)
-        if found is None:
+        initial = self._initialization.add(grey)
+        if initial is None:
             return None
         unit, reason = 1.0, ""
         if self._map is not None:
             unit, reason = self._map.depth, "by a new map: its unit of length is a guess"
             self._maps += 1
         start = inverse(self._pose)
-        self._map = LocalMap.first(found, grey, start, unit, self._matrix, self._settings)
+        self._map = LocalMap.first(initial, grey, start, unit, self._matrix, self._settings)
         self._lost_since = self._initialization = None
         self._known.clear()
         self._continue_from(self._map)
-        count = len(found.points)
+        count = len(initial.points)
         return TrackingResult(
             pose=inverse(self._pose),
             reason=reason,
-            points=found.pixels[1].astype(np.float32),
+            points=initial.pixels[1].astype(np.float32),
             inliers=np.ones(count, np.bool_),
             map=self._maps,
         )
@@ -190,10 +190,10 @@ class MonocularTracker:
         corners, descriptors = detect_and_describe(grey, _ORB_POINTS)
         for keyframe in reversed(self._known):
             known = describe(keyframe.image, keyframe.pixels, keyframe.landmarks)
-            found = relocalize(corners, descriptors, known, self._matrix)
-            if found is not None:  # tracking goes on from there with the next image
+            pose = relocalize(corners, descriptors, known, self._matrix)
+            if pose is not None:  # tracking goes on from there with the next image
                 self._map = LocalMap.around(keyframe, self._matrix, self._settings)
-                self._guess = found
+                self._guess = pose
                 break
         else:
             waited = stamp - self._lost_since >= self._settings.reset_timeout * 1e9

@@ -215,8 +215,8 @@ def _sample(image: Depth, pixels: Floats, level: int, how: int = cv2.INTER_LINEA
         return np.empty(0)
     # OpenCV keeps every second pixel, so a pixel's coordinates are halved.
     x, y = (pixels.T / 2**level).astype(np.float32)
-    found = cv2.remap(image, x[None], y[None], how, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, np.float64).ravel()
+    samples = cv2.remap(image, x[None], y[None], how, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(samples, np.float64).ravel()
 
 
 def _project(points: Floats, pose: Floats, matrix: Floats) -> tuple[Floats, Floats]:

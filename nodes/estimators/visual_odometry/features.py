@@ -212,8 +212,8 @@ class FeatureTracker:
         match: MapMatch | None,  # noqa: ARG002
     ) -> MapMatch | None:
         believed = BELIEVED * alignment.information
-        found = self._find(grey, inverse_of, alignment.pose, believed)
-        return found or MapMatch.without_landmarks(alignment.pose)
+        map_match = self._find(grey, inverse_of, alignment.pose, believed)
+        return map_match or MapMatch.without_landmarks(alignment.pose)
 
     def _correct_disparities(self, matcher: StereoMatcher, match: MapMatch, read: Surfaces) -> None:
         """Correct the matcher's disparities, and the depth of all landmarks, by those in view.
@@ -249,10 +249,10 @@ class FeatureTracker:
             return match
         pixels, descriptors = detect_and_describe(grey, ORB_POINTS)
         for frame in self._next_searched():
-            found = relocalize(pixels, descriptors, frame.points, self._matrix, cv2.SOLVEPNP_AP3P)
-            if found is not None:
+            pose = relocalize(pixels, descriptors, frame.points, self._matrix, cv2.SOLVEPNP_AP3P)
+            if pose is not None:
                 self._near = None
-                match = self._find(grey, inverse_of, found)
+                match = self._find(grey, inverse_of, pose)
                 # Again from there, for the landmarks that were beyond the margin of the search.
                 match = match and self._find(grey, inverse_of, match.pose)
                 if match is not None and match.share > _SURE:
@@ -292,10 +292,10 @@ class FeatureTracker:
         if (errors < 2 * _AGREES).mean() > 0.6:
             return pose
         cv2.setRNGSeed(1)
-        found, rotation, translation, _ = cv2.solvePnPRansac(
+        solved, rotation, translation, _ = cv2.solvePnPRansac(
             places, there, self._matrix, None, flags=cv2.SOLVEPNP_EPNP, reprojectionError=2.0
         )
-        if not found:
+        if not solved:
             return None
         return transform(cv2.Rodrigues(rotation)[0], translation)
 
@@ -323,8 +323,8 @@ class FeatureTracker:
         rows, patches = rows[oldest], patches.take(oldest)
         if len(rows) < least:
             return None
-        pixels, found = find_patches(patches, self._images(), grey, settings.window)
-        missed, rows, pixels = rows[~found], rows[found], pixels[found]
+        pixels, matched = find_patches(patches, self._images(), grey, settings.window)
+        missed, rows, pixels = rows[~matched], rows[matched], pixels[matched]
         if len(rows) < least:
             return None
         read = self._surfaces_at(inverse_of, pixels, settings.depth_noise)

@@ -153,12 +153,12 @@ class Landmarks:
         good = (area > _SHRUNK**2) & (area < _GROWN**2)
         good &= np.abs(warps).max(axis=(1, 2)) < _SHEARED
         these = these[good]
-        found = Patches(these["keyframe"], these["pixel"], expected[good], warps[good])
-        return rows[good], found
+        patches = Patches(these["keyframe"], these["pixel"], expected[good], warps[good])
+        return rows[good], patches
 
-    def update_found(self, now: int, found: Rows, missed: Rows) -> None:
+    def update_found(self, now: int, matched: Rows, missed: Rows) -> None:
         """Record found landmarks; repeatedly missed ones are left out the longer."""
-        self.table["missed"][found] = 0
+        self.table["missed"][matched] = 0
         self.table["missed"][missed] += 1
         self.table["inactive_until"][missed] = now + 1 + self.table["missed"][missed] ** 2
 
@@ -277,13 +277,13 @@ def find_corners(
     blocks = whole.reshape(down, spacing, across, spacing).swapaxes(1, 2).reshape(-1, spacing**2)
     best = blocks.argmax(axis=1)
     square = np.arange(len(blocks))
-    found = np.stack(
+    corners = np.stack(
         [square % across * spacing + best % spacing, square // across * spacing + best // spacing],
         axis=1,
     )
-    found = found[blocks[square, best] > _TEXTURE].astype(np.float64)
-    free = ~np.isin(squares(found, spacing), squares(taken, spacing))
-    return np.asarray(found[free])
+    corners = corners[blocks[square, best] > _TEXTURE].astype(np.float64)
+    free = ~np.isin(squares(corners, spacing), squares(taken, spacing))
+    return np.asarray(corners[free])
 
 
 SAME = 0.5  # least correlation of a patch with its counterpart; flow alone would confirm any place
@@ -341,8 +341,8 @@ def around(image: Grey, pixels: Floats, window: int) -> Grey:
     steps = np.arange(window, dtype=np.float32) - window // 2
     x, y = pixels.T.astype(np.float32)[..., None] + steps
     columns, rows = np.tile(x, window), np.repeat(y, window, axis=1)  # a square a row
-    found = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, np.uint8).reshape(-1, window, window)
+    patches = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(patches, np.uint8).reshape(-1, window, window)
 
 
 def correlation(one: Grey, other: Grey) -> Floats:
@@ -406,28 +406,30 @@ class References:
 
     def align(self, view: View, starts: list[Floats], lost: bool) -> Alignment | None:
         """Return a view's alignment with the reference, or the last image, from initial poses."""
-        found = None
+        alignment = None
         if self._reference is not None:
-            found = self._best(self._reference, view, starts, lost)
-        if found is None and self._known is not None:
+            alignment = self._best(self._reference, view, starts, lost)
+        if alignment is None and self._known is not None:
             grey, inverse_of, pose = self._known
             if self._reference is None or (self._reference.pose != pose).any():
                 self._reference = self._made(View.of(grey, inverse_of), pose)
-                found = self._best(self._reference, view, starts, lost)
-        return found
+                alignment = self._best(self._reference, view, starts, lost)
+        return alignment
 
     def _best(
         self, reference: Reference, view: View, starts: list[Floats], lost: bool
     ) -> Alignment | None:
         """Return the alignment with most agreeing edges, from several initial poses."""
         tried = (self._align(reference, view, start, lost) for start in starts)
-        return max((found for found in tried if found), key=lambda f: f.sharp, default=None)
+        return max((a for a in tried if a), key=lambda f: f.sharp, default=None)
 
     def carry(self, view: View, expected: Floats) -> Floats:
         """Return a view's pose while lost, by alignment with images before it, or as expected."""
-        found = None if self._bridge is None else self._align(self._bridge, view, expected, False)
-        pose = expected if found is None else found.pose
-        if found is None or found.share < _AGREE:
+        alignment = (
+            None if self._bridge is None else self._align(self._bridge, view, expected, False)
+        )
+        pose = expected if alignment is None else alignment.pose
+        if alignment is None or alignment.share < _AGREE:
             self._bridge = self._made(view, pose) if self.suffices(view) else None
         return pose
 
@@ -443,7 +445,7 @@ class References:
         self, reference: Reference, view: View, expected: Floats, lost: bool
     ) -> Alignment | None:
         prior = _PRIOR_LOST if lost else _PRIOR
-        found = align(reference, view, expected, self._matrix, _READING * self._noise, prior)
-        enough = bool(found.agree.sum() >= _POINTS and found.agree.mean() > _AGREE)
-        enough &= found.sharp > (_AGREE_AGAIN if lost else _AGREE)
-        return found if enough and found.deviation() < _UNSURE else None
+        alignment = align(reference, view, expected, self._matrix, _READING * self._noise, prior)
+        enough = bool(alignment.agree.sum() >= _POINTS and alignment.agree.mean() > _AGREE)
+        enough &= alignment.sharp > (_AGREE_AGAIN if lost else _AGREE)
+        return alignment if enough and alignment.deviation() < _UNSURE else None

@@ -110,8 +110,8 @@ class DenseTracker:
         self._keyframe, self._keyframe_pose, self._age = frame, self._pose, 0
 
     def _align(self, frame: Any, other: Any, pose: Floats) -> Floats | None:
-        found, motion = self._odometry.compute(frame, other)
-        return np.asarray(pose @ motion) if found and np.isfinite(motion).all() else None
+        success, motion = self._odometry.compute(frame, other)
+        return np.asarray(pose @ motion) if success and np.isfinite(motion).all() else None
 
     def _lose(self, stamp: int, reason: str) -> TrackingResult:
         if self._lost_since is None:

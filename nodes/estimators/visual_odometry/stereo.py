@@ -134,11 +134,11 @@ class StereoMatcher:
         noise: float,  # standard deviation of inverse depth, 1/m
     ) -> Surfaces:
         """Return the planes around pixels of the pair last given to `depth`."""
-        found = surfaces_at(inverse, pixels, _COARSE * noise)
+        coarse = surfaces_at(inverse, pixels, _COARSE * noise)
         if self._pair is None or not len(pixels):
-            return found
-        rows, without = np.flatnonzero(found.continuous), np.flatnonzero(~found.continuous)
-        there, slope = found.inverse * self.unit, found.slope.copy()
+            return coarse
+        rows, without = np.flatnonzero(coarse.continuous), np.flatnonzero(~coarse.continuous)
+        there, slope = coarse.inverse * self.unit, coarse.slope.copy()
         fine = np.zeros(len(pixels))
         if len(rows):
             disparity, good = self._disparity(pixels[rows], there[rows], 0)

@@ -82,16 +82,16 @@ def held_errors(
     missing &= ~answered(frames, poses)
     after = np.clip(np.searchsorted(poses, frames), 1, max(len(poses) - 1, 1))
     nearer = abs(poses[after - 1] - frames) <= abs(poses[after % len(poses)] - frames)
-    found = errors[np.where(nearer, after - 1, after % len(poses))]
+    at_frames = errors[np.where(nearer, after - 1, after % len(poses))]
     own = np.searchsorted((frames[:-1] + frames[1:]) // 2, poses)  # the image of each pose
     worst = np.full(len(frames), -np.inf)
     np.maximum.at(worst, own, errors)
-    found = np.where(np.bincount(own, minlength=len(frames)) > 0, worst, found)
+    at_frames = np.where(np.bincount(own, minlength=len(frames)) > 0, worst, at_frames)
     before = np.searchsorted(poses, frames, side="right") - 1
     none = before < 0
     since = np.where(none, path[:1], _path_at(truth, poses)[before])
     held = np.where(none, 0.0, errors[before]) + path - since
-    return np.asarray(np.where(missing, held, found))
+    return np.asarray(np.where(missing, held, at_frames))
 
 
 def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory) -> Floats:
@@ -106,8 +106,8 @@ def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory)
     first, last = int(estimate.stamps[0]), int(estimate.stamps[-1])
     inside = np.clip(frames, first, last)
     away = abs(_path_at(truth, frames) - _path_at(truth, inside))
-    true, said = (interpolated(t.stamps, t.positions, inside) for t in (truth, estimate))
-    return position_errors(true, said) + away
+    true, estimated = (interpolated(t.stamps, t.positions, inside) for t in (truth, estimate))
+    return position_errors(true, estimated) + away
 
 
 def _path_at(truth: Trajectory, stamps: Stamps) -> Floats:
@@ -140,9 +140,9 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
     orientations: Orientations | None = None  # whether they are the body's, if that can be told
     # The same in the truth's frame, where there is a truth; `None` if there are none.
     aligned: Trajectory | None = None
-    of_images: Errors | None = None  # errors of each pose at the time of its image
+    image_errors: Errors | None = None  # errors of each pose at the time of its image
     # Errors of the newest pose at each control tick; of a long flight every second one, fourth, ….
-    of_ticks: Errors | None = None
+    tick_errors: Errors | None = None
     lost: list[Interval] = []  # intervals without a pose
     final: Trajectory | None = None  # trajectory after loop closures in the truth's frame, if sent
 
@@ -227,7 +227,7 @@ def judge(
         figures |= without()
         return Judgement(figures, estimate, final_note, lost=coverage.lost, final=final)
     # An interval that lasts to the end of the flight counts as long as it is: it took no less.
-    if took := [seconds([each]) for each in coverage.lost if each.start >= poses[0]]:
+    if took := [seconds([interval]) for interval in coverage.lost if interval.start >= poses[0]]:
         figures["relocalization_p50_seconds"] = float(np.median(took))
         figures["relocalization_max_seconds"] = max(took)
     figures["alignment"] = how
@@ -266,25 +266,25 @@ def judge(
         rows = truth.covers(poses, hole)
         there, moved = truth.at(poses[rows]), whole.take(rows)
         arrived = arrivals[rows] if len(arrivals) else arrivals
-    of_images = Errors(
+    at_images = Errors(
         stamps=there.stamps,
         since=arrived,
         position=position_errors(there.positions, moved.positions),
         rotation=rotation_errors(there.orientations, moved.orientations),
     )
-    held = held_errors(truth, due, there.stamps, of_images.position, coverage.lost)
+    held = held_errors(truth, due, there.stamps, at_images.position, coverage.lost)
     figures |= _held(held, path, due, planned)
-    figures |= _said_with_poses(record, truth, there, moved, aligned)
-    of_ticks = None
+    figures |= _velocities_and_covariances(record, truth, there, moved, aligned)
+    at_ticks = None
     if len(arrivals):
-        of_ticks, available = errors_at_ticks(truth, whole, arrivals, rate, hole)
+        at_ticks, available = errors_at_ticks(truth, whole, arrivals, rate, hole)
         figures |= available
     if orientations is not None and not orientations.usable:
         figures = {k: v for k, v in figures.items() if not figure(k).of_orientation}
         figures["why_no_rotations"] = orientations.text()
     note = "; ".join(filter(None, notes))
     return Judgement(
-        figures, estimate, note, orientations, moved, of_images, of_ticks, coverage.lost, final
+        figures, estimate, note, orientations, moved, at_images, at_ticks, coverage.lost, final
     )
 
 
@@ -393,26 +393,26 @@ def _not_compared(truth: Trajectory, stamps: Stamps, hole: int) -> str:
     """Return how many poses of these stamps (ns) no truth is known for, and why; empty if none."""
     inside = truth.covers(stamps)
     outside, between = (~inside).sum(), (inside & ~truth.covers(stamps, hole)).sum()
-    said = [f"{outside} outside the truth's time"] if outside else []
+    reasons = [f"{outside} outside the truth's time"] if outside else []
     if between:
         longest = int(np.diff(truth.stamps).max()) / SECOND
-        said += [
+        reasons += [
             f"{between} between true poses more than {hole / SECOND:g} s apart (as max_difference "
             f"says; the longest hole is {longest:.3g} s)"
         ]
-    return f"not compared, of {len(stamps)} poses: {', '.join(said)}" if said else ""
+    return f"not compared, of {len(stamps)} poses: {', '.join(reasons)}" if reasons else ""
 
 
 def _aligned_as_a_whole(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
     """Return the ATE after each alignment as a whole, and the scale; nothing for a line."""
-    found: dict[str, float] = {}
+    figures: dict[str, float] = {}
     wholes: tuple[AlignmentMethod, ...] = ("se3", "sim3")
     with contextlib.suppress(ValueError):
         for how in wholes:
-            laid = align(estimate, truth, how)
-            errors = position_errors(truth.positions, laid.trajectory.positions)
-            found |= {f"ate_{how}_rmse_m": rms(errors), "scale": laid.scale}
-    return found
+            whole = align(estimate, truth, how)
+            errors = position_errors(truth.positions, whole.trajectory.positions)
+            figures |= {f"ate_{how}_rmse_m": rms(errors), "scale": whole.scale}
+    return figures
 
 
 def to_planned_end(
@@ -494,8 +494,8 @@ def _judge_final(
     offset = best_time_offset(truth, final, with_scale=how == "sim3")
     if offset is not None:
         notes.append(offset.text())
-    said = "; ".join(filter(None, notes))
-    return moved, f"after loop closures: {said}" if said else ""
+    note = "; ".join(filter(None, notes))
+    return moved, f"after loop closures: {note}" if note else ""
 
 
 def _possible(
@@ -532,8 +532,8 @@ def _tilted(truth: Trajectory, aligned: Trajectory, method: AlignmentMethod) -> 
     except ValueError:
         return ""
     before, after = (
-        rms(position_errors(truth.positions, each.positions))
-        for each in (aligned, rigid.trajectory)
+        rms(position_errors(truth.positions, trajectory.positions))
+        for trajectory in (aligned, rigid.trajectory)
     )
     tilt = math.degrees(math.acos(float(np.clip(rigid.rotation[2, 2], -1.0, 1.0))))
     if tilt < _TILT or after > _FITS * before:
@@ -544,7 +544,7 @@ def _tilted(truth: Trajectory, aligned: Trajectory, method: AlignmentMethod) -> 
     )
 
 
-def _said_with_poses(
+def _velocities_and_covariances(
     record: EstimatorRecord,
     truth: Trajectory,
     there: Trajectory,
@@ -554,21 +554,21 @@ def _said_with_poses(
     """Return the figures of velocities and covariances, as far as they were given."""
     figures: dict[str, Any] = {}
     rotation, scale = aligned.rotation, aligned.scale
-    for name, each in (("velocities", record.velocities), ("covariances", record.covariances)):
-        if len(each):
-            figures[f"{name}_percent"] = 100.0 * len(each) / len(record)
-    rows, said = record.velocities.at(there.stamps)
+    for name, series in (("velocities", record.velocities), ("covariances", record.covariances)):
+        if len(series):
+            figures[f"{name}_percent"] = 100.0 * len(series) / len(record)
+    rows, values = record.velocities.at(there.stamps)
     if rows.any():
         # The true velocity is the difference of the true positions, as densely as there are.
         near = truth.near(there.stamps[rows])
         true = interpolated(near.stamps, near.velocities(), there.stamps[rows])
-        wrong = position_errors(true, scale * said @ rotation.T)
+        wrong = position_errors(true, scale * values @ rotation.T)
         figures["velocity_rmse_m_per_s"] = rms(wrong)
         figures["velocity_error_percent"] = velocity_error_percent(wrong, true)
-    rows, said = record.covariances.at(there.stamps)
+    rows, values = record.covariances.at(there.stamps)
     if rows.any():
         turn = np.kron(np.diag([scale, 1.0]), rotation)
-        turned = turn @ said.reshape(-1, 6, 6) @ turn.T
+        turned = turn @ values.reshape(-1, 6, 6) @ turn.T
         figures["covariance_too_large_percent"] = too_large_percent(turned, there.length())
         figures |= consistency(there.take(rows), moved.take(rows), turned)
     return figures
@@ -621,7 +621,7 @@ def errors_at_ticks(
         position = position_errors(there.positions, estimate.positions[rows])
         rotation = rotation_errors(there.orientations, estimate.orientations[rows])
         sums += (position**2).sum(), (rotation**2).sum(), (now - since).sum()
-        kept.append([each[::step] for each in (now, since, position, rotation)])
+        kept.append([values[::step] for values in (now, since, position, rotation)])
     square, turned, age = (sums / len(ticks)).tolist()
     return Errors(*map(np.concatenate, zip(*kept, strict=True))), {
         "newest_pose_rmse_m": math.sqrt(square),
@@ -663,10 +663,10 @@ class Flight:
 
     def figures(self, truth: Trajectory | None) -> dict[str, float]:
         """Return the number of collisions, and the distance from planned poses."""
-        found: dict[str, float] = {"collisions": len(self.collisions)}
+        figures: dict[str, float] = {"collisions": len(self.collisions)}
         if truth is not None and len(self._plan):
-            found |= beside_the_plan(truth, self._plan.trajectory())
-        return found
+            figures |= beside_the_plan(truth, self._plan.trajectory())
+        return figures
 
 
 def collision_rows(collisions: Sequence[Collision]) -> str:

@@ -37,7 +37,7 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
     errors = position_errors(truth.positions, estimate.positions)
     angles = rotation_errors(truth.orientations, estimate.orientations)
     x, y, z = (estimate.positions - truth.positions).T
-    ahead, said = (t.rotations().apply([1.0, 0.0, 0.0]) @ [1, 1j, 0] for t in (truth, estimate))
+    ahead, heading = (t.rotations().apply([1.0, 0.0, 0.0]) @ [1, 1j, 0] for t in (truth, estimate))
     return {
         "ate_rmse_m": rms(errors),
         "ate_mean_m": float(errors.mean()),
@@ -48,7 +48,7 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
         "ate_east_rmse_m": rms(y),
         "ate_down_rmse_m": rms(z),
         "rot_rmse_deg": rms(np.degrees(angles)),
-        "heading_rmse_deg": rms(np.angle(said * ahead.conj(), deg=True)),
+        "heading_rmse_deg": rms(np.angle(heading * ahead.conj(), deg=True)),
     }
 
 
@@ -122,20 +122,20 @@ def segment_errors(
     distances = truth.distances()
     shares = {f"{share}pct": share / 100.0 * path for share in SHARES}
     metres = {f"{metres}m": float(metres) for metres in KITTI_LENGTHS if metres < path}
-    found: dict[str, float | None] = {}
+    figures: dict[str, float | None] = {}
     for lengths, mean in ((shares, "mean"), (metres, "kitti")):
         everything: list[tuple[Floats, Floats]] = []
         for name, length in lengths.items():
             shifts, angles = relative_errors(
                 truth, estimate, *path_pairs(distances, length, pieces=pieces)
             )
-            each = 100.0 * shifts / length, np.degrees(angles) / length
-            everything.append(each)
-            found |= dict(zip(_segment_names(name), map(_mean, each), strict=True))
+            errors = 100.0 * shifts / length, np.degrees(angles) / length
+            everything.append(errors)
+            figures |= dict(zip(_segment_names(name), map(_mean, errors), strict=True))
         if everything:
             all_of = (np.concatenate(values) for values in zip(*everything, strict=True))
-            found |= dict(zip(_segment_names(mean), map(_mean, all_of), strict=True))
-    return found
+            figures |= dict(zip(_segment_names(mean), map(_mean, all_of), strict=True))
+    return figures
 
 
 def _segment_names(which: str) -> tuple[str, str]:
@@ -298,18 +298,18 @@ def consistency(
     turns: Rotation = estimate.rotations() * truth.rotations().inv()
     errors = np.concatenate([shifts, turns.as_rotvec()], axis=1)
     valid = positive_definite(covariances)
-    found: dict[str, float | int | None] = {"covariance_invalid": int((~valid).sum())}
+    figures: dict[str, float | int | None] = {"covariance_invalid": int((~valid).sum())}
     for name, size in (("position", 3), ("pose", 6)):
         e, p = errors[valid, :size], covariances[valid, :size, :size]
         nees = np.einsum("ni,ni->n", e, np.linalg.solve(p, e[..., None])[..., 0])
         low, high = chdtri(size, 0.975), chdtri(size, 0.025)
         inside = int(((nees >= low) & (nees <= high)).sum())
-        found[f"nees_{name}"] = float(nees.mean()) if len(nees) else None
-        found[f"nees_{name}_inside_percent"] = 100.0 * inside / len(valid)
+        figures[f"nees_{name}"] = float(nees.mean()) if len(nees) else None
+        figures[f"nees_{name}_inside_percent"] = 100.0 * inside / len(valid)
         if name == "position":
             covered = int((nees <= _THREE_SIGMA).sum())
-            found["within_3_sigma_percent"] = 100.0 * covered / len(valid)
-    return found
+            figures["within_3_sigma_percent"] = 100.0 * covered / len(valid)
+    return figures
 
 
 def positive_definite(matrices: Floats) -> npt.NDArray[np.bool_]:

@@ -145,12 +145,12 @@ class EvaluationConfig(NodeConfig):
                 f"align_first: expected a number of poses or a duration: {error}"
             ) from None
         for name, own in self.estimators.items():
-            for each in own.thresholds:
+            for figure in own.thresholds:
                 known = [k for k in self.thresholds.__struct_fields__ if not FIGURES[k].of_flight]
-                if each not in known:
+                if figure not in known:
                     raise ValueError(
                         f"estimators.{name}.thresholds: expected the name of a figure of an "
-                        f"estimator, found {each}{suggest(each, known)}"
+                        f"estimator, found {figure}{suggest(figure, known)}"
                     )
 
     @property
@@ -220,7 +220,7 @@ class Evaluation(Node[EvaluationConfig]):
     def check(self) -> Iterable[str]:
         """Say if there is no such vehicle as the file names, or nobody to judge."""
         config = self.config
-        asked = any(each.given() for each in (config.thresholds, *config.own_thresholds().values()))
+        asked = any(t.given() for t in (config.thresholds, *config.own_thresholds().values()))
         if asked and not (self._records or self.senders_of(PoseEstimate, TrajectoryEstimate)):
             yield "thresholds: expected an estimator to judge, found none"
         senders = self.senders_of(PoseEstimate, TrajectoryEstimate)
@@ -409,7 +409,7 @@ class Evaluation(Node[EvaluationConfig]):
             faults,
             how,
             declared,
-            flights={vehicle: each for vehicle, each in flown.items() if vehicle},
+            flights={vehicle: flight for vehicle, flight in flown.items() if vehicle},
             own=config.own_thresholds(),
             ended_flights=ended,
         )
@@ -471,9 +471,9 @@ class Evaluation(Node[EvaluationConfig]):
             return Judgement(figures={"why": why}, estimate=None)
 
     def _vehicle_of(self, estimator: str) -> str:
-        found = self.config.vehicle or self._vehicles.of(estimator)
+        chosen = self.config.vehicle or self._vehicles.of(estimator)
         flying = [vehicle for vehicle, flight in self._flights.items() if len(flight.truth)]
-        return flying[0] if len(flying) == 1 else found  # the file may have chosen its odometry
+        return flying[0] if len(flying) == 1 else chosen  # the file may have chosen its odometry
 
     def _flight_of(self, estimator: str) -> Flight:
         return self._flights.get(self._vehicle_of(estimator)) or Flight()

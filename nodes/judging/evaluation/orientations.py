@@ -103,9 +103,9 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
         ValueError: The stamps of the two differ.
     """
     same_stamps(truth, estimate)
-    true, said = truth.rotations(), estimate.rotations()
+    true, given = truth.rotations(), estimate.rotations()
     constant = [float(np.ptp(t.orientations, axis=0).max()) < 1e-9 for t in (truth, estimate)]
-    rotates = [_mean_and_spread(rotations)[1] for rotations in (true, said)]
+    rotates = [_mean_and_spread(rotations)[1] for rotations in (true, given)]
     if constant[0] and (constant[1] or rotates[1] > _ROTATES):
         return Orientations(kind="truth without")
     if constant[1]:
@@ -121,13 +121,13 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
     if residual > _EXTENT * extents[1]:
         return None
     frame = Rotation.from_matrix(matrix)
-    mean, spread = _mean_and_spread(true.inv() * frame * said)
+    mean, spread = _mean_and_spread(true.inv() * frame * given)
     degrees = float(np.degrees(mean.magnitude()))
     kind: Kind = "same"
     if spread > _STILL:
         guesses: dict[Kind, list[Rotation]] = {
-            "inverse": [said.inv()],
-            "order": [Rotation.from_quat(np.roll(said.as_quat(), by, axis=1)) for by in (1, -1)],
+            "inverse": [given.inv()],
+            "order": [Rotation.from_quat(np.roll(given.as_quat(), by, axis=1)) for by in (1, -1)],
         }
         for name, rotations in guesses.items():
             left = min(_mean_and_spread(true.inv() * frame * guess)[1] for guess in rotations)

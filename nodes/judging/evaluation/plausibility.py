@@ -124,7 +124,7 @@ class CommandLog:
         Args:
             sent_by: Whether a source is that of the commands wanted.
         """
-        return ", ".join(_text(each) for each in self._commands if sent_by(each.source))
+        return ", ".join(_text(command) for command in self._commands if sent_by(command.source))
 
     def ended(self, sent_by: Callable[[str], bool], vehicle: str) -> str:
         """Return the command that ended a vehicle's flight, if it is one of those; else "".
@@ -135,16 +135,16 @@ class CommandLog:
         Args:
             sent_by: As of `text`.
         """
-        events = [each for each in self._events if each.source == vehicle]
-        flown = [k for k, each in enumerate(events) if isinstance(each, TakenOff)]
-        commands = [each for each in self._commands if each.vehicle in {"", vehicle}]
+        events = [event for event in self._events if event.source == vehicle]
+        flown = [k for k, event in enumerate(events) if isinstance(event, TakenOff)]
+        commands = [command for command in self._commands if command.vehicle in {"", vehicle}]
         if not flown or len(events) == flown[-1] + 1 or all(sent_by(c.source) for c in commands):
             return ""
         taken_off, over = events[flown[-1]].stamp, events[flown[-1] + 1].stamp
         ending = (
-            each
-            for each in commands
-            if isinstance(each, Land | Disarm | Reset) and taken_off <= each.stamp <= over
+            command
+            for command in commands
+            if isinstance(command, Land | Disarm | Reset) and taken_off <= command.stamp <= over
         )
         first = next(ending, None)
         return "" if first is None or not sent_by(first.source) else _text(first)

@@ -82,7 +82,7 @@ def cover(
     silent = np.flatnonzero((ends - starts > gap) & (missing > 0))
     clipped = [Interval(max(s, first), min(e, last)) for s, e in announced]
     lost = [Interval(int(starts[k]), int(ends[k])) for k in silent]
-    lost += [each for each in clipped if each.end > each.start]
+    lost += [interval for interval in clipped if interval.end > interval.start]
     count = len(frames)
     if planned is not None and planned > last > first:
         count += round((planned - last) * (count - 1) / (last - first))
@@ -149,21 +149,21 @@ def choose_frames(cameras: Mapping[str, Stamps], poses: Stamps) -> Stamps | None
 
 def union(intervals: Sequence[Interval]) -> list[Interval]:
     """Return the union of intervals, disjoint and in order."""
-    found: list[Interval] = []
-    for each in sorted(intervals):
-        if found and each.start <= found[-1].end:
-            found[-1] = Interval(found[-1].start, max(found[-1].end, each.end))
+    merged: list[Interval] = []
+    for interval in sorted(intervals):
+        if merged and interval.start <= merged[-1].end:
+            merged[-1] = Interval(merged[-1].start, max(merged[-1].end, interval.end))
         else:
-            found.append(each)
-    return found
+            merged.append(interval)
+    return merged
 
 
 def seconds(intervals: Sequence[Interval]) -> float:
     """Return how long intervals are together."""
-    return sum(each.end - each.start for each in intervals) / SECOND
+    return sum(interval.end - interval.start for interval in intervals) / SECOND
 
 
-class Said:
+class SampledRows:
     """Rows of numbers of some of the poses (velocity, covariance), by rising stamp."""
 
     def __init__(self, width: int) -> None:
@@ -206,8 +206,8 @@ class EstimatorRecord:
         self.elsewhere = 0  # poses in another frame than the first one
         self.restarts = 0  # number of changes to another frame, one after each loss of tracking
         self.bodies: Counter[str] = Counter()  # number of poses by body (`child_frame_id`)
-        self.velocities = Said(3)  # velocities of the poses that carry one: 3 numbers
-        self.covariances = Said(36)  # likewise: 36 numbers, row by row
+        self.velocities = SampledRows(3)  # velocities of the poses that carry one: 3 numbers
+        self.covariances = SampledRows(36)  # likewise: 36 numbers, row by row
         # The last trajectory after loop closures; `None` for none, or an empty one.
         self.final: Trajectory | None = None
         self.final_frame_id = ""  # frame of `final`
@@ -273,14 +273,14 @@ class EstimatorRecord:
 
     def reported_lost(self, end: int) -> list[Interval]:
         """Return the lost intervals reported by the estimator, up to the run's end (ns)."""
-        found = []
+        intervals = []
         since: int | None = None
         for stamp, lost in self._tracking:
             if lost:
                 since = stamp if since is None else since
             elif since is not None:
-                found.append(Interval(since, stamp))
+                intervals.append(Interval(since, stamp))
                 since = None
         if since is not None:
-            found.append(Interval(since, end))
-        return found
+            intervals.append(Interval(since, end))
+        return intervals

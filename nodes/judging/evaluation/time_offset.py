@@ -92,7 +92,7 @@ def best_time_offset(
 def _correlated(truth: Trajectory, estimate: Trajectory, start: float) -> float | None:
     """Return the offset (s) near `start` at which the speeds are most alike, if they tell any."""
     step = max(min(truth.step(), estimate.step()), 10_000_000)
-    if max(int(np.ptp(each.stamps)) for each in (truth, estimate)) > _MOST * step:
+    if max(int(np.ptp(trajectory.stamps)) for trajectory in (truth, estimate)) > _MOST * step:
         return None  # as of stamps in another unit
     lengths = []
     for trajectory, shift in ((truth, 0), (estimate, round(start * 1e9))):

@@ -45,21 +45,21 @@ class _Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
         One that switches a default off asks for nothing.
         """
-        limits = ((each.default, getattr(self, each.name)) for each in _asked(of_flight))
+        limits = ((figure.default, getattr(self, figure.name)) for figure in _asked(of_flight))
         return any(limit != usual and not is_off(limit) for usual, limit in limits)
 
     def missed(self, figures: Mapping[str, Any], *, of_flight: bool = False) -> list[str]:
         """Return a sentence for each missed threshold of an estimator, or else of the flight."""
         asked = _asked(of_flight)
-        found = (each.missed(getattr(self, each.name), figures.get(each.name)) for each in asked)
-        return [*filter(None, found)]
+        sentences = (f.missed(getattr(self, f.name), figures.get(f.name)) for f in asked)
+        return [*filter(None, sentences)]
 
 
 def _asked(of_flight: bool) -> list[Figure]:
-    return [each for each in _ASKED if each.of_flight == of_flight]
+    return [figure for figure in _ASKED if figure.of_flight == of_flight]
 
 
-_ASKED = [each for each in FIGURES.values() if each.limit]
+_ASKED = [figure for figure in FIGURES.values() if figure.limit]
 
 if TYPE_CHECKING:
 
@@ -72,18 +72,18 @@ else:
     Thresholds = msgspec.defstruct(
         "Thresholds",
         [
-            (each.name, kind, each.default)
-            if each.default is not None
-            else (each.name, kind | None, None)
-            for each in _ASKED
-            for kind in [int | float if each.counts else float]  # ``inf`` for none
+            (figure.name, kind, figure.default)
+            if figure.default is not None
+            else (figure.name, kind | None, None)
+            for figure in _ASKED
+            for kind in [int | float if figure.counts else float]  # ``inf`` for none
         ],
         bases=(_Limits,),
         module=__name__,
         namespace={
             "__doc__": "What an estimator's figures may be; what is not given, and has no default, "
             "is not asked for.\n\nAttributes:\n"
-            + "".join(f"    {each.name}: {each.setting}\n" for each in _ASKED)
+            + "".join(f"    {figure.name}: {figure.setting}\n" for figure in _ASKED)
         },
         frozen=True,
         kw_only=True,
@@ -94,7 +94,7 @@ UNDECLARED = "reads_truth: expected it to announce that it reads the truth, foun
 
 
 def conclude(
-    found: Mapping[str, dict[str, Any]],  # see `judge`
+    judged: Mapping[str, dict[str, Any]],  # see `judge`
     thresholds: Thresholds,
     faults: Sequence[str] = (),  # further reasons why all have failed
     end: RunEnd | None = None,
@@ -116,10 +116,10 @@ def conclude(
     stopped = ""  # by the user, before the plan was flown
     if end is not None and end.by == "user" and not end.planned:
         stopped = f"the user ended the run before its plan was flown: {end.reason}"
-    absent = {name: {"why": "expected estimates, found none"} for name in own if name not in found}
-    found = {**found, **absent}  # who is asked for something and is not there has failed
+    absent = {name: {"why": "expected estimates, found none"} for name in own if name not in judged}
+    judged = {**judged, **absent}  # who is asked for something and is not there has failed
     estimators = {}
-    for name, figures in found.items():
+    for name, figures in judged.items():
         of_run = {} if end is None else _of_run(name, figures, end, name in declared)
         failed = []
         if figures.get("ate_rmse_m") is None:
@@ -165,7 +165,7 @@ def conclude(
     }
     if own:
         verdict["own_thresholds"] = msgspec.to_builtins(own)
-    if not found and thresholds.given():
+    if not judged and thresholds.given():
         why = "expected an estimator to judge, found none that announced itself or sent a pose"
         verdict |= {"passed": None if stopped else False, "failed": [stopped or why, *faults]}
     return verdict
@@ -200,16 +200,16 @@ def _of_run(name: str, figures: Mapping[str, Any], end: RunEnd, declared: bool) 
     if not end.planned:  # of a run that has no planned duration nobody knows how much is missing
         planned = end.duration
         missing = None if planned is None else max(planned - end.stamp / SECOND, 0.0)
-    found: dict[str, Any] = {"early_end_seconds": missing, "ended_by": end.by or "duration"}
+    facts: dict[str, Any] = {"early_end_seconds": missing, "ended_by": end.by or "duration"}
     owner = owner_of(name, end)
     again = end.restarts.get(node_of(owner, end.restarts), 0)
     if again or "restarts" in figures:  # who restarts in a new frame has it in both
-        found["restarts"] = max(figures.get("restarts", 0), again)
+        facts["restarts"] = max(figures.get("restarts", 0), again)
     if declared or node_of(owner, end.truth_readers):
-        found["reads_truth"] = "declared" if declared else "undeclared"
+        facts["reads_truth"] = "declared" if declared else "undeclared"
     elif node_of(owner, end.truth_relays):
-        found["reads_truth"] = "offered"
-    return found
+        facts["reads_truth"] = "offered"
+    return facts
 
 
 def owner_of(source: str, end: RunEnd) -> str:
@@ -251,10 +251,10 @@ def write_results(
         rows = [f"{start},{end}\n" for start, end in judgement.lost]
         lost = "".join(["start_ns,end_ns\n", *rows])
         (evaluation / f"{name}.lost.csv").write_text(lost, encoding="ascii")
-        if judgement.of_images is not None:
-            _write_errors(evaluation / f"{name}.csv", "arrival_ns", judgement.of_images)
-        if judgement.of_ticks is not None:
-            _write_errors(evaluation / f"{name}.ticks.csv", "pose_ns", judgement.of_ticks)
+        if judgement.image_errors is not None:
+            _write_errors(evaluation / f"{name}.csv", "arrival_ns", judgement.image_errors)
+        if judgement.tick_errors is not None:
+            _write_errors(evaluation / f"{name}.ticks.csv", "pose_ns", judgement.tick_errors)
     text = msgspec.json.format(msgspec.json.encode(verdict), indent=2)
     (evaluation / "verdict.json").write_bytes(text + b"\n")
 

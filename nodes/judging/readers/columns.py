@@ -138,13 +138,13 @@ def columns_of(names: Sequence[str]) -> list[Column] | None:
     Raises:
         ValueError: Two columns hold the same, a quaternion is not whole, or a unit is unknown.
     """
-    found = [column_of(name) for name in names]
-    if not {"stamp", *POSITION} <= {column.kind for column in found}:
+    columns = [column_of(name) for name in names]
+    if not {"stamp", *POSITION} <= {column.kind for column in columns}:
         return None
-    _choose_stamp(names, found)
-    kinds = [column.kind for column in found if column.kind]
+    _choose_stamp(names, columns)
+    kinds = [column.kind for column in columns if column.kind]
     if twice := sorted({kind for kind in kinds if kinds.count(kind) > 1}):
-        same = [name.strip() for name, c in zip(names, found, strict=True) if c.kind == twice[0]]
+        same = [name.strip() for name, c in zip(names, columns, strict=True) if c.kind == twice[0]]
         raise ValueError(f"expected one column of {twice[0]} (see --columns), found {same}")
     some = sorted({*QUATERNION} & {*kinds}) or [
         name.strip() for name in names if _NO_QUATERNION.fullmatch(_plain(name))
@@ -154,7 +154,7 @@ def columns_of(names: Sequence[str]) -> list[Column] | None:
             "expected four columns of a quaternion with w, x, y, z in their names, or none (see "
             f"--columns), found {', '.join(some)}"
         )
-    for name, column in zip(names, found, strict=True):
+    for name, column in zip(names, columns, strict=True):
         known = UNITS if column.kind == "stamp" else LENGTHS
         if column.unit and column.unit not in known:
             per = " per second" if column.kind in VELOCITY else ""
@@ -163,11 +163,11 @@ def columns_of(names: Sequence[str]) -> list[Column] | None:
                 f"{', '.join(known)}{per} (see --columns), found {column.unit!r}"
             )
     for group in (POSITION, VELOCITY):  # "tx ty tz[mm]" is of all three
-        units = {column.unit for column in found if column.kind in group} - {""}
+        units = {column.unit for column in columns if column.kind in group} - {""}
         if len(units) == 1:
             (unit,) = units
-            found = [c._replace(unit=unit) if c.kind in group else c for c in found]
-    return found
+            columns = [c._replace(unit=unit) if c.kind in group else c for c in columns]
+    return columns
 
 
 def _choose_stamp(names: Sequence[str], columns: list[Column]) -> None:
@@ -243,14 +243,14 @@ def layout_by_header(start: Start) -> Layout | None:
         joined = _UNIT.sub(
             lambda unit: f"[{unit[1].replace(' ', '')}]", line.lstrip(" ").strip("#%")
         )
-        for each in dict.fromkeys((separator, ",", None)):
-            names = fields_of(joined, each)
+        for sep in dict.fromkeys((separator, ",", None)):
+            names = fields_of(joined, sep)
             if comment and names[:1] == [""] and len(names) > count:  # of the comment's sign
                 names = names[1:]
             columns: list[Column] | None
-            if len(names) == count or (separator == each == "\t" and len(names) == count + 1):
+            if len(names) == count or (separator == sep == "\t" and len(names) == count + 1):
                 columns = columns_of(names)  # without the last field of the row, if it is empty
-            elif each == separator and len(names) == count - 1 and (each == "\t" or not comment):
+            elif sep == separator and len(names) == count - 1 and (sep == "\t" or not comment):
                 unnamed = unnamed or names
                 columns = columns_of(names) if _has_name(fields, names) else None
                 columns = columns and [SKIPPED, *columns]

@@ -133,12 +133,12 @@ def _read_ours(path: Path, _: Options) -> Source:
     assert start is not None
     separator = separator_of(start)
     named = layout_by_header(start)
-    found = read_columns(path, named or (EUROC if separator == "," else TUM))
+    poses = read_columns(path, named or (EUROC if separator == "," else TUM))
     match = _OURS.search(_head(start))
     assert match is not None
     world_up = "z up" in _head(start)
     return msgspec.structs.replace(
-        found,
+        poses,
         axes=Axes("nwu" if world_up else "ned", "frd"),
         frame_id=match[1] or match[2] or "",
     )

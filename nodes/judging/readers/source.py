@@ -148,7 +148,7 @@ def with_decimal_comma(field: str) -> bool:
 
 def decimal_commas(row: str) -> bool:
     """Return whether the commas of a row are those of numbers, with other separators between."""
-    separator = next((each for each in ";\t" if each in row), None)
+    separator = next((candidate for candidate in ";\t" if candidate in row), None)
     fields = [field.strip() for field in row.split(separator)]
     with_comma = [field for field in fields if "," in field]
     return len(fields) >= 4 and bool(with_comma) and all(map(with_decimal_comma, with_comma))

@@ -44,15 +44,15 @@ def complaints() -> list[str]:
 
 @cache
 def _loaded() -> tuple[tuple[Offer, tuple[Reader, ...]], ...]:
-    found = []
+    loaded = []
     for offer in sorted(offers(GROUP), key=lambda offer: offer.package == OURS):
         try:
-            found.append((offer, _rows(offer, offer.load())))
+            loaded.append((offer, _rows(offer, offer.load())))
         except CommandError as error:
             if offer.package == OURS:
                 raise
             _complaints[f"{offer.package}:{offer.name}"] = f"reader left out: {error}"
-    return tuple(found)
+    return tuple(loaded)
 
 
 def _rows(offer: Offer, loaded: Any) -> tuple[Reader, ...]:
@@ -179,7 +179,7 @@ def _read(path: Path, options: Options) -> Source:
     match = _matching(path, start)
     if match is None:
         if path.is_dir():
-            names = ", ".join(sorted(each.name for each in path.iterdir())[:8]) or "nothing in it"
+            names = ", ".join(sorted(file.name for file in path.iterdir())[:8]) or "nothing in it"
             raise ValueError(
                 f"{path}: expected a trajectory, a bag or the folder of a run, found a folder with "
                 f"{names}"

@@ -88,8 +88,8 @@ def bags_in(path: Path) -> list[Path]:
         return []
     if (path / "metadata.yaml").is_file():
         return [path]
-    files = [each for suffix in SUFFIXES for each in path.glob(f"*{suffix}")]
-    folders = [each.parent for each in path.glob("*/metadata.yaml")]
+    files = [file for suffix in SUFFIXES for file in path.glob(f"*{suffix}")]
+    folders = [file.parent for file in path.glob("*/metadata.yaml")]
     return sorted({*files, *folders})
 
 
@@ -101,7 +101,7 @@ def read_topic(path: Path, options: Options) -> Source:
     """
     bags = bags_in(path)
     if len(bags) > 1:
-        names = ", ".join(each.name for each in bags)
+        names = ", ".join(bag_path.name for bag_path in bags)
         raise ValueError(f"{path}: expected one bag, found {names}: name one of them")
     (path,) = bags
     with readable(path), contextlib.closing(open_bag(path)) as bag:
@@ -274,8 +274,8 @@ def _edges(path: Path, bag: Bag, topic: str) -> dict[str, tuple[str, _Edge]]:
     static = [name for name in bag.topics() if name.strip("/") == "tf_static"]
     edges: dict[str, tuple[str, _Edge]] = {}
     for name, type_, _, message in bag.messages({topic, *static}):
-        for each in message.transforms if type_ in TREES else ():
-            posed = _transform_stamped(each)
+        for message_transform in message.transforms if type_ in TREES else ():
+            posed = _transform_stamped(message_transform)
             child, parent = posed.child.lstrip("/"), posed.header.frame_id.lstrip("/")
             if child not in edges:
                 place = f"{path}:{topic}: {parent} to {child}"

@@ -117,7 +117,7 @@ def draw_clouds(run: Run) -> list[Plot]:
             run.missing.append(f"clouds/{path.name} cannot be drawn: it has no points")
     if not clouds:
         return []
-    clouds.sort(key=lambda each: "tru" not in each.name)  # a true one, if there is one, is first
+    clouds.sort(key=lambda cloud: "tru" not in cloud.name)  # a true one, if there is one, is first
     first, *others = clouds
     views = _views(first)
     if not others:

@@ -36,19 +36,19 @@ _FEWEST = 5  # least number of pose pairs for a box
 
 def draw_errors(run: Run) -> Plot | None:
     """Draw position and rotation error of each estimate over time, lost intervals shaded."""
-    known = [(e, e.of_images) for e in run.estimators if e.of_images is not None]
+    known = [(e, e.image_errors) for e in run.estimators if e.image_errors is not None]
     if not known:
         return None
-    figure = sheet(4.6, names=[*(each.name for each, _ in known), _LOST])
+    figure = sheet(4.6, names=[*(estimator.name for estimator, _ in known), _LOST])
     axes: Any = figure.subplots(2, 1, sharex=True)
-    for each, errors in known:
+    for estimator, errors in known:
         for axis, values in zip(axes, (errors.position, np.degrees(errors.rotation)), strict=True):
             some = thin(len(values))
             stamps = errors.stamps[some]
-            line = broken(values[some], stamps, [*each.lost, *holes(run.truth_of(each))])
+            line = broken(values[some], stamps, [*estimator.lost, *holes(run.truth_of(estimator))])
             seconds = (stamps - run.start) / SECOND
-            axis.plot(seconds, line, color=each.color, lw=1.2, label=label(each.name))
-    lost = any(each.lost for each in run.estimators)
+            axis.plot(seconds, line, color=estimator.color, lw=1.2, label=label(estimator.name))
+    lost = any(estimator.lost for estimator in run.estimators)
     for axis in axes if lost else ():
         _shade(run, axis)
     _scale(axes[0], [e.position for _, e in known], "y")
@@ -59,12 +59,12 @@ def draw_errors(run: Run) -> Plot | None:
     patch = Patch(facecolor="#bbbbbb", alpha=0.5, label=_LOST)
     legend_above(figure, axes[0], *([patch] if lost else []))
     when = "; ".join(
-        f"{each.name} "
+        f"{e.name} "
         + ", ".join(
-            f"{(a - run.start) / SECOND:.1f}–{(b - run.start) / SECOND:.1f} s" for a, b in each.lost
+            f"{(a - run.start) / SECOND:.1f}–{(b - run.start) / SECOND:.1f} s" for a, b in e.lost
         )
-        for each in run.estimators
-        if each.lost
+        for e in run.estimators
+        if e.lost
     )
     caption = "Each estimate against the truth at the time of its image."
     caption += f" Lost (shaded): {when}." if lost else " Nobody was lost."
@@ -72,20 +72,20 @@ def draw_errors(run: Run) -> Plot | None:
 
 
 def _shade(run: Run, axis: Any) -> None:
-    for each in run.estimators:
-        for start, end in each.lost:
+    for estimator in run.estimators:
+        for start, end in estimator.lost:
             a, b = (start - run.start) / SECOND, (end - run.start) / SECOND
-            axis.axvspan(a, b, facecolor=each.color, alpha=0.18, lw=0, zorder=0.5)
+            axis.axvspan(a, b, facecolor=estimator.color, alpha=0.18, lw=0, zorder=0.5)
 
 
 def _known(run: Run) -> list[tuple[Estimator, Trajectory, Trajectory]]:
-    found = []
-    for each in run.estimators:
-        truth = run.truth_of(each)
-        if each.aligned is not None and truth is not None:
-            inside = each.aligned.take(truth.covers(each.aligned.stamps))
-            found.append((each, inside, truth.at(inside.stamps)))
-    return found
+    known = []
+    for estimator in run.estimators:
+        truth = run.truth_of(estimator)
+        if estimator.aligned is not None and truth is not None:
+            inside = estimator.aligned.take(truth.covers(estimator.aligned.stamps))
+            known.append((estimator, inside, truth.at(inside.stamps)))
+    return known
 
 
 def draw_axes(run: Run) -> Plot | None:
@@ -93,16 +93,16 @@ def draw_axes(run: Run) -> Plot | None:
     known = _known(run)
     if not known:
         return None
-    figure = sheet(4.6, names=[each.name for each, *_ in known])
+    figure = sheet(4.6, names=[estimator.name for estimator, *_ in known])
     axes: Any = figure.subplots(3, 1, sharex=True)
-    for each, inside, truth in known:
+    for estimator, inside, truth in known:
         errors = inside.positions - truth.positions
         some = thin(len(inside))
         stamps = inside.stamps[some]
-        lines = broken(errors[some], stamps, [*each.lost, *holes(run.truth_of(each))]).T
+        lines = broken(errors[some], stamps, [*estimator.lost, *holes(run.truth_of(estimator))]).T
         for axis, line in zip(axes, lines, strict=True):
             seconds = (stamps - run.start) / SECOND
-            axis.plot(seconds, line, color=each.color, lw=1.2, label=label(each.name))
+            axis.plot(seconds, line, color=estimator.color, lw=1.2, label=label(estimator.name))
     for axis, name in zip(axes, ("north", "east", "down"), strict=True):
         axis.set_ylabel(f"{name} (m)")
     axes[0].margins(x=0.01)
@@ -118,17 +118,19 @@ def draw_axes(run: Run) -> Plot | None:
 
 def draw_distributions(run: Run) -> Plot | None:
     """Draw the cumulative distribution of errors, at image time and at the control ticks."""
-    known = [e for e in run.estimators if e.of_images is not None or e.of_ticks is not None]
+    known = [e for e in run.estimators if e.image_errors is not None or e.tick_errors is not None]
     if not known:
         return None
-    styles = _STYLES if any(each.of_ticks is not None for each in known) else {}
-    figure = sheet(3.4, names=[*(each.name for each in known), *styles])
+    styles = _STYLES if any(estimator.tick_errors is not None for estimator in known) else {}
+    figure = sheet(3.4, names=[*(estimator.name for estimator in known), *styles])
     axes: Any = figure.subplots(1, 2, sharey=True)
     shares = np.linspace(0.0, 1.0, 401)
     series: tuple[list[Floats], list[Floats]] = ([], [])
-    for each in known:
-        name: str | None = label(each.name)
-        for errors, style in zip((each.of_images, each.of_ticks), _STYLES.values(), strict=True):
+    for estimator in known:
+        name: str | None = label(estimator.name)
+        for errors, style in zip(
+            (estimator.image_errors, estimator.tick_errors), _STYLES.values(), strict=True
+        ):
             if errors is None:
                 continue
             for k, values in enumerate((errors.position, np.degrees(errors.rotation))):
@@ -136,7 +138,7 @@ def draw_distributions(run: Run) -> Plot | None:
                 axes[k].plot(
                     np.quantile(values, shares),
                     100.0 * shares,
-                    color=each.color,
+                    color=estimator.color,
                     ls=style,
                     label=None if k else name,
                 )
@@ -164,18 +166,18 @@ def draw_distributions(run: Run) -> Plot | None:
 def draw_latency(run: Run) -> Plot | None:
     """Draw how long estimates took, and how old the newest was at the control ticks."""
     took = [
-        (e, (e.of_images.since - e.of_images.stamps) / MILLISECOND)
+        (e, (e.image_errors.since - e.image_errors.stamps) / MILLISECOND)
         for e in run.estimators
-        if e.of_images is not None and len(e.of_images.since)
+        if e.image_errors is not None and len(e.image_errors.since)
     ]
     age = [
-        (e, (e.of_ticks.stamps - e.of_ticks.since) / MILLISECOND)
+        (e, (e.tick_errors.stamps - e.tick_errors.since) / MILLISECOND)
         for e in run.estimators
-        if e.of_ticks is not None
+        if e.tick_errors is not None
     ]
     if not took and not age:
         return None
-    figure = sheet(3.0, names=[each.name for each in run.estimators])
+    figure = sheet(3.0, names=[estimator.name for estimator in run.estimators])
     axes: Any = figure.subplots(1, 2)
     _shares(axes[0], took, "from exposure to estimate (ms)", "share of estimates up to (%)")
     _shares(axes[1], age, "age of the newest pose (ms)", "share of control ticks up to (%)")
@@ -204,11 +206,11 @@ def _shares(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, ylab
     margin = max(0.05 * (high - low), 5.0)
     left, right = max(low - margin, 0.0), high + margin
     shares = np.linspace(0.0, 100.0, 401)
-    for each, values in series:
+    for estimator, values in series:
         line = np.percentile(values, shares, method="inverted_cdf")
         x = np.concatenate([[left], line, [max(right, line[-1])]])
         y = np.concatenate([[0.0], shares, [100.0]])
-        axis.step(x, y, color=each.color, lw=1.3, label=label(each.name), where="post")
+        axis.step(x, y, color=estimator.color, lw=1.3, label=label(estimator.name), where="post")
     axis.set_xlim(left, right)
 
 
@@ -217,21 +219,21 @@ def draw_relative(run: Run) -> Plot | None:
     known = _known(run)
     boxes = []
     for place, length in enumerate(LENGTHS):
-        for k, (each, inside, truth) in enumerate(known):
+        for k, (estimator, inside, truth) in enumerate(known):
             shifts, angles = relative_errors(truth, inside, *path_pairs(truth.distances(), length))
             if len(shifts) >= _FEWEST:
                 share = 0.7 / len(known)
                 where = place + (k - (len(known) - 1) / 2) * share
                 values = 100.0 * shifts / length, np.degrees(angles) / length
-                boxes.append((each, where, 0.8 * share, length, values))
+                boxes.append((estimator, where, 0.8 * share, length, values))
     if not boxes:
         return None
-    figure = sheet(3.4, names=[each.name for each, *_ in known])
+    figure = sheet(3.4, names=[estimator.name for estimator, *_ in known])
     axes: Any = figure.subplots(1, 2)
     for row, axis in enumerate(axes):
-        for each in dict.fromkeys(each for each, *_ in boxes):
-            own = [box for box in boxes if box[0] is each]
-            _boxes(axis, each, [(where, width, v[row]) for _, where, width, _, v in own])
+        for estimator in dict.fromkeys(estimator for estimator, *_ in boxes):
+            own = [box for box in boxes if box[0] is estimator]
+            _boxes(axis, estimator, [(where, width, v[row]) for _, where, width, _, v in own])
         _scale(axis, [values[row] for *_, values in boxes], "y", 95)
         axis.set_xticks(range(len(LENGTHS)), [f"{length:g}" for length in LENGTHS])
         axis.set(xlabel="length of path (m)", xlim=(-0.6, len(LENGTHS) - 0.4))
@@ -250,7 +252,7 @@ def draw_relative(run: Run) -> Plot | None:
     )
 
 
-def _boxes(axis: Any, each: Estimator, boxes: list[tuple[float, float, Floats]]) -> None:
+def _boxes(axis: Any, estimator: Estimator, boxes: list[tuple[float, float, Floats]]) -> None:
     names = ("whislo", "q1", "med", "q3", "whishi")
     statistics = [
         dict(zip(names, np.percentile(v, (5, 25, 50, 75, 95)).tolist(), strict=True))
@@ -263,12 +265,12 @@ def _boxes(axis: Any, each: Estimator, boxes: list[tuple[float, float, Floats]])
         showfliers=False,
         patch_artist=True,
         manage_ticks=False,
-        boxprops={"facecolor": f"{each.color}40", "edgecolor": each.color},
-        medianprops={"color": each.color, "lw": 1.8},
-        whiskerprops={"color": each.color},
-        capprops={"color": each.color},
+        boxprops={"facecolor": f"{estimator.color}40", "edgecolor": estimator.color},
+        medianprops={"color": estimator.color, "lw": 1.8},
+        whiskerprops={"color": estimator.color},
+        capprops={"color": estimator.color},
     )
-    drawn["boxes"][0].set_label(label(each.name))
+    drawn["boxes"][0].set_label(label(estimator.name))
 
 
 def _scale(axis: Any, series: list[Floats], which: str, share: float = 100.0) -> None:

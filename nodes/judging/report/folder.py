@@ -50,7 +50,7 @@ def holes(truth: Trajectory | None) -> list[Interval]:
     steps = np.diff(truth.stamps)
     before = np.flatnonzero(steps > max(HOLE, 10 * np.median(steps)))
     ends = zip(truth.stamps[before].tolist(), truth.stamps[before + 1].tolist(), strict=True)
-    return [Interval(*each) for each in ends]
+    return [Interval(*span) for span in ends]
 
 
 def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interval]) -> Floats:
@@ -126,13 +126,13 @@ class _Reader:
         names = {
             source_of(p.stem.partition(".")[2]) or first: f"trajectories/{p.name}" for p in paths
         }
-        found = {vehicle: self._try(name, read_poses) for vehicle, name in names.items()}
-        order = sorted(found.items(), key=lambda item: item[0] != first)
+        by_vehicle = {vehicle: self._try(name, read_poses) for vehicle, name in names.items()}
+        order = sorted(by_vehicle.items(), key=lambda item: item[0] != first)
         return {vehicle: poses for vehicle, poses in order if poses is not None}
 
     def _collisions(self) -> npt.NDArray[np.float64]:
-        found = self._try("trajectories/collisions.csv", _places)
-        return np.empty((0, 3)) if found is None else found
+        places = self._try("trajectories/collisions.csv", _places)
+        return np.empty((0, 3)) if places is None else places
 
     def _estimators(
         self, verdict: Verdict | None, truths: dict[str, Trajectory]
@@ -160,7 +160,7 @@ class _Reader:
         first = next(iter(truths.values()), None)
         truth = truths.get(str(figures.get("vehicle")), first)
         final = self._try(f"evaluation/{file}.final.tum", read_poses)
-        found = Estimator(name=name, color=color, figures=figures, final=final)
+        estimator = Estimator(name=name, color=color, figures=figures, final=final)
         aligned = self._try(f"evaluation/{file}.aligned.tum", read_poses)
         errors = self._try(f"evaluation/{file}.csv", _errors)
         ticks = self._try(f"evaluation/{file}.ticks.csv", _errors)
@@ -169,13 +169,13 @@ class _Reader:
             if estimate is None:
                 why = figures.get("why") or "it left no poses"
                 self.missing.append(f"{name}: no curves: {why}")
-                return found
+                return estimator
             if truth is not None:
                 judged = judge(EstimatorRecord.of(estimate), truth, alignment="origin")
-                aligned, errors = judged.aligned, judged.of_images
+                aligned, errors = judged.aligned, judged.image_errors
                 if aligned is None:
                     self.missing.append(f"{name}: no curves: {judged.figures['why']}")
-                    return found
+                    return estimator
                 self.missing.append(
                     f"{name}: the run left no evaluation of it; its first pose was laid on the "
                     "true one for this report, its scale left as it is"
@@ -190,7 +190,7 @@ class _Reader:
                     f"tell of {known:.1f} s, which are what the figures show"
                 )
         return msgspec.structs.replace(
-            found, aligned=aligned, of_images=errors, of_ticks=ticks, lost=lost
+            estimator, aligned=aligned, image_errors=errors, tick_errors=ticks, lost=lost
         )
 
     def _try(self, name: str, read: Callable[[Path], T], without: str = "") -> T | None:
@@ -243,19 +243,19 @@ def _intervals(path: Path) -> list[Interval]:
 
 
 def _frames(folder: Path) -> dict[str, list[Path]]:
-    found: dict[str, list[Path]] = {}
+    frames: dict[str, list[Path]] = {}
     for path in sorted(folder.glob("*.jpg")):
-        found.setdefault(path.stem.rpartition("_")[0], []).append(path)
-    return found
+        frames.setdefault(path.stem.rpartition("_")[0], []).append(path)
+    return frames
 
 
 def _loud(log: str) -> list[str]:
-    found: list[str] = []
+    lines: list[str] = []
     loud = False
     for line in log.splitlines():
         words = line.split(None, 2)
         if len(words) > 1 and words[0].replace(".", "", 1).isdigit():
             loud = words[1] in _LOUD
         if loud:
-            found.append(line)
-    return found[-_LOG_LINES:]
+            lines.append(line)
+    return lines[-_LOG_LINES:]

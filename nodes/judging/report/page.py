@@ -73,12 +73,12 @@ def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:
             draw_relative,
         )
         with drawing():
-            for place, found in zip(
+            for place, figures in zip(
                 shown,
                 ((draw(run) for draw in curves), draw_clouds(run), draw_frames(run)),
                 strict=True,
             ):
-                place += [embedded(each, plots, formats) for each in found if each is not None]
+                place += [embedded(f, plots, formats) for f in figures if f is not None]
     page = out / PAGE
     page.write_text(render(run, *shown), encoding="utf-8", newline="\n")
     return page
@@ -106,7 +106,7 @@ def render(
         curves=curves,
         frames=frames,
         clouds=clouds,
-        verdicts=[_verdict(*each) for each in _judged(run)],
+        verdicts=[_verdict(*row) for row in _judged(run)],
     )
 
 
@@ -137,14 +137,14 @@ def embedded(plot: Plot, folder: Path, formats: Sequence[str] = ()) -> dict[str,
 
 
 def _judged(run: Run) -> list[tuple[str, dict[str, Any], str]]:
-    found = [(each.name, each.figures, each.color) for each in run.estimators]
+    rows = [(estimator.name, estimator.figures, estimator.color) for estimator in run.estimators]
     verdict = run.facts.verdict
     summary = {} if verdict is None else dict(verdict.estimators)
-    for vehicle, each in (verdict.flights if verdict else {}).items():
-        if each["passed"] is not None:
-            summary[f"flight of {vehicle}"] = each
-    known = {name for name, _, _ in found}
-    return found + [(name, each, "inherit") for name, each in summary.items() if name not in known]
+    for vehicle, flight in (verdict.flights if verdict else {}).items():
+        if flight["passed"] is not None:
+            summary[f"flight of {vehicle}"] = flight
+    known = {name for name, _, _ in rows}
+    return rows + [(name, f, "inherit") for name, f in summary.items() if name not in known]
 
 
 def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
@@ -152,15 +152,15 @@ def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
     failed = figures.get("failed")
     if passed is None and "why" in figures:
         failed = [figures["why"]]
-    laid = _ALIGNED.get(str(figures.get("alignment")), "")
+    alignment = _ALIGNED.get(str(figures.get("alignment")), "")
     vehicle = f"of {figures['vehicle']}" if "vehicle" in figures else ""
     return {
         "name": name,
         "color": color,
         "method": str(figures.get("method") or ""),
-        "alignment": "; ".join(filter(None, (vehicle, laid))),
+        "alignment": "; ".join(filter(None, (vehicle, alignment))),
         "state": "not judged" if passed is None else "passed" if passed else "failed",
-        "failed": [str(each) for each in failed] if isinstance(failed, list) else [],
+        "failed": [str(sentence) for sentence in failed] if isinstance(failed, list) else [],
     }
 
 
@@ -181,7 +181,7 @@ class Report(Node[ReportConfig]):
     files = ("plots", "report.html")
 
     async def on_shutdown(self) -> None:
-        """Have the report written once the other nodes and the summary have left their files."""
+        """Schedule the report for after the run's summary is written."""
         if self.out is not None:
             self.after_run(self._write)
 

@@ -78,8 +78,8 @@ class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     color: str
     figures: dict[str, Any] = {}
     aligned: Trajectory | None = None
-    of_images: Errors | None = None
-    of_ticks: Errors | None = None
+    image_errors: Errors | None = None
+    tick_errors: Errors | None = None
     lost: list[Interval] = []
     final: Trajectory | None = None
 
@@ -139,24 +139,24 @@ def figures(run: Run, *, main: bool) -> list[Row]:
     thresholds = run.verdict.thresholds if run.verdict is not None else {}
     limits = {name: limit for name, limit in thresholds.items() if limit is not None}
     asked = {name: limit for name, limit in limits.items() if math.isfinite(limit)}
-    rows = [each for each in FIGURES.values() if each.report]
-    top = sorted(rows, key=lambda each: each.report != "head")
-    names = dict.fromkeys([*(each.name for each in top), *asked])
+    rows = [row for row in FIGURES.values() if row.report]
+    top = sorted(rows, key=lambda row: row.report != "head")
+    names = dict.fromkeys([*(row.name for row in top), *asked])
     if not main:
         others = dict.fromkeys(k for e in run.estimators for k in e.figures)
         names = {k: None for k in others if k not in names and k not in _NO_FIGURES}
-    found = []
+    table = []
     for row in map(figure, names):
         values = [e.figures.get(row.name) for e in run.estimators]
         limit = asked.get(row.name)
         why = [e.figures.get("failed") or () for e in run.estimators]
-        missed = [any(str(each).startswith(f"{row.name}: ") for each in own) for own in why]
+        missed = [any(str(sentence).startswith(f"{row.name}: ") for sentence in own) for own in why]
         known = any(value is not None for value in values)
         if known or any(missed) or (limit is not None and not row.optional):
             cells = list(zip(map(show, values), missed, strict=True))
             threshold = "" if limit is None else f"{row.side} {limit:g}"
-            found.append(Row(row.name, row.meaning, row.unit, threshold, cells))
-    return found
+            table.append(Row(row.name, row.meaning, row.unit, threshold, cells))
+    return table
 
 
 def show(value: Any) -> str:
@@ -208,8 +208,8 @@ def facts(run: Run) -> list[tuple[str, str]]:
         (f"link {port}", f"{link.lost} lost, {link.thinned} left out")
         for port, link in f.links.items()
     ]
-    rows += [(f"{name} as announced, less as it is", _off(each)) for name, each in f.truth.items()]
-    rows += [(f"{name} is slow", each.slower) for name, each in f.workers.items() if each.slower]
+    rows += [(f"{name} as announced, less as it is", _off(e)) for name, e in f.truth.items()]
+    rows += [(f"{name} is slow", w.slower) for name, w in f.workers.items() if w.slower]
     rows += [(f"loop stood still in {node}", f"{count} times") for node, count in f.stalls.items()]
     if f.clock is not None and not any(s.dropped or s.missed for s in f.streams.values()):
         rows.append(("dropped or unmatched", "nothing"))
@@ -220,9 +220,9 @@ def _off(facts: dict[str, Any]) -> str:
     """Return by how much the announced numbers of a sensor are off, number by number."""
     texts = []
     for name, true in facts["true"].items():
-        said = np.atleast_1d(facts["announced"][name]) - np.atleast_1d(true)
-        if said.any():
-            texts.append(f"{name} {' '.join(f'{value:+.2g}' for value in said.tolist())}")
+        offsets = np.atleast_1d(facts["announced"][name]) - np.atleast_1d(true)
+        if offsets.any():
+            texts.append(f"{name} {' '.join(f'{value:+.2g}' for value in offsets.tolist())}")
     return "; ".join(texts)
 
 
@@ -239,17 +239,19 @@ def _digest(f: Facts) -> str:
 def sensors(run: Run) -> list[list[str]]:
     """Return the table of announced sensors: source, kind, rate, and the rest in words."""
     rows = []
-    for each in run.facts.announcements:
-        kind = str(each.get("type", "")).removesuffix("Announcement")
-        if "rate" not in each or not kind:
+    for sensor in run.facts.announcements:
+        kind = str(sensor.get("type", "")).removesuffix("Announcement")
+        if "rate" not in sensor or not kind:
             continue
-        info = each.get("info") or {}
+        info = sensor.get("info") or {}
         size = [f"{info['width']} × {info['height']}"] if "width" in info else []
         lens = any(info.get("distortion", ())) or info.get("distortion_model") == "equidistant"
         size += [str(info["distortion_model"])] if lens else []
-        rest = {k: v for k, v in each.items() if k not in _PLACES and v not in (0, 0.0, "", [])}
-        said = [f"{name.replace('_', ' ')} {_said(value)}" for name, value in rest.items()]
-        rows.append([str(each.get("source")), kind, _said(each["rate"]), ", ".join(size + said)])
+        rest = {k: v for k, v in sensor.items() if k not in _PLACES and v not in (0, 0.0, "", [])}
+        texts = [f"{name.replace('_', ' ')} {_text(value)}" for name, value in rest.items()]
+        rows.append(
+            [str(sensor.get("source")), kind, _text(sensor["rate"]), ", ".join(size + texts)]
+        )
     return rows
 
 
@@ -260,9 +262,9 @@ _PLACES = {
 """Announcement fields not in the table of sensors."""
 
 
-def _said(value: Any) -> str:
+def _text(value: Any) -> str:
     if isinstance(value, list | tuple):
-        return ", ".join(map(_said, value))
+        return ", ".join(map(_text, value))
     return f"{value:g}" if isinstance(value, float) else show(value)
 
 
@@ -270,7 +272,7 @@ def ticks(run: Run) -> list[list[str]]:
     """Return how punctual each ticker was."""
     late = {k: (t.late_p50_us, t.late_p99_us, t.late_max_us) for k, t in run.facts.ticks.items()}
     return [
-        [name, f"{t.hz:g}", str(t.calls), *(f"{each:.0f}" for each in late[name]), str(t.missed)]
+        [name, f"{t.hz:g}", str(t.calls), *(f"{us:.0f}" for us in late[name]), str(t.missed)]
         for name, t in sorted(run.facts.ticks.items())
     ]
 
@@ -282,7 +284,7 @@ def workers(run: Run) -> list[list[str]]:
 
 def outside(run: Run) -> list[list[str]]:
     """Return the table of systems outside the process and their answers."""
-    return [[name, *each.row()] for name, each in sorted(run.facts.outside.items())]
+    return [[name, *system.row()] for name, system in sorted(run.facts.outside.items())]
 
 
 def outputs(run: Run) -> list[list[str]]:
@@ -350,9 +352,9 @@ class Plot(msgspec.Struct, frozen=True, eq=False):
         path = folder / f"{self.name}.png"
         self.figure.savefig(path, dpi=DPI, metadata={"Software": None})
         self.figure.set_layout_engine("none")  # all stays where it is: finding places takes long
-        for each in {"svg", "pdf"}.intersection(() if self.raster else formats):
-            date = {"svg": "Date", "pdf": "CreationDate"}[each]
-            self.figure.savefig(path.with_suffix(f".{each}"), metadata={date: None})
+        for suffix in {"svg", "pdf"}.intersection(() if self.raster else formats):
+            date = {"svg": "Date", "pdf": "CreationDate"}[suffix]
+            self.figure.savefig(path.with_suffix(f".{suffix}"), metadata={date: None})
         return path
 
 
@@ -437,7 +439,7 @@ def legend_columns(names: Sequence[str]) -> int:
 def legend_above(figure: Figure, axes: Any, *extra: Artist) -> None:
     """Put the legend of some axes, and of further artists, at the top of a figure."""
     handles, names = axes.get_legend_handles_labels()
-    handles, names = [*handles, *extra], [*names, *(str(each.get_label()) for each in extra)]
+    handles, names = [*handles, *extra], [*names, *(str(artist.get_label()) for artist in extra)]
     if handles:
         columns = legend_columns(names)
         figure.legend(handles, names, loc="outside upper left", ncols=columns)

@@ -97,11 +97,11 @@ def draw_trajectories(run: Run) -> Plot | None:
 
 def _caption(run: Run, *, astray: bool) -> str:
     how = {str(e.figures["alignment"]) for e in run.estimators if "alignment" in e.figures}
-    laid = f" (alignment: {', '.join(sorted(how))})" if how else ""
+    methods = f" (alignment: {', '.join(sorted(how))})" if how else ""
     text = "Both views have one scale."
     if any(e.aligned is not None for e in run.estimators):
         text += (
-            f" Estimates as laid on the truth for the evaluation{laid}; "
+            f" Estimates as laid on the truth for the evaluation{methods}; "
             "their lines are broken where they were lost or no truth is known."
         )
     if astray:
@@ -110,26 +110,28 @@ def _caption(run: Run, *, astray: bool) -> str:
 
 
 def _lines(run: Run) -> list[_Line]:
-    found = []
+    lines = []
     several = len(run.truths) > 1
     for k, (vehicle, truth) in enumerate(run.truths.items()):
         style = {"color": TRUTHS[k % len(TRUTHS)], "lw": 3.2, "alpha": 0.45}
         style["solid_capstyle"] = "round"
-        found.append(
+        lines.append(
             _line(f"truth of {label(vehicle)}" if several else "truth", truth, style, holes(truth))
         )
     for vehicle, plan in run.plans.items():
         style = {"color": PLAN, "lw": 0.9, "ls": (0, (5, 3))}
-        found.append(_line(f"plan of {label(vehicle)}" if several else "plan", plan, style))
-    for each in run.estimators:
-        if each.aligned is not None:
-            style = {"color": each.color, "lw": 1.3}
-            unknown = [*each.lost, *holes(run.truth_of(each))]
-            found.append(_line(label(each.name), each.aligned, style, unknown))
-        if each.final is not None:
-            style = {"color": each.color, "lw": 1.3, "ls": (0, (2, 1.5))}
-            found.append(_line(f"{label(each.name)} after loop closures", each.final, style))
-    return found
+        lines.append(_line(f"plan of {label(vehicle)}" if several else "plan", plan, style))
+    for estimator in run.estimators:
+        if estimator.aligned is not None:
+            style = {"color": estimator.color, "lw": 1.3}
+            unknown = [*estimator.lost, *holes(run.truth_of(estimator))]
+            lines.append(_line(label(estimator.name), estimator.aligned, style, unknown))
+        if estimator.final is not None:
+            style = {"color": estimator.color, "lw": 1.3, "ls": (0, (2, 1.5))}
+            lines.append(
+                _line(f"{label(estimator.name)} after loop closures", estimator.final, style)
+            )
+    return lines
 
 
 def _line(

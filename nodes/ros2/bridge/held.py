@@ -55,10 +55,10 @@ class HeldEstimator:
         self.subscription = topics[0].subscription
         self._topics, self._stamps = topics, stamps
         self._max_size = config.max_message_size
-        self._needs = [topic_name(config.namespace, each) for each in self.subscription.needs]
+        self._needs = [topic_name(config.namespace, need) for need in self.subscription.needs]
         images = [row.kind for row in PUBLISHED if row.image]
-        found = [publication(kind, self.subscription.answers_to, config) for kind in images]
-        self._images = [each.name for each in found if each is not None]
+        publications = [publication(kind, self.subscription.answers_to, config) for kind in images]
+        self._images = [row.name for row in publications if row is not None]
         self._owed = -1  # stamp of the newest image
         self._sequences: dict[bytes, int] = {}  # by GID
         self._there: dict[str, None] = {}  # tokens of its publishers
@@ -67,19 +67,19 @@ class HeldEstimator:
 
     def follow(self, session: Session) -> None:
         """Subscribe to the answers, and watch the estimator's publishers; may block."""
-        takes = [(each.topic, functools.partial(self._take, each)) for each in self._topics]
+        takes = [(t.topic, functools.partial(self._take, t)) for t in self._topics]
         session.subscribe_in_order(takes)
         session.watch(self._topics[0].topic.name, "MP", self._changed)
 
     def missing(self, matched: Sequence[str]) -> str:
         """Return the missing publisher or subscriptions in words, given the matched topics."""
-        found = [] if self._there else [f"a publisher of {self._topics[0].topic.name}"]
-        if lacking := [each for each in self._needs if each not in matched]:
-            found.append(f"a subscription to {' and '.join(lacking)}")
-        elif not self._needs and not any(each in matched for each in self._images):
-            found.append(f"a subscription to {' or '.join(self._images)}")
-        self._came = self._came or not found
-        return " and ".join(found)
+        parts = [] if self._there else [f"a publisher of {self._topics[0].topic.name}"]
+        if lacking := [name for name in self._needs if name not in matched]:
+            parts.append(f"a subscription to {' and '.join(lacking)}")
+        elif not self._needs and not any(name in matched for name in self._images):
+            parts.append(f"a subscription to {' or '.join(self._images)}")
+        self._came = self._came or not parts
+        return " and ".join(parts)
 
     def owe(self, image: Event, matched: Callable[[], Sequence[str]]) -> Owed[Event] | None:
         """Return the answer owed to an image about to go out, the exposure's first, or `None`."""
@@ -146,16 +146,18 @@ def held_estimators(
     node: Node[Ros2BridgeConfig], incoming: Sequence[IncomingTopic], stamps: Callable[[], Stamps]
 ) -> list[HeldEstimator]:
     """Return the estimators of a node's subscriptions with owed answers, each with its hold."""
-    found = []
-    started = any(getattr(each.config, "feed", "") == "ros2" for each in node.siblings(Node))
-    for each in incoming:
-        given = each.subscription
+    estimators = []
+    started = any(getattr(sibling.config, "feed", "") == "ros2" for sibling in node.siblings(Node))
+    for topic in incoming:
+        given = topic.subscription
         if given.use == "estimate" and given.answers_to:
-            told = [other for other in incoming if given.is_told_by(other.subscription)]
-            hold = node.hold(each.source, given.hold, given.latency)
+            others = [other for other in incoming if given.is_told_by(other.subscription)]
+            hold = node.hold(topic.source, given.hold, given.latency)
             patience = STORY if started else 0.0
-            found.append(HeldEstimator([each, *told], hold, stamps(), node.config, patience))
-    return found
+            estimators.append(
+                HeldEstimator([topic, *others], hold, stamps(), node.config, patience)
+            )
+    return estimators
 
 
 class HeldLine:
@@ -238,8 +240,8 @@ class HeldLine:
         if node.clock.kind == "real" and self._waiting.qsize() >= WAITING:
             self.dropped += 1
             return
-        for each in self._estimators:
-            if (owed := each.owe(image, self._matched)) is not None:
+        for estimator in self._estimators:
+            if (owed := estimator.owe(image, self._matched)) is not None:
                 node.start(self._answer(owed))
         self._waiting.put((clock, node.clock.now()))
         self._waiting.put((put, image))
@@ -253,8 +255,8 @@ class HeldLine:
 
     def _work(self) -> None:
         try:
-            for each in self._estimators:
-                each.follow(self._session)
+            for estimator in self._estimators:
+                estimator.follow(self._session)
             self._there.set_result(self._wait())
         except Exception as error:
             self._there.set_exception(error)
@@ -262,31 +264,31 @@ class HeldLine:
             try:
                 put(what)
             except Exception as error:  # nobody looks at this thread
-                for each in self._estimators:
-                    each.hold.fail(error)
+                for estimator in self._estimators:
+                    estimator.hold.fail(error)
 
     def _wait(self) -> str:
         """Wait for the estimators and their last subscription; return the missing ones in words."""
         begin = since = time.monotonic()
-        end = begin + max(each.subscription.timeout for each in self._estimators)
+        end = begin + max(estimator.subscription.timeout for estimator in self._estimators)
         matched: list[str] = []
         while True:
             now, before, matched = time.monotonic(), matched, self._matched()
             since = since if matched == before else now
-            missing = "; ".join(filter(None, (each.missing(matched) for each in self._estimators)))
+            missing = "; ".join(filter(None, (e.missing(matched) for e in self._estimators)))
             if not missing and now > since + SETTLED:
                 return ""
             if now > end or self._closed.wait(_LOOK):
                 return f"{missing or 'no further subscriptions'} within {end - begin:g} s"
 
     def _matched(self) -> list[str]:
-        return [each.topic.name for each in self._publishers if each.matched()]
+        return [publisher.topic.name for publisher in self._publishers if publisher.matched()]
 
     def _note(self, publisher: Publisher, message: bytearray) -> None:
         """Add a message to the digest of each hold; raise if a subscriber does not read."""
         name = publisher.topic.name
-        for each in self._estimators:
-            each.hold.sent(name, message)
+        for estimator in self._estimators:
+            estimator.hold.sent(name, message)
         if publisher.failed and not self._closed.is_set():
             raise MissingAnswerError(
                 f"{name}: expected subscribers that read, found one that does not"
@@ -297,25 +299,25 @@ def why_no_answers(
     config: Ros2BridgeConfig, rates: Mapping[str, float], *, lockstep: bool
 ) -> Iterator[str]:
     """Yield why estimators could never answer, given the announced rates of cameras and lidars."""
-    for each in config.subscriptions:
-        source, latency = each.answers_to, float(each.latency)
-        if not source or each.use == "done":
+    for given in config.subscriptions:
+        source, latency = given.answers_to, float(given.latency)
+        if not source or given.use == "done":
             continue
         if source not in rates:
             yield (
-                f"{each.topic}: answers_to: expected a camera or lidar that is announced, found "
+                f"{given.topic}: answers_to: expected a camera or lidar that is announced, found "
                 f'"{source}" (there are: {", ".join(rates) or "none"}){suggest(source, rates)}'
             )
-        elif any(each.is_told_by(other) for other in config.subscriptions):
+        elif any(given.is_told_by(other) for other in config.subscriptions):
             continue
         elif (
-            (lockstep and each.hold.skips == "allowed")
-            and not each.hold.latencies
+            (lockstep and given.hold.skips == "allowed")
+            and not given.hold.latencies
             and 0 < rates[source] * latency <= 1
         ):
             yield (
-                f'{each.topic}: skips = "allowed": expected a latency above the period of {source} '
-                f"({1e3 / rates[source]:.4g} ms), found {latency * 1e3:g} ms: that an image was "
+                f'{given.topic}: skips = "allowed": expected a latency above the period of {source}'
+                f" ({1e3 / rates[source]:.4g} ms), found {latency * 1e3:g} ms: that an image was "
                 "skipped is known by the answer to a later one, which is not sent while time "
                 'stands for the first; or have a topic say what is done (as = "done")'
             )

@@ -81,10 +81,10 @@ class IncomingTopic:
         self, session: Session, images: tuple[str, ...], max_size: int
     ) -> concurrent.futures.Future[CameraAnnouncement]:
         """Subscribe to the calibration of a camera with these images; return the first, if any."""
-        found: concurrent.futures.Future[CameraAnnouncement] = concurrent.futures.Future()
+        pending: concurrent.futures.Future[CameraAnnouncement] = concurrent.futures.Future()
 
         def take(message: Message) -> None:
-            if found.done():
+            if pending.done():
                 return
             try:
                 if message.size > max_size:
@@ -96,10 +96,10 @@ class IncomingTopic:
                 self.complain("calibration refused", str(error))
             else:
                 with contextlib.suppress(concurrent.futures.InvalidStateError):
-                    found.set_result(camera)
+                    pending.set_result(camera)
 
         session.subscribe(self.topic, take, late=True)
-        return found
+        return pending
 
     def event(self, data: bytes, now: int, stamps: Stamps) -> Event | None:
         """Return the event of a message; `None` if refused or of no use."""
@@ -189,8 +189,8 @@ class Inbox:
     def take(self, message: Message) -> None:
         """Take a message, in any thread; never waits."""
         if message.size > self._max_size:
-            found = f"expected {self._max_size} bytes or less, found {message.size}"
-            self._complain("message too large", found)
+            fault = f"expected {self._max_size} bytes or less, found {message.size}"
+            self._complain("message too large", fault)
             return
         if not self._within_rate():
             self._complain("too many messages", f"expected {self._max_rate:g} a second or less")

@@ -52,11 +52,11 @@ _TOKEN = re.compile(
 
 def parse_token(key: str) -> Token:
     """Read a liveliness token; a `ValueError` if none of rmw_zenoh_cpp's."""
-    found = _TOKEN.fullmatch(key)
-    if found is None or (found[3] != "NN" and found[6] is None):
+    match = _TOKEN.fullmatch(key)
+    if match is None or (match[3] != "NN" and match[6] is None):
         raise ValueError(f"expected a liveliness token of ROS, found {key!r:.200}")
     kind: Any
-    domain, zid, kind, namespace, name, topic, extra = found.groups("")
+    domain, zid, kind, namespace, name, topic, extra = match.groups("")
     namespace, topic = namespace.replace("%", "/"), topic.replace("%", "/")
     node = NodeName(name=name, namespace=namespace, domain_id=int(domain))
     return Token(key=key, kind=kind, node=node, zid=zid, topic=topic, extra=extra[1:])

@@ -102,7 +102,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         if self.config.publications:
             self._declare_mapped_events()
         # Messages of ROS come at their own time, unless time waits for them.
-        self._unheld = [each.topic for each in self.config.subscriptions if not each.answers_to]
+        self._unheld = [s.topic for s in self.config.subscriptions if not s.answers_to]
         steered = bool(self._unheld) or "vehicle" in self.config.services
         self.deterministic = not steered  # type: ignore[misc]
 
@@ -123,12 +123,12 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         try:
             self._store = await self.offload(TypeStore, config.distribution, config.definitions)
             self._incoming = [
-                IncomingTopic(each, config, self._store, self.name, self._complaints)
-                for each in config.subscriptions
+                IncomingTopic(subscription, config, self._store, self.name, self._complaints)
+                for subscription in config.subscriptions
             ]
             self._outgoing = [
-                OutgoingTopic(each, config, self._store, self._complaints)
-                for each in config.publications
+                OutgoingTopic(publication, config, self._store, self._complaints)
+                for publication in config.publications
             ]
             if self.checking:
                 if any(topic.subscription.use == "camera" for topic in self._incoming):
@@ -143,7 +143,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                 connect=config.connect,
                 listen=config.listen,
                 file=config.zenoh_config,
-                max_wait=max((each.hold.max_wait for each in config.subscriptions), default=5.0),
+                max_wait=max((s.hold.max_wait for s in config.subscriptions), default=5.0),
             )
         except (ValueError, SessionError) as error:
             self.log.fatal("%s", error)
@@ -219,16 +219,16 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             return
         if self._line is not None:
             await self._line.close()
-        mapped = [each.publisher for each in self._outgoing if each.publisher is not None]
-        sent = [each for each in publishing.publishers + mapped if each.sent]
-        refused = sum(self._complaints.counts.values()) + sum(each.dropped for each in self._unread)
+        mapped = [o.publisher for o in self._outgoing if o.publisher is not None]
+        sent = [p for p in publishing.publishers + mapped if p.sent]
+        refused = sum(self._complaints.counts.values()) + sum(s.dropped for s in self._unread)
         self.log.info(
             "%d messages published on %d topics (%d images, %d others dropped); "
             "%d received, %d refused or dropped",
-            sum(each.sent for each in sent),
+            sum(publisher.sent for publisher in sent),
             len(sent),
-            sum(each.dropped for each in (*self._queues.values(), self._line) if each),
-            sum(each.waiting.dropped for each in self._outgoing),
+            sum(queue.dropped for queue in (*self._queues.values(), self._line) if queue),
+            sum(outgoing.waiting.dropped for outgoing in self._outgoing),
             sum(incoming.received for incoming in self._incoming),
             refused,
         )
@@ -277,7 +277,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     def _declare_mapped_events(self) -> None:
         try:
-            events = tuple({event_type(each) for each in self.config.publications})
+            events = tuple({event_type(publication) for publication in self.config.publications})
         except ValueError as error:
             self.log.fatal("%s", error)
         declared = self.declared
@@ -338,17 +338,17 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
         timeout, most = incoming.subscription.timeout, self.config.max_message_size
         kinds = {"image": "rgb", "depth": "depth"}
-        uses = [each.subscription.use for each in self._incoming if each.source == incoming.source]
+        uses = [t.subscription.use for t in self._incoming if t.source == incoming.source]
         images = tuple(kinds[use] for use in uses if use in kinds)
-        found = await self.offload(incoming.find_camera, session, images, most)
+        pending = await self.offload(incoming.find_camera, session, images, most)
         try:
-            self._cameras.append(await self.offload(found.result, timeout))
+            self._cameras.append(await self.offload(pending.result, timeout))
         except TimeoutError:
             self.log.fatal(
                 "%s: expected a calibration within %g s, found none", incoming.topic.name, timeout
             )
         finally:
-            found.cancel()
+            pending.cancel()
 
     def _fix_time(self) -> Stamps:
         """Return the conversion of stamps to times of messages, fixed with the first message."""

@@ -191,12 +191,12 @@ class SimulationServices:
         return {"result": self._make("Result", result=result, error_message=message)}
 
     async def _features(self, _: Any) -> dict[str, Any]:
-        found = [STATE_GETTING, STATE_SETTING]
+        ids = [STATE_GETTING, STATE_SETTING]
         why = self._stepping.fixed()
         if not why:
-            found += [STATE_PAUSE, STEP_SINGLE, STEP_MULTIPLE, STEP_ACTION]
+            ids += [STATE_PAUSE, STEP_SINGLE, STEP_MULTIPLE, STEP_ACTION]
         info = why or f"a step is {self.step / SECOND:g} s of simulated time"
-        kind, features = "SimulatorFeatures", np.array(found, np.uint16)
+        kind, features = "SimulatorFeatures", np.array(ids, np.uint16)
         made = self._make(kind, features=features, spawn_formats=[], custom_info=info)
         return {"features": made}
 
@@ -280,7 +280,7 @@ class SimulateSteps:
         if id_ in self._goals:
             return {"accepted": False, "stamp": stamp}
         if len(self._goals) == KEPT:
-            del self._goals[next(each for each, goal in self._goals.items() if goal.over.is_set())]
+            del self._goals[next(k for k, goal in self._goals.items() if goal.over.is_set())]
         info = self._message("action_msgs/msg/GoalInfo")(goal_id=request.goal_id, stamp=stamp)
         goal = self._goals[id_] = _Goal(info, steps, now)
         if refusal := self._simulation.refusal(steps):
@@ -344,9 +344,9 @@ class SimulateSteps:
         """Cancel the goal of an id, or accepted up to a time; if neither is given, any."""
         id_, stamp = bytes(request.goal_info.goal_id.uuid), request.goal_info.stamp
         until = stamp.sec * SECOND + stamp.nanosec
-        for each, goal in self._goals.items():
+        for goal_id, goal in self._goals.items():
             before = goal.begin <= until if until else not any(id_)
-            if not goal.over.is_set() and (each == id_ or before):
+            if not goal.over.is_set() and (goal_id == id_ or before):
                 self._set(goal, CANCELING)
                 self._stepping.pause()
                 return {"return_code": NO_ERROR, "goals_canceling": [goal.info]}

@@ -162,9 +162,9 @@ class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
 
 
-def _importable(topic: str, what: str, form: str, found: str) -> None:
-    if not re.fullmatch(r"\w+(\.\w+)*:\w+", found):
-        raise ValueError(f'{topic}: {what}: expected "{form}", found {found!r}')
+def _importable(topic: str, what: str, form: str, path: str) -> None:
+    if not re.fullmatch(r"\w+(\.\w+)*:\w+", path):
+        raise ValueError(f'{topic}: {what}: expected "{form}", found {path!r}')
 
 
 class Ros2BridgeConfig(PublishingConfig):
@@ -224,13 +224,13 @@ class Ros2BridgeConfig(PublishingConfig):
                 dds_type(type_)
             except ValueError as error:
                 raise ValueError(f"definitions: {error}") from None
-        if any(each.answers_to for each in self.subscriptions) and self.keys != "rmw_zenoh":
+        if any(s.answers_to for s in self.subscriptions) and self.keys != "rmw_zenoh":
             raise ValueError(
                 'answers_to: expected keys = "rmw_zenoh", whose messages are numbered and whose '
                 f'nodes are seen to go, found keys = "{self.keys}"'
             )
-        for done in (each for each in self.subscriptions if each.use == "done"):
-            if len([each for each in self.subscriptions if each.is_told_by(done)]) != 1:
+        for done in (s for s in self.subscriptions if s.use == "done"):
+            if len([s for s in self.subscriptions if s.is_told_by(done)]) != 1:
                 raise ValueError(
                     f'{done.topic}: as = "done": expected one estimate with the same answers_to, '
                     "and of the same source if there are several"
@@ -239,19 +239,19 @@ class Ros2BridgeConfig(PublishingConfig):
 
 def import_mapping(topic: str, path: str) -> Callable[[Any, Any], Any]:
     """Import a function ``module:function``; a `ValueError` if there is no such function."""
-    found = _imported(topic, "mapping", path)
-    if not callable(found):
-        raise ValueError(f"{topic}: mapping: expected a function, found {found!r}")
-    function: Callable[[Any, Any], Any] = found
+    imported = _imported(topic, "mapping", path)
+    if not callable(imported):
+        raise ValueError(f"{topic}: mapping: expected a function, found {imported!r}")
+    function: Callable[[Any, Any], Any] = imported
     return function
 
 
 def event_type(publication: OwnPublication) -> type[Event]:
     """Import the type of a publication's events; a `ValueError` if there is none."""
-    found = _imported(publication.topic, "event", publication.event)
-    if not (isinstance(found, type) and issubclass(found, Event)):
-        raise ValueError(f"{publication.topic}: event: expected a type of event, found {found!r}")
-    return found
+    kind = _imported(publication.topic, "event", publication.event)
+    if not (isinstance(kind, type) and issubclass(kind, Event)):
+        raise ValueError(f"{publication.topic}: event: expected a type of event, found {kind!r}")
+    return kind
 
 
 def _imported(topic: str, setting: str, path: str) -> Any:

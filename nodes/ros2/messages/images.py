@@ -166,8 +166,8 @@ def image_pixels(message: Any) -> npt.NDArray[np.uint8]:
     channels = _PIXEL_BYTES[encoding]
     pixels = _rows(message, channels).reshape(message.height, message.width, channels)
     turn = _TURNS.get(encoding)
-    found: npt.NDArray[Any] = pixels[:, :, 0] if channels == 1 else np.ascontiguousarray(pixels)
-    return found if turn is None else np.asarray(cv2.cvtColor(pixels, turn), np.uint8)
+    array: npt.NDArray[Any] = pixels[:, :, 0] if channels == 1 else np.ascontiguousarray(pixels)
+    return array if turn is None else np.asarray(cv2.cvtColor(pixels, turn), np.uint8)
 
 
 def high_byte(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:

@@ -161,14 +161,14 @@ def imu(message: Any, context: MessageContext) -> Event:
 
 def distance(message: Any, context: MessageContext) -> Event:
     """Read a Range; a distance outside its limits is out of reach."""
-    least, most, found = (
+    least, most, measured = (
         float(value) for value in (message.min_range, message.max_range, message.range)
     )
     return context.event(
         Range,
         message.header,
         frame_id=context.frame(message.header, "base_link"),
-        range=found if least <= found <= most else inf,
+        range=measured if least <= measured <= most else inf,
         field_of_view=float(message.field_of_view),
         min_range=least,
         max_range=most,
@@ -177,8 +177,8 @@ def distance(message: Any, context: MessageContext) -> Event:
 
 def pressure(message: Any, context: MessageContext) -> Event:
     """Read a FluidPressure."""
-    found, variance = float(message.fluid_pressure), float(message.variance)
-    return context.event(FluidPressure, message.header, fluid_pressure=found, variance=variance)
+    value, variance = float(message.fluid_pressure), float(message.variance)
+    return context.event(FluidPressure, message.header, fluid_pressure=value, variance=variance)
 
 
 def magnetic_field(message: Any, context: MessageContext) -> Event:

@@ -208,11 +208,11 @@ MAPPINGS = (
 PUBLISHED = tuple(row for row in MAPPINGS if row.kind)  # rows of the messages made of events
 READERS = {(row.type, row.use): row for row in MAPPINGS if row.use}  # by type of message and use
 LARGE: tuple[type[Event], ...] = tuple(
-    dict.fromkeys(each for row in PUBLISHED if row.large for each in row.events)
+    dict.fromkeys(event for row in PUBLISHED if row.large for event in row.events)
 )  # events with slow messages: made in threads, a thread for each of these types
 
 SMALL: tuple[type[Event], ...] = (
-    *dict.fromkeys(each for row in PUBLISHED if not row.large for each in row.events),
+    *dict.fromkeys(event for row in PUBLISHED if not row.large for event in row.events),
     TrackedFeatures,  # no message: it tells whose estimates an estimator's are
 )  # all other events with messages, and events with an effect on messages
 
@@ -305,7 +305,7 @@ class Publishing(Generic[P]):
     @property
     def publishers(self) -> list[P]:
         """Return the publishers declared so far."""
-        return [each for each in self._publishers.values() if each is not None]
+        return [publisher for publisher in self._publishers.values() if publisher is not None]
 
     def announced(self, announcement: Announcement) -> None:
         """Declare the topics of an announcement."""
@@ -338,7 +338,7 @@ class Publishing(Generic[P]):
 
     def unused(self) -> Iterator[str]:
         """Yield a line for each new name in `topics` without a topic."""
-        names = {each.topic.name for each in self.publishers}
+        names = {publisher.topic.name for publisher in self.publishers}
         for given, name in self._config.topics.items():
             if topic_name(self._config.namespace, name) not in names:
                 yield f'topics: expected the name of a topic, found "{given}", which none has'

@@ -131,20 +131,20 @@ class Outgoing:
 
     def tree(self, time: Time, transforms: Sequence[Transform]) -> Any:
         """Return a ``tf2_msgs/msg/TFMessage``, if there are any transforms."""
-        found = [
+        messages = [
             self.make(
                 "geometry_msgs/msg/TransformStamped",
-                header=self.store.header(time, each.parent),
-                child_frame_id=each.child,
+                header=self.store.header(time, transform.parent),
+                child_frame_id=transform.child,
                 transform=self.make(
                     "geometry_msgs/msg/Transform",
-                    translation=self.xyz(each.translation),
-                    rotation=self.quaternion(each.rotation),
+                    translation=self.xyz(transform.translation),
+                    rotation=self.quaternion(transform.rotation),
                 ),
             )
-            for each in transforms
+            for transform in transforms
         ]
-        return self.make("tf2_msgs/msg/TFMessage", transforms=found) if found else None
+        return self.make("tf2_msgs/msg/TFMessage", transforms=messages) if messages else None
 
 
 def nothing(*_: Any) -> None:

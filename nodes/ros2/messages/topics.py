@@ -212,9 +212,9 @@ class FrameNames:
             if any(known == name for _, known in self._cameras.values()):
                 name = ros_name(camera.source).replace("/", "_")
             self._cameras[camera.frame_id] = (camera.source, name)
-        found = self.camera(camera.frame_id)
-        assert found is not None
-        return found
+        frames = self.camera(camera.frame_id)
+        assert frames is not None
+        return frames
 
     def camera(self, frame_id: str) -> CameraFrames | None:
         """Return the frames of the camera with this optical frame, if any."""

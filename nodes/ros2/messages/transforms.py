@@ -99,18 +99,18 @@ class Transforms:
 
     def static(self) -> list[Transform]:
         """Return all fixed transforms."""
-        found = [
+        links = [
             self._turned(parent, child, pose, source)
             for (source, child), (parent, pose) in self._fixed.items()
         ]
         for optical, mounted in self._mounted.items():
             if mounted is not None:
                 source, parent, pose = mounted
-                found.append(self._link(parent, optical, pose, source))
+                links.append(self._link(parent, optical, pose, source))
             frames = self._names.camera(optical)
             assert frames is not None
-            found.append(Transform(frames.link, frames.optical, (0.0, 0.0, 0.0), OPTICAL_TO_FLU))
-        return found
+            links.append(Transform(frames.link, frames.optical, (0.0, 0.0, 0.0), OPTICAL_TO_FLU))
+        return links
 
     def of(
         self, event: Odometry | PoseEstimate | PoseStamped | TransformStamped

@@ -100,7 +100,7 @@ class TypeStore:
                 for part in ("Request", "Response")
             ]
             types[f"{type_}_Event"] = [], event
-        parts = [each.rpartition("_")[2] for each in types]
+        parts = [name.rpartition("_")[2] for name in types]
         types[type_] = (
             [],
             [(f"{part.lower()}_message", (node.NAME, f"{type_}_{part}")) for part in parts],
@@ -143,7 +143,7 @@ class TypeStore:
         """Return a message of a known type, with zeros, empty texts and empty sequences."""
         self.check(type_)
         _, fields = self._store.fielddefs[type_]
-        return self._store.types[type_](**{name: self._zero(*each) for name, each in fields})
+        return self._store.types[type_](**{name: self._zero(*kind) for name, kind in fields})
 
     def _zero(self, kind: Any, of: Any) -> Any:
         if kind.name == "NAME":
@@ -213,12 +213,12 @@ class Bag:
         newest: bool = False,  # only the last of all; no other is decoded
     ) -> Iterator[tuple[str, str, int, Any]]:
         """Yield topic, type, time of receipt (ns) and message in order; may raise `ValueError`."""
-        chosen = [each for each in self._reader.connections if each.topic in topics]
+        chosen = [c for c in self._reader.connections if c.topic in topics]
         if not chosen:
             return
         try:
-            found = self._reader.messages(chosen, start, stop)
-            for connection, time, data in deque(found, maxlen=1) if newest else found:
+            records = self._reader.messages(chosen, start, stop)
+            for connection, time, data in deque(records, maxlen=1) if newest else records:
                 yield connection.topic, connection.msgtype, time, self._message(connection, data)
         except MessageError:
             raise

@@ -261,14 +261,14 @@ class Plots:
         for number, event in events:
             key = event.subject, event.metric, event.unit
             apart.setdefault(key, []).append((number, event))
-        for (subject, metric, unit), found in apart.items():
+        for (subject, metric, unit), scores in apart.items():
             entity = path("scores", metric, subject)
             shown, factor = _HANDY.get(unit, (unit, 1.0))
             style = {"colors": [self._colours[subject]]} if subject in self._colours else {}
             name = subject if metric in _TITLED else f"{subject} ({shown})"
             self._style(entity, names=[name], **style)
-            values = np.array([event.value for _, event in found]) * factor
-            self._to.columns(entity, found, self._to.rr.Scalars.columns(scalars=values))
+            values = np.array([event.value for _, event in scores]) * factor
+            self._to.columns(entity, scores, self._to.rr.Scalars.columns(scalars=values))
 
     def note(self, source: str, text: str) -> None:
         """Put a note of the whole run into the log."""
@@ -327,7 +327,7 @@ class ScenePoints:
         image, depth = self._image, self._depth
         if image is None or depth is None or image.stamp != depth.stamp:
             return None
-        pose = next((each for each in self._poses if each.stamp == image.stamp), None)
+        pose = next((pose for pose in self._poses if pose.stamp == image.stamp), None)
         period = int(image.stamp * self._rate // SECOND)
         if pose is None or period == self._done or not self._rate:
             return None

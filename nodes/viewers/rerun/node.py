@@ -118,21 +118,21 @@ class Recorder:
     def begin(self, announcements: Iterable[Announcement]) -> None:
         """Put the announced entities, for the whole run."""
         vehicles_first = sorted(announcements, key=lambda a: not isinstance(a, VehicleAnnouncement))
-        for each in vehicles_first:
-            match each:
+        for announcement in vehicles_first:
+            match announcement:
                 case VehicleAnnouncement():
-                    self._world.vehicle(each.source)
+                    self._world.vehicle(announcement.source)
                 case EstimatorAnnouncement():
-                    self._world.estimator(each.source)
+                    self._world.estimator(announcement.source)
                     self._plots.plotted.add("scores")
                 case ImuAnnouncement() | SensorAnnouncement():
-                    self._world.sensor(each)
+                    self._world.sensor(announcement)
                 case BodyAnnouncement():
-                    self._world.moving_body(each)
+                    self._world.moving_body(announcement)
                 case CameraAnnouncement():
-                    self._world.camera(each)
-                    if not each.info.is_pinhole:
-                        self._plots.note(each.source, _NO_DISTORTION)
+                    self._world.camera(announcement)
+                    if not announcement.info.is_pinhole:
+                        self._plots.note(announcement.source, _NO_DISTORTION)
         self._show()
 
     def log(self, batch: Sequence[Numbered[Event]]) -> None:
@@ -203,14 +203,14 @@ class Recorder:
 
     def _show(self, eye: Eye | None = None) -> None:
         images = self._world.images
-        found = (
+        counts = (
             len(self._world.trails),
             len(self._plots.plotted),
             *(len(kinds) for kinds in images.values()),
         )
-        if found == self._shown and eye is None:
+        if counts == self._shown and eye is None:
             return
-        self._shown = found
+        self._shown = counts
         plots = self._plots.titles()
         self._stream.send_blueprint(layout(self._rrb, self._world.trails, images, plots, eye))
 
@@ -351,5 +351,5 @@ class RerunView(Node[RerunConfig]):
             for stream in (self._large, self._small)
             for _ in range(min(stream.statistics().buffered, _PACK))
         ]
-        batch.sort(key=lambda each: each[0])
+        batch.sort(key=lambda numbered: numbered[0])
         return batch

@@ -171,16 +171,16 @@ class Viewer:
             with contextlib.suppress(OSError), socket.create_connection((host, port), 1.0):
                 return
             time.sleep(0.05)
-        found = self.last_words() or f"nothing in {_TIMEOUT:g} s"
-        raise VisnavError(f"expected Rerun to listen on {host}:{port}, found: {found}")
+        words = self.last_words() or f"nothing in {_TIMEOUT:g} s"
+        raise VisnavError(f"expected Rerun to listen on {host}:{port}, found: {words}")
 
 
 def program() -> str:
     """Return the path of the program in Rerun's library."""
-    found = importlib.util.find_spec("rerun_cli")
-    if found is None or not found.submodule_search_locations:
+    spec = importlib.util.find_spec("rerun_cli")
+    if spec is None or not spec.submodule_search_locations:
         raise MissingDependencyError(f"the view needs Rerun's program: {install_command('rerun')}")
-    return str(Path(found.submodule_search_locations[0]) / "rerun")
+    return str(Path(spec.submodule_search_locations[0]) / "rerun")
 
 
 def _check_free(setting: str, host: str, port: int) -> None:

@@ -287,8 +287,8 @@ class World:
         return f"{camera}/{kind}"
 
     def _extend_scene(self, event: Image | DepthImage | PoseStamped) -> None:
-        found = self._scene_points.get(event.source)
-        if found is not None and (new := found.take(event)) is not None:
+        scene = self._scene_points.get(event.source)
+        if scene is not None and (new := scene.take(event)) is not None:
             points = self._rr.Points3D(new.points, colors=new.colours, radii=0.02)
             self._to.put(entities.world("points", event.source), points)
 
