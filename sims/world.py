@@ -76,16 +76,16 @@ class SharedWorld:
     air: Air | None  # the wind; `None` if there is none, or no vehicle
 
     def __init__(self, inhabitants: tuple[Sibling, ...], bare: bool, seed: int) -> None:
-        named = [each for each in inhabitants if each.config.world]
+        named = [inhabitant for inhabitant in inhabitants if inhabitant.config.world]
         self.name = named[0].config.world if named else "hall"
         self.named_by = named[0].name if named else ""
         self._inhabitants = inhabitants
-        self.vehicles = [each.name for each in inhabitants if each.node.vehicle]
+        self.vehicles = [inhabitant.name for inhabitant in inhabitants if inhabitant.node.vehicle]
         # State of each vehicle and free camera at its start, once that node has started up.
         self.starts: dict[str, State] = {}
         # Gives the state of each free camera at a time (ns); no physics knows it.
         self.free_cameras: dict[str, Callable[[int], State]] = {}
-        self._bare = bare or not any(each.node.sees(each.config) for each in inhabitants)
+        self._bare = bare or not any(i.node.sees(i.config) for i in inhabitants)
         self._seed = seed
         self._built = False
         self._building = asyncio.Lock()
@@ -145,11 +145,11 @@ class SharedWorld:
     def _build(self) -> None:
         spec, dynamics = load_scene(self.name, bare=self._bare)
         wind = None
-        for each in self._inhabitants:
-            node: type[Inhabitant] = each.node
-            added = node.populate(Scene(spec, dynamics), each.name, each.config)
+        for inhabitant in self._inhabitants:
+            node: type[Inhabitant] = inhabitant.node
+            added = node.populate(Scene(spec, dynamics), inhabitant.name, inhabitant.config)
             dynamics = dynamics.joined(added)
-            wind = node.wind_of(each.config) or wind
+            wind = node.wind_of(inhabitant.config) or wind
         self.model = spec.compile()
         self.__dict__.pop("model_bytes", None)
         self.dynamics = dynamics
@@ -171,10 +171,10 @@ async def join_world(node: Any) -> SharedWorld:
             another process.
     """
     inhabitants, key = node.siblings(Inhabitant), "world"
-    if all(each.node.alone for each in inhabitants):
-        inhabitants = tuple(each for each in inhabitants if each.name == node.name)
+    if all(i.node.alone for i in inhabitants):
+        inhabitants = tuple(i for i in inhabitants if i.name == node.name)
         key = f"world of {node.name}"
-    if absent := [each.name for each in inhabitants if not each.here]:
+    if absent := [inhabitant.name for inhabitant in inhabitants if not inhabitant.here]:
         raise WorldError(
             "expected all that is in one world in one process, found "
             f"{', '.join(absent)} in another one: name them together after --only"
@@ -185,7 +185,7 @@ async def join_world(node: Any) -> SharedWorld:
             f'world: expected "{world.name}", in which {world.named_by} is, since all vehicles of '
             f'a run share one world, found "{node.config.world}"'
         )
-    origins = {each.config.origin for each in inhabitants if hasattr(each.config, "origin")}
+    origins = {i.config.origin for i in inhabitants if hasattr(i.config, "origin")}
     if len(origins) > 1:
         raise WorldError(
             f"origin: expected one for all vehicles of a world, found {sorted(origins)}"
@@ -227,7 +227,7 @@ class World(Inhabitant, Node[WorldConfig]):
 
     async def on_startup(self) -> None:
         """Build the world, or find the built world; `WorldError` beside another such node."""
-        first, *others = (each.name for each in self.siblings(World))
+        first, *others = (world.name for world in self.siblings(World))
         if others and self.name != first:
             raise WorldError(f"expected one node of a world, found {first} besides")
         self._world = await join_world(self)
@@ -411,8 +411,8 @@ class Addressee:
         self._name = name
         self._ports = ports
         self._simulators = simulators
-        self._known = [each.name for each in simulators]
-        vehicles = [each.name for each in simulators if each.node.vehicle]
+        self._known = [simulator.name for simulator in simulators]
+        vehicles = [simulator.name for simulator in simulators if simulator.node.vehicle]
         self._vehicles = vehicles or self._known
         self._refused: set[tuple[str, str]] = set()
 
@@ -444,15 +444,15 @@ class Addressee:
     def _fault(self, order: Order) -> str:
         if order.vehicle in self._known or (not order.vehicle and len(self._vehicles) < 2):
             return ""
-        found = (
+        given = (
             f'"{order.vehicle}"{suggest(order.vehicle, self._known)}' if order.vehicle else "none"
         )
-        return f"expected one of {', '.join(self._vehicles)}, found {found}"
+        return f"expected one of {', '.join(self._vehicles)}, found {given}"
 
     def _narrowed_to(self, source: str) -> bool:
         return any(
             f"{source}/".startswith(f"{narrowed}/")
-            for each in self._simulators
-            for port, narrowed in each.sources.items()
+            for simulator in self._simulators
+            for port, narrowed in simulator.sources.items()
             if port in ("commands", "setpoints")
         )

@@ -52,7 +52,7 @@ class CalibrationError(MountingError, frozen=True, kw_only=True, forbid_unknown_
     @property
     def of_lens(self) -> bool:
         """Whether the announced intrinsics err."""
-        return any(np.any(each) for each in (self.focal, self.centre, self.distortion))
+        return any(np.any(errors) for errors in (self.focal, self.centre, self.distortion))
 
     def of_eye(self, number: int) -> CalibrationError:
         """Return the errors of an eye of a stereo rig: 0 for the left one, 1 for the right."""
@@ -129,9 +129,9 @@ def check(error: CalibrationError, coefficients: int, eyes: int) -> None:
     check_lists(error, {name: size * eyes for name, size in sizes.items()})
 
 
-def difference(said: CameraAnnouncement, true: Calibration) -> dict[str, Any]:
+def difference(announced: CameraAnnouncement, true: Calibration) -> dict[str, Any]:
     """Return the true calibration behind an announcement, for a run's summary."""
-    return {"true": _facts(true), "announced": _facts(said)}
+    return {"true": _facts(true), "announced": _facts(announced)}
 
 
 def _facts(known: CameraAnnouncement | Calibration) -> dict[str, Any]:

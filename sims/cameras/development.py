@@ -71,24 +71,24 @@ class Passes:
         if self._library is None:
             total = sum(codes[image] for image in images)
             return np.asarray((2 * total + count) // (2 * count), np.uint16)
-        found = np.empty(images[0].shape, np.uint16)
+        averaged = np.empty(images[0].shape, np.uint16)
         addresses = np.array([image.ctypes.data for image in images], np.uintp)
         self._library.develop_mean(
-            ctypes.c_int64(found.size), count, *map(_at, (addresses, codes, found))
+            ctypes.c_int64(averaged.size), count, *map(_at, (addresses, codes, averaged))
         )
-        return found
+        return averaged
 
     def develop(self, image: Image | Codes, stages: Stages, key: Key) -> Image:
         """Return the grey levels of an image of levels or codes, any shape, after all stages."""
         if self._library is None:
             return _developed(image, stages, key)
         light: npt.NDArray[Any] = np.ascontiguousarray(image)
-        found = np.empty(light.shape, np.uint8)
+        developed = np.empty(light.shape, np.uint8)
         self._library.develop_image(
             _at(key), ctypes.c_int64(0), ctypes.c_int64(light.size), int(light.itemsize == 2),
-            _at(light), *map(_at, stages), _at(found),
+            _at(light), *map(_at, stages), _at(developed),
         )  # fmt: skip
-        return found
+        return developed
 
     def add_noise(self, values: Depths, sigma: float, key: Key, square: bool = False) -> Depths:
         """Return values plus Gaussian noise, none below zero; ``inf`` stays.
@@ -106,12 +106,12 @@ class Passes:
             noise += values
             return np.asarray(np.maximum(noise, np.float32(0.0)), np.float32)
         values = np.ascontiguousarray(values)
-        found = np.empty_like(values)
+        noisy = np.empty_like(values)
         self._library.develop_depth(
             _at(key), ctypes.c_int64(0), ctypes.c_int64(values.size), int(square),
-            *map(_at, (values, table, found)),
+            *map(_at, (values, table, noisy)),
         )  # fmt: skip
-        return found
+        return noisy
 
     def slant(self, inverse: Depths, u: Depths, v: Depths, per_u: float, per_v: float) -> Depths:
         """Return squared cosines of the angles between rays and the surfaces in 3×3 pixels.
@@ -137,12 +137,12 @@ class Passes:
             return np.asarray(inverse**2 / (normal * (1.0 + u**2 + v**2)))
         height, width = inverse.shape
         inverse = np.ascontiguousarray(inverse)
-        found = np.empty_like(inverse)
+        slants = np.empty_like(inverse)
         self._library.develop_slant(
             width, height, *map(_at, (inverse, u, v)), ctypes.c_float(per_u),
-            ctypes.c_float(per_v), _at(found),
+            ctypes.c_float(per_v), _at(slants),
         )  # fmt: skip
-        return found
+        return slants
 
 
 def noise_key(random: np.random.Generator) -> Key:
@@ -248,9 +248,9 @@ class DepthMeter:
             disparity *= sensor.disparity_step
         # A disparity that noise has brought to zero or below is that of the horizon.
         np.maximum(disparity, 1e-9, out=disparity)
-        found = np.divide(np.float32(self._reach), disparity, out=disparity)
-        hole |= (found < sensor.min_depth) | (found > sensor.max_depth)
-        return np.where(hole, np.float32(np.inf), found)
+        measured = np.divide(np.float32(self._reach), disparity, out=disparity)
+        hole |= (measured < sensor.min_depth) | (measured > sensor.max_depth)
+        return np.where(hole, np.float32(np.inf), measured)
 
     def _hidden(self, inverse: Depths) -> Holes:
         """Return a mask of the pixels hidden from the second eye by a nearer surface.

@@ -145,7 +145,7 @@ def _ellipsoid(radii: Floats, slices: int, stacks: int) -> Mesh:
 def _cylinder(radius: float, half: float, slices: int, stacks: int, ends: bool = True) -> Mesh:
     """Return a cylinder about z, with or without flat ends."""
     lines = np.linspace(0.0, 1.0, slices + 1), np.linspace(-1.0, 1.0, stacks + 1)
-    around, up = (each.ravel() for each in np.meshgrid(*lines))
+    around, up = (grid.ravel() for grid in np.meshgrid(*lines))
     angle = 2.0 * np.pi * around
     normals = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(up)], axis=-1)
     points = normals * radius
@@ -188,10 +188,12 @@ def _directions(
     `low` to `high`.
     """
     lines = np.linspace(0.0, 1.0, slices + 1), np.linspace(low, high, stacks + 1)
-    around, up = (each.ravel() for each in np.meshgrid(*lines))
+    around, up = (grid.ravel() for grid in np.meshgrid(*lines))
     angle, rise = 2.0 * np.pi * around, np.pi * up
-    found = np.stack([np.cos(rise) * np.cos(angle), np.cos(rise) * np.sin(angle), np.sin(rise)], -1)
-    return found, _grid(slices, stacks), around, up
+    directions = np.stack(
+        [np.cos(rise) * np.cos(angle), np.cos(rise) * np.sin(angle), np.sin(rise)], -1
+    )
+    return directions, _grid(slices, stacks), around, up
 
 
 def _plane(size: Floats) -> Mesh:

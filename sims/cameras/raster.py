@@ -69,14 +69,14 @@ _GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing
 @functools.cache
 def libraries() -> dict[str, Any]:
     """Return the compiled rasterisers that run here, by instruction set, the quickest first."""
-    found = {}
+    rasterisers = {}
     for name in ("avx2", "sse4", "any"):
         for path in Path(__file__).parent.glob(f"_raster_{name}.*"):
             library = ctypes.CDLL(str(path))
             library.raster_new.restype = ctypes.c_void_p
             if library.raster_runs():
-                found[name] = library
-    return found
+                rasterisers[name] = library
+    return rasterisers
 
 
 def _at(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:
@@ -198,7 +198,7 @@ class Raster(Stage):
         )
         if not self._kept:
             self._kept.append(self._seen(self._camera.fixedcamid))
-        eyes, poses = (np.concatenate(each) for each in zip(*self._kept, strict=True))
+        eyes, poses = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
         frame = np.zeros(1, VIEW)
         frame["height"], frame["width"], frame["threads"] = height, width, self._threads
         frame["first"], frame["last"], frame["sky"] = first, last, self._sky
@@ -241,8 +241,8 @@ class Raster(Stage):
             int(kinds.mjLIGHT_DIRECTIONAL): 0,
         }
         lights = [of for of in self._scene.lights[: self._scene.nlight] if int(of.type) in known]
-        found = np.zeros(len(lights), LIGHT)
-        for to, of in zip(found, lights, strict=True):
+        rows = np.zeros(len(lights), LIGHT)
+        for to, of in zip(rows, lights, strict=True):
             to["kind"] = known[int(of.type)]
             to["ambient"], to["diffuse"], to["specular"] = of.ambient, of.diffuse, of.specular
             # MuJoCo gives the scene's point lights none.
@@ -258,8 +258,8 @@ class Raster(Stage):
             if to["kind"] or of.diffuse.any() or of.specular.any():
                 to["position"], to["direction"] = of.pos, of.dir
                 if throws:
-                    self._cast(to, of, int((found["size"] > 0).sum()))
-        return found
+                    self._cast(to, of, int((rows["size"] > 0).sum()))
+        return rows
 
     def _cast(self, light: Any, of: Any, number: int) -> None:
         """Have a light throw shadows, by a map (of this number) of what MuJoCo's map covers."""
@@ -289,7 +289,7 @@ class Raster(Stage):
         casting = lights[lights["size"] > 0]
         for number, (light, depth) in enumerate(zip(casting, self._maps, strict=False)):
             seen = b"".join(
-                each.tobytes() for each in (light[["eye", "step"]], geoms["rgba"], poses)
+                array.tobytes() for array in (light[["eye", "step"]], geoms["rgba"], poses)
             )
             if seen == self._mapped[number]:
                 continue
@@ -407,15 +407,15 @@ class Raster(Stage):
         cube = model.tex_type[number] != mujoco.mjtTexture.mjTEXTURE_2D
         if cube and height == width:  # all of its faces
             data, height = np.tile(data, 6), 6 * height
-        found = int(
+        texture = int(
             self._library.raster_texture(self._world, width, height, channels, _at(data), int(cube))
         )
-        if found < 0:
+        if texture < 0:
             raise ValueError(
                 f"texture {model.texture(number).name or number}: expected fewer than 2³¹ texels "
                 f"of all textures and their smaller copies, found more with its {width} x {height}"
             )
-        return found
+        return texture
 
     def _add_mesh(self, mesh: Mesh) -> int:
         points, corners = mesh.points, mesh.corners
@@ -448,10 +448,10 @@ def _even(rays: npt.NDArray[np.float32]) -> bool:
 
 def _sizes(kind: npt.NDArray[Any], size: Floats) -> Floats:
     """Return half lengths of geoms along x, y and z, shape (n, 3)."""
-    found = size.copy()
+    halves = size.copy()
     ball = kind == _Kind.mjGEOM_SPHERE
-    found[ball] = size[ball, :1]
+    halves[ball] = size[ball, :1]
     upright = np.isin(kind, (_Kind.mjGEOM_CYLINDER, _Kind.mjGEOM_CAPSULE))
-    found[upright, 1:] = size[upright, :2]
-    found[found == 0.0] = 1.0  # a plane without end
-    return found
+    halves[upright, 1:] = size[upright, :2]
+    halves[halves == 0.0] = 1.0  # a plane without end
+    return halves

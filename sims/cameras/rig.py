@@ -143,7 +143,7 @@ class CameraRig:
         for spec in self._specs.values():
             left, *others = eyes(spec)
             for eye in (left, *others):
-                said = announcement(
+                announced = announcement(
                     eye,
                     source=f"{name}/{eye.name}",
                     prefix=f"{name}/",
@@ -152,22 +152,22 @@ class CameraRig:
                     known=self._known(eye),
                 )
                 if spec.stereo and eye is not left:
-                    said = msgspec.structs.replace(
-                        said,
-                        latency=said.latency - spec.offset,  # both are delivered together
+                    announced = msgspec.structs.replace(
+                        announced,
+                        latency=announced.latency - spec.offset,  # both are delivered together
                         baseline=spec.stereo.baseline
                         if spec.wrong is None
-                        else math.dist(said.position, self._known(left).position),
+                        else math.dist(announced.position, self._known(left).position),
                         stereo=f"{name}/{left.name}",
                     )
                 if spec.wrong is not None:  # no word of it is in what anybody can read meanwhile
-                    self._node.note_truth(said.source, difference(said, calibration(eye)))
-                yield said
+                    self._node.note_truth(announced.source, difference(announced, calibration(eye)))
+                yield announced
                 if spec.undistorted:
-                    source, (pinhole, _, _) = said.source, undistorted(said.info)
-                    stereo = said.stereo and said.stereo + UNDISTORTED
+                    source, (pinhole, _, _) = announced.source, undistorted(announced.info)
+                    stereo = announced.stereo and announced.stereo + UNDISTORTED
                     yield msgspec.structs.replace(
-                        said,
+                        announced,
                         source=source + UNDISTORTED,
                         undistorted=source,
                         stereo=stereo,

@@ -207,8 +207,8 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def __post_init__(self) -> None:
         apply_matrix(self, OPTICAL_TO_FRD)
         if not self.images or len(set(self.images)) != len(self.images):
-            found = ", ".join(self.images) or "none"
-            raise ValueError(f"images: expected one or more kinds, each once, found {found}")
+            kinds = ", ".join(self.images) or "none"
+            raise ValueError(f"images: expected one or more kinds, each once, found {kinds}")
         if camera_info(self).is_pinhole and self.undistorted:
             raise ValueError("undistorted: expected a lens that distorts, found none")
         fixed = self.exposure or self.gain != 1.0
@@ -304,16 +304,16 @@ def check_cameras(specs: Iterable[CameraSpec]) -> None:
                 )
             names.add(eye.name)
         complete = spec.half + spec.offset
-        for setting, found, most, what in (
+        for setting, value, most, what in (
             ("exposure", spec.longest_exposure, period, "between two exposures"),
             ("readout", spec.readout, period, "between two exposures"),
             ("stereo.offset", spec.offset, period, "between two exposures"),
             ("time_jitter", spec.time_jitter, period / 2.0, "of half the time between two stamps"),
         ):
-            if found > most:
+            if value > most:
                 raise ValueError(
                     f"{where}: {setting}: expected at most the {1e3 * most:.4g} ms {what}, "
-                    f"found {1e3 * found:.4g} ms"
+                    f"found {1e3 * value:.4g} ms"
                 )
         if spec.latency < complete:
             raise ValueError(

@@ -46,7 +46,7 @@ def axes_of(recorded: RecordedMotion) -> BodyAxes:
         name: float(_rotated(recorded.orientations, axis)[:, 2].mean())
         for name, axis in _DOWN.items()
     }
-    name = max(means, key=lambda each: means[each])
+    name = max(means, key=lambda axis_name: means[axis_name])
     if means[name] < _UPRIGHT:
         raise ValueError(
             f"body: expected one of {', '.join(BODIES)}, since no axis of the recorded body points "

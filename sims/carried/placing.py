@@ -121,14 +121,14 @@ def find_place(rows: Floats, clearance: Clearance) -> Placement:
             candidates.append((float(scores[index]), place))
     candidates.sort(key=lambda candidate: -candidate[0])
     refined = [_refined(path, place, clearance) for _, place in candidates[:6]]
-    free = [each for each in refined if each[0] > 0.0]
+    free = [candidate for candidate in refined if candidate[0] > 0.0]
     if not free:
         x, y, z = np.ptp(rows[:, 1:4], axis=0).tolist()
         raise ValueError(
             f"place: expected room for a motion of {x:.3g} x {y:.3g} x {z:.3g} m in the world, "
             "found none: try a scale, or a larger world"
         )
-    return max(free, key=lambda each: each[1])[2]
+    return max(free, key=lambda candidate: candidate[1])[2]
 
 
 def _thinned(rows: Floats, count: int) -> Floats:
@@ -173,7 +173,7 @@ def _turned(path: Floats, place: Placement, angle: float) -> Placement:
     turned = msgspec.structs.replace(place, heading=place.heading + angle)
     before, after = (
         (points.min(axis=0) + points.max(axis=0)) / 2.0
-        for points in (placed(path, each)[:, 1:4] for each in (place, turned))
+        for points in (placed(path, pose)[:, 1:4] for pose in (place, turned))
     )
     x, y, z = (place.position + before - after).tolist()
     return msgspec.structs.replace(turned, position=(x, y, z))

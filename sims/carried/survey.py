@@ -68,7 +68,7 @@ def survey(
         speed=max(math.hypot(*moment.velocity) for moment in moments),
         acceleration=max(math.hypot(*moment.acceleration) for moment in moments),
         rate=max(math.hypot(*moment.angular_velocity) for moment in moments),
-        nearest=min(nearest, key=lambda each: each.distance, default=None),
+        nearest=min(nearest, key=lambda nearness: nearness.distance, default=None),
         near=_stretches(nearest, margin),
         met=_stretches(met, margin),
     )
@@ -91,8 +91,8 @@ def _nearest(
 
 def _stretches(nearest: Iterable[Nearness], margin: float) -> tuple[Nearness, ...]:
     """Return the nearest of each stretch within a margin."""
-    groups = groupby(nearest, lambda each: each.distance < margin or each.distance <= 0.0)
-    return tuple(min(g, key=lambda each: each.distance) for near, g in groups if near)
+    groups = groupby(nearest, lambda n: n.distance < margin or n.distance <= 0.0)
+    return tuple(min(g, key=lambda n: n.distance) for near, g in groups if near)
 
 
 def in_words(rows: int, report: FitReport, result: Survey) -> list[str]:

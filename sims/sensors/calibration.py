@@ -79,10 +79,10 @@ def announced(true: A, error: MountingError, parent: np.random.Generator, name: 
 
 
 def difference(
-    said: ImuAnnouncement | LidarAnnouncement, true: ImuAnnouncement | LidarAnnouncement
+    announced: ImuAnnouncement | LidarAnnouncement, true: ImuAnnouncement | LidarAnnouncement
 ) -> dict[str, Any]:
     """Return the true calibration behind an announcement, for a run's summary."""
-    return {"true": _facts(true), "announced": _facts(said)}
+    return {"true": _facts(true), "announced": _facts(announced)}
 
 
 def _facts(known: ImuAnnouncement | LidarAnnouncement) -> dict[str, Any]:

@@ -99,8 +99,8 @@ class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True
         super().__post_init__()
         for field in ("gyroscope_matrix", "accelerometer_matrix"):
             if len(getattr(self, field)) not in (0, 9):
-                found = len(getattr(self, field))
-                raise ValueError(f"{field}: expected 9 numbers, row by row, found {found}")
+                count = len(getattr(self, field))
+                raise ValueError(f"{field}: expected 9 numbers, row by row, found {count}")
         if self.gyroscope_bias_instability or self.accelerometer_bias_instability:
             check_drift(1.0, self.bias_instability_time, "bias_instability_time")
         if self.wrong is not None:

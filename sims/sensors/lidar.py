@@ -227,7 +227,7 @@ class Scanner:
             hits.append(self._rays.cast(origins[group], part, spec.max_range, _ONLY_FIRST))
         distances, geoms, normals = map(np.concatenate, zip(*hits, strict=True))
         returned = -np.einsum("ri,ri->r", normals, flat) * self._reflectivity[geoms]
-        distances, returned = (each.reshape(rays.shape[:2]) for each in (distances, returned))
+        distances, returned = (values.reshape(rays.shape[:2]) for values in (distances, returned))
         return self._measured(spec, start, directions, times, distances, returned)
 
     def _poses(self, spec: LidarSpec, states: Floats, times: Floats) -> tuple[Floats, Floats]:

@@ -136,16 +136,16 @@ class RangeFinder(Sensor[RangeFinderSpec]):
         directions = self._cone @ _matrix(flip_yz_rotation(turn)).T
         hits = self._rays.cast(np.array(flip_yz(tuple(place))), directions, spec.max_range)
         noise = spec.noise * float(self.random.standard_normal())
-        found = float(hits.distances.min()) + noise
-        if found > spec.max_range:
-            found = math.inf
-        elif found < spec.min_range:
-            found = -math.inf
+        distance = float(hits.distances.min()) + noise
+        if distance > spec.max_range:
+            distance = math.inf
+        elif distance < spec.min_range:
+            distance = -math.inf
         return Range(
             stamp=truth.stamp,
             source=self.source,
             frame_id=self.source,
-            range=found,
+            range=distance,
             field_of_view=math.radians(spec.field_of_view),
             min_range=spec.min_range,
             max_range=spec.max_range,

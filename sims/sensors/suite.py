@@ -60,14 +60,14 @@ class SensorsConfig(SimulatorConfig):
     def __post_init__(self) -> None:
         if self.imu.rate:
             if self.imu_rate not in (_RATE, self.imu.rate):
-                found = f"{self.imu_rate:g} and {self.imu.rate:g} Hz"
-                raise ValueError(f"imu.rate: expected imu_rate or this, found {found}")
+                rates = f"{self.imu_rate:g} and {self.imu.rate:g} Hz"
+                raise ValueError(f"imu.rate: expected imu_rate or this, found {rates}")
             msgspec.structs.force_setattr(self, "imu_rate", self.imu.rate)
         for field in ("gyroscope_bandwidth", "accelerometer_bandwidth"):
             bandwidth, half = getattr(self.imu, field), self.imu_rate / 2
             if bandwidth >= half:
-                found = f"{bandwidth:g} Hz of {self.imu_rate:g} Hz"
-                raise ValueError(f"imu.{field}: expected less than half of imu_rate, found {found}")
+                rates = f"{bandwidth:g} Hz of {self.imu_rate:g} Hz"
+                raise ValueError(f"imu.{field}: expected less than half of imu_rate, found {rates}")
         names = {"imu", "barometer", "gnss", "magnetometer"}
         for field in ("cameras", "range_finders", "lidars"):
             for spec in getattr(self, field):
@@ -193,10 +193,12 @@ class SensorSuite:
     def announcements(self) -> Iterable[Announcement]:
         """Return the announcements of the sensors."""
         for sensor in (self.imu, *self.mounted):
-            said = self._known(sensor)
+            announced = self._known(sensor)
             if sensor.spec.wrong is not None:  # told once the run is over
-                self._node.note_truth(said.source, difference(said, sensor.announcement()))
-            yield said
+                self._node.note_truth(
+                    announced.source, difference(announced, sensor.announcement())
+                )
+            yield announced
 
     def transforms(self) -> Iterable[TransformStamped]:
         """Return the announced pose of each sensor's frame in the body's, constant for the run."""

@@ -70,9 +70,9 @@ def teleport_fault(event: ev.Teleport) -> str | None:
         ("linear_velocity", FASTEST, "m/s"),
         ("angular_velocity", FASTEST_TURN, "rad/s"),
     ):
-        found = getattr(event, field)
-        if max(map(abs, found)) > limit:
-            return f"Teleport.{field}: expected numbers up to {limit:g} {unit}, found {found}"
+        vector = getattr(event, field)
+        if max(map(abs, vector)) > limit:
+            return f"Teleport.{field}: expected numbers up to {limit:g} {unit}, found {vector}"
     return None
 
 
@@ -301,7 +301,7 @@ class Clearance:
         self._place[:] = flip_yz(place)
         mujoco.mj_fwdPosition(self._model, self._data)
         contact, body_of = self._data.contact, self._model.geom_bodyid
-        deepest, found = 0.0, ""
+        deepest, name = 0.0, ""
         for pair, distance in zip(contact.geom.tolist(), contact.dist.tolist(), strict=True):
             own = [geom for geom in pair if body_of[geom] == self._body]
             other = pair[0] if own[-1:] == pair[1:] else pair[1]
@@ -309,8 +309,8 @@ class Clearance:
                 continue
             if distance < min(deepest, 0.0 if self._movers[other] else -DEPTH):
                 deepest = distance
-                found = self._name_of(other)
-        return found
+                name = self._name_of(other)
+        return name
 
     def between(self, start: Vector3, end: Vector3) -> str:
         """Return the name of the first solid on a line; empty for none."""
@@ -353,8 +353,8 @@ class Clearance:
 
 def trouble_at_start(world: Clearance, place: Vector3) -> str:
     """Return the reason against starting at a position; empty if free."""
-    if found := world.at(place, now=True):
-        return f"expected a free place to start at, found {show(place)} in {found}"
+    if obstacle := world.at(place, now=True):
+        return f"expected a free place to start at, found {show(place)} in {obstacle}"
     if world.ground_below(place) is None:
         return f"expected ground below the start, found none at {show(place)}: outside the world"
     return ""
@@ -376,25 +376,25 @@ def _troubles(
     world: Clearance, start: Vector3, waypoints: Sequence[Vector3], margin: float
 ) -> Iterator[str]:
     for number, place in enumerate(waypoints):
-        if found := world.at(place):
-            down = ": heights are negative, z is down" if found.startswith("the ground") else ""
+        if obstacle := world.at(place):
+            down = ": heights are negative, z is down" if obstacle.startswith("the ground") else ""
             where = f"waypoints[{number}]: expected a free place"
-            yield f"{where}, found {show(place)} in {found}{down}"
+            yield f"{where}, found {show(place)} in {obstacle}{down}"
     if not waypoints:
         return
     above = (start[0], start[1], waypoints[0][2])
     for axis in range(3) if margin else ():
         for side in (-margin, margin):
             x, y, z = (value + side * (k == axis) for k, value in enumerate(above))
-            if found := world.at((x, y, z)):
+            if obstacle := world.at((x, y, z)):
                 yield (
                     f"excitation: expected {margin:g} m of free room about {show(above)}, found "
-                    f"{found} at {show((x, y, z))}"
+                    f"{obstacle} at {show((x, y, z))}"
                 )
     for number, (before, place) in enumerate(pairwise([start, above, *waypoints])):
-        if found := world.between(before, place):
+        if obstacle := world.between(before, place):
             yield (
-                f"waypoints[{max(number - 1, 0)}]: expected a free way there, found {found} "
+                f"waypoints[{max(number - 1, 0)}]: expected a free way there, found {obstacle} "
                 f"between {show(before)} and {show(place)}"
             )
 

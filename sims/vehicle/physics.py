@@ -339,7 +339,7 @@ def equivalent_box(model: Any, body: int) -> Vector3:
     """Return the edges of MuJoCo's equivalent inertia box of a body, metres."""
     inertia, mass = model.body_inertia[body], float(model.body_mass[body])
     total = float(inertia.sum())
-    x, y, z = (math.sqrt(max(total - 2.0 * each, 0.0) * 6.0 / mass) for each in inertia.tolist())
+    x, y, z = (math.sqrt(max(total - 2.0 * i, 0.0) * 6.0 / mass) for i in inertia.tolist())
     return x, y, z
 
 

@@ -268,9 +268,9 @@ def attach_vehicle(world: mujoco.MjSpec, name: str, position: Vector3, yaw: floa
     world.attach(vehicle, prefix=f"{name}/", frame=frame)
     default: Any = mujoco.MjSpec().option
     for key, value in _OPTIONS.items():
-        found = np.asarray(getattr(world.option, key))
-        if not any(np.allclose(found, each, atol=0.0) for each in (value, getattr(default, key))):
-            given, ours = (" ".join(f"{x:g}" for x in np.ravel(each)) for each in (found, value))
+        option = np.asarray(getattr(world.option, key))
+        if not any(np.allclose(option, o, atol=0.0) for o in (value, getattr(default, key))):
+            given, ours = (" ".join(f"{x:g}" for x in np.ravel(o)) for o in (option, value))
             raise WorldError(
                 f'world: <option>: expected {key}="{ours}", or none, since vehicles are simulated '
                 f'so, found {key}="{given}"'
@@ -308,7 +308,7 @@ def name_of(model: mujoco.MjModel, geom: int) -> str:
     """Return a geom's name, else its body's; empty if neither has a name."""
     kinds = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
     numbers = geom, int(model.geom_bodyid[geom])
-    names = (mujoco.mj_id2name(model, *each) for each in zip(kinds, numbers, strict=True))
+    names = (mujoco.mj_id2name(model, *entity) for entity in zip(kinds, numbers, strict=True))
     return next((name for name in names if name), "")
 
 

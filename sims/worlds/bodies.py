@@ -133,7 +133,7 @@ def motion_of(spec: BodySpec, name: str) -> BodyMotion:
     yaw = math.radians(spec.heading)
     if len(spec.waypoints) == 1:
         angles = tuple(math.radians(angle) for angle in spec.angles)
-        times = tuple(float(each) for each in spec.times)
+        times = tuple(float(time) for time in spec.times)
         return BodyMotion(name, spec.waypoints[0], yaw, None, times, angles, spec.loop)
     places = spec.places()
     legs = (math.dist(a, b) / spec.speed for a, b in pairwise(places))
@@ -163,8 +163,8 @@ def add_bodies(scene: Scene, node: str, specs: tuple[BodySpec, ...]) -> Dynamics
 def add_shape(scene: Scene, body: Any, kind: Kind, size: Vector3, colour: Vector3) -> None:
     """Add a kind's parts and materials to a body, whose origin is the middle of its foot."""
     shape = _Shape(scene.spec, body, size, colour)
-    for each in _shapes().iterfind(f"{kind}/*"):
-        getattr(shape, each.tag)(each)
+    for element in _shapes().iterfind(f"{kind}/*"):
+        getattr(shape, element.tag)(element)
 
 
 class _Shape:
@@ -179,15 +179,15 @@ class _Shape:
     def cloth(self, given: ET.Element) -> None:
         name = f"{self._name}/{given.get('name')}"
         shade = float(given.get("shade", 1.0))
-        colour = _numbers(given, "rgb") or [shade * each for each in self._colour]
+        colour = _numbers(given, "rgb") or [shade * channel for channel in self._colour]
         self._world.add_texture(
             name=name,
             type=mujoco.mjtTexture.mjTEXTURE_CUBE,
             builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
             rgb1=colour,
-            rgb2=[0.75 * each for each in colour],
+            rgb2=[0.75 * channel for channel in colour],
             mark=mujoco.mjtMark.mjMARK_RANDOM,
-            markrgb=_numbers(given, "marks") or [min(1.25 * each + 0.08, 1.0) for each in colour],
+            markrgb=_numbers(given, "marks") or [min(1.25 * c + 0.08, 1.0) for c in colour],
             random=0.06,
             width=64,
             height=64,

@@ -447,8 +447,8 @@ CLEARANCE = 0.8
 
 
 def _tours() -> dict[str, tuple[Vector3, ...]]:
-    found = tomllib.loads(Path(__file__).with_name("tours.toml").read_text(encoding="utf-8"))
-    return {name: tuple((x, y, z) for x, y, z in points) for name, points in found.items()}
+    tours = tomllib.loads(Path(__file__).with_name("tours.toml").read_text(encoding="utf-8"))
+    return {name: tuple((x, y, z) for x, y, z in points) for name, points in tours.items()}
 
 
 TOURS = _tours()

@@ -248,7 +248,7 @@ class LightMotion(Motion, frozen=True):
     def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
         """Set the light's strength and direction at a time."""
         strength = self.spec.strength(seconds)
-        colours = [[strength * each for each in colour] for colour in self.colours]
+        colours = [[strength * channel for channel in colour] for colour in self.colours]
         if self.name == HEADLIGHT:
             light = model.vis.headlight
             light.ambient[:], light.diffuse[:], light.specular[:] = colours
@@ -296,7 +296,7 @@ def change_lights(scene: Scene, specs: tuple[LightSpec, ...]) -> Dynamics:
         for name in names:
             light = lights[name]
             colours = tuple(
-                tuple(float(each) for each in colour)
+                tuple(float(channel) for channel in colour)
                 for colour in (light.ambient, light.diffuse, light.specular)
             )
             motions.append(LightMotion(name, spec, colours))

@@ -92,10 +92,10 @@ class Canvas(NamedTuple):
             shift = self.random.uniform(0, 1) if stagger == 1.0 else stagger * (row % 2)
             steps = 1.0 + uneven * self.random.uniform(-1.0, 1.0, per_row)
             joints = (np.cumsum(steps) - 1.0 - shift) * wide
-            found = np.searchsorted(joints, columns, side="right").astype(np.int32)
-            below, above = joints[np.maximum(found - 1, 0)], joints[np.minimum(found, per_row - 1)]
+            cell = np.searchsorted(joints, columns, side="right").astype(np.int32)
+            below, above = joints[np.maximum(cell - 1, 0)], joints[np.minimum(cell, per_row - 1)]
             lines = row_of == row
-            index[lines] = found + row * per_row
+            index[lines] = cell + row * per_row
             across[lines] = np.minimum(np.abs(columns - below), np.abs(above - columns))
         place = np.arange(height, dtype=np.float32) % np.float32(high)
         down = np.minimum(place, np.float32(high) - place)[:, None]

@@ -71,7 +71,7 @@ def join(surfaces: list[Surface]) -> Surface:
     """Return several surfaces joined."""
     starts = np.cumsum([0] + [len(surface.points) for surface in surfaces[:-1]])
     *arrays, faces = zip(*surfaces, strict=True)
-    moved = [each + start for each, start in zip(faces, starts, strict=True)]
+    moved = [corners + start for corners, start in zip(faces, starts, strict=True)]
     points, normals, texture = map(np.concatenate, arrays)
     return Surface(points, normals, texture, np.concatenate(moved).astype(np.int32))
 
@@ -241,12 +241,12 @@ def folder() -> Path:
 
 @functools.cache
 def _version() -> str:
-    found = hashlib.blake2b(digest_size=8)
+    digest = hashlib.blake2b(digest_size=8)
     for part in (np.__version__, cv2.__version__, platform.machine()):
-        found.update(part.encode())
+        digest.update(part.encode())
     for source in sorted({Path(__file__).with_suffix(".py"), *_HERE.glob("*.py"), _TABLE}):
-        found.update(source.read_bytes())
-    return found.hexdigest()
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
 
 
 def _digest(content: bytes | memoryview) -> bytes:
@@ -275,6 +275,6 @@ def _write(path: Path, image: npt.NDArray[np.uint8]) -> None:
 
 def _tidy(here: Path) -> None:
     for other in here.parent.iterdir():
-        used = max((each.stat().st_atime for each in other.glob("*")), default=0.0)
+        used = max((file.stat().st_atime for file in other.glob("*")), default=0.0)
         if other != here and time.time() - used > _UNUSED:
             shutil.rmtree(other, ignore_errors=True)
