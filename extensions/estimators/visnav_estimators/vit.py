@@ -36,7 +36,7 @@ from nodes.estimators import (
     StereoInertialFrame,
     TrackingResult,
 )
-from nodes.estimators.odometry import Grey, grey_image
+from nodes.estimators.images import Grey, grey_image
 from runtime import Bundle, Duration
 from runtime.channels.hold import Hold, HoldConfig, Owed
 from runtime.errors import VisnavError

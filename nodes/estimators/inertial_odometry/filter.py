@@ -24,7 +24,7 @@ from nodes.estimators.inertial_odometry.preintegration import (
     ImuModel,
     Preintegrated,
 )
-from nodes.estimators.odometry import huber
+from nodes.estimators.pose import huber
 from nodes.estimators.rig import cross, crosses
 
 THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))  # slices of the error state

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from events import CameraInfo, ImuAnnouncement
 from events.geometry import pose_matrix
-from nodes.estimators.odometry import Depth, rays
+from nodes.estimators.images import Depth
+from nodes.estimators.pose import rays
 from nodes.estimators.rig import cross
 
 Floats = npt.NDArray[np.float64]

@@ -19,11 +19,14 @@ import numpy.typing as npt
 from events import CameraAnnouncement, ImuAnnouncement
 from events.geometry import inverse, pose_matrix
 from nodes.estimators import EstimatorConfig, RgbdInertialFrame, StereoInertialFrame, TrackingResult
+from nodes.estimators.images import Depth, Grey
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
 from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel
 from nodes.estimators.inertial_odometry.preintegration import Rows as ImageRows
-from nodes.estimators.odometry import Depth, Grey, OdometryNode, Surfaces, rays, transform
+from nodes.estimators.odometry import OdometryNode
+from nodes.estimators.pose import rays, transform
 from nodes.estimators.rig import cross
+from nodes.estimators.surfaces import Surfaces
 from nodes.estimators.visual_odometry.alignment import Alignment
 from nodes.estimators.visual_odometry.features import BELIEVED, FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.landmarks import MapMatch, Rows

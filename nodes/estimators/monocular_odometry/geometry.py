@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from nodes.estimators.odometry import Floats, Grey, huber, transform
+from nodes.estimators.images import Floats, Grey
+from nodes.estimators.pose import huber, transform
 
 Indices = npt.NDArray[np.int64]
 

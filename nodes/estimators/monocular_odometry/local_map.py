@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.geometry import inverse
+from nodes.estimators.images import Floats, Grey
 from nodes.estimators.monocular_odometry.geometry import (
     Indices,
     Keyframe,
@@ -18,7 +19,8 @@ from nodes.estimators.monocular_odometry.geometry import (
     reprojection_errors,
     triangulate,
 )
-from nodes.estimators.odometry import Floats, Grey, follow_both_ways, rays, solve_pose
+from nodes.estimators.optical_flow import follow_both_ways
+from nodes.estimators.pose import rays, solve_pose
 
 _SNAPSHOT = 5.0  # median motion between stored views, pixels
 _GOOD = 2.0  # largest reprojection error of a corner in agreement with a motion, pixels

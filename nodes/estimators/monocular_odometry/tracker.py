@@ -18,22 +18,13 @@ import numpy.typing as npt
 from events import CameraInfo
 from events.geometry import inverse
 from nodes.estimators import EstimatorConfig, MonocularFrame, TrackingResult
+from nodes.estimators.images import Floats, Grey, grey_image, inside, refuse_distortion
 from nodes.estimators.monocular_odometry.geometry import Indices, Keyframe, MonocularSettings
 from nodes.estimators.monocular_odometry.local_map import Initialization, LocalMap
-from nodes.estimators.odometry import (
-    Floats,
-    Grey,
-    OdometryNode,
-    describe,
-    detect_and_describe,
-    follow_both_ways,
-    grey_image,
-    inside,
-    intrinsics,
-    refuse_distortion,
-    relocalize,
-    solve_pose,
-)
+from nodes.estimators.odometry import OdometryNode
+from nodes.estimators.optical_flow import follow_both_ways
+from nodes.estimators.pose import intrinsics, solve_pose
+from nodes.estimators.relocalization import describe, detect_and_describe, relocalize
 from runtime import Bundle
 
 _AGREES = 6.0  # inlier threshold of a landmark, standard deviations

@@ -18,18 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from events.geometry import inverse
-from nodes.estimators.odometry import (
-    Depth,
-    Floats,
-    Grey,
-    huber,
-    inside,
-    intrinsics,
-    motion_between,
-    moved,
-    rays,
-    surfaces_at,
-)
+from nodes.estimators.images import Depth, Floats, Grey, inside
+from nodes.estimators.pose import huber, intrinsics, motion_between, moved, rays
+from nodes.estimators.surfaces import surfaces_at
 
 _LEVELS = 4
 _CELL = 4  # side of the squares of the half-sized image with at most a single edge pixel each

@@ -20,21 +20,11 @@ import numpy.typing as npt
 from events import CameraInfo
 from events.geometry import inverse
 from nodes.estimators import TrackingResult
-from nodes.estimators.odometry import (
-    FLOW_CRITERIA,
-    Depth,
-    Floats,
-    Grey,
-    Surfaces,
-    detect_and_describe,
-    grey_and_depth,
-    inverse_depth,
-    refuse_distortion,
-    relocalize,
-    solve_pose,
-    surfaces_at,
-    transform,
-)
+from nodes.estimators.images import Depth, Floats, Grey, grey_and_depth, refuse_distortion
+from nodes.estimators.optical_flow import FLOW_CRITERIA
+from nodes.estimators.pose import solve_pose, transform
+from nodes.estimators.relocalization import detect_and_describe, relocalize
+from nodes.estimators.surfaces import Surfaces, inverse_depth, surfaces_at
 from nodes.estimators.visual_odometry.alignment import Alignment, Motion, View
 from nodes.estimators.visual_odometry.landmarks import (
     ORB_POINTS,

@@ -19,18 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from events.geometry import inverse
-from nodes.estimators.odometry import (
-    Depth,
-    DescribedPoints,
-    Floats,
-    Grey,
-    Surfaces,
-    detect_and_describe,
-    follow_both_ways,
-    intrinsics,
-    rays,
-    surfaces_at,
-)
+from nodes.estimators.images import Depth, Floats, Grey
+from nodes.estimators.optical_flow import follow_both_ways
+from nodes.estimators.pose import intrinsics, rays
+from nodes.estimators.relocalization import DescribedPoints, detect_and_describe
+from nodes.estimators.surfaces import Surfaces, surfaces_at
 from nodes.estimators.visual_odometry.alignment import Alignment, Reference, View, align
 
 _SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5  # limits of a landmark's look relative to the first

@@ -14,8 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from nodes.estimators.odometry import Floats, Surfaces, huber, intrinsics, rays
+from nodes.estimators.images import Floats
+from nodes.estimators.pose import huber, intrinsics, rays
 from nodes.estimators.rig import crosses
+from nodes.estimators.surfaces import Surfaces
 from nodes.estimators.visual_odometry.landmarks import Landmarks, MapMatch
 
 _TERMS = 6

@@ -18,13 +18,8 @@ import numpy.typing as npt
 
 from events import CameraInfo
 from nodes.estimators import EstimatorConfig, RgbdFrame, StereoFrame, TrackingResult
-from nodes.estimators.odometry import (
-    Depth,
-    Floats,
-    OdometryNode,
-    grey_and_depth,
-    refuse_distortion,
-)
+from nodes.estimators.images import Depth, Floats, grey_and_depth, refuse_distortion
+from nodes.estimators.odometry import OdometryNode
 from nodes.estimators.visual_odometry.features import FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings, baseline
 from runtime import Bundle

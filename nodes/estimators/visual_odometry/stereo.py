@@ -19,15 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, CameraInfo
-from nodes.estimators.odometry import (
-    Depth,
-    Floats,
-    Grey,
-    Surfaces,
-    follow_both_ways,
-    grey_image,
-    surfaces_at,
-)
+from nodes.estimators.images import Depth, Floats, Grey, grey_image
+from nodes.estimators.optical_flow import follow_both_ways
+from nodes.estimators.surfaces import Surfaces, surfaces_at
 from nodes.estimators.visual_odometry.landmarks import SAME, around, correlation
 from nodes.estimators.visual_odometry.misalignment import SmoothField
 

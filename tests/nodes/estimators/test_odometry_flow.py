@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from nodes.estimators.images import inside
 from nodes.estimators.monocular_odometry.geometry import new_corners
-from nodes.estimators.odometry import follow_both_ways, inside
+from nodes.estimators.optical_flow import follow_both_ways
 from tests.nodes.estimators.monocular_odometry.world import FLAT, INFO, look, pose
 
 HERE, THERE = look(pose(), FLAT), look(pose(x=0.1), FLAT)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nodes.estimators.images import Floats
 from nodes.estimators.monocular_odometry.geometry import new_corners
-from nodes.estimators.odometry import (
+from nodes.estimators.pose import rays, solve_pose
+from nodes.estimators.relocalization import (
     DescribedPoints,
-    Floats,
     describe,
     detect_and_describe,
-    rays,
     relocalize,
-    solve_pose,
 )
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
 

@@ -18,7 +18,7 @@ from nodes.estimators.monocular_odometry.geometry import (
     reprojection_errors,
     triangulate,
 )
-from nodes.estimators.odometry import rays
+from nodes.estimators.pose import rays
 from tests.nodes.estimators.monocular_odometry.world import MATRIX, Floats, pose
 
 NOISE = 0.5

@@ -8,7 +8,8 @@ import pytest
 
 from events.geometry import inverse
 from nodes.estimators import TrackingResult
-from nodes.estimators.odometry import Floats, moved
+from nodes.estimators.images import Floats
+from nodes.estimators.pose import moved
 from nodes.estimators.visual_odometry.alignment import Motion
 from nodes.estimators.visual_odometry.features import FeatureTracker
 from tests.nodes.estimators.visual_odometry.world import INFO, pose

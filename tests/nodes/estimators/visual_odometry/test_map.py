@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from events.geometry import inverse
-from nodes.estimators.odometry import Floats, inverse_depth, rays, surfaces_at
+from nodes.estimators.images import Floats
+from nodes.estimators.pose import rays
+from nodes.estimators.surfaces import inverse_depth, surfaces_at
 from nodes.estimators.visual_odometry.features import FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.landmarks import (
     Landmarks,

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from events.geometry import inverse
-from nodes.estimators.odometry import Surfaces, inverse_depth
+from nodes.estimators.surfaces import Surfaces, inverse_depth
 from nodes.estimators.visual_odometry.features import FeatureSettings
 from nodes.estimators.visual_odometry.landmarks import Landmarks, MapMatch
 from nodes.estimators.visual_odometry.misalignment import SmoothField, disparity_information

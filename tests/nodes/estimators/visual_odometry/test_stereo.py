@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from events import CameraAnnouncement
-from nodes.estimators.odometry import inverse_depth, surfaces_at
 from nodes.estimators.rectification import ALIGNED, misalignment
+from nodes.estimators.surfaces import inverse_depth, surfaces_at
 from nodes.estimators.visual_odometry.features import FeatureSettings
 from nodes.estimators.visual_odometry.node import StereoTracker
 from nodes.estimators.visual_odometry.stereo import StereoMatcher, StereoSettings

@@ -10,7 +10,7 @@ import pytest
 
 from events import CameraInfo
 from nodes.estimators import TrackingResult
-from nodes.estimators.odometry import Floats
+from nodes.estimators.images import Floats
 from nodes.estimators.visual_odometry.features import FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.node import DenseSettings, DenseTracker
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
