@@ -397,7 +397,9 @@ def judge(
     _check_runtime()
     import numpy as np
 
-    from nodes.judging import judgement
+    from nodes.judging import judged, judgement, mounting, readers
+    from nodes.judging.readers.memory import of_memory
+    from nodes.judging.readers.stamps import read_stamps
     from runtime.config.reading import convert
 
     config = convert(
@@ -419,23 +421,21 @@ def judge(
     )
     camera = None
     if isinstance(body_from_camera, str) and body_from_camera:
-        camera = judgement.read_mounting(body_from_camera, str(truth))
+        camera = mounting.read_mounting(body_from_camera, str(truth))
     elif body_from_camera is not None and not isinstance(body_from_camera, str):
-        camera = judgement.mounting_of(np.asarray(body_from_camera, np.float64))
+        camera = mounting.mounting_of(np.asarray(body_from_camera, np.float64))
 
-    def read(trajectory: Any, name: str) -> judgement.Source:
+    def read(trajectory: Any, name: str) -> readers.Source:
         if isinstance(trajectory, str | Path):
             text = f"{name}={trajectory}" if name else str(trajectory)
-            return judgement.read(text, config.axes, str(times), camera, columns=config.columns)
+            return readers.read(text, config.axes, str(times), camera, columns=config.columns)
         name = name or "estimate"
-        return judgement.of_memory(name, trajectory, config.axes, camera)
+        return of_memory(name, trajectory, config.axes, camera)
 
     true = (
-        judgement.read_truth(
-            str(truth), str(times), config.truth_axes, columns=config.truth_columns
-        )
+        readers.read_truth(str(truth), str(times), config.truth_axes, columns=config.truth_columns)
         if isinstance(truth, str | Path)
-        else judgement.of_memory("truth", truth, config.truth_axes)
+        else of_memory("truth", truth, config.truth_axes)
     )
     named = estimates if isinstance(estimates, Mapping) else {"": estimates}
     sources = [read(trajectory, name) for name, trajectory in named.items()]
@@ -443,7 +443,7 @@ def judge(
         final = {sources[0].name: final} if len(sources) == 1 else {"final": final}
     finals = {name: read(trajectory, name) for name, trajectory in (final or {}).items()}
     stamps = (
-        judgement.read_stamps(Path(frames))
+        read_stamps(Path(frames))
         if isinstance(frames, str | Path)
         else None
         if frames is None
@@ -453,9 +453,9 @@ def judge(
     for note in notes:
         warnings.warn(note, stacklevel=2)
     if out is not None:
-        judgement.write(Path(out), true, judgements, verdict, notes)
+        judged.write(Path(out), true, judgements, verdict, notes)
         return load(out)
-    return Run(judgement.in_memory(true, judgements, verdict, notes), None)
+    return Run(judged.in_memory(true, judgements, verdict, notes), None)
 
 
 def _png(figure: Figure) -> bytes:

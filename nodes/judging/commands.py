@@ -88,7 +88,8 @@ def judge(
     """
     from rich.console import Console
 
-    from nodes.judging import judgement
+    from nodes.judging import judged, judgement, mounting, readers
+    from nodes.judging.readers.stamps import read_stamps
     from runtime.config.model import given
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
@@ -113,22 +114,20 @@ def judge(
                 },
             }
             config = convert(settings, judgement.JudgeConfig, "judge")
-            true = judgement.read_truth(
-                truth, times, config.truth_axes, columns=config.truth_columns
-            )
-            camera = judgement.read_mounting(body_from_camera, truth) if body_from_camera else None
+            true = readers.read_truth(truth, times, config.truth_axes, columns=config.truth_columns)
+            camera = mounting.read_mounting(body_from_camera, truth) if body_from_camera else None
             estimates, finals = (
                 [
-                    judgement.read(text, config.axes, times, camera, columns=config.columns)
+                    readers.read(text, config.axes, times, camera, columns=config.columns)
                     for text in texts
                 ]
                 for texts in (estimate, final or ())
             )
-            stamps = judgement.read_stamps(Path(frames)) if frames else None
+            stamps = read_stamps(Path(frames)) if frames else None
             true, judgements, verdict, notes = judgement.judge_all(
                 true, estimates, stamps, config, {source.name: source for source in finals}
             )
-            page = judgement.write(Path(out or f"judged/{name}"), true, judgements, verdict, notes)
+            page = judged.write(Path(out or f"judged/{name}"), true, judgements, verdict, notes)
             outcomes += of_verdict(name, verdict)
         except ValueError as error:
             raise ConfigError(str(error)) from None
@@ -215,7 +214,8 @@ def vslamlab(
     """
     from rich.console import Console
 
-    from nodes.judging import judgement
+    from nodes.judging import judged, judgement, mounting, readers
+    from nodes.judging.readers.stamps import read_stamps
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
     from runtime.tools.cli.brief import print_verdict, verdict_table
@@ -228,22 +228,22 @@ def vslamlab(
         config = convert(
             {"scale_free": mode == "mono", "gap": "2s"}, judgement.JudgeConfig, "judge"
         )
-        truth = judgement.read_truth(str(sequence / "groundtruth.csv"))
-        images = judgement.read_stamps(sequence / "rgb.csv")
-        camera = judgement.read_mounting(body_from_camera, "") if body_from_camera else None
+        truth = readers.read_truth(str(sequence / "groundtruth.csv"))
+        images = read_stamps(sequence / "rgb.csv")
+        camera = mounting.read_mounting(body_from_camera, "") if body_from_camera else None
         runs.mkdir(parents=True, exist_ok=True)
         for number in range(repeat):
             run = runs / f"{number:05d}"
             given = arguments(sequence, run, mode, settings, dashes=dashes)
             try:
                 path = run_once([*command, *given], run, limit)
-                source = judgement.read(f"{run.name}={path}", camera=camera)
+                source = readers.read(f"{run.name}={path}", camera=camera)
                 judgement.judge_all(truth, [source], images, config)  # raises, of another flight
                 estimates.append(source)
             except ValueError as error:
                 failed[run.name] = {"passed": False, "failure": str(error)}
         truth, judgements, verdict, notes = judgement.judge_all(truth, estimates, images, config)
-        errors = [judged.figures.get("ate_rmse_m", np.nan) for judged in judgements.values()]
+        errors = [result.figures.get("ate_rmse_m", np.nan) for result in judgements.values()]
         if np.isfinite(errors).any():  # of two key frames there is none
             least, middle, most = np.nanpercentile(errors, [0, 50, 100])
             spread = f"ate_rmse_m: median {middle:.4g}, {least:.4g} to {most:.4g}"
@@ -252,7 +252,7 @@ def vslamlab(
         rows = dict(sorted({**verdict.estimators, **failed}.items()))
         passed = False if failed else verdict.passed
         verdict = msgspec.structs.replace(verdict, passed=passed, estimators=rows)
-        page = judgement.write(out, truth, judgements, verdict, notes)
+        page = judged.write(out, truth, judgements, verdict, notes)
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None
     console = Console()

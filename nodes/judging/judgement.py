@@ -7,52 +7,23 @@ ticks and future stamps. What is read, and how, is a table: `nodes.judging.reade
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.data.export import mounting
 from nodes.judging.evaluation.alignment import AlignmentMethod
 from nodes.judging.evaluation.judging import Judgement, judge
 from nodes.judging.evaluation.node import EvaluationConfig
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.verdict import FRAMES, Thresholds, conclude, write_results
-from nodes.judging.readers import (
-    AXES,
-    Axes,
-    AxesName,
-    Collected,
-    Source,
-    complaints,
-    of_body,
-    read,
-    read_truth,
-    to_common_axes,
-)
-from nodes.judging.readers.files import stamp_rows
-from nodes.judging.report.page import write_report
-from nodes.judging.report.tables import COLORS, Estimator, Facts, Run, Verdict
-from nodes.kalibr import mounting_of_kalibr
-from nodes.trajectory import Trajectory, not_rotations
-from nodes.trajectory_files import Row, read_tum, write_tum
+from nodes.judging.evaluation.thresholds import Thresholds
+from nodes.judging.evaluation.verdict import conclude
+from nodes.judging.readers import Axes, AxesName, Source, complaints, to_common_axes
+from nodes.judging.report.tables import Verdict
+from nodes.trajectory import Trajectory
 from runtime import Duration
-from runtime.commit import commit
-from runtime.errors import ResultsError
-from runtime.paths import source_file
-from runtime.run import results
-from runtime.run.results import newest
-from runtime.run.sources import content_hash
-from runtime.run.summarise import command_line, environment
 from runtime.time.clock import SECOND
-
-__all__ = [
-    "JudgeConfig", "Source", "in_memory", "judge_all", "mounting_of", "of_memory", "read",
-    "read_mounting", "read_stamps", "read_truth", "write",
-]  # fmt: skip
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
@@ -337,181 +308,3 @@ def _check_frames(truth: Source, frames: Stamps) -> None:
             f"frames: expected images within the truth's time, {first} to {last} ns, found "
             f"{frames[0]} to {frames[-1]} ns"
         )
-
-
-def write(
-    out: Path,
-    truth: Source,
-    judgements: dict[str, Judgement],
-    verdict: Verdict,
-    notes: Sequence[str],
-) -> Path:
-    """Write a results folder like a run's, with figures and a report; return the report's path.
-
-    An earlier judgement there is renamed by its time.
-
-    Raises:
-        ResultsError: The folder has something else, or cannot be written.
-    """
-    if (out / "config.toml").exists():
-        raise ResultsError(f"{out}: expected no run's folder: name another with --out")
-    with results.Folder(out) as folder:
-        page = _write(out, truth, judgements, verdict, notes)
-        folder.flown()
-    return page
-
-
-def in_memory(
-    truth: Source, judgements: dict[str, Judgement], verdict: Verdict, notes: Sequence[str]
-) -> Run:
-    """Return what `read_run` finds in the folder that `write` writes."""
-    estimators = [
-        Estimator(
-            name=name,
-            color=COLORS[k % len(COLORS)],
-            figures=verdict.estimators[name],
-            aligned=judgement.aligned,
-            image_errors=judgement.image_errors,
-            tick_errors=judgement.tick_errors,
-            lost=judgement.lost,
-            final=judgement.final,
-        )
-        for k, (name, judgement) in enumerate(judgements.items())
-    ]
-    return Run(
-        folder=Path(),
-        facts=Facts(name="trajectories", verdict=verdict),
-        verdict=verdict,
-        truths={"": truth.poses},
-        plans={},
-        collisions=np.empty((0, 3)),
-        estimators=estimators,
-        frames={},
-        clouds=[],
-        config=None,
-        log=[],
-        missing=list(notes),
-    )
-
-
-def _write(
-    out: Path,
-    truth: Source,
-    judgements: dict[str, Judgement],
-    verdict: Verdict,
-    notes: Sequence[str],
-) -> Path:
-    write_results(out, {}, judgements, msgspec.to_builtins(verdict))
-    write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
-    for name, judgement in judgements.items():
-        assert judgement.estimate is not None
-        path = out / "trajectories" / f"{source_file(name)}.tum"
-        write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
-    files = {"truth": truth.file, **{k: j.figures["method"] for k, j in judgements.items()}}
-    facts = Facts(
-        name=out.name,
-        verdict=verdict,
-        environment={**environment(), "command": command_line(), "commit": commit()},
-        judged=files,
-        judged_hashes={name: _hash(file) for name, file in files.items()},
-        notes=list(notes),
-    )
-    text = msgspec.json.format(msgspec.json.encode(facts), indent=2)
-    results.write(out / "summary.json", text + b"\n")
-    return write_report(out)
-
-
-def _hash(file: str) -> str:
-    """Return the hash of a file, of a bag for one of its topics; empty for an array or a folder."""
-    path = Path(file) if Path(file).exists() else Path(file.rpartition(":/")[0])
-    return content_hash(path) if path.is_file() else ""
-
-
-def read_mounting(text: str, run: str) -> Floats:
-    """Return the transform from a camera's optical frame to the body, shape (4, 4).
-
-    Given as ``tx ty tz qx qy qz qw`` (metres, the scalar last), a TUM file with one pose, a chain
-    of Kalibr's (``camchain.yaml``, ``camchain.yaml:cam1``), a sensor.yaml of EuRoC's, or the name
-    of a camera that the run announced. In files of Kalibr and EuRoC the body is the IMU.
-
-    Raises:
-        ValueError: It is none of these.
-    """
-    if (mounted := mounting_of_kalibr(text)) is not None:
-        return mounted
-    if Path(text).is_file():
-        return np.asarray(read_tum(Path(text)).matrices()[0])
-    row = Row("--body-from-camera", text.replace(",", " ").split())
-    if len(row.fields) == 1 and Path(run).is_dir():
-        return mounting(newest(Path(run)), text)
-    if len(row.fields) != 7:
-        row.wrong(
-            '"tx ty tz qx qy qz qw", a file (TUM, Kalibr, a sensor.yaml), or a camera of the run '
-            "that is the truth",
-            text,
-        )
-    values = np.array([row.numbers(0, 7)])
-    pose = Trajectory(np.array([0]), values[:, :3], values[:, [6, 3, 4, 5]])
-    return np.asarray(pose.matrices()[0])
-
-
-def mounting_of(matrix: Floats) -> Floats:
-    """Return a transform of shape (4, 4) as it is; a `ValueError` if it is none."""
-    if matrix.shape != (4, 4) or not_rotations(matrix[None, :3, :3]) or matrix[3, 3] != 1.0:
-        raise ValueError(
-            "body_from_camera: expected a transform of shape (4, 4), found "
-            f"{matrix.tolist() if matrix.shape == (4, 4) else matrix.shape}"
-        )
-    return matrix
-
-
-def of_memory(name: str, given: Any, axes: AxesName | None, camera: Floats | None = None) -> Source:
-    """Return the source of a trajectory in memory; `axes` and `camera` as of `read`.
-
-    Args:
-        given: A `Trajectory`, or rows as TUM's, whose bad ones are left out and counted as a
-            file's: seconds, x, y, z in metres, and a quaternion x, y, z, w, shape (n, 8), or
-            without the quaternion, (n, 4).
-
-    Raises:
-        ValueError: It is neither.
-    """
-    if isinstance(given, Trajectory):
-        source = Source(name=name, file=name, poses=given)
-    else:
-        rows = np.asarray(given, dtype=np.float64)
-        if rows.ndim != 2 or rows.shape[1] not in {4, 8}:
-            raise ValueError(
-                f"{name}: expected a file, a Trajectory, or TUM's rows of shape (n, 8), or (n, 4) "
-                f"without a quaternion, found an array of shape {rows.shape}"
-            )
-        if len(far := rows[abs(rows[:, 0]) > _LONGEST_SECONDS, 0]):
-            raise ValueError(f"{name}: expected stamps in seconds, as TUM's, found {far[0]:.6g}")
-        collected = Collected(name)
-        for number, (stamp, *row) in enumerate(rows.tolist()):
-            time = round(stamp * 1e9) if np.isfinite(stamp) else None
-            turn = [row[6], *row[3:6]] if len(row) == 7 else None
-            collected.add(time, row[:3], turn, row=f": row {number}")
-        source = msgspec.structs.replace(collected.source(), name=name, file=name)
-    if axes:
-        source = msgspec.structs.replace(source, axes=AXES[axes])
-    return source if camera is None else of_body(source, camera)
-
-
-_LONGEST_SECONDS = 9.2e9  # what 64 bits of nanoseconds hold
-
-
-def read_stamps(path: Path) -> Stamps:
-    """Return the stamps (ns) of a list of images or of poses: the first field of each row.
-
-    With commas nanoseconds (EuRoC, VSLAM-LAB), else seconds (TUM, KITTI).
-
-    Raises:
-        ValueError: It cannot be read, or the stamps do not rise; the message names the line.
-    """
-    rows = stamp_rows(path)
-    stamps = np.array([stamp for _, stamp in rows], np.int64)
-    if back := np.flatnonzero(np.diff(stamps) <= 0).tolist():
-        before, after = stamps[back[0] : back[0] + 2]
-        rows[back[0] + 1][0].wrong(f"a stamp above {before} ns", f"{after} ns")
-    return stamps

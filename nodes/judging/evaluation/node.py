@@ -33,19 +33,13 @@ from events import (
 from events.announcements import Vehicles
 from events.frames import angle_between
 from events.geometry import Pose, pose_matrix, pose_tuples
+from nodes.judging.evaluation.album import Album
+from nodes.judging.evaluation.files import FRAMES, write_results
 from nodes.judging.evaluation.judging import Flight, Judgement, collision_rows, judge
 from nodes.judging.evaluation.plausibility import CommandLog, at_images
 from nodes.judging.evaluation.record import EstimatorRecord, Stamps, choose_camera
-from nodes.judging.evaluation.verdict import (
-    FRAMES,
-    Album,
-    Thresholds,
-    conclude,
-    node_of,
-    owner_of,
-    planned_end,
-    write_results,
-)
+from nodes.judging.evaluation.thresholds import Thresholds
+from nodes.judging.evaluation.verdict import conclude, node_of, owner_of, planned_end
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import GrowingFile, tum_row
 from runtime import Duration, Node, NodeConfig, Output, on

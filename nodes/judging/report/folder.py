@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from nodes.judging.evaluation.files import read_errors
 from nodes.judging.evaluation.judging import Errors, judge
 from nodes.judging.evaluation.record import EstimatorRecord, Interval, cover, seconds
-from nodes.judging.evaluation.verdict import read_errors
 from nodes.judging.report.tables import COLORS, Estimator, Facts, Run, Verdict
 from nodes.trajectory import HOLE, Trajectory
 from nodes.trajectory_files import read_tum

@@ -17,7 +17,8 @@ from nodes.judging.evaluation.plausibility import (
     velocity_error_percent,
 )
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.verdict import Thresholds, conclude
+from nodes.judging.evaluation.thresholds import Thresholds
+from nodes.judging.evaluation.verdict import conclude
 from nodes.trajectory import Trajectory
 from runtime.figures import FIGURES, is_off
 from tests.nodes.judging.evaluation.flights import MS, SECOND, heading, place

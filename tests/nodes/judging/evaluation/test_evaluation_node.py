@@ -30,7 +30,7 @@ from events import (
     VehicleAnnouncement,
 )
 from nodes.judging.evaluation import Evaluation
-from nodes.judging.evaluation.verdict import read_errors
+from nodes.judging.evaluation.files import read_errors
 from nodes.trajectory_files import read_tum
 from runtime import Duration, Node, Output
 from runtime.config.model import Config, RunConfig

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from nodes.judging.evaluation.judging import judge
-from nodes.judging.evaluation.verdict import Thresholds
+from nodes.judging.evaluation.thresholds import Thresholds
 from runtime.figures import FIGURES, IN_SWEEPS, figure
 from tests.nodes.judging.report.folders import recorded, walk
 

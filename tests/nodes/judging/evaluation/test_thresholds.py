@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from nodes.judging.evaluation.node import EvaluationConfig
-from nodes.judging.evaluation.verdict import Thresholds
+from nodes.judging.evaluation.thresholds import Thresholds
 from runtime.config.reading import load
 from runtime.errors import ConfigError
 from runtime.figures import FIGURES

@@ -30,7 +30,8 @@ from nodes.judging.evaluation import Evaluation
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.plausibility import at_images
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.verdict import Thresholds, conclude, planned_end
+from nodes.judging.evaluation.thresholds import Thresholds
+from nodes.judging.evaluation.verdict import conclude, planned_end
 from nodes.trajectory import Trajectory
 from runtime import Input, Node, NodeConfig, Output
 from runtime.errors import NodeError

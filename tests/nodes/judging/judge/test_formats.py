@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from nodes.judging import judgement
 from nodes.judging.evaluation.judging import Judgement
-from nodes.judging.readers import read, readers
+from nodes.judging.readers import read, read_truth, readers
 from nodes.judging.readers.columns import column_of, columns_of
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_euroc, write_kitti, write_tum
@@ -444,8 +444,8 @@ def test_what_is_left_out_is_counted_in_files_as_in_topics(tmp_path: Path) -> No
 
 def judged(truth: str, estimate: str, **config: Any) -> Judgement:
     given = judgement.JudgeConfig(**config)
-    true = judgement.read_truth(truth, axes=given.truth_axes)
-    source = judgement.read(f"one={estimate}", given.axes)
+    true = read_truth(truth, axes=given.truth_axes)
+    source = read(f"one={estimate}", given.axes)
     return judgement.judge_all(true, [source], None, given)[1]["one"]
 
 
@@ -482,8 +482,8 @@ def test_a_container_is_no_error(truth: str, estimate: str, containers: dict[str
 
 def test_kittis_truth_against_a_tum_file(containers: dict[str, str]) -> None:
     folder = Path(containers["TUM"]).parent
-    true = judgement.read_truth(str(folder / "k.txt"), str(folder / "times"))
-    source = judgement.read(containers["TUM"])
+    true = read_truth(str(folder / "k.txt"), str(folder / "times"))
+    source = read(containers["TUM"])
     _, judgements, _, _ = judgement.judge_all(true, [source], None, judgement.JudgeConfig())
     assert judgements["t"].figures["rot_rmse_deg"] == pytest.approx(0, abs=1e-6)
 
@@ -510,12 +510,12 @@ def test_estimates_that_declare_different_bodies_need_the_truths(
     containers: dict[str, str], tmp_path: Path
 ) -> None:
     write_tum(tmp_path / "own.tum", POSE, "base_link (FRD) in odom, as it was sent")
-    true = judgement.read_truth(containers["TUM"])
-    sources = [judgement.read(containers["bag"]), judgement.read(str(tmp_path / "own.tum"))]
+    true = read_truth(containers["TUM"])
+    sources = [read(containers["bag"]), read(str(tmp_path / "own.tum"))]
     message = r"expected the axes of the truth's body .*slam/poses: flu, own: frd\), found none"
     with pytest.raises(ValueError, match=message):
         judgement.judge_all(true, sources, None, judgement.JudgeConfig())
-    true = judgement.read_truth(containers["TUM"], axes="enu")
+    true = read_truth(containers["TUM"], axes="enu")
     judgement.judge_all(true, sources, None, judgement.JudgeConfig())
 
 

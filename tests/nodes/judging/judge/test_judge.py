@@ -17,7 +17,7 @@ from evo.core.units import Unit
 from events import Event, Image
 from nodes.data.export import export_trajectories
 from nodes.judging.evaluation import Evaluation
-from nodes.judging.evaluation.verdict import FRAMES
+from nodes.judging.evaluation.files import FRAMES
 from nodes.judging.report.folder import read_run
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import read_tum, write_euroc, write_kitti, write_tum
@@ -48,7 +48,7 @@ def judge(folder: Path, *words: Any, code: int = 0) -> dict[str, Any]:
 
 def said(folder: Path, *words: Any) -> subprocess.CompletedProcess[str]:
     """Run the command without drawing."""
-    with mock.patch("nodes.judging.judgement.write_report", lambda out: out / "report.html"):
+    with mock.patch("nodes.judging.judged.write_report", lambda out: out / "report.html"):
         return command_here("judge", *words, folder=folder)
 
 

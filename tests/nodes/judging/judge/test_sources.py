@@ -15,8 +15,9 @@ from hypothesis import given, settings
 
 from nodes.judging import judgement
 from nodes.judging.evaluation.judging import Judgement
-from nodes.judging.judgement import read, read_mounting, read_stamps, read_truth
-from nodes.judging.readers import Source, of_body
+from nodes.judging.mounting import read_mounting
+from nodes.judging.readers import Source, of_body, read, read_truth
+from nodes.judging.readers.stamps import read_stamps
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_euroc, write_kitti, write_tum
 from tests.nodes.judging.judge import bags

@@ -82,7 +82,7 @@ def judged(sequence: Path, behaviour: str, *words: str) -> tuple[Result, dict[st
     app.command()(vslamlab)
     stub = ["--", sys.executable, str(sequence.parent / "stub.py"), behaviour]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nodes.judging.judgement.write_report", lambda out: out / "report.html")
+        patch.setattr("nodes.judging.judged.write_report", lambda out: out / "report.html")
         result = CliRunner().invoke(app, [str(sequence), "--out", str(out), *words, *stub])
     path = out / "evaluation" / "verdict.json"
     verdict: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}

@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from events import PoseEstimate
+from nodes.judging.evaluation.files import write_results
 from nodes.judging.evaluation.judging import Judgement, judge
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.verdict import Thresholds, write_results
+from nodes.judging.evaluation.thresholds import Thresholds
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_tum
 from runtime.paths import source_file

@@ -10,7 +10,7 @@ import pytest
 
 from events import TrackingLost, TrackingRegained
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.verdict import Thresholds
+from nodes.judging.evaluation.thresholds import Thresholds
 from nodes.judging.report.folder import read_run
 from nodes.judging.report.page import write_report
 from nodes.judging.report.tables import Floats

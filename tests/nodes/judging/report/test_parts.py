@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nodes.judging.evaluation.record import Interval
-from nodes.judging.evaluation.verdict import Thresholds
+from nodes.judging.evaluation.thresholds import Thresholds
 from nodes.judging.report.clouds import Shown, View, paint
 from nodes.judging.report.curves import draw_latency
 from nodes.judging.report.folder import broken, gaps, holes, read_poses, read_run

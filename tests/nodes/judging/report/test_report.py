@@ -15,7 +15,7 @@ import typer
 from typer.testing import CliRunner
 
 import runtime.tools.cli
-from nodes.judging.evaluation.verdict import Thresholds
+from nodes.judging.evaluation.thresholds import Thresholds
 from nodes.judging.report.folder import read_run
 from nodes.judging.report.page import report, write_report
 from nodes.trajectory import Trajectory
