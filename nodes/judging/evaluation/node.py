@@ -35,7 +35,8 @@ from events.frames import angle_between
 from events.geometry import Pose, pose_matrix, pose_tuples
 from nodes.judging.evaluation.album import Album
 from nodes.judging.evaluation.files import FRAMES, write_results
-from nodes.judging.evaluation.judging import Flight, Judgement, collision_rows, judge
+from nodes.judging.evaluation.flight import Flight, collision_rows
+from nodes.judging.evaluation.judging import Judgement, judge
 from nodes.judging.evaluation.plausibility import CommandLog, at_images
 from nodes.judging.evaluation.record import EstimatorRecord, Stamps, choose_camera
 from nodes.judging.evaluation.thresholds import Thresholds

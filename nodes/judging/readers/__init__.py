@@ -5,7 +5,8 @@ points ``visnav.readers``. A row's `read` gives a `Source`: poses as they stand,
 the source declares, if it does (`nodes.judging.readers.axes`).
 """
 
-from nodes.judging.readers.axes import AXES, Axes, AxesName, to_common_axes
+from nodes.judging.readers.axes import AXES, Axes, AxesName
+from nodes.judging.readers.conversion import to_common_axes
 from nodes.judging.readers.source import Collected, Options, Reader, Source, Start
 from nodes.judging.readers.table import complaints, of_body, read, read_truth, readers
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nodes.judging.readers.axes import converted
+from nodes.judging.readers.conversion import converted
 from nodes.judging.readers.table import read_truth
 from runtime.recorded import MotionFile, RecordedMotion
 

@@ -11,12 +11,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 
-from nodes.judging.evaluation.judging import (
-    held_errors,
-    interpolated_errors,
-    judge,
-    to_planned_end,
-)
+from nodes.judging.evaluation.judging import held_errors, interpolated_errors, judge, to_planned_end
 from nodes.judging.evaluation.record import EstimatorRecord, cover
 from nodes.trajectory import Trajectory
 from tests.nodes.judging.evaluation.flights import (
