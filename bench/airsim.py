@@ -56,7 +56,7 @@ def measure(*, rounds: int = 10, progress: Progress = silent) -> list[Row]:
 
 
 def _row(case: str, windows: list[Window], quiet: list[Any]) -> Row:
-    trips = np.concatenate([window.found for window in windows]) / 1e3
+    trips = np.concatenate([window.measured for window in windows]) / 1e3
     seconds = sum(window.end - window.begin for window in windows) / 1e9
     return {
         **figures([*map(lateness, windows)], quiet),

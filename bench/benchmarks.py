@@ -142,12 +142,12 @@ class Benchmark(NamedTuple):
 
 def columns_of(text: str) -> list[Column]:
     """Return the columns of a line as ``heading: key spec | heading: key``."""
-    found = []
+    columns = []
     for column in text.split(" | "):
         heading, _, figure = column.partition(": ")
         key, _, spec = figure.partition(" ")
-        found.append(Column(heading, key, spec))
-    return found
+        columns.append(Column(heading, key, spec))
+    return columns
 
 
 class RoundTrip(NamedTuple):

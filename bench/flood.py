@@ -60,7 +60,7 @@ def _row(case: str, windows: list[Window], quiet: list[Window]) -> Row:
     return {
         **figures(lates, befores),
         "case": case,
-        "messages_per_second": sum(window.found for window in windows) / seconds,
+        "messages_per_second": sum(window.measured for window in windows) / seconds,
         "ratio_p50": ratios(lates, befores)[0],
     }
 

@@ -95,16 +95,16 @@ def _measure_world(world: str, places: int) -> list[Row]:
     tour = TOURS[world]
     for number in range(places):
         place = np.asarray(tour[number * len(tour) // places])
-        for camera, each in CAMERAS.items():
-            shot = _shot(each, model.nq, place, 0.9 * number)
+        for camera, settings in CAMERAS.items():
+            shot = _shot(settings, model.nq, place, 0.9 * number)
             sides = {
                 name: functools.partial(_draw, renderer, shot)
                 for name, renderer in renderers.items()
             }
             for renderer, times in paired(sides, 1).items():
                 taken.setdefault((camera, renderer), []).extend(times)
-    for each_renderer in renderers.values():
-        each_renderer.close()
+    for opened in renderers.values():
+        opened.close()
     rows: list[Row] = []
     for camera in CAMERAS:
         ours, other = (median(taken.get((camera, name), [math.nan])) for name in RENDERERS)

@@ -59,12 +59,12 @@ def pair(taken: Mapping[str, Sequence[int]]) -> dict[str, float]:
 
     Medians and 99th percentiles are in microseconds; `ratio` is that of the two medians.
     """
-    found: dict[str, float] = {}
+    figures: dict[str, float] = {}
     for side, times in taken.items():
         middle, high = np.percentile(times, (50, 99)) / 1e3
-        found |= {f"{side}_us": float(middle), f"{side}_p99_us": float(high)}
-    ours, theirs = (found[f"{side}_us"] for side in taken)
-    return {**found, "ratio": ours / theirs}
+        figures |= {f"{side}_us": float(middle), f"{side}_p99_us": float(high)}
+    ours, theirs = (figures[f"{side}_us"] for side in taken)
+    return {**figures, "ratio": ours / theirs}
 
 
 @contextlib.contextmanager

@@ -80,7 +80,7 @@ class Window(NamedTuple):
 
     begin: int
     end: int
-    found: Any
+    measured: Any
 
 
 def windows_beside(
@@ -137,11 +137,11 @@ def ratios(runs: Sequence[Any], beside: Sequence[Any]) -> tuple[float, float]:
 
     Lateness is in nanoseconds; `beside` has what each run or window is held against.
     """
-    each = [
+    quotients = [
         np.percentile(late, (50, 99)) / np.percentile(before, (50, 99))
         for late, before in zip(runs, beside, strict=False)
     ]
-    p50, p99 = np.median(each, axis=0).tolist()
+    p50, p99 = np.median(quotients, axis=0).tolist()
     return p50, p99
 
 
@@ -166,15 +166,15 @@ def measure_recording(
         case: functools.partial(_record, recorder, seconds, rate)
         for case, recorder in CASES.items()
     }
-    found = paired(sides, repeats, progress)
-    late = {case: [lates for lates, _ in runs] for case, runs in found.items()}
+    measured = paired(sides, repeats, progress)
+    late = {case: [lates for lates, _ in runs] for case, runs in measured.items()}
     return [
         {
             **figures(late[case], late["no recorder"]),
             "case": case,
             **{key: sum(counts[key] for _, counts in runs) for key in runs[0][1]},
         }
-        for case, runs in found.items()
+        for case, runs in measured.items()
     ]
 
 

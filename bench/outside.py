@@ -133,11 +133,11 @@ def measure_held(
     sides = {
         side: functools.partial(_fly, seconds, estimator) for side, estimator in _ESTIMATORS.items()
     }
-    found = paired(sides, repeats, progress)
-    outside, worker = (seconds / median(s.wall_seconds for s in side) for side in found.values())
-    said = {summary.digests[ESTIMATES] for side in found.values() for summary in side}
+    measured = paired(sides, repeats, progress)
+    outside, worker = (seconds / median(s.wall_seconds for s in side) for side in measured.values())
+    digests = {summary.digests[ESTIMATES] for side in measured.values() for summary in side}
     speeds = {"outside_speed": outside, "worker_speed": worker, "ratio": outside / worker}
-    return [{"case": "native interface", "rounds": repeats, **speeds, "equal": len(said) == 1}]
+    return [{"case": "native interface", "rounds": repeats, **speeds, "equal": len(digests) == 1}]
 
 
 def _fly(seconds: float, estimator: dict[str, Any]) -> Summary:
@@ -158,11 +158,11 @@ def track() -> None:
         link.ready()
         for frame in link:
             images = frame.image("rgb8"), frame.image("depth32f")
-            found = tracker.track(frame.stamp, *images)
-            if found.lost:
-                link.lost(frame, found.points)
+            tracked = tracker.track(frame.stamp, *images)
+            if tracked.lost:
+                link.lost(frame, tracked.points)
             else:
-                link.pose(frame, found.pose, points=found.points, inliers=found.inliers)
+                link.pose(frame, tracked.pose, points=tracked.points, inliers=tracked.inliers)
 
 
 def answer() -> None:

@@ -61,8 +61,8 @@ def measure_everything(*, quick: bool, progress: Progress = silent) -> dict[str,
 def environment() -> dict[str, str]:
     """Return machine, how quick that was at the end, versions and commit."""
     speed = f"{_copy() * 1e6:.0f} µs for a copy of 4.67 MB"
-    found = commit() or "unknown"
-    return {**versions(), "cpu": _cpu(), "memory": speed, "commit": found}
+    revision = commit() or "unknown"
+    return {**versions(), "cpu": _cpu(), "memory": speed, "commit": revision}
 
 
 def write_json(path: Path, rows: list[Row], **more: Any) -> None:

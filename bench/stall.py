@@ -172,8 +172,8 @@ def measure(
         settings = {"rate": rate, "size": size, "port": port}
         camera = {"name": "camera", "type": f"{__name__}:Camera", **settings}
         sides = {mode: functools.partial(_run, seconds, camera | {"mode": mode}) for mode in MODES}
-        found = paired(sides, repeats, progress)
-    return [_row(mode, runs, found["none"]) for mode, runs in found.items()]
+        measured = paired(sides, repeats, progress)
+    return [_row(mode, runs, measured["none"]) for mode, runs in measured.items()]
 
 
 def _run(seconds: float, camera: dict[str, Any]) -> Run:

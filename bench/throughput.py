@@ -78,13 +78,13 @@ async def _measure(bursts: int) -> list[Row]:
 
 def _row(case: str, batch: int, bursts: Sequence[int], size: int = 0) -> Row:
     """Return the figures of a case, of the times of its bursts (ns); `size` is in bytes."""
-    each = float(np.median(bursts)) / batch
+    per_event = float(np.median(bursts)) / batch
     return {
         "case": case,
         "batch": batch,
-        "per_event_us": each / 1e3,
-        "events_per_second": 1e9 / each,
-        "bytes_per_second": size * 1e9 / each,
+        "per_event_us": per_event / 1e3,
+        "events_per_second": 1e9 / per_event,
+        "bytes_per_second": size * 1e9 / per_event,
     }
 
 

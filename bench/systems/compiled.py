@@ -116,8 +116,8 @@ def arguments(case: Case, out: Path) -> list[str]:
 
 def deadline_for(case: Case) -> float:
     """Return a deadline for hangs, seconds: 30, plus 0.02 (small) or 0.2 a round trip."""
-    each = 0.02 if case.case == "small" else 0.2
-    return 30 + each * (case.samples + case.warm_up)
+    per_round_trip = 0.02 if case.case == "small" else 0.2
+    return 30 + per_round_trip * (case.samples + case.warm_up)
 
 
 def read(out: Path, case: Case) -> Samples:

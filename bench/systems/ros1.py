@@ -182,7 +182,7 @@ def _packaged(
 
     def missing() -> str | None:
         wanted = {"python3-rosmaster": MASTER, **files}
-        absent = [each for each, path in wanted.items() if not path.exists()]
+        absent = [package for package, path in wanted.items() if not path.exists()]
         if absent:
             return f"not installed; `make peers`, or `apt-get install {' '.join(absent)}`"
         return missing_compiler() if compiled else None

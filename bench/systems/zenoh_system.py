@@ -122,16 +122,16 @@ def measure_processes(case: system.Case) -> system.Samples:
     locator = f"tcp/127.0.0.1:{system.free_port()}"
     with system.zenoh_session(listen=locator) as session:
         pings = system.zenoh_publisher(session, "ping")
-        heard: queue.SimpleQueue[int] = queue.SimpleQueue()
+        numbers: queue.SimpleQueue[int] = queue.SimpleQueue()
 
         def pong(sample: Any) -> None:
-            heard.put(number_of(sample.payload.to_bytes()))
+            numbers.put(number_of(sample.payload.to_bytes()))
 
         _kept = session.declare_subscriber("pong", pong)
 
         def receive() -> int | None:
             try:
-                return heard.get(timeout=1.0)
+                return numbers.get(timeout=1.0)
             except queue.Empty:
                 return None
 

@@ -123,11 +123,11 @@ def cells(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Combination]]:
         different[key] = row | {"estimators": {name: figures}}
         for index, error in enumerate(row.get("crashes", [])):
             different[job.seed, job.id, index] = crashed(job, error)
-    found: dict[str, dict[str, Combination]] = {}
+    table: dict[str, dict[str, Combination]] = {}
     for (scenario, name), group in groups.items():
         cell = combine((scenario, name), name, [*group.values()], COLUMNS)
-        found.setdefault(scenario, {})[name] = cell
-    return found
+        table.setdefault(scenario, {})[name] = cell
+    return table
 
 
 def worth(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
@@ -147,8 +147,8 @@ def worth(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
         if exact := errors.get((f"{scenario}{EXACT}", name, seed)):
             ratios.setdefault(scenario, {}).setdefault(name, []).append(error / exact)
     return {
-        scenario: {name: _times(values) for name, values in each.items()}
-        for scenario, each in ratios.items()
+        scenario: {name: _times(values) for name, values in estimators.items()}
+        for scenario, estimators in ratios.items()
     }
 
 
@@ -159,12 +159,12 @@ def _times(ratios: Sequence[float]) -> str:
 
 def repeating(plan: Plan, rows: Sequence[Row]) -> dict[str, str]:
     """Return whether an estimator gave the same when run twice, in words, by its name."""
-    found = {}
-    for each in summarise(plan, rows):
-        *_, name = each.settings
-        if each.repeatable:
-            found[name] = "yes" if each.repeatable.endswith("equal") else f"no, {each.repeatable}"
-    return found
+    words = {}
+    for cell in summarise(plan, rows):
+        *_, name = cell.settings
+        if cell.repeatable:
+            words[name] = "yes" if cell.repeatable.endswith("equal") else f"no, {cell.repeatable}"
+    return words
 
 
 def summaries(plan: Plan) -> Iterator[tuple[Job, dict[str, Any]]]:
@@ -183,27 +183,27 @@ def flights(suite: Suite, plan: Plan) -> dict[str, dict[int, str]]:
         ConfigError: Two estimators were given flights that differ.
     """
     flying = {node["name"] for node in tomllib.loads(Path(suite.rig).read_text())["nodes"]}
-    found: dict[str, dict[int, str]] = {}
+    digests: dict[str, dict[int, str]] = {}
     for job, summary in summaries(plan):
         if summary.get("error"):  # it ended early: its digest is that of a part
             continue
         sent = {k: v for k, v in summary["digests"].items() if k.partition(".")[0] in flying}
         scenario = dict(job.settings)["scenario"]
-        digest = found.setdefault(scenario, {}).setdefault(job.seed, combined(sent))
+        digest = digests.setdefault(scenario, {}).setdefault(job.seed, combined(sent))
         if digest != combined(sent):
             raise ConfigError(f"{job}: expected the flight of the others, found another")
-    return found
+    return digests
 
 
 def flaws(plan: Plan, rows: Sequence[Row]) -> dict[str, tuple[str, ...]]:
     """Return what is wrong with the flights themselves, as a collision, by scenario."""
-    found: dict[str, dict[str, None]] = {}
+    by_scenario: dict[str, dict[str, None]] = {}
     for job, row in in_order(plan, rows):
         for vehicle, flight in row.get("flights", {}).items():
             for reason in flight["failed"]:
                 words = f"seed {job.seed}, {vehicle}: {reason}"
-                found.setdefault(dict(job.settings)["scenario"], {})[words] = None
-    return {scenario: tuple(reasons) for scenario, reasons in found.items()}
+                by_scenario.setdefault(dict(job.settings)["scenario"], {})[words] = None
+    return {scenario: tuple(reasons) for scenario, reasons in by_scenario.items()}
 
 
 def _costs(name: str, row: Row) -> dict[str, float | None]:
@@ -223,7 +223,7 @@ def draw(suite: Suite, cells: Mapping[str, Mapping[str, Combination]], path: Pat
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    there = [e.name for e in suite.estimators if any(e.name in each for each in cells.values())]
+    there = [e.name for e in suite.estimators if any(e.name in row for row in cells.values())]
     figure = Figure(figsize=(2.1 * len(suite.scenarios) + 2.4, 4.6), layout="constrained")
     axes: Any = figure.add_subplot()
     colours = colormaps["tab20"]
@@ -258,10 +258,10 @@ def pictures(plan: Plan, folder: Path) -> dict[str, str]:
     Returns:
         Scenario to the name of its file; without scenarios of which no images are kept.
     """
-    found: dict[str, str] = {}
+    pages: dict[str, str] = {}
     for job in plan.jobs:
         name = dict(job.settings)["scenario"]
-        if name in found:
+        if name in pages:
             continue
         frames = sorted((Path(job.out) / "frames").glob("*.jpg"))
         newest = {frame.stem.rpartition("_")[0]: frame for frame in frames}
@@ -273,10 +273,10 @@ def pictures(plan: Plan, folder: Path) -> dict[str, str]:
             if image is not None
         ]
         if small:
-            found[name] = f"{name}.jpg"
+            pages[name] = f"{name}.jpg"
             jpeg = cv2.imencode(".jpg", np.hstack(small))[1]
-            (folder / found[name]).write_bytes(jpeg.tobytes())
-    return found
+            (folder / pages[name]).write_bytes(jpeg.tobytes())
+    return pages
 
 
 def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, command: str) -> None:
@@ -288,24 +288,24 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
     """
     folder = path.parent / path.stem.lower()
     folder.mkdir(parents=True, exist_ok=True)
-    found = cells(plan, rows)
-    there = {name for each in found.values() for name in each}
-    draw(suite, found, folder / "suite.png")
+    table = cells(plan, rows)
+    there = {name for row in table.values() for name in row}
+    draw(suite, table, folder / "suite.png")
     text = template(FOLDER / "SUITE.md.jinja").render(
         command=command,
         runs=len(rows),
         seeds=len({job.seed for job in plan.jobs}),
         scenarios=suite.scenarios,
-        entrants=[each for each in suite.estimators if each.name in there],
-        absent=[each for each in suite.estimators if each.name not in there],
-        cells=found,
+        entrants=[estimator for estimator in suite.estimators if estimator.name in there],
+        absent=[estimator for estimator in suite.estimators if estimator.name not in there],
+        cells=table,
         verdict=verdict,
         short=short,
         repeats=repeating(plan, rows),
         worth=worth(plan, rows),
         errors=suite.calibration_errors,
-        both=[each for each in suite.scenarios if each.calibration == "both"],
-        exact=[each.name for each in suite.scenarios if each.calibration == "exact"],
+        both=[scenario for scenario in suite.scenarios if scenario.calibration == "both"],
+        exact=[scenario.name for scenario in suite.scenarios if scenario.calibration == "exact"],
         flights=flights(suite, plan),
         flaws=flaws(plan, rows),
         columns=COLUMNS,
@@ -319,9 +319,9 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
 
 def _where(plan: Plan) -> dict[str, str]:
     """Return where the runs were made; what differs among them, all of it."""
-    found: dict[str, dict[str, None]] = {}
+    environment: dict[str, dict[str, None]] = {}
     for _, summary in summaries(plan):
         for name, value in summary.get("environment", {}).items():
             if value and name != "command":  # without git there is no commit
-                found.setdefault(name, {})[value] = None
-    return {name: ", ".join(values) for name, values in found.items()}
+                environment.setdefault(name, {})[value] = None
+    return {name: ", ".join(values) for name, values in environment.items()}

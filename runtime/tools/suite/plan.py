@@ -135,7 +135,7 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
         ConfigError: A scenario or an estimator has settings that do not exist.
     """
     folder = Path(suite.rig).parent
-    entrants = [each for each in suite.estimators if each.installed(folder)]
+    entrants = [estimator for estimator in suite.estimators if estimator.installed(folder)]
     jobs = (
         make_job(
             parse(_table(suite, scenario, entrant), suite.rig, folder),
@@ -172,7 +172,7 @@ def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]
 
 
 def _named(what: str, known: tuple[Any, ...], names: Sequence[str]) -> tuple[Any, ...]:
-    by_name = {each.name: each for each in known}
+    by_name = {entry.name: entry for entry in known}
     for name in names:
         message = f"--{what}: expected one of {', '.join(by_name)}, found {name}"
         expect_known(name, by_name, message, CommandError)
