@@ -423,11 +423,11 @@ class Vehicles:
 
     def carrier(self, source: str) -> str:
         """Return the vehicle named in a source; empty if there is none."""
-        found = (v for v in self.names if source == v or source.startswith(f"{v}/"))
-        return next(found, "")
+        vehicles = (v for v in self.names if source == v or source.startswith(f"{v}/"))
+        return next(vehicles, "")
 
     def of(self, source: str) -> str:
         """Return the vehicle of a source; empty if there are no vehicles."""
         camera = self._cameras.get(self._followed.get(source, ""), "")
-        said = self._estimated.get(source, "") or self.carrier(source)
-        return said or self.carrier(camera) or next(iter(self.names), "")
+        vehicle = self._estimated.get(source, "") or self.carrier(source)
+        return vehicle or self.carrier(camera) or next(iter(self.names), "")

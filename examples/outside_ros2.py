@@ -40,25 +40,25 @@ class Odometry:
 
     def track(self, grey: Any, depth: Any) -> Any:
         """Return the camera's pose in its first image, or None; uint8 and metres, (h, w)."""
-        found = True if self.key is None else self._follow(grey)
-        if self.key is None or not found or len(self.corners) < FEWEST * self.begun:
+        tracked = True if self.key is None else self._follow(grey)
+        if self.key is None or not tracked or len(self.corners) < FEWEST * self.begun:
             self._new_key(grey, depth)
-        return self.pose if found else None
+        return self.pose if tracked else None
 
     def _follow(self, grey: Any) -> bool:
         image, corners, points, key_pose = self.key
         seen, there, _ = cv2.calcOpticalFlowPyrLK(
             image, grey, corners, self.corners.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW
         )
-        kept = there[:, 0] == 1
-        if kept.sum() < 8:
+        followed = there[:, 0] == 1
+        if followed.sum() < 8:
             return False
         solved, turn, shift, inliers = cv2.solvePnPRansac(
-            points[kept], seen[kept].astype(float), self.matrix, None, reprojectionError=1.5
+            points[followed], seen[followed].astype(float), self.matrix, None, reprojectionError=1.5
         )
         if not solved or inliers is None or len(inliers) < 8:
             return False
-        best = np.flatnonzero(kept)[inliers.ravel()]
+        best = np.flatnonzero(followed)[inliers.ravel()]
         turn, shift = cv2.solvePnPRefineLM(
             points[best], seen[best].astype(float), self.matrix, None, turn, shift
         )
@@ -116,7 +116,7 @@ def main() -> None:
 
     poses = end(ros.ROS2Publisher, "/slam/pose", "geometry_msgs/msg/PoseStamped")
     done = end(ros.ROS2Publisher, "/slam/done", "std_msgs/msg/Header")
-    kept = [  # each has a thread of its own, so what they take is put together again below
+    subscribers = [  # each has a thread of its own, so what they take is put together again below
         end(ros.ROS2Subscriber, topic, type_, callback=lambda m, n=name: came.put((n, m)), **more)
         for name, topic, type_, more in (
             ("tf", "/tf_static", "tf2_msgs/msg/TFMessage", {"qos": LATCHED}),
@@ -125,7 +125,7 @@ def main() -> None:
             ("colour", f"{camera}/image_raw", "sensor_msgs/msg/Image", {}),
         )
     ]
-    print(f"{len(kept)} subscriptions", flush=True)
+    print(f"{len(subscribers)} subscriptions", flush=True)
     latest: dict[str, Any] = {}
     frames: dict[tuple[int, int], dict[str, Any]] = {}
     odometry, mount = None, np.eye(4)
@@ -141,7 +141,7 @@ def main() -> None:
             if any(latest["info"].d) or latest["info"].distortion_model == "equidistant":
                 sys.exit("expected images without distortion, found a lens: rectify them first")
             odometry = Odometry(latest["info"].k.reshape(3, 3))
-            links = {each.child_frame_id: each for each in latest["tf"].transforms}
+            links = {transform.child_frame_id: transform for transform in latest["tf"].transforms}
             frame = latest["info"].header.frame_id
             while frame in links and frame != "base_link":
                 mount = matrix_of(links[frame].transform) @ mount

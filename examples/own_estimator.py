@@ -34,10 +34,10 @@ class FlowOdometry:
         if corners is None:
             return TrackingResult(pose=self.pose, lost=True, reason="no corners")
         corners = corners.reshape(-1, 1, 2)
-        points, found, _ = cv2.calcOpticalFlowPyrLK(last, grey, corners, None)
+        points, status, _ = cv2.calcOpticalFlowPyrLK(last, grey, corners, None)
         pixels, points = corners[:, 0], points.reshape(-1, 2)
         z = last_depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-        seen = (found[:, 0] == 1) & np.isfinite(z) & (z > 0)
+        seen = (status[:, 0] == 1) & np.isfinite(z) & (z > 0)
         pixels, points, z = pixels[seen], points[seen], z[seen]
         rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(self.matrix).T
         inliers, solved = np.zeros(len(points), bool), False

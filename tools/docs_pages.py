@@ -59,14 +59,14 @@ def figures_section() -> str:
     """Return the section on all figures: meanings, units and thresholds."""
     rows = [
         (
-            f"`{each.name}`",
-            each.meaning,
-            each.unit,
-            f"at {each.limit} {'' if each.default is None else f'{each.default:g}'}".rstrip()
-            if each.limit
+            f"`{figure.name}`",
+            figure.meaning,
+            figure.unit,
+            f"at {figure.limit} {'' if figure.default is None else f'{figure.default:g}'}".rstrip()
+            if figure.limit
             else "",
         )
-        for each in FIGURES.values()
+        for figure in FIGURES.values()
     ]
     head = ("figure", "what it is", "unit", "threshold, and its default")
     return "\n".join(["## All figures", "", *_table(head, rows)])
@@ -167,15 +167,15 @@ def nodes_page(nodes: dict[str, type[Node[Any]]]) -> str:
 def _settings(settings: tuple[SettingDescription, ...], table: str = "") -> list[str]:
     """Return a table of settings; those of a table or of a list of tables follow below."""
     rows = []
-    for each in settings:
-        default = "required" if each.required else each.default and f"`{each.default}`"
-        change = " It can be changed in a run." if each.changeable else ""
-        type_ = f"{each.type}, {each.constraint}" if each.constraint else each.type
-        rows.append((f"`{table}{each.name}`", type_, default, _prose(each.doc) + change))
+    for setting in settings:
+        default = "required" if setting.required else setting.default and f"`{setting.default}`"
+        change = " It can be changed in a run." if setting.changeable else ""
+        type_ = f"{setting.type}, {setting.constraint}" if setting.constraint else setting.type
+        rows.append((f"`{table}{setting.name}`", type_, default, _prose(setting.doc) + change))
     lines = _table(("setting", "type", "default", "meaning"), rows)
-    for each in settings:
-        if each.settings:
-            lines += ["", *_settings(each.settings, f"{table}{each.name}.")]
+    for setting in settings:
+        if setting.settings:
+            lines += ["", *_settings(setting.settings, f"{table}{setting.name}.")]
     return lines
 
 
@@ -195,8 +195,8 @@ ABOUT = {
 
 def imports_between_rooms() -> set[tuple[str, str]]:
     """Return pairs of rooms (importer, imported), read from all source files."""
-    found = set()
-    for path in sorted(each for room in ABOUT for each in (ROOT / room).rglob("*.py")):
+    pairs = set()
+    for path in sorted(file for room in ABOUT for file in (ROOT / room).rglob("*.py")):
         if path.name == "__main__.py":  # it starts the command line
             continue
         room = _room(".".join(path.relative_to(ROOT).with_suffix("").parts))
@@ -204,8 +204,8 @@ def imports_between_rooms() -> set[tuple[str, str]]:
             modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and not node.level:
                 modules = [f"{node.module}.{alias.name}" for alias in node.names]
-            found |= {(room, _room(module)) for module in modules}
-    return {(one, other) for one, other in found if one != other and one and other}
+            pairs |= {(room, _room(module)) for module in modules}
+    return {(one, other) for one, other in pairs if one != other and one and other}
 
 
 def _room(module: str) -> str:

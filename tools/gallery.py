@@ -40,14 +40,14 @@ def main() -> None:
 
 
 def _compared(names: tuple[str, ...]) -> dict[str, Any]:
-    found = {}
+    images = {}
     for name in names:
         ours, other = _seen(name), _seen(name, "mujoco")
-        found[f"{name}: raster"], found[f"{name}: mujoco"] = ours, other
+        images[f"{name}: raster"], images[f"{name}: mujoco"] = ours, other
         apart = np.abs(ours.astype(int) - other)
         caption = f"8 x the difference, {apart.mean():.1f} levels on average"
-        found[caption] = np.minimum(8 * apart, 255).astype(np.uint8)
-    return found
+        images[caption] = np.minimum(8 * apart, 255).astype(np.uint8)
+    return images
 
 
 def _seen(name: str, renderer: RendererName = "raster") -> Any:

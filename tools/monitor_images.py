@@ -45,11 +45,11 @@ async def _look(folder: Path, browser: str) -> None:
     from runtime.tools.monitor.screen import Screen
 
     deadline = time.monotonic() + 120
-    while not (found := runs()):
+    while not (sockets := runs()):
         if time.monotonic() > deadline:
             sys.exit("expected the run to begin within two minutes")
         await asyncio.sleep(0.2)
-    path = found["closed_loop"]
+    path = sockets["closed_loop"]
     client = Client(path)
     screen = Screen(client)
     async with screen.run_test(size=SIZE) as pilot:

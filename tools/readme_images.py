@@ -77,9 +77,9 @@ def _legend(axes: Axes, runs: dict[str, Path]) -> None:
     rows = [("truth", TRUTH, "error", "lost", "verdict")]
     for name, (label, colour) in SYSTEMS.items():
         verdict = json.loads((runs[name] / "evaluation" / "verdict.json").read_text())
-        found = verdict["estimators"][name]
-        error, lost = f"{found['flight_ate_percent']:.3g} %", f"{found['lost_seconds']:.1f} s"
-        rows.append((label, colour, error, lost, "passed" if found["passed"] else "failed"))
+        figures = verdict["estimators"][name]
+        error, lost = f"{figures['flight_ate_percent']:.3g} %", f"{figures['lost_seconds']:.1f} s"
+        rows.append((label, colour, error, lost, "passed" if figures["passed"] else "failed"))
     for row, (label, colour, *cells) in enumerate(rows):
         axes.plot([0, 0.07], [row + 0.36] * 2, color=colour, linewidth=4)
         axes.text(0.1, row + 0.5, label, **_text(17))

@@ -79,8 +79,8 @@ def is_cpp_code(line: str) -> bool:
 
 def core(total: dict[str, Size]) -> Size:
     """Return the size of the core, Python and C++."""
-    found = [size for name, size in total.items() if name.removesuffix(" (C++)") in CORE]
-    return sum(found, Size())
+    sizes = [size for name, size in total.items() if name.removesuffix(" (C++)") in CORE]
+    return sum(sizes, Size())
 
 
 def closure(module: str) -> Size:

@@ -71,13 +71,13 @@ def serving(recording: Path) -> Iterator[str]:
 @contextmanager
 def browser() -> Iterator[Page]:
     """Start a browser, and yield its page."""
-    found = next((path for name in CHROMIUM if (path := shutil.which(name))), None)
-    if found is None:
+    program = next((path for name in CHROMIUM if (path := shutil.which(name))), None)
+    if program is None:
         raise SystemExit(f"expected one of {', '.join(CHROMIUM)}, found none")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(  # noqa: S603  # the browser
             [
-                *(found, "--headless=new", "--no-sandbox", "--remote-debugging-port=0"),
+                *(program, "--headless=new", "--no-sandbox", "--remote-debugging-port=0"),
                 *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
                 *(f"--user-data-dir={profile}", f"--window-size={WIDTH},{HEIGHT}", "about:blank"),
             ],
@@ -88,7 +88,7 @@ def browser() -> Iterator[Page]:
             port = _debugging_port(Path(profile) / "DevToolsActivePort")
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
                 pages = json.load(answer)
-            url = next(each["webSocketDebuggerUrl"] for each in pages if each["type"] == "page")
+            url = next(page["webSocketDebuggerUrl"] for page in pages if page["type"] == "page")
             with connect(url, max_size=None, open_timeout=30) as connection:
                 yield Page(connection)
         finally:
