@@ -30,9 +30,9 @@ class Odometry:
         """Return the camera's pose; grey uint8 (h, w), depth metres (h, w)."""
         if self.grey is not None and len(self.pixels):
             before = self.pixels.astype(np.float32)
-            pixels, found, _ = cv2.calcOpticalFlowPyrLK(self.grey, grey, before, None)
+            pixels, status, _ = cv2.calcOpticalFlowPyrLK(self.grey, grey, before, None)
             back, again, _ = cv2.calcOpticalFlowPyrLK(grey, self.grey, pixels, None)
-            kept = (found[:, 0] & again[:, 0] == 1) & (np.abs(back - before).max(axis=1) < 0.5)
+            kept = (status[:, 0] & again[:, 0] == 1) & (np.abs(back - before).max(axis=1) < 0.5)
             self.pixels, self.points = pixels[kept], self.points[kept]
         if self.grey is not None and len(self.pixels) >= 8:
             solved, turn, shift, inliers = cv2.solvePnPRansac(

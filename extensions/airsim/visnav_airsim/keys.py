@@ -59,8 +59,8 @@ def parse(text: str, where: str) -> tuple[dict[str, Any], str, list[str]]:
     strict = text.removeprefix("\ufeff")
     notes: list[str] = []
 
-    def collect(found: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-        pairs = list(found)
+    def collect(entries: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+        pairs = list(entries)
         counts = Counter(key for key, _ in pairs)
         repeated = [key for key in counts if counts[key] > 1]
         notes.extend(
@@ -113,26 +113,26 @@ class Keys:
 
     def number(self, key: str, default: T) -> float | T:
         """Return a finite number."""
-        found = self._get(key, int | float, "a finite number")
-        if found is None or found != found:
+        value = self._get(key, int | float, "a finite number")
+        if value is None or value != value:
             return default
-        if abs(found) > _LARGEST:
-            raise self.error(key, f"expected a finite number, found {found!r:.80}")
-        return float(found)
+        if abs(value) > _LARGEST:
+            raise self.error(key, f"expected a finite number, found {value!r:.80}")
+        return float(value)
 
     def positive(self, key: str, default: float) -> float:
         """Return a number above 0."""
-        found = self.number(key, default)
-        if found <= 0.0:
-            raise self.error(key, f"expected a number above 0, found {found:g}")
-        return found
+        value = self.number(key, default)
+        if value <= 0.0:
+            raise self.error(key, f"expected a number above 0, found {value:g}")
+        return value
 
     def whole(self, key: str, default: int) -> int:
         """Return a whole number; 256.0 counts as whole."""
-        found = self.number(key, default)
-        if found != int(found):
-            raise self.error(key, f"expected a whole number, found {found:g}")
-        return int(found)
+        value = self.number(key, default)
+        if value != int(value):
+            raise self.error(key, f"expected a whole number, found {value:g}")
+        return int(value)
 
     def numbers(self, keys: str, default: float = 0.0) -> list[float]:
         """Return the numbers of several keys, given with blanks between."""
@@ -140,24 +140,24 @@ class Keys:
 
     def mount(self, position: Vector3 = ZERO, orientation: Vector3 = ZERO) -> dict[str, Any]:
         """Return our `position` and `orientation`; the arguments replace missing numbers."""
-        found: dict[str, Any] = {}
+        pose: dict[str, Any] = {}
         places = (("position", "X Y Z", position), ("orientation", "Roll Pitch Yaw", orientation))
         for ours, keys, usual in places:
             given = self.numbers(keys, math.nan)
             if not all(map(math.isnan, given)):
                 pairs = zip(given, usual, strict=True)
-                found[ours] = [other if math.isnan(each) else each for each, other in pairs]
-        return found
+                pose[ours] = [other if math.isnan(number) else number for number, other in pairs]
+        return pose
 
     def flag(self, key: str, default: bool = False) -> bool:
         """Return true or false."""
-        found = self._get(key, bool, "true or false")
-        return default if found is None else bool(found)
+        value = self._get(key, bool, "true or false")
+        return default if value is None else bool(value)
 
     def text(self, key: str, default: str = "") -> str:
         """Return a text."""
-        found = self._get(key, str, "a text")
-        return default if found is None else str(found)
+        value = self._get(key, str, "a text")
+        return default if value is None else str(value)
 
     def table(self, key: str) -> Keys:
         """Return an inner object; empty if missing."""
@@ -171,8 +171,8 @@ class Keys:
 
     def entries(self, key: str) -> Iterator[Keys]:
         """Yield the objects of an inner list."""
-        found = enumerate(self._get(key, list, "a list") or ())
-        inner = Keys({f"{key}[{index}]": each for index, each in found}, self._path, self._notes)
+        listed = enumerate(self._get(key, list, "a list") or ())
+        inner = Keys({f"{key}[{index}]": value for index, value in listed}, self._path, self._notes)
         for name in inner._table:
             yield inner.table(name)
 
@@ -194,12 +194,12 @@ class Keys:
 
     def _get(self, key: str, type_: Any, expected: str) -> Any:
         self._asked.append(key)
-        found = self._table.get(key)
-        if found is None or (
-            isinstance(found, type_) and isinstance(found, bool) == (type_ is bool)
+        value = self._table.get(key)
+        if value is None or (
+            isinstance(value, type_) and isinstance(value, bool) == (type_ is bool)
         ):
-            return found
-        raise self.error(key, f"expected {expected}, found {found!r:.80}")
+            return value
+        raise self.error(key, f"expected {expected}, found {value!r:.80}")
 
     def _at(self, key: str) -> str:
         between = "." if key and not self._path.endswith(": ") else ""

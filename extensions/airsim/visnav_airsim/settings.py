@@ -76,9 +76,9 @@ def read(text: str, path: str, warn: Callable[[str], None], world: str = "hall")
         ConfigError: It is no JSON, or a value's type or request is not supported.
     """
     name = Path(path).name
-    found, strict, oddities = parse(text, name)
+    document, strict, oddities = parse(text, name)
     notes = [f"{name}: {oddity}" for oddity in oddities]
-    table = _configuration(Keys(found, f"{name}: ", notes), strict, world)
+    table = _configuration(Keys(document, f"{name}: ", notes), strict, world)
     for line in dict.fromkeys(notes):
         warn(line)
     return table
@@ -181,7 +181,7 @@ def _recording(keys: Keys) -> Table:
     folder = re.sub(r"[^\w-]", "_", PurePath(given).name, flags=re.ASCII) or "recording"
     if folder != given:
         keys.note("Folder", f'it is "{folder}" in the run\'s folder')
-    found: Table = {
+    recording: Table = {
         "enabled": keys.flag("Enabled"),
         "on_move": keys.flag("RecordOnMove"),
         "interval": keys.positive("RecordInterval", 0.05),
@@ -195,10 +195,10 @@ def _recording(keys: Keys) -> Table:
             "compress": entry.flag("Compress", True),
             "vehicle": entry.text("VehicleName"),
         }
-        found.setdefault("images", []).append(image)
+        recording.setdefault("images", []).append(image)
         entry.done()
     keys.done()
-    return found
+    return recording
 
 
 def _cameras(vehicle_name: str, vehicle: Keys, settings: Keys, free: bool) -> list[Table]:
@@ -208,7 +208,7 @@ def _cameras(vehicle_name: str, vehicle: Keys, settings: Keys, free: bool) -> li
     """
     defaults = settings.table("CameraDefaults")
     usual = _captures(defaults)
-    found: dict[str, Table] = {
+    cameras: dict[str, Table] = {
         names[0]: {"captures": list(usual.values())} for names, _, _ in DEFAULT_CAMERAS if usual
     }
     for name, keys in vehicle.tables("Cameras"):
@@ -216,8 +216,8 @@ def _cameras(vehicle_name: str, vehicle: Keys, settings: Keys, free: bool) -> li
         place = dict(zip(("position", "orientation"), default_mount(name, free), strict=True))
         mount = defaults.mount(**place)
         mount |= keys.mount(**(place | mount))
-        found[name] = {**mount, "captures": list(captures.values())}
-        looks = {(each["width"], each["height"], each["fov"]) for each in captures.values()}
+        cameras[name] = {**mount, "captures": list(captures.values())}
+        looks = {(c["width"], c["height"], c["fov"]) for c in captures.values()}
         if len(looks) > 1:
             keys.note("CaptureSettings", "the types of image differ in size or field of view")
         elif 0 in captures and not {1, 2, 3} & set(captures):
@@ -225,16 +225,16 @@ def _cameras(vehicle_name: str, vehicle: Keys, settings: Keys, free: bool) -> li
         keys.done()
     defaults.mount()  # known, even if no camera asks for it
     defaults.done()
-    return [{"name": name, "vehicle": vehicle_name, **each} for name, each in found.items()]
+    return [{"name": name, "vehicle": vehicle_name, **camera} for name, camera in cameras.items()]
 
 
 def _captures(keys: Keys) -> dict[int, Table]:
     """Return how images are taken, by type; of equal types the last entry counts."""
-    found: dict[int, Table] = {}
+    captures: dict[int, Table] = {}
     for entry in keys.entries("CaptureSettings"):
         type_ = entry.whole("ImageType", 0)
         size = {"width": entry.whole("Width", 256), "height": entry.whole("Height", 144)}
-        found[type_] = {"image_type": type_, **size, "fov": entry.number("FOV_Degrees", 90.0)}
+        captures[type_] = {"image_type": type_, **size, "fov": entry.number("FOV_Degrees", 90.0)}
         projection = entry.text("ProjectionMode") or "perspective"
         if projection.casefold() != "perspective":
             raise entry.error("ProjectionMode", f'expected "perspective", found {projection!r:.80}')
@@ -246,7 +246,7 @@ def _captures(keys: Keys) -> dict[int, Table]:
             entry.note("", "ignored: images on demand are without errors")
     if keys.table("Gimbal").number("Stabilization", 0.0):
         keys.note("Gimbal", "ignored: cameras turn with their vehicle")
-    return {type_: each for type_, each in found.items() if type_ in _IMAGE_TYPES}
+    return {type_: capture for type_, capture in captures.items() if type_ in _IMAGE_TYPES}
 
 
 def _sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str, Any]:
@@ -262,8 +262,8 @@ def _sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str,
         server["sensor_names"]["gps"] = "gnss"
     listed = list(_known(vehicle.tables("Sensors")))
     types = {type_ for _, _, type_ in listed}
-    found: dict[str, Any] = {}
-    for name, keys, type_ in [*listed, *(each for each in _known(usual) if each[2] not in types)]:
+    sensors: dict[str, Any] = {}
+    for name, keys, type_ in [*listed, *(s for s in _known(usual) if s[2] not in types)]:
         setting, enabled = _SETTINGS[type_], keys.flag("Enabled")
         if "Enabled" not in keys:
             keys.note("", "ignored: a sensor is off unless Enabled is true")
@@ -271,14 +271,14 @@ def _sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str,
             ours = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
             if type_ == 6 and (frame := keys.text("DataFrame")):
                 server["lidar_frame"] = frame
-            found.setdefault(setting, []).append({"name": ours} | _sensor(keys, type_))
+            sensors.setdefault(setting, []).append({"name": ours} | _sensor(keys, type_))
             server["sensor_names"][name] = ours
-        elif enabled and setting not in found:
-            found[setting] = _sensor(keys, type_)
+        elif enabled and setting not in sensors:
+            sensors[setting] = _sensor(keys, type_)
             server["sensor_names"][name] = setting
         elif enabled:
             keys.note("", f"ignored: a vehicle has one {setting}")
-    return {"imu": _imu(Keys({}, "", []))} | found  # it always has one
+    return {"imu": _imu(Keys({}, "", []))} | sensors  # it always has one
 
 
 def _known(listed: Iterable[tuple[str, Keys]]) -> Iterable[tuple[str, Keys, int]]:
@@ -290,20 +290,20 @@ def _known(listed: Iterable[tuple[str, Keys]]) -> Iterable[tuple[str, Keys, int]
 
 
 def _sensor(keys: Keys, type_: int) -> dict[str, Any]:
-    found: dict[str, Any] = {**_DIFFERENT.get(type_, {}), **keys.mount()}
+    sensor: dict[str, Any] = {**_DIFFERENT.get(type_, {}), **keys.mount()}
     common = {"UpdateFrequency": "rate"} if type_ not in {2, 6} else {}
     for key, ours in (_NUMBERS.get(type_, {}) | common).items():
         if (value := keys.number(key, None)) is not None:
-            found[ours] = value * _UNITS.get(key, 1.0)
+            sensor[ours] = value * _UNITS.get(key, 1.0)
     for key, ours in (("UpdateLatency", "latency"), ("StartupDelay", "startup_delay")):
         if type_ != 2 and (value := keys.number(key, None)) is not None:
-            found[ours] = f"{value!r}s"
+            sensor[ours] = f"{value!r}s"
     if type_ == 2:
-        found |= _imu(keys)
+        sensor |= _imu(keys)
     if type_ == 6:
-        found |= _lidar(keys)
+        sensor |= _lidar(keys)
     keys.done()
-    return found
+    return sensor
 
 
 def _imu(keys: Keys) -> dict[str, Any]:

@@ -93,15 +93,15 @@ def decode(message: bytes) -> Request | Reply:
     """Return the message in these bytes, invalid UTF-8 replaced, or raise a `WireFormatError`."""
     left = MOST_LISTS
 
-    def count(each: Any) -> Any:
+    def count(container: Any) -> Any:
         nonlocal left
         left -= 1
         if left < 0:
             raise WireFormatError(f"expected at most {MOST_LISTS} lists and maps, found more")
-        return each
+        return container
 
     try:
-        found = msgpack.unpackb(
+        decoded = msgpack.unpackb(
             message,
             raw=False,
             unicode_errors="replace",
@@ -114,14 +114,14 @@ def decode(message: bytes) -> Request | Reply:
         raise
     except Exception as error:  # of many kinds, by the bytes
         raise WireFormatError(f"expected msgpack, found {type(error).__name__}: {error}") from None
-    match found:
+    match decoded:
         case [0, int(id_), str(method), list(arguments)]:
             return Request(id_, method, arguments)
         case [1, int(id_), error, result]:
             return Reply(id_, error, result)
         case [2, str(method), list(arguments)]:
             return Request(None, method, arguments)
-    raise WireFormatError(f"expected a request or a reply, found {reprlib.repr(found)}")
+    raise WireFormatError(f"expected a request or a reply, found {reprlib.repr(decoded)}")
 
 
 _encode = msgspec.msgpack.Encoder().encode

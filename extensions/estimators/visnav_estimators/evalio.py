@@ -167,13 +167,13 @@ class EvalioProcess:
         """
         types, pipeline = self._types, self._pipeline
         for time, *rest in samples.tolist():
-            gyro, force = (np.array(each) * (1, -1, -1) for each in (rest[:3], rest[3:]))
+            gyro, force = (np.array(vector) * (1, -1, -1) for vector in (rest[:3], rest[3:]))
             pipeline.add_imu(types.ImuMeasurement(types.Stamp.from_nsec(int(time)), gyro, force))
         near, far = self._limits
         distances = np.linalg.norm(points, axis=1)
         usable = (distances > near) & (distances < far)  # and so no NaN
-        if (found := int(usable.sum())) < self._min_points:
-            return self._lost(f"{found} points, expected {self._min_points}")
+        if (count := int(usable.sum())) < self._min_points:
+            return self._lost(f"{count} points, expected {self._min_points}")
         cloud = self._cloud(points, times, rings, usable)
         pipeline.add_lidar(types.LidarMeasurement(types.Stamp.from_nsec(stamp), cloud))
         poses = [pose for at, pose in pipeline.saved_estimates() if at.to_nsec() == stamp]
@@ -286,8 +286,8 @@ class Evalio(Estimator[EvalioConfig]):
 
     async def on_ready(self) -> None:
         """Start the pipeline, in a process of its own."""
-        told = self.config, self.the_lidar(), self.imu_announcement
-        self._pipeline = await self.start_tracker(EvalioProcess, *told)
+        arguments = self.config, self.the_lidar(), self.imu_announcement
+        self._pipeline = await self.start_tracker(EvalioProcess, *arguments)
 
     async def run(self) -> None:
         """Track each scan; estimates start with the first scan of enough points."""

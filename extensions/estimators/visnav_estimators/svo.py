@@ -162,20 +162,22 @@ def _matrix(transform: Any) -> Floats:
     quaternion (x, y, z, w) and a translation. Raises `RuntimeError` if it contradicts the module's
     methods.
     """
-    said = np.ravel(transform.translation())
+    translation = np.ravel(transform.translation())
     centre = np.ravel(transform.inverse().translation())
-    if not np.isfinite([said, centre]).all():
+    if not np.isfinite([translation, centre]).all():
         return np.full((4, 4), np.nan)
     address = ctypes.c_void_p.from_address(id(transform) + object.__basicsize__).value
     assert address is not None
     *quaternion, tx, ty, tz = (ctypes.c_double * 7).from_address(address)
     x, y, z, w = quaternion
     matrix = pose_matrix((tx, ty, tz), (w, x, y, z))
-    found = [np.linalg.norm(quaternion), tx, ty, tz, *(matrix[:3, :3] @ centre + matrix[:3, 3])]
-    if not np.allclose(found, [1.0, *said, 0.0, 0.0, 0.0], atol=1e-6 * (1 + abs(centre).max())):
+    actual = [np.linalg.norm(quaternion), tx, ty, tz, *(matrix[:3, :3] @ centre + matrix[:3, 3])]
+    if not np.allclose(
+        actual, [1.0, *translation, 0.0, 0.0, 0.0], atol=1e-6 * (1 + abs(centre).max())
+    ):
         raise RuntimeError(
             "expected svo_cpp's poses as in release 1.5 (a quaternion and a translation), found "
-            f"a quaternion of length {found[0]:g} and {tx:g}, {ty:g}, {tz:g}: {INSTALL}"
+            f"a quaternion of length {actual[0]:g} and {tx:g}, {ty:g}, {tz:g}: {INSTALL}"
         )
     return matrix
 

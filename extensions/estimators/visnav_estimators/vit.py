@@ -85,8 +85,8 @@ ImuCalibration: u32 imu, double rate, InertialCalibration accel, InertialCalibra
 def _structure(line: str) -> type[c.Structure]:
     """Return the structure of a line: its name, and its fields as C declares them."""
     name, _, declarations = line.partition(": ")
-    found = re.findall(r"(\w+) (\w+)(?:\[(\d+)\])?", declarations)
-    fields = [(field, _TYPES[kind] * int(n) if n else _TYPES[kind]) for kind, field, n in found]
+    members = re.findall(r"(\w+) (\w+)(?:\[(\d+)\])?", declarations)
+    fields = [(field, _TYPES[kind] * int(n) if n else _TYPES[kind]) for kind, field, n in members]
     made = _TYPES[name] = type(name, (c.Structure,), {"_fields_": fields})
     return made
 
@@ -116,16 +116,16 @@ class Library:
         except (OSError, AttributeError) as error:
             raise VitError(f"expected a library with the VIT interface, found {error}") from None
         if version[0].value not in {1, 2, 3}:
-            found = ".".join(str(part.value) for part in version)
-            raise VitError(f"{path}: expected version 1 to 3 of the VIT interface, found {found}")
+            actual = ".".join(str(part.value) for part in version)
+            raise VitError(f"{path}: expected version 1 to 3 of the VIT interface, found {actual}")
         given = Config(None if config is None else str(config).encode(), cameras, 1, False)
         self._call("tracker_create", c.byref(given), c.byref(self._tracker))
 
     def start(self, calibrations: Sequence[c.Structure]) -> None:
         """Add the calibrations to the tracker, and start its threads."""
-        for each in calibrations:
-            kind = "imu" if isinstance(each, ImuCalibration) else "camera"
-            self._do(f"add_{kind}_calibration", c.byref(each))
+        for calibration in calibrations:
+            kind = "imu" if isinstance(calibration, ImuCalibration) else "camera"
+            self._do(f"add_{kind}_calibration", c.byref(calibration))
         self._do("start")
 
     def push(self, stamp: int, images: Sequence[Grey], samples: Sequence[Imu]) -> None:
@@ -138,11 +138,11 @@ class Library:
         self._do("is_running", c.byref(running))
         if not running.value:
             raise VitError(f"{self._path}: expected a tracker that runs, found one that does not")
-        stamped = [(each.stamp, each) for each in samples]
+        stamped = [(sample.stamp, sample) for sample in samples]
         if stamped and stamped[-1][0] <= stamp:
             stamped.append((stamp + 1, stamped[-1][1]))
-        for at, each in stamped:
-            sample = ImuSample(at, each.linear_acceleration, each.angular_velocity)
+        for at, measurement in stamped:
+            sample = ImuSample(at, measurement.linear_acceleration, measurement.angular_velocity)
             self._do("push_imu_sample", c.byref(sample))
         for number, image in enumerate(images):
             (height, width), stride = image.shape, image.strides[0]
@@ -178,8 +178,8 @@ class Library:
         """Call a function; a result above 0 is a remark and no error."""
         result = getattr(self._library, f"vit_{name}")(*arguments)
         if result < 0:
-            found = dict(enumerate(RESULTS, 1)).get(-result, result)
-            raise VitError(f"{self._path}: expected vit_{name} to succeed, found VIT_ERROR_{found}")
+            code = dict(enumerate(RESULTS, 1)).get(-result, result)
+            raise VitError(f"{self._path}: expected vit_{name} to succeed, found VIT_ERROR_{code}")
 
 
 FOLDER = "$VISNAV_FOLDER"  # stands in a configuration for the folder of the calibration's files
@@ -235,17 +235,17 @@ class VitTracker:
             for camera, image in zip(self._rig.cameras, images, strict=True)
         ]
         self._library.push(stamp, grey, samples)
-        found: list[tuple[int, TrackingResult]] = []
+        results: list[tuple[int, TrackingResult]] = []
         until = time.monotonic() + wait
-        while not found or abs(found[-1][0] - stamp) > _TOLERANCE:
+        while not results or abs(results[-1][0] - stamp) > _TOLERANCE:
             data = self._library.pop()
             if data is not None:
-                found.append((data.stamp, self._result(data)))
+                results.append((data.stamp, self._result(data)))
             elif time.monotonic() >= until:
                 break
             else:
                 time.sleep(_POLL)
-        return found
+        return results
 
     def close(self) -> None:
         """End the library's threads."""
@@ -276,8 +276,8 @@ def _write(config: str, files: dict[str, str], folder: Path) -> Path | None:
     text = Path(config).read_text(encoding="utf-8") if config else ""
     if FOLDER in text:
         files = {Path(config).name: text.replace(FOLDER, str(folder)), **files}
-    for name, each in files.items():
-        (folder / name).write_text(each, encoding="utf-8")
+    for name, content in files.items():
+        (folder / name).write_text(content, encoding="utf-8")
     if config and FOLDER not in text:
         return Path(config)  # beside the files that it may name
     return folder / next(iter(files)) if files else None
@@ -412,12 +412,12 @@ class Vit(Estimator[VitConfig]):
                 files = write_files(rig, config.calibration, topics=False)
             except ValueError as error:
                 self.log.fatal("calibration: %s", error)
-            for each in left_out(rig, config.calibration):
-                self.log.warning("calibration: %s", each)
+            for omission in left_out(rig, config.calibration):
+                self.log.warning("calibration: %s", omission)
         self._hold = self.hold(self.name, config.hold, config.latency)
-        told = config.library, config.config, files, rig
+        arguments = config.library, config.config, files, rig
         limit = config.hold.max_wait + 60.0
-        start = self.worker(VitTracker, *told, latency=config.latency, timeout=limit)
+        start = self.worker(VitTracker, *arguments, latency=config.latency, timeout=limit)
         self._tracker = await start
 
     async def run(self) -> None:
@@ -433,8 +433,8 @@ class Vit(Estimator[VitConfig]):
             early = not self._said and since < config.hold.initialise
             wait = patience_left(config.patience, since, began) if early else config.hold.max_wait
             pixels = [image.data for image in images]
-            told = stamp, pixels, samples, float(wait) if hold.expects else 0.0
-            for of, result in await self._tracker.call(VitTracker.track, *told):
+            arguments = stamp, pixels, samples, float(wait) if hold.expects else 0.0
+            for of, result in await self._tracker.call(VitTracker.track, *arguments):
                 self._said = True
                 hold.answer(of, result, "lost" if result.lost else "")
             if early and not owed.work.done():

@@ -69,8 +69,8 @@ class Gate:
         with self._lock:
             self._closed = True
             open_ = [self._listener, *self._open]
-        for each in open_:
-            _shut(each)
+        for connection in open_:
+            _shut(connection)
         self._listener.close()
 
     def check(self, head: str) -> None:
@@ -139,8 +139,8 @@ class Gate:
             if not self._holds(server):
                 return
             server.connect(self._inside)
-            for each in (viewer, server):
-                each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
+            for end in (viewer, server):
+                end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
             server.sendall(head + rest)
             back = threading.Thread(target=_pass_on, args=(server, viewer), daemon=True)
             back.start()
@@ -149,10 +149,10 @@ class Gate:
         except OSError:
             pass
         finally:
-            for each in (viewer, server):
+            for end in (viewer, server):
                 with self._lock:
-                    self._open.discard(each)
-                each.close()
+                    self._open.discard(end)
+                end.close()
 
 
 def _read_head(viewer: socket.socket) -> tuple[bytes, bytes]:

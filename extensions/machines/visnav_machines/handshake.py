@@ -191,8 +191,8 @@ class Handshakes:
                     tag = contact.member.sealing.tag
                     due.append((other, contact.nonce, contact.doubt, tag))
                 contact.doubt = b""
-        for each in due:
-            self._greet_one(*each)
+        for greeting in due:
+            self._greet_one(*greeting)
 
     def _greet(self) -> None:
         while not self._enough.wait(GREET_EVERY):
@@ -216,7 +216,7 @@ def what_all_share(config: Config) -> dict[str, Any]:
     """Return the settings common to all processes: no network, log, stall, or file folders."""
     table: dict[str, Any] = to_builtins(config)
     types = [spec.node.config_type for spec in config.nodes]
-    table["nodes"] = [file_names(*each) for each in zip(table["nodes"], types, strict=True)]
+    table["nodes"] = [file_names(*pair) for pair in zip(table["nodes"], types, strict=True)]
     return {
         **{key: value for key, value in table.items() if key != "network"},
         "run": {key: value for key, value in table["run"].items() if key not in {"log", "stall"}},
@@ -248,8 +248,8 @@ def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:
         )
 
 
-def _in_order(found: set[str], nodes: Sequence[str]) -> str:
-    return ", ".join(node for node in nodes if node in found)
+def _in_order(members: set[str], nodes: Sequence[str]) -> str:
+    return ", ".join(node for node in nodes if node in members)
 
 
 def _difference(mine: Any, other: Any, where: str = "") -> tuple[str, str, str] | None:
@@ -259,14 +259,14 @@ def _difference(mine: Any, other: Any, where: str = "") -> tuple[str, str, str] 
             if key not in mine or key not in other:
                 inside = f"{where}.{key}".strip(".")
                 return inside, *(show(t[key]) if key in t else "nothing" for t in (mine, other))  # type: ignore[return-value]
-            if found := _difference(mine[key], other[key], f"{where}.{key}".strip(".")):
-                return found
+            if difference := _difference(mine[key], other[key], f"{where}.{key}".strip(".")):
+                return difference
         return None
     if isinstance(mine, list | tuple) and isinstance(other, list | tuple):
         if len(mine) != len(other):
             return where, f"{len(mine)} entries", f"{len(other)} entries"
         for index, pair in enumerate(zip(mine, other, strict=True)):
-            if found := _difference(*pair, f"{where}[{index}]"):
-                return found
+            if difference := _difference(*pair, f"{where}[{index}]"):
+                return difference
         return None
     return None if mine == other else (where, show(mine), show(other))

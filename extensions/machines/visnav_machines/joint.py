@@ -81,7 +81,7 @@ class JointStart:
         """Send the announcements of the nodes here; return those of all, in file order."""
         self.say(
             Announcements(
-                {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in own.items()}
+                {name: tuple(bytes(pack(a).frame()) for a in sent) for name, sent in own.items()}
             )
         )
         membership = self._membership

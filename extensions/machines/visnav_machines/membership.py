@@ -345,8 +345,8 @@ class Membership:
         return [m for m in members if not (m.unfit or m.over)]
 
     def _missing(self) -> list[str]:
-        found = {*self.here, *(node for member in self._fitting() for node in member.nodes)}
-        return [node for node in self.nodes if node not in found]
+        present = {*self.here, *(node for member in self._fitting() for node in member.nodes)}
+        return [node for node in self.nodes if node not in present]
 
 
 class Waiting:

@@ -122,7 +122,9 @@ class Peers(Others):
         """Connect the listeners here to outputs elsewhere, and notify the others."""
         self._remote.connect(listeners, fault)
         self._start.say(
-            messages.Subscriptions(subscriptions(each for each in listeners if each.node != "run"))
+            messages.Subscriptions(
+                subscriptions(listener for listener in listeners if listener.node != "run")
+            )
         )
 
     def stopping(self, reason: str, error: Exception | None, *, by: str, from_peer: bool) -> None:
@@ -380,7 +382,7 @@ class RemoteEvents:
     def wants(self, process: int, wanted: tuple[messages.Subscription, ...]) -> None:
         """Record the subscriptions of a process, empty if gone; `WireError` for unknown events."""
         self._wanted[process] = [
-            _Wanted(tuple(map(event_type, each.kinds)), each.source, each.latest) for each in wanted
+            _Wanted(tuple(map(event_type, want.kinds)), want.source, want.latest) for want in wanted
         ]
 
     def listeners(self, output: str) -> list[Listener]:
@@ -434,29 +436,29 @@ class RemoteListener(Listener):
 
     def may_receive(self, event: type[Event]) -> bool:
         """Return whether anything there can receive from an output of this type."""
-        return any(each.may_receive(event) for each in self._wanted)
+        return any(wanted.may_receive(event) for wanted in self._wanted)
 
     def receives_all(self, event: type[Event]) -> bool:
         """Return whether any listener there receives all events of an output of this type."""
-        return any(each.receives_all(event) for each in self._wanted)
+        return any(wanted.receives_all(event) for wanted in self._wanted)
 
     def receives(self, event: type[Event], source: str) -> bool:
         """Return whether anything there receives events of this very type from this source."""
-        return any(each.receives(event, source) for each in self._wanted)
+        return any(wanted.receives(event, source) for wanted in self._wanted)
 
     def offer(self, event: Event) -> None:
         """Send an event there."""
         key = (type(event), event.source)
         skip = self._may_skip.get(key)
         if skip is None:
-            skip = all(each.latest for each in self._wanted if each.receives(*key))
+            skip = all(wanted.latest for wanted in self._wanted if wanted.receives(*key))
             self._may_skip[key] = skip
         self._leave(self._process, self._output, event, skip)
 
 
 def subscriptions(listeners: Iterable[Listener]) -> tuple[messages.Subscription, ...]:
     """Return the subscriptions of these listeners, for other processes."""
-    found = {
+    unique = {
         messages.Subscription(
             kinds=tuple(kind_of(event) for event in listener.events),
             source=listener.source,
@@ -466,4 +468,4 @@ def subscriptions(listeners: Iterable[Listener]) -> tuple[messages.Subscription,
         ): None
         for listener in listeners
     }
-    return tuple(found)
+    return tuple(unique)

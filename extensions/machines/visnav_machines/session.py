@@ -201,8 +201,8 @@ def certified(network: NetworkConfig) -> bool:
 
 
 def _endpoints(configuration: zenoh.Config, way: str) -> list[str]:
-    found = json.loads(configuration.get_json(f"{way}/endpoints"))
-    return found if isinstance(found, list) else [e for each in found.values() for e in each]
+    ends = json.loads(configuration.get_json(f"{way}/endpoints"))
+    return ends if isinstance(ends, list) else [e for group in ends.values() for e in group]
 
 
 def _warn_if_open(configuration: zenoh.Config) -> None:
@@ -260,8 +260,8 @@ class ForgedError(WireError):
 def derive(secret: bytes, *about: str | bytes) -> bytes:
     """Return a key (32 bytes) for a single purpose, derivable only with the secret."""
     mac = hashlib.blake2b(key=hashlib.sha256(secret).digest(), digest_size=32)
-    for each in about:
-        part = each.encode() if isinstance(each, str) else each
+    for value in about:
+        part = value.encode() if isinstance(value, str) else value
         mac.update(len(part).to_bytes(4, "little") + part)
     return mac.digest()
 
@@ -289,16 +289,16 @@ class Seal:
         tag = self._tag(head, message, payload)
         if not hmac.compare_digest(tag, sealed[_HEAD.size : _HEAD.size + _TAG]):
             raise ForgedError("expected a message of this run, found another seal")
-        version, found, _ = _HEAD.unpack(head)
+        version, received, _ = _HEAD.unpack(head)
         if version != VERSION:
             raise PeerError(
                 f"expected a process that speaks version {VERSION} of the messages, found "
                 f"version {version}: install the same on both sides"
             )
-        if found < number:
-            raise ForgedError(f"expected message {number}, found message {found} again")
-        if found > number:
-            raise WireError(f"expected message {number}, found {found}: some are lost")
+        if received < number:
+            raise ForgedError(f"expected message {number}, found message {received} again")
+        if received > number:
+            raise WireError(f"expected message {number}, found {received}: some are lost")
         return message
 
     def _tag(self, head: bytes, message: bytes, payload: bytes) -> bytes:
@@ -352,18 +352,18 @@ def secret_of(setting: str) -> bytes:
     """Return a run's secret by `network.secret`; `PeerError` without one, or if others read it."""
     kind, _, name = setting.partition(":")
     if kind == "env":
-        found = os.environ.get(name, "")
+        secret = os.environ.get(name, "")
     elif kind == "file":
-        found = _read(Path(name).expanduser())
+        secret = _read(Path(name).expanduser())
     else:
-        found = setting or _of_this_user()
-    if len(found) < SHORTEST:
+        secret = setting or _of_this_user()
+    if len(secret) < SHORTEST:
         where = setting if kind in {"env", "file"} else "the file"
         raise PeerError(
             f"network.secret: expected at least {SHORTEST} characters in {where}, found "
-            f"{len(found)}"
+            f"{len(secret)}"
         )
-    return found.encode()
+    return secret.encode()
 
 
 def _of_this_user() -> str:

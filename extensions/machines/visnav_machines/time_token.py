@@ -81,10 +81,10 @@ class TimeTokenHolder:
         self._next = None
         self._oldest = self._epoch + 1
         self._report_due = True
-        for each in new:
-            self._received[each] = 0
-            self._sent[self._me][each] = 0
-            self._inbox = [item for item in self._inbox if item[0] != each]
+        for process in new:
+            self._received[process] = 0
+            self._sent[self._me][process] = 0
+            self._inbox = [item for item in self._inbox if item[0] != process]
         self._outbox = [item for item in self._outbox if item[0] in self._alive]
 
     def suspend(self) -> None:
@@ -222,9 +222,9 @@ class TimeTokenHolder:
             self._send(maker, standing, None)
 
     def _resume(self) -> None:
-        found = [self._reports.get(n) for n in sorted(self._alive)]
+        reports = [self._reports.get(n) for n in sorted(self._alive)]
         if min(self._alive, default=-1) != self._me or any(
-            s is None or s.processes != self._ids for s in found
+            s is None or s.processes != self._ids for s in reports
         ):
             return
         standings = {n: self._reports.pop(n) for n in self._alive}

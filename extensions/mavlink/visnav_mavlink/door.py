@@ -118,7 +118,7 @@ class Door:
                 return
             stamp, covariance, q = message.time_usec, message.pose_covariance, message.q
             size = math.hypot(*q)
-            orientation = tuple(each / size for each in q) if 0.5 < size < 2.0 else ()
+            orientation = tuple(value / size for value in q) if 0.5 < size < 2.0 else ()
         else:
             stamp, covariance = message.usec, message.covariance
             angles = message.roll, message.pitch, message.yaw

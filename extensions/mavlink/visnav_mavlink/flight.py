@@ -179,12 +179,12 @@ class Flight:
             above = vehicle.origin[2] - home[2] if _GLOBAL[frame] else 0.0
             if not (math.isfinite(z) and abs(x) <= 9e8 and abs(y) <= 18e8):
                 return None
-            found = from_geodetic((x * 1e-7, y * 1e-7, z + above), vehicle.origin)
+            position = from_geodetic((x * 1e-7, y * 1e-7, z + above), vehicle.origin)
         elif frame == mav.MAV_FRAME_LOCAL_NED:
-            found = (x, y, z)
+            position = (x, y, z)
         else:
             return None
-        return found if all(abs(each) <= FARTHEST for each in found) else None
+        return position if all(abs(coordinate) <= FARTHEST for coordinate in position) else None
 
     def _arm(self, numbers: Sequence[float], now: int) -> int:  # noqa: ARG002
         vehicle = self._vehicle
@@ -359,7 +359,7 @@ class Flight:
         size = math.hypot(*message.q)
         if not (math.isfinite(size) and math.isfinite(thrust) and size > 0.5):
             return self._no_setpoint("SET_ATTITUDE_TARGET with no attitude")
-        turned = tuple(each / size for each in message.q)
+        turned = tuple(part / size for part in message.q)
         return ev.AttitudeSetpoint, {"orientation": turned, "thrust": thrust}
 
     def _no_setpoint(self, what: str) -> tuple[type[Setpoint], dict[str, Any]] | None:

@@ -197,7 +197,7 @@ class Links:
     def _hang_up(self, peer: Peer) -> None:
         self._loop.remove_reader(peer.end)
         self._loop.remove_writer(peer.end)
-        self.peers = [each for each in self.peers if each is not peer]
+        self.peers = [other for other in self.peers if other is not peer]
         peer.end.close()
 
 
@@ -242,7 +242,7 @@ class Wire:
             return None
         self._peer.settimeout(patience)
         try:
-            self._peer.sendall(b"".join(each.pack(self._parser) for each in messages))
+            self._peer.sendall(b"".join(message.pack(self._parser) for message in messages))
         except TimeoutError:
             raise
         except OSError as error:
@@ -263,10 +263,10 @@ class Wire:
                 data = b""
             if not data and not self._closed:
                 raise ConnectionError(f"PX4 has gone after {self.answers} answers")
-            for found in self._parser.parse_buffer(data) or ():
-                if found.get_type() == "HIL_ACTUATOR_CONTROLS":
+            for message in self._parser.parse_buffer(data) or ():
+                if message.get_type() == "HIL_ACTUATOR_CONTROLS":
                     self.answers += 1
-                    return found
+                    return message
         return None
 
     def close(self) -> None:
@@ -296,7 +296,7 @@ def sensors(imu: Imu, field: MagneticField | None, pressure: FluidPressure | Non
 
 def satellites(fix: NavSatFix) -> Any:
     """Return a ``HIL_GPS`` of a fix."""
-    north, east, down = (round(100 * each) for each in fix.velocity)
+    north, east, down = (round(100 * speed) for speed in fix.velocity)
     place = round(1e7 * fix.latitude), round(1e7 * fix.longitude), round(1e3 * fix.altitude)
     speed = round((north**2 + east**2) ** 0.5)
     kind = mav.GPS_FIX_TYPE_3D_FIX if fix.status >= 0 else mav.GPS_FIX_TYPE_NO_FIX
@@ -308,5 +308,5 @@ def satellites(fix: NavSatFix) -> Any:
 def motors(answer: Any) -> tuple[bool, tuple[float, ...]]:
     """Return whether PX4 has armed, and its first motors' commands, 0 to 1 of full thrust."""
     armed = bool(answer.mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
-    values = (each if each == each else 0.0 for each in answer.controls[:MOTORS])
-    return armed, tuple(min(max(each, 0.0), 1.0) for each in values)
+    values = (control if control == control else 0.0 for control in answer.controls[:MOTORS])
+    return armed, tuple(min(max(value, 0.0), 1.0) for value in values)

@@ -117,7 +117,7 @@ class Mavlink(VehicleController[MavlinkConfig]):
             return
         from visnav_mavlink.door import Door
 
-        origins = [getattr(each.config, "origin", None) for each in self.siblings(Node)]
+        origins = [getattr(node.config, "origin", None) for node in self.siblings(Node)]
         origin = next(filter(None, origins), ORIGIN)
         self._door = Door(self.config, origin, self._act, self._see, self.clock.now, self.log)
         self._door.open()
@@ -148,8 +148,8 @@ class Mavlink(VehicleController[MavlinkConfig]):
             yield f'telemetry: expected an estimator, found "{wanted}"; there are: {there}'
         speed = self.stepping.target_speed
         if not self.stepping.fixed() and (speed is None or speed > 1.0):
-            found = "no limit" if speed is None else f"{speed:g}"
-            yield f"expected run.speed = 1.0 or less, for programs keep real time, found {found}"
+            shown = "no limit" if speed is None else f"{speed:g}"
+            yield f"expected run.speed = 1.0 or less, for programs keep real time, found {shown}"
 
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
@@ -252,11 +252,11 @@ class Px4(VehicleController[Px4Config]):
     def check(self) -> Iterable[str]:
         """Say what is missing, or cannot be what PX4 expects."""
         if len(self._vehicles) != 1:
-            found = ", ".join(self._vehicles) or "none"
-            yield f"expected one vehicle whose motors to drive, found {found}: set vehicle"
-        for each in self._imus:
-            if each.orientation != LEVEL:
-                yield f"expected an IMU along the body's axes, found {each.source} turned"
+            names = ", ".join(self._vehicles) or "none"
+            yield f"expected one vehicle whose motors to drive, found {names}: set vehicle"
+        for imu in self._imus:
+            if imu.orientation != LEVEL:
+                yield f"expected an IMU along the body's axes, found {imu.source} turned"
         if not self._imus:
             yield "expected an IMU, found none: add one to the vehicle"
 

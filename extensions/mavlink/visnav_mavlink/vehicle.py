@@ -148,7 +148,7 @@ def _local_position(v: Vehicle, ms: int) -> Any:
 def _global_position(v: Vehicle, ms: int) -> Any:
     if not v.gps:
         return None
-    speeds = [round(100 * each) for each in v.velocity]
+    speeds = [round(100 * speed) for speed in v.velocity]
     relative = round(1e3 * v.height)
     return mav.MAVLink_global_position_int_message(
         ms, *v.place(v.position), relative, *speeds, _heading(v)
@@ -271,8 +271,8 @@ class Telemetry:
 
     def tell(self, number: int, now: int) -> bool:
         """Send a message now; `False` if there is none."""
-        found = TELEMETRY.get(number)
-        message = found[1](self._vehicle, now // 1_000_000 % 2**32) if found else None
+        entry = TELEMETRY.get(number)
+        message = entry[1](self._vehicle, now // 1_000_000 % 2**32) if entry else None
         if message is not None:
             self._send(message)
         return message is not None

@@ -179,11 +179,11 @@ def decode(responses: Any, wanted: Sequence[Wanted], bgr: bool) -> ImageSet:
     Raises:
         ValueError: They are not what was asked for.
     """
-    found = msgspec.convert(responses, list[ImageResponse])
-    if len(found) != len(wanted) or not found:
-        raise ValueError(f"expected {len(wanted)} images, found {len(found)}")
-    result = ImageSet(found[0].time_stamp, {}, {}, [])
-    for (camera, kind), response in zip(wanted, found, strict=True):
+    decoded = msgspec.convert(responses, list[ImageResponse])
+    if len(decoded) != len(wanted) or not decoded:
+        raise ValueError(f"expected {len(wanted)} images, found {len(decoded)}")
+    result = ImageSet(decoded[0].time_stamp, {}, {}, [])
+    for (camera, kind), response in zip(wanted, decoded, strict=True):
         rows, columns = response.height, response.width
         data: Any = response.image_data_float if kind == "depth" else response.image_data_uint8
         channels = len(data) // max(rows * columns, 1)

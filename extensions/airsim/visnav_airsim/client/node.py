@@ -85,13 +85,13 @@ class AirsimClient(Node[AirsimClientConfig]):
         """Ask for everything to announce; a server's first images may take longer."""
         config = self.config
         call = functools.partial(self._state.call, limit=float(config.start_timeout))
-        self._remote = found = await ask(call, config, self.name, self.log.warning)
-        for camera in found.first.resampled:
+        self._remote = server = await ask(call, config, self.name, self.log.warning)
+        for camera in server.first.resampled:
             self.log.warning("%s: its depth has another size than its image: resampled", camera)
-        speed, limit = found.clock_speed, float(config.call_timeout)
+        speed, limit = server.clock_speed, float(config.call_timeout)
         if speed != 1.0 and not self._lockstep:
             self.log.warning("expected a ClockSpeed of 1 in real time, found %g", speed)
-        what = self._where, found.vehicle, found.cosys, found.wanted, limit
+        what = self._where, server.vehicle, server.cosys, server.wanted, limit
         self._source: Worker[ImageSource] = await self.worker(
             ImageSource, *what, timeout=2.0 * limit + 10.0
         )
@@ -102,7 +102,7 @@ class AirsimClient(Node[AirsimClientConfig]):
 
     def check(self) -> Iterable[str]:
         """Return why the server's time cannot be led."""
-        peers = (each.config for each in self.siblings(AirsimClient))
+        peers = (sibling.config for sibling in self.siblings(AirsimClient))
         if self._lockstep and [(p.host, p.port) for p in peers].count(self._where) > 1:
             yield "port: expected one AirsimClient for each server in lockstep, found several"
 
@@ -187,10 +187,10 @@ class AirsimClient(Node[AirsimClientConfig]):
                     self.counts["gaps between samples of the IMU"] += 1
                 self.imu.send(event)
         if state is not None:
-            found = self._made("state", state.timestamp, remote.odometry, state, origin)
-            if found is not None:
-                self._pose = found
-                self.odometry.send(found)
+            odometry = self._made("state", state.timestamp, remote.odometry, state, origin)
+            if odometry is not None:
+                self._pose = odometry
+                self.odometry.send(odometry)
 
     async def _follow(self, ahead: int) -> None:
         """In lockstep, wait for the server's present instant, `ahead` ns from now."""
@@ -208,11 +208,11 @@ class AirsimClient(Node[AirsimClientConfig]):
         await self.clock.sleep_until(self.clock.now() + ahead)
 
     async def _take_images(self) -> None:
-        found = await self._source.call_for(0.0, ImageSource.fetch)
-        if isinstance(found, str):
-            self._report("a set of images is lost", found)
+        images = await self._source.call_for(0.0, ImageSource.fetch)
+        if isinstance(images, str):
+            self._report("a set of images is lost", images)
         else:
-            self._send_images(found)
+            self._send_images(images)
         contact = await self._ask("simGetCollisionInfo", CollisionInfo, self._remote.vehicle)
         if contact is not None and contact.has_collided and self._pose is not None:
             known = contact, self._remote.origin, self._pose
@@ -221,21 +221,21 @@ class AirsimClient(Node[AirsimClientConfig]):
             if event is not None and not stands:
                 self.vehicle_events.send(event)
 
-    def _send_images(self, found: ImageSet) -> None:
+    def _send_images(self, images: ImageSet) -> None:
         outputs: tuple[tuple[str, Any, Any], ...] = (
             ("depth", self.depth_images, ev.DepthImage),
             ("segmentation", self.segmentation_images, ev.SegmentationImage),
             ("rgb", self.images, ev.Image),
         )
         for name, camera in self._remote.cameras.items():
-            known = found.poses[name], self._remote.origin
-            pose = self._made(name, found.stamp, remote.camera_pose, *known)
+            known = images.poses[name], self._remote.origin
+            pose = self._made(name, images.stamp, remote.camera_pose, *known)
             if pose is None:
                 continue
             self.camera_poses.send(pose)
             fields: Any = {"source": pose.source, "frame_id": camera.frame_id}
             for kind, output, event in outputs:
-                data = found.images.get((name, kind))
+                data = images.images.get((name, kind))
                 if data is not None and data.shape[:2] == (camera.info.height, camera.info.width):
                     output.send(event(stamp=pose.stamp, **fields, data=data))
                 elif data is not None:
@@ -313,7 +313,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             paused = await call("simIsPaused") is True
             self._was_paused = paused if self._connected == 1 else self._was_paused
             await call("simPause", True)
-        found = await self._relate()
+        state = await self._relate()
         if not config.takeover:
             return
         await self._commands.call("enableApiControl", True, vehicle)
@@ -323,7 +323,7 @@ class AirsimClient(Node[AirsimClientConfig]):
         self._orders = Orders(
             self._commands,
             vehicle,
-            found.landed_state == 1,
+            state.landed_state == 1,
             round(config.setpoint_timeout * SECOND),
             1.0 / config.control_rate,
             functools.partial(self._report, "refused by the server"),
@@ -332,8 +332,8 @@ class AirsimClient(Node[AirsimClientConfig]):
     async def _relate(self) -> MultirotorState:
         """Relate the server's clock to ours, with no stamp in the future."""
         before = self.clock.now()
-        found = await self._state.call("getMultirotorState", self._remote.vehicle)
-        state = msgspec.convert(found, MultirotorState)
+        reply = await self._state.call("getMultirotorState", self._remote.vehicle)
+        state = msgspec.convert(reply, MultirotorState)
         ahead = state.timestamp - self._shift - self._newest.get("state", 0)
         if not self._newest or not 0 <= ahead < _NEW_CLOCK:
             self._shift = state.timestamp - before

@@ -137,13 +137,13 @@ async def ask(
     if vehicle not in names:
         listed = ", ".join(names) or "none"
         raise ValueError(f'vehicle: expected one of the server\'s ({listed}), found "{vehicle}"')
-    said = _read(await call("getSettingsString"), log)
-    own: dict[str, Any] = next((n for n in said["nodes"] if n["name"] == vehicle), {})
+    settings = _read(await call("getSettingsString"), log)
+    own: dict[str, Any] = next((n for n in settings["nodes"] if n["name"] == vehicle), {})
     captured = {
-        each["name"]: {capture["image_type"]: capture for capture in each["captures"]}
-        for node in said["nodes"]
-        for each in node.get("cameras", ())
-        if each["vehicle"] == vehicle
+        camera["name"]: {capture["image_type"]: capture for capture in camera["captures"]}
+        for node in settings["nodes"]
+        for camera in node.get("cameras", ())
+        if camera["vehicle"] == vehicle
     }
     state = msgspec.convert(await call("getMultirotorState", vehicle), MultirotorState)
     kinematics = state.kinematics_estimated
@@ -163,28 +163,28 @@ async def ask(
         stamp=0, source=name, rate=config.imu_rate, frame_id=FRAME, **_noise(own)
     )
     wished = config.cameras or _cameras(captured)
-    wanted = tuple((each.name, kind) for each in wished for kind in each.images)
+    wanted = tuple((camera.name, kind) for camera in wished for kind in camera.images)
     taken = await call("simGetImages", *requests(wanted, vehicle, cosys))
     first = decode(taken, wanted, not cosys)
     cameras = {}
-    for each in wished:
-        found = await call("simGetCameraInfo", each.name, vehicle, *(() if cosys else (False,)))
-        info = msgspec.convert(found, CameraInfo)
-        height, width = first.images[each.name, each.images[0]].shape[:2]
+    for camera in wished:
+        reply = await call("simGetCameraInfo", camera.name, vehicle, *(() if cosys else (False,)))
+        info = msgspec.convert(reply, CameraInfo)
+        height, width = first.images[camera.name, camera.images[0]].shape[:2]
         # By the settings: AirSim reports another one.
-        fov = math.radians(captured.get(each.name, {}).get(0, {}).get("fov", info.fov))
+        fov = math.radians(captured.get(camera.name, {}).get(0, {}).get("fov", info.fov))
         (x, y, z), turn = pose_of(info.pose)
         apart = x - body[0][0], y - body[0][1], z - body[0][2]
-        cameras[each.name] = ev.CameraAnnouncement(
+        cameras[camera.name] = ev.CameraAnnouncement(
             stamp=0,
-            source=f"{name}/{each.name}",
-            images=each.images,
+            source=f"{name}/{camera.name}",
+            images=camera.images,
             # AirSim's users have the centre at W/2, from the image's corner. Here whole
             # coordinates are those of pixels' centres: the same point is at (W - 1)/2.
             info=ev.CameraInfo.from_fov(width, height, fov),
             rate=config.image_rate,
             latency=0.0,
-            frame_id=f"{name}/{each.name}_optical",
+            frame_id=f"{name}/{camera.name}_optical",
             parent_frame_id=FRAME,
             position=rotate_inverse(body[1], apart),
             orientation=normalize(multiply(multiply(inverse(body[1]), turn), OPTICAL_TO_FRD)),
@@ -193,7 +193,7 @@ async def ask(
         vehicle,
         cosys,
         origin,
-        said["run"]["speed"],
+        settings["run"]["speed"],
         wanted,
         first,
         (announced, imu, *cameras.values()),
@@ -214,7 +214,7 @@ def _read(text: Any, log: Callable[[str], None]) -> dict[str, Any]:
 def _noise(own: dict[str, Any]) -> dict[str, Any]:
     imu = own.get("imu") or settings.read("{}", "", lambda _: None)["nodes"][0]["imu"]
     sensors = ("gyroscope", "accelerometer")
-    names = [f"{each}_{what}" for each in sensors for what in ("noise_density", "random_walk")]
+    names = [f"{sensor}_{what}" for sensor in sensors for what in ("noise_density", "random_walk")]
     return {name: imu.get(name, 0.0) for name in names}
 
 
@@ -222,7 +222,7 @@ def _cameras(captured: dict[str, dict[int, Any]]) -> list[RemoteCamera]:
     """Return the cameras of the settings with the kinds they are set to capture, or ``0``."""
     cameras = []
     for name, captures in captured.items():
-        kinds: Any = tuple(dict.fromkeys(_KINDS[each] for each in captures if each in _KINDS))
+        kinds: Any = tuple(dict.fromkeys(_KINDS[kind] for kind in captures if kind in _KINDS))
         cameras.append(RemoteCamera(name=name, images=kinds or ("rgb", "depth")))
     return cameras or [RemoteCamera(name="0")]
 
@@ -232,8 +232,8 @@ async def _origin(
 ) -> ev.Vector3:
     """Return where a vehicle's local frame is: by where its pawn is, or else by the settings."""
     try:
-        found = await call("simGetObjectPose", vehicle, *((True,) if cosys else ()))
-        x, y, z = astuple(msgspec.convert(found, Pose).position)
+        reply = await call("simGetObjectPose", vehicle, *((True,) if cosys else ()))
+        x, y, z = astuple(msgspec.convert(reply, Pose).position)
         if math.isfinite(x + y + z):
             return x - local[0], y - local[1], z - local[2]
     except (RpcCallError, msgspec.ValidationError):
@@ -241,15 +241,15 @@ async def _origin(
     return (*own.get("position", (0.0, 0.0)), -own.get("height", 0.0))
 
 
-def pose_of(found: Pose, origin: ev.Vector3 = (0.0, 0.0, 0.0)) -> tuple[ev.Vector3, ev.Quaternion]:
+def pose_of(pose: Pose, origin: ev.Vector3 = (0.0, 0.0, 0.0)) -> tuple[ev.Vector3, ev.Quaternion]:
     """Return a pose in the types of events, translated by its frame's `origin`."""
-    (x, y, z), turn = astuple(found.position), astuple(found.orientation)
+    (x, y, z), turn = astuple(pose.position), astuple(pose.orientation)
     return (x + origin[0], y + origin[1], z + origin[2]), normalize(turn)
 
 
-def odometry(stamp: int, source: str, found: MultirotorState, origin: ev.Vector3) -> ev.Odometry:
+def odometry(stamp: int, source: str, reply: MultirotorState, origin: ev.Vector3) -> ev.Odometry:
     """Return the true state of a vehicle."""
-    state = found.kinematics_estimated
+    state = reply.kinematics_estimated
     position, orientation = pose_of(Pose(state.position, state.orientation), origin)
     return ev.Odometry(
         stamp=stamp,
@@ -261,29 +261,29 @@ def odometry(stamp: int, source: str, found: MultirotorState, origin: ev.Vector3
     )
 
 
-def imu(stamp: int, source: str, found: ImuData) -> ev.Imu:
+def imu(stamp: int, source: str, sample: ImuData) -> ev.Imu:
     """Return a sample of the IMU."""
-    turn, force = astuple(found.angular_velocity), astuple(found.linear_acceleration)
+    turn, force = astuple(sample.angular_velocity), astuple(sample.linear_acceleration)
     return ev.Imu(stamp=stamp, source=source, angular_velocity=turn, linear_acceleration=force)
 
 
-def camera_pose(stamp: int, source: str, found: Pose, origin: ev.Vector3) -> ev.PoseStamped:
+def camera_pose(stamp: int, source: str, pose: Pose, origin: ev.Vector3) -> ev.PoseStamped:
     """Return the pose of a camera's optical frame."""
-    position, turn = pose_of(found, origin)
+    position, turn = pose_of(pose, origin)
     orientation = normalize(multiply(turn, OPTICAL_TO_FRD))
     return ev.PoseStamped(stamp=stamp, source=source, position=position, orientation=orientation)
 
 
 def collision(
-    stamp: int, source: str, found: CollisionInfo, origin: ev.Vector3, vehicle: ev.Odometry
+    stamp: int, source: str, info: CollisionInfo, origin: ev.Vector3, vehicle: ev.Odometry
 ) -> ev.Collision:
     """Return a collision; its speed is the vehicle's against the normal."""
-    normal, place = astuple(found.normal), Pose(found.impact_point)
+    normal, place = astuple(info.normal), Pose(info.impact_point)
     velocity = rotate(vehicle.orientation, vehicle.linear_velocity)
     return ev.Collision(
         stamp=stamp,
         source=source,
-        other=found.object_name,
+        other=info.object_name,
         position=pose_of(place, origin)[0],
         normal=normal,
         speed=max(-sum(a * b for a, b in zip(normal, velocity, strict=True)), 0.0),

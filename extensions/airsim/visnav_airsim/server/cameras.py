@@ -133,22 +133,22 @@ class Cameras:
     ) -> None:
         self._model, self._drawn_state = model, drawn_state
         self._named: dict[str, dict[str, Camera]] = {}
-        known = {each.name for each in carriers}
+        known = {carrier.name for carrier in carriers}
         for entry in entries:
             if entry.vehicle not in {"", *known}:
                 raise ValueError(
                     f"cameras: {entry.name}: vehicle: expected {' or '.join(sorted(known))}, "
                     f'or "" for all, found "{entry.vehicle}"'
                 )
-        for each in carriers:
-            free = not each.node.vehicle
-            body = model.body(each.name if free else f"{each.name}/base_link").id
-            own = [entry for entry in entries if entry.vehicle in {"", each.name}]
-            named = cameras_by_name(each.config.cameras, own, body, free)
-            self._named[each.name] = named
+        for carrier in carriers:
+            free = not carrier.node.vehicle
+            body = model.body(carrier.name if free else f"{carrier.name}/base_link").id
+            own = [entry for entry in entries if entry.vehicle in {"", carrier.name}]
+            named = cameras_by_name(carrier.config.cameras, own, body, free)
+            self._named[carrier.name] = named
             for names, _, _ in DEFAULT_CAMERAS:
-                if given := {e.name for e in (*own, *each.config.cameras)} & set(names):
-                    log.info("%s: %s are one camera, %s", each.name, names, min(given))
+                if given := {e.name for e in (*own, *carrier.config.cameras)} & set(names):
+                    log.info("%s: %s are one camera, %s", carrier.name, names, min(given))
         cameras = (camera for named in self._named.values() for camera in named.values())
         specs = [spec for camera in cameras for spec in camera.specs.values()]
         self.largest = tuple(camera_info(spec) for spec in specs)
@@ -159,18 +159,23 @@ class Cameras:
             raise RpcError("not supported by visnav-runtime: external cameras")
         named = self._named[vehicle.name]
         if name not in named:
-            names = ", ".join(f"'{each}'" for each in sorted(named))
+            names = ", ".join(f"'{known}'" for known in sorted(named))
             raise RpcError(f"expected a camera of {vehicle.name} ({names}), found '{name}'")
         return named[name]
 
-    def announced(self, said: CameraAnnouncement) -> None:
+    def announced(self, announcement: CameraAnnouncement) -> None:
         """Take note of the announced calibration of a camera, if it has errors."""
-        vehicle, _, name = said.source.partition("/")
+        vehicle, _, name = announcement.source.partition("/")
         camera = self._named.get(vehicle, {}).get(name)
         if camera is not None and camera.errs:
-            turn = multiply(said.orientation, inverse(OPTICAL_TO_FRD))
-            camera.told_mount = said.position, turn
-            camera.told_intrinsics = said.info.fx, said.info.fy, said.info.cx, said.info.cy
+            turn = multiply(announcement.orientation, inverse(OPTICAL_TO_FRD))
+            camera.told_mount = announcement.position, turn
+            camera.told_intrinsics = (
+                announcement.info.fx,
+                announcement.info.fy,
+                announcement.info.cx,
+                announcement.info.cy,
+            )
 
     def pose(self, vehicle: ServedVehicle, eye: Eye, qpos: npt.NDArray[np.float64]) -> Pose:
         """Return a camera's pose in the vehicle's local frame, x forward, in a state (nq,)."""
@@ -204,10 +209,10 @@ class Cameras:
         """Set a camera's pose relative to its vehicle; images of the run's own nodes stay."""
         position = astuple(pose.position)
         turn = astuple(pose.orientation)
-        if not (all(abs(each) <= FARTHEST for each in (*position, *turn)) and any(turn)):
+        if not (all(abs(number) <= FARTHEST for number in (*position, *turn)) and any(turn)):
             raise RpcError(f"expected a rotation, and numbers up to {FARTHEST:g}, found {pose}")
-        found = self.find(vehicle, camera, external)
-        found.mount, found.told_mount = (position, normalize(turn)), None
+        target = self.find(vehicle, camera, external)
+        target.mount, target.told_mount = (position, normalize(turn)), None
 
     @rpc("simSetCameraFov", cosys=3)
     def set_fov(
@@ -216,11 +221,11 @@ class Cameras:
         """Set the horizontal field of view of all of a camera's images, 1 to 170 degrees."""
         if not 1.0 <= degrees <= 170.0:
             raise RpcError(f"expected a field of view of 1 to 170 degrees, found {degrees}")
-        found = self.find(vehicle, camera, external)
-        found.told_intrinsics = None
-        found.specs = {
+        target = self.find(vehicle, camera, external)
+        target.told_intrinsics = None
+        target.specs = {
             kind: msgspec.structs.replace(spec, fov=degrees, intrinsics=None)
-            for kind, spec in found.specs.items()
+            for kind, spec in target.specs.items()
         }
 
     @rpc("simGetDistortionParams", cosys=2)
@@ -254,8 +259,8 @@ def cameras_by_name(
     given = {eye.name: camera_of_file(eye, body) for spec in files for eye in eyes(spec)}
     named = {entry.name: _of_entry(entry, body, free) for entry in entries}
     if len(named) < len(entries):
-        found = sorted(entry.name for entry in entries)
-        raise ValueError(f"cameras: expected names of their own on a vehicle, found {found}")
+        repeated = sorted(entry.name for entry in entries)
+        raise ValueError(f"cameras: expected names of their own on a vehicle, found {repeated}")
     given |= named
     cameras = given.copy()
     for names, _, _ in DEFAULT_CAMERAS:
@@ -286,13 +291,13 @@ def camera_of_file(spec: CameraSpec, body: int) -> Camera:
 def _of_entry(entry: ServedCamera, body: int, free: bool) -> Camera:
     position, orientation = default_mount(entry.name, free)
     mount = _mount(entry.position or position, entry.orientation or orientation)
-    captures = {-1: Capture()} | {each.image_type: each for each in entry.captures}
+    captures = {-1: Capture()} | {c.image_type: c for c in entry.captures}
     return Camera(
         body,
         mount,
         {
-            kind: CameraSpec(name="view", width=each.width, height=each.height, fov=each.fov)
-            for kind, each in captures.items()
+            kind: CameraSpec(name="view", width=c.width, height=c.height, fov=c.fov)
+            for kind, c in captures.items()
         },
     )
 
@@ -384,7 +389,7 @@ class Images:
             images = msgspec.msgpack.decode(
                 await self._develop(exposure), type=list[wire.ImageResponse]
             )
-            return b"".join([each.image_data_uint8 for each in images])
+            return b"".join([image.image_data_uint8 for image in images])
 
         return png()
 
@@ -416,26 +421,26 @@ class Images:
         exposure = _Exposure(stamp, qpos, self._segmentation_ids(), [], [])
         poses: dict[str, Pose] = {}
         length = 0
-        for each in requests:
-            camera = self._cameras.find(vehicle, each.camera_name, external)
-            if each.image_type not in ImageType.__members__.values():
-                raise RpcError(_not_drawn(each.image_type))
-            eye = camera.eye(each.image_type)
-            form: Form = "png" if each.compress else "rgb" if flavour == "cosys" else "bgr"
-            form = "float" if each.pixels_as_float else form
-            exposure.wanted.append(Wanted(eye, ImageType(each.image_type), form))
-            if each.camera_name not in poses:
-                poses[each.camera_name] = self._cameras.pose(
-                    vehicle, camera.told(each.image_type), qpos
+        for request in requests:
+            camera = self._cameras.find(vehicle, request.camera_name, external)
+            if request.image_type not in ImageType.__members__.values():
+                raise RpcError(_not_drawn(request.image_type))
+            eye = camera.eye(request.image_type)
+            form: Form = "png" if request.compress else "rgb" if flavour == "cosys" else "bgr"
+            form = "float" if request.pixels_as_float else form
+            exposure.wanted.append(Wanted(eye, ImageType(request.image_type), form))
+            if request.camera_name not in poses:
+                poses[request.camera_name] = self._cameras.pose(
+                    vehicle, camera.told(request.image_type), qpos
                 )
-            pose = poses[each.camera_name]
+            pose = poses[request.camera_name]
             width, height = eye.spec.width, eye.spec.height
             length += width * height * (5 if form == "float" else 3)
             known: dict[str, Any] = {
-                "camera_name": each.camera_name,
-                "image_type": each.image_type,
-                "pixels_as_float": each.pixels_as_float,
-                "compress": each.compress,
+                "camera_name": request.camera_name,
+                "image_type": request.image_type,
+                "pixels_as_float": request.pixels_as_float,
+                "compress": request.compress,
                 "camera_position": pose.position,
                 "camera_orientation": pose.orientation,
                 "time_stamp": stamp,
@@ -445,7 +450,7 @@ class Images:
             exposure.responses.append(
                 wire.ImageResponse(**known)
                 if flavour == "airsim"
-                else wire.CosysImageResponse(**known, annotation_name=each.annotation_name)
+                else wire.CosysImageResponse(**known, annotation_name=request.annotation_name)
             )
         if length > LONGEST:
             raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")
@@ -472,5 +477,5 @@ class Images:
 def _not_drawn(image_type: int) -> str:
     return (
         f"not supported by visnav-runtime: images of type {image_type}: expected one of "
-        + ", ".join(f"{each.value} ({each.name.lower()})" for each in ImageType)
+        + ", ".join(f"{type_.value} ({type_.name.lower()})" for type_ in ImageType)
     )

@@ -233,8 +233,8 @@ class Connection:
         """Send a chunk of what is unsent; the rest is for further turns of the loop."""
         chunk: list[memoryview] = []
         room = CHUNK
-        for each in self._unsent:
-            chunk.append(each[:room])
+        for piece in self._unsent:
+            chunk.append(piece[:room])
             room -= len(chunk[-1])
             if not room:
                 break

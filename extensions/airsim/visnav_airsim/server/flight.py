@@ -124,13 +124,13 @@ class Control:
                 angular_velocity=state.angular_velocity,
             )
             self._tasks.order(vehicle, order)
-            found = vehicle.physics.state()
+            reached = vehicle.physics.state()
             self._collisions.forget(vehicle)
         else:
             if max(map(abs, state.position)) <= FARTHEST:
                 self._move(vehicle, state)
-            found = vehicle.state()
-        if found.position != state.position:
+            reached = vehicle.state()
+        if reached.position != state.position:
             raise RpcError(
                 f"vehicle '{vehicle.name}' cannot be put there: it is too far, too fast, or too "
                 "deep inside something, or the vehicle follows a file; see the run's log"
@@ -389,7 +389,7 @@ class Flight:
             raise RpcError("Yaw cannot be specified as rate if drivetrain is ForwardOnly")
         ahead = lookahead_of(lookahead, adaptive, velocity)
         ox, oy, oz = vehicle.origin
-        corners = [(ox + each.x_val, oy + each.y_val, oz + each.z_val) for each in path]
+        corners = [(ox + corner.x_val, oy + corner.y_val, oz + corner.z_val) for corner in path]
         whole = [vehicle.state().position, *corners]
         heading = _heading(yaw_mode, drivetrain)
         task = moves.along_path(whole, velocity, ahead, heading, timeout)

@@ -140,10 +140,10 @@ class Sensors:
             announcements.RangeAnnouncement, "distance sensor", name, vehicle
         )
         low, high = sensor.min_range, sensor.max_range
-        found = 0.0 if sample is None else min(max(sample.range, low), high)
+        distance = 0.0 if sample is None else min(max(sample.range, low), high)
         return wire.DistanceSensorData(
             0 if sample is None else sample.stamp,
-            found,
+            distance,
             low,
             high,
             Pose(Vector3r(*sensor.position), Quaternionr(*sensor.orientation)),
@@ -239,25 +239,25 @@ class Estimates:
         self._vehicles, self._cameras, self._now, self._send = vehicles, cameras, now, send
         self._estimators: dict[str, ScriptEstimator] = {}
         self._last: dict[str, int] = {}
-        for each in estimators:
-            if each.name in self._estimators:
+        for estimator in estimators:
+            if estimator.name in self._estimators:
                 raise ValueError("estimators: expected names of their own, found one twice")
-            self._estimators[each.name] = each
+            self._estimators[estimator.name] = estimator
             try:
-                self._mount(each)
+                self._mount(estimator)
             except RpcError as error:
-                raise ValueError(f"estimators: {each.name}: {error}") from None
+                raise ValueError(f"estimators: {estimator.name}: {error}") from None
 
     def announce(self) -> Iterable[ev.EstimatorAnnouncement]:
         """Announce the clients' estimators."""
-        for each in self._estimators.values():
+        for estimator in self._estimators.values():
             yield ev.EstimatorAnnouncement(
                 stamp=0,
-                source=each.name,
-                method=each.method,
-                scale_free=each.scale_free,
-                reads=each.reads,
-                vehicle=each.vehicle,
+                source=estimator.name,
+                method=estimator.method,
+                scale_free=estimator.scale_free,
+                reads=estimator.reads,
+                vehicle=estimator.vehicle,
             )
 
     @rpc("visnavPublishPose")
@@ -268,26 +268,26 @@ class Estimates:
             RpcError: There is no such estimator; the stamp is later than now, or not later than
                 that of the pose before; or the pose is none.
         """
-        found = self._estimators.get(estimator)
-        if found is None:
+        entry = self._estimators.get(estimator)
+        if entry is None:
             names = ", ".join(sorted(self._estimators)) or "none: the setting `estimators` is empty"
             raise RpcError(f"expected an estimator of the settings ({names}), found '{estimator}'")
         last, now = self._last.get(estimator, -1), self._now()
         if not last < stamp <= now:
             raise RpcError(f"expected a stamp after {last} and up to {now} ns, found {stamp}")
         position, orientation = _checked(pose)
-        if (mount := self._mount(found)) is not None:
+        if (mount := self._mount(entry)) is not None:
             offset, turn = mount
             orientation = normalize(multiply(orientation, inverse(turn)))
             position = _sum(position, rotate(orientation, offset), -1.0)
-        if found.frame_id == "map":
-            position = _sum(position, self._vehicles.find(found.vehicle).origin)
+        if entry.frame_id == "map":
+            position = _sum(position, self._vehicles.find(entry.vehicle).origin)
         self._last[estimator] = stamp
         self._send(
             ev.PoseEstimate(
                 stamp=stamp,
-                source=found.name,
-                frame_id=found.frame_id,
+                source=entry.name,
+                frame_id=entry.frame_id,
                 position=position,
                 orientation=orientation,
             )
@@ -434,9 +434,9 @@ class Recording:
             return
         self._last[name] = pose
         requests = [
-            ImageRequest(each.camera, each.image_type, each.pixels_as_float, each.compress)
-            for each in self._config.images
-            if each.vehicle in {"", name}
+            ImageRequest(image.camera, image.image_type, image.pixels_as_float, image.compress)
+            for image in self._config.images
+            if image.vehicle in {"", name}
         ]
 
         async def take(taken: Awaitable[msgspec.Raw]) -> msgspec.Raw:

@@ -153,9 +153,9 @@ class Table:
         self._called: set[str] = set()
         self.methods = constant_methods(self._note)
         for group in groups:
-            found = methods_of(group)
-            assert not found.keys() & self.methods.keys(), found.keys() & self.methods.keys()
-            self.methods |= found
+            methods = methods_of(group)
+            assert not methods.keys() & self.methods.keys(), methods.keys() & self.methods.keys()
+            self.methods |= methods
         # Of the tuple of all arguments.
         self._shapes = {
             name: tuple.__class_getitem__(tuple(method.parameters.values()) or ((),))
@@ -244,16 +244,16 @@ def constant_methods(note: Callable[[str], None] = lambda _: None) -> dict[str, 
 def methods_of(group: object) -> dict[str, Method]:
     """Return the methods of a group by name; those of its class, too, for the documentation."""
     marked = (function for _, function in inspect.getmembers(group, callable))
-    methods = (_method(each, *each.rpc) for each in marked if hasattr(each, "rpc"))
+    methods = (_method(function, *function.rpc) for function in marked if hasattr(function, "rpc"))
     return {method.name: method for method in methods}
 
 
 def _method(function: Callable[..., Any], name: str, cosys: int | None) -> Method:
     hints = typing.get_type_hints(function, include_extras=True)
     parameters = {
-        each.name: each.default
-        for each in inspect.signature(function).parameters.values()
-        if each.name != "self"
+        parameter.name: parameter.default
+        for parameter in inspect.signature(function).parameters.values()
+        if parameter.name != "self"
     }
     types = {name: hints[name] for name in parameters}
     wants_caller = Caller in types.values()
@@ -261,7 +261,7 @@ def _method(function: Callable[..., Any], name: str, cosys: int | None) -> Metho
         types = {name: type_ for name, type_ in types.items() if type_ is not Caller}
     named = {index: type_ for index, type_ in enumerate(types.values()) if _is_named(type_)}
     types = {name: str if _is_named(type_) else type_ for name, type_ in types.items()}
-    defaults = tuple(each for each in parameters.values() if each is not inspect.Parameter.empty)
+    defaults = tuple(value for value in parameters.values() if value is not inspect.Parameter.empty)
     description = (inspect.getdoc(function) or "").partition("\n")[0]
     return Method(name, function, types, description, named, defaults, wants_caller, cosys)
 

@@ -69,8 +69,8 @@ class SpareObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 def spare_objects(node: str, specs: tuple[SpareObject, ...]) -> dict[str, SpareObject]:
     """Return the spare objects of a server's settings, by the names of their bodies."""
-    each = (spec for spec in specs for _ in range(spec.count))
-    return {f"{node}/{spec.asset}_{number}": spec for number, spec in enumerate(each)}
+    spares = (spec for spec in specs for _ in range(spec.count))
+    return {f"{node}/{spec.asset}_{number}": spec for number, spec in enumerate(spares)}
 
 
 def add_movables(
@@ -132,11 +132,11 @@ class Holder:
     @classmethod
     def of(cls, simulation: Simulation) -> Holder:
         """Return the holder of a simulation, added at the first request."""
-        found = [each for each in simulation.influences if isinstance(each, Holder)]
-        if not found:
-            found.append(cls())
-            simulation.add_influence(found[0])
-        return found[0]
+        holders = [holder for holder in simulation.influences if isinstance(holder, Holder)]
+        if not holders:
+            holders.append(cls())
+            simulation.add_influence(holders[0])
+        return holders[0]
 
     def __init__(self) -> None:
         self._poses: dict[int, Any] = {}
@@ -170,7 +170,7 @@ def _add_spare(
         length, width, height = (a * b for a, b in zip(SIZES[kind], spec.scale, strict=True))
         add_shape(scene, body, kind, (length, width, height), spec.colour or COLOURS[kind])
         return
-    x, y, z = (0.5 * each for each in spec.scale)
+    x, y, z = (0.5 * length for length in spec.scale)
     options: dict[str, Any] = {"size": [x, z, 0.0] if spec.asset == "Cylinder" else [x, y, z]}
     if spec.asset == "Cone":
         turns = np.arange(24) * math.pi / 12
@@ -185,9 +185,9 @@ def _free(spec: Any, world: Any, expression: str) -> list[str]:
     geoms = {geom.name: geom for geom in spec.worldbody.geoms if geom.name}
     bodies = {body.name: body for body in spec.worldbody.bodies if body.name}
     still = {name: body for name, body in bodies.items() if not body.joints and not body.mocap}
-    found = whole_matches(expression, [name for name in geoms if not name.endswith(LOOK)])
-    for name in found:
-        parts = [geoms[each] for each in (name, name + LOOK) if each in geoms]
+    matches = whole_matches(expression, [name for name in geoms if not name.endswith(LOOK)])
+    for name in matches:
+        parts = [geoms[key] for key in (name, name + LOOK) if key in geoms]
         if any(part.type == mujoco.mjtGeom.mjGEOM_PLANE for part in parts):
             raise ValueError(f"movable: expected what can be moved, found {name}, a plane")
         pose = _pose(world, name)
@@ -204,11 +204,11 @@ def _free(spec: Any, world: Any, expression: str) -> list[str]:
     for name in names:
         still[name].add_joint(type=mujoco.mjtJoint.mjJNT_FREE, armature=HELD)
         still[name].gravcomp = 1.0
-    if not found and not names:
+    if not matches and not names:
         raise ValueError(
             f"movable: expected names of geoms or of bodies without joints, found {expression}"
         )
-    return found + names
+    return matches + names
 
 
 def _pose(world: Any, geom: str) -> Any:
@@ -249,13 +249,13 @@ def whole_matches(expression: str, texts: Iterable[str], *, ignore_case: bool = 
         ValueError: It is no expression; or it is longer, has more repetitions (``*``, ``+``, ``?``,
             ``{2,3}``) than are allowed, or repeats a group.
     """
-    pieces = [each for each in _PIECE.findall(expression) if each[0] not in "\\["]
-    repetitions = [each for each in pieces if each[-1] in "*+?}" and each not in ("(?", "}")]
+    pieces = [piece for piece in _PIECE.findall(expression) if piece[0] not in "\\["]
+    repetitions = [piece for piece in pieces if piece[-1] in "*+?}" and piece not in ("(?", "}")]
     if len(expression) > LONGEST or len(repetitions) > MOST_REPETITIONS:
         raise _error(f"up to {LONGEST} characters and {MOST_REPETITIONS} repetitions", expression)
     if 3 * len(repetitions) + pieces.count("|") > MOST_CHOICES:
         raise _error("fewer alternatives", expression)
-    if any(each[0] == ")" for each in repetitions):
+    if any(piece[0] == ")" for piece in repetitions):
         raise _error("no repeated group", expression)
     try:
         with warnings.catch_warnings():
@@ -266,5 +266,5 @@ def whole_matches(expression: str, texts: Iterable[str], *, ignore_case: bool = 
     return [text for text in texts if matches(text)]
 
 
-def _error(expected: str, found: str) -> ValueError:
-    return ValueError(f"regular expression: expected {expected}, found {found!r:.80}")
+def _error(expected: str, expression: str) -> ValueError:
+    return ValueError(f"regular expression: expected {expected}, found {expression!r:.80}")

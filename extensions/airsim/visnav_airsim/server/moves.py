@@ -212,7 +212,7 @@ class PathFollower:
         first = max(bisect.bisect_right(along, self.progress) - 1, 0)
         farthest = self.progress + 2.0 * max(self._lookahead, CLOSE)
         nearest = math.inf
-        found = self.progress
+        closest = self.progress
         for index in range(first, min(first + _WINDOW, len(corners) - 1)):
             start, length = along[index], along[index + 1] - along[index]
             if start > farthest:
@@ -225,8 +225,8 @@ class PathFollower:
             place = min(max(place, self.progress), farthest)
             apart = math.dist(self._at(place), position)
             if apart < nearest:
-                nearest, found = apart, place
-        self.progress = found
+                nearest, closest = apart, place
+        self.progress = closest
 
     def _at(self, place: float) -> Vector3:
         """Return the point at some metres along the path."""

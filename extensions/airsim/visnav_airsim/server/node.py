@@ -124,13 +124,13 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         world = await join_world(self)
         vehicles = Vehicles(world, config.default_vehicle, config.settings, self)
         for cls, served in ((Multirotor, ServedMultirotor), (FreeCamera, ServedFreeCamera)):
-            for each in self.siblings(cls):
-                vehicles[each.name] = served(each.name, world, each.config, now)
+            for node in self.siblings(cls):
+                vehicles[node.name] = served(node.name, world, node.config, now)
 
         def drawn_state() -> tuple[int, Any]:
             return vehicles.drawn_state(now())
 
-        carriers = [each for each in self.siblings(Simulator) if each.name in vehicles]
+        carriers = [node for node in self.siblings(Simulator) if node.name in vehicles]
         objects = Objects(world, spare_objects(self.name, config.objects), now, log)
         cameras = Cameras(carriers, config.cameras, world.model, drawn_state, log)
         ids = objects.segmentation_ids
@@ -138,9 +138,9 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         images = Images(self, world, cameras, drawn_state, ids, *draw)
         scenery = Scenery(world, vehicles, objects, now, log)
         rates = [
-            camera.rate for each in self.siblings(Multirotor) for camera in each.config.cameras
+            camera.rate for node in self.siblings(Multirotor) for camera in node.config.cameras
         ]
-        rates += [each.config.rate for each in self.siblings(FreeCamera)]
+        rates += [node.config.rate for node in self.siblings(FreeCamera)]
         frame_rate = max(rates, default=FRAMES_WITHOUT_CAMERAS)
         self.vehicles, self.cameras = vehicles, cameras
         self.collisions = Collisions(vehicles, objects.identify)

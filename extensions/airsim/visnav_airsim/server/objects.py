@@ -80,7 +80,7 @@ class Objects:
         for body in self._held:
             self._put(body, self._home(body))
         self._ids = np.full(model.ngeom + 1, HIDDEN)
-        for name in sorted(self.geoms, key=lambda each: -len(self.geoms[each])):
+        for name in sorted(self.geoms, key=lambda object_name: -len(self.geoms[object_name])):
             self._number(name, initial_id(name))  # that of a part goes before that of the whole
 
     def reset(self) -> None:
@@ -110,7 +110,7 @@ class Objects:
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, touched)
         body = mujoco.mj_name2id(model, _BODY, touched)
         body = int(model.geom_bodyid[geom]) if geom >= 0 else body
-        name = next((name for name, each in self._bodies.items() if each == body), touched)
+        name = next((name for name, number in self._bodies.items() if number == body), touched)
         return name, self.segmentation_id(name)
 
     def segmentation_ids(self) -> npt.NDArray[np.uint8]:
@@ -120,7 +120,7 @@ class Objects:
     @rpc("simGetSegmentationObjectID")
     def segmentation_id(self, name: str) -> int:
         """Return the ID of an object, whatever the case of its name; -1 if there is none."""
-        known = {each.lower(): geoms for each, geoms in self.geoms.items()}
+        known = {key.lower(): geoms for key, geoms in self.geoms.items()}
         geoms = known.get(name.lower())
         return int(self._ids[geoms[0]]) if geoms else HIDDEN
 
@@ -128,12 +128,12 @@ class Objects:
     def set_segmentation_id(self, name: str, object_id: int, is_regex: bool = False) -> bool:
         """Set the ID (at most 255) of the objects of a name; -1 leaves them out, in black."""
         if is_regex:
-            found = movables.whole_matches(name, self.geoms, ignore_case=True)
+            matches = movables.whole_matches(name, self.geoms, ignore_case=True)
         else:
-            found = [name] if name in self.geoms else []
-        for each in found:
-            self._number(each, min(max(object_id, HIDDEN), 255))
-        return bool(found)
+            matches = [name] if name in self.geoms else []
+        for matched in matches:
+            self._number(matched, min(max(object_id, HIDDEN), 255))
+        return bool(matches)
 
     @rpc("simListSceneObjects")
     def names(self, expression: str) -> list[str]:
@@ -146,7 +146,7 @@ class Objects:
         if name not in self.geoms:
             return UNKNOWN
         model, data = self._world.model, self.data()
-        bodies = (mujoco.mj_name2id(model, _BODY, each) for each in (name, f"{name}/base_link"))
+        bodies = (mujoco.mj_name2id(model, _BODY, key) for key in (name, f"{name}/base_link"))
         body = self._bodies.get(name, max(bodies))
         if body >= 0:
             place, turn = data.xpos[body], data.xquat[body]
@@ -170,7 +170,7 @@ class Objects:
     @rpc("simListAssets")
     def assets(self) -> list[str]:
         """Return the assets for ``simSpawnObject``, as given in the settings."""
-        return sorted({each.asset for each in self._spares.values()})
+        return sorted({spare.asset for spare in self._spares.values()})
 
     @rpc("simSpawnObject")
     def spawn(
@@ -193,13 +193,13 @@ class Objects:
         if not (free := [body for body in free if body not in used]):
             raise RpcError(f"all objects {asset} are in the world: the settings can have more")
         wanted = astuple(scale)
-        body = next((each for each in free if self._spares[each].scale == wanted), free[0])
-        if (found := self._spares[body].scale) != wanted:
-            self._warn("simSpawnObject", f"the scale is {found} of the settings, not {wanted}")
+        body = next((body for body in free if self._spares[body].scale == wanted), free[0])
+        if (fixed := self._spares[body].scale) != wanted:
+            self._warn("simSpawnObject", f"the scale is {fixed} of the settings, not {wanted}")
         name = name or asset
         if name in self.geoms:
             numbered = (f"{name}{number}" for number in itertools.count(1))
-            name = next(each for each in numbered if each not in self.geoms)
+            name = next(candidate for candidate in numbered if candidate not in self.geoms)
         self._bodies[name] = body
         geoms = tuple(np.flatnonzero(self._world.model.geom_bodyid == body).tolist())
         self.geoms = dict(sorted({**self.geoms, name: geoms}.items()))
@@ -347,8 +347,8 @@ class Scenery:
         length = float(np.linalg.norm(way))
         if not 1e-9 < length < math.inf:
             return length <= 1e-9
-        found = np.zeros(1, np.int32)
-        ray = begin, way / length, None, 1, body, found
+        geom_id = np.zeros(1, np.int32)
+        ray = begin, way / length, None, 1, body, geom_id
         distance: float = mujoco.mj_ray(model, data, *ray)
         return distance < 0.0 or distance >= length
 
@@ -367,21 +367,21 @@ def _qpos(pose: Pose) -> Any:
         raise ValueError(
             f"pose: expected one within {FARTHEST:g} m, with a rotation, found {place}, {turn}"
         )
-    return np.array([*flip_yz(place), *flip_yz_rotation(tuple(each / length for each in turn))])
+    return np.array([*flip_yz(place), *flip_yz_rotation(tuple(part / length for part in turn))])
 
 
 def geoms_by_object(model: Any) -> dict[str, tuple[int, ...]]:
     """Return the numbers of the geoms of each object of a model, by its name, sorted."""
-    found: dict[str, list[int]] = defaultdict(list)
+    geoms: dict[str, list[int]] = defaultdict(list)
     for geom in range(model.ngeom):
         if mover := mover_of(model, geom):
-            found[mover].append(geom)
+            geoms[mover].append(geom)
             continue
         if name := model.geom(geom).name:
-            found[name.removesuffix(LOOK)].append(geom)
+            geoms[name.removesuffix(LOOK)].append(geom)
         body = int(model.geom_bodyid[geom])
         while body:
             name, body = model.body(body).name, int(model.body_parentid[body])
-            if name and (not found[name] or found[name][-1] != geom):
-                found[name].append(geom)
-    return {name: tuple(found[name]) for name in sorted(found)}
+            if name and (not geoms[name] or geoms[name][-1] != geom):
+                geoms[name].append(geom)
+    return {name: tuple(geoms[name]) for name in sorted(geoms)}

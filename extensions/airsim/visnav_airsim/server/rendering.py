@@ -233,8 +233,8 @@ class Renderer:
         self._stage.enter()
         images: dict[int, npt.NDArray[np.uint8]] = {}
         places: dict[Eye, list[int]] = {}
-        for number, each in enumerate(wanted):
-            places.setdefault(each.eye, []).append(number)
+        for number, request in enumerate(wanted):
+            places.setdefault(request.eye, []).append(number)
         for eye, numbers in places.items():
             seen = self._see(eye, stamp, qpos, ids, {wanted[n].kind for n in numbers})
             images |= {n: packed(wanted[n].kind, seen, wanted[n].form) for n in numbers}
@@ -252,14 +252,14 @@ class Renderer:
 
         All work on pixels is done here: it would hold up the run's loop.
         """
-        found = msgspec.msgpack.decode(responses)
+        replies = msgspec.msgpack.decode(responses)
         images = self.take(stamp, qpos, ids, wanted)
-        for response, each, image in zip(found, wanted, images, strict=True):
-            if each.form == "float":
+        for response, request, image in zip(replies, wanted, images, strict=True):
+            if request.form == "float":
                 response["image_data_float"] = msgspec.Raw(image.data)
             else:
                 response["image_data_uint8"] = image.data
-        return np.frombuffer(msgspec.msgpack.encode(found), np.uint8)
+        return np.frombuffer(msgspec.msgpack.encode(replies), np.uint8)
 
     def close(self) -> None:
         """Give back what the renderer holds."""

@@ -193,18 +193,18 @@ class Vehicles(dict[str, ServedVehicle]):
 
     def find(self, name: str) -> ServedVehicle:
         """Return a vehicle of either kind by name, or raise `RpcError`."""
-        found = self.get(name or self._default or min(self, default=""))
-        if found is None:
+        vehicle = self.get(name or self._default or min(self, default=""))
+        if vehicle is None:
             raise _unknown("Vehicle Sim-API", name)
-        return found
+        return vehicle
 
     def find_multirotor(self, name: str) -> ServedMultirotor:
         """Return a multirotor, unnamed the first by name; an `RpcError` if there is none."""
-        flying = (each for each in self if isinstance(self[each], ServedMultirotor))
-        found = self.get(name or self._default or min(flying, default=""))
-        if not isinstance(found, ServedMultirotor):
+        flying = (key for key in self if isinstance(self[key], ServedMultirotor))
+        vehicle = self.get(name or self._default or min(flying, default=""))
+        if not isinstance(vehicle, ServedMultirotor):
             raise _unknown("Vehicle API", name)
-        return found
+        return vehicle
 
     def find_commanded(self, name: str) -> ServedMultirotor:
         """Return a multirotor open to commands; an `RpcError` where AirSim would wait."""
@@ -347,9 +347,9 @@ class Collisions:
     @rpc("simGetCollisionInfo")
     def collision_info(self, vehicle: ServedVehicle) -> wire.CollisionInfo:
         """Return a vehicle's last collision, and clear its ``has_collided``."""
-        found = vehicle.collision
-        vehicle.collision = msgspec.structs.replace(found, has_collided=False)
-        return found
+        collision = vehicle.collision
+        vehicle.collision = msgspec.structs.replace(collision, has_collided=False)
+        return collision
 
     def forget(self, vehicle: ServedVehicle) -> None:
         """Forget a vehicle's collision, and count its present contacts as known."""
@@ -370,13 +370,13 @@ class Collisions:
             contacts = vehicle.physics.contacts() if vehicle.physics.touching() else []
             before = self._touched.get(vehicle.name, _ANYTHING)
             aged = {name: looks + 1 for name, looks in before.items() if looks < APART}
-            self._touched[vehicle.name] = aged | {each.other: 0 for each in contacts}
-            new = [each for each in contacts if each.other not in before]
+            self._touched[vehicle.name] = aged | {contact.other: 0 for contact in contacts}
+            new = [contact for contact in contacts if contact.other not in before]
             if new and "" not in before:
                 self._take(vehicle, new)
 
     def _take(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
-        contact = max(contacts, key=lambda each: each.depth)
+        contact = max(contacts, key=lambda c: c.depth)
         vehicle.collision = wire.CollisionInfo(
             True,
             contact.depth,
@@ -388,12 +388,14 @@ class Collisions:
         )
 
 
-def _described_camera(camera: CameraSpec, said: CameraAnnouncement | None) -> dict[str, Any]:
+def _described_camera(
+    camera: CameraSpec, announcement: CameraAnnouncement | None
+) -> dict[str, Any]:
     info, position, angles = camera_info(camera), camera.position, camera.orientation
-    if camera.wrong is not None and said is not None:
-        matrix = pose_matrix(said.position, said.orientation)
+    if camera.wrong is not None and announcement is not None:
+        matrix = pose_matrix(announcement.position, announcement.orientation)
         data = EurocMatrix(data=tuple(matrix.ravel().tolist()))
-        info, (position, angles) = said.info, angles_of(data, OPTICAL_TO_FRD)
+        info, (position, angles) = announcement.info, angles_of(data, OPTICAL_TO_FRD)
     fov = math.degrees(2 * math.atan(info.width / (2 * info.fx)))
     size = {"Width": info.width, "Height": info.height, "FOV_Degrees": fov}
     return {

@@ -231,9 +231,9 @@ class OrbSlam3Process:
             result = self._slam.track_stereo(image, right, stamp * 1e-9, chunk)
         else:
             result = self._slam.track_monocular(image, stamp * 1e-9, chunk)
-        found = self._result(result)
+        tracked = self._result(result)
         self._left_alone = time.process_time()
-        return found
+        return tracked
 
     def trajectory(self) -> tuple[npt.NDArray[np.int64], Floats, int]:
         """End ORB-SLAM3's threads; return the poses of its largest map after all corrections.
@@ -344,8 +344,8 @@ def check_arrays(
         ("imu", imu, "inertial", ((len(imu) if imu is not None else 0, 7),)),
     ):
         if (array is not None) != (part in mode):
-            expected, found = ("an array", "none") if array is None else ("none", "an array")
-            raise ValueError(f"{name}: mode {mode!r} expects {expected}, found {found}")
+            expected, actual = ("an array", "none") if array is None else ("none", "an array")
+            raise ValueError(f"{name}: mode {mode!r} expects {expected}, found {actual}")
         if array is not None and array.shape not in shapes:
             raise ValueError(
                 f"{name}: expected shape {' or '.join(map(str, shapes))}, found {array.shape}"
@@ -367,15 +367,15 @@ def wait_for_other_threads(until: float) -> None:
 
 def _naps() -> dict[str, tuple[bool, str]]:
     """Return by thread id, for all other threads, whether running, and waits so far."""
-    found = {}
+    threads = {}
     for task in Path("/proc/self/task").iterdir():
         with contextlib.suppress(OSError):  # it has ended
             status = (task / "status").read_text(encoding="utf-8", errors="replace")
             fields = dict(line.split(":\t", 1) for line in status.splitlines() if ":\t" in line)
             if task.name != str(threading.get_native_id()):
                 runs = fields["State"][0] in "RD"
-                found[task.name] = runs, fields["voluntary_ctxt_switches"]
-    return found
+                threads[task.name] = runs, fields["voluntary_ctxt_switches"]
+    return threads
 
 
 _QUIET = 0.0025  # seconds between two looks; three are longer than the threads' naps
@@ -484,8 +484,8 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
     async def on_ready(self) -> None:
         """Start ORB-SLAM3, in a process of its own."""
         mapping = float(self.config.mapping_timeout) if self.clock.kind == "lockstep" else 0.0
-        told = self._settings, self._vocabulary, mapping
-        self._slam = await self.worker(OrbSlam3Process, *told, latency=self.config.latency)
+        arguments = self._settings, self._vocabulary, mapping
+        self._slam = await self.worker(OrbSlam3Process, *arguments, latency=self.config.latency)
 
     async def run(self) -> None:
         """Track each image; images arriving meanwhile are skipped."""

@@ -211,20 +211,20 @@ def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary
         ValueError: There are no descriptors, or they are not of ORB's size.
     """
     shape = shape or TreeShape()
-    for found in images:
-        if found.dtype != np.uint8 or found.ndim != 2 or found.shape[1] != _BYTES:
+    for features in images:
+        if features.dtype != np.uint8 or features.ndim != 2 or features.shape[1] != _BYTES:
             raise ValueError(
                 f"expected descriptors as uint8 of shape (n, {_BYTES}), "
-                f"found {found.dtype} of shape {found.shape}"
+                f"found {features.dtype} of shape {features.shape}"
             )
-    total = sum(len(found) for found in images)
+    total = sum(len(features) for features in images)
     if total < shape.branching:
         raise ValueError(
             f"expected at least {shape.branching} descriptors to train a vocabulary from, "
             f"found {total} in {len(images)} images"
         )
     descriptors = np.concatenate(images)
-    image_of = np.repeat(np.arange(len(images)), [len(found) for found in images])
+    image_of = np.repeat(np.arange(len(images)), [len(features) for features in images])
     parents, centres, node_of = _grow(descriptors, shape)
     leaves = np.ones(len(parents), bool)
     leaves[parents[1:]] = False
@@ -253,8 +253,8 @@ def _grow(descriptors: Bytes, shape: TreeShape) -> tuple[Integers, Bytes, Intege
         above, level = level, []
         for members in above:
             node = int(leaf_of[members[0]])
-            found, cluster = _split(descriptors[members], shape.branching, rng)
-            for number, centre in enumerate(found):
+            means, cluster = _split(descriptors[members], shape.branching, rng)
+            for number, centre in enumerate(means):
                 below = members[cluster == number]
                 leaf_of[below] = len(parents)
                 parents.append(node)
@@ -290,7 +290,7 @@ def _split(descriptors: Bytes, k: int, rng: np.random.Generator) -> tuple[Bytes,
 
 def _distances(descriptors: Bytes, centres: Bytes) -> Integers:
     """Return the Hamming distances of descriptors from centres, shape (n, k)."""
-    a, b = (np.ascontiguousarray(each).view(np.uint64) for each in (descriptors, centres))
+    a, b = (np.ascontiguousarray(array).view(np.uint64) for array in (descriptors, centres))
     distances: Integers = np.bitwise_count(a[:, None] ^ b).sum(-1, dtype=np.int64)
     return distances
 

@@ -56,8 +56,8 @@ class VocabularyTrainer(Node[VocabularyTrainerConfig]):
         async for image in self.images:
             count = seen[image.source] = seen.get(image.source, -1) + 1
             if count % self.config.image_interval == 0:
-                found = await self.offload(describe, image.data, self.config.features)
-                self._descriptors.append(found)
+                descriptors = await self.offload(describe, image.data, self.config.features)
+                self._descriptors.append(descriptors)
 
     async def on_shutdown(self) -> None:
         """Train, and write the file."""
