@@ -23,8 +23,8 @@ setup(
     ext_modules=[
         Extension(
             f"sims.cameras._raster_{name}",
-            [str(each) for each in FOLDER.glob("*.cpp")],
-            depends=[str(each) for each in FOLDER.glob("*.hpp")],
+            [str(path) for path in FOLDER.glob("*.cpp")],
+            depends=[str(path) for path in FOLDER.glob("*.hpp")],
             extra_compile_args=[*FLAGS, *flags],
             optional=True,  # MuJoCo's renderer needs none
         )

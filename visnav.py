@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from matplotlib.figure import Figure
 
-    from nodes.judging.report.tables import Run as _Found
+    from nodes.judging.report.tables import Run as _Results
     from nodes.judging.report.tables import Verdict
     from nodes.trajectory import Trajectory
     from runtime.config.model import Config
@@ -53,21 +53,21 @@ class Run:
     """
 
     def __init__(
-        self, found: _Found, folder: Path | None, summary: Mapping[str, Any] | None = None
+        self, results: _Results, folder: Path | None, summary: Mapping[str, Any] | None = None
     ) -> None:
         self.folder = folder
         self.summary = dict(summary or {})
-        self._found = found
+        self._results = results
 
     @property
     def name(self) -> str:
         """Name of the run."""
-        return self._found.name
+        return self._results.name
 
     @property
     def verdict(self) -> Verdict | None:
         """Contents of ``evaluation/verdict.json``; `None` if nothing was evaluated."""
-        return self._found.verdict
+        return self._results.verdict
 
     @property
     def passed(self) -> bool | None:
@@ -82,12 +82,12 @@ class Run:
     @property
     def truth(self) -> Trajectory | None:
         """True poses of the (first) vehicle: base_link (FRD) in map (NED)."""
-        return self._found.truth
+        return self._results.truth
 
     @property
     def estimates(self) -> dict[str, Trajectory]:
         """Poses by estimator, aligned with the truth as the figure ``alignment`` says."""
-        return {e.name: e.aligned for e in self._found.estimators if e.aligned is not None}
+        return {e.name: e.aligned for e in self._results.estimators if e.aligned is not None}
 
     @property
     def report(self) -> Path | None:
@@ -102,7 +102,7 @@ class Run:
         from nodes.judging.report.trajectories import draw_trajectories
 
         with drawing():
-            plots = [draw(self._found) for draw in (draw_trajectories, draw_errors)]
+            plots = [draw(self._results) for draw in (draw_trajectories, draw_errors)]
         figures = [plot.figure for plot in plots if plot is not None]
         with contextlib.suppress(ImportError):
             from IPython import get_ipython
@@ -118,16 +118,16 @@ class Run:
         from runtime.units import significant
 
         states = {True: "passed", False: "failed", None: "not judged"}
-        found = []
+        words = []
         for name, figures in self.figures.items():
             ate = figures.get("ate_percent")
             error = ""
             if ate is not None:
                 error = f", ATE {significant(ate, 3)} % of the path ({figures['alignment']})"
             missed = "".join(f", {reason}" for reason in figures.get("failed", ()))
-            found.append(f"{name} {states[figures['passed']]}{error}{missed}")
+            words.append(f"{name} {states[figures['passed']]}{error}{missed}")
         where = "" if self.folder is None else f" in {self.folder}"
-        return f"<{self.name}{where}: {'; '.join(found) or 'no estimator'}>"
+        return f"<{self.name}{where}: {'; '.join(words) or 'no estimator'}>"
 
     def _repr_html_(self) -> str:
         from html import escape
@@ -135,10 +135,10 @@ class Run:
         from nodes.judging.report.tables import figures
 
         rows = [
-            ["", "unit", *(each.name for each in self._found.estimators)],
+            ["", "unit", *(estimator.name for estimator in self._results.estimators)],
             *(
                 [row.meaning, row.unit, *(text for text, _ in row.cells)]
-                for row in figures(self._found, main=True)
+                for row in figures(self._results, main=True)
             ),
         ]
         cells = "".join(
@@ -182,10 +182,10 @@ def run(
     if seed is not None:
         changes["run.seed"] = seed
     settings = _settings(config, changes)
-    found = of_file(settings)
-    if found.errors:
-        raise ConfigError("; ".join(found.errors))
-    for warning in found.warnings:
+    findings = of_file(settings)
+    if findings.errors:
+        raise ConfigError("; ".join(findings.errors))
+    for warning in findings.warnings:
         warnings.warn(warning, stacklevel=2)
     folder = Folder(Path(out or Path("runs") / settings.run.name), by_time=out is None)
     handlers, watch = observed(
@@ -212,10 +212,10 @@ def load(folder: str | Path) -> Run:
     from runtime.run.results import run_folder
 
     folder = run_folder(Path(folder))
-    found = read_run(folder)
+    results = read_run(folder)
     summary = folder / "summary.json"
     return Run(
-        found, folder, msgspec.json.decode(summary.read_bytes()) if summary.is_file() else {}
+        results, folder, msgspec.json.decode(summary.read_bytes()) if summary.is_file() else {}
     )
 
 
@@ -320,7 +320,7 @@ def compare(
     from runtime.tools import sweep as sweeping
 
     compared = comparison.compare(
-        [Path(each) for each in what],
+        [Path(path) for path in what],
         _changes(a or {}),
         _changes(b or {}),
         seeds=seeds,
@@ -492,9 +492,9 @@ def _toml(value: Any) -> str:
 def _plain(value: Any) -> Any:
     """Return what TOML knows for a value of Python's: a class is named, an array is a list."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
+        return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [_plain(inner) for inner in value]
     if isinstance(value, type):
         return f"{value.__module__}:{value.__qualname__}"
     if isinstance(value, Path):
@@ -523,10 +523,10 @@ def _check_runtime() -> None:
     """Raise ImportError if `runtime` is not the package beside this file."""
     expected = Path(__file__).resolve().parent / "runtime"
     spec = importlib.util.find_spec("runtime")
-    found = Path(spec.origin).resolve() if spec is not None and spec.origin else None
-    if found != expected / "__init__.py":
+    origin = Path(spec.origin).resolve() if spec is not None and spec.origin else None
+    if origin != expected / "__init__.py":
         raise ImportError(
-            f"expected the package runtime in {expected}, found {found or 'none'}: "
+            f"expected the package runtime in {expected}, found {origin or 'none'}: "
             "another package of this name stands in the way"
         )
     if not (expected / "node.py").is_file():

@@ -18,17 +18,17 @@ def commit() -> str:
 
     The folder in which a command is called plays no part. Empty if nothing is known.
     """
-    found = of_repository(Path(__file__))
-    if not found and NOTE.is_file():
-        found = NOTE.read_text(encoding="ascii", errors="replace").strip()
-    return found
+    revision = of_repository(Path(__file__))
+    if not revision and NOTE.is_file():
+        revision = NOTE.read_text(encoding="ascii", errors="replace").strip()
+    return revision
 
 
 def write_note(folder: Path) -> None:
     """Write the commit beside a copy of this file; of an unpacked archive, the archive's note."""
-    if found := commit():
+    if revision := commit():
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / NOTE.name).write_text(f"{found}\n", encoding="ascii")
+        (folder / NOTE.name).write_text(f"{revision}\n", encoding="ascii")
 
 
 def of_repository(file: Path) -> str:

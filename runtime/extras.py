@@ -40,16 +40,16 @@ def check_events() -> None:
     expected = Path(__file__).resolve().parents[1] / "events" / "__init__.py"
     try:
         events = importlib.import_module("events")
-        found = Path(events.__file__ or "?").resolve()
-        ours = found == expected and hasattr(events, "PoseEstimate")
+        location = Path(events.__file__ or "?").resolve()
+        ours = location == expected and hasattr(events, "PoseEstimate")
     except ModuleNotFoundError as error:
         if error.name != "events":
             raise
-        found, ours = Path("none"), False
+        location, ours = Path("none"), False
     if not ours:
-        over = " installed over it" if found == expected else ""
+        over = " installed over it" if location == expected else ""
         raise ImportError(
-            f"expected the package events of visnav-runtime in {expected.parent}, found {found}"
+            f"expected the package events of visnav-runtime in {expected.parent}, found {location}"
             f"{over}: another package of this name stands in the way; remove or rename it",
             name="runtime",
         )
@@ -72,11 +72,11 @@ def install_command(extra: str) -> str:
     except importlib.metadata.PackageNotFoundError:
         required = []
     wanted = [
-        requirement.partition(";")[0].strip()
-        for requirement in required
-        if f"extra == '{extra}'" in requirement.replace('"', "'")
+        name.partition(";")[0].strip()
+        for name in required
+        if f"extra == '{extra}'" in name.replace('"', "'")
     ]
-    return f"pip install {' '.join(repr(each) for each in wanted or [f'visnav-runtime[{extra}]'])}"
+    return f"pip install {' '.join(repr(name) for name in wanted or [f'visnav-runtime[{extra}]'])}"
 
 
 def why_missing(library: str) -> str:
@@ -162,18 +162,18 @@ def offers(group: str) -> tuple[Offer, ...]:
     Raises:
         CommandError: There are none of this project: it is not installed.
     """
-    found = [
+    offered = [
         Offer(point.dist.name if point.dist else "?", point.name, point.value)
         for point in entry_points(group=group)
     ]
-    found.sort(key=lambda o: (o.package != OURS, not is_ours(o.package), o.package))
-    ours = _declared(group) or [offer for offer in found if offer.package == OURS]
+    offered.sort(key=lambda o: (o.package != OURS, not is_ours(o.package), o.package))
+    ours = _declared(group) or [offer for offer in offered if offer.package == OURS]
     if not ours and group != EXAMPLES:
         raise CommandError(
             f"expected the package {OURS} to be installed, found no {group} of it: "
             '"pip install ." in its folder installs it'
         )
-    return (*ours, *(offer for offer in found if offer.package != OURS))
+    return (*ours, *(offer for offer in offered if offer.package != OURS))
 
 
 def extension(group: str, name: str) -> Any:

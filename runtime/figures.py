@@ -80,10 +80,10 @@ class Figure(msgspec.Struct, frozen=True):
             return ""
         if value is None and (self.optional or (self.if_known and limit == self.default)):
             return ""
-        found = "none" if value is None else f"{value:.4g}"
+        shown = "none" if value is None else f"{value:.4g}"
         if value is not None and (value >= limit if self.limit == "least" else value <= limit):
             return ""
-        return f"{self.name}: expected at {self.limit} {limit:g}, found {found}"
+        return f"{self.name}: expected at {self.limit} {limit:g}, found {shown}"
 
 
 def is_off(limit: float | None) -> bool:
@@ -126,12 +126,12 @@ def _segments() -> list[Figure]:
     lengths = {f"{share}pct": f"{share} % of the path" for share in SHARES}
     lengths |= {f"{metres}m": f"{metres} m" for metres in KITTI_LENGTHS}
     means = {"mean": "1 to 20 % of the path", "kitti": "100 to 800 m"}
-    each = [
+    details = [
         _detail(f"rpe_{k}_{end}", f"RPE over {text}, {what}, mean")
         for k, text in lengths.items()
         for end, what in both
     ]
-    return each + [
+    return details + [
         Figure(f"rpe_{k}_{end}", f"RPE, mean over stretches of {text}, {what}")
         for k, text in means.items()
         for end, what in both

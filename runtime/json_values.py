@@ -11,13 +11,13 @@ import numpy as np
 def plain(value: Any, where: str) -> Any:
     """Return a value, numpy's too, in JSON types; raise `TypeError` if it has no form in JSON."""
     try:
-        found = msgspec.to_builtins(value, enc_hook=_without_numpy, str_keys=True)
-        msgspec.json.encode(found)
+        converted = msgspec.to_builtins(value, enc_hook=_without_numpy, str_keys=True)
+        msgspec.json.encode(converted)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise TypeError(
             f"{where}: expected what JSON knows, found {value!r:.80}: {error}"
         ) from None
-    return found
+    return converted
 
 
 def _without_numpy(value: Any) -> Any:

@@ -188,8 +188,8 @@ class _Listener(logging.handlers.QueueListener):
     def _record(self, text: str) -> logging.LogRecord:
         fields = {"name": "visnav.runtime", "levelno": logging.WARNING, "levelname": "WARNING"}
         record = logging.makeLogRecord({**fields, "msg": text})
-        for each in self._queued.filters:
-            each(record)  # type: ignore[operator]
+        for log_filter in self._queued.filters:
+            log_filter(record)  # type: ignore[operator]
         return record
 
 
@@ -264,8 +264,8 @@ def logging_to(
         if listener.unshown:
             listener.say(f"{listener.unshown} log lines are not shown here: they came too fast")
         root.removeHandler(handler)
-        for each in handlers:
-            each.close()
+        for target in handlers:
+            target.close()
 
 
 _levels: list[int] = []

@@ -257,16 +257,16 @@ class Node(Generic[C]):
 
     def siblings(self, cls: type[Any]) -> tuple[Sibling, ...]:
         """Return the run's nodes of a class in file order, with this node and those elsewhere."""
-        return tuple(each for each in self._host.siblings if issubclass(each.node, cls))
+        return tuple(sibling for sibling in self._host.siblings if issubclass(sibling.node, cls))
 
     def senders_of(self, *events: type[Event]) -> list[str]:
         """Return the names of the other nodes with outputs for some types of event."""
         listener = Listener(self.name, lambda _: None, events)
         return [
-            each.name
-            for each in self.siblings(Node)
-            if each.name != self.name
-            and any(listener.may_receive(o.event) for o in each.node.declared.outputs.values())
+            sibling.name
+            for sibling in self.siblings(Node)
+            if sibling.name != self.name
+            and any(listener.may_receive(o.event) for o in sibling.node.declared.outputs.values())
         ]
 
     def share(self, name: str, make: Callable[[], R]) -> R:
@@ -277,8 +277,8 @@ class Node(Generic[C]):
         shared = self._host.shared
         if name not in shared:
             shared[name] = make()
-        found: R = shared[name]
-        return found
+        value: R = shared[name]
+        return value
 
     async def offload(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
         """Run a slow function in a thread, and await its result; the loop goes on meanwhile.
@@ -373,9 +373,9 @@ class Node(Generic[C]):
                 f"{where}: passed: expected True, False or None, "
                 f"found {passed!r:.80} ({type(passed).__name__})"
             )
-        found = {str(name): plain(each, f"{where}: {name}") for name, each in figures.items()}
+        values = {str(name): plain(value, f"{where}: {name}") for name, value in figures.items()}
         known = None if passed is None else bool(passed)
-        self._host.conclude(str(subject), found, known, flight)
+        self._host.conclude(str(subject), values, known, flight)
 
     def note_environment(self, name: str, value: str) -> None:
         """Record a machine property relevant to figures, beside the summary's versions."""
@@ -428,8 +428,8 @@ def make_node(
 
 def streams(node: Node[Any]) -> dict[str, Stream[Any]]:
     """Return a node's streams by port."""
-    found = {port: getattr(node, port) for port in node.declared.inputs}
-    return found | {port: matcher.stream for port, matcher in matchers(node).items()}
+    by_port = {port: getattr(node, port) for port in node.declared.inputs}
+    return by_port | {port: matcher.stream for port, matcher in matchers(node).items()}
 
 
 def matchers(node: Node[Any]) -> dict[str, Matcher[Any]]:

@@ -82,9 +82,9 @@ def resolve(table: Any, type_: Any, folder: Path) -> Any:
 def unmarked(value: Any) -> Any:
     """Return settings without the marks of texts from the command line."""
     if isinstance(value, dict):
-        return {key: unmarked(each) for key, each in value.items()}
+        return {key: unmarked(inner) for key, inner in value.items()}
     if isinstance(value, list):
-        return [unmarked(each) for each in value]
+        return [unmarked(inner) for inner in value]
     return str(value) if isinstance(value, GivenHere) else value
 
 
@@ -106,15 +106,15 @@ def inputs(config: msgspec.Struct) -> Iterator[str]:
 
 
 def _of_kinds(config: msgspec.Struct, kinds: Container[Kind]) -> Iterator[str]:
-    found: list[str] = []
+    texts: list[str] = []
 
     def note(kind: Kind, text: str) -> str:
         if kind in kinds and text:
-            found.append(text)
+            texts.append(text)
         return text
 
     _walk(msgspec.to_builtins(config, enc_hook=plain), type(config), note)
-    yield from found
+    yield from texts
 
 
 def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
@@ -129,12 +129,12 @@ def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
         if not isinstance(value, Mapping):
             return value
         types = {field.encode_name: field.type for field in msgspec.structs.fields(type_)}
-        return {key: _walk(each, types.get(key), change) for key, each in value.items()}
-    inner = [each for each in get_args(type_) if each is not type(None)]
+        return {key: _walk(entry, types.get(key), change) for key, entry in value.items()}
+    inner = [argument for argument in get_args(type_) if argument is not type(None)]
     if isinstance(value, list | tuple) and inner:
-        return [_walk(each, inner[0], change) for each in value]
+        return [_walk(entry, inner[0], change) for entry in value]
     if isinstance(value, Mapping) and get_origin(type_) is dict:
-        return {key: _walk(each, inner[1], change) for key, each in value.items()}
+        return {key: _walk(entry, inner[1], change) for key, entry in value.items()}
     if len(inner) == 1:  # or None
         return _walk(value, inner[0], change)
     return value
@@ -173,12 +173,12 @@ def user_folder() -> Path:
     path = Path(base) / "visnav" if base else Path(tempfile.gettempdir()) / f"visnav-{os.getuid()}"
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = path.lstat()
+        status = path.lstat()
     except OSError as error:
         raise CommandError(f"{path}: expected a folder for sockets: {error.strerror}") from None
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise CommandError(
             f"{path}: expected a folder that only its user may enter, found mode "
-            f"{stat.S_IMODE(found.st_mode):o} of user {found.st_uid}"
+            f"{stat.S_IMODE(status.st_mode):o} of user {status.st_uid}"
         )
     return path

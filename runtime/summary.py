@@ -111,7 +111,7 @@ class WorkerSummary(msgspec.Struct, frozen=True):
         return [
             "varies" if self.latency_ms is None else f"{self.latency_ms:g}",
             f"{self.calls}",
-            *(f"{each:.3g}" if each < 100 else f"{each:.0f}" for each in wall + cpu),
+            *(f"{number:.3g}" if number < 100 else f"{number:.0f}" for number in wall + cpu),
             "" if self.peak_rss_mb is None else f"{self.peak_rss_mb:.0f}",
             f"{self.processes}",
         ]
@@ -192,10 +192,10 @@ class OutsideSummary(msgspec.Struct, frozen=True):
 
     def row(self) -> list[str]:
         """Return the cells of a table row, under `OUTSIDE_COLUMNS`."""
-        found = (getattr(self, field) for field in _OUTSIDE.values())
-        figures = ("–" if each is None else each for each in found)
+        values = (getattr(self, field) for field in _OUTSIDE.values())
+        figures = ("–" if value is None else value for value in values)
         return [
-            *(f"{each:.3g}" if isinstance(each, float) else str(each) for each in figures),
+            *(f"{figure:.3g}" if isinstance(figure, float) else str(figure) for figure in figures),
             "yes" if self.reproducible else f"no: {'; '.join(self.why_not)}",
             {True: "yes", False: "no", None: "unknown until run --twice"}[self.repeats],
         ]
@@ -321,27 +321,27 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def verdict_of(
-    found: dict[str, dict[str, Any]], flights: dict[str, dict[str, Any]]
+    conclusions: dict[str, dict[str, Any]], flights: dict[str, dict[str, Any]]
 ) -> Verdict | None:
     """Return the joint verdict of several conclusions; `None` if there are none."""
-    if not found and not flights:
+    if not conclusions and not flights:
         return None
-    return Verdict(overall(found.values(), flights.values()), found, flights)
+    return Verdict(overall(conclusions.values(), flights.values()), conclusions, flights)
 
 
 def overall(
-    found: Iterable[Mapping[str, Any]], flights: Iterable[Mapping[str, Any]] = ()
+    conclusions: Iterable[Mapping[str, Any]], flights: Iterable[Mapping[str, Any]] = ()
 ) -> bool | None:
     """Return the joint result of verdicts: failed before not judged before passed.
 
     A flight of which nothing was asked counts only if there is no estimator.
     """
-    each = {one["passed"] for one in found}
+    states = {one["passed"] for one in conclusions}
     flown = {one["passed"] for one in flights}
-    if False in each | flown:
+    if False in states | flown:
         return False
-    each = each or flown
-    return None if None in each or not each else True
+    states = states or flown
+    return None if None in states or not states else True
 
 
 def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:

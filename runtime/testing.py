@@ -120,7 +120,7 @@ def run_nodes(
     async def main() -> NodeResult:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, LockstepLoop)
-        scripted = ["script", *(each.name for each in nodes if each.node in _SCRIPTED)]
+        scripted = ["script", *(spec.name for spec in nodes if spec.node in _SCRIPTED)]
         supervisor = Supervisor(settings, LockstepClock(loop), [collect], out, scripted=scripted)
         await supervisor.main()
         if supervisor.state.error is not None:

@@ -341,8 +341,8 @@ class Declared(msgspec.Struct):
         return [
             f"{name}.{field}"
             for name, bundle in self.bundles.items()
-            for field, each in bundle.fields.items()
-            if each.kind == "maybe"
+            for field, member in bundle.fields.items()
+            if member.kind == "maybe"
         ]
 
 
@@ -357,8 +357,8 @@ def read_declarations(cls: type[Any], base: type[Any]) -> Declared:
     """
     _check_phases(cls, base)
     reserved = {*vars(base), *base.__annotations__}
-    found = Declared({}, {}, {}, {}, {}, [])
-    names = dict.fromkeys(name for each in reversed(cls.__mro__) for name in vars(each))
+    declared = Declared({}, {}, {}, {}, {}, [])
+    names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
     for name in names:
         value = getattr(cls, name, None)
         if isinstance(value, Input | Bundle | Output) and name in reserved:
@@ -367,18 +367,18 @@ def read_declarations(cls: type[Any], base: type[Any]) -> Declared:
                 "call the port something else"
             )
         if isinstance(value, Input):
-            found.inputs[name] = value
+            declared.inputs[name] = value
         elif isinstance(value, Bundle):
-            found.bundles[name] = value
+            declared.bundles[name] = value
         elif isinstance(value, Output):
-            found.outputs[name] = value
+            declared.outputs[name] = value
         if handles := getattr(value, "__handles__", None):
-            found.handlers[name] = handles
+            declared.handlers[name] = handles
         if ticks := getattr(value, "__ticks__", None):
-            found.ticks[name] = ticks
-        if name in found.inputs or name in found.bundles or name in found.handlers:
-            found.listening.append(name)
-    return found
+            declared.ticks[name] = ticks
+        if name in declared.inputs or name in declared.bundles or name in declared.handlers:
+            declared.listening.append(name)
+    return declared
 
 
 def _check_phases(cls: type[Any], base: type[Any]) -> None:
@@ -388,11 +388,11 @@ def _check_phases(cls: type[Any], base: type[Any]) -> None:
             continue
         awaited = inspect.iscoroutinefunction(meant)
         if inspect.iscoroutinefunction(inspect.unwrap(method)) != awaited:
-            expected, found = f"async def {phase}", f"def {phase}"
+            expected, actual = f"async def {phase}", f"def {phase}"
             if inspect.isasyncgenfunction(method):
-                found = f"async def {phase} with a yield in it"
+                actual = f"async def {phase} with a yield in it"
             if not awaited:
-                expected, found = f"def {phase}", f"async def {phase}"
+                expected, actual = f"def {phase}", f"async def {phase}"
             raise DeclarationError(
-                f"{cls.__name__}.{phase}: expected `{expected}`, found `{found}`"
+                f"{cls.__name__}.{phase}: expected `{expected}`, found `{actual}`"
             )

@@ -149,14 +149,14 @@ def on(*events: type[Event], source: str | None = None) -> Callable[[F], F]:
         raise DeclarationError("@on: expected an event type, found nothing")
 
     def declare(method: F) -> F:
-        for kind, found in (
+        for kind, actual in (
             (inspect.iscoroutinefunction, "a coroutine function"),
             (inspect.isasyncgenfunction, "an asynchronous generator"),
             (inspect.isgeneratorfunction, "a generator"),
         ):
             if kind(method):
                 raise DeclarationError(
-                    f"@on: {method.__qualname__}: expected a plain function, found {found}; "
+                    f"@on: {method.__qualname__}: expected a plain function, found {actual}; "
                     "to wait for things, read an Input in run()"
                 )
         method.__handles__ = Handles(events, source)  # type: ignore[attr-defined]

@@ -95,7 +95,7 @@ class Voices:
             source = source.rpartition("/")[0]
         return self._owners.get(source)
 
-    def _check(self, sender: str, source: str, found: str) -> None:
+    def _check(self, sender: str, source: str, described: str) -> None:
         """Raise an error unless a source belongs to a sender, ``node`` or ``node.port``."""
         node = sender.partition(".")[0]
         owner = self.owner(source)
@@ -104,7 +104,7 @@ class Voices:
         whose = f"which is {owner}'s" if owner else "which nobody announces"
         raise ChannelSourceError(
             f"{sender}: expected a source that is {node!r}, below it, or announced by this node, "
-            f"found {found}, {whose}"
+            f"found {described}, {whose}"
         )
 
 

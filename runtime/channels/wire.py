@@ -73,7 +73,7 @@ def event_type(kind: str) -> type[Event]:
     """Return the type of event of a kind imported in this process, or raise `WireError`."""
     known = _types.get(kind)
     if known is None:
-        _types.update((kind_of(each), each) for each in _subclasses(Event))
+        _types.update((kind_of(event), event) for event in _subclasses(Event))
         known = _types.get(kind)
     if known is None:
         raise WireError(f"expected a type of event that this process knows, found {kind!r}")
@@ -171,7 +171,7 @@ def _decoder(cls: type[Event], arrays: Sequence[Array]) -> msgspec.msgpack.Decod
 
 
 def _subclasses(cls: type[Event]) -> list[type[Event]]:
-    return [cls, *(found for each in cls.__subclasses__() for found in _subclasses(each))]
+    return [cls, *(type_ for child in cls.__subclasses__() for type_ in _subclasses(child))]
 
 
 _CHUNK = 1 << 16
@@ -232,8 +232,8 @@ class Digest:
 
 def fingerprint(data: Any) -> int:
     """Return a fingerprint of data, arrays included, of 64 bits."""
-    found: int = xxhash.xxh3_64_intdigest(_ENCODER.encode(data))
-    return found
+    digest: int = xxhash.xxh3_64_intdigest(_ENCODER.encode(data))
+    return digest
 
 
 def combined(outputs: Mapping[str, str]) -> str:
@@ -262,8 +262,8 @@ def _encode_array(value: Any) -> Any:
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         content = xxhash.xxh3_128_digest(np.ascontiguousarray(value).view(np.uint8).data)
         return (value.dtype.str, value.shape, content)
-    if isinstance(value, np.generic) and not isinstance(found := value.item(), np.generic):
-        return found
+    if isinstance(value, np.generic) and not isinstance(scalar := value.item(), np.generic):
+        return scalar
     shown = " ".join(f"{value!r:.80}".split())  # in one line
     raise TypeError(f"{shown} ({type(value).__name__})")
 

@@ -149,8 +149,8 @@ def explain(message: str, value: Any, type_: type[msgspec.Struct], where: str) -
     place = where + path if not where.endswith(")") or not path else f"{where}: {path[1:]}"
     if match := re.fullmatch(r"Object contains unknown field `(.*)`", text):
         known = _fields_at(type_, path)
-        found = f"found unknown key {match[1]!r}" + suggest(match[1], known)
-        return f"{place}: {found}; expected one of {', '.join(known) or 'no settings'}"
+        problem = f"found unknown key {match[1]!r}" + suggest(match[1], known)
+        return f"{place}: {problem}; expected one of {', '.join(known) or 'no settings'}"
     if match := re.fullmatch(r"Object missing required field `(.*)`", text):
         return f"{place}: expected a setting {show(match[1])}, found none"
     if "found" in text:  # a check of our own, which has said it all
@@ -268,16 +268,16 @@ def override(table: dict[str, Any], change: str) -> None:
 def given(text: str) -> Any:
     """Return a command-line text's value in TOML, or the text; else raise `ValueError`."""
     try:
-        found = tomllib.loads(f"value = {text}")
+        table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
         return GivenHere(text.strip())
     except ValueError:  # of Python's int()
         raise ValueError("expected a number of a usual size") from None
     except RecursionError:
         raise ValueError("expected a value, found brackets nested too deep") from None
-    if len(found) > 1:
+    if len(table) > 1:
         raise ValueError("expected one setting, found more lines")
-    value = found["value"]
+    value = table["value"]
     return GivenHere(value) if isinstance(value, str) else value
 
 
@@ -289,11 +289,11 @@ def _part(nodes: dict[str, dict[str, Any]], name: str, where: str) -> dict[str, 
         for key, entries in table.items()
         for part, entry in _by_name(entries).items()
     }
-    found = [path for path in parts if path.endswith(f".{name}")]
-    if len(found) == 1:
-        return parts[found[0]]
-    if found:
-        raise ConfigError(f"{where}: expected one of {', '.join(found)}; found {show(name)}")
+    matches = [path for path in parts if path.endswith(f".{name}")]
+    if len(matches) == 1:
+        return parts[matches[0]]
+    if matches:
+        raise ConfigError(f"{where}: expected one of {', '.join(matches)}; found {show(name)}")
     known = ["run", *nodes, *(path.rpartition(".")[2] for path in parts)]
     raise ConfigError(
         f"{where}: expected run or a node ({', '.join(nodes)}), found {show(name)}"

@@ -70,14 +70,14 @@ def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
 
 def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
     """Return the keys of the changeable settings; ``cameras.*.loss`` is every camera's."""
-    found = []
+    keys = []
     for name, field in types_of(type_).items():
         key, inner = f"{before}{name}", struct_in(field)
         if is_marked(field):
-            found.append(key)
+            keys.append(key)
         elif inner is not None:
-            found += changeable(inner, f"{key}." if inner is field else f"{key}.*.")
-    return found
+            keys += changeable(inner, f"{key}." if inner is field else f"{key}.*.")
+    return keys
 
 
 def _checked(name: str, before: NodeConfig, after: NodeConfig) -> Change:
@@ -96,15 +96,15 @@ def _checked(name: str, before: NodeConfig, after: NodeConfig) -> Change:
 def toml(value: Any) -> str:
     """Format a value as TOML on a single line, as after the equals sign."""
     if isinstance(value, list):
-        return f"[{', '.join(toml(each) for each in value)}]"
+        return f"[{', '.join(toml(entry) for entry in value)}]"
     if isinstance(value, dict):
-        return f"{{ {', '.join(f'{key} = {toml(each)}' for key, each in value.items())} }}"
+        return f"{{ {', '.join(f'{key} = {toml(entry)}' for key, entry in value.items())} }}"
     return tomli_w.dumps({"v": value}).strip().removeprefix("v = ")
 
 
 def _table(config: msgspec.Struct) -> dict[str, Any]:
-    found: dict[str, Any] = without_none(msgspec.to_builtins(config, enc_hook=plain))
-    return found
+    table: dict[str, Any] = without_none(msgspec.to_builtins(config, enc_hook=plain))
+    return table
 
 
 def _differences(before: Any, after: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -143,7 +143,7 @@ def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
 
 def settings(config: NodeConfig) -> dict[str, str]:
     """Return the changeable settings with their values, as `Change.values`."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
 
     def walk(type_: Any, value: Any, before: str) -> None:
         for name, field in types_of(type_).items():
@@ -151,7 +151,7 @@ def settings(config: NodeConfig) -> dict[str, str]:
             if inner is None:
                 continue
             if is_marked(field):
-                found[key] = toml(inner)
+                texts[key] = toml(inner)
             elif isinstance(inner, dict) and struct is not None:
                 walk(struct, inner, f"{key}.")
             elif names := _names(inner):
@@ -160,4 +160,4 @@ def settings(config: NodeConfig) -> dict[str, str]:
 
     if changeable(type(config)):
         walk(type(config), _table(config), "")
-    return found
+    return texts

@@ -205,9 +205,9 @@ def _refuse_extremes(table: Mapping[str, Any], where: str) -> None:
     while left:
         value, depth = left.pop()
         if isinstance(value, Mapping):
-            left += [(each, depth + 1) for each in value.values()]
+            left += [(inner, depth + 1) for inner in value.values()]
         elif isinstance(value, list):
-            left += [(each, depth + 1) for each in value]
+            left += [(inner, depth + 1) for inner in value]
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             raise ConfigError(f"{where}: expected whole numbers of 64 bits, found a larger one")
         if depth > _DEEPEST:
@@ -221,14 +221,14 @@ _DEEPEST = 32
 
 def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
     """Return the node classes offered by packages, by name, sorted; warn of broken ones."""
-    found = {}
+    nodes = {}
     offered = Counter(offer.name for offer in offers(NODES))
     for package, name, value in offers(NODES):
         try:
-            found[name if offered[name] == 1 else value] = find_node(value, value)
+            nodes[name if offered[name] == 1 else value] = find_node(value, value)
         except VisnavError as error:
             warn(f"a node of the package {package}: {error}")
-    return dict(sorted(found.items()))
+    return dict(sorted(nodes.items()))
 
 
 def find_node(type_: str, where: str) -> type[Node[Any]]:
@@ -287,8 +287,8 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
         raise ConfigError(
             f"{where}: {module_name} cannot be imported: {type(error).__name__}: {error}{place}"
         ) from error
-    found = vars(module).get(class_name)
-    if isinstance(found, type) and issubclass(found, Node) and (lacks := abstract(found)):
+    node = vars(module).get(class_name)
+    if isinstance(node, type) and issubclass(node, Node) and (lacks := abstract(node)):
         raise ConfigError(f"{where}: {type_}: expected {lacks} in it, found none")
     known = {
         name: value
@@ -335,8 +335,8 @@ Presets = Mapping[str, Mapping[str, Any]]
 
 def presets_in(extra: Mapping[str, Any] | None) -> Presets:
     """Return the presets in the `extra` of a type's `Meta`."""
-    found: Presets = (extra or {}).get("presets", {})
-    return found
+    presets: Presets = (extra or {}).get("presets", {})
+    return presets
 
 
 def by_name_alone(table: type[msgspec.Struct]) -> list[str]:
@@ -355,7 +355,7 @@ def expanded(value: Any, type_: Any, where: str, at: str = "") -> Any:
     if table is None:
         return value
     if isinstance(value, list):
-        return [expanded(each, table, where, f"{at}[{i}]") for i, each in enumerate(value)]
+        return [expanded(entry, table, where, f"{at}[{i}]") for i, entry in enumerate(value)]
     extra = _extra(table)
     if isinstance(value, str) and extra:
         value = {"preset": value}
@@ -379,7 +379,7 @@ def _put_in(value: Mapping[str, Any], extra: Mapping[str, Any], where: str) -> d
                 f"{where}: expected {other} beside {key}, since that of {name} belongs to its own "
                 f"{key}, found none"
             )
-    return _merged(preset, {key: each for key, each in value.items() if key != "preset"})
+    return _merged(preset, {key: inner for key, inner in value.items() if key != "preset"})
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -402,11 +402,11 @@ def _not_finite(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
     if isinstance(value, float) and not math.isfinite(value):
         yield path, value
     elif isinstance(value, Mapping):
-        for key, each in value.items():
-            yield from _not_finite(each, f"{path}.{key}")
+        for key, inner in value.items():
+            yield from _not_finite(inner, f"{path}.{key}")
     elif isinstance(value, list | tuple):
-        for index, each in enumerate(value):
-            yield from _not_finite(each, f"{path}[{index}]")
+        for index, inner in enumerate(value):
+            yield from _not_finite(inner, f"{path}[{index}]")
 
 
 def _node(entry: Any, where: str, folder: Path) -> NodeSpec:

@@ -54,10 +54,10 @@ def resumable() -> bool:
     if not works(None):
         Stream.use_futures()
         log.warning("%s: streams wait on futures, since its tasks accept nothing else", PYTHON)
-    found = works(functools.partial(_task_factory, Nesting()))
-    if not found:
+    supported = works(functools.partial(_task_factory, Nesting()))
+    if not supported:
         log.warning("%s: streams wake tasks through the loop, which is slower", PYTHON)
-    return found
+    return supported
 
 
 def works(factory: Factory | None) -> bool:

@@ -98,7 +98,7 @@ def code_of_estimators(config: Config, only: Collection[str] = ()) -> dict[str, 
         spec.name: code_of(spec)
         for spec in config.nodes
         if (not only or spec.name in only)
-        and any(issubclass(each.event, estimates) for each in spec.node.declared.outputs.values())
+        and any(issubclass(port.event, estimates) for port in spec.node.declared.outputs.values())
     }
 
 
@@ -238,8 +238,8 @@ def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> It
     names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
 
     def stop(number: int, _: Any) -> None:
-        for each in before:
-            signal.signal(each, signal.SIG_DFL)
+        for handled in before:
+            signal.signal(handled, signal.SIG_DFL)
         supervisor.state.stop_requested = names[signal.Signals(number)]
         loop.call_soon_threadsafe(supervisor.stop, supervisor.state.stop_requested)
 

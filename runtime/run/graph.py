@@ -48,7 +48,7 @@ def listeners(
     wrap: Wrap = unwrapped,
 ) -> list[Listener]:
     """Return a node's inputs, fields of bundles and handlers, in order."""
-    found = []
+    receivers = []
     sources = node.sources
 
     def add(
@@ -58,7 +58,7 @@ def listeners(
             deliver, stream = _linked(links[port], wrap(node.name, deliver), fault), None
         elif stream is None:  # a stream's reader is wrapped already, with its task
             deliver = wrap(node.name, deliver)
-        found.append(Listener(node.name, deliver, events, source, stream))
+        receivers.append(Listener(node.name, deliver, events, source, stream))
 
     for name in node.declared.listening:
         if name in node.declared.handlers:
@@ -77,7 +77,7 @@ def listeners(
             input_, stream = node.declared.inputs[name], getattr(node, name)
             source = sources.get(name, input_.source)
             add(name, stream.offer, (input_.event,), source, stream)
-    return found
+    return receivers
 
 
 def connect(
@@ -121,9 +121,9 @@ def truth_receivers(
 ) -> set[str]:
     """Return the nodes that receive true poses of announced vehicles or cameras."""
     truths = [
-        (Odometry if isinstance(each, VehicleAnnouncement) else PoseStamped, each.source)
-        for each in announcements
-        if isinstance(each, VehicleAnnouncement | CameraAnnouncement)
+        (Odometry if isinstance(a, VehicleAnnouncement) else PoseStamped, a.source)
+        for a in announcements
+        if isinstance(a, VehicleAnnouncement | CameraAnnouncement)
     ]
     return {
         listener.node
@@ -172,7 +172,7 @@ def sends_estimates(node: Node[Any]) -> bool:
 
 def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str, str, str]]:
     """Return the graph as (sender, output, event, receiver, input), from the classes alone."""
-    found = []
+    graph = []
     for sender, sending in nodes:
         for output, declared in sending.declared.outputs.items():
             for receiver, receiving in nodes:
@@ -181,8 +181,8 @@ def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, 
                 for port, events in input_types(receiving).items():
                     listener = Listener(receiver, _nothing, events)
                     if listener.may_receive(declared.event):
-                        found.append((sender, output, declared.event.__name__, receiver, port))
-    return found
+                        graph.append((sender, output, declared.event.__name__, receiver, port))
+    return graph
 
 
 def edges_of(specs: Sequence[NodeSpec]) -> list[tuple[str, str, str, str, str]]:
@@ -193,22 +193,22 @@ def edges_of(specs: Sequence[NodeSpec]) -> list[tuple[str, str, str, str, str]]:
         when = by_name[sender].node.declared.outputs[output].when
         return not when or bool(getattr(by_name[sender].config, when))
 
-    found = edges([(spec.name, spec.node) for spec in specs])
-    return [each for each in found if used(each[0], each[1])]
+    graph = edges([(spec.name, spec.node) for spec in specs])
+    return [edge for edge in graph if used(edge[0], edge[1])]
 
 
 def input_types(cls: type[Node[Any]]) -> dict[str, tuple[Any, ...]]:
     """Return the event types of a class's inputs, fields of bundles and handlers."""
-    found: dict[str, tuple[Any, ...]] = {}
+    types: dict[str, tuple[Any, ...]] = {}
     for name in cls.declared.listening:
         if name in cls.declared.handlers:
-            found[name] = cls.declared.handlers[name].events
+            types[name] = cls.declared.handlers[name].events
         elif name in cls.declared.bundles:
             fields = cls.declared.bundles[name].fields
-            found |= {f"{name}.{field}": (each.event,) for field, each in fields.items()}
+            types |= {f"{name}.{field}": (member.event,) for field, member in fields.items()}
         else:
-            found[name] = (cls.declared.inputs[name].event,)
-    return found
+            types[name] = (cls.declared.inputs[name].event,)
+    return types
 
 
 def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str]]:
@@ -242,27 +242,27 @@ def circles(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[str]:
         for name, cls in nodes
         for handler in cls.declared.handlers
     }
-    found: dict[frozenset[str], str] = {}
+    unique: dict[frozenset[str], str] = {}
 
     def follow(place: tuple[str, str], way: dict[tuple[str, str], str]) -> None:
         for step, following in after[place]:
             if following in way:
                 steps = [*way.values(), step]
                 steps = steps[[*way].index(following) + 1 :]
-                found.setdefault(frozenset(steps), ", ".join(steps))
+                unique.setdefault(frozenset(steps), ", ".join(steps))
             elif following > next(iter(way)):  # else it was found from there
                 follow(following, {**way, following: step})
 
     for place in after:
         follow(place, {place: ""})
-    return list(found.values())
+    return list(unique.values())
 
 
 def _always_sends(cls: type[Node[Any]], handler: str) -> list[str]:
     """Return the outputs always used by a handler; none if there are branches."""
     code = list(dis.get_instructions(inspect.unwrap(getattr(cls, handler))))
-    names = {each.argval for each in code if each.opname in {"LOAD_ATTR", "LOAD_METHOD"}}
-    if "send" not in names or any(each.is_jump_target for each in code):
+    names = {op.argval for op in code if op.opname in {"LOAD_ATTR", "LOAD_METHOD"}}
+    if "send" not in names or any(op.is_jump_target for op in code):
         return []
     return [output for output in cls.declared.outputs if output in names]
 

@@ -94,11 +94,11 @@ def roots_of(config: Config, folder: Path | None = None, modules: Iterable[str] 
     programs: list[CommandLine] = []
     for spec in config.nodes:
         besides = [*spec.node.made_from(spec.config)]
-        lines = [each for each in besides if isinstance(each, CommandLine)]
+        lines = [source for source in besides if isinstance(source, CommandLine)]
         of_programs = {text for line in lines for text in line.texts()}
-        own_files = [each for each in inputs(spec.config) if each not in of_programs]
+        own_files = [file for file in inputs(spec.config) if file not in of_programs]
         files |= dict.fromkeys(own_files)
-        files |= dict.fromkeys(str(each) for each in besides if isinstance(each, Path))
+        files |= dict.fromkeys(str(source) for source in besides if isinstance(source, Path))
         apart = {*written(spec.config), *of_programs, *own_files}
         own = msgspec.to_builtins(spec.config, enc_hook=plain)
         texts |= dict.fromkeys(text for text in _texts(own) if text not in apart)
@@ -120,8 +120,8 @@ def _texts(value: Any) -> Iterator[str]:
         if len(value) < 4096 and value.isprintable():
             yield value
     elif isinstance(value, dict | list | tuple):
-        for each in value.values() if isinstance(value, dict) else value:
-            yield from _texts(each)
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _texts(inner)
 
 
 def made_from(roots: Roots) -> Parts:
@@ -129,14 +129,14 @@ def made_from(roots: Roots) -> Parts:
 
     Never raises: a file that is missing or cannot be read is a part of its own kind.
     """
-    found = _Collector(roots.folder)
+    collector = _Collector(roots.folder)
     finder = Finder([Path(roots.folder)] if roots.folder else [])
-    found.read_settings(roots.inputs, finder)
-    possible = found.read_settings(roots.texts, finder, certain=False)
-    found.add_code(finder, roots.modules, possible=possible)
+    collector.read_settings(roots.inputs, finder)
+    possible = collector.read_settings(roots.texts, finder, certain=False)
+    collector.add_code(finder, roots.modules, possible=possible)
     for line in roots.programs:
-        found.add_program(line)
-    return found.parts() | {"python": platform.python_version(), "machine": platform.machine()}
+        collector.add_program(line)
+    return collector.parts() | {"python": platform.python_version(), "machine": platform.machine()}
 
 
 def code_of(spec: NodeSpec, folder: Path | None = None) -> str:
@@ -144,19 +144,19 @@ def code_of(spec: NodeSpec, folder: Path | None = None) -> str:
 
     The events and the runtime, which the commit tells, are no part of it.
     """
-    found = _Collector(str(folder or ""))
+    collector = _Collector(str(folder or ""))
     finder, module = Finder([folder] if folder else []), spec.node.__module__
     if module == "__main__":  # a script, or a notebook
         script = Path(getattr(sys.modules[module], "__file__", None) or "")
-        found.add_code(finder, scripts=[script] if script.is_file() else [], libraries=False)
+        collector.add_code(finder, scripts=[script] if script.is_file() else [], libraries=False)
         with contextlib.suppress(OSError, TypeError):
-            found.add_text(spec.node.__qualname__, inspect.getsource(spec.node))
+            collector.add_text(spec.node.__qualname__, inspect.getsource(spec.node))
     else:
-        found.add_code(finder, [module], ours=_of_nodes, libraries=False)
-    for each in spec.node.made_from(spec.config):
-        if isinstance(each, CommandLine):
-            found.add_program(each, libraries=False)
-    return key_of(found.parts())
+        collector.add_code(finder, [module], ours=_of_nodes, libraries=False)
+    for source in spec.node.made_from(spec.config):
+        if isinstance(source, CommandLine):
+            collector.add_program(source, libraries=False)
+    return key_of(collector.parts())
 
 
 def _of_nodes(module: str) -> bool:
@@ -197,7 +197,7 @@ def during(before: Parts, after: Parts) -> tuple[Parts, list[str]]:
         for name in before
         if before[name].startswith(_WRITABLE) and before[name] != after.get(name)
     }
-    parts = {name: each for name, each in before.items() if name not in made}
+    parts = {name: part for name, part in before.items() if name not in made}
     return parts, changes(parts, {k: v for k, v in after.items() if k not in made})
 
 
@@ -289,19 +289,19 @@ class _Collector:
         working: Path | None = None,
     ) -> None:
         """Add the files of modules and scripts with what they import."""
-        found: Found = find_sources(
+        sources: Found = find_sources(
             finder, modules, scripts, possible=possible, ours=ours, working=[working or Path.cwd()]
         )
-        for name, paths in found.folders.items():
+        for name, paths in sources.folders.items():
             for path in paths:
                 self._add_named_folder(Path(path), name, [working or Path.cwd()])
-        for name, paths in found.files.items():
+        for name, paths in sources.files.items():
             for path in paths:
-                self._note(name, path, certain=name not in found.named)
+                self._note(name, path, certain=name not in sources.named)
                 if path.endswith(".so") and name.partition("/")[0] not in OURS and libraries:
                     self._add_libraries(Path(path), None)
         if libraries:
-            self._others |= distributions(found.installed, finder.sites)
+            self._others |= distributions(sources.installed, finder.sites)
 
     def add_program(self, line: CommandLine, *, libraries: bool = True) -> None:
         """Add a program and the files on its command line."""
@@ -309,7 +309,7 @@ class _Collector:
         working = Path(line.folder).absolute()
         words = [_expanded(word, environment) for word in line.words]
         scripts: list[Path] = []
-        first = [Path(each) for each in environment.get("PYTHONPATH", "").split(":") if each]
+        first = [Path(entry) for entry in environment.get("PYTHONPATH", "").split(":") if entry]
         for text in (value for _, value in line.environment):
             if _is_file(working / text):
                 scripts += self._add(working / text, [working], line, certain=False)
@@ -397,7 +397,7 @@ class _Collector:
                     else:
                         todo.append(named)
         if line is None and scripts:
-            self.add_code(Finder([each.parent for each in scripts]), scripts=scripts)
+            self.add_code(Finder([script.parent for script in scripts]), scripts=scripts)
         return scripts
 
     def _name(self, path: Path, bases: Sequence[Path]) -> str:
@@ -424,8 +424,8 @@ class _Collector:
             for folder in sorted(folders):
                 files = sorted(_files_in(folder))
                 large = sum(size for _, size in files) > LARGE
-                each = [f"{path} {content_hash(folder / path, large=large)}" for path, _ in files]
-                hashes.append(hashed(each))
+                lines = [f"{path} {content_hash(folder / path, large=large)}" for path, _ in files]
+                hashes.append(hashed(lines))
             result[name] = ("" if any(folders.values()) else _WRITABLE) + hashed(hashes)
         return result
 
@@ -454,25 +454,25 @@ def _expanded(word: str, environment: Mapping[str, str]) -> str:
 
 def _arguments(words: Iterable[str]) -> list[str]:
     """Return all that may be a path, such as ``x.yaml`` of ``--settings=x.yaml``."""
-    found: dict[str, None] = {}
+    texts: dict[str, None] = {}
     for word in words:
         pieces = [word]
         if re.search(r"\s", word):
             with contextlib.suppress(ValueError):
                 pieces += shlex.split(word)
         for piece in pieces:
-            found |= dict.fromkeys([piece, *re.split(":=|=|:", piece)[1:]])
-    return [text for text in found if text.strip("-.") and "\0" not in text]
+            texts |= dict.fromkeys([piece, *re.split(":=|=|:", piece)[1:]])
+    return [text for text in texts if text.strip("-.") and "\0" not in text]
 
 
 def _executable(words: Sequence[str], working: Path, environment: Mapping[str, str]) -> Path | None:
     if not words or "$" in words[0]:
         return None
     place = str(working / words[0]) if "/" in words[0] else words[0]
-    found = shutil.which(place, path=environment.get("PATH"))
-    if found is None and _is_file(Path(place)):
-        found = place
-    return None if found is None else Path(found)
+    program = shutil.which(place, path=environment.get("PATH"))
+    if program is None and _is_file(Path(place)):
+        program = place
+    return None if program is None else Path(program)
 
 
 def _python_arguments(words: Sequence[str], working: Path) -> tuple[Path | None, list[str]]:
@@ -543,8 +543,8 @@ def _is_named_data(folder: Path, around: Iterable[Path]) -> bool:
     if not _is_folder(folder) or not _is_data(folder) or folder.name in _RESULTS:
         return False
     around = (*around, Path.cwd(), TOOL, Path(tempfile.gettempdir()))
-    inside = (Path(os.path.normpath(each.absolute())) for each in around)
-    if len(folder.parts) <= 2 or any(each.is_relative_to(folder) for each in inside):
+    inside = (Path(os.path.normpath(place.absolute())) for place in around)
+    if len(folder.parts) <= 2 or any(place.is_relative_to(folder) for place in inside):
         return False
     with contextlib.suppress(OSError):
         if any((folder / name).exists() for name in ("__init__.py", MARKER, "rows.jsonl")):
@@ -562,12 +562,12 @@ def _is_small(folder: Path) -> bool:
             continue
         seen.add(inside)
         with contextlib.suppress(OSError), os.scandir(inside) as entries:
-            for each in entries:
+            for entry in entries:
                 count += 1
                 if count > MOST_FILES:
                     return False
-                if each.is_dir():
-                    todo.append(each.path)
+                if entry.is_dir():
+                    todo.append(entry.path)
     return True
 
 
@@ -580,8 +580,8 @@ _LINKED: dict[tuple[str, str | None, int, int], list[str]] = {}
 
 def _libraries(program: Path, search: str | None) -> list[str]:
     """Return the shared libraries that a program is linked with."""
-    found = program.stat()
-    key = str(program), search, found.st_mtime_ns, found.st_size
+    status = program.stat()
+    key = str(program), search, status.st_mtime_ns, status.st_size
     if key not in _LINKED:
         environment = {**os.environ, **({"LD_LIBRARY_PATH": search} if search else {})}
         output = ""
@@ -596,16 +596,16 @@ def _libraries(program: Path, search: str | None) -> list[str]:
 
 def _included(path: Path) -> list[Path]:
     """Return the files that a MuJoCo model and the models that it includes name."""
-    found, todo, folders = {path}, [path], {path.parent}
+    included, todo, folders = {path}, [path], {path.parent}
     while todo:
         if (file := todo.pop()).suffix == ".xml":
             text = file.read_text(encoding="utf-8", errors="replace")
             folders |= {base / name for name in _FOLDERS.findall(text) for base in [*folders]}
             named = {folder / name for folder in folders for name in _FILES.findall(text)}
-            todo += (new := sorted({each for each in named if each.is_file()} - found))
-            found.update(new)
-            folders |= {each.parent for each in new if each.suffix == ".xml"}
-    return sorted(found - {path})
+            todo += (new := sorted({file for file in named if file.is_file()} - included))
+            included.update(new)
+            folders |= {added.parent for added in new if added.suffix == ".xml"}
+    return sorted(included - {path})
 
 
 def _named_in(path: Path, bases: Iterable[Path]) -> Iterator[Path]:
@@ -628,18 +628,18 @@ def _files_in(folder: Path, without: frozenset[str] = _RESULTS) -> Iterator[tupl
         inside = todo.pop()
         with contextlib.suppress(OSError):
             entries = list(os.scandir(folder / inside))
-            names = {each.name for each in entries}
+            names = {entry.name for entry in entries}
             mark = (folder / inside).stat()
             if (mark.st_dev, mark.st_ino) in seen:
                 continue
             seen.add((mark.st_dev, mark.st_ino))
             if inside and (MARKER in names or "rows.jsonl" in names):
                 continue
-            for each in entries:
-                path = f"{inside}/{each.name}".lstrip("/")
-                if each.name.startswith(".") or each.name in without:
+            for entry in entries:
+                path = f"{inside}/{entry.name}".lstrip("/")
+                if entry.name.startswith(".") or entry.name in without:
                     continue
-                if each.is_dir():
+                if entry.is_dir():
                     todo.append(path)
-                elif each.is_file() and not each.name.endswith(".pyc"):
-                    yield path, each.stat().st_size
+                elif entry.is_file() and not entry.name.endswith(".pyc"):
+                    yield path, entry.stat().st_size

@@ -114,33 +114,33 @@ class NodeRunner:
         try:
             given: Any = self.node.announce()
             given = given if isinstance(given, Iterable) else [given]
-            found = self._items("announce", given, limit)
-            for each in found:
-                if not isinstance(each, Announcement):
+            announced = self._items("announce", given, limit)
+            for announcement in announced:
+                if not isinstance(announcement, Announcement):
                     raise NodeError(
                         name,
                         "announce(): expected announcements, "
-                        f"found {each!r:.80} ({type(each).__name__})",
+                        f"found {announcement!r:.80} ({type(announcement).__name__})",
                     )
-                plain(each, f"announce(): {type(each).__name__}")
-            return found
+                plain(announcement, f"announce(): {type(announcement).__name__}")
+            return announced
         except BaseException as error:
             raise wrap(name, error) from error
 
     def _items(self, phase: str, given: Iterable[Any], limit: float) -> list[Any]:
         """Return what a phase gives, which may be endless; or raise `NodeError`."""
-        found: list[Any] = []
+        values: list[Any] = []
         until = time.monotonic() + limit
-        for each in given:
-            if len(found) == MOST_GIVEN:
+        for value in given:
+            if len(values) == MOST_GIVEN:
                 raise NodeError(
                     self.spec.name,
                     f"{phase}(): expected an end after at most {MOST_GIVEN:,} values, found more",
                 )
             if time.monotonic() > until:
                 raise self._too_late(phase, limit, "")
-            found.append(each)
-        return found
+            values.append(value)
+        return values
 
     def receive_announcements(self, announcements: Iterable[Announcement], limit: float) -> None:
         """Hand the node all announcements, then call its `check`, within a limit (real s).
@@ -299,13 +299,13 @@ def wrap(name: str, error: BaseException) -> NodeError:
     """Return a node's exception as a `NodeError` naming the node; a `NodeError` as is."""
     if isinstance(error, NodeError):
         return error
-    found = event_loop.leaf(error)
-    if isinstance(found, VisnavError):  # says all there is to say; others need their type
-        wrapped = NodeError(name, str(found).removeprefix(f"{name}: "))
+    leaf = event_loop.leaf(error)
+    if isinstance(leaf, VisnavError):  # says all there is to say; others need their type
+        wrapped = NodeError(name, str(leaf).removeprefix(f"{name}: "))
     else:
-        wrapped = NodeError(name, _described(found))
-        there = getattr(found, "place_in_worker", "")
-        wrapped.place = there or (event_loop.of_error(found)[1] if found.__traceback__ else "")
+        wrapped = NodeError(name, _described(leaf))
+        there = getattr(leaf, "place_in_worker", "")
+        wrapped.place = there or (event_loop.of_error(leaf)[1] if leaf.__traceback__ else "")
     wrapped.__cause__ = error
     return wrapped
 
@@ -376,8 +376,8 @@ async def start_up(
         return
     for runner in runners:
         try:
-            announced[runner.spec.name] = found = runner.announcements(limit)
-            for announcement in found:
+            announced[runner.spec.name] = announcements = runner.announcements(limit)
+            for announcement in announcements:
                 try:
                     voices.announce(runner.spec.name, announcement)
                 except ChannelSourceError as error:

@@ -101,14 +101,14 @@ class Folder:
 
 def run_folder(path: Path) -> Path:
     """Return the run's folder meant by a path: itself or its ``latest``; else `ResultsError`."""
-    found = newest(path)
-    if any((found / sign).exists() for sign in SIGNS):
-        return found
+    folder = newest(path)
+    if any((folder / sign).exists() for sign in SIGNS):
+        return folder
     inside = "none"
-    if found != path:
-        inside = f"a link to {found.name}, which is none"
+    if folder != path:
+        inside = f"a link to {folder.name}, which is none"
     elif path.is_dir():
-        inside = ", ".join(sorted(each.name for each in path.iterdir())[:5]) or "nothing in it"
+        inside = ", ".join(sorted(entry.name for entry in path.iterdir())[:5]) or "nothing in it"
     raise ResultsError(
         f"{path}: expected the folder of a run, with {', '.join(SIGNS[:-1])} or {SIGNS[-1]} in it, "
         f"or one with a link {LATEST} to such a folder, found {inside}"
@@ -156,10 +156,10 @@ def claim(out: Path) -> None:
         return
     if os.path.lexists(marker):
         raise ResultsError(f"{marker}: expected a file, which a run has made, found none")
-    if found := sorted(each.name for each in out.iterdir()):
+    if names := sorted(entry.name for entry in out.iterdir()):
         raise ResultsError(
             f"{out}: expected a new or empty folder, or one that a run has made (with a "
-            f"{MARKER} in it), found {found[0]!r}: name another with --out, or remove it"
+            f"{MARKER} in it), found {names[0]!r}: name another with --out, or remove it"
         )
     marker.write_text(_MARK, encoding="utf-8")
 
@@ -307,7 +307,7 @@ def private_results(out: Path) -> Iterator[Path]:
     except OSError as error:
         raise ResultsError(f"{base}: expected to write a run's results, found: {error}") from error
     with _private_results_locked(made):
-        left = [each.name for each in sorted(base.glob("[!.]*")) if _is_left(each)]
+        left = [entry.name for entry in sorted(base.glob("[!.]*")) if _is_left(entry)]
         if left:
             names = ", ".join(left[:3] + ["…"] * (len(left) > 3))
             log.warning("what killed runs have recorded is in %s: move or remove %s", base, names)
@@ -346,9 +346,9 @@ def _is_left(folder: Path) -> bool:
 
 def _private_results_move(source: Path, target: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
-    for each in source.iterdir():
-        there = target / each.name
-        if each.is_dir() and there.is_dir():
-            _private_results_move(each, there)
+    for entry in source.iterdir():
+        there = target / entry.name
+        if entry.is_dir() and there.is_dir():
+            _private_results_move(entry, there)
         else:
-            each.replace(there)
+            entry.replace(there)

@@ -314,8 +314,8 @@ class RunState(Host):
     def conclude(
         self, subject: str, figures: Mapping[str, Any], passed: bool | None, flight: bool
     ) -> None:
-        found = self.flights if flight else self.conclusions
-        found[subject] = {"passed": passed, **figures}
+        verdicts = self.flights if flight else self.conclusions
+        verdicts[subject] = {"passed": passed, **figures}
 
     @override
     def after_run(self, call: Callable[[Path], Any]) -> None:
@@ -433,7 +433,7 @@ class Instruments:
 
     def detach(self, instrument: Instrument) -> None:
         """Detach an instrument."""
-        self._attached = tuple(each for each in self._attached if each is not instrument)
+        self._attached = tuple(other for other in self._attached if other is not instrument)
         self._renew()
 
     @property
@@ -446,7 +446,8 @@ class Instruments:
     @property
     def taps(self) -> tuple[Tap, ...]:
         """Taps of the instruments, called with every event before its listeners."""
-        return tuple(each.event_sent for each in self._attached if each.event_sent is not None)
+        taps = (instrument.event_sent for instrument in self._attached)
+        return tuple(tap for tap in taps if tap is not None)
 
     def listener(self, node: str, deliver: Deliver) -> Deliver:
         """Return a handler, or the far end of a link, wrapped by all instruments."""
@@ -477,8 +478,8 @@ class Instruments:
     def offloaded(self, node: str, call: Any) -> Callable[[], Any]:
         """Return a node's offloaded `functools.partial`, wrapped by all instruments."""
         name = getattr(call.func, "__qualname__", type(call.func).__name__)
-        for each in self._attached:
-            call = each.wrap_offload(node, call, name)
+        for instrument in self._attached:
+            call = instrument.wrap_offload(node, call, name)
         return call  # type: ignore[no-any-return]
 
     def _renew(self) -> None:
@@ -492,12 +493,12 @@ class Instruments:
         self._reconnect()
 
     def _wrapped(self, node: str, what: str, call: Call) -> Call:
-        for each in self._attached:
-            call = each.wrap_call(node, what, call)
+        for instrument in self._attached:
+            call = instrument.wrap_call(node, what, call)
         return call
 
     def _worker_called(
         self, process: str, method: str, answer: concurrent.futures.Future[Any]
     ) -> None:
-        for each in self._attached:
-            each.worker_called(process, method, answer)
+        for instrument in self._attached:
+            instrument.worker_called(process, method, answer)

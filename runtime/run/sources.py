@@ -69,11 +69,11 @@ def hashed(parts: Iterable[str | bytes]) -> str:
 def content_hash(path: Path, *, large: bool = False) -> str:
     """Return the hash of a file's content; of a `large` one that of name, size and time."""
     with contextlib.suppress(OSError):
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
             return "no file"
-        if large or found.st_size > LARGE:
-            return hashed([path.name, str(found.st_size), str(found.st_mtime_ns)])
+        if large or status.st_size > LARGE:
+            return hashed([path.name, str(status.st_size), str(status.st_mtime_ns)])
         return _once(path, _hash)
     return "missing"
 
@@ -89,14 +89,14 @@ def _once(path: Path | str, make: Callable[[bytes], T]) -> T:
     """Return what is made of a file's content, as long as the file does not change."""
     key = str(path), make
     path = Path(path)
-    found = path.stat()
-    mark = found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    status = path.stat()
+    mark = status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
     known = _KNOWN.get(key)
     if known is not None and known[0] == mark:
         result: T = known[1]
         return result
     result = make(path.read_bytes())
-    if time.time() - found.st_mtime > _SETTLED:
+    if time.time() - status.st_mtime > _SETTLED:
         _KNOWN[key] = mark, result
     return result
 
@@ -190,7 +190,7 @@ def _read_whole(content: bytes) -> Code:
         if _is_text(node):
             texts.append(node.value)
         elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
-            joined.append([each.value for each in _joined(node)])
+            joined.append([part.value for part in _joined(node)])
         elif isinstance(node, ast.Call):
             name = _called(node)
             if name in _LOADERS and (given := [*node.args, *(k.value for k in node.keywords)]):
@@ -203,13 +203,13 @@ def _read_whole(content: bytes) -> Code:
                     dynamic = True
             dynamic |= name in _DISCOVERIES
             if name in _WRITERS or (name == "open" and _writes(node)):
-                written |= {each.value for each in paths.texts_in(node)}
+                written |= {text.value for text in paths.texts_in(node)}
         inner, place, base = _place(node)
         if place and placed.isdisjoint(map(id, inner)):  # an outer expression is read first
             placed.update(map(id, inner))
             places.append((inner, place, paths.ups(base)))
-    texts += ["/".join(each) for each in joined if not written.issuperset(each)]
-    kept = dict.fromkeys(
+    texts += ["/".join(parts) for parts in joined if not written.issuperset(parts)]
+    literals = dict.fromkeys(
         text
         for text in texts
         if text not in written and (_FILE.fullmatch(text) or _REFERENCE.fullmatch(text))
@@ -217,15 +217,15 @@ def _read_whole(content: bytes) -> Code:
     kept_places = dict.fromkeys(
         (place, ups)
         for inner, place, ups in places
-        if _PATTERN.fullmatch(place) and not written.issuperset(each.value for each in inner)
+        if _PATTERN.fullmatch(place) and not written.issuperset(part.value for part in inner)
     )
     text = content.decode(errors="replace")
-    of_stem = "__file__" in text and any(each in text for each in _OF_STEM)
+    of_stem = "__file__" in text and any(mark in text for mark in _OF_STEM)
     return Code(
         tuple(imports),
         tuple(dict.fromkeys(loaded)),
         dynamic,
-        tuple(kept),
+        tuple(literals),
         tuple(kept_places),
         of_stem,
     )
@@ -241,16 +241,16 @@ class _Paths:
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
                 for target in targets:
                     values.setdefault(_name(target), []).append(node.value)
-        self._values = {name: each[0] for name, each in values.items() if name and len(each) == 1}
+        self._values = {name: v[0] for name, v in values.items() if name and len(v) == 1}
 
     def texts_in(self, node: ast.AST) -> Iterator[_Text]:
         """Yield the texts in an expression and in the values of the names in it."""
         todo, seen = [node], {""}
         while todo:
-            for each in ast.walk(todo.pop()):
-                if _is_text(each):
-                    yield each
-                elif (name := _name(each)) not in seen and name in self._values:
+            for child in ast.walk(todo.pop()):
+                if _is_text(child):
+                    yield child
+                elif (name := _name(child)) not in seen and name in self._values:
                     seen.add(name)
                     todo.append(self._values[name])
 
@@ -307,16 +307,16 @@ def _place(node: ast.AST) -> tuple[list[_Text], str, ast.expr | None]:
         elif len(given) > 1 and not _is_text(given[0]):
             base = given.pop(0)
         if len(node.args) > 1 or base is not None:
-            others = (n for n, each in enumerate(given) if not _is_text(each))
-            inner = [each for each in given[: next(others, len(given))] if _is_text(each)]
+            others = (n for n, arg in enumerate(given) if not _is_text(arg))
+            inner = [arg for arg in given[: next(others, len(given))] if _is_text(arg)]
     elif isinstance(node, ast.JoinedStr):
-        inner = [each for each in node.values if _is_text(each)]
+        inner = [part for part in node.values if _is_text(part)]
         first = node.values[0] if node.values else None
-        place = "".join(each.value if _is_text(each) else "*" for each in node.values)
+        place = "".join(part.value if _is_text(part) else "*" for part in node.values)
         if isinstance(first, ast.FormattedValue) and place.startswith("*/"):
             return inner, place[2:], first.value
         return inner, place, None
-    return inner, "/".join(each.value for each in inner), base
+    return inner, "/".join(part.value for part in inner), base
 
 
 def _is_text(node: ast.AST) -> TypeGuard[_Text]:
@@ -325,8 +325,8 @@ def _is_text(node: ast.AST) -> TypeGuard[_Text]:
 
 def _writes(call: ast.Call) -> bool:
     """Tell whether a call of ``open`` has a mode to write."""
-    given = [*call.args, *(each.value for each in call.keywords)]
-    return any(_is_text(each) and re.fullmatch("[wax][bt+]*", each.value) for each in given)
+    given = [*call.args, *(keyword.value for keyword in call.keywords)]
+    return any(_is_text(arg) and re.fullmatch("[wax][bt+]*", arg.value) for arg in given)
 
 
 def _parsed(content: bytes) -> ast.AST:
@@ -409,8 +409,8 @@ class Finder:
         return sorted(name for name in names if name.isidentifier() and name != "__init__")
 
     def _root(self, root: str) -> tuple[str, list[str]]:
-        if root and (found := self._inside(self.first, root))[0]:
-            return found
+        if root and (location := self._inside(self.first, root))[0]:
+            return location
         if not root.isidentifier() or root in sys.stdlib_module_names:
             return "", []
         if self.sites is not None:
@@ -438,7 +438,7 @@ class Finder:
             for end in _ENDS:
                 if f"{name}{end}" in listed:
                     return f"{path}{end}", []
-        return "", [each for each in spaces if self._listed(each)]
+        return "", [space for space in spaces if self._listed(space)]
 
     def _listed(self, folder: str) -> frozenset[str]:
         if folder not in self._lists:
@@ -503,7 +503,7 @@ def find_sources(
         possible: Names that may be modules.
         working: Folders in which paths in code may begin, beside those of its files.
     """
-    found = Found()
+    sources = Found()
     working = list(working)
     todo = [*modules]
     roots = {name.partition(".")[0] for name in todo}
@@ -516,10 +516,10 @@ def find_sources(
         code = read_code(Path(path), whole=not own)
         for level, module, names in code.imports:
             base = _absolute(level, module, package)
-            todo.extend([base, *(f"{base}.{each}" for each in names)] if base else ())
-        for each in code.loaded:
-            level = len(each) - len(each.lstrip("."))
-            todo.append(_absolute(level, each.lstrip("."), package) or each)
+            todo.extend([base, *(f"{base}.{name}" for name in names)] if base else ())
+        for reference in code.loaded:
+            level = len(reference) - len(reference.lstrip("."))
+            todo.append(_absolute(level, reference.lstrip("."), package) or reference)
         if own:
             return
         folder = Path(path).parent
@@ -534,7 +534,7 @@ def find_sources(
                 todo.append(text.lstrip("."))
             if ("." in text or "/" in text) and (beside := folder / text).is_file():
                 named = beside.name if text.startswith("/") else text
-                found.named.add(named)
+                sources.named.add(named)
                 add_script(str(beside), named)
             if adds_folders:
                 others = (Path(os.path.normpath(up / text)) for up in (folder, folder.parent))
@@ -557,14 +557,14 @@ def find_sources(
     def name_place(place: Path, base: Path, *, file_too: bool) -> None:
         name = place.relative_to(base).as_posix() if place.is_relative_to(base) else place.name
         if place.is_dir():
-            found.folders.setdefault(name, set()).add(str(place))
+            sources.folders.setdefault(name, set()).add(str(place))
         elif file_too and place.is_file() and place.suffix not in {".py", ".pyc", ".pyi"}:
-            if name not in found.files:
-                found.named.add(name)
-            found.add(name, str(place))
+            if name not in sources.files:
+                sources.named.add(name)
+            sources.add(name, str(place))
 
     def add_script(path: str, name: str) -> None:
-        found.add(name, path)
+        sources.add(name, path)
         if path not in read and (path.endswith(".py") or _is_python(path)):
             read.add(path)
             read_file(path, "", "")
@@ -581,15 +581,15 @@ def find_sources(
             package = name.removesuffix("*").removesuffix(".")
             inside = finder.find(package)[1] if package else finder.first
             if root not in roots and any(map(is_installed, inside)):
-                found.installed.add(root)
+                sources.installed.add(root)
             else:
                 prefix = f"{package}." if package else ""
-                todo += [prefix + each for each in finder.modules(inside)]
+                todo += [prefix + submodule for submodule in finder.modules(inside)]
             continue
         file, folders = finder.find(name)
         place = file or next(iter(folders), "")
         if root not in roots and is_installed(place):
-            found.installed.add(root)
+            sources.installed.add(root)
             continue
         if root in OURS and not ours(name):
             continue
@@ -600,14 +600,14 @@ def find_sources(
         parts = name.split(".")
         is_package = bool(folders)
         base = "/".join(parts if is_package else parts[:-1])
-        found.add(f"{base}/{Path(file).name}".lstrip("/"), file)
+        sources.add(f"{base}/{Path(file).name}".lstrip("/"), file)
         if is_package:
             for beside in os.scandir(folders[0]):
                 skipped = beside.name.endswith((".py", ".pyc", ".pyi")) or beside.path == str(NOTE)
                 if not skipped and beside.is_file():
-                    found.add(f"{base}/{beside.name}", beside.path)
+                    sources.add(f"{base}/{beside.name}", beside.path)
         read_file(file, name, name if is_package else ".".join(parts[:-1]))
-    return found
+    return sources
 
 
 def _up(folder: Path, count: int) -> Path:
@@ -653,13 +653,13 @@ def distributions(roots: Iterable[str], sites: Sequence[Path] | None = None) -> 
         sites: Folders of installed packages; by default those of this process.
     """
     if sites is None:
-        sites = [Path(each) for each in dict.fromkeys(sys.path) if is_installed(each)]
+        sites = [Path(entry) for entry in dict.fromkeys(sys.path) if is_installed(entry)]
     known: dict[str, Path] = {}
     for site in sites:
         with contextlib.suppress(OSError):
-            for each in sorted(site.iterdir()):
-                if each.suffix in {".dist-info", ".egg-info"}:
-                    known.setdefault(_normal(each.name.partition("-")[0]), each)
+            for entry in sorted(site.iterdir()):
+                if entry.suffix in {".dist-info", ".egg-info"}:
+                    known.setdefault(_normal(entry.name.partition("-")[0]), entry)
     todo = []
     for root in roots:
         todo += [name for name, info in known.items() if root in _provides(info)]
@@ -698,8 +698,8 @@ def _read_metadata(content: bytes) -> _Metadata:
             fields.setdefault(key, []).append(value.strip())
     requires = (
         _normal(match[0])
-        for each in fields.get("Requires-Dist", [])
-        if "extra ==" not in each and (match := re.match(r"[\w.-]+", each))
+        for requirement in fields.get("Requires-Dist", [])
+        if "extra ==" not in requirement and (match := re.match(r"[\w.-]+", requirement))
     )
     return _Metadata(fields.get("Name", [""])[0], fields.get("Version", [""])[0], tuple(requires))
 
@@ -732,7 +732,7 @@ def _hash_record(content: bytes) -> str:
     lines = (
         line
         for line in content.splitlines()
-        if not line.startswith(b"..") and not any(each in line for each in made)
+        if not line.startswith(b"..") and not any(name in line for name in made)
     )
     return hashed(sorted(lines))[:16]
 

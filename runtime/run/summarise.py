@@ -71,7 +71,7 @@ _SECRET = re.compile(r"(secret\s*=\s*)(?!\W*(?:file|env):).*", re.DOTALL)
 def command_line() -> str:
     """Return the command line of this process, without Python's folder and secrets."""
     program, *arguments = sys.orig_argv
-    shown = [_SECRET.sub(r"\1…", each) for each in arguments]
+    shown = [_SECRET.sub(r"\1…", argument) for argument in arguments]
     return shlex.join([Path(program).name, *shown])
 
 
@@ -89,19 +89,19 @@ def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
 
 def count_drops(state: RunState) -> dict[str, StreamSummary]:
     """Return each input's bound, peak and drops."""
-    found: dict[str, StreamSummary] = {}
+    summaries: dict[str, StreamSummary] = {}
     for node in state.all_nodes:
         missed = {port: matcher.missed for port, matcher in matchers(node).items()}
         for port, stream in streams(node).items():
-            before = found.get(stream.name, StreamSummary(stream.bound, 0, 0))
+            before = summaries.get(stream.name, StreamSummary(stream.bound, 0, 0))
             now = stream.statistics()
-            found[stream.name] = StreamSummary(
+            summaries[stream.name] = StreamSummary(
                 stream.bound,
                 max(before.peak, now.peak),
                 before.dropped + now.dropped,
                 dict(Counter(before.missed) + Counter(missed.get(port, {}))),
             )
-    return found
+    return summaries
 
 
 def tick_summaries(state: RunState) -> dict[str, TickSummary]:
@@ -134,20 +134,20 @@ def inputs(state: RunState, outputs: Mapping[str, str]) -> dict[str, str]:
     Args:
         outputs: Fingerprint of each output's events, by its name.
     """
-    others = [each for each in state.announcements if isinstance(each, _OF_OTHERS)]
-    given = [each for each in state.announcements if not _named(each.source, others)]
-    found = {f"{each.source} {type(each).__name__}": f"{fingerprint(each):016x}" for each in given}
+    others = [a for a in state.announcements if isinstance(a, _OF_OTHERS)]
+    given = [a for a in state.announcements if not _named(a.source, others)]
+    digests = {f"{a.source} {type(a).__name__}": f"{fingerprint(a):016x}" for a in given}
     for node in state.all_nodes:
         for sender in senders(node).values():
             if any(event.category in _INPUTS for event in sender.sent()) and any(
                 _named(source, given) and not _named(source, others) for source in sender.sources
             ):
-                found[sender.name] = outputs[sender.name]
-    return dict(sorted(found.items()))
+                digests[sender.name] = outputs[sender.name]
+    return dict(sorted(digests.items()))
 
 
 def _named(source: str, announcements: Iterable[Announcement]) -> bool:
-    return any(f"{source}/".startswith(f"{each.source}/") for each in announcements)
+    return any(f"{source}/".startswith(f"{a.source}/") for a in announcements)
 
 
 def summarise(
@@ -200,18 +200,18 @@ def summarise(
             name: key
             for name, key in state.code.items()
             if any(
-                isinstance(each, EstimatorAnnouncement) and f"{each.source}/".startswith(f"{name}/")
-                for each in state.announcements
+                isinstance(a, EstimatorAnnouncement) and f"{a.source}/".startswith(f"{name}/")
+                for a in state.announcements
             )
         },
         truth=state.truth,
         workers={
-            name: WorkerSummary.of(each)
-            for name, each in (
+            name: WorkerSummary.of(costs)
+            for name, costs in (
                 state.costs | {k: a.costs for k, a in state.outside.items() if a.costs.calls}
             ).items()
         },
-        outside={name: OutsideSummary.of(each) for name, each in state.outside.items()},
+        outside={name: OutsideSummary.of(answers) for name, answers in state.outside.items()},
     )
 
 

@@ -143,7 +143,7 @@ class Supervisor:
             error="" if error is None else str(error),
             planned=error is None and self._is_planned(by),
             duration=state.config.run.duration or None,
-            restarts={name: max(each.starts - 1, 0) for name, each in state.runners.items()},
+            restarts={name: max(runner.starts - 1, 0) for name, runner in state.runners.items()},
             truth_readers=frozenset(state.truth_readers()),
             truth_relays=frozenset(self._truth_relays()),
             owners=dict(state.owners),
@@ -174,9 +174,9 @@ class Supervisor:
         """Return the nodes that received the truth and pass on estimates of others."""
         state = self.state
         speaking = {node.name for node in state.all_nodes if graph.sends_estimates(node)}
-        for each in state.announcements:
-            if isinstance(each, EstimatorAnnouncement):
-                speaking.add(state.owners.get(each.source, ""))
+        for announcement in state.announcements:
+            if isinstance(announcement, EstimatorAnnouncement):
+                speaking.add(state.owners.get(announcement.source, ""))
         relays = {spec.name for spec in state.config.nodes if graph.relays(spec.node)}
         return state.truth_receivers & speaking & relays
 
@@ -243,9 +243,9 @@ class Supervisor:
     def _note_inputs(self, listeners: list[Listener]) -> None:
         """Note who receives true poses, and whose images and scans; of restarted nodes, too."""
         state = self.state
-        for each in state.announcements:
-            if owner := self._voices.owner(each.source):
-                state.owners[each.source] = owner
+        for announcement in state.announcements:
+            if owner := self._voices.owner(announcement.source):
+                state.owners[announcement.source] = owner
         state.truth_receivers |= graph.truth_receivers(listeners, state.announcements)
         for node, sources in graph.sensors_read(listeners, state.announcements).items():
             state.sensors_read.setdefault(node, set()).update(sources)
@@ -286,9 +286,12 @@ class Supervisor:
                 tap(None, announcement)
         self.connect()
         readers = state.truth_readers()
-        for each in state.announcements:
-            node = self._voices.owner(each.source)
-            undeclared = isinstance(each, EstimatorAnnouncement) and "truth" not in each.reads
+        for announcement in state.announcements:
+            node = self._voices.owner(announcement.source)
+            undeclared = (
+                isinstance(announcement, EstimatorAnnouncement)
+                and "truth" not in announcement.reads
+            )
             if undeclared and node in readers:
                 log.warning("%s: receives true poses, and does not announce so", node)
         state.running = True

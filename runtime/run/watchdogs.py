@@ -160,14 +160,14 @@ class ProgressWatchdog:
         starvation = Starvation()
         since, due, interrupted, deaf = 0.0, 0.0, 0.0, 0.0
         while not self._end.wait(min(self._limit / 8, _LONGEST_LOOK)):
-            found, now = self._mark(), time.monotonic()
+            current, now = self._mark(), time.monotonic()
             if self._is_deaf():
                 deaf = deaf or now
                 if self._main and now - deaf > _PATIENCE:
                     deaf = now
                     self._interrupt()
-            if found != mark:
-                mark, since, due, interrupted = found, now, self._limit, now
+            if current != mark:
+                mark, since, due, interrupted = current, now, self._limit, now
                 starvation = Starvation()
                 if self._state.first_update is None:
                     starvation.look()  # from here on
@@ -308,9 +308,9 @@ def _explain_time(loop: LockstepLoop, run: RunState) -> str:
 
 
 def _all(run: RunState) -> str:
-    found = [(runner.spec.name, task) for runner in run.runners.values() for task in runner.tasks]
-    listed = ", ".join(f"{name}{_at([task])}" for name, task in found[:_MOST_NAMED])
-    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    tasks = [(runner.spec.name, task) for runner in run.runners.values() for task in runner.tasks]
+    listed = ", ".join(f"{name}{_at([task])}" for name, task in tasks[:_MOST_NAMED])
+    more = f" and {len(tasks) - _MOST_NAMED} more" if len(tasks) > _MOST_NAMED else ""
     return f" ({listed}{more})" if listed else ""
 
 

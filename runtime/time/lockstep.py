@@ -51,7 +51,7 @@ def passes(
 
     It runs in a thread, because another loop may run in this one, and costs 3 ms.
     """
-    found: list[bool] = []
+    outcomes: list[bool] = []
 
     def run() -> None:
         reported: list[Any] = []
@@ -59,16 +59,16 @@ def passes(
             loop = make_loop()
             loop.set_exception_handler(lambda _, context: reported.append(context))
             try:
-                found.append(loop.run_until_complete(test(loop)) and not reported)
+                outcomes.append(loop.run_until_complete(test(loop)) and not reported)
             finally:
                 loop.close()
         except Exception:  # whatever another interpreter may raise
-            found.append(False)
+            outcomes.append(False)
 
     thread = threading.Thread(target=run, name="self-test", daemon=True)
     thread.start()
     thread.join(LIMIT)
-    return found == [True]
+    return outcomes == [True]
 
 
 R = TypeVar("R")
@@ -419,16 +419,16 @@ class Starvation:
 
 def waits_of(process: int) -> dict[str, int]:
     """Return how long each thread of a process and of its children has waited to run (ns)."""
-    found, processes = {}, [process]
+    waits, processes = {}, [process]
     for number in processes:
         threads: list[Path] = []
         with contextlib.suppress(OSError):  # it has ended
             threads += Path(f"/proc/{number}/task").iterdir()
         for thread in threads:
             with contextlib.suppress(OSError, IndexError):  # it has ended, or the kernel is another
-                found[thread.name] = int((thread / "schedstat").read_bytes().split()[1])
+                waits[thread.name] = int((thread / "schedstat").read_bytes().split()[1])
                 processes += map(int, (thread / "children").read_bytes().split())
-    return found
+    return waits
 
 
 async def ended(tasks: Iterable[asyncio.Task[Any]], seconds: float) -> list[asyncio.Task[Any]]:

@@ -130,11 +130,11 @@ def describe(cls: type[Node[Any]], type_name: str = "") -> NodeDescription:
 def describe_settings(table: type[msgspec.Struct]) -> tuple[SettingDescription, ...]:
     """Describe the settings of a table of the file, including nested tables."""
     docs = attribute_docs(table)
-    found = []
+    settings = []
     for field in msgspec.structs.fields(table):
         kind = kind_of(types.type_info(field.type))
         inner = next(iter(kind.tables), None)
-        found.append(
+        settings.append(
             SettingDescription(
                 name=field.encode_name,
                 type=kind.text,
@@ -146,7 +146,7 @@ def describe_settings(table: type[msgspec.Struct]) -> tuple[SettingDescription, 
                 settings=describe_settings(inner) if inner and inner is not table else (),
             )
         )
-    return tuple(found)
+    return tuple(settings)
 
 
 def summary(described: type | Callable[..., Any]) -> str:
@@ -156,13 +156,13 @@ def summary(described: type | Callable[..., Any]) -> str:
 
 def attribute_docs(cls: type) -> dict[str, str]:
     """Return the docstring text of each attribute of a class and its bases, as a line."""
-    found: dict[str, str] = {}
-    for each in reversed(cls.__mro__):
-        section = inspect.cleandoc(each.__doc__ or "").partition("Attributes:\n")[2]
+    docs: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        section = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")[2]
         section = re.split(r"\n(?=\S)", section)[0]
         for name, text in re.findall(r"^    (\w+): (.*(?:\n {8}.*|\n)*)", section, re.MULTILINE):
-            found[name] = " ".join(text.split())
-    return found
+            docs[name] = " ".join(text.split())
+    return docs
 
 
 def _head(name: str, type_: str, doc: str, default: str = "") -> SettingDescription:
@@ -177,7 +177,7 @@ NODE_SETTINGS = (
     _head("type", "string", TYPE_DOC),
     _head(
         "on_error",
-        " or ".join(json.dumps(each) for each in get_args(OnError)),
+        " or ".join(json.dumps(choice) for choice in get_args(OnError)),
         "What an exception in the node does: end the run, bring the node up again (after a "
         "growing pause), or go on without it.",
         '"stop"',
@@ -282,27 +282,27 @@ def kind_of(info: types.Type) -> Kind:
         case types.LiteralType():
             return Kind(_any(info.values), "", {"enum": list(info.values)})
         case types.UnionType():
-            kinds = [kind_of(each) for each in info.types if not isinstance(each, types.NoneType)]
-            schemas = [each.schema for each in kinds]
+            kinds = [kind_of(t) for t in info.types if not isinstance(t, types.NoneType)]
+            schemas = [kind.schema for kind in kinds]
             return Kind(
-                " or ".join(dict.fromkeys(each.text for each in kinds)),
-                "; ".join(each.constraint for each in kinds if each.constraint),
+                " or ".join(dict.fromkeys(kind.text for kind in kinds)),
+                "; ".join(kind.constraint for kind in kinds if kind.constraint),
                 schemas[0] if len(schemas) == 1 else {"anyOf": schemas},
-                tuple(table for each in kinds for table in each.tables),
+                tuple(table for kind in kinds for table in kind.tables),
             )
         case types.TupleType():
-            kinds = [kind_of(each) for each in info.item_types]
-            texts = [each.text for each in kinds]
-            each = "; ".join(dict.fromkeys(each.constraint for each in kinds if each.constraint))
+            kinds = [kind_of(t) for t in info.item_types]
+            texts = [kind.text for kind in kinds]
+            limit = "; ".join(dict.fromkeys(kind.constraint for kind in kinds if kind.constraint))
             number = len(kinds)
             return Kind(
                 f"list of {f'{number} {texts[0]}' if len({*texts}) == 1 else ', '.join(texts)}",
-                f"each {each}" if each else "",
+                f"each {limit}" if limit else "",
                 {
-                    "type": "array", "items": [each.schema for each in kinds],
+                    "type": "array", "items": [kind.schema for kind in kinds],
                     "minItems": number, "maxItems": number,
                 },
-                tuple(table for each in kinds for table in each.tables),
+                tuple(table for kind in kinds for table in kind.tables),
             )  # fmt: skip
         case types.ListType() | types.VarTupleType() | types.FrozenSetType() | types.SetType():
             item, (words, bounds) = kind_of(info.item_type), _bounds(info, "Items", "items")
@@ -449,7 +449,7 @@ class _Maker:
         properties, required = {}, []
         for field in msgspec.structs.fields(cls):
             kind = kind_of(types.type_info(field.type))
-            found = kind.schema
+            schema = kind.schema
             for table in kind.tables:
                 self.struct(table)
             text = documented.get(field.name, "")
@@ -459,15 +459,15 @@ class _Maker:
                 required.append(field.encode_name)
             elif _may_stand(field.default):
                 default = msgspec.to_builtins(field.default, enc_hook=plain)
-                found = _beside(found, "default", default)
-            properties[field.encode_name] = _beside(found, "description", text) if text else found
+                schema = _beside(schema, "default", default)
+            properties[field.encode_name] = _beside(schema, "description", text) if text else schema
         made: Schema = {"type": "object", "properties": properties, "additionalProperties": False}
         return made | ({"required": required} if required else {})
 
 
-def _beside(found: Schema, key: str, value: Any) -> Schema:
+def _beside(schema: Schema, key: str, value: Any) -> Schema:
     """Add a key; references go into ``allOf``: draft 7 ignores all keys beside them."""
-    return {"allOf": [found], key: value} if "$ref" in found else {**found, key: value}
+    return {"allOf": [schema], key: value} if "$ref" in schema else {**schema, key: value}
 
 
 def _may_stand(default: Any) -> bool:

@@ -84,22 +84,22 @@ def recorded(config: Config, *, record: bool) -> Watch | None:
     path = home() / f"{content_key(part)}.flight"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for each in (path, _unfinished(path)):
-            if each.exists() and not each.is_file():
-                raise OSError(errno.EEXIST, "what is no file", str(each))
+        for file in (path, _unfinished(path)):
+            if file.exists() and not file.is_file():
+                raise OSError(errno.EEXIST, "what is no file", str(file))
         with _locked(path):  # whoever comes second waits, and finds it
-            found = _opened(path)
-            if found is None and record:
+            opened = _opened(path)
+            if opened is None and record:
                 _write(part, path)
-                found = _opened(path)
-            if found is None:
+                opened = _opened(path)
+            if opened is None:
                 return None
             os.utime(path)
     except OSError as error:
         what = f"{error.filename or home()}: {error.strerror}"
         _LOG.warning("expected a cache of flights, found %s: the run flies itself", what)
         return None
-    return functools.partial(_played, *found)
+    return functools.partial(_played, *opened)
 
 
 def home() -> Path:
@@ -110,12 +110,12 @@ def home() -> Path:
 
 def kept() -> list[Kept]:
     """Return the kept flights, the last used first."""
-    found = []
+    flights = []
     for path in home().glob("[!.]*.flight"):
         with contextlib.suppress(OSError):  # removed meanwhile
             if path.is_file():
-                found.append(Kept(path, path.stat().st_size, path.stat().st_mtime))
-    return sorted(found, key=lambda each: -each.used)
+                flights.append(Kept(path, path.stat().st_size, path.stat().st_mtime))
+    return sorted(flights, key=lambda flight: -flight.used)
 
 
 def remove_beyond(gigabytes: float) -> list[Kept]:
@@ -127,8 +127,8 @@ def remove_beyond(gigabytes: float) -> list[Kept]:
         if unfinished.is_file():
             _remove(unfinished, unfinished.with_name(unfinished.stem[1:]))
     sizes = 0
-    beyond = [each for each in kept() if (sizes := sizes + each.size) > gigabytes * 1e9]
-    return [each for each in beyond if _remove(each.path, each.path)]
+    beyond = [flight for flight in kept() if (sizes := sizes + flight.size) > gigabytes * 1e9]
+    return [flight for flight in beyond if _remove(flight.path, flight.path)]
 
 
 def _remove(file: Path, flight: Path) -> bool:
@@ -363,7 +363,7 @@ def content_key(flight: Config) -> str:
     texts += [f"{k}={v}" for k, v in sorted(os.environ.items()) if _VARIABLES.match(k)]
     for pattern in _DRIVERS:
         for path in sorted(Path("/").glob(pattern[1:])):
-            found = path.stat()
-            texts.append(f"{path} {found.st_size} {found.st_mtime_ns}")
+            status = path.stat()
+            texts.append(f"{path} {status.st_size} {status.st_mtime_ns}")
     parts = made_from(roots_of(flight, modules=(*RUN, __name__)))
     return hashed([*texts, key_of(parts)])

@@ -78,8 +78,8 @@ def of_file(config: Config, only: Collection[str] = ()) -> Findings:
         for port in _unread(spec.node)
     ]
     warnings += [
-        f"expected handlers that come to an end, found some that always answer one another: {each}"
-        for each in circles([(spec.name, spec.node) for spec in config.nodes])
+        f"expected handlers that come to an end, found some that always answer one another: {loop}"
+        for loop in circles([(spec.name, spec.node) for spec in config.nodes])
     ]
     return Findings(list(_clashes(here)), warnings)
 
@@ -115,7 +115,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
         await runner.start_up(host, config.run.startup_limit)
 
     async def exchange(announced: Announced) -> list[Announcement]:
-        everything.extend(each for of_node in announced.values() for each in of_node)
+        everything.extend(a for of_node in announced.values() for a in of_node)
         (warnings if uncertain else errors).extend(_unknown_sources(config.nodes, everything))
         return everything
 
@@ -131,7 +131,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
         elif phase == "announce":
             if runner.spec.name not in cut_short:
                 errors.append(str(error))
-        elif not any(each.startswith(f"{runner.spec.name}: inputs.") for each in errors):
+        elif not any(reported.startswith(f"{runner.spec.name}: inputs.") for reported in errors):
             (warnings if uncertain else errors).append(str(error))
 
     try:
@@ -277,13 +277,13 @@ def mentioned_in(cls: type[Node[Any]]) -> set[Any]:
 def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement]) -> Iterator[str]:
     """Yield errors for `inputs` narrowed to a source without events, of nodes that announce any."""
     specs = {spec.name: spec for spec in nodes}
-    sources = dict.fromkeys([*specs, *(each.source for each in announced)])
+    sources = dict.fromkeys([*specs, *(announcement.source for announcement in announced)])
     for spec in specs.values():
         for port, source in spec.inputs.items():
             where = f"{spec.name}: inputs.{port}"
             events = _types(spec.node, port)
             owner = source.partition("/")[0]
-            below = [each for each in sources if each.startswith(f"{owner}/")]
+            below = [known for known in sources if known.startswith(f"{owner}/")]
             if owner in specs and not _may_send(specs[owner].node, events):
                 names = " or ".join(event.__name__ for event in events)
                 yield f"{where}: expected a source of {names}, found {source}: {owner} sends none"
@@ -291,9 +291,9 @@ def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement
                 source in specs
                 or (owner in specs and not below)
                 or any(
-                    f"{each}/".startswith(f"{source}/")
-                    or ("/" in each and source.startswith(f"{each}/"))
-                    for each in sources
+                    f"{known}/".startswith(f"{source}/")
+                    or ("/" in known and source.startswith(f"{known}/"))
+                    for known in sources
                 )
             ):
                 known = ", ".join(below or sources)
@@ -341,8 +341,8 @@ Rule = Callable[[Config, Sequence[Announcement]], Iterable[Finding]]
 
 def rules() -> dict[str, Rule]:
     """Return all rules by name; raise `CommandError` if one cannot be imported."""
-    found: list[Rule] = [rule for offer in offers(GROUP) for rule in offer.load()]
-    return {rule.__name__.replace("_", "-"): rule for rule in found}
+    imported: list[Rule] = [rule for offer in offers(GROUP) for rule in offer.load()]
+    return {rule.__name__.replace("_", "-"): rule for rule in imported}
 
 
 def lint(
@@ -355,7 +355,7 @@ def lint(
     """
     known = rules()
     accepted = {*config.run.accept, *ignore}
-    found = [
+    findings = [
         Finding(
             "run", f"accept names no rule: {name}", f"take it out{suggest(name, known)}", "accept"
         )
@@ -364,28 +364,28 @@ def lint(
     ]
     for name, rule in known.items():
         if name not in accepted:
-            each = (msgspec.structs.replace(one, rule=name) for one in rule(config, announcements))
-            found += [one for one in each if f"{name}:{one.subject}" not in accepted]
-    return found
+            odd = (msgspec.structs.replace(one, rule=name) for one in rule(config, announcements))
+            findings += [one for one in odd if f"{name}:{one.subject}" not in accepted]
+    return findings
 
 
 def no_end(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:  # noqa: ARG001
     """Nothing but Ctrl-C ends a run without a duration, a pilot or a replay."""
     if not config.run.duration and not any(map(_may_end, config.nodes)):
-        found = "it has no duration, and no node that ends it, as a pilot or a replay does"
-        yield Finding("run", found, "give it a duration")
+        problem = "it has no duration, and no node that ends it, as a pilot or a replay does"
+        yield Finding("run", problem, "give it a duration")
 
 
 def idle(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:  # noqa: ARG001
     """Without a node to send its orders, a vehicle stands still."""
-    heard = {receiver for *_, receiver, _ in edges_of(config.nodes)}
+    receivers = {receiver for *_, receiver, _ in edges_of(config.nodes)}
     for spec in config.nodes:
         handlers = spec.node.declared.handlers
         only = handlers and len(handlers) == len(spec.node.declared.listening)
-        if only and spec.name not in heard and not _may_end(spec):
+        if only and spec.name not in receivers and not _may_end(spec):
             events = dict.fromkeys(e.__name__ for h in handlers.values() for e in h.events)
-            found = f"it waits for {' or '.join(events)}, which no node sends"
-            yield Finding(spec.name, found, "add one that does")
+            problem = f"it waits for {' or '.join(events)}, which no node sends"
+            yield Finding(spec.name, problem, "add one that does")
 
 
 def nobody_judged(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:

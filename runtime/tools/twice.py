@@ -67,8 +67,8 @@ def run_twice(
         VisnavError: Something went wrong in one of the runs.
     """
     if config.run.clock != "lockstep" or only:
-        found = "--only" if only else f'clock = "{config.run.clock}"'
-        raise ConfigError(f'--twice: expected one process and clock = "lockstep", found {found}')
+        given = "--only" if only else f'clock = "{config.run.clock}"'
+        raise ConfigError(f'--twice: expected one process and clock = "lockstep", found {given}')
     first = Track()
     before = execute(config, digest=first)
     second = Track(first)

@@ -79,5 +79,5 @@ def peak_memory(pid: int) -> int:
         status = Path(f"/proc/{pid}/status").read_bytes()
     except OSError:
         return 0
-    found = re.search(rb"VmHWM:\s+(\d+) kB", status)
-    return int(found[1]) << 10 if found else 0
+    match = re.search(rb"VmHWM:\s+(\d+) kB", status)
+    return int(match[1]) << 10 if match else 0

@@ -105,8 +105,8 @@ class Worker(Generic[W]):
         environment = {**os.environ, **(env or {})}
         names = [f"{name}[{n}]" for n in range(processes)] if processes > 1 else [name]
         self._make = [
-            functools.partial(_Process, each, timeout, environment, self._printed, died, self.costs)
-            for each in names
+            functools.partial(_Process, name, timeout, environment, self._printed, died, self.costs)
+            for name in names
         ]
         cores = spare_cores() if clock.kind == "real" else ()
         self._conditions = sys.path, niceness, cores, factory.__module__

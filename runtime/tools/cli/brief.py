@@ -60,13 +60,13 @@ def runs(folder: Annotated[Path, typer.Argument(help="Folder of runs.")] = Path(
     from runtime.run.results import has_run, time_of
 
     places = [*folder.glob("[!.]*"), *folder.glob("[!.]*/[!.]*")]
-    found = [each for each in places if not each.is_symlink() and has_run(each)]
-    if not found:
+    folders = [place for place in places if not place.is_symlink() and has_run(place)]
+    if not folders:
         raise ResultsError(f"{folder}: expected folders of runs in it, found none")
     table = Table("run", "time", "s", "seed", "state", "estimators", box=None, pad_edge=False)
-    for each in sorted(found, key=time_of):
-        when = datetime.fromtimestamp(time_of(each)).strftime("%Y-%m-%d %H:%M")
-        table.add_row(escape(str(each)), when, *_row(each))
+    for run in sorted(folders, key=time_of):
+        when = datetime.fromtimestamp(time_of(run)).strftime("%Y-%m-%d %H:%M")
+        table.add_row(escape(str(run)), when, *_row(run))
     Console().print(table, soft_wrap=True)
 
 
@@ -140,8 +140,8 @@ def lines(summary: Summary, folder: Path) -> Iterator[str]:
         f"clock, seed {summary.seed},{took or ' in real time'}, ended by: {escape(summary.reason)}"
     )
     if (twice := summary.twice) is not None:
-        found = "[green]repeats[/green]" if twice.repeats else f"[red]differs[/red]: {twice.first}"
-        yield f"run twice, it {found}"
+        words = "[green]repeats[/green]" if twice.repeats else f"[red]differs[/red]: {twice.first}"
+        yield f"run twice, it {words}"
     if summary.not_deterministic:
         yield f"repeating it is not promised, because of {', '.join(summary.not_deterministic)}"
     estimators = summary.verdict.estimators if summary.verdict else {}
@@ -222,11 +222,11 @@ def _flow(name: str, figures: Mapping[str, Any], summary: Summary) -> Iterator[s
         times = "never lost" if not lost else f"lost {lost} × ({figures['lost_seconds']:.3g} s)"
         shown.append(times)
     if figures.get("latency_p50_ms") is not None:
-        said = [figures["latency"]] if "latency" in figures else []
+        parts = [figures["latency"]] if "latency" in figures else []
         for worker, costs in summary.workers.items():
             if worker.startswith(f"{node}.") and costs.latency_ms:
-                said.append(f"a call takes {costs.wall_p50_ms:.3g} ms here")
-        kind = f" ({'; '.join(said)})" if said else ""
+                parts.append(f"a call takes {costs.wall_p50_ms:.3g} ms here")
+        kind = f" ({'; '.join(parts)})" if parts else ""
         shown.append(f"latency {figures['latency_p50_ms']:.3g} ms{kind}")
     dropped = sum(s.dropped for port, s in summary.streams.items() if port.startswith(f"{node}."))
     shown.append(f"{dropped} inputs dropped" if dropped else "nothing dropped")
@@ -300,9 +300,9 @@ def run_tables(summary: Summary) -> Iterator[Table]:
 
 def verdict_table(verdict: Verdict) -> Table:
     """Return the figures of the judged estimators, a column each."""
-    figures = dict.fromkeys(key for each in verdict.estimators.values() for key in each)
+    figures = dict.fromkeys(key for row in verdict.estimators.values() for key in row)
     rows = {
-        figure: [each.get(figure, "") for each in verdict.estimators.values()] for figure in figures
+        figure: [row.get(figure, "") for row in verdict.estimators.values()] for figure in figures
     }
     return table_of(
         "verdict",
@@ -380,7 +380,7 @@ def _state(run: RunConfig, supervisor: Supervisor) -> tuple[float, str]:
     from runtime.run.summarise import count_events
 
     runners = list(supervisor.state.runners.values())
-    busy = [f"{each.spec.name}: {each.doing}" for each in runners if each.doing]
+    busy = [f"{runner.spec.name}: {runner.doing}" for runner in runners if runner.doing]
     if supervisor.state.first_update is None:
         return 0.0, " ".join(["starting", *busy[:1]])
     seconds = supervisor.state.clock.now() / SECOND

@@ -103,11 +103,11 @@ def _plain_errors() -> Iterator[None]:
     try:
         yield
     except _USAGE_ERROR as error:
-        found: Any = error
+        usage: Any = error
         if type(error).__name__ == "NoArgsIsHelpError":  # prints the help, and is meant
             raise
-        message = " ".join(found.format_message().split()).replace("Value error, ", "").rstrip(".")
-        path = getattr(getattr(found, "ctx", None), "command_path", "python -m runtime")
+        message = " ".join(usage.format_message().split()).replace("Value error, ", "").rstrip(".")
+        path = getattr(getattr(usage, "ctx", None), "command_path", "python -m runtime")
         raise ConfigError(
             f"{message[:1].lower()}{message[1:]}; `{path} --help` says what it takes"
         ) from None
@@ -115,13 +115,13 @@ def _plain_errors() -> Iterator[None]:
 
 def load(offer: Offer) -> Any:
     """Import a command, or raise `CommandError`."""
-    found = offer.load()
-    if not isinstance(found, typer.Typer):
+    command = offer.load()
+    if not isinstance(command, typer.Typer):
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-        app.command(offer.name)(found)
-        found = app
+        app.command(offer.name)(command)
+        command = app
     try:
-        return typer.main.get_command(found)
+        return typer.main.get_command(command)
     except Exception as error:  # whatever Typer does not like
         raise CommandError(
             f"{offer.name} of the package {offer.package}: expected {offer.value!r} to be a "
@@ -131,10 +131,10 @@ def load(offer: Offer) -> Any:
 
 @cache
 def _commands() -> dict[str, list[Offer]]:
-    found: dict[str, list[Offer]] = {}
+    by_name: dict[str, list[Offer]] = {}
     for offer in offers(COMMANDS):
-        found.setdefault(offer.name, []).append(offer)
-    return found
+        by_name.setdefault(offer.name, []).append(offer)
+    return by_name
 
 
 def _chosen(name: str) -> Offer:
@@ -155,8 +155,8 @@ def _help(offer: Offer) -> str:
             if isinstance(node, ast.FunctionDef) and node.name == name:
                 return ast.get_docstring(node) or ""
     try:
-        found = offer.load()
-        return str(found.info.help if isinstance(found, typer.Typer) else load(offer).help or "")
+        app = offer.load()
+        return str(app.info.help if isinstance(app, typer.Typer) else load(offer).help or "")
     except CommandError as error:
         return f"(cannot be used: {error})"
 
@@ -167,8 +167,8 @@ def _source(module: str) -> Path | None:
     parts = module.split(".")
     for depth in range(1, len(parts) + 1):
         name = ".".join(parts[:depth])
-        found = (finder.find_spec(name, search) for finder in sys.meta_path)
-        spec = next((each for each in found if each is not None), None)
+        specs = (finder.find_spec(name, search) for finder in sys.meta_path)
+        spec = next((candidate for candidate in specs if candidate is not None), None)
         if spec is None:
             return None
         search = spec.submodule_search_locations
@@ -225,7 +225,7 @@ def of_verdict(run: str, verdict: Verdict | None, seconds: float | None = None) 
             run=run,
             estimator=name,
             state=_STATES[figures["passed"]],
-            reasons=[str(each) for each in figures.get("failed", ())],
+            reasons=[str(reason) for reason in figures.get("failed", ())],
             seconds=seconds,
             figures=figures,
         )
@@ -237,17 +237,17 @@ def of_rows(names: Iterable[str], rows: Iterable[Row]) -> list[Outcome]:
     """Return the outcomes of a sweep's runs."""
     from runtime.summary import Verdict
 
-    found: list[Outcome] = []
+    outcomes: list[Outcome] = []
     for name, row in zip(names, rows, strict=True):
         if row["error"]:
             crashed = Outcome(
                 run=name, state="crashed", reasons=[row["error"]], seconds=row["wall_seconds"]
             )
-            found.append(crashed)
+            outcomes.append(crashed)
         else:
             verdict = Verdict(row["passed"], row["estimators"], row.get("flights", {}))
-            found += of_verdict(name, verdict, row["wall_seconds"])
-    return found
+            outcomes += of_verdict(name, verdict, row["wall_seconds"])
+    return outcomes
 
 
 @contextlib.contextmanager
@@ -274,32 +274,32 @@ def to_junit(name: str, outcomes: Sequence[Outcome]) -> bytes:
     """Return JUnit's XML (github.com/testmoapp/junitxml describes it)."""
     from xml.etree import ElementTree as ET
 
-    number = Counter(each.state for each in outcomes)
+    number = Counter(outcome.state for outcome in outcomes)
     total = {
         "name": _printable(name),
         "tests": str(len(outcomes)),
         "failures": str(number["failed"]),
         "errors": str(number["crashed"]),
         "skipped": str(number["not judged"]),
-        "time": f"{math.fsum(each.seconds or 0.0 for each in outcomes):.3f}",
+        "time": f"{math.fsum(outcome.seconds or 0.0 for outcome in outcomes):.3f}",
     }
     suites = ET.Element("testsuites")
     suite = ET.SubElement(suites, "testsuite", total)
     elements = {"failed": "failure", "crashed": "error", "not judged": "skipped"}
-    for each in outcomes:
+    for outcome in outcomes:
         case = ET.SubElement(
             suite,
             "testcase",
             {
-                "classname": _printable(each.run),
-                "name": _printable(each.estimator or "run"),
-                "time": f"{each.seconds or 0.0:.3f}",
+                "classname": _printable(outcome.run),
+                "name": _printable(outcome.estimator or "run"),
+                "time": f"{outcome.seconds or 0.0:.3f}",
             },
         )
-        if each.state != "passed":
-            reasons = [_printable(reason) for reason in each.reasons] or [each.state]
-            said = ET.SubElement(case, elements[each.state], {"message": reasons[0]})
-            said.text = "\n".join(reasons)
+        if outcome.state != "passed":
+            reasons = [_printable(reason) for reason in outcome.reasons] or [outcome.state]
+            problem = ET.SubElement(case, elements[outcome.state], {"message": reasons[0]})
+            problem.text = "\n".join(reasons)
     ET.indent(suites)
     return bytes(ET.tostring(suites, encoding="utf-8", xml_declaration=True)) + b"\n"
 

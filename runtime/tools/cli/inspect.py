@@ -36,16 +36,16 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     from runtime.tools.preflight import lint
 
     settings = load_configuration(config, overrides or [])
-    found = preflight.of_file(settings)
-    if not found.errors:
+    findings = preflight.of_file(settings)
+    if not findings.errors:
         nodes = preflight.of_nodes(settings)
         odd = [] if nodes.errors else [str(e) for e in lint(settings, nodes.announcements)]
-        warnings = found.warnings + nodes.warnings + odd
-        found = preflight.Findings(nodes.errors, warnings, nodes.announcements, nodes.facts)
-    errors = found.errors
-    for fact in found.facts:
+        warnings = findings.warnings + nodes.warnings + odd
+        findings = preflight.Findings(nodes.errors, warnings, nodes.announcements, nodes.facts)
+    errors = findings.errors
+    for fact in findings.facts:
         print(fact)
-    for warning in found.warnings:
+    for warning in findings.warnings:
         warn(warning)
     for error in errors:
         print(f"error: {config.name}: {error}", file=sys.stderr)
@@ -69,11 +69,11 @@ def graph(
 
     settings = load_configuration(config, overrides or [])
     names = [spec.name for spec in settings.nodes]
-    found = edges_of(settings.nodes)
+    edges = edges_of(settings.nodes)
     if out is None:
-        print(mermaid(names, found))
+        print(mermaid(names, edges))
         return
-    draw(names, found, out)
+    draw(names, edges, out)
     print(out)
 
 
@@ -186,10 +186,10 @@ def nodes(
     from runtime.errors import ConfigError, suggest
     from runtime.tools.describe import describe
 
-    found = find_nodes(warn)
+    classes = find_nodes(warn)
     shown = {
         name: cls
-        for name, cls in found.items()
+        for name, cls in classes.items()
         if which is None or which.lower() in f"{name} {cls.__module__}".lower()
     }
     if not shown and which is not None and ":" in which:
@@ -197,7 +197,7 @@ def nodes(
         shown = {which: find_node(which, "nodes")}
     if not shown:
         raise ConfigError(
-            f"expected the name of a node, found {which!r}" + suggest(str(which), found)
+            f"expected the name of a node, found {which!r}" + suggest(str(which), classes)
         )
     console = Console()
     if which is None and not every:
@@ -260,14 +260,14 @@ def settings() -> None:
     from runtime.tools.describe import NODE_SETTINGS, describe_settings, summary
 
     console = Console()
-    for title, doc, found in (
+    for title, doc, entries in (
         ("[run]", summary(RunConfig), describe_settings(RunConfig)),
         ("[network]", summary(NetworkConfig), describe_settings(NetworkConfig)),
         ("[[nodes]]", "What every node may have, beside its own settings.", NODE_SETTINGS),
         ("[nodes.links.PORT]", summary(LinkConfig), describe_settings(LinkConfig)),
     ):
         tree = Tree(f"[bold]{escape(title)}[/bold]\n{escape(doc)}")
-        add_settings(tree, found)
+        add_settings(tree, entries)
         console.print(tree, highlight=False)
 
 
@@ -368,8 +368,8 @@ def example(
 
     examples = example_files()
     if name is None:
-        for each, path in examples.items():
-            print(f"{each:18} {_about(path)}")
+        for label, path in examples.items():
+            print(f"{label:18} {_about(path)}")
         return
     name = name.removesuffix(".toml")
     expect_known(name, examples, f"expected the name of an example, found {name!r}")
@@ -430,7 +430,7 @@ def _copy(example: Path, out: Path, words: dict[str, str]) -> Path:
         return text
 
     listed = [example, *_read_by(example)]
-    files = [each for file in listed for each in (file, *sorted(file.rglob("*"))) if each.is_file()]
+    files = [path for file in listed for path in (file, *sorted(file.rglob("*"))) if path.is_file()]
     targets = [out / renamed(str(file.relative_to(example.parent))) for file in files]
     if existing := [target for target in targets if target.exists()]:
         raise CommandError(f"{existing[0]}: expected no file of this name, found one")

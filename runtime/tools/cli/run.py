@@ -177,11 +177,11 @@ def look_at(settings: Config, only: Collection[str] = ()) -> None:
     from runtime.errors import ConfigError
     from runtime.tools.preflight import of_file
 
-    found = of_file(settings, only)
-    for warning in found.warnings:
+    findings = of_file(settings, only)
+    for warning in findings.warnings:
         warn(warning)
-    if found.errors:
-        raise ConfigError("; ".join(found.errors))
+    if findings.errors:
+        raise ConfigError("; ".join(findings.errors))
 
 
 def leave_behind(code: int, last: str = "") -> NoReturn:
@@ -381,8 +381,8 @@ def set_(
     """
     from runtime.tools.monitor.protocol import Set, ask, find
 
-    found = find(run)
-    print(f"run {found.stem.rpartition('-')[0]}: {ask(found, Set(text=change))}")
+    path = find(run)
+    print(f"run {path.stem.rpartition('-')[0]}: {ask(path, Set(text=change))}")
 
 
 def trace(file: Annotated[Path, typer.Argument(help="A trace that run --trace wrote.")]) -> None:
@@ -396,18 +396,18 @@ def trace(file: Annotated[Path, typer.Argument(help="A trace that run --trace wr
 
     from runtime.tools.tracing.write import read_trace
 
-    found = read_trace(file)
+    trace = read_trace(file)
     console = Console()
-    for table in tables(found, console.encoding):
+    for table in tables(trace, console.encoding):
         console.print(table)
-    clock = found.about.get("clock", "?")
+    clock = trace.about.get("clock", "?")
     console.print(
-        f"run {found.about.get('run', '?')!r} on the {clock} clock; ui.perfetto.dev shows the rest",
+        f"run {trace.about.get('run', '?')!r} on the {clock} clock; ui.perfetto.dev shows the rest",
         highlight=False,
     )
 
 
-def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
+def tables(trace: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
     """Return the paths of a trace, and its nodes, as a terminal of this encoding can show them."""
     from rich.text import Text
 
@@ -415,9 +415,9 @@ def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
     from runtime.tools.tracing.write import node_loads, paths, quantile
 
     def shown(ms: list[float]) -> list[str]:
-        return [f"{each:.2f}" for each in (quantile(ms, 0.5), quantile(ms, 0.99), max(ms))]
+        return [f"{value:.2f}" for value in (quantile(ms, 0.5), quantile(ms, 0.99), max(ms))]
 
-    routes = paths(found)
+    routes = paths(trace)
     for number, route in enumerate(routes, 1):
         yield Text(f"path {number}: {_for(encoding, route.path)}")
     if routes:
@@ -433,14 +433,14 @@ def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
         yield Text("no set-point was sent that a sensor led to")
     loads = [
         (
-            _for(encoding, each.node),
-            each.steps,
-            f"{each.busy_ms:.1f}",
-            f"{each.share:.1%}",
-            f"{each.longest_ms:.3f}",
-            _for(encoding, each.longest),
+            _for(encoding, load.node),
+            load.steps,
+            f"{load.busy_ms:.1f}",
+            f"{load.share:.1%}",
+            f"{load.longest_ms:.3f}",
+            _for(encoding, load.longest),
         )
-        for each in node_loads(found)
+        for load in node_loads(trace)
     ]
     yield table_of("on the loop", ("node", "steps", "loop ms", "share", "longest ms", "in"), loads)
 

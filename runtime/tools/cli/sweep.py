@@ -206,13 +206,13 @@ def flights(
 
     if clear or keep is not None:
         removed = remove_beyond(0.0 if clear or keep is None else keep)
-        gigabytes = sum(each.size for each in removed) / 1e9
+        gigabytes = sum(flight.size for flight in removed) / 1e9
         print(f"{len(removed)} flights removed, {gigabytes:.2f} GB")
-    found = kept()
-    for each in found:
-        used = datetime.fromtimestamp(each.used).strftime("%Y-%m-%d %H:%M")
-        print(f"{each.path.stem}  {each.size / 1e9:7.2f} GB  used {used}")
-    print(f"{len(found)} flights, {sum(each.size for each in found) / 1e9:.2f} GB in {home()}")
+    cached = kept()
+    for flight in cached:
+        used = datetime.fromtimestamp(flight.used).strftime("%Y-%m-%d %H:%M")
+        print(f"{flight.path.stem}  {flight.size / 1e9:7.2f} GB  used {used}")
+    print(f"{len(cached)} flights, {sum(f.size for f in cached) / 1e9:.2f} GB in {home()}")
 
 
 def compare(
@@ -272,8 +272,8 @@ def compare(
             out=out,
             fly=functools.partial(carry_out, jobs=jobs),
         )
-        for each in compared.rows:
-            outcomes += of_comparison(each, margin)
+        for row in compared.rows:
+            outcomes += of_comparison(row, margin)
     print_table(compared)
     for note in compared.notes:
         warn(note)
@@ -284,26 +284,26 @@ def compare(
         raise typer.Exit(1)
 
 
-def of_comparison(each: Comparison, margin: float) -> list[Outcome]:
+def of_comparison(row: Comparison, margin: float) -> list[Outcome]:
     """Return an outcome for each scenario of a figure.
 
     If a figure fails, so do the scenarios in most of whose flights B is worse; all, if it is so in
     none.
     """
-    counts = each.by_scenario()
+    counts = row.by_scenario()
     guilty = [name for name, (worse, better, _) in counts.items() if worse > better]
-    found = []
+    outcomes = []
     for name, (worse, _, flights) in counts.items():
         state: State = "passed"
-        if each.fails(margin):
+        if row.fails(margin):
             state = "failed" if name in guilty or not guilty else "passed"
-        elif each.verdict in {"not enough runs", "not comparable"} or each.more:
+        elif row.verdict in {"not enough runs", "not comparable"} or row.more:
             state = "not judged"
-        reason = f"{each.words}: {each.interval} in all; worse in {worse} of {flights} flights here"
+        reason = f"{row.words}: {row.interval} in all; worse in {worse} of {flights} flights here"
         reasons = [] if state == "passed" else [reason]
-        label = f"{each.estimator} {each.figure}"
-        found.append(Outcome(run=name, estimator=label, state=state, reasons=reasons))
-    return found
+        label = f"{row.estimator} {row.figure}"
+        outcomes.append(Outcome(run=name, estimator=label, state=state, reasons=reasons))
+    return outcomes
 
 
 WIDTH = 120  # of the table where there is no terminal, in letters
@@ -320,14 +320,14 @@ def print_table(compared: Compared) -> None:
         number.justify = "right"
     table = Table("estimator", *names, "verdict", box=box.SIMPLE_HEAD)
     style = {"better": "green", "worse": "red"}
-    for each in compared.rows:
-        cells = each.estimator, each.figure, *each.medians, each.interval, each.words
-        table.add_row(*cells, style=style.get(each.verdict, ""))
+    for row in compared.rows:
+        cells = row.estimator, row.figure, *row.medians, row.interval, row.words
+        table.add_row(*cells, style=style.get(row.verdict, ""))
     console = Console()
     if not console.is_terminal:
         console.width = WIDTH
     console.print(table)
-    flights = max((each.pairs for each in compared.rows), default=0)
+    flights = max((row.pairs for row in compared.rows), default=0)
     console.print(
         f"{flights} flights, medians; the page is {compared.page}", highlight=False, soft_wrap=True
     )

@@ -57,11 +57,11 @@ class Compared(msgspec.Struct, frozen=True):
     @property
     def worse(self) -> bool:
         """Whether a figure is worse; with a margin, whether one may be worse by more than that."""
-        return any(each.fails(self.margin) for each in self.rows)
+        return any(row.fails(self.margin) for row in self.rows)
 
     def __repr__(self) -> str:
-        told = [f"{e.estimator} {e.figure}: {e.interval}, {e.words}" for e in self.rows]
-        return "\n".join([*told, *self.notes, f"page: {self.page}"])
+        lines = [f"{e.estimator} {e.figure}: {e.interval}, {e.words}" for e in self.rows]
+        return "\n".join([*lines, *self.notes, f"page: {self.page}"])
 
 
 def compare(
@@ -87,9 +87,9 @@ def compare(
         ConfigError: A file, a folder, a setting or a figure is wrong, or two folders are of other
             flights.
     """
-    for each in figures:
-        if each not in FIGURES:
-            raise ConfigError(f"--figure {each}: expected one of {', '.join(FIGURES)}")
+    for name in figures:
+        if name not in FIGURES:
+            raise ConfigError(f"--figure {name}: expected one of {', '.join(FIGURES)}")
     options: dict[str, Any] = {"figures": figures or USUAL, "margin": margin}
     notes: list[str] = []
     if all(path.is_dir() for path in what):
@@ -98,14 +98,14 @@ def compare(
         sides = [read_folder(path) for path in what]
         notes += check_flights(*sides, whole=False)
         notes += [*_edited(zip("AB", sides, strict=True))]
-        found = compare_rows(*sides, **options)
+        rows = compare_rows(*sides, **options)
     else:
         if not (a or b):
             raise ConfigError("compare: expected --a or --b: in what the two sides differ")
-        found = _fly(what, (a, b), seeds, repeats, overrides, out.absolute(), fly, options, notes)
+        rows = _fly(what, (a, b), seeds, repeats, overrides, out.absolute(), fly, options, notes)
     names = list(a) or [str(what[0])], list(b) or [str(what[-1])]
-    page = write_page(found, out, *names, notes)
-    return Compared(found, margin, page, tuple(notes))
+    page = write_page(rows, out, *names, notes)
+    return Compared(rows, margin, page, tuple(notes))
 
 
 def _fly(
@@ -144,16 +144,16 @@ def _fly(
         for job, row in zip(now, rows, strict=True):
             (_, side), (_, scenario) = job.settings
             sides[side].setdefault((scenario, job.seed), []).append(row)
-        notes[:] = check_flights(*(_unchanged(each, changed) for each in sides.values()))
+        notes[:] = check_flights(*(_unchanged(runs, changed) for runs in sides.values()))
         return compare_rows(sides["A"], sides["B"], error=error, **options)
 
     same = sorted(j.id for j in planned if j.seed == begin[dict(j.settings)["scenario"]])
     key = hashlib.sha256(" ".join(same).encode()).hexdigest()[:16]
     file = out / "looks.json"
     looks = msgspec.json.decode(file.read_bytes(), type=Looks) if file.is_file() else {}
-    found = compare_until_sure(compare_first, seeds, looks.setdefault(key, []))
+    comparisons = compare_until_sure(compare_first, seeds, looks.setdefault(key, []))
     write(file, msgspec.json.encode(looks))
-    return found
+    return comparisons
 
 
 def _unchanged(side: Mapping[Key, list[Row]], changed: set[Key]) -> dict[Key, list[Row]]:
@@ -191,7 +191,7 @@ def check_flights(
     common = sum(key in b for key in a)
     notes = []
     if differing:
-        names = list(dict.fromkeys(name for each in differing.values() for name in each))
+        names = list(dict.fromkeys(name for parts in differing.values() for name in parts))
         notes.append(
             f"{len(differing)} of {common} flights are not the same for A and B: {_some(names)} "
             "differ; what is compared is of different flights"
@@ -209,14 +209,14 @@ def _edited(sides: Iterable[tuple[str, Mapping[Key, Sequence[Row]]]]) -> Iterato
     for side, runs in sides:
         edited = [row["edited"] for rows in runs.values() for row in rows if row.get("edited")]
         if edited:
-            what = listed(dict.fromkeys(each for own in edited for each in own))
+            what = listed(dict.fromkeys(change for own in edited for change in own))
             yield f"{len(edited)} runs of {side} are of a mixture: {what} while they ran"
 
 
 def _inputs(rows: Sequence[Row]) -> tuple[str, dict[str, str] | None]:
     """Return name and fingerprints of the inputs of the first run that has some."""
     known = [(row.get("name", ""), row.get("inputs")) for row in rows if not row["error"]]
-    return next((each for each in known if each[1] is not None), ("", None))
+    return next((entry for entry in known if entry[1] is not None), ("", None))
 
 
 def _some(names: Sequence[str]) -> str:
@@ -226,15 +226,15 @@ def _some(names: Sequence[str]) -> str:
 
 def read_folder(folder: Path) -> dict[Key, list[Row]]:
     """Read the rows of a finished sweep or run by flight; or raise `ConfigError`."""
-    found: dict[Key, list[Row]] = {}
+    flights: dict[Key, list[Row]] = {}
     if (folder / "rows.jsonl").is_file():
         for row in decode_rows((folder / "rows.jsonl").read_bytes()).values():
             settings = " ".join(f"{path}={text}" for path, text in row["parameters"].items())
             if "inputs" not in row:  # of an earlier version
                 with contextlib.suppress(OSError, msgspec.MsgspecError):
                     note_inputs(row, _ended(folder / "runs" / row["id"]))
-            found.setdefault((settings or "run", row["seed"]), []).append(row)
-        return found
+            flights.setdefault((settings or "run", row["seed"]), []).append(row)
+        return flights
     try:
         ended = _ended(newest(folder))
     except (OSError, msgspec.MsgspecError) as error:
@@ -266,7 +266,7 @@ COLOURS = {
 
 
 def write_page(
-    found: Sequence[Comparison],
+    comparisons: Sequence[Comparison],
     out: Path,
     a: Sequence[str],
     b: Sequence[str],
@@ -275,32 +275,32 @@ def write_page(
     """Write ``compare.html`` into a folder, made if missing; return its path."""
     out.mkdir(parents=True, exist_ok=True)
     page = template(Path(__file__).with_name("page.html.jinja")).render(
-        sides=[(side, " ".join(said)) for side, said in (("A", a), ("B", b)) if said],
-        found=found,
+        sides=[(side, " ".join(changes)) for side, changes in (("A", a), ("B", b)) if changes],
+        comparisons=comparisons,
         notes=notes,
         figure=figure,
-        image=base64.b64encode(_slopes(found)).decode(),
+        image=base64.b64encode(_slopes(comparisons)).decode(),
     )
     path = out / "compare.html"
     write(path, page.encode())
     return path
 
 
-def _slopes(found: Sequence[Comparison]) -> bytes:
+def _slopes(comparisons: Sequence[Comparison]) -> bytes:
     from matplotlib.figure import Figure
 
-    columns = min(max(len(found), 1), 4)
-    height = math.ceil(max(len(found), 1) / columns)
+    columns = min(max(len(comparisons), 1), 4)
+    height = math.ceil(max(len(comparisons), 1) / columns)
     sheet = Figure(figsize=(2.9 * columns, 3.4 * height), layout="constrained")
     handles: dict[str, Any] = {}
-    several = len({each.estimator for each in found}) > 1
-    for index, each in enumerate(found, 1):
+    several = len({comparison.estimator for comparison in comparisons}) > 1
+    for index, comparison in enumerate(comparisons, 1):
         axes: Any = sheet.add_subplot(height, columns, index)
-        values = [v for pair in each.flights.values() for v in pair if v is not None]
+        values = [v for pair in comparison.flights.values() for v in pair if v is not None]
         most = max(values, default=1.0)
-        failed = most * 1.6 if figure(each.figure).limit != "least" else 0.0
-        scenarios = list(dict.fromkeys(name.rpartition(",")[0] for name in each.flights))
-        for name, pair in each.flights.items():
+        failed = most * 1.6 if figure(comparison.figure).limit != "least" else 0.0
+        scenarios = list(dict.fromkeys(name.rpartition(",")[0] for name in comparison.flights))
+        for name, pair in comparison.flights.items():
             ends = [failed if value is None else value for value in pair]
             scenario = name.rpartition(",")[0]
             colour = f"C{scenarios.index(scenario) % 10}"
@@ -313,8 +313,8 @@ def _slopes(found: Sequence[Comparison]) -> bytes:
             axes.yaxis.set_major_formatter("{x:g}")
         axes.set_xticks([0, 1], ["A", "B"])
         axes.set_xlim(-0.25, 1.25)
-        title = f"{each.estimator}\n" * several + f"{each.figure}\n{each.verdict}"
-        axes.set_title(title, fontsize=9, color=COLOURS[each.verdict])
+        title = f"{comparison.estimator}\n" * several + f"{comparison.figure}\n{comparison.verdict}"
+        axes.set_title(title, fontsize=9, color=COLOURS[comparison.verdict])
         axes.grid(alpha=0.3, axis="y")
     if len(handles) > 1:
         sheet.legend(handles.values(), handles, loc="outside lower center", fontsize=8, ncols=4)

@@ -115,12 +115,12 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     def by_scenario(self) -> dict[str, tuple[int, int, int]]:
         """Return the flights of each scenario: where B is worse, where it is better, and all."""
         sign = -1.0 if figure(self.figure).limit == "least" else 1.0
-        found: dict[str, tuple[int, int, int]] = {}
+        counts: dict[str, tuple[int, int, int]] = {}
         for name, pair in self.flights.items():
             a, b = (math.inf if value is None else sign * value for value in pair)
-            worse, better, flights = found.get(scenario := name.rpartition(",")[0], (0, 0, 0))
-            found[scenario] = worse + (b > a), better + (b < a), flights + 1
-        return found
+            worse, better, flights = counts.get(scenario := name.rpartition(",")[0], (0, 0, 0))
+            counts[scenario] = worse + (b > a), better + (b < a), flights + 1
+        return counts
 
     def inferior(self, margin: float) -> bool:
         """Return whether B may be worse than A by more than a margin."""
@@ -152,11 +152,11 @@ def compare_values(
     sign = -1.0 if figure(name).limit == "least" else 1.0  # of a change for the worse
     known = [(a, b) for a, b in pairs.values() if a is not None and b is not None]
     relative = bool(known) and all(a > 0 and b > 0 for a, b in known)
-    found = np.array([math.log(b / a) if relative else b - a for a, b in known])
+    changes = np.array([math.log(b / a) if relative else b - a for a, b in known])
     # Farther than any average of two differences: the sign of a failure's pair is all that counts.
-    worst = 1e3 * (abs(found).max(initial=0.0) + 1.0)
+    worst = 1e3 * (abs(changes).max(initial=0.0) + 1.0)
     lost = [(a is None, b is None) for a, b in pairs.values() if a is None or b is None]
-    differences = np.concatenate([found, [sign * worst * (int(b) - int(a)) for a, b in lost]])
+    differences = np.concatenate([changes, [sign * worst * (int(b) - int(a)) for a, b in lost]])
     p, change, low, high = signed_rank(differences, error)
 
     def told(value: float) -> float:
@@ -198,8 +198,8 @@ def signed_rank(differences: Floats, error: float) -> tuple[float, float, float,
     ranks = np.round(2 * rankdata(abs(differences))).astype(int)
     signed = ranks[differences != 0]
     sums = _sums(signed)
-    found = int(ranks[differences > 0].sum())
-    p = min(2 * min(sums[: found + 1].sum(), sums[found:].sum()), 1.0)
+    rank_sum = int(ranks[differences > 0].sum())
+    p = min(2 * min(sums[: rank_sum + 1].sum(), sums[rank_sum:].sum()), 1.0)
     averages = np.sort(
         ((differences[:, None] + differences) / 2)[np.triu_indices(n)], kind="stable"
     )
@@ -252,17 +252,17 @@ def compare_until_sure(
     """
     half = math.ceil(most / 2)
     looks = {half, most} if half in looked or half > max(looked, default=0) else {most}
-    found: list[Comparison] = []
+    rows: list[Comparison] = []
     for look in sorted(looks):
         number = looked.index(look) if look in looked else len(looked)
         error = ERROR / 2 ** (number + 1)
-        found = compare(look, error)
-        if look not in looked and max(each.pairs for each in found) >= _least(error / len(found)):
+        rows = compare(look, error)
+        if look not in looked and max(row.pairs for row in rows) >= _least(error / len(rows)):
             looked.append(look)
         # What is identical in half of the flights may still differ in the others.
-        if all(each.verdict not in {"not enough runs", "identical"} for each in found):
+        if all(row.verdict not in {"not enough runs", "identical"} for row in rows):
             break
-    return found
+    return rows
 
 
 def compare_rows(
@@ -287,17 +287,17 @@ def compare_rows(
             f"{_some(a)}; {_some(b)}"
         )
     ours, theirs = ([*_estimators(side.values())] for side in (a, b))
-    names = [(each, each) for each in ours if each in theirs]
+    names = [(name, name) for name in ours if name in theirs]
     if not names and len(ours) == len(theirs) == 1:  # two systems of different names
         names = [(ours[0], theirs[0])]
     if not names and bool(ours) == bool(theirs):
         raise ConfigError(f"compare: expected an estimator in both, found {ours} and {theirs}")
     wanted = [
-        (name, other, each)
+        (name, other, metric)
         for name, other in names
-        for each in figures
-        if any(_value(a[k], name, each) is not None for k in common)
-        or any(_value(b[k], other, each) is not None for k in common)
+        for metric in figures
+        if any(_value(a[k], name, metric) is not None for k in common)
+        or any(_value(b[k], other, metric) is not None for k in common)
     ]
     paired = {name for pair in names for name in pair}
     alone = [
@@ -306,19 +306,21 @@ def compare_rows(
     ]
     if not wanted and not alone:
         raise ConfigError(f"compare: expected {', '.join(figures)}, found none of them in any run")
-    found = []
-    for name, other, each in wanted:
-        pairs = {key: (_value(a[key], name, each), _value(b[key], other, each)) for key in common}
+    comparisons = []
+    for name, other, metric in wanted:
+        pairs = {
+            key: (_value(a[key], name, metric), _value(b[key], other, metric)) for key in common
+        }
         label = name if name == other else f"{name} / {other}"
-        one = compare_values(label, each, pairs, margin=margin, error=error / len(wanted))
-        laid = [(_alignments(a[key], name), _alignments(b[key], other)) for key in common]
-        differing = sorted({text for x, y in laid if x and y and x != y for text in x | y})
-        if differing and _after_alignment(each):
+        one = compare_values(label, metric, pairs, margin=margin, error=error / len(wanted))
+        alignments = [(_alignments(a[key], name), _alignments(b[key], other)) for key in common]
+        differing = sorted({text for x, y in alignments if x and y and x != y for text in x | y})
+        if differing and _after_alignment(metric):
             one = msgspec.structs.replace(
                 one, verdict="not comparable", more=0, alignments=tuple(differing)
             )
-        found.append(one)
-    return found + alone
+        comparisons.append(one)
+    return comparisons + alone
 
 
 def _alone(
@@ -330,15 +332,15 @@ def _alone(
 ) -> Comparison:
     """Return the row of an estimator that one side does not have, with a figure of the other."""
     by_figure = {f: [_value(runs[key], name, f) for key in common] for f in figures}
-    each = next((f for f, v in by_figure.items() if any(x is not None for x in v)), figures[0])
-    values = by_figure[each]
+    shown = next((f for f, v in by_figure.items() if any(x is not None for x in v)), figures[0])
+    values = by_figure[shown]
     known = [value for value in values if value is not None]
     there = float(np.median(known)) if known else None
-    sign = -1.0 if figure(each).limit == "least" else 1.0
+    sign = -1.0 if figure(shown).limit == "least" else 1.0
     change = sign * (math.inf if missing == "B" else -math.inf)
     lost, all_ = len(values) - len(known), len(values)
     return Comparison(
-        estimator=name, figure=each, change=change, low=change, high=change, relative=False, p=1.0,
+        estimator=name, figure=shown, change=change, low=change, high=change, relative=False, p=1.0,
         pairs=all_, missing=missing, verdict="worse" if missing == "B" else "better",
         a=None if missing == "A" else there, b=None if missing == "B" else there,
         failures=(all_, lost) if missing == "A" else (lost, all_),
@@ -351,7 +353,7 @@ def _alone(
 
 def _alignments(rows: Sequence[Row], estimator: str) -> set[str]:
     verdicts = (row["estimators"].get(estimator, {}) for row in rows)
-    return {str(each["alignment"]) for each in verdicts if each.get("alignment")}
+    return {str(verdict["alignment"]) for verdict in verdicts if verdict.get("alignment")}
 
 
 def _after_alignment(name: str) -> bool:

@@ -53,7 +53,7 @@ class Path:
 
     def add(self, stamp: int, *place: float) -> None:
         """Keep a place, rounded to millimetres."""
-        self.points.append(tuple(round(each, 3) for each in place))
+        self.points.append(tuple(round(coordinate, 3) for coordinate in place))
         if len(self.points) > MOST_POINTS:
             del self.points[1::2]
             self._spacing *= 2
@@ -105,11 +105,13 @@ class Estimator:
         """Return its path; if free of scale, laid on the truth by the similarity that fits best."""
         if not self.scale_free or not self.path.points:
             return list(self.path.points)
-        said, true = (np.array(self.path.points) @ [[1, 0], [1j, 0], [0, 1], [0, 1j]]).T
-        centred = said - said.mean()
+        estimated, true = (np.array(self.path.points) @ [[1, 0], [1j, 0], [0, 1], [0, 1j]]).T
+        centred = estimated - estimated.mean()
         factor = np.vdot(centred, true) / max(np.vdot(centred, centred).real, 1e-12)
-        laid = factor * centred + true.mean()
-        return list(zip(laid.real.round(3).tolist(), laid.imag.round(3).tolist(), strict=True))
+        aligned = factor * centred + true.mean()
+        return list(
+            zip(aligned.real.round(3).tolist(), aligned.imag.round(3).tolist(), strict=True)
+        )
 
 
 class Measured:
@@ -139,10 +141,10 @@ class Measured:
     @functools.cached_property
     def _vehicles(self) -> Vehicles:
         vehicles = Vehicles()
-        for each in self._state.announcements:
-            vehicles.announced(each)
-            if isinstance(each, EstimatorAnnouncement):
-                self._estimators.setdefault(each.source, Estimator(each.scale_free))
+        for announcement in self._state.announcements:
+            vehicles.announced(announcement)
+            if isinstance(announcement, EstimatorAnnouncement):
+                self._estimators.setdefault(announcement.source, Estimator(announcement.scale_free))
         return vehicles
 
     def _odometry(self, _: str, event: Odometry) -> None:
@@ -202,18 +204,18 @@ class Measured:
         return [
             (
                 name,
-                each.tracking(now),
+                estimator.tracking(now),
                 score((name, "ate_rmse")),
                 score((name, "ate_percent")),
-                None if each.heard is None else each.latency / 1e6,
+                None if estimator.heard is None else estimator.latency / 1e6,
             )
-            for name, each in self._estimators.items()
+            for name, estimator in self._estimators.items()
         ]
 
     def paths(self) -> dict[str, Points]:
         """Return the paths of vehicles and estimators: metres east, metres north."""
         true = {f"{name}: truth": list(path.points) for name, (path, _) in self._truths.items()}
-        return true | {name: each.shown() for name, each in self._estimators.items()}
+        return true | {name: estimator.shown() for name, estimator in self._estimators.items()}
 
     def cameras(self) -> list[str]:
         """Return the cameras that have sent images."""
@@ -229,7 +231,7 @@ class Measured:
         expect_known(camera, self._images, message, CommandError)
         for image in reversed(self._images[camera]):
             key = image.stamp, image.frame_id
-            found = [f for f in self._features.values() if (f.stamp, f.frame_id) == key]
-            if found:
-                return image, found
+            features = [f for f in self._features.values() if (f.stamp, f.frame_id) == key]
+            if features:
+                return image, features
         return self._images[camera][-1], []

@@ -87,11 +87,11 @@ class RecentSamples:
 
     def amount(self, name: str) -> Amount:
         """Return the durations of a node or an output."""
-        found = Amount()
+        amount = Amount()
         for sample in itertools.islice(self._samples, 1, None):
-            if (each := sample.amounts.get(name)) is not None:
-                found.add(each.total, each.longest, each.times)
-        return found
+            if (measured := sample.amounts.get(name)) is not None:
+                amount.add(measured.total, measured.longest, measured.times)
+        return amount
 
 
 class Meter(Instrument):
@@ -237,11 +237,11 @@ class Observer:
             "estimators": self._measured.rows(),
             "nodes": map(self._node, runners.values()),
             "ticks": (
-                (name, each.hz, each.calls, each.missed, each.late_p99_us, each.late_max_us)
-                for name, each in tick_summaries(state).items()
+                (name, tick.hz, tick.calls, tick.missed, tick.late_p99_us, tick.late_max_us)
+                for name, tick in tick_summaries(state).items()
             ),
             "inputs": self._inputs(),
-            "links": ((each.name, each.lost, each.thinned) for each in state.links.values()),
+            "links": ((link.name, link.lost, link.thinned) for link in state.links.values()),
             "outputs": self._outputs(sample),
             "settings": (
                 (f"{name}.{key}", value)

@@ -303,15 +303,15 @@ def find(run: str | None) -> Path:
         if not _answers(path := Path(run)):
             raise _not_listening(path, ConnectionRefusedError())
         return path
-    found = runs()
-    listed = ", ".join(found)
-    if not found:
+    sockets = runs()
+    listed = ", ".join(sockets)
+    if not sockets:
         raise CommandError("expected a run to look at, found none that goes on")
-    if run is None and len(found) > 1:
+    if run is None and len(sockets) > 1:
         raise CommandError(f"expected the name of one of several runs: {listed}")
-    if run is not None and run not in found:
-        raise CommandError(f"expected one of {listed}; found {run!r}{suggest(run, found)}")
-    return found[run] if run is not None else next(iter(found.values()))
+    if run is not None and run not in sockets:
+        raise CommandError(f"expected one of {listed}; found {run!r}{suggest(run, sockets)}")
+    return sockets[run] if run is not None else next(iter(sockets.values()))
 
 
 def _answers(path: Path) -> bool:

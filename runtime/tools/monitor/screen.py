@@ -142,17 +142,17 @@ class Screen(App[str]):
         """Update a table's rows in place, to keep the cursor."""
         columns = protocol.COLUMNS[name]
         table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
-        found = {
-            row[0]: [_cell(*each) for each in zip(row, columns.values(), strict=True)]
+        rows = {
+            row[0]: [_cell(*pair) for pair in zip(row, columns.values(), strict=True)]
             for row in snapshot.tables[name]
         }
-        table.set_class(not found, "none")
-        if [*found] != [key.value for key in table.rows]:
+        table.set_class(not rows, "none")
+        if [*rows] != [key.value for key in table.rows]:
             table.clear()
-            for key, cells in found.items():
+            for key, cells in rows.items():
                 table.add_row(*cells, key=key)
             return
-        for key, cells in found.items():
+        for key, cells in rows.items():
             for title, cell in zip(columns, cells, strict=True):
                 if table.get_cell(key, title) != cell:
                     table.update_cell(key, title, cell, update_width=True)

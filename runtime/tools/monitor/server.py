@@ -234,9 +234,9 @@ def small_jpeg(data: npt.NDArray[np.uint8], features: Sequence[TrackedFeatures] 
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
     elif features:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
-    for each in features:
-        places = np.rint((each.points + 0.5) * scale - 0.5).astype(int).tolist()
-        for place, inlier in zip(places, each.inliers.tolist(), strict=True):
+    for tracked in features:
+        places = np.rint((tracked.points + 0.5) * scale - 0.5).astype(int).tolist()
+        for place, inlier in zip(places, tracked.inliers.tolist(), strict=True):
             cv2.circle(pixels, place, 2, (60, 220, 60) if inlier else (60, 60, 230), 1, cv2.LINE_AA)
     return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 

@@ -98,7 +98,7 @@ def sweep(
             watch.interrupted()
             for row in [_row(future, futures[future]) for future in left]:  # waits
                 if not row["error"]:
-                    job = next(each for each in plan.jobs if each.id == row["id"])
+                    job = next(planned for planned in plan.jobs if planned.id == row["id"])
                     rows.add(_with_parts(row, now[job.roots]))
             raise
         return [row for job in plan.jobs if (row := rows.get(job)) is not None]
@@ -221,7 +221,7 @@ class Display(Watch):
             failed = ", failed" if row["passed"] is False else ""
             self._print(f"{self._count()} {job}: {seconds}{failed}, {self.state()}")
         if edited := row.get("edited"):
-            what = listed([f"{each} while it ran" for each in edited])
+            what = listed([f"{part} while it ran" for part in edited])
             self._print(f"warning: {job}: {what}: the next call runs it again")
 
     def interrupted(self) -> None:
@@ -232,8 +232,8 @@ class Display(Watch):
         """Return failures, running jobs with processes and memory, and the time left."""
         left = "?"
         if self.finished:
-            each = (self._last - self._begin) / self.finished
-            until = self._last + each * (self._missing - self.finished)
+            pace = (self._last - self._begin) / self.finished
+            until = self._last + pace * (self._missing - self.finished)
             left = _clock(max(until - time.monotonic(), 0))
         if time.monotonic() - self._looked > 1.0:
             self._usage, self._looked = self.children.usage(), time.monotonic()
@@ -250,7 +250,7 @@ class Display(Watch):
 
 def words(changed: Mapping[Job, Sequence[str]]) -> str:
     """Return which finished runs are run again, and why: ``2 are run again: x.py changed``."""
-    reasons = [each for why in changed.values() for each in why]
+    reasons = [reason for why in changed.values() for reason in why]
     are = "is" if len(changed) == 1 else "are"
     return f"{len(changed)} {are} run again: {listed(dict.fromkeys(reasons))}"
 
@@ -310,9 +310,9 @@ def print_summary(console: Console, plan: Plan, combinations: Sequence[Combinati
         left_out.insert(0, figures[-1].heading)
     console.print(_table(shown))
     if left_out:
-        said = f"also in table.csv and the page: {', '.join(left_out)}"
-        console.print(said, highlight=False)
-    if len({each.alignment for each in combinations}) > 1:
+        line = f"also in table.csv and the page: {', '.join(left_out)}"
+        console.print(line, highlight=False)
+    if len({combination.alignment for combination in combinations}) > 1:
         console.print(
             "Errors after different alignments are different things: compare those of one only.",
             style="yellow",
@@ -321,11 +321,11 @@ def print_summary(console: Console, plan: Plan, combinations: Sequence[Combinati
 
 def _columns(plan: Plan, combinations: Sequence[Combination]) -> Iterator[Column]:
     for index, parameter in enumerate(plan.parameters):
-        yield Column(parameter.path, tuple(each.settings[index] for each in combinations))
+        yield Column(parameter.path, tuple(c.settings[index] for c in combinations))
     passed = ["" if c.passed is None else f"{c.passed} of {c.runs}" for c in combinations]
     for name in ("estimator", "runs", "crashed", "passed", "repeatable", "alignment"):
-        found = passed if name == "passed" else [str(getattr(c, name)) for c in combinations]
-        yield Column(name, tuple(found))
+        cells = passed if name == "passed" else [str(getattr(c, name)) for c in combinations]
+        yield Column(name, tuple(cells))
     for name in MAIN:
         texts = tuple(str(c.figures.get(name, "")) for c in combinations)
         yield Column(name, texts, figure(name).unit)
@@ -335,13 +335,13 @@ def _table(columns: Sequence[Column]) -> Table:
     table = Table(
         title="median (least–most) of the runs", title_justify="left", box=box.SIMPLE_HEAD
     )
-    for each in columns:
-        number = each.unit is not None
-        heading = each.heading.replace("_", "\n").replace(".", ".\n")
+    for column in columns:
+        number = column.unit is not None
+        heading = column.heading.replace("_", "\n").replace(".", ".\n")
         table.add_column(
             Text(heading), justify="right" if number else "left", no_wrap=number, overflow="fold"
         )
-    for texts in zip(*(each.texts for each in columns), strict=True):
+    for texts in zip(*(column.texts for column in columns), strict=True):
         table.add_row(*map(Text, texts))
     return table
 

@@ -96,10 +96,10 @@ def split(text: str, where: str) -> tuple[str, ...]:
             expected.append(letter)
     if expected:
         raise ConfigError(f"{where}: expected a closing {expected[-1]}, found the end")
-    found = tuple(piece.strip() for piece in pieces)
-    if not all(found):
+    values = tuple(piece.strip() for piece in pieces)
+    if not all(values):
         raise ConfigError(f'{where}: expected a value between commas, found none ("" is a text)')
-    return found
+    return values
 
 
 def value(text: str) -> Any:
@@ -221,7 +221,7 @@ def make_plan(
     parameters = [parameter(change) for change in vary]
     _refuse_repeated([p.path for p in parameters], [o.partition("=")[0] for o in overrides])
     pairs = ([(p.path, text) for text in p.texts] for p in parameters)
-    loaded = {each: _load(config, overrides, each) for each in itertools.product(*pairs)}
+    loaded = {chosen: _load(config, overrides, chosen) for chosen in itertools.product(*pairs)}
     first = loaded[next(iter(loaded))].run
     out = (out or Path("sweeps") / first.name).absolute()
     jobs: dict[str, Job] = {}
@@ -241,12 +241,12 @@ def make_plan(
 
 def plan_of(jobs: Iterable[Job], out: Path) -> Plan:
     """Return the plan of some jobs, with `record` set for jobs of a shared flight."""
-    found = tuple(jobs)
-    counts = Counter(job.flight for job in found)
+    planned = tuple(jobs)
+    counts = Counter(job.flight for job in planned)
     return Plan(
         jobs=tuple(
             msgspec.structs.replace(job, record=job.flight != "" and counts[job.flight] > 1)
-            for job in found
+            for job in planned
         ),
         out=out,
     )

@@ -21,7 +21,7 @@ from runtime.run.results import write
 from runtime.tools.sweep.plan import Parameter, Plan, axis
 from runtime.tools.sweep.tables import MAIN, Row, Spread, in_order, numbers, summarise
 
-PLOTTED = {each.name: each.plot for each in FIGURES.values() if each.plot}
+PLOTTED = {figure.name: figure.plot for figure in FIGURES.values() if figure.plot}
 """Axis label of each plotted figure."""
 
 _SHARES = "failures (% of the runs)"
@@ -53,12 +53,12 @@ def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
     own = [row for _, row in in_order(plan, rows)]
     drawn = []
     for parameter in plan.parameters:
-        found = {name: lines(plan, own, parameter, name) for name in PLOTTED}
-        found = {name: each for name, each in found.items() if any(map(_seen, each))}
-        if found and len(parameter.texts) > 1:
+        by_figure = {name: lines(plan, own, parameter, name) for name in PLOTTED}
+        by_figure = {name: curves for name, curves in by_figure.items() if any(map(_seen, curves))}
+        if by_figure and len(parameter.texts) > 1:
             path = plan.out / "plots" / (re.sub(r"[^\w.-]", "_", parameter.path) + ".png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            _draw(parameter, found, _shares(parameter, own), path)
+            _draw(parameter, by_figure, _shares(parameter, own), path)
             drawn.append(path)
     return drawn
 
@@ -69,22 +69,22 @@ def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) ->
     One line for each combination of the other parameters and each estimator; if these are more
     than 8, one for each estimator. Errors after different alignments are never in one line.
     """
-    verdicts = [each for row in rows for each in row["estimators"].values()]
-    aligned = len({each.get("alignment") for each in verdicts}) > 1
+    verdicts = [verdict for row in rows for verdict in row["estimators"].values()]
+    aligned = len({verdict.get("alignment") for verdict in verdicts}) > 1
     short = _short([other.path for other in plan.parameters])
-    found: list[tuple[str, str, str, float]] = []
+    samples: list[tuple[str, str, str, float]] = []
     for job, row in in_order(plan, rows):
         settings = dict(job.settings)
         here = settings.pop(parameter.path)
         others = ", ".join(f"{short[path]}={text}" for path, text in settings.items())
         for estimator, figures in row["estimators"].items():
             name = f"{estimator} ({figures.get('alignment', 'none')})" if aligned else estimator
-            found += [(name, others, here, number) for number in numbers([figures.get(figure)])]
-    several = len({name for name, *_ in found}) > 1
-    if len({(name, others) for name, others, *_ in found}) > _MOST_LINES:
-        several, found = True, [(name, "all others", here, n) for name, _, here, n in found]
+            samples += [(name, others, here, number) for number in numbers([figures.get(figure)])]
+    several = len({name for name, *_ in samples}) > 1
+    if len({(name, others) for name, others, *_ in samples}) > _MOST_LINES:
+        several, samples = True, [(name, "all others", here, n) for name, _, here, n in samples]
     points: dict[str, dict[str, list[float]]] = {}
-    for name, others, here, number in found:
+    for name, others, here, number in samples:
         label = ", ".join(filter(None, (name * several, others)))
         points.setdefault(label, {}).setdefault(here, []).append(number)
     return [_line(label, line, parameter) for label, line in points.items()]
@@ -100,9 +100,9 @@ def _seen(line: Line) -> bool:
     return any(spread.most != 0 or spread.least != 0 for spread in line.spreads)
 
 
-def _line(label: str, found: dict[str, list[float]], parameter: Parameter) -> Line:
-    texts = tuple(text for text in parameter.texts if text in found)
-    return Line(label, texts, tuple(Spread.of(found[text]) for text in texts))
+def _line(label: str, values: dict[str, list[float]], parameter: Parameter) -> Line:
+    texts = tuple(text for text in parameter.texts if text in values)
+    return Line(label, texts, tuple(Spread.of(values[text]) for text in texts))
 
 
 def _shares(parameter: Parameter, rows: Sequence[Row]) -> dict[str, list[float]]:
@@ -114,25 +114,25 @@ def _shares(parameter: Parameter, rows: Sequence[Row]) -> dict[str, list[float]]
     return shares if any(map(any, shares.values())) else {}
 
 
-def _percent(found: Iterable[bool]) -> float:
-    each = [*found]
-    return 100.0 * sum(each) / max(len(each), 1)
+def _percent(outcomes: Iterable[bool]) -> float:
+    flags = [*outcomes]
+    return 100.0 * sum(flags) / max(len(flags), 1)
 
 
 def _draw(
-    parameter: Parameter, found: dict[str, list[Line]], shares: dict[str, list[float]], path: Path
+    parameter: Parameter, lines: dict[str, list[Line]], shares: dict[str, list[float]], path: Path
 ) -> None:
     from matplotlib.figure import Figure
 
     scale = axis(parameter.texts)
     place = dict(zip(parameter.texts, scale.places, strict=True))
-    panels = len(found) + bool(shares)
+    panels = len(lines) + bool(shares)
     columns, rows = min(panels, _ACROSS), math.ceil(panels / _ACROSS)
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
-    labels = list(dict.fromkeys(line.label for own in found.values() for line in own))
+    labels = list(dict.fromkeys(line.label for own in lines.values() for line in own))
     colours = {label: f"C{index}" for index, label in enumerate(labels)}
     handles: dict[str, Any] = {}
-    for index, (name, own) in enumerate([*found.items(), *[("", [])] * bool(shares)], 1):
+    for index, (name, own) in enumerate([*lines.items(), *[("", [])] * bool(shares)], 1):
         axes: Any = figure.add_subplot(rows, columns, index)
         for line in own:
             points = sorted(
@@ -186,11 +186,11 @@ def decades(values: Sequence[float]) -> bool:
 def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
     """Write the page of a sweep into its folder, beside its tables and plots, and return it."""
     combinations = summarise(plan, rows)
-    aligned = Counter(each.alignment for each in combinations if each.alignment)
+    aligned = Counter(c.alignment for c in combinations if c.alignment)
     page = template(Path(__file__).with_name("page.html.jinja")).render(
         name=plan.out.name,
         parameters=[parameter.path for parameter in plan.parameters],
-        figures=[n for n in MAIN if any(n in each.figures for each in combinations)],
+        figures=[n for n in MAIN if any(n in c.figures for c in combinations)],
         alignments=[name for name, _ in aligned.most_common()],
         summary=combinations,
         repeated=any(job.repeat > 1 for job in plan.jobs),

@@ -169,10 +169,10 @@ def kill_tree(run: int) -> None:
         if run != os.getpid():
             os.kill(run, signal.SIGSTOP)  # or it might start more
         for _ in range(2):  # again, for what these have started meanwhile
-            found, tree = _processes(), {run}
+            processes, tree = _processes(), {run}
             while more := {
                 number
-                for number, (parent, session) in found.items()
+                for number, (parent, session) in processes.items()
                 if (parent in tree or session == run) and number not in tree
             }:
                 tree |= more
@@ -184,12 +184,12 @@ def kill_tree(run: int) -> None:
 
 def _processes() -> dict[int, tuple[int, int]]:
     """Return the parent and the session of all processes, by number."""
-    found = {}
+    processes = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it may just have ended
             _, parent, _, session, *_ = stat.read_bytes().rpartition(b")")[2].split()
-            found[int(stat.parent.name)] = int(parent), int(session)
-    return found
+            processes[int(stat.parent.name)] = int(parent), int(session)
+    return processes
 
 
 def read_results(job: Job, code: int, wall_seconds: float) -> Row:
@@ -245,7 +245,7 @@ def note_inputs(row: Row, ended: Ended) -> None:
 
 
 def _outputs_of(node: str, digests: dict[str, str]) -> dict[str, str]:
-    return {name: each for name, each in digests.items() if name.partition(".")[0] == node}
+    return {name: digest for name, digest in digests.items() if name.partition(".")[0] == node}
 
 
 def last_error(output: str) -> str:

@@ -97,7 +97,7 @@ def _enter(rows: dict[str, Row], row: Row) -> Row:
     Crashes of other code than today's are none of its: what was mended has not crashed.
     """
     earlier = rows.get(row["id"])
-    keys = {each["made_from"] for each in (earlier, row) if each and "made_from" in each}
+    keys = {entry["made_from"] for entry in (earlier, row) if entry and "made_from" in entry}
     if earlier is not None and len(keys) < 2:
         crashes = earlier.get("crashes", []) + [earlier["error"]] * bool(earlier["error"])
         if crashes:
@@ -155,7 +155,7 @@ class Rows:
         Of a run that nothing is known of, such as one of an earlier version, that is said.
         """
         if edited := row.get("edited"):
-            return [f"{each} while it ran" for each in edited]
+            return [f"{part} while it ran" for part in edited]
         parts = self._parts.get(row.get("made_from", ""))
         if parts is None:
             return ["nothing says what they were made from"]
@@ -183,12 +183,12 @@ class _Set(msgspec.Struct):
 
 
 def _decode_parts(path: Path) -> dict[str, Parts]:
-    found: dict[str, Parts] = {}
+    parts: dict[str, Parts] = {}
     for line in path.read_bytes().splitlines() if path.is_file() else ():
         with contextlib.suppress(msgspec.MsgspecError):  # cut short, or empty
             one = msgspec.json.decode(line, type=_Set)
-            found[one.key] = one.parts
-    return found
+            parts[one.key] = one.parts
+    return parts
 
 
 class Spread(msgspec.Struct, frozen=True):
@@ -269,11 +269,11 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     )
     _write(plan.out / "costs.csv", [*head, "worker", *keys], costs)
     head += ["exit_code", "error", "passed", "sim_seconds", "digest", "estimator"]
-    found = {key for _, row in own for figures in row["estimators"].values() for key in figures}
-    first = [name for name in ("alignment", *IN_SWEEPS) if name in found]
+    present = {key for _, row in own for figures in row["estimators"].values() for key in figures}
+    first = [name for name in ("alignment", *IN_SWEEPS) if name in present]
     columns = {
         name: f"estimator_{name}" if name in head else name
-        for name in [*first, *sorted(found - {*first})]
+        for name in [*first, *sorted(present - {*first})]
     }
     table = [
         {**run, "estimator": name, **{column: figures.get(key) for key, column in columns.items()}}
@@ -285,15 +285,15 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     head += [f"{name}_{what}" for name in IN_SWEEPS for what in SPREAD]
     summary = [
         {
-            **msgspec.structs.asdict(each),
-            **dict(zip(paths, each.settings, strict=True)),
+            **msgspec.structs.asdict(combination),
+            **dict(zip(paths, combination.settings, strict=True)),
             **{
                 f"{name}_{what}": getattr(spread, field)
-                for name, spread in each.figures.items()
+                for name, spread in combination.figures.items()
                 for what, field in SPREAD.items()
             },
         }
-        for each in summarise(plan, rows)
+        for combination in summarise(plan, rows)
     ]
     _write(plan.out / "summary.csv", head, summary)
 
@@ -360,7 +360,7 @@ def combine(
         runs=len(group), crashed=sum(bool(row["error"]) for row in group),
         passed=sum(passed) if passed else None, failed=passed.count(False),
         repeatable=_repeatable(name, group), reasons=tuple(reasons.values()),
-        figures={figure: Spread.of(each) for figure, each in values.items() if each},
+        figures={figure: Spread.of(samples) for figure, samples in values.items() if samples},
     )  # fmt: skip
 
 
@@ -379,7 +379,7 @@ def _repeatable(name: str, group: Sequence[Row]) -> str:
         return f"{runs} of {runs} equal"
     errors = [numbers(r["estimators"][name].get("ate_percent") for r in rows) for rows in differing]
     least, most = max(
-        ((min(each), max(each)) for each in errors if each),
+        ((min(values), max(values)) for values in errors if values),
         key=lambda ends: ends[1] - ends[0],
         default=(0.0, 0.0),
     )

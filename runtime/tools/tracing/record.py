@@ -154,10 +154,10 @@ class Spool:
                 log.warning("no trace from here on: %s", error)
 
     def _drained(self) -> list[tuple[Any, ...]]:
-        found = []
+        notes = []
         while self.beside:
-            found.append(self.beside.popleft())
-        return found
+            notes.append(self.beside.popleft())
+        return notes
 
     def _append(self, notes: list[tuple[Any, ...]]) -> None:
         content = self._encode([self._plain(n) if n[0] == "event" else n for n in notes])
@@ -170,8 +170,10 @@ class Spool:
         name = "run.announced" if sender is None else sender.name
         key = (name, event.__name__, source)
         if key not in self.receivers:
-            heard = (each.node for each in listeners or () if each.receives(event, source))
-            self.receivers[key] = tuple(dict.fromkeys(heard))
+            nodes = (
+                listener.node for listener in listeners or () if listener.receives(event, source)
+            )
+            self.receivers[key] = tuple(dict.fromkeys(nodes))
             self.kinds[event.__name__] = _kind(event)
         return ("event", *EventNote(time, run, *key, stamp, identity, cause))
 
@@ -318,12 +320,12 @@ class SentEvent(msgspec.Struct, eq=False):
 
     def path(self) -> list[SentEvent]:
         """Return all events from the sensor's event to this."""
-        found: list[SentEvent] = []
-        each: SentEvent | None = self
-        while each is not None:
-            found.append(each)
-            each = each.cause
-        return found[::-1]
+        events: list[SentEvent] = []
+        event: SentEvent | None = self
+        while event is not None:
+            events.append(event)
+            event = event.cause
+        return events[::-1]
 
 
 class _HeardEvents:
@@ -368,8 +370,8 @@ class Causes:
         node, kind = note.sender.partition(".")[0], self._kinds[note.event]
         sent = SentEvent(note.time, note.run, node, note.event, note.source, note.stamp)
         # Another event may lie where one lay that has come from elsewhere.
-        found, heard = self._by_identity.get(note.given, (None, ()))
-        self._trace_back(sent, kind, found if node in heard else None)
+        cause, heard = self._by_identity.get(note.given, (None, ()))
+        self._trace_back(sent, kind, cause if node in heard else None)
         sent.seen = kind.image if sent.cause is None else sent.cause.seen
         receivers = self._receivers.get((note.sender, note.event, note.source), ())
         self._by_identity[note.identity] = sent, receivers
@@ -408,4 +410,4 @@ class Causes:
 
 def _passes(sent: SentEvent, node: str) -> bool:
     """Tell whether a path can go on to a node: each node is on a path only once."""
-    return all(each.node != node for each in sent.path())
+    return all(step.node != node for step in sent.path())

@@ -323,10 +323,10 @@ def read_trace(path: Path) -> Trace:
             content = gzip.decompress(content)
         trace = msgspec.json.decode(content, type=Trace)
     except OSError as error:
-        found = error.strerror or str(error)
+        reason = error.strerror or str(error)
         if path.with_name(path.name + ".part").exists():
-            found += ": its run goes on, or was killed and could not write it"
-        raise ConfigError(f"{path}: expected a trace, found: {found}") from None
+            reason += ": its run goes on, or was killed and could not write it"
+        raise ConfigError(f"{path}: expected a trace, found: {reason}") from None
     except (ValueError, EOFError, zlib.error, RecursionError) as error:  # msgspec's is a ValueError
         raise ConfigError(f"{path}: expected a trace, found: {error}") from None
     if trace.about.get("made by") != MADE_BY:
@@ -336,14 +336,14 @@ def read_trace(path: Path) -> Trace:
 
 def paths(trace: Trace) -> list[PathLatency]:
     """Return the latencies of all paths, the most frequent first."""
-    found: dict[str, PathLatency] = {}
+    latencies: dict[str, PathLatency] = {}
     for event in trace.events:
         if "path" in event.args:
             name = event.args["path"]
-            path = found.setdefault(name, PathLatency(name, [], []))
+            path = latencies.setdefault(name, PathLatency(name, [], []))
             path.run_ms.append(event.args["run_ms"])
             path.real_ms.append(event.args["real_ms"])
-    return sorted(found.values(), key=lambda path: -len(path.run_ms))
+    return sorted(latencies.values(), key=lambda path: -len(path.run_ms))
 
 
 def node_loads(trace: Trace) -> list[NodeLoad]:
@@ -356,14 +356,14 @@ def node_loads(trace: Trace) -> list[NodeLoad]:
     own_times = _own_times(slices)
     total = max((e.ts + e.dur for e in slices), default=0.0) - (slices[0].ts if slices else 0.0)
     by_node: dict[str, list[tuple[float, str]]] = {}
-    for each, own in zip(slices, own_times, strict=True):
-        by_node.setdefault(names[each.tid], []).append((own, each.name))
-    found = []
+    for slice_, own in zip(slices, own_times, strict=True):
+        by_node.setdefault(names[slice_.tid], []).append((own, slice_.name))
+    loads = []
     for node, steps in by_node.items():
         busy, (longest, what) = sum(own for own, _ in steps), max(steps)
         share = busy / total if total else 0.0
-        found.append(NodeLoad(node, len(steps), busy / 1e3, share, longest / 1e3, what))
-    return sorted(found, key=lambda each: -each.busy_ms)
+        loads.append(NodeLoad(node, len(steps), busy / 1e3, share, longest / 1e3, what))
+    return sorted(loads, key=lambda load: -load.busy_ms)
 
 
 def quantile(values: list[float], q: float) -> float:
@@ -374,12 +374,12 @@ def quantile(values: list[float], q: float) -> float:
 
 def _own_times(slices: list[TraceEvent]) -> list[float]:
     """Return each slice's own time (µs), without nested slices; sorted by beginning."""
-    alone = [each.dur for each in slices]
+    alone = [slice_.dur for slice_ in slices]
     open_: list[int] = []
-    for index, each in enumerate(slices):
-        while open_ and slices[open_[-1]].ts + slices[open_[-1]].dur <= each.ts:
+    for index, slice_ in enumerate(slices):
+        while open_ and slices[open_[-1]].ts + slices[open_[-1]].dur <= slice_.ts:
             open_.pop()
         if open_:
-            alone[open_[-1]] -= each.dur
+            alone[open_[-1]] -= slice_.dur
         open_.append(index)
     return [max(own, 0.0) for own in alone]
