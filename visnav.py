@@ -467,7 +467,7 @@ def _png(figure: Figure) -> bytes:
 
 
 def _settings(config: str | Path | Mapping[str, Any], changes: Mapping[str, Any]) -> Config:
-    from runtime.config.model import override
+    from runtime.config.overrides import override
     from runtime.config.reading import find_modules_in, load_configuration, parse
 
     if not isinstance(config, Mapping):

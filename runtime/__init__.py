@@ -2,12 +2,13 @@
 
 Read the core in this order:
 
-- Writing a node: `node` (its `host` is the run), with its declarations in `channels.ports` and
-  `channels.bundles`.
-- Delivery of events: `channels.sender` and `streams`, as `run.graph` has connected them;
-  its speed: `channels.tasks`, `run.event_loop`.
-- Time: `time.clock` and `lockstep`.
-- A run: `run.node_runner`, `run_state` (with the instruments of observers), `supervisor`,
+- Writing a node: `node` (its `host` is the run), with its `channels.declarations` of `ports` and
+  `bundles`.
+- Delivery of events: `channels.sender` and `streams`, as `run.graph` has connected them, through
+  `channels.links` if imperfect; who may send in which name: `channels.sources`; its speed:
+  `channels.tasks`, `run.event_loop`.
+- Time: `time.clock`, `lockstep`, `stepping`; limits in `time.real_time`.
+- A run: `run.node_runner`, `run_state` (with the `instruments` of observers), `supervisor`,
   `execute`; `watchdogs` find the node that blocks the loop or holds up the run.
 - Results: the digest in `channels.wire`, `summary` (made by `run.summarise`), `run.results`,
   `logs`.

@@ -29,7 +29,8 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from events import Announcement, Event
-from runtime.channels.bundles import Declared, Matcher, read_declarations
+from runtime.channels.bundles import Matcher
+from runtime.channels.declarations import Declared, read_declarations
 from runtime.channels.ports import MAX_HZ
 from runtime.channels.sender import Listener, Sender
 from runtime.channels.streams import Stream

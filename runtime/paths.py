@@ -1,4 +1,4 @@
-"""Settings naming files, file names of sources, and a user's private folder.
+"""Settings naming files.
 
 A setting names what the file reads, or what its nodes write into the run's folder::
 
@@ -14,16 +14,12 @@ may write the same file.
 from __future__ import annotations
 
 import os
-import stat
-import tempfile
-import urllib.parse
 from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
-from runtime.errors import CommandError
 from runtime.units import plain
 
 Kind = Literal["input", "json", "name", "output", "secret"]
@@ -138,47 +134,3 @@ def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
     if len(inner) == 1:  # or None
         return _walk(value, inner[0], change)
     return value
-
-
-_RESERVED = {"truth", "plan"}
-
-
-def source_file(source: str) -> str:
-    """Return the name of a source's files, without a suffix; no two sources have the same.
-
-    ``/`` becomes ``+``. All but ASCII's letters and digits, ``-`` and ``_`` becomes ``~`` and two
-    hexadecimal digits for each byte, and so does the first letter of a name that other files have.
-    There is no dot in it: what follows one says which file of the source it is.
-    """
-    quoted = urllib.parse.quote(source, safe="/", errors="surrogatepass")
-    if source in _RESERVED:
-        quoted = f"%{ord(source[0]):02X}{source[1:]}"
-    quoted = quoted.replace("~", "%7E").replace(".", "%2E")
-    return quoted.replace("/", "+").replace("%", "~")
-
-
-def source_of(name: str) -> str:
-    """Return the source of a file name; the inverse of `source_file`."""
-    quoted = name.replace("~", "%").replace("+", "/")
-    return urllib.parse.unquote(quoted, errors="surrogatepass")
-
-
-def user_folder() -> Path:
-    """Return the folder, made if missing.
-
-    Raises:
-        CommandError: It cannot be made, or others than its user may get at it.
-    """
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    path = Path(base) / "visnav" if base else Path(tempfile.gettempdir()) / f"visnav-{os.getuid()}"
-    try:
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = path.lstat()
-    except OSError as error:
-        raise CommandError(f"{path}: expected a folder for sockets: {error.strerror}") from None
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise CommandError(
-            f"{path}: expected a folder that only its user may enter, found mode "
-            f"{stat.S_IMODE(status.st_mode):o} of user {status.st_uid}"
-        )
-    return path

@@ -18,8 +18,9 @@ import msgspec
 
 from events import Announcement, Event
 from runtime.channels.answers import Answers
+from runtime.channels.links import LinkConfig
 from runtime.channels.ports import Output
-from runtime.channels.sender import LinkConfig, Sender
+from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, OnError, RunConfig
 from runtime.config.reading import convert
 from runtime.node import Node

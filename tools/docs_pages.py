@@ -19,7 +19,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
-from runtime.channels.sender import LinkConfig
+from runtime.channels.links import LinkConfig
 from runtime.config.model import NetworkConfig, RunConfig
 from runtime.config.reading import find_nodes
 from runtime.figures import FIGURES

@@ -26,10 +26,10 @@ from nodes.trajectory_files import tum_row
 from runtime.config.model import Config, NodeSpec, to_builtins
 from runtime.config.reading import load_configuration, parse
 from runtime.errors import ConfigError
-from runtime.paths import source_file
 from runtime.run.execute import execute
 from runtime.run.results import claim
 from runtime.run.supervisor import Supervisor
+from runtime.source_files import source_file
 from runtime.tools import preflight
 from runtime.tools.cli.commands import ConfigFile, Overrides
 from runtime.tools.cli.run import leave_behind

@@ -25,8 +25,8 @@ from events.geometry import pose_matrix
 from events.sensors import MEASURED, fields_of, numbers
 from nodes.trajectory import Trajectory, associate
 from nodes.trajectory_files import EPOCH, epoch_of, read_tum, write_euroc, write_kitti, write_tum
-from runtime.paths import source_file
 from runtime.run.results import run_folder
+from runtime.source_files import source_file
 
 FORMATS = ("tum", "euroc", "kitti")
 TRUTH = "truth"

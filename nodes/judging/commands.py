@@ -90,7 +90,7 @@ def judge(
 
     from nodes.judging import judged, judgement, mounting, readers
     from nodes.judging.readers.stamps import read_stamps
-    from runtime.config.model import given
+    from runtime.config.overrides import given
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
     from runtime.tools.cli.brief import print_verdict, verdict_table

@@ -16,10 +16,10 @@ from nodes.judging.report.tables import COLORS, Estimator, Facts, Run, Verdict
 from nodes.trajectory_files import write_tum
 from runtime.commit import commit
 from runtime.errors import ResultsError
-from runtime.paths import source_file
 from runtime.run import results
 from runtime.run.sources import content_hash
 from runtime.run.summarise import command_line, environment
+from runtime.source_files import source_file
 
 
 def write(

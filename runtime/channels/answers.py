@@ -20,7 +20,7 @@ from typing_extensions import Buffer
 
 from runtime.channels.wire import combined, fingerprint
 from runtime.errors import ConfigError
-from runtime.paths import source_file
+from runtime.source_files import source_file
 from runtime.time.clock import SECOND
 from runtime.workers.costs import Costs
 

@@ -1,18 +1,7 @@
-"""Sending end of an output: a single loop over a frozen tuple of listeners; and imperfect links.
+"""Sending end of an output: a single loop over a frozen tuple of listeners.
 
 Delivery is synchronous: when `send` returns, every handler has run and every waiting reader has
 been resumed. Who listens is decided by `runtime.run.graph` before the first event.
-
-An imperfect link delays, loses or thins out events, in the run's own time::
-
-    [nodes.links.frames]
-    delay = "80ms"
-    jitter = "5ms"
-    loss = 0.02
-    rate = 10
-
-Any input, handler, bundle, or field of a bundle may have one. Its effect depends on the run's
-seed and the names of node and port only.
 """
 
 from __future__ import annotations
@@ -20,27 +9,21 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
-import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from types import FrameType
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-import msgspec
-import numpy as np
-
-from events import Announcement, Event
+from events import Event
+from runtime.channels.sources import SourceOwners
 from runtime.channels.streams import Stream
 from runtime.channels.tasks import FanOut, Fault
 from runtime.errors import (
     ChannelClosedError,
-    ChannelSourceError,
     ChannelThreadError,
     ChannelTypeError,
     HandlerCircleError,
 )
-from runtime.time.clock import SECOND, Clock, Once
-from runtime.units import Latency
 
 T = TypeVar("T", bound=Event)
 
@@ -49,63 +32,6 @@ Deliver = Callable[[Any], Any]  # a handler, or a stream's `offer`; a true resul
 Tap = Callable[["Sender[Any] | None", Event], None]
 """Sees every event before its listeners do: the digest, the event log. (An announcement has no
 sender.)"""
-
-
-class Voices:
-    """Owners of source names: each node owns its name, its announced sources, and all names below.
-
-    A node that announces ``*`` (a replay does) may send in all names without another owner; those
-    in `scripted`, scripts of tests, in any.
-    """
-
-    def __init__(self, nodes: Iterable[str], scripted: Collection[str] = ()) -> None:
-        self._owners = {name: name for name in nodes}
-        self._scripted = frozenset(scripted)
-        self._for_others: set[str] = set()
-        self._announced: set[tuple[type[Announcement], str]] = set()
-
-    def announce(self, node: str, announcement: Announcement) -> None:
-        """Register a node as the owner of an announced source, or raise `ChannelSourceError`."""
-        kind, source = type(announcement), announcement.source
-        if kind is Announcement and source == "*":
-            self._for_others.add(node)
-            return
-        if node in self._scripted:
-            return
-        self._check(node, source, f"{kind.__name__} of {source!r}")
-        self._owners.setdefault(source, node)
-        if kind is not Announcement and (kind, source) in self._announced:
-            raise ChannelSourceError(
-                f"{node}: expected to announce each source once, found {kind.__name__} of "
-                f"{source!r} twice"
-            )
-        self._announced.add((kind, source))
-
-    def check(self, port: str, event: Event) -> None:
-        """Raise an error if an event is sent by ``node.port`` in the name of another."""
-        node = port.partition(".")[0]
-        if node not in self._scripted and not (
-            node in self._for_others and self.owner(event.source) is None
-        ):
-            self._check(port, event.source, f"{type(event).__name__} of {event.source!r}")
-
-    def owner(self, source: str) -> str | None:
-        """Return the owner of a source; `None` if there is none."""
-        while source not in self._owners and "/" in source:
-            source = source.rpartition("/")[0]
-        return self._owners.get(source)
-
-    def _check(self, sender: str, source: str, described: str) -> None:
-        """Raise an error unless a source belongs to a sender, ``node`` or ``node.port``."""
-        node = sender.partition(".")[0]
-        owner = self.owner(source)
-        if owner == node or (sender == node and owner is None):
-            return
-        whose = f"which is {owner}'s" if owner else "which nobody announces"
-        raise ChannelSourceError(
-            f"{sender}: expected a source that is {node!r}, below it, or announced by this node, "
-            f"found {described}, {whose}"
-        )
 
 
 class Sender(Generic[T]):
@@ -117,9 +43,25 @@ class Sender(Generic[T]):
     """
 
     __slots__ = (
-        "_candidates", "_deliver", "_expected", "_fault", "_known", "_listeners", "_outside",
-        "_routes", "_sent", "_source", "_taps", "_thread", "_to_streams", "_voices",
-        "_waiting", "event", "name", "send", "sources",
+        "_candidates",
+        "_deliver",
+        "_expected",
+        "_fault",
+        "_known",
+        "_listeners",
+        "_outside",
+        "_owners",
+        "_routes",
+        "_sent",
+        "_source",
+        "_taps",
+        "_thread",
+        "_to_streams",
+        "_waiting",
+        "event",
+        "name",
+        "send",
+        "sources",
     )  # fmt: skip
 
     def __init__(self, name: str, event: type[T], outside: Collection[Any] = ()) -> None:
@@ -131,7 +73,7 @@ class Sender(Generic[T]):
         self._source = ""  # of the event that was checked last
         self.sources: set[str] = set()
         """Sources of all events sent so far."""
-        self._voices: Voices | None = None
+        self._owners: SourceOwners | None = None
         self._sent = 0
         self.send: Callable[[T], bool] = self._refuse
         """Deliver an event now; True if a handler ended the delivery."""
@@ -150,13 +92,13 @@ class Sender(Generic[T]):
         candidates: Iterable[Listener],
         taps: Iterable[Tap] = (),
         fault: Fault | None = None,
-        voices: Voices | None = None,
+        owners: SourceOwners | None = None,
     ) -> None:
         """Freeze the listeners in their order, and pick the shortest way of delivery.
 
-        Without `voices`, events may be of any source.
+        Without `owners`, events may be of any source.
         """
-        self._voices = voices
+        self._owners = owners
         self._candidates = tuple(c for c in candidates if c.may_receive(self.event))
         self._listeners = tuple(c.deliver for c in self._candidates)
         for route in self._known.values():
@@ -212,8 +154,8 @@ class Sender(Generic[T]):
                 f"it after the await, or use loop.call_soon_threadsafe({self.name}.send, event)"
             )
         if event.source not in self.sources:
-            if self._voices is not None:
-                self._voices.check(self.name, event)
+            if self._owners is not None:
+                self._owners.check(self.name, event)
             self.sources.add(event.source)
         self._source = self._to_streams.source = event.source
         if not self._outside:
@@ -381,95 +323,4 @@ def _circle(error: BaseException) -> str:
 
 
 def _raise(_: Deliver, error: BaseException) -> None:
-    raise error
-
-
-class LinkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Imperfections of a link to a port.
-
-    Attributes:
-        delay: Delay of every event.
-        jitter: Most additional delay, at random; the order is kept.
-        loss: Share of events lost, at random.
-        rate: Most events a second, by their stamps; 0 for all.
-    """
-
-    delay: Latency = Latency(0)  # immutable
-    jitter: Latency = Latency(0)
-    loss: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
-    rate: Annotated[float, msgspec.Meta(ge=0)] = 0.0
-
-
-class Link:
-    """Link before a port; delivers each event later, or not at all.
-
-    A handler behind a link with a delay cannot end a delivery: when it is called, the nodes after
-    it have had the event.
-
-    Args:
-        before: Replaced link, whose figures are carried on.
-    """
-
-    def __init__(
-        self, name: str, config: LinkConfig, clock: Clock, seed: int, before: Link | None = None
-    ) -> None:
-        self.name = name
-        self.lost: int = before.lost if before else 0
-        self.thinned: int = before.thinned if before else 0
-        self._config = config
-        self._clock = clock
-        self._rng = np.random.default_rng([seed, zlib.crc32(name.encode()), zlib.crc32(b"link")])
-        self._deliver: Callable[[Any], Any] | None = None
-        self._fault: Callable[[BaseException], None] = _raise_again
-        self._last_period: dict[str, int] = {}  # by source
-        self._last_due = 0
-
-    def to(
-        self, deliver: Callable[[Any], Any], fault: Callable[[BaseException], None] | None = None
-    ) -> Callable[[Any], Any]:
-        """Connect the far end to a receiver; return the function to call at this end."""
-        self._deliver = deliver
-        self._fault = fault or _raise_again
-        return self.offer
-
-    def close(self) -> None:
-        """Deliver nothing any more: the far end is gone."""
-        self._deliver = None
-
-    def offer(self, event: Any) -> bool:
-        """Take an event (or a tuple of events, whose first has the stamp)."""
-        config = self._config
-        if config.rate and self._is_too_soon(event[0] if isinstance(event, tuple) else event):
-            self.thinned += 1
-            return False
-        if config.loss and self._rng.random() < config.loss:
-            self.lost += 1
-            return False
-        delay = float(config.delay)
-        if config.jitter:
-            delay += float(config.jitter) * self._rng.random()
-        if not delay:
-            return bool(self._deliver and self._deliver(event))
-        due = max(self._clock.now() + round(delay * SECOND), self._last_due)
-        self._last_due = due
-        self._clock.schedule.add(due, Once(lambda: self._arrive(event)))
-        return False
-
-    def _arrive(self, event: Any) -> None:
-        try:
-            if self._deliver is not None:
-                self._deliver(event)
-        except BaseException as error:
-            self._fault(error)
-
-    def _is_too_soon(self, event: Any) -> bool:
-        """Return whether a source already had an event in this period of the rate."""
-        period = int(event.stamp * self._config.rate // SECOND)
-        if self._last_period.get(event.source) == period:
-            return True
-        self._last_period[event.source] = period
-        return False
-
-
-def _raise_again(error: BaseException) -> None:
     raise error

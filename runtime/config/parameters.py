@@ -19,7 +19,9 @@ import msgspec
 import tomli_w
 
 from runtime.changeable import is_marked
-from runtime.config.model import override, struct_in, types_of, without_none
+from runtime.config.explain import struct_in, types_of
+from runtime.config.model import without_none
+from runtime.config.overrides import override
 from runtime.config.reading import convert
 from runtime.errors import ConfigError
 from runtime.node import NodeConfig

@@ -48,20 +48,11 @@ from typing import Any, TypeVar, get_origin
 
 import msgspec
 
+from runtime.channels.links import LinkConfig
 from runtime.channels.ports import MAX_HZ
-from runtime.channels.sender import LinkConfig
-from runtime.config.model import (
-    Config,
-    NetworkConfig,
-    NodeSpec,
-    OnError,
-    RunConfig,
-    explain,
-    override,
-    show,
-    struct_in,
-    types_of,
-)
+from runtime.config.explain import explain, show, struct_in, types_of
+from runtime.config.model import Config, NetworkConfig, NodeSpec, OnError, RunConfig
+from runtime.config.overrides import override
 from runtime.errors import ConfigError, DeclarationError, VisnavError, expect_known, suggest
 from runtime.extras import CONFIGURATIONS, NODES, missing_extension, offers
 from runtime.node import Node

@@ -31,8 +31,9 @@ from runtime.channels import tasks
 from runtime.channels.streams import Stream
 from runtime.channels.tasks import Nesting, ResumableCoroutine
 from runtime.errors import NodeError, UnraisableError
+from runtime.interpreter import PYTHON, passes
 from runtime.node import Node
-from runtime.time.lockstep import PYTHON, call_after, passes
+from runtime.time.real_time import call_after
 
 log = logging.getLogger("visnav.runtime")
 

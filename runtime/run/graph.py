@@ -25,7 +25,9 @@ from events import (
     TrajectoryEstimate,
     VehicleAnnouncement,
 )
-from runtime.channels.sender import Deliver, Link, Listener, Tap, Voices
+from runtime.channels.links import Link
+from runtime.channels.sender import Deliver, Listener, Tap
+from runtime.channels.sources import SourceOwners
 from runtime.channels.tasks import Fault
 from runtime.config.model import NodeSpec
 from runtime.node import Node, senders
@@ -88,7 +90,7 @@ def connect(
     last: Iterable[Listener] = (),
     elsewhere: Callable[[str], Iterable[Listener]] = lambda _: (),
     wrap: Wrap = unwrapped,
-    voices: Voices | None = None,
+    owners: SourceOwners | None = None,
     deaf: Collection[str] = (),
 ) -> list[Listener]:
     """Freeze the listeners of every output, and return all listeners of this process.
@@ -112,7 +114,7 @@ def connect(
     for node in nodes:
         others = [listener for listener in connected if listener.node != node.name]
         for sender in senders(node).values():
-            sender.connect([*elsewhere(sender.name), *others], taps, fault, voices)
+            sender.connect([*elsewhere(sender.name), *others], taps, fault, owners)
     return connected
 
 

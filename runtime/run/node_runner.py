@@ -19,7 +19,8 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any, Literal
 
 from events import Announcement
-from runtime.channels.sender import Link, Voices
+from runtime.channels.links import Link
+from runtime.channels.sources import SourceOwners
 from runtime.config.model import NodeSpec
 from runtime.errors import (
     ChannelSourceError,
@@ -33,7 +34,7 @@ from runtime.json_values import plain
 from runtime.node import Node, make_node, streams
 from runtime.run import event_loop
 from runtime.time.clock import Ticker
-from runtime.time.lockstep import ended
+from runtime.time.real_time import ended
 
 if TYPE_CHECKING:
     from runtime.channels.hold import Hold
@@ -352,7 +353,7 @@ async def start_up(
     exchange: Callable[[Announced], Awaitable[list[Announcement]]],
     ready: Step | None = None,
     failed: Callable[[Phase, NodeRunner, NodeError], None],
-    voices: Voices,
+    owners: SourceOwners,
     limit: float,
     give_up: Callable[[], bool] = lambda: False,
 ) -> None:
@@ -379,7 +380,7 @@ async def start_up(
             announced[runner.spec.name] = announcements = runner.announcements(limit)
             for announcement in announcements:
                 try:
-                    voices.announce(runner.spec.name, announcement)
+                    owners.announce(runner.spec.name, announcement)
                 except ChannelSourceError as error:
                     raise wrap(runner.spec.name, error) from error
         except NodeError as error:

@@ -22,15 +22,17 @@ from pathlib import Path
 from typing import Any
 
 from events import Announcement, EstimatorAnnouncement, Event, Shutdown, WindowClosed
-from runtime.channels.sender import Deliver, Listener, Tap, Voices
+from runtime.channels.sender import Deliver, Listener, Tap
+from runtime.channels.sources import SourceOwners
 from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
 from runtime.host import RunEnd
 from runtime.run import event_loop, graph
 from runtime.run.event_loop import RunTask
+from runtime.run.instruments import Instruments
 from runtime.run.node_runner import Announced, NodeRunner, Phase, log_error, start_up, wrap
 from runtime.run.others import Others
-from runtime.run.run_state import Instruments, RunState
+from runtime.run.run_state import RunState
 from runtime.time.clock import SECOND, Clock, Once
 
 log = logging.getLogger("visnav.runtime")
@@ -77,7 +79,7 @@ class Supervisor:
         self.state.out, self.state.out_of_programs = out, out_of_programs or out
         self.stepping = self.state.stepping
         self._taps = tuple(taps)
-        self._voices = Voices([spec.name for spec in config.nodes], scripted)
+        self._owners = SourceOwners([spec.name for spec in config.nodes], scripted)
         self.others = Others(clock)
         if self.state.several_processes:
             from runtime.extras import PROCESSES, extension
@@ -233,7 +235,7 @@ class Supervisor:
             last=[Listener("run", self._receive_end, (Shutdown, WindowClosed))],
             elsewhere=self.others.listeners,
             wrap=self.instruments.listener,
-            voices=self._voices,
+            owners=self._owners,
             deaf={runner.spec.name for runner in runners if runner.shutting_down},
         )
         self._note_inputs(listeners)
@@ -244,7 +246,7 @@ class Supervisor:
         """Note who receives true poses, and whose images and scans; of restarted nodes, too."""
         state = self.state
         for announcement in state.announcements:
-            if owner := self._voices.owner(announcement.source):
+            if owner := self._owners.owner(announcement.source):
                 state.owners[announcement.source] = owner
         state.truth_receivers |= graph.truth_receivers(listeners, state.announcements)
         for node, sources in graph.sensors_read(listeners, state.announcements).items():
@@ -260,7 +262,7 @@ class Supervisor:
 
     def _receive_end(self, event: Event) -> None:
         reason = getattr(event, "reason", "") or type(event).__name__
-        by = self._voices.owner(event.source) or event.source
+        by = self._owners.owner(event.source) or event.source
         self.stop(f"{event.source}: {reason}", by=by)
 
     # Starting.
@@ -287,7 +289,7 @@ class Supervisor:
         self.connect()
         readers = state.truth_readers()
         for announcement in state.announcements:
-            node = self._voices.owner(announcement.source)
+            node = self._owners.owner(announcement.source)
             undeclared = (
                 isinstance(announcement, EstimatorAnnouncement)
                 and "truth" not in announcement.reads
@@ -334,7 +336,7 @@ class Supervisor:
             exchange=exchange,
             ready=ready,
             failed=_give_up,
-            voices=self._voices,
+            owners=self._owners,
             limit=self.state.config.run.startup_limit,
         )
         await self.others.begin()

@@ -33,7 +33,8 @@ from runtime.run.node_runner import NodeRunner
 from runtime.run.run_state import RunState
 from runtime.summary import Stall
 from runtime.time import lockstep
-from runtime.time.lockstep import LockstepLoop, Starvation
+from runtime.time.lockstep import LockstepLoop
+from runtime.time.real_time import Starvation
 from runtime.time.stepping import Stepping
 
 _LONGEST_PAUSE = 0.05  # seconds between two looks at most; a run's end waits for the last of them

@@ -1,4 +1,4 @@
-"""Simulated time: an asyncio loop with jumps to the next due time; and limits in real time.
+"""Simulated time: an asyncio loop with jumps to the next due time, and its clock.
 
 A selector loop calls `select(timeout)` with a timeout above zero only when nothing is ready to
 run. Then, instead of sleeping, this loop moves its clock: to the next timer of asyncio's (so plain
@@ -12,8 +12,6 @@ simulated; only `Clock.beside` (that is, `Node.offload` and workers), `asyncio.t
 `loop.run_in_executor` are.
 
 A self-test, once per process, tells whether this interpreter's asyncio works as relied on here.
-
-`asyncio.timeout` on a lockstep loop is simulated: where nothing else is due, it is over at once.
 """
 
 from __future__ import annotations
@@ -25,51 +23,15 @@ import contextvars
 import functools
 import heapq
 import itertools
-import os
-import platform
 import selectors
-import threading
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, Literal, Protocol, TypeVar
 
 from runtime.errors import UnsupportedInterpreterError
+from runtime.interpreter import PYTHON, passes
 from runtime.logs import executor
 from runtime.time.clock import SECOND, Clock, Once, Schedule, settle
-
-LIMIT = 20.0  # real seconds until an unfinished test has failed; busy machines take their time
-
-PYTHON = f"{platform.python_implementation()} {platform.python_version()}"
-
-
-def passes(
-    make_loop: Callable[[], asyncio.AbstractEventLoop],
-    test: Callable[[asyncio.AbstractEventLoop], Coroutine[Any, Any, bool]],
-) -> bool:
-    """Return whether a test succeeds on a new loop, with no exceptions reported.
-
-    It runs in a thread, because another loop may run in this one, and costs 3 ms.
-    """
-    outcomes: list[bool] = []
-
-    def run() -> None:
-        reported: list[Any] = []
-        try:
-            loop = make_loop()
-            loop.set_exception_handler(lambda _, context: reported.append(context))
-            try:
-                outcomes.append(loop.run_until_complete(test(loop)) and not reported)
-            finally:
-                loop.close()
-        except Exception:  # whatever another interpreter may raise
-            outcomes.append(False)
-
-    thread = threading.Thread(target=run, name="self-test", daemon=True)
-    thread.start()
-    thread.join(LIMIT)
-    return outcomes == [True]
-
 
 R = TypeVar("R")
 _Work = concurrent.futures.Future[Any]
@@ -346,103 +308,3 @@ def _is_over(held: _Held) -> bool:
 
 def _nothing() -> None:
     """Do nothing: only called to wake the loop."""
-
-
-LOOK_EVERY = 1.0  # real seconds between two looks at how busy the machine is
-
-
-def call_after(
-    seconds: float, loop: asyncio.AbstractEventLoop, call: Callable[[], object]
-) -> threading.Timer:
-    """Call a function on a loop, unless closed, after real seconds; return the running timer."""
-
-    def ring() -> None:
-        with contextlib.suppress(RuntimeError):  # closed
-            loop.call_soon_threadsafe(call)
-
-    timer = threading.Timer(seconds, ring)
-    timer.daemon = True
-    timer.start()
-    return timer
-
-
-@contextlib.asynccontextmanager
-async def real_time_limit(seconds: float) -> AsyncIterator[None]:
-    """Cancel the block and raise `TimeoutError` after `seconds` of real time."""
-    task = asyncio.current_task()
-    assert task is not None
-    cancelled_before = task.cancelling()
-    expired = cancelled = False
-
-    def expire() -> None:
-        nonlocal expired
-        if not over:
-            expired = True
-            task.cancel()
-
-    over = False
-    timer = call_after(seconds, asyncio.get_running_loop(), expire)
-    try:
-        yield
-    except asyncio.CancelledError:
-        cancelled = True
-        raise
-    finally:
-        over = True
-        timer.cancel()
-        if expired and task.uncancel() <= cancelled_before and cancelled:
-            raise TimeoutError from None
-
-
-class Starvation:
-    """Real seconds that a process or its descendants waited for a processor, from the first look.
-
-    On a busy machine that is most of the time, and no fault of whoever has a limit. It is 0 where
-    the kernel does not tell.
-    """
-
-    def __init__(self, process: int | None = None) -> None:
-        self._process = os.getpid() if process is None else process
-        self._waits: dict[str, int] | None = None
-        self._at = 0.0
-        self._seconds = 0.0
-
-    def look(self) -> float:
-        """Return the seconds; between two looks, those of the longest waiting thread."""
-        now, waits, before = time.monotonic(), waits_of(self._process), self._waits
-        if before is not None:
-            longest = max((wait - before.get(key, 0) for key, wait in waits.items()), default=0)
-            self._seconds += min(longest / 1e9, now - self._at)
-        self._at, self._waits = now, waits
-        return self._seconds
-
-
-def waits_of(process: int) -> dict[str, int]:
-    """Return how long each thread of a process and of its children has waited to run (ns)."""
-    waits, processes = {}, [process]
-    for number in processes:
-        threads: list[Path] = []
-        with contextlib.suppress(OSError):  # it has ended
-            threads += Path(f"/proc/{number}/task").iterdir()
-        for thread in threads:
-            with contextlib.suppress(OSError, IndexError):  # it has ended, or the kernel is another
-                waits[thread.name] = int((thread / "schedstat").read_bytes().split()[1])
-                processes += map(int, (thread / "children").read_bytes().split())
-    return waits
-
-
-async def ended(tasks: Iterable[asyncio.Task[Any]], seconds: float) -> list[asyncio.Task[Any]]:
-    """Wait for tasks to end, so many real seconds without `Starvation`; return late ones."""
-    tasks = [task for task in tasks if not task.done()]
-    begin, starvation, left = time.monotonic(), Starvation(), seconds
-    while tasks:
-        with contextlib.suppress(TimeoutError):
-            async with real_time_limit(min(left, LOOK_EVERY)):
-                await asyncio.wait(tasks)
-        tasks = [task for task in tasks if not task.done()]
-        left = seconds - (time.monotonic() - begin)
-        if tasks and seconds > LOOK_EVERY:
-            left += starvation.look()
-        if left <= 0:
-            break
-    return tasks

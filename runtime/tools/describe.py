@@ -24,7 +24,7 @@ import msgspec
 from msgspec import inspect as types
 
 from runtime.changeable import is_marked
-from runtime.channels.sender import LinkConfig
+from runtime.channels.links import LinkConfig
 from runtime.config.model import NetworkConfig, OnError, RunConfig
 from runtime.config.reading import by_name_alone, presets_in
 from runtime.node import Node

@@ -44,8 +44,8 @@ from runtime.node import Node, NodeConfig
 from runtime.paths import written
 from runtime.run.execute import Watch, execute
 from runtime.run.graph import edges_of
+from runtime.run.instruments import Instrument
 from runtime.run.made_from import RUN, key_of, made_from, roots_of
-from runtime.run.run_state import Instrument
 from runtime.run.sources import hashed
 from runtime.run.summarise import environment
 from runtime.run.supervisor import Supervisor

@@ -31,7 +31,8 @@ import msgspec
 
 from events import Announcement, EstimatorAnnouncement, Shutdown, WindowClosed
 from runtime.channels.hold import Hold, HoldConfig
-from runtime.channels.sender import Listener, Voices
+from runtime.channels.sender import Listener
+from runtime.channels.sources import SourceOwners
 from runtime.config.model import Config, NodeSpec
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
 from runtime.extras import offers
@@ -140,7 +141,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
             start=start,
             exchange=exchange,
             failed=failed,
-            voices=Voices(spec.name for spec in config.nodes),
+            owners=SourceOwners(spec.name for spec in config.nodes),
             limit=config.run.startup_limit,
             give_up=lambda: bool(errors),  # what others then miss is of no interest
         )

@@ -30,7 +30,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.time.clock import SECOND, Clock, result_of
-from runtime.time.lockstep import Starvation
+from runtime.time.real_time import Starvation
 from runtime.workers.costs import Costs
 from runtime.workers.output import Output, Throttle, how_it_ended
 from runtime.workers.shared_memory import SharedPipe, anonymous_file

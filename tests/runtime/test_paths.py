@@ -15,16 +15,8 @@ from hypothesis import strategies as st
 from runtime import Changeable, Node, NodeConfig
 from runtime.config.model import to_builtins
 from runtime.config.reading import load
-from runtime.paths import (
-    InputPath,
-    NameOrPath,
-    OutputPath,
-    file_names,
-    resolve,
-    source_file,
-    source_of,
-    written,
-)
+from runtime.paths import InputPath, NameOrPath, OutputPath, file_names, resolve, written
+from runtime.source_files import source_file, source_of
 
 
 class Part(msgspec.Struct):

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from runtime.config.model import Config, show, to_builtins
+from runtime.config.explain import show
+from runtime.config.model import Config, to_builtins
 from runtime.errors import PeerError, VisnavError, WireError
 from runtime.paths import file_names
 from visnav_machines.member import Member, Outbox

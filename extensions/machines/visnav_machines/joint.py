@@ -41,7 +41,8 @@ from runtime.channels.wire import pack, unpack
 from runtime.errors import PeerError, WireError
 from runtime.summary import ProcessSummary, Summary, merged
 from runtime.time.clock import Clock, RealClock
-from runtime.time.lockstep import LockstepClock, LockstepLoop, call_after, real_time_limit
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.real_time import call_after, real_time_limit
 from visnav_machines.member import Member
 from visnav_machines.membership import Membership
 from visnav_machines.messages import (

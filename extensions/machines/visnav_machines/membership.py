@@ -22,7 +22,8 @@ import msgspec
 from events import Event
 from runtime.config.model import Config
 from runtime.errors import PeerError, VisnavError, WireError
-from runtime.time.lockstep import LockstepLoop, real_time_limit
+from runtime.time.lockstep import LockstepLoop
+from runtime.time.real_time import real_time_limit
 from visnav_machines import messages
 from visnav_machines.handshake import Handshakes, check_fits, what_all_share
 from visnav_machines.member import Exchange, Incoming, Member, Outgoing

@@ -42,7 +42,7 @@ import zenoh
 
 from runtime.config.model import NetworkConfig
 from runtime.errors import CommandError, PeerError, WireError
-from runtime.paths import user_folder
+from runtime.user_folder import user_folder
 
 log = logging.getLogger("visnav.runtime")
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from events import Image, TrackedFeatures
-from runtime.paths import source_file
+from runtime.source_files import source_file
 from runtime.time.clock import SECOND
 
 _WAITING = 30  # images whose features may still come

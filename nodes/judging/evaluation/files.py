@@ -26,7 +26,7 @@ import numpy as np
 from nodes.judging.evaluation.judging import Errors, Judgement
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_tum
-from runtime.paths import source_file
+from runtime.source_files import source_file
 
 FRAMES = "base_link (FRD) in {}: timestamp[s] tx ty tz[m] qx qy qz qw"
 

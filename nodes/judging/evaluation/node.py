@@ -47,7 +47,7 @@ from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
 from runtime.figures import FIGURES
 from runtime.host import RunEnd
-from runtime.paths import source_file
+from runtime.source_files import source_file
 from runtime.time.clock import SECOND
 
 

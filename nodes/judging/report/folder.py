@@ -17,8 +17,8 @@ from nodes.judging.evaluation.record import EstimatorRecord, Interval, cover, se
 from nodes.judging.report.tables import COLORS, Estimator, Facts, Run, Verdict
 from nodes.trajectory import HOLE, Trajectory
 from nodes.trajectory_files import read_tum
-from runtime.paths import source_file, source_of
 from runtime.run.results import run_folder
+from runtime.source_files import source_file, source_of
 from runtime.time.clock import SECOND
 
 Floats = npt.NDArray[np.float64]

@@ -31,7 +31,7 @@ from nodes.judging.report.tables import (
     thin,
 )
 from nodes.trajectory import Trajectory
-from runtime.paths import source_file, source_of
+from runtime.source_files import source_file, source_of
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 0.7, 0.2, 0.5, 0.5
 _ASIDE, _BETWEEN = 0.75, 0.8  # inches around the axes, and between them

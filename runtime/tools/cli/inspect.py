@@ -255,7 +255,7 @@ def settings() -> None:
     from rich.markup import escape
     from rich.tree import Tree
 
-    from runtime.channels.sender import LinkConfig
+    from runtime.channels.links import LinkConfig
     from runtime.config.model import NetworkConfig, RunConfig
     from runtime.tools.describe import NODE_SETTINGS, describe_settings, summary
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from runtime.config.model import show
+from runtime.config.explain import show
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
 from runtime.figures import FIGURES, figure

@@ -22,8 +22,8 @@ from runtime.config.model import Config
 from runtime.config.parameters import settings
 from runtime.errors import CommandError, expect_known
 from runtime.node import NodeConfig, senders, streams
+from runtime.run.instruments import Call, Instrument
 from runtime.run.node_runner import NodeRunner
-from runtime.run.run_state import Call, Instrument
 from runtime.run.summarise import count_drops, count_events, tick_summaries
 from runtime.run.supervisor import Supervisor
 from runtime.time.clock import SECOND, Clock

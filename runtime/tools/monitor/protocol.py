@@ -20,7 +20,7 @@ from typing import Annotated
 import msgspec
 
 from runtime.errors import CommandError, suggest
-from runtime.paths import user_folder
+from runtime.user_folder import user_folder
 
 SLOWEST, QUICKEST = 1e-3, 1e6  # limits of the speed, in simulated seconds per real second
 

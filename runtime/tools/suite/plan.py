@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from runtime.config.model import override
+from runtime.config.overrides import override
 from runtime.config.reading import parse
 from runtime.errors import CommandError, ConfigError, expect_known
 from runtime.tools.sweep import Plan, make_job, plan_of

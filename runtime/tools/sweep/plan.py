@@ -16,7 +16,8 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from runtime.config.model import Config, given, to_builtins
+from runtime.config.model import Config, to_builtins
+from runtime.config.overrides import given
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
 from runtime.run.made_from import RUN, Roots, roots_of

@@ -31,7 +31,7 @@ import msgspec
 from events import Category, Event, Image, Setpoint
 from runtime.channels.sender import Sender, Tap
 from runtime.logs import RunThread
-from runtime.run.run_state import Call, Instrument
+from runtime.run.instruments import Call, Instrument
 from runtime.time.clock import Clock, RealClock
 
 log = logging.getLogger("visnav.runtime")

@@ -12,7 +12,7 @@ import pytest
 
 from events import Announcement
 from runtime import Duration, Input, Node, Tick, every
-from runtime.channels.sender import LinkConfig
+from runtime.channels.links import LinkConfig
 from runtime.config.model import Config, RunConfig
 from runtime.config.reading import find_node
 from runtime.errors import ConfigError, NodeError

@@ -13,7 +13,7 @@ from runtime.channels.sender import Sender
 from runtime.channels.tasks import ResumableCoroutine
 from runtime.errors import ChannelClosedError
 from runtime.node import Node, senders
-from runtime.run.run_state import Call, Instrument
+from runtime.run.instruments import Call, Instrument
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from tests.runtime.samples_loop import Camera, Estimator, Pilot, look, until_sent

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from runtime import interpreter as self_test
 from runtime.channels import tasks
 from runtime.channels.streams import Stream
 from runtime.channels.tasks import Nesting
@@ -20,7 +21,6 @@ from runtime.run import event_loop as task_factory
 from runtime.run.execute import make_loop
 from runtime.testing import run_in_lockstep, spec
 from runtime.time import lockstep
-from runtime.time import lockstep as self_test
 from runtime.time.lockstep import LockstepLoop
 from tests.runtime.samples_loop import Camera, Estimator, Pilot, look
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from runtime.time import lockstep
-from runtime.time.lockstep import real_time_limit
+from runtime.time import real_time
+from runtime.time.real_time import real_time_limit
 from tests.runtime.loops import Run, turns
 
 # Real, here and below, for it is real time that is limited; short enough to wait for.
@@ -131,12 +131,12 @@ def test_what_a_busy_machine_takes_is_no_part_of_a_limit(
         raise TimeoutError
         yield
 
-    monkeypatch.setattr(lockstep, "time", SimpleNamespace(monotonic=lambda: now))
-    monkeypatch.setattr(lockstep, "real_time_limit", passes)
-    monkeypatch.setattr(lockstep, "waits_of", lambda _: {"1": now * starved * 1e9, "2": 0})
+    monkeypatch.setattr(real_time, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(real_time, "real_time_limit", passes)
+    monkeypatch.setattr(real_time, "waits_of", lambda _: {"1": now * starved * 1e9, "2": 0})
     loop = asyncio.new_event_loop()
     task: Any = loop.create_future()
-    late = loop.run_until_complete(lockstep.ended([task], 60.0))
+    late = loop.run_until_complete(real_time.ended([task], 60.0))
     loop.close()
     assert late == ([] if seconds is None else [task])
     assert now == pytest.approx(seconds or 1001)
@@ -146,9 +146,9 @@ def test_starvation_is_that_of_the_thread_that_waits_longest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now: tuple[float, dict[str, float]] = 0, {"a": 7e9}
-    monkeypatch.setattr(lockstep, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr(lockstep, "waits_of", lambda _: now[1])
-    starvation = lockstep.Starvation()
+    monkeypatch.setattr(real_time, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(real_time, "waits_of", lambda _: now[1])
+    starvation = real_time.Starvation()
     assert starvation.look() == 0
     now = 10, {"a": 9e9, "b": 3e9}
     assert starvation.look() == 3
@@ -159,8 +159,8 @@ def test_starvation_is_that_of_the_thread_that_waits_longest(
 
 
 def test_the_kernel_says_how_long_threads_wait() -> None:
-    assert min(lockstep.waits_of(os.getpid()).values(), default=0) >= 0
-    assert lockstep.waits_of(-1) == {}
+    assert min(real_time.waits_of(os.getpid()).values(), default=0) >= 0
+    assert real_time.waits_of(-1) == {}
 
 
 def test_a_limit_within_a_limit_expires_alone(run: Run) -> None:

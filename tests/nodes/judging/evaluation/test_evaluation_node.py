@@ -35,8 +35,8 @@ from nodes.trajectory_files import read_tum
 from runtime import Duration, Node, Output
 from runtime.config.model import Config, RunConfig
 from runtime.errors import ConfigError, NodeError
-from runtime.paths import source_file
 from runtime.run.execute import execute
+from runtime.source_files import source_file
 from runtime.testing import run_node, run_nodes, spec
 from tests.nodes.judging.evaluation.flights import (
     MS,

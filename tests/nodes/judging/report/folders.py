@@ -17,7 +17,7 @@ from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.judging.evaluation.thresholds import Thresholds
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_tum
-from runtime.paths import source_file
+from runtime.source_files import source_file
 
 SECOND = 1_000_000_000
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from runtime.errors import VisnavError
-from runtime.paths import user_folder
 from runtime.tools.monitor.protocol import find, runs, socket_of
+from runtime.user_folder import user_folder
 
 
 @pytest.fixture

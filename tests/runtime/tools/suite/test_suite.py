@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import visnav
-from runtime.config.model import override
+from runtime.config.overrides import override
 from runtime.errors import CommandError, ConfigError
 from runtime.tools.suite.page import cells, flights, write_page
 from runtime.tools.suite.plan import FOLDER, LEVELS, Entrant, Scenario, Suite, make_plan, read_suite
