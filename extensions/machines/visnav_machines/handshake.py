@@ -13,10 +13,10 @@ import contextlib
 import logging
 import secrets
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -27,9 +27,6 @@ from runtime.paths import file_names
 from visnav_machines.member import Member, Outbox
 from visnav_machines.messages import Hello, decode, encode
 from visnav_machines.session import NONCE, ForgedError, OnMessage, Sealing, Session, hello_seal
-
-if TYPE_CHECKING:
-    from visnav_machines.membership import Membership
 
 log = logging.getLogger("visnav.runtime")
 
@@ -51,6 +48,24 @@ class Contact:
     doubt: bytes = b""
 
 
+class Group(Protocol):
+    """Processes of a run as the handshakes know them; called on its loop, by `soon`."""
+
+    hello: Hello
+
+    def soon(self, call: Callable[..., Any], *args: Any) -> None:
+        """Call a function on the run's loop; may be called in any thread."""
+
+    def joined(self, member: Member) -> None:
+        """Handle the start of a session."""
+
+    def left(self, member: Member, why: str = ...) -> None:
+        """Handle the end of a session."""
+
+    def unsent(self, name: str, error: VisnavError) -> None:
+        """Handle a failure to send."""
+
+
 class Handshakes:
     """All visible processes, and our sessions with them.
 
@@ -60,7 +75,7 @@ class Handshakes:
         refused: Number of messages left out, since no process of the run wrote them.
     """
 
-    def __init__(self, key: bytes, session: Session, membership: Membership) -> None:
+    def __init__(self, key: bytes, session: Session, membership: Group) -> None:
         self.refused = 0
         self._key = key
         self._session = session

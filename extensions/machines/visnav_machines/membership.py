@@ -15,7 +15,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -28,9 +28,6 @@ from visnav_machines import messages
 from visnav_machines.handshake import Handshakes, check_fits, what_all_share
 from visnav_machines.member import Exchange, Incoming, Member, Outgoing
 from visnav_machines.session import ForgedError, Session, certified, derive, is_hello, secret_of
-
-if TYPE_CHECKING:
-    from visnav_machines.peers import Peers
 
 log = logging.getLogger("visnav.runtime")
 
@@ -64,6 +61,22 @@ class Seat:
     new: bool = False
 
 
+class Run(Protocol):
+    """What a membership tells of the other processes; called on the run's loop."""
+
+    def receive(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
+        """Handle a message of another process, or raise `WireError`."""
+
+    def joined(self, member: Member) -> None:
+        """Handle a process joining or returning after the numbering of processes."""
+
+    def lost(self, member: Member) -> None:
+        """Handle the loss of a process."""
+
+    def now(self, ago: int = 0) -> int:
+        """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
+
+
 class Membership:
     """The processes of a run.
 
@@ -81,7 +94,7 @@ class Membership:
         ended: Once the run ends, what is sent to processes that join.
     """
 
-    def __init__(self, config: Config, only: Iterable[str], peers: Peers) -> None:
+    def __init__(self, config: Config, only: Iterable[str], peers: Run) -> None:
         chosen = set(only)
         self.nodes = [spec.name for spec in config.nodes]
         self.here = tuple(name for name in self.nodes if name in chosen)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
@@ -29,63 +28,16 @@ from events import (
 from nodes.pilots.pilot import VehicleController, VehicleControllerConfig
 from runtime import Duration, Input, Node, Output, Tick, every, on
 from runtime.errors import MissingDependencyError
+from visnav_mavlink.settings import MavlinkConfig
 
 if TYPE_CHECKING:
-    from visnav_mavlink.door import Door
+    from visnav_mavlink.endpoint import MavlinkEndpoint
     from visnav_mavlink.links import Wire
+
 
 RATE = 50.0  # of telemetry, and of set-points on the way to a place, Hz
 ORIGIN = (47.397742, 8.545594, 488.0)  # PX4's in simulations, for vehicles that have none
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-
-
-class MavlinkConfig(VehicleControllerConfig):
-    """Settings of the door.
-
-    Attributes:
-        vehicle: Vehicle to fly; may be left out if there is only one.
-        endpoints: ``udp://HOST:PORT`` sends to who listens there; ``tcp://HOST:PORT`` listens.
-            Whoever reaches one flies the vehicle.
-        system_id: MAVLink's number of the vehicle: another one for each of a run.
-        telemetry: Source of the pose in the telemetry: empty for the true one, or an estimator.
-        gps: Whether the telemetry has a global position.
-        vision: Whether poses come from outside (``ODOMETRY``, ``VISION_POSITION_ESTIMATE``); they
-            are judged as this node's estimates.
-        link_loss: What a flying vehicle does when nobody is heard any more.
-        link_timeout: Real time after which that is so.
-        signing_key: Secret of 64 hexadecimal digits, without which nobody is heard; empty for
-            none.
-    """
-
-    endpoints: tuple[str, ...] = ("udp://127.0.0.1:14540", "udp://127.0.0.1:14550")
-    system_id: Annotated[int, msgspec.Meta(ge=1, le=254)] = 1
-    telemetry: str = ""
-    gps: bool = True
-    vision: bool = False
-    link_loss: Literal["nothing", "hold", "land"] = "hold"
-    link_timeout: Duration = Duration(3.0)  # immutable
-    signing_key: str = ""
-
-    def __post_init__(self) -> None:
-        for link in self.endpoints:
-            if not _is_address(link):
-                raise ValueError(
-                    f"endpoints: expected udp://HOST:PORT or tcp://HOST:PORT, found {link!r}"
-                )
-        try:
-            size = len(bytes.fromhex(self.signing_key))
-        except ValueError:
-            size = -1
-        if size not in {0, 32}:
-            raise ValueError("signing_key: expected 64 hexadecimal digits, or nothing")
-
-
-def _is_address(link: str) -> bool:
-    try:
-        parts = urlsplit(link)
-        return parts.scheme in {"udp", "tcp"} and bool(parts.hostname) and parts.port is not None
-    except ValueError:
-        return False
 
 
 class Mavlink(VehicleController[MavlinkConfig]):
@@ -108,19 +60,21 @@ class Mavlink(VehicleController[MavlinkConfig]):
     def __init__(self) -> None:
         super().__init__()
         self._estimators: list[str] = []
-        self._door: Door | None = None
+        self._endpoint: MavlinkEndpoint | None = None
 
     async def on_startup(self) -> None:
         """Open the links."""
         _expect_library("Mavlink")
         if self.checking:
             return
-        from visnav_mavlink.door import Door
+        from visnav_mavlink.endpoint import MavlinkEndpoint
 
         origins = [getattr(node.config, "origin", None) for node in self.siblings(Node)]
         origin = next(filter(None, origins), ORIGIN)
-        self._door = Door(self.config, origin, self._act, self._see, self.clock.now, self.log)
-        self._door.open()
+        self._endpoint = MavlinkEndpoint(
+            self.config, origin, self._act, self._see, self.clock.now, self.log
+        )
+        self._endpoint.open()
 
     def announce(self) -> Iterable[Announcement]:
         """Announce the vehicle to fly, and an estimator outside."""
@@ -154,31 +108,31 @@ class Mavlink(VehicleController[MavlinkConfig]):
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
         """Take note of the true pose."""
-        if self._door and not self.config.telemetry and event.source == self._vehicles[0]:
-            self._door.vehicle.note(event)
+        if self._endpoint and not self.config.telemetry and event.source == self._vehicles[0]:
+            self._endpoint.vehicle.note(event)
 
     @on(PoseEstimate)
     def poses(self, event: PoseEstimate) -> None:
         """Take note of the estimated pose."""
-        if self._door and event.source == self.config.telemetry:
-            self._door.vehicle.note(event)
+        if self._endpoint and event.source == self.config.telemetry:
+            self._endpoint.vehicle.note(event)
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
         """Take note of arming, take-off and landing."""
-        if self._door and event.source == self._vehicles[0]:
-            self._door.flight.noted(event)
+        if self._endpoint and event.source == self._vehicles[0]:
+            self._endpoint.flight.noted(event)
 
     @every(hz=RATE)
     def go_on(self, tick: Tick) -> None:
         """Send telemetry, and steer."""
-        if self._door:
-            self._door.update(tick.stamp, self.wall())
+        if self._endpoint:
+            self._endpoint.update(tick.stamp, self.wall())
 
     async def on_shutdown(self) -> None:
         """Close the links."""
-        if self._door:
-            self._door.close()
+        if self._endpoint:
+            self._endpoint.close()
 
     def _act(self, kind: Callable[..., Command | Setpoint], **fields: Any) -> None:
         event = self.made(kind, **fields)

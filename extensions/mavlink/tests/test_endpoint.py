@@ -1,4 +1,4 @@
-"""The door without a network: what each message does to the vehicle, and what is answered."""
+"""The endpoint without a network: what each message does to the vehicle, and what is answered."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from runtime.logs import NodeLogger
 from runtime.testing import run_nodes, spec
 from tests.nodes.pilots.test_pilot import Vehicle
 from tests.runtime.tools.samples_cli import ROOT, command_here
-from visnav_mavlink.door import Door
+from visnav_mavlink.endpoint import MavlinkEndpoint
 from visnav_mavlink.links import BURST, MOST_PEERS, Links
-from visnav_mavlink.node import Mavlink, MavlinkConfig, Px4
+from visnav_mavlink.node import Mavlink, Px4
+from visnav_mavlink.settings import MavlinkConfig
 
 SECOND = 1_000_000_000
 ORIGIN = (47.0, 8.0, 400.0)
@@ -29,7 +30,7 @@ GROUND = (1.0, 2.0, -0.1)
 
 
 class Outside:
-    """A program at the other end of a door's link, and the vehicle behind it."""
+    """A program at the other end of an endpoint's link, and the vehicle behind it."""
 
     def __init__(self, **changes: Any) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -40,15 +41,15 @@ class Outside:
         self.acts: list[Any] = []
         self.seen: list[dict[str, Any]] = []
         config = MavlinkConfig(endpoints=(link,), **changes)
-        self.door = Door(
+        self.endpoint = MavlinkEndpoint(
             config, ORIGIN, self._act, self._see, lambda: self.now, NodeLogger("mavlink")
         )
-        self.door.open()
+        self.endpoint.open()
         self.parser = mav.MAVLink(None, 245, 190)
         if config.signing_key:
             self.parser.signing.secret_key = bytes.fromhex(config.signing_key)
             self.parser.signing.sign_outgoing = True
-            (peer,) = self.door._links.peers
+            (peer,) = self.endpoint._links.peers
             self.parser.signing.timestamp = peer.parser.signing.timestamp
         self.at(GROUND)
 
@@ -61,7 +62,7 @@ class Outside:
     def at(self, position: Any) -> None:
         """Put the vehicle somewhere, level."""
         still = (0.0, 0.0, 0.0)
-        self.door.vehicle.note(
+        self.endpoint.vehicle.note(
             Odometry(
                 stamp=self.now, source="drone", position=position, orientation=(1, 0, 0, 0),
                 linear_velocity=still, angular_velocity=still,
@@ -75,7 +76,7 @@ class Outside:
         self.acts.clear()
 
     def say(self, *messages: Any) -> list[Any]:
-        """Let the door hear messages; return what it answers at once."""
+        """Let the endpoint hear messages; return what it answers at once."""
         self.hear()
         for message in messages:
             data = message if isinstance(message, bytes) else message.pack(self.parser)
@@ -83,9 +84,9 @@ class Outside:
         return self.hear()
 
     def _hand_in(self, data: bytes) -> None:
-        (peer,) = self.door._links.peers
+        (peer,) = self.endpoint._links.peers
         self._socket.sendto(data, peer.end.getsockname())
-        self.door._links.hear(peer)
+        self.endpoint._links.hear(peer)
 
     def passes(self, seconds: float, heartbeat: bool = True) -> list[Any]:
         """Let time pass, as the node does; return what is sent."""
@@ -94,7 +95,7 @@ class Outside:
             if heartbeat and step % 50 == 0:
                 self._hand_in(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(self.parser))
             self.now += SECOND // 50
-            self.door.update(self.now, self.now / SECOND)
+            self.endpoint.update(self.now, self.now / SECOND)
             heard += self.hear()
         return heard
 
@@ -108,7 +109,7 @@ class Outside:
             messages += self.parser.parse_buffer(data) or []
 
     def close(self) -> None:
-        self.door.close()
+        self.endpoint.close()
         self._socket.close()
 
 
@@ -213,7 +214,7 @@ async def test_offboard_needs_setpoints_and_ends_without(outside: Outside) -> No
     texts = [message.text for message in of("STATUSTEXT", outside.passes(1.0))]
     assert "offboard: no set-point for 0.5 s: holding" in texts
     assert isinstance(outside.acts[-1], ev.Hover)
-    assert outside.door.vehicle.mode == "hold"
+    assert outside.endpoint.vehicle.mode == "hold"
 
 
 async def test_a_place_is_approached_at_the_cruising_speed(outside: Outside) -> None:
@@ -322,7 +323,7 @@ async def test_only_the_signed_are_heard_if_there_is_a_key() -> None:
 async def test_a_flood_waits_and_our_own_name_is_not_heard(outside: Outside) -> None:
     outside.passes(0.1)
     outside.say(*[mav.MAVLink_ping_message(0, 1, 0, 0)] * (BURST + 1))
-    assert outside.door._links.counts["pauses in a flood"] >= 1
+    assert outside.endpoint._links.counts["pauses in a flood"] >= 1
     outside.passes(0.1)
     outside.parser = mav.MAVLink(None, 1, 1)
     assert outside.say(arm(1)) == []
@@ -454,8 +455,8 @@ def _sizes(kind: Any) -> list[int]:
 @pytest.mark.slow
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(hostile(), min_size=1, max_size=8))
-async def test_no_message_breaks_the_door(data: list[bytes]) -> None:
-    """Whatever comes, every act is a valid event, and the door goes on."""
+async def test_no_message_breaks_the_endpoint(data: list[bytes]) -> None:
+    """Whatever comes, every act is a valid event, and the endpoint goes on."""
     outside = Outside(vision=True)
     try:
         outside.flies()
@@ -463,6 +464,6 @@ async def test_no_message_breaks_the_door(data: list[bytes]) -> None:
         outside.passes(0.2)
         assert results(outside.say(command(2500))) == [mav.MAV_RESULT_UNSUPPORTED]
         outside.passes(1.0)
-        assert outside.door._links.counts["messages"] >= 1
+        assert outside.endpoint._links.counts["messages"] >= 1
     finally:
         outside.close()

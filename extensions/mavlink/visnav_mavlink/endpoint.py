@@ -1,10 +1,10 @@
-"""The door: what comes in goes to whom it is for, and what is due goes out."""
+"""Endpoint of a vehicle's links: dispatches received messages, and sends periodic ones."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,17 +12,15 @@ from events.frames import Geodetic, from_rpy
 from runtime.logs import NodeLogger
 from visnav_mavlink.flight import Flight
 from visnav_mavlink.links import Links, mav
+from visnav_mavlink.settings import MavlinkConfig
 from visnav_mavlink.vehicle import SECOND, Missions, Parameters, Telemetry, Vehicle
-
-if TYPE_CHECKING:
-    from visnav_mavlink.node import MavlinkConfig
 
 OLDEST = 10 * SECOND  # age of a vision stamp beyond which its clock is not ours
 MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it
 _COVARIANCE = np.triu_indices(6)
 
 
-class Door:
+class MavlinkEndpoint:
     """A vehicle's links with all that answers on them.
 
     Args:
