@@ -16,10 +16,11 @@ A package names its entry points in its ``pyproject.toml``; this project does th
     airspeed = "my_package.airspeed:AirspeedSensor"    # a sims.sensors.sensor.Sensor
 
     [project.entry-points."visnav.readers"]
-    mine = "my_package.reader:MyDataSet"  # a nodes.data.replay.Dataset; or rows for `judge`
+    mine = "my_package.reader:MyDataset"    # a nodes.data.replay.folders.Dataset; or a
+                                            # Reader of trajectories for `judge`, or several
 
     [project.entry-points."visnav.worlds"]
-    maze = "my_package.worlds:maze"       # maze(seed, bare): an mujoco.MjSpec, or a Scene
+    maze = "my_package.worlds:maze"         # maze(seed, bare): a mujoco.MjSpec, or a Scene
 
 A file names a node that is listed here by its name, ``type = "MyNode"``, and any other as
 ``module:Class``.
@@ -109,6 +110,7 @@ NODES = "visnav.nodes"
 CONFIGURATIONS = "visnav.configurations"
 EXAMPLES = "visnav.examples"
 PROCESSES = "visnav.processes"
+READERS = "visnav.readers"
 SENSORS = "visnav.sensors"
 WORLDS = "visnav.worlds"
 OURS = "visnav-runtime"
