@@ -16,22 +16,22 @@ from runtime.extras import Offer
 from runtime.sensors import fields_of, measured, sensor_kinds
 
 
-class Airspeed(Event):
+class Echo(Event):
     """A measurement that only its own package knows."""
 
-    airspeed: float
+    echo: float
 
 
 KIND = SensorKind(
-    name="airspeed",
-    event=Airspeed,
+    name="echo",
+    event=Echo,
     announcement=SensorAnnouncement,
-    group="airspeeds",
-    fields={"airspeed": "m/s"},
+    group="echoes",
+    fields={"echo": "m/s"},
 )
 
 
-class Pitot:
+class Sonar:
     """A sensor, as far as the table knows one."""
 
     kind = KIND
@@ -40,7 +40,7 @@ class Pitot:
 class Package(Offer):
     """Entry point of another package, whose object is at hand."""
 
-    loaded: Any = Pitot
+    loaded: Any = Sonar
 
     def load(self) -> Any:
         return self.loaded
@@ -49,7 +49,7 @@ class Package(Offer):
 @pytest.fixture
 def package(monkeypatch: pytest.MonkeyPatch) -> Iterator[Package]:
     """Another package's sensor, for the time of a test."""
-    offer = Package("their-sensors", "airspeed", "theirs:Pitot")
+    offer = Package("their-sensors", "echo", "theirs:Sonar")
     monkeypatch.setattr(sensors, "others", lambda _: (offer,))
     caches = (sensors.other_sensors, sensors.measured, sensors.fields_of)
     for cached in caches:
@@ -70,10 +70,10 @@ def test_a_plot_is_of_a_measured_field() -> None:
 
 
 def test_subclasses_measure_what_their_base_does() -> None:
-    class Sonar(Range):
+    class Near(Range):
         """A node's own."""
 
-    assert fields_of(Sonar) == {"range": "m"}
+    assert fields_of(Near) == {"range": "m"}
     assert fields_of(Event) == {}
 
 
@@ -86,15 +86,15 @@ def test_numbers_are_what_was_measured() -> None:
 
 def test_a_packages_sensor_comes_after_ours(package: Package) -> None:
     assert sensor_kinds() == (*SENSOR_KINDS.values(), KIND)
-    assert fields_of(Airspeed) == {"airspeed": "m/s"}
+    assert fields_of(Echo) == {"echo": "m/s"}
 
 
-@pytest.mark.parametrize("loaded", [Airspeed, Pitot(), None, 3])
+@pytest.mark.parametrize("loaded", [Echo, Sonar(), None, 3])
 def test_what_is_no_sensor_is_refused_by_the_name_of_its_package(
     package: Package, loaded: Any
 ) -> None:
     package.loaded = loaded
-    with pytest.raises(CommandError, match=r"airspeed of the package their-sensors: expected a cl"):
+    with pytest.raises(CommandError, match=r"echo of the package their-sensors: expected a cl"):
         sensor_kinds()
 
 
