@@ -66,7 +66,7 @@ fix: $(READY)  ## Mend what style checks can mend.
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-size: $(CORE)  ## Print the lines of each room, of the core, and of what an import brings.
+size: $(CORE)  ## Print the lines of each room and of the core, what an import brings, files per change.
 	@$(BIN)/python tools/size.py
 
 docs: $(READY)  ## Build the documentation into build/site; every broken link is an error.

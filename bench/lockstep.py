@@ -35,7 +35,7 @@ from runtime.workers.shared_memory import SharedPipe, anonymous_file
 from sims.cameras import CameraSpec
 from sims.cameras.development import Development
 from sims.cameras.optics import generator
-from sims.sensors import ImuNoise, ImuParameters
+from sims.sensors.imu import ImuNoise, ImuParameters
 from sims.vehicle import STANDING_HEIGHT, Autopilot, Physics, attach_vehicle
 from sims.worlds import load_world
 

@@ -13,6 +13,7 @@ from math import hypot, inf, isfinite
 from typing import Any, ClassVar, dataclass_transform
 
 import msgspec
+import numpy as np
 
 Vector3 = tuple[float, float, float]
 """Vector x, y, z; unit and frame are given at each field of this type."""
@@ -226,6 +227,21 @@ def check_covariance(event: Any, field: str, size: int) -> None:
     numbers = getattr(event, field)
     if numbers.__class__ is not tuple or numbers:
         _check_numbers(f"{type(event).__name__}.{field}", numbers, size * size)
+
+
+def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
+    """Make `array` read-only; raise `TypeError` for a wrong dtype or number of dimensions."""
+    if not isinstance(array, np.ndarray) or array.dtype != dtype or array.ndim not in ndim:
+        given = (
+            f"{array.dtype} of shape {array.shape}"
+            if isinstance(array, np.ndarray)
+            else type(array).__name__
+        )
+        dims = " or ".join(str(n) for n in sorted(ndim))
+        raise TypeError(
+            f"{owner}.{name}: expected a {dims}-dimensional {np.dtype(dtype)} array, found {given}"
+        )
+    array.setflags(write=False)
 
 
 def _norm(numbers: tuple[float, ...]) -> float:

@@ -15,8 +15,8 @@ from events.base import (
     check_covariance,
     check_frames,
     check_pose,
+    publish,
 )
-from events.sensors import publish
 
 
 class PoseEstimate(Event, category=Category.ESTIMATE):

@@ -1,4 +1,4 @@
-"""Measurements of sensors, and the fields of each for plotting.
+"""Measurements of sensors, and the table of the kinds of sensors.
 
 Arrays are checked and made read-only when the event is made: what has been sent does not change,
 and an image passes from node to node by reference.
@@ -6,28 +6,20 @@ and an image passes from node to node by reference.
 
 from __future__ import annotations
 
-from typing import Any
-
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events.base import Category, Event, Vector3, check, check_covariance
-from events.geometry import Wind
-
-
-def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
-    """Make `array` read-only; raise `TypeError` for a wrong dtype or number of dimensions."""
-    if not isinstance(array, np.ndarray) or array.dtype != dtype or array.ndim not in ndim:
-        given = (
-            f"{array.dtype} of shape {array.shape}"
-            if isinstance(array, np.ndarray)
-            else type(array).__name__
-        )
-        dims = " or ".join(str(n) for n in sorted(ndim))
-        raise TypeError(
-            f"{owner}.{name}: expected a {dims}-dimensional {np.dtype(dtype)} array, found {given}"
-        )
-    array.setflags(write=False)
+from events.announcements import (
+    Announcement,
+    BarometerAnnouncement,
+    ImuAnnouncement,
+    LidarAnnouncement,
+    MagnetometerAnnouncement,
+    NavSatAnnouncement,
+    RangeAnnouncement,
+)
+from events.base import Category, Event, Vector3, check, check_covariance, publish
 
 
 class Image(Event, category=Category.SENSOR, eq=False):
@@ -219,20 +211,82 @@ class LidarScan(Event, category=Category.SENSOR, eq=False):
         return self.stamp + (round(float(self.times[-1]) * 1e9) if len(self.times) else 0)
 
 
-MEASURED: dict[type[Event], dict[str, str]] = {
-    Imu: {"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
-    FluidPressure: {"fluid_pressure": "Pa"},
-    MagneticField: {"magnetic_field": "T"},
-    NavSatFix: {"latitude": "°", "longitude": "°", "altitude": "m", "velocity": "m/s"},
-    Range: {"range": "m"},
-    Wind: {"velocity": "m/s"},
+class SensorKind(msgspec.Struct, frozen=True, kw_only=True):
+    """Kind of sensor: its events, and their names wherever they are sent, shown or written.
+
+    Attributes:
+        name: Name in settings: of the table of the sensor in a vehicle's, and in ``reads``.
+        event: Type of the measurements.
+        announcement: Type of the sensor's announcement.
+        group: Name of the measurements in the plural: of the vehicle's output, the group of topics,
+            and the part of the tree of plots.
+        fields: Fields of a measurement that are numbers or vectors (x, y, z), with their units.
+        plots: Titles of the plots with a place of their own, by field.
+    """
+
+    name: str
+    event: type[Event]
+    announcement: type[Announcement]
+    group: str
+    fields: dict[str, str] = {}
+    plots: dict[str, str] = {}
+
+
+SENSOR_KINDS = {
+    kind.name: kind
+    for kind in (
+        SensorKind(
+            name="imu",
+            event=Imu,
+            announcement=ImuAnnouncement,
+            group="imu",
+            fields={"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
+            plots={
+                "angular_velocity": "angular velocity",
+                "linear_acceleration": "specific force",
+            },
+        ),
+        SensorKind(
+            name="barometer",
+            event=FluidPressure,
+            announcement=BarometerAnnouncement,
+            group="pressures",
+            fields={"fluid_pressure": "Pa"},
+            plots={"fluid_pressure": "pressure"},
+        ),
+        SensorKind(
+            name="magnetometer",
+            event=MagneticField,
+            announcement=MagnetometerAnnouncement,
+            group="magnetic_fields",
+            fields={"magnetic_field": "T"},
+            plots={"magnetic_field": "magnetic field"},
+        ),
+        SensorKind(
+            name="gnss",
+            event=NavSatFix,
+            announcement=NavSatAnnouncement,
+            group="fixes",
+            fields={"latitude": "°", "longitude": "°", "altitude": "m", "velocity": "m/s"},
+            plots={"velocity": "satellite velocity"},
+        ),
+        SensorKind(
+            name="range",
+            event=Range,
+            announcement=RangeAnnouncement,
+            group="ranges",
+            fields={"range": "m"},
+            plots={"range": "range"},
+        ),
+        SensorKind(
+            name="lidar",
+            event=LidarScan,
+            announcement=LidarAnnouncement,
+            group="lidar_scans",
+        ),
+    )
 }
-"""Fields and their units, by type of event; the field of a vector has x, y and z."""
-
-
-def fields_of(kind: type[Event]) -> dict[str, str]:
-    """Return the measured fields of an event type with their units; empty for other types."""
-    return next((fields for known, fields in MEASURED.items() if issubclass(kind, known)), {})
+"""The kinds of sensors, by name; those of other packages are in `runtime.sensors`."""
 
 
 def numbers(event: Event, field: str) -> tuple[float, ...]:

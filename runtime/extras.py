@@ -12,6 +12,16 @@ A package names its entry points in its ``pyproject.toml``; this project does th
     json = "my_package.settings:read"     # read(text, path, warn): the table of a TOML file of
                                           # ours; `import`, which prints it, may add world="yard"
 
+    [project.entry-points."visnav.sensors"]
+    airspeed = "my_package.airspeed:AirspeedSensor"    # a sims.sensors.sensor.Sensor
+
+    [project.entry-points."visnav.readers"]
+    mine = "my_package.reader:MyDataset"    # a nodes.data.replay.folders.Dataset; or a
+                                            # Reader of trajectories for `judge`, or several
+
+    [project.entry-points."visnav.worlds"]
+    maze = "my_package.worlds:maze"         # maze(seed, bare): a mujoco.MjSpec, or a Scene
+
 A file names a node that is listed here by its name, ``type = "MyNode"``, and any other as
 ``module:Class``.
 """
@@ -100,7 +110,11 @@ NODES = "visnav.nodes"
 CONFIGURATIONS = "visnav.configurations"
 EXAMPLES = "visnav.examples"
 PROCESSES = "visnav.processes"
+READERS = "visnav.readers"
+SENSORS = "visnav.sensors"
+WORLDS = "visnav.worlds"
 OURS = "visnav-runtime"
+_OTHERS_ONLY = (EXAMPLES, SENSORS, WORLDS)  # groups without entry points of the core
 
 EXTENSIONS = {
     "airsim": ("AirsimClient", "AirsimServer", ".json"),
@@ -168,12 +182,17 @@ def offers(group: str) -> tuple[Offer, ...]:
     ]
     offered.sort(key=lambda o: (o.package != OURS, not is_ours(o.package), o.package))
     ours = _declared(group) or [offer for offer in offered if offer.package == OURS]
-    if not ours and group != EXAMPLES:
+    if not ours and group not in _OTHERS_ONLY:
         raise CommandError(
             f"expected the package {OURS} to be installed, found no {group} of it: "
             '"pip install ." in its folder installs it'
         )
     return (*ours, *(offer for offer in offered if offer.package != OURS))
+
+
+def others(group: str) -> tuple[Offer, ...]:
+    """Return the entry points of a group of all packages but the core."""
+    return tuple(offer for offer in offers(group) if offer.package != OURS)
 
 
 def extension(group: str, name: str) -> Any:

@@ -10,8 +10,8 @@ import events as ev
 from events import Vector3
 from runtime import Output, Tick, every, on
 from sims.cameras import add_camera
-from sims.sensors import mount_imu
 from sims.sensors.platform import FRAME, PlatformConfig, SensorPlatform
+from sims.sensors.suite import mount_imu
 from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,

@@ -90,6 +90,12 @@ class SharedWorld:
         self._built = False
         self._building = asyncio.Lock()
 
+    def wind_at(self, name: str) -> Vector3:
+        """Return the present velocity of the air round a body, m/s NED; zeros without wind."""
+        if self.air is None or name not in self.vehicles:
+            return (0.0, 0.0, 0.0)
+        return self.air.velocity_at(name)
+
     async def build(self, node: Node[Any]) -> None:
         """Build the world, unless built already with its physics still finite."""
         async with self._building:

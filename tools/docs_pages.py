@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
+from events.sensors import SENSOR_KINDS
+from nodes.ros2.messages.mappings import PUBLISHED, READERS
 from runtime.channels.links import LinkConfig
 from runtime.config.model import NetworkConfig, RunConfig
 from runtime.config.reading import find_nodes
@@ -46,11 +48,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace the placeholder of the table of all figures, and links that leave a folder of pages.
+    """Replace the placeholders of tables, and links that leave a folder of pages.
 
     Pages of extensions stand in ``extensions/NAME/docs``, and in the site in ``extensions/NAME``.
     """
-    markdown = re.sub(r"<!-- all figures.*-->", lambda _: figures_section(), markdown)
+    for pattern, content in _GENERATED.items():
+        if match := re.search(pattern, markdown):
+            markdown = markdown.replace(match[0], content())
     markdown = re.sub(r"\]\((?:\.\./){3}docs/", "](../../", markdown)
     return re.sub(r"\]\(\.\./((?:\.\./)?extensions/\w+)/docs/", r"](\1/", markdown)
 
@@ -70,6 +74,58 @@ def figures_section() -> str:
     ]
     head = ("figure", "what it is", "unit", "threshold, and its default")
     return "\n".join(["## All figures", "", *_table(head, rows)])
+
+
+_LISTS = {"range": "range_finders", "lidar": "lidars"}
+"""Settings of sensors of which a vehicle has several."""
+
+
+def sensors_table() -> str:
+    """Return the table of the sensors: setting, output, event and announcement."""
+    rows = [
+        tuple(
+            f"`{name}`"
+            for name in (
+                _LISTS.get(kind.name, kind.name),
+                kind.group,
+                kind.event.__name__,
+                kind.announcement.__name__,
+            )
+        )
+        for kind in SENSOR_KINDS.values()
+    ]
+    return "\n".join(_table(("sensor", "output", "event", "announcement"), rows))
+
+
+def mappings_tables() -> str:
+    """Return the tables of the messages that are published, and of those that are read."""
+    published = [
+        (
+            f"`{row.topic.format('<source>')}`",
+            f"`{row.type}`",
+            ", ".join(f"`{event.__name__}`" for event in row.events) or "the run",
+            f"`{row.group}`",
+        )
+        for row in PUBLISHED
+    ]
+    read = [
+        (f"`{use}`", f"`{type_}`", "a replay of a bag" if row.bags else "a bridge")
+        for (type_, use), row in sorted(READERS.items(), key=lambda item: item[0][1])
+    ]
+    lines = [
+        *_table(("topic", "message", "events", "group (`publish`)"), published),
+        "",
+        *_table(("becomes (`as`)", "message", "read by"), read),
+    ]
+    return "\n".join(lines)
+
+
+_GENERATED: dict[str, Callable[[], str]] = {
+    "<!-- all figures.*-->": figures_section,
+    "<!-- all sensors.*-->": sensors_table,
+    "<!-- all mappings.*-->": mappings_tables,
+}
+"""Placeholders on the pages, and what stands there on the site."""
 
 
 def _refuse(warning: str) -> None:

@@ -1,4 +1,4 @@
-"""What a maintainer must hold: lines of the core and of the extensions, and what an import brings.
+"""What a maintainer must hold: lines, what an import brings, and files per kind of change.
 
 A line of code is one that is neither blank nor a comment nor part of a docstring.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import io
+import re
 import subprocess
 import sys
 import tokenize
@@ -17,6 +18,52 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 CORE = ("events", "runtime", "sims", "nodes", "visnav.py", "visnav_pytest.py")
 CLOSURES = ("runtime.node", "runtime.run.execute")
+
+
+class Change(NamedTuple):
+    """Kind of change, measured by something that is there: whatever names it was touched for it."""
+
+    instance: str
+    names: str  # regular expression of its names in code
+    limit: int  # of files
+    within: tuple[str, ...] = ("events", "runtime", "sims", "nodes", "pyproject.toml")
+    without: tuple[str, ...] = ()  # what names it for another reason
+    beside: tuple[str, ...] = ()  # its test and its page, which count
+
+
+CHANGES = {
+    "sensor": Change(
+        "magnetometer",
+        r"Magnetometer|MagneticField\b",
+        6,
+        without=(
+            "nodes/ros2",  # a mapping, which has a row of its own here
+            "nodes/outside/native/visnav_link.hpp",  # version 2 of the protocol has its rows
+        ),
+        beside=("tests/sims/sensors/test_earth.py", "docs/how-to/sensors.md"),
+    ),
+    "ROS mapping": Change("sensor_msgs/MagneticField", r"\bmagnetic_field\b", 3, ("nodes/ros2",)),
+    "reader": Change("KITTI", r"\bKitti\b", 1),
+    "figure": Change("heading_rmse_deg", r"\bheading_rmse_deg\b", 2),
+    "command": Change("recover", r"recover:recover|def recover\(", 2),
+}
+"""The kinds of change that CONTRIBUTING.md describes."""
+
+
+def files_of(change: Change) -> list[str]:
+    """Return the files that a change of a kind touches: those that name its instance."""
+    files = []
+    for name in _tracked(*change.within):
+        if name.startswith(change.without) or not name.endswith((".py", ".hpp", ".toml")):
+            continue
+        if re.search(change.names, (ROOT / name).read_text(encoding="utf-8")):
+            files.append(name)
+    return [*files, *change.beside]
+
+
+def _tracked(*patterns: str) -> list[str]:
+    command = ["git", "ls-files", "--", *patterns]
+    return subprocess.check_output(command, cwd=ROOT, text=True).split()  # noqa: S603
 
 
 class Size(NamedTuple):
@@ -59,9 +106,8 @@ def code_lines(text: str) -> int:
 
 def sizes() -> dict[str, Size]:
     """Return the sizes of all rooms: Python, and beside it C++ as ``room (C++)``."""
-    command = ["git", "ls-files", "*.py", "*.cpp", "*.hpp"]
     total: dict[str, Size] = defaultdict(Size)
-    for name in subprocess.check_output(command, cwd=ROOT, text=True).split():  # noqa: S603
+    for name in _tracked("*.py", "*.cpp", "*.hpp"):
         text = (ROOT / name).read_text(encoding="utf-8")
         lines = len(text.splitlines())
         if name.endswith(".py"):
@@ -97,13 +143,17 @@ def closure(module: str) -> Size:
 
 
 def main() -> None:
-    """Print a row for each room, for the core, and for what an import brings."""
+    """Print a row for each room, the core, what an import brings, and each kind of change."""
     total = sizes()
     print(f"{'':30} {'files':>6} {'lines':>8} {'code':>8}")
     rows = [*total.items(), ("", None), ("core, Python and C++", core(total))]
     rows += [(f"loaded with {module}", closure(module)) for module in CLOSURES]
     for name, size in rows:
         print(f"{name:30} {size.files:6,} {size.lines:8,} {size.code:8,}" if size else "")
+    print(f"\n{'files to touch for a new':30} {'files':>6} {'limit':>8}")
+    for kind, change in CHANGES.items():
+        touched = f"as {change.instance}: {', '.join(files_of(change))}"
+        print(f"{kind:30} {len(files_of(change)):6} {change.limit:8}   {touched}")
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from runtime.errors import ConfigError
 from runtime.run.execute import execute
 from runtime.run.results import claim
 from runtime.run.supervisor import Supervisor
+from runtime.sensors import sensor_kinds
 from runtime.source_files import source_file
 from runtime.tools import preflight
 from runtime.tools.cli.commands import ConfigFile, Overrides
@@ -155,7 +156,8 @@ def _is_carried(table: dict[str, Any]) -> bool:
 def _alone(config: Config, spec: NodeSpec, folder: Path) -> dict[str, Any]:
     """Return the vehicle's node table at the room's centre, without inputs and links."""
     (table,) = (node for node in to_builtins(config)["nodes"] if node["name"] == spec.name)
-    for key in ("inputs", "links", "barometer", "gnss", "magnetometer", "range_finders", "lidars"):
+    sensors = (kind.name for kind in sensor_kinds() if kind.name != "imu")
+    for key in ("inputs", "links", *sensors, "range_finders", "lidars"):
         table.pop(key, None)
     table.get("imu", {}).pop("calibration_error", None)
     for camera in table.get("cameras", ()):

@@ -22,10 +22,11 @@ import typer
 from events import Event, Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD
 from events.geometry import pose_matrix
-from events.sensors import MEASURED, fields_of, numbers
+from events.sensors import numbers
 from nodes.trajectory import Trajectory, associate
 from nodes.trajectory_files import EPOCH, epoch_of, read_tum, write_euroc, write_kitti, write_tum
 from runtime.run.results import run_folder
+from runtime.sensors import fields_of, measured
 from runtime.source_files import source_file
 
 FORMATS = ("tum", "euroc", "kitti")
@@ -233,7 +234,7 @@ def export_measurements(run: Path, out: Path | None = None, epoch: int | str = E
     with ExitStack() as stack:
         for path in recordings:
             for event in _measurements(path):
-                kind = next(known for known in MEASURED if isinstance(event, known))
+                kind = next(known for known in measured() if isinstance(event, known))
                 name = f"{source_file(event.source)}.{kind.__name__}.csv"
                 file = files.get(folder / name)
                 if file is None:

@@ -36,6 +36,7 @@ from typing import Any
 import msgspec
 
 from runtime.config.model import Config, NodeSpec
+from runtime.extras import READERS, SENSORS, WORLDS, others
 from runtime.node import CommandLine
 from runtime.paths import inputs, written
 from runtime.run.results import MARKER
@@ -106,6 +107,9 @@ def roots_of(config: Config, folder: Path | None = None, modules: Iterable[str] 
     named = (spec.type_name.partition(":") for spec in config.nodes)
     own_modules = {spec.node.__module__ for spec in config.nodes}
     own_modules |= {module for module, colon, _ in named if colon}
+    # Sensors, readers and worlds of other packages, as nothing here tells which of them are used.
+    plugged = (offer for group in (SENSORS, READERS, WORLDS) for offer in others(group))
+    own_modules |= {offer.value.partition(":")[0] for offer in plugged}
     return Roots(
         modules=tuple(sorted({*modules, *own_modules})),
         folder=str(folder or ""),

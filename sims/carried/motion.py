@@ -13,7 +13,7 @@ from runtime.recorded import RecordedMotion
 from sims.cameras import pose_to_qpos
 from sims.carried.placing import products
 from sims.carried.spline import Moment, MotionSpline
-from sims.sensors import ImuParameters
+from sims.sensors.imu import ImuParameters
 from sims.vehicle import State
 from sims.world import SharedWorld
 

@@ -13,6 +13,7 @@ from typing_extensions import TypeVar
 import events as ev
 from runtime import Output, Tick
 from sims.cameras import CameraSpec, check_cameras
+from sims.sensors.sensor import all_sensors
 from sims.sensors.suite import SensorsConfig, SensorSuite
 from sims.vehicle import State, VehicleMotion
 from sims.world import SharedWorld, Simulator, join_world
@@ -46,9 +47,8 @@ class SensorPlatform(Simulator[P]):
     """
 
     imu = Output(ev.Imu)
-    pressures = Output(ev.FluidPressure)
-    fixes = Output(ev.NavSatFix)
-    magnetic_fields = Output(ev.MagneticField)
+    # An output for each sensor of the table: the body of a class is a namespace to be written to.
+    locals().update({each.kind.group: Output(each.kind.event) for each in all_sensors()})
     ranges = Output(ev.Range)
     lidar_scans = Output(ev.LidarScan)
 

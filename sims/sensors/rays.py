@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from events import Quaternion, Range, RangeAnnouncement
+from events import Quaternion, Range
 from events.frames import flip_yz, flip_yz_rotation, multiply, rotate
+from events.sensors import SENSOR_KINDS
 from sims.sensors.sensor import Name, NonNegative, Place, Positive, Sensor, SensorSpec, Truth
 from sims.worlds import Dynamics
 
@@ -117,8 +118,7 @@ def cone(angle: float) -> Floats:
 class RangeFinder(Sensor[RangeFinderSpec]):
     """Distance to the nearest surface in the cone."""
 
-    port = "ranges"
-    announced = RangeAnnouncement
+    kind = SENSOR_KINDS["range"]
 
     def __init__(
         self, spec: RangeFinderSpec, place: Place, random: np.random.Generator, rays: Rays

@@ -13,6 +13,8 @@ import numpy as np
 import events as ev
 from events import Announcement, Event, Quaternion, Vector3
 from events.frames import IDENTITY, cross, from_rpy, multiply, rotate, rotate_inverse, to_geodetic
+from events.sensors import SENSOR_KINDS, SensorKind
+from runtime.sensors import other_sensors
 from runtime.units import Duration, Latency
 from sims.calibration import MountingError
 from sims.mounting import Matrix, apply_matrix
@@ -76,6 +78,7 @@ class Truth(NamedTuple):
     velocity: Vector3  # metres per second NED
     angular_velocity: Vector3  # radians per second FRD
     qpos: Any  # the world's generalised positions, shape (nq,), for sensors of the surroundings
+    wind: Vector3 = (0.0, 0.0, 0.0)  # of the air round the body, metres per second NED
 
 
 class Place(NamedTuple):
@@ -128,9 +131,20 @@ class Mounted(Generic[S]):
 
 
 class Sensor(Mounted[S], ABC):
-    """Model of a sensor: from the truth to measurements, at its rate."""
+    """Model of a sensor: from the truth to measurements, at its rate.
 
-    port: ClassVar[str]  # output of the vehicle's node for the measurements
+    A class of which a vehicle has one or none is in `SENSORS`, or an entry point of the group
+    ``visnav.sensors``.
+    """
+
+    kind: ClassVar[SensorKind]  # its name, its events and its output
+    spec_type: ClassVar[type[SensorSpec]]  # its table in the vehicle's settings
+    meaning: ClassVar[str]  # of that table, for the documentation of the settings
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "kind" in vars(cls):
+            cls.announced = cls.kind.announcement
 
     def __init__(self, spec: S, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place)
@@ -218,8 +232,8 @@ def altitude_at(pressure: float) -> float:
 class Barometer(Sensor[BarometerSpec]):
     """Pressure at the sensor's place."""
 
-    port = "pressures"
-    announced = ev.BarometerAnnouncement
+    kind, spec_type = SENSOR_KINDS["barometer"], BarometerSpec
+    meaning = "The barometer; none if it is not set. ``{}`` is one with all its defaults."
 
     def __init__(self, spec: BarometerSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
@@ -298,8 +312,8 @@ def dipole_field(place: Geodetic) -> Vector3:
 class Magnetometer(Sensor[MagnetometerSpec]):
     """The field at the origin, the same in the whole world."""
 
-    port = "magnetic_fields"
-    announced = ev.MagnetometerAnnouncement
+    kind, spec_type = SENSOR_KINDS["magnetometer"], MagnetometerSpec
+    meaning = "The magnetometer; none if it is not set."
 
     def __init__(self, spec: MagnetometerSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
@@ -362,8 +376,8 @@ class GnssSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True
 class Gnss(Sensor[GnssSpec]):
     """Position and velocity of the antenna."""
 
-    port = "fixes"
-    announced = ev.NavSatAnnouncement
+    kind, spec_type = SENSOR_KINDS["gnss"], GnssSpec
+    meaning = "The satellite receiver; none if it is not set."
 
     def __init__(self, spec: GnssSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
@@ -407,3 +421,12 @@ class Gnss(Sensor[GnssSpec]):
             return spec.eph_final
         left = exp(-seconds / spec.eph_time_constant)
         return spec.eph_final + (spec.eph_initial - spec.eph_final) * left
+
+
+SENSORS: tuple[type[Sensor[Any]], ...] = (Barometer, Gnss, Magnetometer)
+"""Sensors of which a vehicle has one or none, in the order of its settings."""
+
+
+def all_sensors() -> tuple[type[Sensor[Any]], ...]:
+    """Return `SENSORS`, and those of other packages."""
+    return (*SENSORS, *other_sensors())

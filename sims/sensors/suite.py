@@ -13,25 +13,19 @@ from events import Announcement, Event, Imu, TransformStamped
 from events.frames import flip_yz, flip_yz_rotation
 from runtime import Node, Tick
 from sims.calibration import generator_of
-from sims.cameras.rig import DrawnWorld
 from sims.sensors.calibration import announced, difference
 from sims.sensors.imu import ImuModel, ImuParameters, Motion, mean_between, motion_at
 from sims.sensors.lidar import Lidar, LidarRig, LidarSpec
 from sims.sensors.rays import RangeFinder, RangeFinderSpec, Rays
 from sims.sensors.sensor import (
-    Barometer,
-    BarometerSpec,
-    Gnss,
-    GnssSpec,
-    Magnetometer,
-    MagnetometerSpec,
     Mounted,
     Place,
     Sensor,
     Truth,
+    all_sensors,
 )
 from sims.vehicle import State, VehicleMotion
-from sims.world import Rate, SimulatorConfig
+from sims.world import Rate, SharedWorld, SimulatorConfig
 
 _RATE = 200
 
@@ -42,18 +36,16 @@ class SensorsConfig(SimulatorConfig):
     Attributes:
         imu_rate: Rate of the IMU and of the ground truth (`odometry`; also at each exposure), Hz.
         imu: Noise of the IMU, or the name of a preset.
-        barometer: The barometer; none if it is not set. ``{}`` is one with all its defaults.
-        gnss: The satellite receiver; none if it is not set.
-        magnetometer: The magnetometer; none if it is not set.
+        {sensors}
         range_finders: The range finders.
         lidars: The lidars.
     """
 
     imu_rate: Rate = _RATE
     imu: ImuParameters = ImuParameters()
-    barometer: BarometerSpec | None = None
-    gnss: GnssSpec | None = None
-    magnetometer: MagnetometerSpec | None = None
+    # A setting for each sensor of the table: the body of a class is a namespace to be written to.
+    __annotations__ |= {each.kind.name: each.spec_type | None for each in all_sensors()}
+    locals().update(dict.fromkeys([each.kind.name for each in all_sensors()]))
     range_finders: tuple[RangeFinderSpec, ...] = ()
     lidars: tuple[LidarSpec, ...] = ()
 
@@ -68,7 +60,7 @@ class SensorsConfig(SimulatorConfig):
             if bandwidth >= half:
                 rates = f"{bandwidth:g} Hz of {self.imu_rate:g} Hz"
                 raise ValueError(f"imu.{field}: expected less than half of imu_rate, found {rates}")
-        names = {"imu", "barometer", "gnss", "magnetometer"}
+        names = {"imu", *(sensor.kind.name for sensor in all_sensors())}
         for field in ("cameras", "range_finders", "lidars"):
             for spec in getattr(self, field):
                 if spec.name in names:
@@ -77,6 +69,11 @@ class SensorsConfig(SimulatorConfig):
                         "another sensor"
                     )
                 names.add(spec.name)
+
+
+SensorsConfig.__doc__ = str(SensorsConfig.__doc__).replace(
+    "{sensors}", "\n        ".join(f"{each.kind.name}: {each.meaning}" for each in all_sensors())
+)
 
 
 def mount_imu(world: mujoco.MjSpec, vehicle: str, parameters: ImuParameters) -> None:
@@ -139,7 +136,7 @@ class SensorSuite:
         frame_id: str,
         body: VehicleMotion,
         advance: Callable[[Tick], int],
-        world: DrawnWorld,
+        world: SharedWorld,
     ) -> None:
         self._node = node
         self._body = body
@@ -158,11 +155,10 @@ class SensorSuite:
         ) -> Callable[[], Sensor[Any]]:
             return lambda: model(spec, place(name), generator_of(node.rng, name), *rest)
 
-        single = {"barometer": Barometer, "gnss": Gnss, "magnetometer": Magnetometer}
         self._making = [
-            making(model, getattr(config, name), name)
-            for name, model in single.items()
-            if getattr(config, name) is not None
+            making(model, spec, model.kind.name)
+            for model in all_sensors()
+            if (spec := getattr(config, model.kind.name)) is not None
         ]
         if config.range_finders:
             rays = Rays(body.model, world.dynamics, f"{node.name}/base_link")
@@ -227,11 +223,12 @@ class SensorSuite:
         if tick.stamp >= sensor.spec.startup_delay * 1e9:
             stamp = self._advance(tick)
             state, qpos, _ = self._body.state_at(stamp)
-            truth = Truth(stamp=stamp, qpos=qpos, **msgspec.structs.asdict(state))
+            wind = self._world.wind_at(self._node.name)
+            truth = Truth(stamp=stamp, qpos=qpos, wind=wind, **msgspec.structs.asdict(state))
             self._send_later(sensor, sensor.measure(truth))
 
     def _send_later(self, sensor: Sensor[Any], event: Event) -> None:
-        send = getattr(self._node, sensor.port).send
+        send = getattr(self._node, sensor.kind.group).send
         if not sensor.spec.latency:
             send(event)
             return

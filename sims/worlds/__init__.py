@@ -1,7 +1,8 @@
 """Worlds to fly in, found by name or path: geometry, materials, lights; no vehicles, no cameras.
 
 A built-in world costs physics little (primitives, all in the world body) and is made to be seen:
-textures are drawn from a seed, and nothing repeats for long.
+textures are drawn from a seed, and nothing repeats for long. A package adds its own by entry points
+of the group ``visnav.worlds``: functions like those in `WORLDS`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from typing import Any
 import mujoco
 
 from runtime import VisnavError
+from runtime.errors import CommandError
+from runtime.extras import WORLDS as GROUP
+from runtime.extras import others
 from sims.worlds.builder import CLEARANCE, TOURS
 from sims.worlds.dynamics import Dynamics, Motion, Scene
 from sims.worlds.forest import forest
@@ -50,13 +54,14 @@ def load_scene(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
     """Return a world, ready for vehicles and cameras; MuJoCo's warnings go to the log from then on.
 
     Args:
-        name_or_path: A name in `WORLDS`, or the path of an MJCF file (what ends in ``.xml``,
-            contains a slash, or is a `Path`).
+        name_or_path: A name in `WORLDS` or of another package's world, or the path of an MJCF file
+            (what ends in ``.xml``, contains a slash, or is a `Path`).
         seed: Seed of a built-in world's textures, and of what lies on shelves. A file has none.
         bare: Leave out a built-in world's images.
 
     Raises:
-        WorldError: No such name or file, or the file is no MJCF that compiles.
+        WorldError: No such name or file, the file is no MJCF that compiles, or a package's world
+            cannot be built; the message names the package.
     """
     # Else they would go to a file of MuJoCo's in whatever folder the run was started.
     mujoco.set_mju_user_warning(logging.getLogger("visnav.mujoco").warning)
@@ -64,15 +69,30 @@ def load_scene(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
     is_path = isinstance(name_or_path, Path) or "/" in text or text.lower().endswith(".xml")
     if is_path:
         return Scene(_from_file(Path(name_or_path)))
-    if text not in WORLDS:
-        known = ", ".join(sorted(WORLDS))
-        near = difflib.get_close_matches(text, WORLDS, n=2, cutoff=0.5)
+    built = WORLDS[text](seed, bare) if text in WORLDS else _from_package(text, seed, bare)
+    return built if isinstance(built, Scene) else Scene(built)
+
+
+def _from_package(name: str, seed: int, bare: bool) -> mujoco.MjSpec | Scene:
+    offers = {offer.name: offer for offer in reversed(others(GROUP))}
+    if name not in offers:
+        known = sorted({*WORLDS, *offers})
+        near = difflib.get_close_matches(name, known, n=2, cutoff=0.5)
         hint = f"; did you mean {' or '.join(near)}?" if near else ""
         raise WorldError(
-            f'world: expected one of {known}, or a path to an .xml file, found "{text}"{hint}'
+            f"world: expected one of {', '.join(known)}, or a path to an .xml file, "
+            f'found "{name}"{hint}'
         )
-    built = WORLDS[text](seed, bare)
-    return built if isinstance(built, Scene) else Scene(built)
+    whose = f"world: {name} of the package {offers[name].package}"
+    try:
+        built = offers[name].load()(seed, bare)
+    except CommandError as error:
+        raise WorldError(f"world: {error}") from error
+    except Exception as error:  # whatever a package does
+        raise WorldError(f"{whose}: {type(error).__name__}: {error}") from error
+    if not isinstance(built, mujoco.MjSpec | Scene):
+        raise WorldError(f"{whose}: expected a mujoco.MjSpec or a Scene, found {built!r}")
+    return built
 
 
 def _from_file(path: Path) -> Any:

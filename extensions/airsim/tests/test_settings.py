@@ -54,11 +54,10 @@ def test_without_settings_there_is_a_drone_with_airsims_sensors(settings: Any) -
     assert imu.gyroscope_random_walk == pytest.approx(9.9735e-7, rel=1e-4)
     assert imu.accelerometer_noise_density == pytest.approx(2.3536e-3, rel=1e-4)
     assert imu.accelerometer_random_walk == pytest.approx(1.2482e-5, rel=1e-4)
-    assert vehicle.config.barometer is not None
-    assert vehicle.config.barometer.model == "airsim"
-    assert vehicle.config.magnetometer is not None
-    assert vehicle.config.gnss is not None
-    assert vehicle.config.gnss.latency == 0.2
+    sensors: Any = vehicle.config  # a table for each of the sensors that there are
+    assert sensors.barometer.model == "airsim"
+    assert sensors.magnetometer is not None
+    assert sensors.gnss.latency == 0.2
     assert not vehicle.config.range_finders
     assert server.node is AirsimServer
     assert isinstance(server.config, AirsimServerConfig)

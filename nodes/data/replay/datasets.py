@@ -8,7 +8,9 @@ or ``camera.yaml`` notes (``epoch_ns``).
 from __future__ import annotations
 
 import bisect
+import inspect
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,25 +40,26 @@ from events.geometry import Pose, pose_matrix, pose_tuples
 from nodes.data.dataset.recording import notable
 from nodes.data.replay.chains import as_pairs, chain_of, check_size, mountings, with_noise
 from nodes.data.replay.folders import (
+    Dataset,
     Files,
-    FolderReader,
     Rows,
     Sensor,
     as_pair,
     camera_at,
-    first_image,
     read_sensor,
 )
 from nodes.data.replay.reader import Pinhole, ReplayConfig, ReplayError
 from nodes.data.replay.truth import read_truth
 from nodes.kalibr import Chain, KalibrCamera, read_chain
 from nodes.trajectory_files import Row, read_kitti, read_rows
+from runtime.errors import CommandError
+from runtime.extras import READERS, others
 
 _MODELS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 """Kalibr's names of distortion models, and ours."""
 
 
-class Euroc(FolderReader):
+class Euroc(Dataset):
     """Reader of a data set's cameras, first IMU and ground truth; the folder has cam0 in it (mav0).
 
     M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The body keeps the data
@@ -70,6 +73,7 @@ class Euroc(FolderReader):
 
     layout = "EuRoC's (mav0)"
     noted = "body.yaml"
+    calibrated = True
 
     @classmethod
     def find(cls, path: Path) -> Path | None:
@@ -78,10 +82,11 @@ class Euroc(FolderReader):
         matches = (f for f in folders if (f / "cam0").is_dir() or (f / "imu0").is_dir())
         return next(matches, None)
 
-    def _read(self) -> None:
-        folder = self._folder
+    def load(self) -> None:
+        """Read cameras, IMU and truth, with their calibrations."""
+        folder = self.folder
         chain = self._chain()
-        self._imu_source, self._imu_frame = f"{self._vehicle}/imu0", "base_link"
+        self._imu_source, self._imu_frame = f"{self.vehicle}/imu0", "base_link"
         self._imu = self._measurements(folder / "imu0" / "data.csv")
         imu = self._imu_announcement(chain) if self._imu else None
         mounted: dict[str, tuple[KalibrCamera, Pose]] = {}
@@ -93,29 +98,29 @@ class Euroc(FolderReader):
                 for camera, place in zip(chain.cameras, places, strict=True)
             }
         folders = sorted(folder.glob("cam[0-9]*"))
-        if self._config.calibration and mounted and not any(f.name in mounted for f in folders):
+        if self.config.calibration and mounted and not any(f.name in mounted for f in folders):
             raise ReplayError(
                 f"calibration: expected one of {', '.join(f.name for f in folders) or 'a camera'}, "
                 f"found {', '.join(mounted)}"
             )
-        self._announcements += as_pairs([self._camera(folder, mounted) for folder in folders])
+        self.sensors += as_pairs([self._camera(folder, mounted) for folder in folders])
         if imu is not None:
-            self._announcements.append(imu)
-        self._truth = self._poses()
-        self._begin([row[0] for row in self._imu])
+            self.sensors.append(imu)
+        self.truth = self._poses()
+        self.others.append(Rows(Imu, self._imu_source, self._imu, self._measurement))
 
     def _chain(self) -> Chain | None:
         """Return the calibration that the settings name, or one beside cameras without their own.
 
         TUM VI has its in ``dso``.
         """
-        given = chain_of(self._config)
-        sensors = [*self._folder.glob("cam[0-9]*"), *self._folder.glob("imu0")]
+        given = chain_of(self.config)
+        sensors = [*self.folder.glob("cam[0-9]*"), *self.folder.glob("imu0")]
         if given or all((sensor / "sensor.yaml").is_file() for sensor in sensors):
             return given
         paths = []
         for names in _CHAINS, _NOISES:
-            places = (self._folder, self._folder.parent, self._folder.parent / "dso")
+            places = (self.folder, self.folder.parent, self.folder.parent / "dso")
             there = (place / name for place in places for name in names)
             paths += [path for path in there if path.is_file()][:1]
         if not paths:
@@ -125,44 +130,40 @@ class Euroc(FolderReader):
 
     def _poses(self) -> list[tuple[int, list[float]]]:
         for name in _TRUTHS:
-            truth = self._folder / name / "data.csv"
+            truth = self.folder / name / "data.csv"
             if truth.is_file():
                 self.notes.append(f"true poses: {truth}")
                 return read_truth(truth, self.complain, euroc=True, whole=self._whole(truth))
         return []
 
-    def _rows(self) -> Iterator[Rows]:
-        yield Rows(Imu, self._imu_source, self._imu, self._measurement)
-        yield from super()._rows()
-
     def _measurement(self, stamp: int, values: list[float]) -> Imu:
         return Imu(
-            stamp=stamp - self._origin,
+            stamp=stamp,
             source=self._imu_source,
             frame_id=self._imu_frame,
             angular_velocity=(values[0], values[1], values[2]),
             linear_acceleration=(values[3], values[4], values[5]),
         )
 
-    def _odometry(self, stamp: int, values: list[float]) -> Odometry:
+    def odometry(self, stamp: int, values: list[float]) -> Odometry:
         """Return the true odometry; the data set has no angular velocity, so 0."""
         x, y, z, qw, qx, qy, qz, u, v, w = [*values, 0.0, 0.0, 0.0][:10]
         turn = qw, qx, qy, qz
         velocity = rotate_inverse(turn, (u, v, w))
-        return self._pose(stamp, flip_yz((x, y, z)), rotation_to_ned(turn), velocity)
+        return self.pose(stamp, flip_yz((x, y, z)), rotation_to_ned(turn), velocity)
 
     def _camera(
         self, folder: Path, mounted: Mapping[str, tuple[KalibrCamera, Pose]]
     ) -> CameraAnnouncement:
-        source = f"{self._vehicle}/{folder.name}"
-        self._images[source] = files = self._index(folder)
-        images = [first_image(files[0][1])[0] if files else "grey"]
+        source = f"{self.vehicle}/{folder.name}"
+        self.images[source] = files = self._index(folder)
+        images = [self.first_image(files[0][1])[0] if files else "grey"]
         if files:
             self._check_bits(files[0][1])
         if (given := mounted.get(folder.name)) is not None:
             calibrated, place = given
             if files:
-                check_size(calibrated, first_image(files[0][1])[1:], str(files[0][1]))
+                check_size(calibrated, self.first_image(files[0][1])[1:], str(files[0][1]))
             announced = camera_at(source, (*images,), calibrated.info, _rate_of(files), *place)
             return msgspec.structs.replace(announced, time_offset=calibrated.time_offset)
         if not (folder / "sensor.yaml").is_file():
@@ -184,10 +185,10 @@ class Euroc(FolderReader):
         if model == "plumb_bob":
             lens = [*lens, 0.0][:5]  # of four, k3 is none
         position, orientation = pose_tuples(np.reshape(sensor.list("data", 16), (4, 4)))
-        depth = self._folder / folder.name.replace("cam", "depth")
+        depth = self.folder / folder.name.replace("cam", "depth")
         if depth.is_dir():
             factor = read_sensor(depth / "sensor.yaml").number("depth_factor")
-            self._depths[source] = self._index(depth), factor
+            self.depths[source] = self._index(depth), factor
             images.append("depth")
         info = sensor.converted(
             {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy}
@@ -199,7 +200,7 @@ class Euroc(FolderReader):
         return _with_noted(camera, sensor)
 
     def _imu_announcement(self, chain: Chain | None) -> ImuAnnouncement:
-        path = self._folder / "imu0" / "sensor.yaml"
+        path = self.folder / "imu0" / "sensor.yaml"
         if not path.is_file():
             if chain is None or chain.imu is None:
                 self.complain(
@@ -282,7 +283,7 @@ def _with_noted(announcement: A, sensor: Sensor) -> A:
 FARTHEST = 20_000_000  # nanoseconds between a depth image and its colour image
 
 
-class TumRgbd(FolderReader):
+class TumRgbd(Dataset):
     """Reader of colour, depth and true poses; the camera looks ahead from the body's origin.
 
     J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and
@@ -298,14 +299,15 @@ class TumRgbd(FolderReader):
         """Return the folder of rgb.txt."""
         return path if (path / "rgb.txt").is_file() else None
 
-    def _read(self) -> None:
-        folder, camera = self._folder, self._config.camera
-        self._source = f"{self._vehicle}/camera"
-        self._images[self._source] = rgb = self._index("rgb.txt")
+    def load(self) -> None:
+        """Read the camera with its images, depth images and truth."""
+        folder, camera = self.folder, self.config.camera
+        self._source = f"{self.vehicle}/camera"
+        self.images[self._source] = rgb = self._index("rgb.txt")
         depth = self._index("depth.txt") if (folder / "depth.txt").is_file() else []
-        self._truth = self._poses()
+        self.truth = self._poses()
         depth = self._paired(depth, [stamp for stamp, _ in rgb])
-        factor = self._config.depth_factor
+        factor = self.config.depth_factor
         span = rgb[-1][0] - rgb[0][0]
         rate = (len(rgb) - 1) * 1e9 / span if span else 30.0
         calibration = folder / self.noted
@@ -324,28 +326,27 @@ class TumRgbd(FolderReader):
                 "camera = { fx = …, fy = …, cx = …, cy = … } (pixels); the benchmark's page has "
                 "those of its sequences (freiburg1: 517.3, 516.5, 318.6, 255.3)"
             )
-        self._depths[self._source] = depth, factor
-        kind, *size = first_image(rgb[0][1])
+        self.depths[self._source] = depth, factor
+        kind, *size = self.first_image(rgb[0][1])
         kinds = (kind, "depth") if depth else (kind,)
         announced = camera_at(self._source, kinds, camera.info(*size), rate)
         if calibration.is_file():
             announced = _with_noted(announced, sensor)
-        self._announcements.append(announced)
-        self._begin()
+        self.sensors.append(announced)
 
-    def _rows(self) -> Iterator[Rows]:
-        truth, *images = super()._rows()
+    def rows(self) -> Iterator[Rows]:
+        """Yield the rows, with those of the camera's pose after the body's."""
+        truth, *images = super().rows()
         yield truth
-        yield Rows(PoseStamped, self._source, self._truth, self._camera_pose)
+        yield Rows(PoseStamped, self._source, self.truth, self._camera_pose)
         yield from images
 
-    def _odometry(self, stamp: int, position: Vector3, optical: Quaternion) -> Odometry:
-        return self._pose(stamp, position, multiply(optical, inverse(OPTICAL_TO_FRD)))
+    def odometry(self, stamp: int, position: Vector3, optical: Quaternion) -> Odometry:
+        """Return the odometry of the body, from the pose of the camera."""
+        return self.pose(stamp, position, multiply(optical, inverse(OPTICAL_TO_FRD)))
 
     def _camera_pose(self, stamp: int, position: Vector3, optical: Quaternion) -> PoseStamped:
-        return PoseStamped(
-            stamp=stamp - self._origin, source=self._source, position=position, orientation=optical
-        )
+        return PoseStamped(stamp=stamp, source=self._source, position=position, orientation=optical)
 
     def _paired(self, depth: Files, stamps: list[int]) -> Files:
         """Give each depth image the stamp of its colour image; those without are left out."""
@@ -361,12 +362,12 @@ class TumRgbd(FolderReader):
         return sorted((stamp, path) for stamp, (_, path) in taken.items())
 
     def _index(self, name: str) -> Files:
-        path = self._folder / name
+        path = self.folder / name
         rows = read_rows(path, None, (2,), "timestamp filename", whole=self._whole(path))
-        return self._written(sorted((row.seconds(), self._folder / row.fields[1]) for row in rows))
+        return self._written(sorted((row.seconds(), self.folder / row.fields[1]) for row in rows))
 
     def _poses(self) -> list[tuple[int, Vector3, Quaternion]]:
-        path = self._folder / "groundtruth.txt"
+        path = self.folder / "groundtruth.txt"
         if not path.is_file():
             return []
         rows = read_truth(path, self.complain, euroc=False, whole=self._whole(path))
@@ -379,7 +380,7 @@ class TumRgbd(FolderReader):
 _AXES = pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
 
 
-class Kitti(FolderReader):
+class Kitti(Dataset):
     """Reader of rectified cameras in a row on a car, and of its true poses if they are there.
 
     A. Geiger, P. Lenz and R. Urtasun, "Are we ready for autonomous driving? The KITTI vision
@@ -400,37 +401,34 @@ class Kitti(FolderReader):
         """Return the folder of times.txt and calib.txt."""
         return path if all((path / f"{n}.txt").is_file() for n in ("times", "calib")) else None
 
-    def _read(self) -> None:
-        folder = self._folder
+    def load(self) -> None:
+        """Read the cameras with their images, and the truth."""
+        folder = self.folder
         self._stamps = [
             row.seconds() for row in read_rows(folder / "times.txt", None, (1,), "seconds")
         ]
-        self._truth = self._poses()
+        self.truth = self._poses()
         rows = read_rows(folder / "calib.txt", None, (13,), "name: 12 numbers")
         projections = {row.fields[0].rstrip(":"): row for row in rows}
         seconds = (self._stamps[-1] - self._stamps[0]) / 1e9
         rate = (len(self._stamps) - 1) / seconds if seconds > 0 else 10.0
         cameras: dict[str, CameraAnnouncement] = {}
         for images in sorted(folder.glob("image_[0-3]")):
-            source, number = f"{self._vehicle}/{images.name}", images.name[-1]
+            source, number = f"{self.vehicle}/{images.name}", images.name[-1]
             paths = sorted(images.glob("*.png"))
             self._count(images, "images", len(paths))
-            self._images[source] = list(zip(self._stamps, paths, strict=True))
+            self.images[source] = list(zip(self._stamps, paths, strict=True))
             if (row := projections.get(f"P{number}")) is None:
                 raise ReplayError(f"{folder / 'calib.txt'}: expected P{number}, found none")
-            cameras[number] = _camera(source, row, paths[0], rate)
+            cameras[number] = _camera(source, row, self.first_image(paths[0]), rate)
             if (left := cameras.get({"1": "0", "3": "2"}.get(number, ""))) is not None:
                 cameras[number] = as_pair(left, cameras[number])
         if not cameras:
             raise ReplayError(f"{folder}: expected images in image_0 to image_3, found none")
-        self._announcements += cameras.values()
-        self._begin()
-
-    def _odometry(self, stamp: int, position: Vector3, orientation: Quaternion) -> Odometry:
-        return self._pose(stamp, position, orientation)
+        self.sensors += cameras.values()
 
     def _poses(self) -> list[tuple[int, Vector3, Quaternion]]:
-        path = self._folder.parent.parent / "poses" / f"{self._folder.name}.txt"
+        path = self.folder.parent.parent / "poses" / f"{self.folder.name}.txt"
         if not path.is_file():
             self.complain(f"expected true poses in {path}, found none")
             return []
@@ -447,10 +445,10 @@ class Kitti(FolderReader):
             )
 
 
-def _camera(source: str, row: Row, image: Path, rate: float) -> CameraAnnouncement:
+def _camera(source: str, row: Row, first: tuple[str, int, int], rate: float) -> CameraAnnouncement:
     """Return a camera by its projection K [I | t] of points in the left grey camera."""
     projection = np.reshape(row.numbers(1, 13), (3, 4))
-    kind, width, height = first_image(image)
+    kind, width, height = first
     (fx, _, cx), (_, fy, cy) = projection[:2, :3].tolist()
     info = CameraInfo(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
     moved = np.eye(4)
@@ -458,21 +456,67 @@ def _camera(source: str, row: Row, image: Path, rate: float) -> CameraAnnounceme
     return camera_at(source, (kind,), info, rate, *pose_tuples(_AXES @ moved))
 
 
-_READERS: tuple[type[FolderReader], ...] = (Euroc, TumRgbd, Kitti)
+_READERS: tuple[type[Dataset], ...] = (Euroc, TumRgbd, Kitti)
 
 
-def open_folder(path: Path, config: ReplayConfig, vehicle: str) -> FolderReader:
+def open_folder(path: Path, config: ReplayConfig, vehicle: str) -> Dataset:
     """Return the reader of a data set's folder; a `ReplayError` if its layout is unknown."""
+    if (other := open_other(path, config, vehicle)) is not None:
+        return other
     for reader in _READERS:
         if (folder := reader.find(path)) is not None:
-            if config.calibration and reader is not Euroc:
-                raise ReplayError(
-                    f"calibration: expected a bag of ROS or a data set in {Euroc.layout} layout "
-                    f"beside it, found one in {reader.layout} layout: {path}"
-                )
+            _check_calibration(reader, path, config)
             return reader(folder, config, vehicle)
-    *others, last = (reader.layout for reader in _READERS)
+    *others, last = (reader.layout for reader in (*_others(), *_READERS))
     raise ReplayError(
         f"{path}: expected a ROS 2 bag (metadata.yaml), or a data set of {', '.join(others)} or "
         f"{last}, found a folder with none of these"
     )
+
+
+def open_other(path: Path, config: ReplayConfig, vehicle: str) -> Dataset | None:
+    """Return the reader of another package for a file or folder; `None` if there is none.
+
+    Raises:
+        ReplayError: The package's reader cannot be imported, or fails; the message names the
+            package.
+    """
+    for reader, whose in _others().items():
+        try:
+            if (found := reader.find(path)) is not None:
+                _check_calibration(reader, path, config)
+                return reader(found, config, vehicle)
+        except ReplayError:
+            raise
+        except Exception as error:
+            text = f"{path}: {whose} cannot read it: {type(error).__name__}: {error}"
+            raise ReplayError(text) from error
+    return None
+
+
+def _check_calibration(reader: type[Dataset], path: Path, config: ReplayConfig) -> None:
+    if config.calibration and not reader.calibrated:
+        raise ReplayError(
+            f"calibration: expected a bag of ROS or a data set in {Euroc.layout} layout "
+            f"beside it, found one in {reader.layout} layout: {path}"
+        )
+
+
+@cache
+def _others() -> dict[type[Dataset], str]:
+    """Import and return other packages' readers, with the name of each and of its package."""
+    readers: dict[type[Dataset], str] = {}
+    for offer in others(READERS):
+        try:
+            loaded = offer.load()
+        except CommandError as error:
+            raise ReplayError(str(error)) from error
+        if isinstance(loaded, type):  # rows for `judge` are no classes
+            whose = f"{offer.name} of the package {offer.package}"
+            if not issubclass(loaded, Dataset) or inspect.isabstract(loaded):
+                raise ReplayError(
+                    f"{whose}: expected a class derived from {Dataset.__module__}.Dataset, with "
+                    f"find and load in it, found {loaded.__name__}"
+                )
+            readers[loaded] = whose
+    return readers

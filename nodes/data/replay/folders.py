@@ -1,4 +1,4 @@
-"""Common parts of data sets in folders: image files, calibrations, truth, rows to merge."""
+"""Readers of data sets: what each of them has to say, and what all have in common."""
 
 from __future__ import annotations
 
@@ -90,7 +90,10 @@ def as_pair(left: CameraAnnouncement, right: CameraAnnouncement) -> CameraAnnoun
 
 
 class Rows(NamedTuple):
-    """Ordered rows of a data set, each with its stamp (ns) first, and the function to events."""
+    """Ordered rows of a data set, each with its stamp (ns) first, and the function to events.
+
+    The function gets a stamp of the run (ns) in place of the row's, and the rest of the row.
+    """
 
     kind: type[Event]
     source: str
@@ -98,12 +101,37 @@ class Rows(NamedTuple):
     make: Callable[..., Event]
 
 
-class FolderReader(Reader):
-    """Reader of a data set in a folder, with its stamps as times; sensors are below `vehicle`.
+class Dataset(Reader):
+    """Base of the readers of data sets in a layout of files; its sensors are below `vehicle`.
 
-    Args:
-        folder: As of `find`.
-        vehicle: Source of the truth.
+    A subclass says how to recognize its layout and what is in it::
+
+        class MyDataset(Dataset):
+            layout = "My own (poses.txt)"
+
+            @classmethod
+            def find(cls, path):
+                return path if (path / "poses.txt").is_file() else None
+
+            def load(self):
+                source = f"{self.vehicle}/camera"
+                self.images[source] = [(0, self.folder / "0.png"), …]   # stamps: ns
+                self.sensors.append(camera_at(source, ("rgb",), CameraInfo(…), 10.0))
+                self.truth += [(0, (x, y, z), (qw, qx, qy, qz)), …]     # of the body, as Odometry
+
+    What it does not say is as here: images are what OpenCV reads, depth images have 16 bits, and
+    the events are images, depth images, the truth and `others`, merged by their stamps. The class
+    is an entry point of the group ``visnav.readers``.
+
+    Attributes:
+        folder: What `find` returned.
+        config: Settings of the replay: of a camera without calibration, of depth images.
+        vehicle: Source of the truth; sources of sensors begin with it and a slash.
+        images: Files of each camera's images with their stamps (ns), by source.
+        depths: The same of depth images, with their steps per metre.
+        truth: Rows of the true pose: a stamp (ns), and the arguments of `odometry`, in order.
+        others: Rows of sensors besides cameras.
+        sensors: Announcements of cameras and other sensors.
 
     Raises:
         ReplayError: A file is not as published.
@@ -111,37 +139,95 @@ class FolderReader(Reader):
 
     layout: ClassVar[str]  # name and marks of the layout, for an error
     noted: ClassVar[str] = ""  # file in which our own data sets note the epoch
+    calibrated: ClassVar[bool] = False  # whether it heeds the setting `calibration`
 
     def __init__(self, folder: Path, config: ReplayConfig, vehicle: str) -> None:
         super().__init__()
-        self._folder, self._config, self._vehicle = folder, config, vehicle
+        self.folder, self.config, self.vehicle = folder, config, vehicle
+        self.images: dict[str, Files] = {}
+        self.depths: dict[str, tuple[Files, float]] = {}
+        self.truth: list[Any] = []
+        self.others: list[Rows] = []
+        self.sensors: list[Announcement] = []
         self._origin = 0  # stamp in the data set (ns) of the run's time 0
-        self._images: dict[str, Files] = {}  # by source, as are the depth images
-        self._depths: dict[str, tuple[Files, float]] = {}  # with their steps per metre
-        self._truth: list[Any] = []  # tuples: the stamp (ns), then the arguments of `_odometry`
-        self._announcements: list[Announcement] = []
         try:
             self._epoch = noted_epoch(folder / self.noted) if self.noted else []
-            self._read()
+            self.load()
+            self._begin()
         except ValueError as error:
             raise ReplayError(str(error)) from None
+
+    # The contract: a subclass has the first two, and others where it differs.
 
     @classmethod
     @abstractmethod
     def find(cls, path: Path) -> Path | None:
-        """Return the folder to read, `path` or one in it; `None` if the layout is another."""
+        """Return what to read, `path` or a folder in it; `None` if the layout is another."""
 
     @abstractmethod
-    def _read(self) -> None:
-        """Read indices, truth and calibrations, then call `_begin`; may raise `ValueError`."""
+    def load(self) -> None:
+        """Read indices, calibrations and truth, no images, into the attributes.
 
-    @abstractmethod
-    def _odometry(self, *row: Any) -> Odometry:
-        """Return the true odometry of a row of the truth."""
+        Stamps are as in the data set: the earliest becomes the run's time 0. A `ValueError` names
+        the file; `complain` is for parts left out, `notes` for a choice that was made.
+        """
+
+    def odometry(self, stamp: int, *pose: Any) -> Odometry:
+        """Return the true odometry of a row of the truth, at a stamp of the run (ns).
+
+        By default the row is position and orientation of the body (FRD) in the world (NED), and
+        perhaps its velocity in its own frame: see `pose`.
+        """
+        return self.pose(stamp, *pose)
+
+    def read_image(self, path: Path) -> npt.NDArray[np.uint8]:
+        """Read an image, shape (height, width, 3) as RGB or (height, width); beside the loop."""
+        return read_image(path)
+
+    def read_depth(self, path: Path, factor: float) -> npt.NDArray[np.float32]:
+        """Read a depth image in metres along z, ``inf`` where there is none; beside the loop.
+
+        Args:
+            factor: Steps per metre, as `depths` has it.
+        """
+        return read_depth(path, factor)
+
+    def rows(self) -> Iterator[Rows]:
+        """Yield the rows of all events; at equal stamps, earlier ones come first."""
+        yield from self.others
+        yield Rows(Odometry, self.vehicle, self.truth, self.odometry)
+        for source, (files, factor) in self.depths.items():
+            yield Rows(DepthImage, source, files, partial(self._depth_image, source, factor))
+        for source, files in self.images.items():
+            yield Rows(Image, source, files, partial(self._image, source))
+
+    # What follows from it.
+
+    def pose(
+        self,
+        stamp: int,
+        position: Vector3,
+        orientation: Quaternion,
+        velocity: Vector3 = (0.0, 0.0, 0.0),
+    ) -> Odometry:
+        """Return the true odometry; velocities missing in the data set are 0."""
+        return Odometry(
+            stamp=stamp,
+            source=self.vehicle,
+            position=position,
+            orientation=orientation,
+            linear_velocity=velocity,
+            angular_velocity=(0.0, 0.0, 0.0),
+        )
+
+    def first_image(self, path: Path) -> tuple[str, int, int]:
+        """Return the kind of images, ``rgb`` or ``grey``, their width and their height."""
+        pixels = self.read_image(path)
+        return "rgb" if pixels.ndim == 3 else "grey", pixels.shape[1], pixels.shape[0]
 
     def announcements(self) -> Sequence[Announcement]:
         """Return the announcements of the vehicle, at its first pose, and its sensors."""
-        return self._announcements
+        return self.sensors
 
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
         """Yield all events by stamp; at equal stamps, those of earlier `Rows` first."""
@@ -150,19 +236,11 @@ class FolderReader(Reader):
             for row in table.rows:
                 time = row[0] - self._origin
                 if start <= time and (end is None or time < end):
-                    yield table.make(*row)
+                    yield table.make(time, *row[1:])
 
-        wanted = (made(table) for table in self._rows() if wants(table.kind, table.source))
+        wanted = (made(table) for table in self.rows() if wants(table.kind, table.source))
         merged = heapq.merge(*wanted, key=lambda event: event.stamp)
         return (Timed(event.stamp, event) for event in merged)
-
-    def _rows(self) -> Iterator[Rows]:
-        """Yield the rows of the truth and of each sensor."""
-        yield Rows(Odometry, self._vehicle, self._truth, self._odometry)
-        for source, (files, factor) in self._depths.items():
-            yield Rows(DepthImage, source, files, partial(self._depth_image, source, factor))
-        for source, files in self._images.items():
-            yield Rows(Image, source, files, partial(self._image, source))
 
     def _check_bits(self, path: Path) -> None:
         """Complain of an image of 16 bits that will be dark."""
@@ -191,48 +269,28 @@ class FolderReader(Reader):
             )
         return existing or files
 
-    def _begin(self, others: Sequence[int] = ()) -> None:
-        """Choose time 0, cut the truth to the sensors' time, and announce the vehicle.
-
-        Args:
-            others: Stamps of sensors besides cameras, ns.
-        """
-        firsts = [files[0][0] for files in self._images.values() if files]
-        lasts = [files[-1][0] for files in self._images.values() if files]
+    def _begin(self) -> None:
+        """Choose time 0, cut the truth to the sensors' time, and announce the vehicle."""
+        others = [row[0] for each in self.others for row in each.rows]
+        firsts = [files[0][0] for files in self.images.values() if files]
+        lasts = [files[-1][0] for files in self.images.values() if files]
         if not firsts and not others:
-            raise ReplayError(f"{self._folder}: expected the data of cameras or an IMU, found none")
+            raise ReplayError(f"{self.folder}: expected the data of cameras or an IMU, found none")
         first, last = min([*firsts, *others]), max([*lasts, *others])
         # One pose beside the sensors' time is kept at either end.
-        begin = bisect.bisect_right(self._truth, first, key=lambda row: row[0]) - 1
-        end = bisect.bisect_left(self._truth, last, key=lambda row: row[0]) + 1
-        self._truth = self._truth[max(begin, 0) : end]
-        self._origin = min([first, *(row[0] for row in self._truth[:1]), *self._epoch])
-        if self._truth:
-            seen = min(firsts, default=self._truth[0][0])
-            row = next((row for row in self._truth if row[0] >= seen), self._truth[0])
-            self._announcements.insert(0, vehicle_at(self._odometry(*row)))
-
-    def _pose(
-        self,
-        stamp: int,
-        position: Vector3,
-        orientation: Quaternion,
-        velocity: Vector3 = (0.0, 0.0, 0.0),
-    ) -> Odometry:
-        """Return the true odometry; velocities missing in the data set are 0."""
-        return Odometry(
-            stamp=stamp - self._origin,
-            source=self._vehicle,
-            position=position,
-            orientation=orientation,
-            linear_velocity=velocity,
-            angular_velocity=(0.0, 0.0, 0.0),
-        )
+        begin = bisect.bisect_right(self.truth, first, key=lambda row: row[0]) - 1
+        end = bisect.bisect_left(self.truth, last, key=lambda row: row[0]) + 1
+        self.truth = self.truth[max(begin, 0) : end]
+        self._origin = min([first, *(row[0] for row in self.truth[:1]), *self._epoch])
+        if self.truth:
+            seen = min(firsts, default=self.truth[0][0])
+            row = next((row for row in self.truth if row[0] >= seen), self.truth[0])
+            self.sensors.insert(0, vehicle_at(self.odometry(row[0] - self._origin, *row[1:])))
 
     def _image(self, source: str, stamp: int, path: Path) -> Image:
-        pixels = read_image(path)
+        pixels = self.read_image(path)
         return Image(
-            stamp=stamp - self._origin,
+            stamp=stamp,
             source=source,
             frame_id=f"{source}_optical",
             encoding="rgb8" if pixels.ndim == 3 else "mono8",
@@ -240,8 +298,8 @@ class FolderReader(Reader):
         )
 
     def _depth_image(self, source: str, factor: float, stamp: int, path: Path) -> DepthImage:
-        metres, frame_id = read_depth(path, factor), f"{source}_optical"
-        return DepthImage(stamp=stamp - self._origin, source=source, frame_id=frame_id, data=metres)
+        metres, frame_id = self.read_depth(path, factor), f"{source}_optical"
+        return DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=metres)
 
 
 def noted_epoch(path: Path) -> list[int]:
@@ -250,12 +308,6 @@ def noted_epoch(path: Path) -> list[int]:
     if text is not None and not (text.isdecimal() and len(text) <= 19):
         raise ReplayError(f"{path}: epoch_ns: expected whole nanoseconds, found {text!r:.80}")
     return [] if text is None else [int(text)]
-
-
-def first_image(path: Path) -> tuple[str, int, int]:
-    """Return the kind of a camera's images, ``rgb`` or ``grey``, their width and their height."""
-    pixels = read_image(path)
-    return "rgb" if pixels.ndim == 3 else "grey", pixels.shape[1], pixels.shape[0]
 
 
 def read_image(path: Path) -> npt.NDArray[np.uint8]:

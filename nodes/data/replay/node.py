@@ -18,6 +18,7 @@ from nodes.data.replay.bags import Recorded, RosBag, is_ours
 from nodes.data.replay.chains import chain_of
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError, Timed
 from runtime import Node, Output
+from runtime.extras import READERS, others
 from runtime.run.results import newest
 from runtime.time.clock import SECOND
 
@@ -127,6 +128,11 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
             f"{path}: expected a recording or the folder of a data set, found nothing there; "
             "docs/how-to/datasets.md says where to download those of EuRoC, TUM and KITTI"
         )
+    if path.is_file() and others(READERS):
+        from nodes.data.replay.datasets import open_other
+
+        if (reader := open_other(path, config, vehicle)) is not None:
+            return reader
     if path.is_file() and path.suffix not in {".db3", ".bag"} and is_ours(path):
         if config.calibration:
             raise ReplayError(

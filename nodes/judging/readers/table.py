@@ -22,11 +22,9 @@ from nodes.judging.readers.source import Floats, Options, Reader, Source, Start
 from nodes.judging.readers.topics import bags_in
 from nodes.trajectory import Trajectory
 from runtime.errors import CommandError
-from runtime.extras import OURS, Offer, offers
+from runtime.extras import OURS, READERS, Offer, offers
 from runtime.run.results import newest, run_folder
 from runtime.time.clock import SECOND
-
-GROUP = "visnav.readers"
 
 _LONGEST_STEP = 10 * 86_400 * SECOND  # more are stamps of different units or clocks
 _complaints: dict[str, str] = {}  # by package and name of the entry point
@@ -45,7 +43,7 @@ def complaints() -> list[str]:
 @cache
 def _loaded() -> tuple[tuple[Offer, tuple[Reader, ...]], ...]:
     loaded = []
-    for offer in sorted(offers(GROUP), key=lambda offer: offer.package == OURS):
+    for offer in sorted(offers(READERS), key=lambda offer: offer.package == OURS):
         try:
             loaded.append((offer, _rows(offer, offer.load())))
         except CommandError as error:
@@ -56,6 +54,8 @@ def _loaded() -> tuple[tuple[Offer, tuple[Reader, ...]], ...]:
 
 
 def _rows(offer: Offer, loaded: Any) -> tuple[Reader, ...]:
+    if isinstance(loaded, type):  # of a data set, for `Replay`
+        return ()
     rows = (loaded,) if isinstance(loaded, Reader) else loaded
     if isinstance(rows, Iterable):
         rows = tuple(rows)

@@ -24,6 +24,7 @@ from nodes.outside.native.client import (
     STATUS,
     VELOCITY,
 )
+from nodes.outside.native.rows import described_row
 from runtime.errors import VisnavError
 
 TOLERANCE = 1e-4  # tolerated deviation from orthonormality, for rotations in single precision
@@ -161,7 +162,7 @@ def describe(
 
     Args:
         cameras: Each with the kinds of image that will be sent of it (``rgb8``, ``depth32f``, …).
-        inputs: Name, kind (one of `client.RECORDS`) and announcement of each.
+        inputs: Name, kind (of its rows) and announcement of each.
         clock: ``kind`` of the run's clock (``lockstep`` or ``real``), and what else is known.
     """
     return {
@@ -171,7 +172,12 @@ def describe(
             for camera, kinds in cameras
         ],
         "inputs": [
-            {"name": name, "kind": kind, **_sensor(announced, "body_from_sensor")}
+            {
+                "name": name,
+                "kind": kind,
+                **described_row(kind),
+                **_sensor(announced, "body_from_sensor"),
+            }
             for name, kind, announced in inputs
         ],
         "outputs": [*outputs],

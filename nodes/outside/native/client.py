@@ -118,12 +118,13 @@ class Frame(NamedTuple):
     images: tuple[LinkImage, ...]  # all images
     inputs: tuple[LinkInput, ...]  # what came since the frame before, in the order in which it came
     kinds: Mapping[str, str]  # kind of each input, by name
+    records: Mapping[str, np.dtype[Any]] = RECORDS  # rows of each kind
 
     def rows(self, name: str) -> npt.NDArray[Any]:
         """Return what came of an input since the frame before; raise `LookupError` if unknown."""
         if name not in self.kinds:
             raise LookupError(f"expected one of {', '.join(self.kinds) or 'none'}, found {name!r}")
-        none = np.empty(0, RECORDS[self.kinds[name]])
+        none = np.empty(0, self.records[self.kinds[name]])
         return np.concatenate([none, *(each.rows for each in self.inputs if each.name == name)])
 
     def image(self, kind: str, camera: int = 0) -> npt.NDArray[Any]:
@@ -151,6 +152,7 @@ class Link:
         self._sending = threading.Lock()
         self._expected = 0
         self._kinds: dict[str, str] = {}
+        self._records = RECORDS
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         with contextlib.ExitStack() as unless_joined:
             unless_joined.callback(self._socket.close)
@@ -161,6 +163,11 @@ class Link:
             self._send(HELLO, GREETING.pack(MAGIC, VERSION, 0) + name.encode())
             self.description = self._welcome()
             self._kinds = {each["name"]: each["kind"] for each in self.description["inputs"]}
+            self._records = RECORDS | {
+                each["kind"]: np.dtype([("stamp", "<i8"), *map(_column, each["row"])])
+                for each in self.description["inputs"]
+                if "row" in each  # of a kind that is not part of the protocol
+            }
             unless_joined.pop_all()
 
     description: dict[str, Any]
@@ -229,7 +236,7 @@ class Link:
     def _input(self, body: bytearray) -> LinkInput:
         number, count, arrived = INPUT_HEAD.unpack_from(body)
         name, kind = list(self._kinds.items())[number]
-        rows = np.frombuffer(body, RECORDS[kind], offset=INPUT_HEAD.size)
+        rows = np.frombuffer(body, self._records[kind], offset=INPUT_HEAD.size)
         if len(rows) != count:
             raise ValueError(f"{len(rows)} rows in place of {count}")
         return LinkInput(name, arrived, rows)
@@ -255,7 +262,7 @@ class Link:
             strides = (stride, step, dtype.itemsize)[: 2 + len(pixel)]
             data = np.ndarray((height, width, *pixel), dtype, self._memory, offset, strides)
             images.append(LinkImage(camera, kind, data))
-        return Frame(sequence, stamp, tuple(images), (), self._kinds)
+        return Frame(sequence, stamp, tuple(images), (), self._kinds, self._records)
 
     def pose(
         self,
@@ -353,6 +360,12 @@ class Link:
             raise
         except (EOFError, OSError) as error:
             raise ProtocolError(f"the run is gone: {str(error) or 'without BYE'}") from None
+
+
+def _column(described: list[Any]) -> tuple[Any, ...]:
+    """Return a column of a record: its name, its type, and the shape of its values if any."""
+    name, type_, *shape = described
+    return (name, type_, *map(tuple, shape))
 
 
 def message(kind: int, *parts: bytes) -> bytes:

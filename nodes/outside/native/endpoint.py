@@ -173,7 +173,7 @@ class Endpoint:
         Args:
             number: Index in the description's inputs.
             arrived: Time of the run's clock at which the last one came (ns).
-            rows: Of the type in `client.RECORDS`.
+            rows: Of the type of the input's kind; see `nodes.outside.native.rows`.
 
         Raises:
             ValueError: They are longer than a message may be.

@@ -98,6 +98,7 @@ struct Input {
     std::string bytes;
     template <class T> std::vector<T> rows() const {
         if (kind != T::kind) throw Error("expected " + name + " of kind " + T::kind + ", found " + kind);
+        if (bytes.size() % sizeof(T)) throw Error("expected rows of another size of " + name);
         std::vector<T> all(bytes.size() / sizeof(T));
         if (!all.empty()) std::memcpy(all.data(), bytes.data(), bytes.size());
         return all;
@@ -415,8 +416,10 @@ private:
         const auto arrived = get<std::int64_t>(body, 8);
         if (number >= inputs_.size()) throw Error("expected an input of the description");
         const auto& [name, kind] = inputs_[number];
-        if (const auto size = sizes.find(kind); size == sizes.end() ||
-            body.size() != 16 + std::size_t{count} * size->second)
+        const auto known = sizes.find(kind);  // other kinds are in the description
+        const std::size_t size = known != sizes.end() ? known->second : static_cast<std::size_t>(
+            description_.number("inputs." + std::to_string(number) + ".row_bytes"));
+        if (body.size() != 16 + std::size_t{count} * size)
             throw Error("expected whole rows of the input " + name);
         return {name, kind, arrived, body.substr(16)};
     }

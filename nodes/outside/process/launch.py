@@ -27,6 +27,7 @@ from runtime import Duration
 from runtime.channels.hold import HoldConfig
 from runtime.errors import VisnavError
 from runtime.paths import InputPath
+from runtime.sensors import sensor_kinds
 
 
 class FileConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -64,10 +65,9 @@ class ProcessConfig(EstimatorConfig):
         cameras: Cameras whose images of one exposure are sent together, as of a stereo rig:
             sources, or last parts of them. Poses are of the first. If empty, the first camera
             that gives the `images`.
-        reads: What is sent besides: ``imu``, ``barometer``, ``magnetometer``, ``gnss``, ``range``,
-            ``lidar`` (the first of the vehicle), the last part of a sensor's source, or an
-            estimator, whose estimates are sent when they come, at its latency. The IMU of the
-            camera's body comes unasked.
+        reads: What is sent besides: {sensors} (the first of the vehicle), the last part of a
+            sensor's source, or an estimator, whose estimates are sent when they come, at its
+            latency. The IMU of the camera's body comes unasked.
         asks: Input each of whose measurements asks for an answer, at their stamp; if empty, the
             images do.
         every: Every how many of these.
@@ -119,6 +119,11 @@ class ProcessConfig(EstimatorConfig):
         for name in ("images", "cameras", "reads", "outputs"):
             if len({*getattr(self, name)}) < len(getattr(self, name)):
                 raise ValueError(f"{name}: expected each once, found {getattr(self, name)}")
+
+
+ProcessConfig.__doc__ = str(ProcessConfig.__doc__).replace(
+    "{sensors}", ", ".join(f"``{kind.name}``" for kind in sensor_kinds())
+)
 
 
 _LONGEST = 100  # bytes of a socket's path; Linux allows 107

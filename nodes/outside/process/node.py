@@ -20,18 +20,13 @@ from events import (
     Command,
     DepthImage,
     Event,
-    FluidPressure,
     Image,
     Imu,
     ImuAnnouncement,
     Land,
-    LidarScan,
-    MagneticField,
-    NavSatFix,
     PilotAnnouncement,
     PoseEstimate,
     PositionSetpoint,
-    Range,
     SensorAnnouncement,
     Setpoint,
     Takeoff,
@@ -53,6 +48,7 @@ from runtime.channels.bundles import Field, Matcher, Slot
 from runtime.channels.hold import Hold, Owed
 from runtime.channels.streams import Stream
 from runtime.node import CommandLine
+from runtime.sensors import sensor_kinds
 from runtime.workers.output import Throttle
 
 _BEYOND = 64  # waiting frames beyond the slots, in lockstep with `on_missing = "continue"`
@@ -297,7 +293,7 @@ class Process(Estimator[ProcessConfig]):
         """Keep the samples of the IMU until the next frame."""
         self.measurements(event)
 
-    @on(FluidPressure, MagneticField, NavSatFix, Range, LidarScan, PoseEstimate, TrackingLost)
+    @on(*(k.event for k in sensor_kinds() if k.event is not Imu), PoseEstimate, TrackingLost)
     def measurements(self, event: Event) -> None:
         """Keep an input until the next frame; ask for an answer, if it is the one that asks."""
         name = self._inputs.take(event, self.clock.now())

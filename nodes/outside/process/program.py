@@ -28,31 +28,22 @@ import numpy.typing as npt
 
 from events import (
     Announcement,
-    BarometerAnnouncement,
     DepthImage,
     EstimatorAnnouncement,
     Event,
-    FluidPressure,
     Image,
-    Imu,
     ImuAnnouncement,
-    LidarAnnouncement,
-    LidarScan,
-    MagneticField,
-    MagnetometerAnnouncement,
-    NavSatAnnouncement,
-    NavSatFix,
     PoseEstimate,
-    Range,
-    RangeAnnouncement,
     TrackingEvent,
     TrackingLost,
 )
 from events.geometry import pose_matrix
 from nodes.outside.native import Endpoint, LinkAnswer, LinkError
 from nodes.outside.native.client import RECORDS
+from nodes.outside.native.rows import kind_of, row_kind, rows_of
 from runtime.channels.hold import Hold
 from runtime.errors import suggest
+from runtime.sensors import sensor_kinds
 from runtime.workers.output import Output, how_it_ended
 
 _AT_ONCE = 1 << 16  # bytes of a single read
@@ -306,51 +297,6 @@ def _pixels(kind: str, event: Image | DepthImage) -> npt.NDArray[Any]:
 MOST_BYTES = 64 << 20  # most bytes waiting for the next frame; beyond, the oldest are dropped
 
 
-class Sensor(NamedTuple):
-    """A kind of sensor: its announcement, and the kind and fields of its rows."""
-
-    announced: type[Announcement]
-    kind: str
-    event: type[Event]
-    fields: Callable[[Any], tuple[Any, ...]]
-
-
-def _fix(event: NavSatFix) -> tuple[Any, ...]:
-    covariance = np.reshape(event.position_covariance or (np.nan,) * 9, (3, 3))
-    place = event.latitude, event.longitude, event.altitude
-    return (*place, event.velocity, covariance, event.status)
-
-
-SENSORS = {
-    "imu": Sensor(
-        ImuAnnouncement, "imu", Imu, lambda e: (e.angular_velocity, e.linear_acceleration)
-    ),
-    "barometer": Sensor(
-        BarometerAnnouncement,
-        "fluid_pressure",
-        FluidPressure,
-        lambda e: (e.fluid_pressure, e.variance),
-    ),
-    "magnetometer": Sensor(
-        MagnetometerAnnouncement, "magnetic_field", MagneticField, lambda e: (e.magnetic_field,)
-    ),
-    "gnss": Sensor(NavSatAnnouncement, "nav_sat_fix", NavSatFix, _fix),
-    "range": Sensor(
-        RangeAnnouncement, "range", Range, lambda e: (e.range, e.min_range, e.max_range)
-    ),
-    "lidar": Sensor(LidarAnnouncement, "lidar_scan", LidarScan, tuple),  # see `_points`
-}  # kinds of sensor by their names in the setting ``reads``
-
-_BY_EVENT = {sensor.event: sensor for sensor in SENSORS.values()}
-
-
-def _points(scan: LidarScan) -> npt.NDArray[Any]:
-    rows = np.empty(len(scan.times), RECORDS["lidar_scan"])
-    rows["stamp"] = scan.stamp + np.round(scan.times.astype(np.float64) * 1e9).astype(np.int64)
-    rows["point"], rows["intensity"], rows["ring"] = scan.points, scan.intensities, scan.rings
-    return rows
-
-
 class Message(NamedTuple):
     """Rows of an input: index of the input, when the last row came (ns), and the rows."""
 
@@ -379,7 +325,7 @@ class Inputs:
 
     def announced(self, announcement: Announcement) -> None:
         """Note a sensor or an estimator."""
-        kinds = [sensor.announced for sensor in SENSORS.values()]
+        kinds = [sensor.announcement for sensor in sensor_kinds()]
         if isinstance(announcement, (EstimatorAnnouncement, *kinds)):
             self._announced.append(announcement)
 
@@ -406,10 +352,10 @@ class Inputs:
         self._numbers = {each.source: number for number, (*_, each) in enumerate(self.chosen)}
 
     def _find(self, name: str, body: str) -> Announcement | None:
-        sensor = SENSORS.get(name)
+        sensor = next((each for each in sensor_kinds() if each.name == name), None)
         for each in self._announced:
             estimator = isinstance(each, EstimatorAnnouncement)
-            if sensor is not None and isinstance(each, sensor.announced):
+            if sensor is not None and isinstance(each, sensor.announcement):
                 if body in ("", each.source.rpartition("/")[0]):
                     return each
             elif each.source == name or (not estimator and each.source.endswith(f"/{name}")):
@@ -444,14 +390,9 @@ class Inputs:
 
     def _rows(self, event: Event, kind: str) -> npt.NDArray[Any] | None:
         """Return an event as rows of a kind; `None` if it is another's."""
-        if isinstance(event, LidarScan):
-            return _points(event)
         if isinstance(event, PoseEstimate | TrackingLost):
             return self._estimate(event)
-        sensor = _BY_EVENT.get(type(event))
-        if sensor is None or sensor.kind != kind:
-            return None
-        return np.array([(event.stamp, *sensor.fields(event))], RECORDS[kind])
+        return rows_of(event) if kind_of(event) == kind else None
 
     def _estimate(self, event: PoseEstimate | TrackingLost) -> npt.NDArray[Any]:
         frames = self._frames.setdefault(event.source, [])
@@ -471,5 +412,7 @@ class Inputs:
 
 
 def _kind(announced: Announcement) -> str:
-    found = (sensor.kind for sensor in SENSORS.values() if isinstance(announced, sensor.announced))
-    return next(found, "pose_estimate")
+    for sensor in sensor_kinds():
+        if isinstance(announced, sensor.announcement):
+            return row_kind(sensor)
+    return "pose_estimate"

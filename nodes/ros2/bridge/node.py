@@ -14,17 +14,9 @@ from events import (
     Announcement,
     CameraAnnouncement,
     Command,
-    DepthImage,
     Event,
-    FluidPressure,
-    Image,
-    Imu,
     LidarAnnouncement,
-    MagneticField,
-    NavSatFix,
-    Odometry,
     PoseEstimate,
-    Range,
     Setpoint,
     VehicleAnnouncement,
     VehicleEvent,
@@ -35,7 +27,7 @@ from nodes.ros2.bridge.keys import Complaints, NodeName
 from nodes.ros2.bridge.services import Services
 from nodes.ros2.bridge.session import Publisher, Session, SessionError
 from nodes.ros2.bridge.settings import Ros2BridgeConfig, event_type
-from nodes.ros2.messages.mappings import LARGE, SMALL, Publishing
+from nodes.ros2.messages.mappings import LARGE, READERS, RECEIVED, SMALL, Publishing
 from nodes.ros2.messages.typestore import Stamps, TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
 from runtime.channels.ports import Handles
@@ -70,14 +62,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     relays_estimates = True
     estimates = Output(PoseEstimate)
     setpoints = Output(Setpoint)
-    images = Output(Image)
-    depth_images = Output(DepthImage)
-    imu = Output(Imu)
-    odometry = Output(Odometry)
-    ranges = Output(Range)
-    pressures = Output(FluidPressure)
-    magnetic_fields = Output(MagneticField)
-    fixes = Output(NavSatFix)
+    # The estimates first: an event goes to the first output that takes it.
+    locals().update({group: Output(event) for group, event in RECEIVED.items()})
     commands = Output(Command)
     mapped_events = Output(Event)
     """Events of the user's own mappings."""
@@ -315,7 +301,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                     self._send(event)
 
         take: Callable[[bytes], object] = deliver
-        if subscription.use in {"image", "depth"}:
+        reader = READERS.get((subscription.type, subscription.use))
+        if reader is not None and reader.large:
             name = f"{self.name}.{incoming.topic.name}"
             waiting = Stream[bytes](name, subscription.depth, "drop_oldest", soon=True)
             self._unread.append(waiting)

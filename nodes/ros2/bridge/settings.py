@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from events import Event
-from nodes.ros2.messages.mappings import READERS
+from nodes.ros2.messages.mappings import READERS, described_uses
 from nodes.ros2.messages.topics import (
     Positive,
     PublishingConfig,
@@ -34,13 +34,7 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     Attributes:
         topic: Relative to the namespace, or with a leading slash.
         type: Type of the messages: ``geometry_msgs/msg/PoseStamped``.
-        use: ``as`` in the file: what a message becomes. ``estimate`` (from PoseStamped,
-            PoseWithCovarianceStamped, Odometry or the end of a Path), ``odometry`` (Odometry),
-            ``velocity`` (Twist, TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``,
-            ``depth`` (Image), ``imu`` (Imu), ``range`` (Range), ``pressure`` (FluidPressure),
-            ``magnetic_field`` (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the run
-            waits for it, and announces a camera), ``done`` (Header or Time: an estimator is done
-            with the image of this stamp).
+        use: ``as`` in the file: what a message becomes. {uses}.
         mapping: Instead of `use`: ``module:function``, called with a message and a
             `MessageContext`; returns an event, or None.
         source: Source of the events; if empty, the node's name and the topic.
@@ -124,6 +118,9 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             and self.answers_to == other.answers_to
             and other.source in {"", self.source}
         )
+
+
+Subscription.__doc__ = str(Subscription.__doc__).replace("{uses}", described_uses())
 
 
 class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from functools import cache
-from typing import Any, Generic, Protocol, TypeVar
+from functools import cache, partial
+from itertools import groupby
+from typing import Any, Generic, Protocol, TypeVar, get_type_hints
 
 import msgspec
 
@@ -47,10 +48,12 @@ from events import (
     VelocitySetpoint,
     Wind,
 )
+from events.sensors import SensorKind
 from nodes.ros2.messages import incoming, outgoing
 from nodes.ros2.messages.incoming import Reader
 from nodes.ros2.messages.outgoing import Outgoing
 from nodes.ros2.messages.topics import (
+    ALL_GROUPS,
     PublishingConfig,
     Qos,
     Topic,
@@ -59,6 +62,7 @@ from nodes.ros2.messages.topics import (
     topic_name,
 )
 from nodes.ros2.messages.typestore import MessageBuilder, Time, TypeStore
+from runtime.sensors import sensor_kinds
 
 TopicKind = str  # the `kind` of a mapping
 Kind = type[Event]
@@ -110,7 +114,7 @@ class Mapping(msgspec.Struct, frozen=True):
 
 
 # fmt: off
-MAPPINGS = (
+_OWN = (
     # Images and point clouds, each with its camera's calibration before it.
     Mapping("info", "{}/camera_info", _CAMERA_INFO, "images", (Image,), outgoing.camera_info,
             (CameraAnnouncement,), _COLOURS, _SENSOR, large=True, source=_of_camera, use="camera"),
@@ -205,8 +209,65 @@ MAPPINGS = (
 )
 # fmt: on
 
+
+def _plain(kind: SensorKind) -> Iterator[Mapping]:
+    """Yield the rows of a sensor without a message of its own: a topic for each measured field."""
+    hints = get_type_hints(kind.event)
+    for field in kind.fields:
+        name, write = "std_msgs/msg/Float64", outgoing.number
+        if hints[field] is not float:
+            name, write = "geometry_msgs/msg/Vector3Stamped", outgoing.vector
+        yield Mapping(
+            f"{kind.group}.{field}",
+            f"{{}}/{field}",
+            name,
+            kind.group,
+            (kind.event,),
+            partial(write, field=field),
+            (kind.announcement,),
+            qos=_SENSOR,
+        )
+
+
+_MAPPED = {event for row in _OWN for event in row.events}
+MAPPINGS = (
+    *_OWN,
+    *(row for kind in sensor_kinds() if kind.event not in _MAPPED for row in _plain(kind)),
+)
+"""The table: the project's rows, then those of sensors that have none among them."""
+
 PUBLISHED = tuple(row for row in MAPPINGS if row.kind)  # rows of the messages made of events
 READERS = {(row.type, row.use): row for row in MAPPINGS if row.use}  # by type of message and use
+RECEIVED: dict[str, type[Event]] = {
+    row.group: row.events[0]
+    for group in ALL_GROUPS
+    for row in MAPPINGS
+    if row.group == group and row.use and row.becomes is None
+    if row.events and row.read is not incoming.nothing
+}  # groups of topics whose messages are also read, and the events that are made of them
+
+_USES = {
+    "estimate": "from PoseStamped, PoseWithCovarianceStamped, Odometry or the end of a Path",
+    **dict.fromkeys(("odometry", "velocity", "position", "pose", "image", "depth"), ""),
+    **dict.fromkeys(("imu", "range", "pressure", "magnetic_field", "fix"), ""),
+    "camera": "CameraInfo; the run waits for it, and announces a camera",
+    "done": "Header or Time: an estimator is done with the image of this stamp",
+}
+"""The order in which uses are documented, and what more is said of them than their types; uses that
+are not in it follow."""
+
+
+def described_uses() -> str:
+    """Return the uses of messages read by a bridge, each with its types, as a sentence's part."""
+    types: dict[str, list[str]] = {use: [] for use in _USES}
+    for row in MAPPINGS:
+        if row.use and not row.bags:
+            types.setdefault(row.use, []).append(row.type.rpartition("/")[2])
+    words = {use: _USES.get(use) or ", ".join(names) for use, names in types.items()}
+    groups = [(", ".join(f"``{u}``" for u in g), w) for w, g in groupby(words, words.__getitem__)]
+    return ", ".join(f"{uses} ({meant})" for uses, meant in groups)
+
+
 LARGE: tuple[type[Event], ...] = tuple(
     dict.fromkeys(event for row in PUBLISHED if row.large for event in row.events)
 )  # events with slow messages: made in threads, a thread for each of these types

@@ -381,6 +381,19 @@ def score(out: Outgoing, event: Score) -> Any:
     return out.make("std_msgs/msg/Float64", data=event.value)
 
 
+def number(out: Outgoing, event: Event, field: str) -> Any:
+    """Return a std_msgs/Float64 of a measured field."""
+    return out.make("std_msgs/msg/Float64", data=getattr(event, field))
+
+
+def vector(out: Outgoing, event: Event, field: str) -> Any:
+    """Return a geometry_msgs/Vector3Stamped of a measured field, in the event's frame."""
+    frame_id = getattr(event, "frame_id", "base_link")
+    measured = out.vector(out.names.axes(frame_id), getattr(event, field))
+    header = out.header(event, frame_id)
+    return out.make("geometry_msgs/msg/Vector3Stamped", header=header, vector=measured)
+
+
 def clock(out: Outgoing, now: int) -> Any:
     """Return a rosgraph_msgs/Clock of a time (ns)."""
     sec, nanosec = out.time(now)

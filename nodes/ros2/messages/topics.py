@@ -8,7 +8,7 @@ values): std_srvs and action_msgs of ROS 2 Jazzy, simulation_interfaces 2.1.0.
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 
@@ -16,6 +16,7 @@ from events import CameraAnnouncement
 from events.announcements import Vehicles
 from events.frames import Axes, axes_of
 from runtime import NodeConfig
+from runtime.sensors import sensor_kinds
 
 NO_HASH = "TypeHashNotSupported"  # text of Humble in the place of a type's hash
 _DEFAULT_DEPTH = 42
@@ -77,13 +78,21 @@ def ros_name(source: str) -> str:
     return "/".join(f"_{part}" if part[0].isdigit() else part for part in parts) or "_"
 
 
-TopicGroup = Literal[
+_USUAL_GROUPS = (
     "images", "depth_images", "segmentation_images", "point_clouds", "imu", "odometry",
     "camera_poses", "transforms", "estimates", "scores", "ranges", "pressures", "magnetic_fields",
     "fixes", "lidar_scans", "wind", "body_poses", "clock", "paths",
-]  # fmt: skip
+)  # fmt: skip
 
-ALL_GROUPS: tuple[TopicGroup, ...] = TopicGroup.__args__  # type: ignore[attr-defined]
+ALL_GROUPS: tuple[str, ...] = tuple(
+    dict.fromkeys((*_USUAL_GROUPS, *(kind.group for kind in sensor_kinds())))
+)
+"""Groups of topics, in the order of the default; sensors that are not in it come last."""
+
+if TYPE_CHECKING:
+    TopicGroup = str
+else:
+    TopicGroup = Literal[ALL_GROUPS]
 
 Positive = Annotated[int, msgspec.Meta(ge=1)]
 Rate = Annotated[float, msgspec.Meta(gt=0)]

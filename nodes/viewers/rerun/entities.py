@@ -13,7 +13,7 @@ map/estimates/<estimator>  the frame an estimator works in; its path and newest 
 images/<camera>            images of a camera that nobody announced
 map/clouds/<node>          clouds; map/points/<camera>: points of depth images
 …/cloud/<node>             clouds in the frame of a body, a camera or an estimator
-imu, scores, log           plots and text; so pressures, ranges, magnetic_fields, fixes, wind
+imu, scores, log           plots and text; so the groups of all sensors, and wind
 
 What the viewer shows at first: the world large, images beside it, plots below.
 """
@@ -34,21 +34,18 @@ from events import (
     CameraInfo,
     DepthImage,
     Event,
-    FluidPressure,
     Image,
-    Imu,
-    MagneticField,
     NavSatFix,
     PoseStamped,
-    Range,
     Score,
     TrackingLost,
     Wind,
 )
 from events.geometry import pose_matrix
-from events.sensors import fields_of, numbers
+from events.sensors import numbers
 from nodes.mapping import back_project, rays_of
 from nodes.viewers.common import REMEMBERED, Colour, describe
+from runtime.sensors import fields_of, sensor_kinds
 from runtime.time.clock import SECOND
 
 WORLD = "map"
@@ -201,24 +198,20 @@ _DARK = (22, 25, 31)  # background of the world in every theme, matched to the c
 
 _AXES = [(230, 80, 70), (90, 200, 90), (90, 140, 255)]  # colours of x, y, z
 GROUPS: dict[type[Event], str] = {
-    Imu: "imu",
-    FluidPressure: "pressures",
-    MagneticField: "magnetic_fields",
-    NavSatFix: "fixes",
-    Range: "ranges",
+    **{kind.event: kind.group for kind in sensor_kinds() if kind.fields},
     Wind: "wind",
 }  # parts of the tree of plots, by type of event
 
 _HANDY = {"rad": ("°", 180.0 / np.pi), "s": ("ms", 1000.0)}  # plotted unit and factor, by unit
+_FIRST = ("imu", "barometer", "range")  # sensors whose plots come before those of the others
 PLOTS = {
     "position error (m)": "+ /scores/position_error/**",
     "rotation error (°)": "+ /scores/rotation_error/**",
-    "angular velocity (rad/s)": "+ /imu/angular_velocity/**",
-    "specific force (m/s²)": "+ /imu/linear_acceleration/**",
-    "pressure (Pa)": "+ /pressures/fluid_pressure/**",
-    "range (m)": "+ /ranges/range/**",
-    "magnetic field (T)": "+ /magnetic_fields/magnetic_field/**",
-    "satellite velocity (m/s)": "+ /fixes/velocity/**",
+    **{
+        f"{title} ({kind.fields[field]})": f"+ /{kind.group}/{field}/**"
+        for kind in sorted(sensor_kinds(), key=lambda kind: kind.name not in _FIRST)
+        for field, title in kind.plots.items()
+    },
     "wind (m/s)": "+ /wind/velocity/**",
 }  # plots with a place in the layout, by title, and their entities
 

@@ -38,13 +38,13 @@ from events import (
     VehicleEvent,
     Wind,
 )
-from events.sensors import MEASURED
 from nodes.trajectory_files import part_name
 from nodes.viewers.common import ImageSelection
 from nodes.viewers.rerun.entities import GROUPS, EntityLog, Eye, Numbered, Plots, layout
 from nodes.viewers.rerun.sdk import RerunConfig, Viewer, load
 from nodes.viewers.rerun.world import World
 from runtime import Node, Stream, on
+from runtime.sensors import measured
 
 _GATHERED = 500  # events written into a file together
 _TIMEOUT = 3.0  # real seconds for a viewer to take data; else new ones are left out
@@ -302,7 +302,7 @@ class RerunView(Node[RerunConfig]):
         Score,
         TrackingEvent,
         VehicleEvent,
-        *MEASURED,
+        *measured(),
     )
     def measurements(self, event: Event) -> None:
         """Queue a small event."""

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from scipy.signal import butter, lfilter
 
 from sims.multirotor import MultirotorConfig
-from sims.sensors import ImuModel, ImuParameters
 from sims.sensors.bandwidth import LowPass
-from sims.sensors.imu import NOISES
+from sims.sensors.imu import NOISES, ImuModel, ImuParameters
 from tests.sims.sensors.truths import PLACE
 
 FORCE = (0.0, 0.0, -9.81)

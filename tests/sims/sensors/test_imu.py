@@ -21,8 +21,16 @@ from events import Imu, ImuAnnouncement, TransformStamped
 from events.frames import from_rpy, multiply, rotate
 from runtime.testing import run_node
 from sims.multirotor import Multirotor
-from sims.sensors import ImuModel, ImuNoise, ImuParameters, mount_imu
-from sims.sensors.imu import NOISES, Motion, mean_between, motion_at
+from sims.sensors.imu import (
+    NOISES,
+    ImuModel,
+    ImuNoise,
+    ImuParameters,
+    Motion,
+    mean_between,
+    motion_at,
+)
+from sims.sensors.suite import mount_imu
 from sims.sensors.vibration import Vibration
 from sims.vehicle import Physics, State, attach_vehicle
 from tests.sims.sensors.truths import PLACE, random

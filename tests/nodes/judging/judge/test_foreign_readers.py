@@ -33,7 +33,7 @@ class Package(Offer):
 @pytest.fixture
 def offered(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Package]]:
     """Yield a list for other packages' entry points."""
-    ours, others = offers(table.GROUP), list[Package]()
+    ours, others = offers(table.READERS), list[Package]()
     monkeypatch.setattr("nodes.judging.readers.table.offers", lambda _: (*ours, *others))
     monkeypatch.setattr(table, "_complaints", {})
     table._loaded.cache_clear()

@@ -1,0 +1,1 @@
+"""An airspeed sensor, and one of everything else that a package can add."""
