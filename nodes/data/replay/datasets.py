@@ -10,11 +10,10 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-from typing_extensions import TypeVar
 
 from events import (
     CameraAnnouncement,
