@@ -246,7 +246,7 @@ def test_what_the_core_imports_is_required_by_it_or_by_an_extra() -> None:
     for name in set(required):
         required |= distributions(metadata.requires(name) or ())
     core = {"events", "runtime", "runtime.tools", "sims", "nodes"}
-    modules = {room(name) for where in core for _, found in of_room(where) for name in found}
+    modules = {room(name) for where in core for _, names in of_room(where) for name in names}
     strangers = modules - core - sys.stdlib_module_names - {"typing_extensions"}
     origins = metadata.packages_distributions()
     assert {name for name in strangers if not distributions(origins[name]) & required} == set()
