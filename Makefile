@@ -9,8 +9,13 @@ READY := $(VENV)/.ready
 # Tests start hundreds of processes, which begin sooner if modules stay compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
+# Where images are drawn, read, written or tracked.
+OPENCV_TESTS := $(addprefix tests/,events sims/cameras sims/worlds nodes/calibration nodes/data/dataset \
+	nodes/data/replay nodes/estimators nodes/judging/report nodes/mapping nodes/ros2/messages nodes/viewers \
+	runtime/tools/monitor)
+
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-core test-slow test-pythons test-all check fix size docs wheel peers bench bench-quick orbslam3 svo suite images clean
+.PHONY: help setup demo test test-core test-slow test-pythons test-opencv4 test-all check fix size docs wheel peers bench bench-quick orbslam3 svo suite images clean
 
 # Setuptools warns at length of every editable install that folders here may hide packages.
 INSTALL = PYTHONWARNINGS='ignore:Editable installation' $(BIN)/python -m pip install --quiet
@@ -55,7 +60,15 @@ test-slow: $(READY)  ## Run the slow tests; what fails is repeated once, alone.
 test-pythons: $(READY)  ## Run the core's tests on every other Python that is here.
 	@sh tools/test_pythons.sh
 
-test-all: test test-slow test-pythons  ## Run all tests.
+# Python looks into the folder first; the oldest version that pyproject.toml allows is in it.
+.venv-opencv4: pyproject.toml
+	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target $@ 'opencv-python-headless==4.10.*'
+	@touch $@
+
+test-opencv4: $(READY) .venv-opencv4  ## Run the quick tests of what draws, sees and writes images with OpenCV 4.
+	PYTHONPATH=.venv-opencv4 $(BIN)/python -m pytest -n 3 --dist loadfile -m 'not slow' $(OPENCV_TESTS)
+
+test-all: test test-slow test-pythons test-opencv4  ## Run all tests.
 
 check: $(READY)  ## Check style and types.
 	$(BIN)/ruff check .

@@ -17,11 +17,12 @@ from typing import Any, NoReturn
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from events import CameraInfo
 from events.camera_info import COEFFICIENTS
 from events.geometry import inverse
+from runtime.errors import MissingDependencyError
+from runtime.extras import install_command
 
 Floats = npt.NDArray[np.float64]
 
@@ -227,6 +228,12 @@ class _Keys:
 
 def _parse(text: str, where: str) -> Mapping[str, Any]:
     # Headers of OpenCV ("%YAML:1.0") are no YAML; of several files only the first could have one.
+    try:
+        import yaml
+    except ImportError:
+        raise MissingDependencyError(
+            f"{where}: Kalibr's YAML needs pyyaml: {install_command('kalibr')}"
+        ) from None
     lines = (line for line in text.splitlines() if not re.match(r"%YAML|---\s*$", line))
     try:
         table = yaml.safe_load("\n".join(lines))

@@ -12,10 +12,9 @@ import concurrent.futures
 import functools
 from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
-from typing_extensions import TypeVar
 
 from runtime.time.clock import Clock, Tick, Ticker
 

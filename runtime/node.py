@@ -26,7 +26,6 @@ from typing import (
 
 import msgspec
 import numpy as np
-from typing_extensions import TypeVar
 
 from events import Announcement, Event
 from runtime.channels.bundles import Matcher
@@ -39,6 +38,7 @@ from runtime.host import Host, RunEnd, Sibling
 from runtime.json_values import plain
 from runtime.logs import NodeLogger
 from runtime.time.clock import SECOND, Clock, Tick, Ticker
+from runtime.typed import TypeVar
 
 P = ParamSpec("P")
 if TYPE_CHECKING:

@@ -14,7 +14,6 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from typing_extensions import TypeVar
 
 import events as ev
 from events import Announcement, BodyAnnouncement, PoseStamped, Vector3, Wind, WindAnnouncement
@@ -23,6 +22,7 @@ from runtime import Duration, Node, NodeConfig, Output, Tick, every
 from runtime.errors import suggest
 from runtime.host import Sibling
 from runtime.paths import NameOrPath
+from runtime.typed import TypeVar
 from sims.cameras import CameraSpec, model_to_bytes
 from sims.cameras.rig import CameraOutputs, CameraRig
 from sims.cameras.stage import RendererName

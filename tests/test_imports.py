@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -40,11 +42,13 @@ BRIDGES = {
     "foxglove",
     "mcap",
     "msgpack",
+    "pygeomag",
     "pymavlink",
     "pyorbslam3",
     "rosbags",
     "svo_cpp",
     "textual",
+    "yaml",
 }
 PURE = {"asyncio", "socket", "threading"}
 """What no event imports."""
@@ -222,6 +226,30 @@ def test_entry_points_name_modules_of_ours() -> None:
     assert [name for name in modules if name not in known] == []
     nodes = {value.partition(".")[0] for value in groups["visnav.nodes"].values()}
     assert nodes == {"sims", "nodes"}
+
+
+def distributions(requirements: Iterable[str]) -> set[str]:
+    """Return the names of what is required, but for extras: of ``rosbags>=0.11``, ``rosbags``."""
+    return {
+        re.split(r"[^\w.-]", line)[0].lower().replace("_", "-")
+        for line in requirements
+        if "extra ==" not in line
+    }
+
+
+def test_what_the_core_imports_is_required_by_it_or_by_an_extra() -> None:
+    """Or by what that requires in turn; those who check types bring what is for types only."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    offered = [line for name in extras.keys() - {"dev", "docs", "peers"} for line in extras[name]]
+    required = distributions([*project["dependencies"], *offered])
+    for name in set(required):
+        required |= distributions(metadata.requires(name) or ())
+    core = {"events", "runtime", "runtime.tools", "sims", "nodes"}
+    modules = {room(name) for where in core for _, names in of_room(where) for name in names}
+    strangers = modules - core - sys.stdlib_module_names - {"typing_extensions"}
+    origins = metadata.packages_distributions()
+    assert {name for name in strangers if not distributions(origins[name]) & required} == set()
 
 
 @pytest.mark.parametrize("package", EXTENSIONS)

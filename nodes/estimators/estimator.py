@@ -11,7 +11,6 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from typing_extensions import TypeVar
 
 from events import (
     Announcement,
@@ -44,6 +43,7 @@ from runtime.errors import DeclarationError, NodeError, suggest
 from runtime.extras import why_missing
 from runtime.node import matchers
 from runtime.time.clock import SECOND
+from runtime.typed import TypeVar
 from runtime.units import Latency
 
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from typing_extensions import TypeVar
 
 from events import (
     Announcement,
@@ -46,6 +45,7 @@ from nodes.pilots.waypoint_path import (
 )
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.changeable import Changeable
+from runtime.typed import TypeVar
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 

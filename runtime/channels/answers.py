@@ -16,7 +16,6 @@ from typing import Literal
 
 import msgspec
 import xxhash
-from typing_extensions import Buffer
 
 from runtime.channels.wire import combined, fingerprint
 from runtime.errors import ConfigError
@@ -115,7 +114,7 @@ class Answers:
         with self._lock:
             self.received = (self.received or 0) + count
 
-    def took_in(self, stream: str, data: Buffer) -> None:
+    def took_in(self, stream: str, data: bytes | bytearray | memoryview) -> None:
         """Add data sent to the system to the digest of its inputs.
 
         Args:

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import msgspec
-from typing_extensions import Buffer
 
 from runtime.channels.answers import Answers, Outcome, Settled, Wrong, read_latencies
 from runtime.channels.wire import fingerprint
@@ -211,7 +210,7 @@ class Hold(Generic[T]):
 
     # In any thread.
 
-    def sent(self, stream: str, data: Buffer) -> None:
+    def sent(self, stream: str, data: bytes | bytearray | memoryview) -> None:
         """Add data sent to the system to the digest of its inputs; see `Answers.took_in`."""
         self.answers.took_in(stream, data)
 

@@ -19,7 +19,6 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 import xxhash
-from typing_extensions import Buffer
 
 from events import Event
 from runtime.channels.sender import Sender
@@ -113,7 +112,7 @@ def pack(event: Event) -> Packed:
     return Packed(head, tuple(arrays), tuple(begin + at for at in relative), begin + place)
 
 
-def unpack(frame: Buffer) -> Event:
+def unpack(frame: bytes | bytearray | memoryview) -> Event:
     """Put an event together, its arrays in `frame`, read-only; `WireError` if it is none known."""
     view = memoryview(frame).cast("B").toreadonly()
     try:

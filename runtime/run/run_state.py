@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-from typing_extensions import TypeVar, override
 
 from events import Announcement, EstimatorAnnouncement, ParameterChanged
 from runtime.channels.answers import Answers
@@ -40,6 +39,7 @@ from runtime.run.instruments import Instruments
 from runtime.run.node_runner import Create, NodeRunner
 from runtime.time.clock import SECOND, Clock, Tick, Ticker
 from runtime.time.stepping import Stepping
+from runtime.typed import TypeVar, override
 from runtime.workers.costs import Costs
 
 if TYPE_CHECKING:

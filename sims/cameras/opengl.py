@@ -15,9 +15,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from typing_extensions import override
 
 from events import CameraInfo
+from runtime.typed import override
 from sims.cameras.optics import MARGIN, Face, Maps, faces
 from sims.cameras.stage import (
     FAR,

@@ -15,10 +15,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from typing_extensions import override
 
 from events import CameraInfo
 from events.camera_info import srgb_light
+from runtime.typed import override
 from sims.cameras.meshes import Mesh, mesh_of, narrow, shape_of
 from sims.cameras.optics import pixel_rays
 from sims.cameras.stage import (

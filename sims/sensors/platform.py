@@ -8,10 +8,9 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Literal
 
-from typing_extensions import TypeVar
-
 import events as ev
 from runtime import Output, Tick
+from runtime.typed import TypeVar
 from sims.cameras import CameraSpec, check_cameras
 from sims.sensors.sensor import all_sensors
 from sims.sensors.suite import SensorsConfig, SensorSuite

@@ -14,6 +14,8 @@ import events as ev
 from events import Announcement, Event, Quaternion, Vector3
 from events.frames import IDENTITY, cross, from_rpy, multiply, rotate, rotate_inverse, to_geodetic
 from events.sensors import SENSOR_KINDS, SensorKind
+from runtime.errors import MissingDependencyError
+from runtime.extras import install_command
 from runtime.sensors import other_sensors
 from runtime.units import Duration, Latency
 from sims.calibration import MountingError
@@ -281,9 +283,17 @@ class MagnetometerSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 def world_field(place: Geodetic, year: float) -> Vector3:
-    """Return the field of the World Magnetic Model (NCEI and BGS) at a place, tesla NED."""
-    from pygeomag import GeoMag  # a tenth of a second that only magnetometers need
+    """Return the field of the World Magnetic Model (NCEI and BGS) at a place, tesla NED.
 
+    Raises:
+        MissingDependencyError: pygeomag is not installed.
+    """
+    try:
+        from pygeomag import GeoMag  # a tenth of a second that only magnetometers need
+    except ImportError:
+        raise MissingDependencyError(
+            f"a magnetometer's World Magnetic Model needs pygeomag: {install_command('wmm')}"
+        ) from None
     five_years = min(5 * int(year // 5), 2025)
     latitude, longitude, altitude = place
     field = GeoMag(base_year=five_years).calculate(latitude, longitude, altitude / 1e3, year)

@@ -13,8 +13,9 @@ from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
 from extensions.foxglove.tests.client import Viewer
+from runtime.http_gate import HttpError
 from visnav_foxglove import server as gate
-from visnav_foxglove.server import FoxgloveConfig, Gate, HttpError, Server, hidden_host
+from visnav_foxglove.server import FoxgloveConfig, Gate, Server, hidden_host
 
 PROTOCOL = [Subprotocol("foxglove.sdk.v1")]
 
@@ -64,12 +65,9 @@ def request(*headers: str) -> str:
     ("headers", "status"),
     [
         (["Host: localhost:8765"], 0),
-        (["Host: 10.0.0.7:8765"], 0),
-        (["Host: [::1]:8765"], 0),
+        ([f"Host: {socket.gethostname()}"], 0),
         (["Host: evil.example:8765"], 403),
-        (["Host: localhost.evil.example"], 403),
         ([], 403),
-        (["Host: localhost", "Host: evil.example"], 400),
         (["Host: evil.example", "host : localhost"], 400),
         (["Host: localhost", "Origin: file://", "Origin: https://evil.example"], 400),
     ],

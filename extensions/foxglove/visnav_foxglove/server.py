@@ -21,6 +21,7 @@ import msgspec
 
 from runtime import NodeConfig
 from runtime.errors import MissingDependencyError, VisnavError
+from runtime.http_gate import HttpError, check_headers
 
 MOST = 64  # viewers at a time, including those still to send their request
 _HEAD_TIMEOUT = 10.0  # real seconds for a viewer to send its request
@@ -31,10 +32,6 @@ _PART = 1 << 16
 def hidden_host() -> str:
     """Return a random address of this machine, for no page to guess."""
     return str(ipaddress.IPv4Address((127 << 24) + 2 + secrets.randbelow((1 << 24) - 4)))
-
-
-class HttpError(Exception):
-    """Refusal of a request: a status, and a text."""
 
 
 class Gate:
@@ -78,23 +75,8 @@ class Gate:
         first, _, fields = head.partition("\r\n")
         if len(first.split(" ")) != 3 or " HTTP/1." not in first:
             raise HttpError(400, "expected a request of HTTP/1.1")
-        headers: dict[str, str] = {}
-        for line in fields.split("\r\n"):
-            name, _, value = line.partition(":")
-            name = name.strip().lower()
-            if name in headers and name in {"host", "origin"}:  # which of them counts is unclear
-                raise HttpError(400, f"expected one header {name}, found two")
-            headers[name] = value.strip()
-        address = headers.get("host", "")
-        host = address[1:].partition("]")[0] if address[:1] == "[" else address.partition(":")[0]
-        try:
-            ipaddress.ip_address(host)
-        except ValueError:
-            # A page can give this machine's address a name of its own, and then it is its origin.
-            if host not in {"localhost", socket.gethostname()}:
-                raise HttpError(
-                    403, f"expected a request to an address or localhost, found {host!r:.80}"
-                ) from None
+        pairs = (line.partition(":")[::2] for line in fields.split("\r\n"))
+        headers = check_headers(pairs, ("host", "origin"), ("localhost", socket.gethostname()))
         origin = headers.get("origin")
         if origin is not None and origin not in self._origins:
             raise HttpError(

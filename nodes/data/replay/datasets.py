@@ -12,11 +12,10 @@ import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-from typing_extensions import TypeVar
 
 from events import (
     CameraAnnouncement,

@@ -1,6 +1,6 @@
 """Visual odometry nodes: RGB-D, feature-based or dense, and stereo.
 
-The dense one is OpenCV's `cv2.Odometry` on all pixels: colour and depth, coarse to fine (F.
+The dense one is OpenCV 5's `cv2.Odometry` on all pixels: colour and depth, coarse to fine (F.
 Steinbrücker, J. Sturm and D. Cremers, "Real-time visual odometry from dense RGB-D images", ICCV
 Workshops 2011), with the point-to-plane distances of depth beside the differences of colour. The
 library gives no certainty: before a plain wall poses are wrong by percents of the path and not
@@ -9,6 +9,7 @@ lost.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import cv2
@@ -135,7 +136,7 @@ class VisualOdometryConfig(EstimatorConfig):
 
     Attributes:
         method: ``features``: corners, followed by optical flow, and their depth; ``dense``: every
-            pixel, by OpenCV's ``cv2.Odometry``, an example that never knows itself lost.
+            pixel, by OpenCV 5's ``cv2.Odometry``, an example that never knows itself lost.
         features: Settings of the method ``features``.
         dense: Settings of the method ``dense``.
     """
@@ -156,6 +157,15 @@ class VisualOdometry(OdometryNode[VisualOdometryConfig]):
     def __init__(self) -> None:
         example = ", an example" if self.config.method == "dense" else ""
         self.method = f"RGB-D odometry ({self.config.method}{example})"
+
+    def check(self) -> Iterable[str]:
+        """Return the errors of every estimator, and one if OpenCV lacks the dense method."""
+        yield from super().check()
+        if self.config.method == "dense" and not hasattr(cv2, "Odometry"):
+            yield (
+                f'method = "dense" needs OpenCV 5, found {cv2.__version__}: '
+                "pip install 'opencv-python-headless>=5'"
+            )
 
     def tracker(self) -> tuple[Any, ...]:
         """Return what makes the tracker of the chosen method."""

@@ -227,10 +227,10 @@ def draw_frames(run: Run) -> list[Plot]:
 def read_image(path: Path) -> npt.NDArray[Any]:
     """Read an image (h, w, 3), red, green, blue; may raise `OSError` or `ValueError`."""
     data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if image is None:
         raise ValueError(f"expected a JPEG or PNG, found {data[:8].tobytes()!r}")
-    return image
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _sheet(run: Run, paths: list[Path]) -> Figure | None:

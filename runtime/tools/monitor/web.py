@@ -23,18 +23,13 @@ import jinja2
 import msgspec
 
 from runtime.errors import CommandError
+from runtime.http_gate import HttpError, check_headers
 from runtime.tools.monitor import protocol
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
 LONGEST_BODY = 64 << 10  # bytes of a command at most
 
-_HOSTS = {"127.0.0.1", "localhost"}
 _ONCE = ("host", "origin", "content-length", TOKEN_HEADER)
-"""Headers to be given only once: with two, the valid host or token would be unclear."""
-
-
-class HttpError(Exception):
-    """Refusal of a request: a status, and a text."""
 
 
 class PageServer(ThreadingHTTPServer):
@@ -102,14 +97,9 @@ class _Handler(BaseHTTPRequestHandler):
                 raise HttpError(404, f"there is no {url.path}")
 
     def _authorize(self, token: str) -> None:
-        """Check a request's token and, against DNS rebinding, its host; or raise `HttpError`."""
-        for name in _ONCE:
-            if len(self.headers.get_all(name, ())) > 1:
-                raise HttpError(400, f"expected one header {name}, found two")
-        host = self.headers.get("host", "").partition(":")[0]
-        if host not in _HOSTS:
-            raise HttpError(403, f"expected a request to 127.0.0.1, found {host!r}")
-        given = self.headers.get(TOKEN_HEADER, "") if self.command == "POST" else token
+        """Check a request's host and token, or raise `HttpError`."""
+        headers = check_headers(self.headers.items(), _ONCE)
+        given = headers.get(TOKEN_HEADER, "") if self.command == "POST" else token
         if not secrets.compare_digest(given.encode(), self.server.token.encode()):
             raise HttpError(403, "expected the address that was printed, token included")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from events.geometry import inverse, pose_matrix
 from nodes.calibration.formats import camera_in_imu, imu_axes, write_files
 from nodes.data.dataset.recording import Rig
 from nodes.kalibr import mounting_of_kalibr, parse_chain, read_chain, transform
+from runtime.errors import MissingDependencyError
 from tests.nodes.calibration.kalibr_files import CHAIN, IMU, IN_IMU
 from tests.nodes.calibration.samples import IMU as ANNOUNCED
 from tests.nodes.calibration.samples import LENSES, camera, stereo
@@ -46,6 +48,13 @@ def test_a_published_chain_is_read(tmp_path: Path) -> None:
     assert (imu.rate, imu.topic) == (200.0, "/imu0")
     assert imu.gyroscope_noise_density == 8e-5
     assert imu.accelerometer_random_walk == 8.6e-5
+
+
+def test_the_library_of_yaml_is_named_if_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    expected = r"chain: Kalibr's YAML needs pyyaml: pip install -e '\.\[kalibr\]'"
+    with pytest.raises(MissingDependencyError, match=expected):
+        parse_chain(CHAIN, "chain")
 
 
 @pytest.mark.parametrize("lens", sorted(set(LENSES) - {"rational", "radtan5"}))

@@ -30,6 +30,7 @@ from sims.cameras.raster import Raster, libraries
 from sims.cameras.spec import camera_info
 from sims.cameras.stage import Drawn, Stage, View
 from sims.worlds import TOURS, WORLDS
+from tests.opencv import drawn_by_5
 from tests.sims.cameras.scenes import fresh
 
 HASHES = Path(__file__).with_name("raster.json")
@@ -472,6 +473,7 @@ def hash_of(name: str, instructions: str, threads: int = 1) -> str:
     return total.hexdigest()
 
 
+@drawn_by_5
 @pytest.mark.parametrize("name", WORLD)
 @pytest.mark.timeout(300)
 def test_the_bytes_are_those_of_every_machine(name: str) -> None:

@@ -7,6 +7,7 @@ The satellite receiver: AirSim's by default, and with the errors that it announc
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 
 from events import Vector3
 from events.frames import from_geodetic, from_rpy, multiply
+from runtime.errors import MissingDependencyError
 from sims.sensors.sensor import (
     Barometer,
     BarometerSpec,
@@ -115,6 +117,16 @@ def test_the_world_model_gives_what_others_compute(
     place: tuple[float, float, float], year: float, nanotesla: tuple[float, float, float]
 ) -> None:
     assert np.multiply(world_field(place, year), 1e9) == pytest.approx(nanotesla, abs=0.1)
+
+
+def test_the_world_model_names_its_library_if_it_is_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """AirSim's field needs none."""
+    monkeypatch.setitem(sys.modules, "pygeomag", None)
+    with pytest.raises(MissingDependencyError, match=r"pygeomag: pip install -e '\.\[wmm\]'"):
+        magnetometer()
+    assert magnetometer(model="airsim").field == dipole_field(ORIGIN)
 
 
 def test_near_seattle_it_points_15_degrees_east_of_north_and_69_down() -> None:

@@ -13,6 +13,7 @@ import pytest
 from sims.worlds import WORLDS, load_world, surfaces
 from sims.worlds.builder import Builder
 from sims.worlds.materials import Canvas, Image
+from tests.opencv import drawn_by_5
 
 SAVED: dict[str, dict[str, str]] = json.loads(
     Path(__file__).with_name("textures.json").read_text(encoding="utf-8")
@@ -47,6 +48,7 @@ def places(model: Any) -> list[Any]:
     "name",
     [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SAVED],
 )
+@drawn_by_5
 def test_neither_pixels_nor_places_have_changed(name: str) -> None:
     """Nor are things elsewhere where nobody sees."""
     model, bare = (load_world(name, bare=bare).compile() for bare in (False, True))

@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
-from typing_extensions import override
 
 from events import CameraAnnouncement, CameraInfo, Image, ImuAnnouncement
 from runtime import Node, Output, Tick, every
+from runtime.typed import override
 from visnav_estimators.orb_slam3.node import OrbSlam3Result, check_arrays
 from visnav_estimators.orb_slam3.settings import Settings
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from events import DepthImage, Event, Image, PoseEstimate, TrackingLost, Vehicle
 from nodes.estimators.monocular_odometry import MonocularOdometry
 from nodes.estimators.visual_odometry import VisualOdometry
 from runtime import Node, Output, Tick, every
+from runtime.errors import RefusedError
 from runtime.testing import run_nodes, spec
 from tests.nodes.estimators.test_estimator import LOOKING_AHEAD, MS, camera, vehicle
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
@@ -101,3 +103,11 @@ def test_shown_nothing_it_says_nothing() -> None:
     seen = camera("drone/front", "grey", "depth", info=INFO)
     result = run_nodes([spec(VisualOdometry, "est")], inputs=[vehicle(), seen], duration=1.0)
     assert (result.reason, result.of(PoseEstimate)) == ("duration", [])
+
+
+def test_a_dense_method_that_opencv_4_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(cv2, "Odometry", raising=False)
+    monkeypatch.setattr(cv2, "__version__", "4.10.0")
+    seen = camera("drone/front", "grey", "depth", info=INFO)
+    with pytest.raises(RefusedError, match=r'"dense" needs OpenCV 5, found 4\.10\.0: pip install'):
+        run_nodes([spec(VisualOdometry, "est", {"method": "dense"})], inputs=[vehicle(), seen])

@@ -14,10 +14,13 @@ from nodes.estimators.images import Floats
 from nodes.estimators.visual_odometry.features import FeatureSettings, FeatureTracker
 from nodes.estimators.visual_odometry.node import DenseSettings, DenseTracker
 from tests.nodes.estimators.visual_odometry.world import INFO, look, pose
+from tests.opencv import needs_dense
 
 Tracker = FeatureTracker | DenseTracker
 Make = Callable[[CameraInfo], Tracker]
-METHODS = pytest.mark.parametrize("make", [FeatureTracker, DenseTracker])
+METHODS = pytest.mark.parametrize(
+    "make", [FeatureTracker, pytest.param(DenseTracker, marks=needs_dense)]
+)
 FRAME = 33_000_000
 
 
@@ -147,6 +150,7 @@ def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
     assert 0.2 < x < 0.5  # the pose goes on as it moved, and ever more slowly
 
 
+@needs_dense
 @pytest.mark.slow
 def test_a_dense_map_at_a_guessed_pose_has_a_number_of_its_own() -> None:
     tracker = DenseTracker(INFO, DenseSettings(reset_timeout=0.0))

@@ -12,7 +12,7 @@ from tests.nodes.viewers.common.samples import decoded
 def test_red_stays_red() -> None:
     data = np.zeros((16, 16, 3), np.uint8)
     data[..., 0] = 220
-    back = decoded(encode_image(data, "jpeg").tobytes(), cv2.IMREAD_COLOR_RGB)
+    back = decoded(encode_image(data, "jpeg").tobytes(), cv2.IMREAD_COLOR)[..., ::-1]
     assert np.abs(back.astype(int) - data).max() < 8
 
 

@@ -148,7 +148,7 @@ def test_images_and_features_are_below_their_camera(tmp_path: Path) -> None:
     shown = record(tmp_path, events, points_max_height=9.0)
     entity = "map/drone/camera"
     ((_, _, (blob,)),) = shown.of(f"{entity}/rgb", "EncodedImage:blob")
-    assert decoded(blob, cv2.IMREAD_COLOR_RGB)[3, 4] == pytest.approx([200, 100, 50], abs=4)
+    assert decoded(blob, cv2.IMREAD_COLOR)[3, 4] == pytest.approx([50, 100, 200], abs=4)
     ((_, _, (blob,)),) = shown.of(f"{entity}/depth", "EncodedDepthImage:blob")
     assert decoded(blob, cv2.IMREAD_UNCHANGED).tolist() == [[200] * 4] * 3
     points = shown.values(f"{entity}/rgb/features/vo", "Points2D:positions")
