@@ -117,8 +117,10 @@ class Process(Estimator[ProcessConfig]):
         self._connected = self._closing = False
         self._pose: npt.NDArray[np.float64] = np.eye(4)
         self._unsent = 0
-        found = (s.config for s in self.siblings(Node) if isinstance(s.config, PublishingConfig))
-        self._bridge = next((each for each in found if hasattr(each, "domain_id")), None)
+        self._why_gone = ""
+        configs = (node.config for node in self.siblings(Node))
+        publishers = (config for config in configs if isinstance(config, PublishingConfig))
+        self._bridge = next((config for config in publishers if hasattr(config, "domain_id")), None)
         folder = None if self.out is None else self.out / "programs" / self.name
         self._show = Throttle(lambda line: self.log.info("%s", line))
         self._launch = Launch(config, self._bridge if config.feed == "ros2" else None, folder)
@@ -267,20 +269,19 @@ class Process(Estimator[ProcessConfig]):
         self._hold: Hold[LinkAnswer] = self.hold(self.name, config.hold, config.latency)
         real = self.clock.kind == "real"
         slots = math.ceil(config.latency * cameras[0].rate) + 2 if cameras else _SLOTS
-        self._room = slots if real else math.inf
-        if config.hold.on_missing == "continue" and not real:
-            self._room = slots + _BEYOND
+        goes_on = config.hold.on_missing == "continue"
         pixels = sum(camera.info.height * camera.info.width for camera in cameras)
         described = [(c, kinds) for c in cameras], self._inputs.chosen, {"kind": self.clock.kind}
         return Feed(
             self._launch.socket,
             describe(*described, config.outputs),
             self._hold,
-            self._story,
             self._processes,
-            skips=config.hold.skips == "allowed" or real,
+            waits=not real,
+            room=slots if real else _BEYOND if goes_on else math.inf,
             slots=slots,
             slot_bytes=pixels * sum(KINDS[kind][1] for kind in config.images),
+            gone=self._disconnected,
             logged=self._show.take,
             orders=config.pilot,
         )
@@ -324,7 +325,7 @@ class Process(Estimator[ProcessConfig]):
         """Send a frame, with what came since the last, and await the answer."""
         assert self._feed is not None
         owed = self._hold.owe(stamp)
-        if not self._hold.expects or len(self._feed.unanswered) >= self._room:
+        if not self._hold.expects or self._feed.full:
             self._unsent += 1
             return
         self._feed.send(stamp, exposure, self._inputs.drain())
@@ -381,10 +382,8 @@ class Process(Estimator[ProcessConfig]):
 
     async def on_shutdown(self) -> None:
         """Close the connection, and end the program if still running."""
-        if self._unsent:
-            self.log.warning(
-                "%d frames were not sent: the program was gone or had no room", self._unsent
-            )
+        if unsent := self._unsent + (self._feed.left_out if self._feed else 0):
+            self.log.warning("%d frames were not sent: the program was gone or had no room", unsent)
         if missed := sum(self._matcher.missed.values()) if self._slots else 0:
             self.log.warning("%d exposures lacked an image", missed)
         if dropped := self._inputs.dropped:
@@ -407,13 +406,18 @@ class Process(Estimator[ProcessConfig]):
     def _processes(self) -> list[int]:
         return [] if self._program is None else self._program.processes()
 
+    def _disconnected(self, why: str) -> None:
+        """Report the end of the program's connection."""
+        self._why_gone = why
+        self._hold.gone(self._story(why))
+
     def _note_end(self, story: str) -> None:
         """Report the program's end before the run's."""
         if self._closing:  # as it was told
             return
         story = f"{self.config.command[0]} {story}"
         if self._feed is not None:
-            self._hold.gone("; ".join(filter(None, [self._feed.why_gone, story])))
+            self._hold.gone("; ".join(filter(None, [self._why_gone, story])))
             if not self._connected:
                 self._feed.close()
         elif self._ends_the_run():

@@ -53,6 +53,7 @@ from nodes.outside.native import Endpoint, LinkAnswer, LinkError
 from nodes.outside.native.client import RECORDS
 from runtime.channels.hold import Hold
 from runtime.errors import suggest
+from runtime.time.clock import SECOND
 from runtime.workers.output import Output, how_it_ended
 
 _AT_ONCE = 1 << 16  # bytes of a single read
@@ -211,9 +212,8 @@ class Feed:
 
     Args:
         description: What the program is told; see `nodes.outside.native.describe`.
-        story: Called in a thread with why it is gone; returns what else is known.
         processes: Returns the numbers of the program's processes, whose costs are measured.
-        options: Of the `Endpoint`: `slots`, `slot_bytes`, `logged`, `orders`.
+        options: Of the `Endpoint`: `slots`, `slot_bytes`, `gone`, `logged`, `orders`.
     """
 
     def __init__(
@@ -221,32 +221,34 @@ class Feed:
         path: Path,
         description: Mapping[str, Any],
         hold: Hold[LinkAnswer],
-        story: Callable[[str], str],
         processes: Callable[[], Sequence[int]],
         *,
-        skips: bool,  # whether an answer says that none will come for the frames before it
+        waits: bool,  # whether frames wait for a free slot, or are left out
+        room: float,  # frames waiting to be sent, at most
         **options: Any,
     ) -> None:
-        self.unanswered: dict[int, int] = {}
-        """Stamps of frames sent or about to be, with the real times of sending (ns)."""
-        self.why_gone = ""
-        self._hold, self._story, self._skips, self._processes = hold, story, skips, processes
+        self.left_out = 0  # number of frames without a free slot, or without a program
+        self._hold, self._processes, self._waits, self._room = hold, processes, waits, room
         self._initialised = self._closed = False
-        self._names = [each["name"] for each in description["inputs"]]
+        self._names = [row["name"] for row in description["inputs"]]
         self._outbox: queue.SimpleQueue[tuple[int, Exposure, Sequence[Message]] | None] = (
             queue.SimpleQueue()
         )
         self._endpoint = Endpoint(
-            path, description, answered=self._take, gone=self._lose, skips=skips, **options
+            path, description, answered=self._answer, ready=hold.back, **options
         )
         self._endpoint.listen()
         self.connect = self._endpoint.wait
         self._sender = threading.Thread(target=self._send_all, name=f"feed {path}", daemon=True)
         self._sender.start()
 
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for a frame."""
+        return self._outbox.qsize() >= self._room
+
     def send(self, stamp: int, exposure: Exposure, inputs: Sequence[Message]) -> None:
         """Have inputs sent, and then a frame of a stamp (ns); returns at once."""
-        self.unanswered[stamp] = time.monotonic_ns()
         self._outbox.put((stamp, exposure, inputs))
 
     def close(self) -> None:
@@ -261,39 +263,28 @@ class Feed:
             stamp, exposure, inputs = due
             images = [(camera, kind, _pixels(kind, event)) for camera, kind, event in exposure]
             try:
-                for each in inputs:
-                    if self._endpoint.send_input(*each):
-                        self._hold.sent(self._names[each.number], each.rows.tobytes())
-                if self._endpoint.send_frame(stamp, images):
-                    self._hold.sent("frames", stamp.to_bytes(8, "little", signed=True))
-                    for camera, kind, image in images:
-                        self._hold.sent(f"{kind} {camera}", image.data)
+                for message in inputs:
+                    if self._endpoint.send_input(*message):
+                        self._hold.sent(self._names[message.number], message.rows.tobytes())
+                if not self._endpoint.send_frame(stamp, images, self._waits):
+                    self.left_out += 1
+                    continue
+                self._hold.sent("frames", stamp.to_bytes(8, "little", signed=True))
+                for camera, kind, image in images:
+                    self._hold.sent(f"{kind} {camera}", image.data)
             except ValueError as error:  # an image is not as announced
                 self._hold.fail(LinkError(str(error)))
 
-    def _take(self, answer: LinkAnswer) -> None:
-        if sent := self.unanswered.get(answer.stamp):
-            costs = self._hold.answers.costs
-            costs.measure(time.monotonic_ns() - sent, self._processes())
-        earlier = [stamp for stamp in list(self.unanswered) if stamp < answer.stamp]
-        for stamp in (*(earlier if self._skips else ()), answer.stamp):
-            self.unanswered.pop(stamp, None)
+    def _answer(self, answer: LinkAnswer) -> None:
+        if (seconds := self._hold.waited(answer.stamp)) is not None:
+            self._hold.answers.costs.measure(round(seconds * SECOND), self._processes())
+        if self._hold.skips:
+            self._endpoint.release(answer.stamp)
         self._initialised = self._initialised or answer.pose is not None
         useful = answer.pose is not None or bool(answer.before)
         useful = useful or (answer.status == "lost" and self._initialised)
         says = answer.status if answer.status in ("initialising", "lost") else ""
         self._hold.answer(answer.stamp, answer if useful else None, says)
-
-    def _lose(self, why: str) -> None:
-        """Report the loss of the program, and wait for another in its place."""
-        self.why_gone = why
-        self._hold.gone(self._story(why))
-        while not self._closed:
-            with contextlib.suppress(LinkError):
-                self._endpoint.wait(1.0)
-                self.unanswered.clear()
-                self._hold.back()
-                return
 
 
 def _pixels(kind: str, event: Image | DepthImage) -> npt.NDArray[Any]:

@@ -162,16 +162,22 @@ def test_a_frame_waits_for_a_slot_and_answers_may_come_in_any_order(run: Noted) 
         assert not run.endpoint.send_frame(15, images(), wait=False)
 
 
-def test_with_skips_an_answer_frees_what_was_before_it(tmp_path: Path) -> None:
-    with listening(tmp_path / "s", slots=3, skips=True) as run, program(run.path) as raw:
+def test_what_was_skipped_frees_its_slots_and_nothing_else_does(tmp_path: Path) -> None:
+    with listening(tmp_path / "s", slots=3) as run, program(run.path) as raw:
         raw.get_ready()
         run.endpoint.wait(LIMIT)
         for stamp in range(3):
             assert run.endpoint.send_frame(stamp, images())
-        raw.send(33, done(2, 2))
-        assert run.answer().stamp == 2
-        for stamp in range(3, 6):
-            assert run.endpoint.send_frame(stamp, images(), wait=False)
+        raw.send(33, done(1, 1))
+        assert run.answer().stamp == 1
+        assert run.endpoint.send_frame(3, images(), wait=False)
+        assert not run.endpoint.send_frame(4, images(), wait=False)
+        run.endpoint.release(1)
+        assert run.endpoint.send_frame(4, images(), wait=False)
+        assert not run.endpoint.send_frame(5, images(), wait=False)  # 2, 3 and 4 are out
+        raw.send(33, done(0, 0))  # skipped, and answered after all
+        assert run.answer().stamp == 0
+        assert not run.endpoint.send_frame(5, images(), wait=False)
 
 
 @pytest.mark.parametrize("how", ["killed", "close"])
