@@ -109,7 +109,7 @@ class Process(Estimator[ProcessConfig]):
         self._named: dict[str, CameraAnnouncement] = {}
         self._imus: list[ImuAnnouncement] = []
         self._inputs = Inputs((*dict.fromkeys((*config.reads, *filter(None, [config.asks]))),))
-        self._asked = self._last = -1
+        self._asked = -1
         self._further: dict[int, Mount] = {}
         self._slots: dict[tuple[str, type], Slot] = {}
         self._feed: Feed | None = None
@@ -159,18 +159,18 @@ class Process(Estimator[ProcessConfig]):
         if config.feed == "ros2":
             return
         reads = (*sorted(self.needs), *config.reads)
-        for each in super().announce():
-            own = msgspec.structs.replace(each, reads=reads, vehicle=config.vehicle)
-            yield own
+        for announced in super().announce():
+            completed = msgspec.structs.replace(announced, reads=reads, vehicle=config.vehicle)
+            yield completed
             for name in config.outputs:
-                yield msgspec.structs.replace(own, source=f"{self.name}/{name}")
+                yield msgspec.structs.replace(completed, source=f"{self.name}/{name}")
         if config.pilot:
             yield PilotAnnouncement(stamp=0, source=self.name, vehicle=config.vehicle)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Choose the cameras, and note the other sensors."""
+        """Choose the cameras, and record the other sensors."""
         if announcement.source.partition("/")[0] != self.name:
-            self._inputs.announced(announcement)
+            self._inputs.record(announcement)
         if isinstance(announcement, ImuAnnouncement):
             self._imus.append(announcement)
         if not self.config.images:
@@ -226,15 +226,15 @@ class Process(Estimator[ProcessConfig]):
         self._loop = asyncio.get_running_loop()
         self._end: asyncio.Future[str] = self._loop.create_future()
         rig = self._rig()
-        for each in left_out(rig, config.calibration) if rig is not None else ():
-            self.log.warning("calibration: %s", each)
+        for sensor in left_out(rig, config.calibration) if rig is not None else ():
+            self.log.warning("calibration: %s", sensor)
         for path, text in launch.texts(self._known(), rig).items():
             path.parent.mkdir(parents=True, exist_ok=True)
             await self.offload(path.write_text, text, "utf-8")
         if config.feed == "link":
             self._feed = self._make_feed()
         if config.command:
-            start = self.offload(launch.start, config.command, self._show, self._note_end)
+            start = self.offload(launch.start, config.command, self._show, self._on_end)
             self._program = await start
         else:
             self.log.warning("start the program with VISNAV_SOCKET=%s", launch.socket)
@@ -295,19 +295,18 @@ class Process(Estimator[ProcessConfig]):
 
     @on(Imu)
     def imu(self, event: Imu) -> None:
-        """Keep the samples of the IMU until the next frame."""
+        """Store the samples of the IMU until the next frame."""
         self.measurements(event)
 
     @on(FluidPressure, MagneticField, NavSatFix, Range, LidarScan, PoseEstimate, TrackingLost)
     def measurements(self, event: Event) -> None:
-        """Keep an input until the next frame; ask for an answer, if it is the one that asks."""
-        name = self._inputs.take(event, self.clock.now())
+        """Store an input until the next frame; ask for an answer, if it is the one that asks."""
+        name = self._inputs.store(event, self.clock.now())
         if not name or name != self.config.asks or self._feed is None:
             return
         self._asked += 1
-        if self._asked % self.config.every == 0 and self.exposed_at(event) > self._last:
-            self._last = self.exposed_at(event)
-            self._ask(event, self._last, ())
+        if self._asked % self.config.every == 0 and self.exposed_at(event) > self._hold.newest:
+            self._ask(event, self.exposed_at(event), ())
 
     @on(Image, DepthImage)
     def frames(self, event: Image | DepthImage) -> None:
@@ -336,18 +335,18 @@ class Process(Estimator[ProcessConfig]):
         answer = await owed
         if answer is None:
             return
-        for each in answer.before:
-            if isinstance(each, LinkOrder):
-                self._order(each)
-            elif each.pose is not None:
-                self._publish_further(event, each, each.pose)
+        for message in answer.before:
+            if isinstance(message, LinkOrder):
+                self._order(message)
+            elif message.pose is not None:
+                self._publish_further(event, message, message.pose)
         if answer.status == "done":
             return
         lost = answer.pose is None
         self._pose = self._pose if answer.pose is None else answer.pose
         reason = "the program says so" if lost else ""
-        found = answer.points, answer.inliers, answer.velocity, answer.covariance
-        self.send_result(event, TrackingResult(self._pose, lost, reason, *found))
+        fields = answer.points, answer.inliers, answer.velocity, answer.covariance
+        self.send_result(event, TrackingResult(self._pose, lost, reason, *fields))
 
     def _publish_further(
         self, event: Event, answer: LinkAnswer, pose: npt.NDArray[np.float64]
@@ -411,9 +410,9 @@ class Process(Estimator[ProcessConfig]):
         self._why_gone = why
         self._hold.gone(self._story(why))
 
-    def _note_end(self, story: str) -> None:
+    def _on_end(self, story: str) -> None:
         """Report the program's end before the run's."""
-        if self._closing:  # as it was told
+        if self._closing:  # as was asked for
             return
         story = f"{self.config.command[0]} {story}"
         if self._feed is not None:
@@ -427,8 +426,9 @@ class Process(Estimator[ProcessConfig]):
             self.log.warning("%s", story)
 
     def _ends_the_run(self) -> bool:
-        """Tell whether the bridge depends on the program's answers."""
-        held = [each.hold for each in getattr(self._bridge, "subscriptions", ()) if each.answers_to]
+        """Return whether the bridge depends on the program's answers."""
+        subscriptions = getattr(self._bridge, "subscriptions", ())
+        held = [topic.hold for topic in subscriptions if topic.answers_to]
         return not held or any(hold.on_missing == "error" for hold in held)
 
     def _story(self, why: str) -> str:
@@ -450,9 +450,10 @@ class Process(Estimator[ProcessConfig]):
         """Return the sensor of the pose: the camera, or the body itself."""
         if self.config.images:
             return super()._sensor()
-        of = next(each for name, _, each in self._inputs.chosen if name == self.config.asks)
+        asks = self.config.asks
+        of = next(announced for name, _, announced in self._inputs.chosen if name == asks)
         body = of.source.rpartition("/")[0] or self.config.vehicle
-        body = body or next((each.source for each in self._vehicles), self.name)
+        body = body or next((vehicle.source for vehicle in self._vehicles), self.name)
         frame = getattr(of, "parent_frame_id", "base_link")
         rate = getattr(of, "rate", 0.0)
         return SensorAnnouncement(stamp=0, source=f"{body}/", rate=rate, parent_frame_id=frame)
@@ -473,12 +474,12 @@ class Process(Estimator[ProcessConfig]):
         """Return the variables of the templates."""
 
         def topic(kind: TopicKind, source: str) -> str:
-            found = publication(kind, source, self._bridge or PublishingConfig())
-            return "" if found is None else found.name
+            topic = publication(kind, source, self._bridge or PublishingConfig())
+            return "" if topic is None else topic.name
 
         rig = self._rig()
-        vehicles = (each for each in self._vehicles if rig and each.source == rig.body)
-        own = {
+        vehicles = (vehicle for vehicle in self._vehicles if rig and vehicle.source == rig.body)
+        of_the_run = {
             "vehicle": next(vehicles, None),
             "topic": topic,
             "folder": str(self._launch.folder),
@@ -489,7 +490,7 @@ class Process(Estimator[ProcessConfig]):
             "imu": None,
             "stereo": False,
             **(variables(rig, topics=self.config.feed == "ros2") if rig else {}),
-            **own,
+            **of_the_run,
         }
 
 

@@ -120,12 +120,12 @@ class Program:
 
     def processes(self) -> list[int]:
         """Return the process IDs of the program and of its running descendants."""
-        found = [self._guard.pid]
-        for pid in found:
+        pids = [self._guard.pid]
+        for pid in pids:
             for thread in Path(f"/proc/{pid}/task").glob("*/children"):
                 with contextlib.suppress(OSError):
-                    found += map(int, thread.read_text("ascii").split())
-        return found[1:]
+                    pids += map(int, thread.read_text("ascii").split())
+        return pids[1:]
 
     def story(self) -> str:
         """Return how the program ended, or "still runs", and its last output."""
@@ -151,16 +151,16 @@ class Program:
         news = select.poll()
         news.register(output, select.POLLIN)
         news.register(control, select.POLLIN)
-        told, more = b"", b"\0"
+        exit_code, more = b"", b"\0"
         while more:
             ready = {number for number, _ in news.poll()}
             if output in ready and not self._read(output):
                 news.unregister(output)
             if control in ready:
                 more = self._control.recv(_AT_ONCE)
-                told += more
-                if not self._over.is_set() and (told.endswith(b"\n") or not more):
-                    self._note_end(output, told.decode().strip())
+                exit_code += more
+                if not self._over.is_set() and (exit_code.endswith(b"\n") or not more):
+                    self._report_end(output, exit_code.decode().strip())
         os.close(output)
         self._guard.wait()
         self._control.close()
@@ -173,15 +173,15 @@ class Program:
         self._output.take(data)
         return bool(data)
 
-    def _note_end(self, output: int, told: str) -> None:
+    def _report_end(self, output: int, exit_code: str) -> None:
         """Report the program's end, after its last output is read."""
         rest, until = select.poll(), time.monotonic() + _REST
         rest.register(output, select.POLLIN)
         while rest.poll(0) and time.monotonic() < until and self._read(output):
             pass
         with contextlib.suppress(ValueError):
-            self.code = int(told)
-        self._how = (told or "killed") if self.code is None else how_it_ended(self.code)
+            self.code = int(exit_code)
+        self._how = (exit_code or "killed") if self.code is None else how_it_ended(self.code)
         self._over.set()
         if not self._closing:
             self._ended(self.story())
@@ -208,10 +208,10 @@ Exposure = Sequence[tuple[int, str, Image | DepthImage]]
 
 
 class Feed:
-    """Sends exposures and measurements to a program, and takes its answers.
+    """Sends exposures and measurements to a program, and its answers to the hold.
 
     Args:
-        description: What the program is told; see `nodes.outside.native.describe`.
+        description: Sent to the program; see `nodes.outside.native.describe`.
         processes: Returns the numbers of the program's processes, whose costs are measured.
         options: Of the `Endpoint`: `slots`, `slot_bytes`, `gone`, `logged`, `orders`.
     """
@@ -368,8 +368,8 @@ class Inputs:
         self._bytes = 0
         self._frames: dict[str, list[str]] = {}  # of each estimator, in the order of their use
 
-    def announced(self, announcement: Announcement) -> None:
-        """Note a sensor or an estimator."""
+    def record(self, announcement: Announcement) -> None:
+        """Record a sensor or an estimator that may be chosen."""
         kinds = [sensor.announced for sensor in SENSORS.values()]
         if isinstance(announcement, (EstimatorAnnouncement, *kinds)):
             self._announced.append(announcement)
@@ -382,33 +382,33 @@ class Inputs:
         """Choose among what was announced, and yield an error for each that is missing."""
         self.chosen = []
         for name in self._names:
-            found = self._find(name, body)
-            if found is None:
-                sources = [each.source for each in self._announced]
+            sensor = self._find(name, body)
+            if sensor is None:
+                sources = [announced.source for announced in self._announced]
                 known = f"found {', '.join(sources) or 'none'}{suggest(name, sources)}"
                 yield f"reads: expected a sensor or an estimator called {name}, {known}"
-            elif (other := next((n for n, _, each in self.chosen if each is found), "")) != "":
-                yield f"reads: expected each once, found {found.source} as {other} and as {name}"
+            elif other := next((n for n, _, chosen in self.chosen if chosen is sensor), ""):
+                yield f"reads: expected each once, found {sensor.source} as {other} and as {name}"
             else:
-                self.chosen.append((name, _kind(found), found))
-                body = body or found.source.rpartition("/")[0]
+                self.chosen.append((name, _kind(sensor), sensor))
+                body = body or sensor.source.rpartition("/")[0]
         if imu is not None and all(kind != "imu" for _, kind, _ in self.chosen):
             self.chosen.insert(0, ("imu", "imu", imu))
-        self._numbers = {each.source: number for number, (*_, each) in enumerate(self.chosen)}
+        self._numbers = {chosen.source: number for number, (*_, chosen) in enumerate(self.chosen)}
 
     def _find(self, name: str, body: str) -> Announcement | None:
         sensor = SENSORS.get(name)
-        for each in self._announced:
-            estimator = isinstance(each, EstimatorAnnouncement)
-            if sensor is not None and isinstance(each, sensor.announced):
-                if body in ("", each.source.rpartition("/")[0]):
-                    return each
-            elif each.source == name or (not estimator and each.source.endswith(f"/{name}")):
-                return each
+        for announced in self._announced:
+            source, estimator = announced.source, isinstance(announced, EstimatorAnnouncement)
+            if sensor is not None and isinstance(announced, sensor.announced):
+                if body in ("", source.rpartition("/")[0]):
+                    return announced
+            elif source == name or (not estimator and source.endswith(f"/{name}")):
+                return announced
         return None
 
-    def take(self, event: Event, now: int) -> str:
-        """Keep an event until the next frame; return the name of its input, if that is news."""
+    def store(self, event: Event, now: int) -> str:
+        """Store an event until the next frame; return the name of its input, if that is news."""
         number = self._numbers.get(event.source)
         rows = None if number is None else self._rows(event, self.chosen[number][1])
         if number is None or rows is None:
@@ -422,16 +422,16 @@ class Inputs:
 
     def drain(self) -> list[Message]:
         """Return what has come since, in the order of arrival; rows of an input in one message."""
-        found = []
-        for number, together in itertools.groupby(self._waiting, lambda each: each.number):
+        rows_of_inputs = []
+        for number, together in itertools.groupby(self._waiting, lambda message: message.number):
             messages = [*together]
             scans = self.chosen[number][1] == "lidar_scan"
-            for some in [[each] for each in messages] if scans else [messages]:
-                rows = np.concatenate([each.rows for each in some])
-                found.append(Message(number, some[-1].arrived, rows))
+            for some in [[message] for message in messages] if scans else [messages]:
+                rows = np.concatenate([message.rows for message in some])
+                rows_of_inputs.append(Message(number, some[-1].arrived, rows))
         self._waiting.clear()
         self._bytes = 0
-        return found
+        return rows_of_inputs
 
     def _rows(self, event: Event, kind: str) -> npt.NDArray[Any] | None:
         """Return an event as rows of a kind; `None` if it is another's."""
@@ -462,5 +462,5 @@ class Inputs:
 
 
 def _kind(announced: Announcement) -> str:
-    found = (sensor.kind for sensor in SENSORS.values() if isinstance(announced, sensor.announced))
-    return next(found, "pose_estimate")
+    kinds = (sensor.kind for sensor in SENSORS.values() if isinstance(announced, sensor.announced))
+    return next(kinds, "pose_estimate")
