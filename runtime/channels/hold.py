@@ -285,11 +285,12 @@ class Hold(Generic[T]):
             self._lose_all()
 
     def back(self) -> None:
-        """Report the system as back; the system may initialise anew."""
+        """Report the system as back, if it was gone; the system may initialise anew."""
         with self._lock:
-            if self._gone:
-                self._log(f"{self.name}: it is there again")
-                self._not_reproducible("when it came back was up to real time")
+            if not self._gone:
+                return
+            self._log(f"{self.name}: it is there again")
+            self._not_reproducible("when it came back was up to real time")
             self._gone, self._let_go, self._in_a_row = "", False, 0
             self._began = self._heard = None
 

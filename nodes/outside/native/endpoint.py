@@ -288,14 +288,13 @@ class Endpoint:
         with self._listener, self._selector:
             self._selector.register(self._listener, selectors.EVENT_READ)
             while self._selector.get_map():
-                nameless = [program for program in self._programs if not program.name]
-                for key, _ in self._selector.select(_LOOK if nameless else None):
+                for key, _ in self._selector.select(_LOOK):
                     if key.data is None:
                         self._accept(self._listener)
                     else:
                         self._serve(key.data)
-                for program in nameless:
-                    if not (program.name or program.gone) and time.monotonic() > program.greeted_by:
+                for program in [program for program in self._programs if not program.name]:
+                    if time.monotonic() > program.greeted_by:
                         self._drop(program, "its connection has ended")
 
     def _accept(self, listener: socket.socket) -> None:

@@ -136,8 +136,8 @@ class HeldEstimator:
 
     def _miss(self) -> None:
         if not self._there:
-            self._gone = True
             self.hold.gone(f"nobody publishes {self._topics[0].topic.name} any more")
+            self._gone = True  # not before: `owe` reports it as back
 
 
 def held_estimators(

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from events.geometry import inverse, pose_matrix
-from nodes.outside.native import LinkError
+from nodes.outside.native import LinkError, endpoint
 from nodes.outside.native.client import RECORDS, Frame, Link
 from tests.nodes.outside.native.samples_link import (
     CAMERA,
@@ -112,6 +112,35 @@ def test_a_second_program_is_refused_and_the_first_goes_on(run: Noted) -> None:
         first.send(33, done(0, 5))
         assert run.answer().stamp == 5
     assert run.reason() == "raw: its connection has ended"
+
+
+def test_one_that_is_slow_to_speak_holds_nobody_up(run: Noted) -> None:
+    """Of all who connect, each byte may come by itself."""
+    with program(run.path) as first, program(run.path) as other:
+        first.get_ready()
+        run.endpoint.wait(LIMIT)
+        assert run.endpoint.send_frame(5, images())
+        hello = struct.pack("<II", 20, 1) + b"VISNAVLK" + struct.pack("<II", 2, 0) + b"slow"
+        answer = struct.pack("<II", 16, 33) + done(0, 5)
+        for n in range(max(len(hello), len(answer))):
+            other.socket.sendall(hello[n : n + 1])
+            first.socket.sendall(answer[n : n + 1])
+        assert run.answer().stamp == 5
+        assert other.receive() == (
+            3,
+            b"VISNAVLK" + struct.pack("<II", 2, 0) + b"expected one program, found raw connected",
+        )
+
+
+def test_one_that_never_greets_is_disconnected(run: Noted, monkeypatch: pytest.MonkeyPatch) -> None:
+    with program(run.path) as first:
+        first.get_ready()
+        run.endpoint.wait(LIMIT)
+        monkeypatch.setattr(endpoint, "GREETING_TIME", 0.0)
+        monkeypatch.setattr(endpoint, "_LOOK", 0.01)
+        with program(run.path) as silent:
+            assert silent.receive() == (5, b"its connection has ended")
+        assert run.endpoint.send_frame(5, images())
 
 
 def test_a_socket_that_a_dead_run_left_is_replaced(tmp_path: Path) -> None:
