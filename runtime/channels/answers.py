@@ -110,12 +110,12 @@ class Answers:
         with self._lock:
             self.counts[kind] += 1
 
-    def got(self, count: int = 1) -> None:
+    def count_received(self, count: int = 1) -> None:
         """Count frames confirmed by the system as received."""
         with self._lock:
             self.received = (self.received or 0) + count
 
-    def took_in(self, stream: str, data: Buffer) -> None:
+    def record_input(self, stream: str, data: Buffer) -> None:
         """Add data sent to the system to the digest of its inputs.
 
         Args:

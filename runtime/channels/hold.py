@@ -170,9 +170,9 @@ class Hold(Generic[T]):
         self._settled: dict[int, Settled] = {}  # by stamp
         self._last: tuple[int, int] | None = None  # stamp and due of the newest frame
         self._began: tuple[int, float] | None = None  # stamp and real time of the first frame
-        self._heard: float | None = None  # when it last answered anything
+        self._last_answer: float | None = None  # real time of it, or of the last lost frame
         self._in_a_row = 0
-        self._let_go = False
+        self._released = False  # whether time runs on without answers
         self._gone = ""
         self._error: Exception | None = None
         self._thread: threading.Thread | None = None
@@ -211,7 +211,7 @@ class Hold(Generic[T]):
             self._owed[stamp] = owed
             if not self.expects:
                 self._settle(owed, "lost")
-            elif self._let_go:
+            elif self._released:
                 self._release(owed)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._watch, name=self.name, daemon=True)
@@ -221,7 +221,7 @@ class Hold(Generic[T]):
     @property
     def expects(self) -> bool:
         """Whether answers are expected; if not, frames are lost and need no sending."""
-        return not (self._gone or (self._let_go and self.config.on_missing == "lost"))
+        return not (self._gone or (self._released and self.config.on_missing == "lost"))
 
     # In any thread.
 
@@ -232,12 +232,12 @@ class Hold(Generic[T]):
             return None if owed is None else self._wall() - owed.since
 
     def sent(self, stream: str, data: Buffer) -> None:
-        """Add data sent to the system to the digest of its inputs; see `Answers.took_in`."""
-        self.answers.took_in(stream, data)
+        """Add data sent to the system to the digest of its inputs; see `Answers.record_input`."""
+        self.answers.record_input(stream, data)
 
     def received(self, count: int = 1) -> None:
         """Count frames confirmed by the system as received."""
-        self.answers.got(count)
+        self.answers.count_received(count)
 
     def answer(
         self, stamp: int, value: T | None, says: Literal["", "initialising", "lost"] = ""
@@ -265,9 +265,9 @@ class Hold(Generic[T]):
                 if says == "initialising":
                     outcome, value = "initialising", None
                 self._settle(owed, outcome, value, now - owed.since, digest, says == "lost")
-            if self._let_go:
+            if self._released:
                 self._log(f"{self.name}: it answers again")
-            self._heard, self._let_go, self._in_a_row = now, False, 0
+            self._last_answer, self._released, self._in_a_row = now, False, 0
 
     def gone(self, why: str) -> None:
         """Report the loss of the system, effective at once."""
@@ -291,8 +291,8 @@ class Hold(Generic[T]):
                 return
             self._log(f"{self.name}: it is there again")
             self._not_reproducible("when it came back was up to real time")
-            self._gone, self._let_go, self._in_a_row = "", False, 0
-            self._began = self._heard = None
+            self._gone, self._released, self._in_a_row = "", False, 0
+            self._began = self._last_answer = None
 
     def fail(self, error: Exception) -> None:
         """Raise an error in whoever waits for an answer, and with the next frame."""
@@ -324,7 +324,7 @@ class Hold(Generic[T]):
                     if now < self._real_time(oldest) + BEHIND:
                         return
                     self._settle(oldest, "initialising")
-                elif now < max(oldest.since, self._heard or 0.0) + self.config.max_wait:
+                elif now < max(oldest.since, self._last_answer or 0.0) + self.config.max_wait:
                     return
                 else:
                     self._give_up(oldest)
@@ -332,7 +332,7 @@ class Hold(Generic[T]):
     # With the lock.
 
     def _initialising(self, stamp: int) -> bool:
-        if self._heard is not None or self._began is None:
+        if self._last_answer is not None or self._began is None:
             return False
         return stamp - self._began[0] < self.config.initialise * SECOND
 
@@ -386,7 +386,7 @@ class Hold(Generic[T]):
             self._fail(MissingAnswerError(f"{self.name}: {missing} ({self._story()})"))
             return
         if self.config.on_missing == "continue":
-            self._let_go = True
+            self._released = True
             self._log(f"{self.name}: {missing}; the run goes on without")
             self._not_reproducible("the run went on without an answer")
             for frame in self._owed.values():
@@ -395,11 +395,11 @@ class Hold(Generic[T]):
             return
         self._log(f"{self.name}: {missing}: the frame is lost")
         self._not_reproducible(f"frames were lost after {self.config.max_wait:g} s of real time")
-        self._heard = self._wall()
+        self._last_answer = self._wall()
         self._in_a_row += 1
         self._settle(owed, "lost")
         if self._in_a_row >= IN_A_ROW:
-            self._let_go = True
+            self._released = True
             self._log(
                 f"{self.name}: {IN_A_ROW} frames in a row are lost: it is not waited for again "
                 "before it answers"

@@ -342,7 +342,7 @@ class Endpoint:
             self._gone(f"{program.name}: {why}")
 
     def _greet(self, program: _Program, kind: int, body: bytearray) -> None:
-        """Take the program that says HELLO if there is no other, and send WELCOME."""
+        """Accept the program that says HELLO if there is no other, and send WELCOME."""
         magic, version, _ = wire.GREETING.unpack_from(body.ljust(wire.GREETING.size, b"\0"))
         if kind != wire.HELLO or magic != wire.MAGIC:
             raise LinkError(f"expected HELLO with {wire.MAGIC!r}, found type {kind} with {magic!r}")
@@ -377,13 +377,15 @@ class Endpoint:
                 self._changed.notify_all()
             self._on_ready()
         elif kind in READERS and program.poses:
-            self._take(program, program.poses, READERS[kind](body))
+            self._record(program, program.poses, READERS[kind](body))
         else:
             expected = "READY once, POSE, DONE, ORDER, LOG or BYE"
             raise LinkError(f"expected {expected}, found type {kind}")
 
-    def _take(self, program: _Program, poses: CameraPoses, message: LinkAnswer | LinkOrder) -> None:
-        """Return an answer with what came before it, and free the slot of its frame."""
+    def _record(
+        self, program: _Program, poses: CameraPoses, message: LinkAnswer | LinkOrder
+    ) -> None:
+        """Report an answer with what came before it, and free the slot of its frame."""
         if isinstance(message, LinkAnswer):
             if (output := message.output) > self._outputs:
                 raise LinkError(f"POSE.output: expected at most {self._outputs}, found {output}")

@@ -85,7 +85,7 @@ class Process(Estimator[ProcessConfig]):
     """
 
     starts_programs = True
-    lenses = frozenset(COEFFICIENTS)  # the program is told the model
+    lenses = frozenset(COEFFICIENTS)  # the model is in the description
 
     setpoints = Output(Setpoint, when="pilot")
     commands = Output(Command, when="pilot")
