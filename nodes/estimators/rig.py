@@ -23,7 +23,7 @@ from events import (
     TrajectoryEstimate,
     VehicleAnnouncement,
 )
-from events.geometry import pose_matrix, pose_tuples
+from events.geometry import cross_matrix, moved_covariance, pose_matrix, pose_tuples
 from runtime.errors import suggest
 
 
@@ -353,11 +353,9 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
         covariance: tuple[float, ...] = ()
         if result.covariance is not None:
             # A rotation about the camera moves the body, which is not there.
-            moved = np.eye(6)
-            moved[:3, :3] = moved[3:, 3:] = turn
             lever = body[:3, 3] - (body @ self.camera)[:3, 3]
-            moved[:3, 3:] = -cross(lever) @ turn
-            covariance = tuple((moved @ result.covariance @ moved.T).ravel().tolist())
+            moved = moved_covariance(result.covariance, turn, -cross_matrix(lever) @ turn)
+            covariance = tuple(moved.ravel().tolist())
         return PoseEstimate(
             stamp=stamp,
             source=source,
@@ -393,12 +391,6 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
         """Return poses of the body, shape (..., 4, 4), from those of the camera."""
         bodies: Floats = self.start @ self.camera @ poses @ np.linalg.inv(self.camera)
         return bodies
-
-
-def cross(vector: Floats) -> Floats:
-    """Return the matrix of a cross product with a vector from the left, shape (3, 3)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def crosses(vectors: Floats) -> Floats:

@@ -88,7 +88,7 @@ class Answers:
     @property
     def says_lost(self) -> int:
         """Number of answers reporting lost tracking."""
-        return sum(each.says_lost for each in self._settled)
+        return sum(frame.says_lost for frame in self._settled)
 
     def settled(self, frame: Settled) -> None:
         """Record the outcome of a frame."""
@@ -101,20 +101,20 @@ class Answers:
     def end(self, now: int) -> None:
         """Forget the outcomes of frames not due by now (ns): they are up to real time."""
         with self._lock:
-            self.counts -= Counter(each.outcome for each in self._settled if each.due > now)
-            self._settled = [each for each in self._settled if each.due <= now]
+            self.counts -= Counter(frame.outcome for frame in self._settled if frame.due > now)
+            self._settled = [frame for frame in self._settled if frame.due <= now]
 
     def wrong(self, kind: Wrong) -> None:
         """Count an answer without a waiting frame."""
         with self._lock:
             self.counts[kind] += 1
 
-    def got(self, count: int = 1) -> None:
+    def count_received(self, count: int = 1) -> None:
         """Count frames confirmed by the system as received."""
         with self._lock:
             self.received = (self.received or 0) + count
 
-    def took_in(self, stream: str, data: bytes | bytearray | memoryview) -> None:
+    def record_input(self, stream: str, data: bytes | bytearray | memoryview) -> None:
         """Add data sent to the system to the digest of its inputs.
 
         Args:
@@ -123,11 +123,11 @@ class Answers:
         """
         content = memoryview(data).cast("B")
         with self._lock:
-            found = self._inputs.get(stream)
-            if found is None:
-                found = self._inputs[stream] = xxhash.xxh3_128()
-            found.update(content.nbytes.to_bytes(8, "little"))
-            found.update(content)
+            digest = self._inputs.get(stream)
+            if digest is None:
+                digest = self._inputs[stream] = xxhash.xxh3_128()
+            digest.update(content.nbytes.to_bytes(8, "little"))
+            digest.update(content)
 
     @property
     def initialisation(self) -> float | None:
@@ -139,13 +139,13 @@ class Answers:
     def inputs(self) -> str | None:
         """Return the digest of all data sent to the system; `None` if there was none."""
         with self._lock:
-            digests = {name: each.hexdigest() for name, each in self._inputs.items()}
+            digests = {name: digest.hexdigest() for name, digest in self._inputs.items()}
         return combined(digests) if digests else None
 
     def outputs(self) -> str | None:
         """Return the digest of all answers, by their frames' stamps; `None` if there were none."""
         with self._lock:
-            rows = sorted((each.stamp, each.outcome, each.digest or 0) for each in self._settled)
+            rows = sorted((row.stamp, row.outcome, row.digest or 0) for row in self._settled)
         return f"{fingerprint(rows):016x}" if rows else None
 
     def latency_quantiles(self, *quantiles: float) -> list[float | None]:
@@ -162,9 +162,9 @@ class Answers:
         with file.open("w", newline="", encoding="utf-8") as out:
             rows = csv.writer(out)
             rows.writerow(COLUMNS)
-            for each in self._settled:
-                known = "" if math.isnan(each.latency) else f"{each.latency * 1e3:.6f}"
-                rows.writerow((each.stamp, each.outcome, known))
+            for frame in self._settled:
+                known = "" if math.isnan(frame.latency) else f"{frame.latency * 1e3:.6f}"
+                rows.writerow((frame.stamp, frame.outcome, known))
 
 
 def read_latencies(path: Path, factor: float = 1.0) -> Callable[[int], float]:

@@ -37,8 +37,7 @@ from runtime.time.clock import SECOND, Clock, result_of
 from runtime.units import Duration
 
 T = TypeVar("T")
-
-LET_GO: Any = object()  # result of a wait released without an answer; the answer may still come
+V = TypeVar("V")
 
 
 class Owed(Generic[T]):
@@ -54,21 +53,23 @@ class Owed(Generic[T]):
         self._clock = clock
         self.stamp = stamp
         self.due = due
-        self.since = since
+        self.since = since  # real seconds
         self.work = future()
         self.later: concurrent.futures.Future[Any] | None = None
-        """Future of the answer, once the clock is released."""
+        """Future of the answer, if the clock was released without."""
+
+    @property
+    def pending(self) -> concurrent.futures.Future[Any]:
+        """Future that gets the answer."""
+        return self.work if self.later is None else self.later
 
     def __await__(self) -> Generator[Any, None, T | None]:
         return self._answer().__await__()
 
     async def _answer(self) -> T | None:
         latency = max(self.due - self._clock.now(), 0)
-        result = await self._clock.beside(self.work, latency)
-        if self.later is not None and result is LET_GO:
-            result = await result_of(self.later)
-        found: T | None = result
-        return found
+        answer: T | None = await self._clock.beside(self.work, latency)
+        return answer if self.later is None else await result_of(self.later)
 
 
 def future() -> concurrent.futures.Future[Any]:
@@ -119,7 +120,13 @@ class HoldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class Hold(Generic[T]):
-    """Answers owed by an outside system.
+    """Ledger of the frames sent to an outside system: which of them it owes an answer.
+
+    A frame is owed until it is settled by one of these: an answer, an answer to a later frame if
+    `skips`, too long a silence, the loss of the system. What comes for a settled frame is counted.
+
+    Attributes:
+        skips: Whether an answer means that none will come for the frames before it.
 
     Args:
         latency: Seconds of the run's clock from a frame to its answer.
@@ -154,23 +161,28 @@ class Hold(Generic[T]):
         self._clock = clock
         self._log = log
         self._wall = wall
-        self._skips = config.skips == "allowed" or clock.kind == "real"
+        self.skips = config.skips == "allowed" or clock.kind == "real"
         if clock.kind == "real":
             self.answers.why_not["the clock is real"] = None
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()
         self._owed: dict[int, Owed[T]] = {}  # by stamp, in the order of sending
         self._settled: dict[int, Settled] = {}  # by stamp
         self._last: tuple[int, int] | None = None  # stamp and due of the newest frame
         self._began: tuple[int, float] | None = None  # stamp and real time of the first frame
-        self._heard: float | None = None  # when it last answered anything
+        self._last_answer: float | None = None  # real time of it, or of the last lost frame
         self._in_a_row = 0
-        self._let_go = False
+        self._released = False  # whether time runs on without answers
         self._gone = ""
         self._error: Exception | None = None
         self._thread: threading.Thread | None = None
-        self._closed = False
+        self._closed = threading.Event()
 
     # On the loop.
+
+    @property
+    def newest(self) -> int:
+        """Stamp of the newest frame (ns); -1 without any."""
+        return -1 if self._last is None else self._last[0]
 
     def owe(self, stamp: int) -> Owed[T]:
         """Register an outgoing frame by its stamp (ns), and return its pending answer.
@@ -179,7 +191,7 @@ class Hold(Generic[T]):
             ValueError: The stamp is not greater than that of the frame before.
             MissingAnswerError: The system is gone, or hangs, and by the settings that is an error.
         """
-        with self._changed:
+        with self._lock:
             if self._error is not None:
                 raise self._error
             if self._last is not None and stamp <= self._last[0]:
@@ -198,117 +210,110 @@ class Hold(Generic[T]):
             self._owed[stamp] = owed
             if not self.expects:
                 self._settle(owed, "lost")
-            elif self._let_go:
+            elif self._released:
                 self._release(owed)
-            self._watch()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._watch, name=self.name, daemon=True)
+                self._thread.start()
             return owed
 
     @property
     def expects(self) -> bool:
         """Whether answers are expected; if not, frames are lost and need no sending."""
-        return not (self._gone or (self._let_go and self.config.on_missing == "lost"))
+        return not (self._gone or (self._released and self.config.on_missing == "lost"))
 
     # In any thread.
 
+    def waited(self, stamp: int) -> float | None:
+        """Return for how many real seconds a frame is owed an answer; `None` if it is owed none."""
+        with self._lock:
+            owed = self._owed.get(stamp)
+            return None if owed is None else self._wall() - owed.since
+
     def sent(self, stream: str, data: bytes | bytearray | memoryview) -> None:
-        """Add data sent to the system to the digest of its inputs; see `Answers.took_in`."""
-        self.answers.took_in(stream, data)
+        """Add data sent to the system to the digest of its inputs; see `Answers.record_input`."""
+        self.answers.record_input(stream, data)
 
     def received(self, count: int = 1) -> None:
         """Count frames confirmed by the system as received."""
-        self.answers.got(count)
+        self.answers.count_received(count)
 
     def answer(
         self, stamp: int, value: T | None, says: Literal["", "initialising", "lost"] = ""
     ) -> None:
-        """Take an answer to the frame of a stamp (ns); `None` if no more is to come for it.
+        """Record the answer to the frame of a stamp (ns); `None` if no more is to come for it.
 
         Args:
             says: What it says of the system: nothing, that it still initialises, or has lost track.
         """
         digest = None if says == "initialising" else fingerprint(value)  # no answer yet
-        with self._changed:
-            if self._closed:
+        with self._lock:
+            if self._closed.is_set():
                 return
             now = self._wall()
-            unanswered = [each for each in self._owed if self._initialising(each)]
-            self._heard = now
-            owed = self._match(stamp)
+            owed = _nearest(stamp, self._owed, self.config.tolerance_ns)
             if owed is None:
-                known = _nearest(stamp, self._settled, self.config.tolerance_ns)
-                before = None if known is None else self._settled[known]
-                kind: Wrong = "unknown" if before is None else "late"
-                if before is not None and before.digest is not None:
-                    same = value is None or digest == before.digest  # no more to come, or the same
-                    kind = "repeated" if same else "contradicting"
-                self.answers.wrong(kind)
-                if kind == "contradicting":
-                    self._contradicted(stamp)
-                elif before is not None and before.outcome == "initialising":
-                    self.doubt("its first answer came too late to be held for")
-            if self._let_go:
+                self._record_unawaited(stamp, value, digest)
+            else:
+                for earlier in [frame for frame in self._owed.values() if frame.stamp < owed.stamp]:
+                    if self._initialising(earlier.stamp):
+                        self._settle(earlier, "initialising")
+                    elif self.skips:
+                        self._settle(earlier, "skipped")
+                outcome: Outcome = "empty" if value is None else "answered"
+                if says == "initialising":
+                    outcome, value = "initialising", None
+                self._settle(owed, outcome, value, now - owed.since, digest, says == "lost")
+            if self._released:
                 self._log(f"{self.name}: it answers again")
-            self._let_go, self._in_a_row = False, 0
-            if owed is None:
-                return
-            for each in [each for each in self._owed if each < owed.stamp]:
-                if each in unanswered:
-                    self._settle(self._owed[each], "initialising")
-                elif self._skips:
-                    self._settle(self._owed[each], "skipped")
-            outcome: Outcome = "empty" if value is None else "answered"
-            if says == "initialising":
-                outcome, value = "initialising", None
-            self._settle(owed, outcome, value, now - owed.since, digest, says == "lost")
+            self._last_answer, self._released, self._in_a_row = now, False, 0
 
     def gone(self, why: str) -> None:
         """Report the loss of the system, effective at once."""
-        with self._changed:
-            if self._closed or self._gone:
+        with self._lock:
+            if self._closed.is_set() or self._gone:
                 return
             self._gone = why
             if self.config.on_missing == "error":
-                said = "\n" if "\n" in why else " "  # a program's last lines
-                self._fail(MissingAnswerError(f"{self.name}: {why}{said}({self._story()})"))
+                separator = "\n" if "\n" in why else " "  # a program's last lines
+                self._fail(MissingAnswerError(f"{self.name}: {why}{separator}({self._story()})"))
                 return
             self._log(f"{self.name}: {why}")
             if self.config.on_missing == "continue":
                 self._not_reproducible("it was gone for a while")
-            for each in list(self._owed.values()):
-                self._settle(each, "lost")
+            self._lose_all()
 
     def back(self) -> None:
-        """Report the system as back; the system may initialise anew."""
-        with self._changed:
-            if self._gone:
-                self._log(f"{self.name}: it is there again")
-                self._not_reproducible("when it came back was up to real time")
-            self._gone, self._let_go, self._in_a_row = "", False, 0
-            self._began = self._heard = None
+        """Report the system as back, if it was gone; the system may initialise anew."""
+        with self._lock:
+            if not self._gone:
+                return
+            self._log(f"{self.name}: it is there again")
+            self._not_reproducible("when it came back was up to real time")
+            self._gone, self._released, self._in_a_row = "", False, 0
+            self._began = self._last_answer = None
 
     def fail(self, error: Exception) -> None:
         """Raise an error in whoever waits for an answer, and with the next frame."""
-        with self._changed:
+        with self._lock:
             self._fail(error)
 
     def doubt(self, why: str) -> None:
-        """Take note, and say in the log, why an equal run might differ."""
+        """Record and log why an equal run might differ."""
         if why not in self.answers.why_not:
             self._log(f"{self.name}: an equal run may differ: {why}")
         self._not_reproducible(why)
 
     def close(self) -> None:
         """Stop watching and taking answers; outstanding answers stay owed."""
-        with self._changed:
-            if self._closed:
-                return
-            self._closed = True
-            self.answers.end(self._clock.now())
-            self._changed.notify_all()
+        with self._lock:
+            if not self._closed.is_set():
+                self._closed.set()
+                self.answers.end(self._clock.now())
 
     def look(self) -> None:
         """Give up on overdue answers; called repeatedly by a thread."""
-        with self._changed:
+        with self._lock:
             now = self._wall()
             while self._owed:
                 oldest = next(iter(self._owed.values()))
@@ -318,7 +323,7 @@ class Hold(Generic[T]):
                     if now < self._real_time(oldest) + BEHIND:
                         return
                     self._settle(oldest, "initialising")
-                elif now < max(oldest.since, self._heard or 0.0) + self.config.max_wait:
+                elif now < max(oldest.since, self._last_answer or 0.0) + self.config.max_wait:
                     return
                 else:
                     self._give_up(oldest)
@@ -326,7 +331,7 @@ class Hold(Generic[T]):
     # With the lock.
 
     def _initialising(self, stamp: int) -> bool:
-        if self._heard is not None or self._began is None:
+        if self._last_answer is not None or self._began is None:
             return False
         return stamp - self._began[0] < self.config.initialise * SECOND
 
@@ -336,9 +341,23 @@ class Hold(Generic[T]):
         stamp, since = self._began
         return since + (owed.stamp - stamp) / SECOND + self._latency_at(owed.stamp)
 
-    def _match(self, stamp: int) -> Owed[T] | None:
-        near = _nearest(stamp, self._owed, self.config.tolerance_ns)
-        return None if near is None else self._owed[near]
+    def _record_unawaited(self, stamp: int, value: T | None, digest: int | None) -> None:
+        """Count an answer to a frame that is settled already, or to none."""
+        settled = _nearest(stamp, self._settled, self.config.tolerance_ns)
+        kind: Wrong = "unknown" if settled is None else "late"
+        if settled is not None and settled.digest is not None:
+            same = value is None or digest == settled.digest  # no more to come, or the same
+            kind = "repeated" if same else "contradicting"
+        self.answers.wrong(kind)
+        if kind == "contradicting":
+            if self.answers.counts["contradicting"] == 1:
+                self._log(
+                    f"{self.name}: expected one answer to the frame of {_seconds(stamp)}, found a "
+                    "second one that differs (two that answer?): the first one counts"
+                )
+            self._not_reproducible("frames were answered twice, differently")
+        elif settled is not None and settled.outcome == "initialising":
+            self.doubt("its first answer came too late to be held for")
 
     def _settle(
         self, owed: Owed[T], outcome: Outcome, value: T | None = None, *answer: Any
@@ -350,12 +369,12 @@ class Hold(Generic[T]):
         while len(self._settled) > _REMEMBERED:
             del self._settled[next(iter(self._settled))]
         self.answers.settled(settled)
-        (owed.work if owed.later is None else owed.later).set_result(value)
+        owed.pending.set_result(value)
 
     def _release(self, owed: Owed[T]) -> None:
         """Release the clock from a frame; its answer may still come."""
         owed.later = future()
-        owed.work.set_result(LET_GO)
+        owed.work.set_result(None)
 
     def _give_up(self, owed: Owed[T]) -> None:
         missing = (
@@ -366,42 +385,37 @@ class Hold(Generic[T]):
             self._fail(MissingAnswerError(f"{self.name}: {missing} ({self._story()})"))
             return
         if self.config.on_missing == "continue":
-            self._let_go = True
+            self._released = True
             self._log(f"{self.name}: {missing}; the run goes on without")
             self._not_reproducible("the run went on without an answer")
-            for each in self._owed.values():
-                if each.later is None:
-                    self._release(each)
+            for frame in self._owed.values():
+                if frame.later is None:
+                    self._release(frame)
             return
         self._log(f"{self.name}: {missing}: the frame is lost")
         self._not_reproducible(f"frames were lost after {self.config.max_wait:g} s of real time")
-        self._heard = self._wall()
+        self._last_answer = self._wall()
         self._in_a_row += 1
         self._settle(owed, "lost")
         if self._in_a_row >= IN_A_ROW:
-            self._let_go = True
+            self._released = True
             self._log(
                 f"{self.name}: {IN_A_ROW} frames in a row are lost: it is not waited for again "
                 "before it answers"
             )
-            for each in list(self._owed.values()):
-                self._settle(each, "lost")
+            self._lose_all()
+
+    def _lose_all(self) -> None:
+        for owed in list(self._owed.values()):
+            self._settle(owed, "lost")
 
     def _fail(self, error: Exception) -> None:
-        if self._error is not None or self._closed:
+        if self._error is not None or self._closed.is_set():
             return
         self._error = error
         for owed in self._owed.values():
-            (owed.work if owed.later is None else owed.later).set_exception(error)
+            owed.pending.set_exception(error)
         self._owed.clear()
-
-    def _contradicted(self, stamp: int) -> None:
-        if self.answers.counts["contradicting"] == 1:
-            self._log(
-                f"{self.name}: expected one answer to the frame of {_seconds(stamp)}, found a "
-                "second one that differs (two that answer?): the first one counts"
-            )
-        self._not_reproducible("frames were answered twice, differently")
 
     def _not_reproducible(self, why: str) -> None:
         self.answers.why_not[why] = None
@@ -414,29 +428,16 @@ class Hold(Generic[T]):
         )
 
     def _watch(self) -> None:
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._look_on, name=self.name, daemon=True)
-            self._thread.start()
-        self._changed.notify_all()
-
-    def _look_on(self) -> None:
-        while True:
-            with self._changed:
-                while not self._owed and not self._closed:
-                    self._changed.wait()
-                if not self._closed:
-                    self._changed.wait(_LOOK)
-                if self._closed:
-                    return
+        while not self._closed.wait(_LOOK):
             self.look()
 
 
-def _nearest(stamp: int, known: Mapping[int, Any], tolerance: int) -> int | None:
-    """Return the known stamp nearest to another, if within the tolerance."""
-    if stamp in known:
-        return stamp
-    near = min(known, key=lambda each: abs(each - stamp), default=None)
-    return None if near is None or abs(near - stamp) > tolerance else near
+def _nearest(stamp: int, frames: Mapping[int, V], tolerance: int) -> V | None:
+    """Return the frame whose stamp is nearest to another, if within the tolerance."""
+    if stamp in frames:
+        return frames[stamp]
+    near = min(frames, key=lambda known: abs(known - stamp), default=None)
+    return None if near is None or abs(near - stamp) > tolerance else frames[near]
 
 
 def _seconds(stamp: int) -> str:

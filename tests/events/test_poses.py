@@ -8,7 +8,14 @@ from hypothesis import strategies as st
 
 from events import Quaternion, Vector3
 from events.frames import from_rpy, rotate
-from events.geometry import inverse, pose_matrix, pose_tuples, relative
+from events.geometry import (
+    cross_matrix,
+    inverse,
+    moved_covariance,
+    pose_matrix,
+    pose_tuples,
+    relative,
+)
 
 numbers = st.floats(-1e3, 1e3)
 vectors = st.tuples(numbers, numbers, numbers)
@@ -42,3 +49,17 @@ def test_a_relative_pose_is_what_leads_from_its_base_to_the_pose(
     offset = pose_matrix(*relative((base, turned), (place, rotation)))
     expected = pose_matrix(place, rotation)
     np.testing.assert_allclose(pose_matrix(base, turned) @ offset, expected, atol=1e-8)
+
+
+@given(orientations, vectors, vectors, vectors)
+def test_an_error_is_at_another_point_what_the_rotation_makes_of_it(
+    orientation: Quaternion, lever: Vector3, shift: Vector3, rotation: Vector3
+) -> None:
+    turn = pose_matrix((0.0, 0.0, 0.0), orientation)[:3, :3]
+    at_point = np.concatenate([shift, rotation])
+    elsewhere = np.concatenate([turn @ (shift + np.cross(rotation, lever)), turn @ rotation])
+    expected = np.outer(elsewhere, elsewhere)
+    before, after = np.array(lever), turn @ lever
+    for moves in (-turn @ cross_matrix(before), -cross_matrix(after) @ turn):
+        moved = moved_covariance(np.outer(at_point, at_point), turn, moves)
+        np.testing.assert_allclose(moved, expected, atol=1e-9 * (1.0 + np.abs(expected).max()))

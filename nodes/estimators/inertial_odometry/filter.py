@@ -18,14 +18,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from events.geometry import inverse
+from events.geometry import cross_matrix, inverse
 from nodes.estimators.inertial_odometry.preintegration import (
     Floats,
     ImuModel,
     Preintegrated,
 )
 from nodes.estimators.pose import huber
-from nodes.estimators.rig import cross, crosses
+from nodes.estimators.rig import crosses
 
 THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))  # slices of the error state
 G = slice(15, 17)  # slice of gravity's direction: small rotations about the two level axes
@@ -163,8 +163,8 @@ class InertialFilter:
         turn[:3, :3] = np.eye(3)
         change = np.eye(_SIZE)
         change[THETA, THETA] = motion.rotation.T
-        change[V, THETA] = -state.rotation @ cross(motion.velocity)
-        change[P, THETA] = -state.rotation @ cross(motion.position)
+        change[V, THETA] = -state.rotation @ cross_matrix(motion.velocity)
+        change[P, THETA] = -state.rotation @ cross_matrix(motion.position)
         fall = GRAVITY * np.stack([-state.level[:, 1], state.level[:, 0]], axis=1)
         change[P, V], change[V, G], change[P, G] = np.eye(3) * t, fall * t, fall * (t * t / 2)
         order = np.r_[THETA, V, P]
@@ -211,11 +211,11 @@ class InertialFilter:
         relative = rotation.T @ body[:3, :3], rotation.T @ (body[:3, 3] - position)
         by = np.zeros((6, 6 + _FRAME))
         by[:, :6] = np.eye(6)
-        by[:3, 6:9], by[3:, 6:9] = -relative[0].T, rotation @ cross(relative[1])
+        by[:3, 6:9], by[3:, 6:9] = -relative[0].T, rotation @ cross_matrix(relative[1])
         by[3:, 9:12] = -np.eye(3)
         mounted = self.camera[:3, :3].T
         small = np.zeros((6, 6))
-        small[:3, :3], small[:3, 3:] = mounted @ cross(self.camera[:3, 3]), -camera[:3, :3].T
+        small[:3, :3], small[:3, 3:] = mounted @ cross_matrix(self.camera[:3, 3]), -camera[:3, :3].T
         small[3:, :3] = -mounted
         of_body = small.T @ information @ small
         if first:

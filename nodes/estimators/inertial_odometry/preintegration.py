@@ -17,10 +17,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from events import CameraInfo, ImuAnnouncement
-from events.geometry import pose_matrix
+from events.geometry import cross_matrix, pose_matrix
 from nodes.estimators.images import Depth
 from nodes.estimators.pose import rays
-from nodes.estimators.rig import cross
 
 Floats = npt.NDArray[np.float64]
 
@@ -101,12 +100,12 @@ class ImuModel:
             # How an error at the start of the step, and one of the rates in it, goes on.
             change = np.eye(9)
             change[:3, :3] = turn.T
-            change[3:6, :3] = -rotation @ cross(half @ force) * dt
+            change[3:6, :3] = -rotation @ cross_matrix(half @ force) * dt
             change[6:, :3] = change[3:6, :3] * (dt / 2)
             change[6:, 3:6] = dt * np.eye(3)
             by_rates = np.zeros((9, 6))
             by_rates[:3, :3] = half.T * dt
-            by_rates[3:6, :3] = -middle @ cross(force) * (dt * dt / 2)
+            by_rates[3:6, :3] = -middle @ cross_matrix(force) * (dt * dt / 2)
             by_rates[3:6, 3:] = middle * dt
             by_rates[6:] = by_rates[3:6] * (dt / 2)
             by_bias = change @ by_bias - by_rates

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, ImuAnnouncement
-from events.geometry import inverse, pose_matrix
+from events.geometry import cross_matrix, inverse, pose_matrix
 from nodes.estimators import EstimatorConfig, RgbdInertialFrame, StereoInertialFrame, TrackingResult
 from nodes.estimators.images import Depth, Grey
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
@@ -25,7 +25,6 @@ from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel
 from nodes.estimators.inertial_odometry.preintegration import Rows as ImageRows
 from nodes.estimators.odometry import OdometryNode
 from nodes.estimators.pose import rays, transform
-from nodes.estimators.rig import cross
 from nodes.estimators.surfaces import Surfaces
 from nodes.estimators.visual_odometry.alignment import Alignment
 from nodes.estimators.visual_odometry.features import BELIEVED, FeatureSettings, FeatureTracker
@@ -169,7 +168,7 @@ class InertialTracker(FeatureTracker):
     def _camera_covariance(self) -> Floats:
         state, camera = self._filter.state, self._filter.camera
         moved = np.zeros((6, 6))
-        moved[:3, :3] = -state.rotation @ cross(camera[:3, 3])
+        moved[:3, :3] = -state.rotation @ cross_matrix(camera[:3, 3])
         moved[:3, 3:], moved[3:, :3] = np.eye(3), state.rotation
         covariance: Floats = moved @ self._filter.covariance[POSE, POSE] @ moved.T
         way = self._scale * self._camera_pose()[:3, 3]

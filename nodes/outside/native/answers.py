@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Announcement, CameraAnnouncement
-from events.geometry import pose_matrix
+from events.geometry import cross_matrix, inverse, moved_covariance, pose_matrix
 from nodes.outside.native.client import (
     AXES,
     COVARIANCE,
@@ -96,11 +96,11 @@ def read_order(body: bytearray) -> LinkOrder:
     """
     if len(body) != ORDER_BODY.size:
         raise LinkError(f"ORDER: expected {ORDER_BODY.size} bytes, found {len(body)}")
-    sequence, stamp, order, axes, *found = ORDER_BODY.unpack(body)
+    sequence, stamp, order, axes, *numbers = ORDER_BODY.unpack(body)
     if order not in ORDERS.values() or axes not in AXES.values():
         raise LinkError(f"ORDER: expected an order 0 to 3 with axes 0 or 1, found {order}, {axes}")
-    _finite("ORDER", np.array(found))
-    (x, y, z, u, v, w, yaw, rate), names = found, ([*ORDERS][order], [*AXES][axes])
+    _finite("ORDER", np.array(numbers))
+    (x, y, z, u, v, w, yaw, rate), names = numbers, ([*ORDERS][order], [*AXES][axes])
     return LinkOrder(sequence, stamp, *names, (x, y, z), (u, v, w), yaw, rate)
 
 
@@ -143,13 +143,45 @@ def read_pose(body: bytearray) -> LinkAnswer:
     points = np.frombuffer(body, "<f4", 2 * count, at).reshape(-1, 2)
     _finite("POSE.points", points)
     inliers = np.frombuffer(body, "u1", count, at + 8 * count) != 0
-    found: Any = status, pose, covariance, velocity, points, inliers, output
-    return LinkAnswer(sequence, stamp, *found)
+    fields: Any = status, pose, covariance, velocity, points, inliers, output
+    return LinkAnswer(sequence, stamp, *fields)
 
 
 def _finite(field: str, values: npt.NDArray[np.floating] | None) -> None:
     if values is not None and not (good := np.isfinite(values)).all():
         raise LinkError(f"{field}: expected finite numbers, found {values[~good][0]}")
+
+
+class CameraPoses:
+    """Turns a program's poses into those of the optical camera in that of the first pose.
+
+    Args:
+        body_from_camera: Transform, shape (4, 4), if the program's poses are of the body and there
+            is a camera; else `None`.
+    """
+
+    def __init__(self, body_from_camera: npt.NDArray[np.float64] | None) -> None:
+        self._body_from_camera = body_from_camera
+        self._origins: dict[int, npt.NDArray[np.float64]] = {}  # inverse first pose, by output
+
+    def of(self, answer: LinkAnswer) -> LinkAnswer:
+        """Return an answer with pose, covariance and velocity in the frame of the first pose."""
+        if answer.pose is None:
+            return answer
+        pose, lever = answer.pose, np.zeros(3)
+        if self._body_from_camera is not None:
+            pose = answer.pose @ self._body_from_camera
+            lever = pose[:3, 3] - answer.pose[:3, 3]  # from body to camera, in the program's frame
+        origin = self._origins.setdefault(answer.output, inverse(pose))
+        turn, covariance, velocity = origin[:3, :3], answer.covariance, answer.velocity
+        if covariance is not None:
+            covariance = moved_covariance(covariance, turn, -turn @ cross_matrix(lever))
+        return msgspec.structs.replace(
+            answer,
+            pose=origin @ pose,
+            covariance=covariance,
+            velocity=None if velocity is None else turn @ velocity,
+        )
 
 
 def describe(
@@ -185,7 +217,7 @@ def describe(
 
 
 def _sensor(announced: Announcement, transform: str) -> dict[str, Any]:
-    found: dict[str, Any] = msgspec.to_builtins(announced)
-    if "position" not in found:
-        return found
-    return {**found, transform: pose_matrix(found["position"], found["orientation"]).tolist()}
+    fields: dict[str, Any] = msgspec.to_builtins(announced)
+    if "position" not in fields:
+        return fields
+    return {**fields, transform: pose_matrix(fields["position"], fields["orientation"]).tolist()}

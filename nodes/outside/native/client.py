@@ -125,15 +125,15 @@ class Frame(NamedTuple):
         if name not in self.kinds:
             raise LookupError(f"expected one of {', '.join(self.kinds) or 'none'}, found {name!r}")
         none = np.empty(0, self.records[self.kinds[name]])
-        return np.concatenate([none, *(each.rows for each in self.inputs if each.name == name)])
+        return np.concatenate([none, *(part.rows for part in self.inputs if part.name == name)])
 
     def image(self, kind: str, camera: int = 0) -> npt.NDArray[Any]:
         """Return a camera's image of a kind; raise `LookupError` if there is none."""
         for image in self.images:
             if (image.camera, image.kind) == (camera, kind):
                 return image.data
-        found = ", ".join(f"{image.kind} of {image.camera}" for image in self.images)
-        raise LookupError(f"expected an image {kind} of camera {camera}, found {found or 'none'}")
+        known = ", ".join(f"{image.kind} of {image.camera}" for image in self.images)
+        raise LookupError(f"expected an image {kind} of camera {camera}, found {known or 'none'}")
 
 
 class Link:
@@ -162,11 +162,11 @@ class Link:
                 raise ProtocolError(f"expected the socket of a run at {path!r}: {error}") from None
             self._send(HELLO, GREETING.pack(MAGIC, VERSION, 0) + name.encode())
             self.description = self._welcome()
-            self._kinds = {each["name"]: each["kind"] for each in self.description["inputs"]}
+            self._kinds = {row["name"]: row["kind"] for row in self.description["inputs"]}
             self._records = RECORDS | {
-                each["kind"]: np.dtype([("stamp", "<i8"), *map(_column, each["row"])])
-                for each in self.description["inputs"]
-                if "row" in each  # of a kind that is not part of the protocol
+                row["kind"]: np.dtype([("stamp", "<i8"), *map(_column, row["row"])])
+                for row in self.description["inputs"]
+                if "row" in row  # of a kind that is not part of the protocol
             }
             unless_joined.pop_all()
 
@@ -374,7 +374,7 @@ def message(kind: int, *parts: bytes) -> bytes:
 
 
 def read_message(
-    connection: Any,  # a socket, or what has its `recv_into`
+    connection: socket.socket,
     head: bytes = b"",  # the first bytes
 ) -> tuple[int, bytearray]:
     """Wait for a message, whose first bytes may be there, and return its type and body.
@@ -384,13 +384,23 @@ def read_message(
         OSError: The same, found out in another way.
         ProtocolError: The message is too long.
     """
-    length, kind = HEADER.unpack(head + _exactly(connection, HEADER.size - len(head)))
-    if length > LONGEST:
-        raise ProtocolError(f"expected at most {LONGEST} bytes, found a message of {length}")
+    length, kind = read_header(head + _exactly(connection, HEADER.size - len(head)))
     return kind, _exactly(connection, length)
 
 
-def _exactly(connection: Any, size: int) -> bytearray:
+def read_header(data: bytes | bytearray, at: int = 0) -> tuple[int, int]:
+    """Return length of the body and type of the message that begins at an offset.
+
+    Raises:
+        ProtocolError: The message is too long.
+    """
+    length, kind = HEADER.unpack_from(data, at)
+    if length > LONGEST:
+        raise ProtocolError(f"expected at most {LONGEST} bytes, found a message of {length}")
+    return length, kind
+
+
+def _exactly(connection: socket.socket, size: int) -> bytearray:
     data = bytearray(size)
     rest = memoryview(data)
     while rest:

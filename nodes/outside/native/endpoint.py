@@ -1,30 +1,30 @@
 """Run's side of the native interface: socket, shared-memory slots, a single program.
 
-Threads and no asyncio: one accepts, one for each connection reads; the caller's thread sends.
+It turns bytes into messages and back. Which frames are owed an answer is not known here, only what
+memory a program may still read. One thread reads all connections; the caller's thread sends.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import functools
-import io
 import mmap
 import os
+import selectors
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events.geometry import inverse
 from nodes.outside.native import client as wire
 from nodes.outside.native.answers import (
+    CameraPoses,
     LinkAnswer,
     LinkError,
     LinkOrder,
@@ -35,8 +35,9 @@ from nodes.outside.native.answers import (
 from runtime.workers.output import plain_lines
 from runtime.workers.shared_memory import anonymous_file
 
-_AT_ONCE = 1 << 16  # size of the read buffer for a program's messages, bytes
+_AT_ONCE = 1 << 16  # bytes of a single read
 GREETING_TIME = 10.0  # real seconds for a connection to send HELLO
+_LOOK = 0.5  # real seconds between two checks of that time
 GREETING = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
 
 READERS: dict[int, Callable[[bytearray], LinkAnswer | LinkOrder]] = {
@@ -52,20 +53,50 @@ ALIGNMENT = 64
 """Images begin at multiples of this (bytes); a slot has room for the gaps between 16 of them."""
 
 
+class _Lent(NamedTuple):
+    """Slot lent to a program, for the images of a frame."""
+
+    stamp: int  # of the frame (ns)
+    slot: int
+    before: list[LinkAnswer | LinkOrder]  # what has come of the frame before its answer
+
+
 class _Program:
-    """Connection of a program, with its unanswered frames."""
+    """Connection of a program."""
 
     def __init__(self, connection: socket.socket, slots: int) -> None:
         self.connection = connection
+        self.greeted_by = time.monotonic() + GREETING_TIME
         self.sending = threading.Lock()
-        self.name = ""
-        self.pose_of = ""  # until READY
+        self.name = ""  # until HELLO
+        self.poses: CameraPoses | None = None  # until READY
         self.sequence = 0
-        self.owed: dict[int, tuple[int, int]] = {}  # sequence: stamp, slot
-        self.before: dict[int, list[LinkAnswer | LinkOrder]] = {}  # of a sequence, until its answer
+        self.lent: dict[int, _Lent] = {}  # by sequence
         self.free = list(range(slots))
-        self.origins: dict[int, npt.NDArray[np.float64]] = {}  # inverse first pose, by output
         self.gone = False
+        self._received = bytearray()
+
+    def receive(self) -> Iterator[tuple[int, bytearray]]:
+        """Yield type and body of the messages that are here.
+
+        Raises:
+            EOFError: The program has closed the connection.
+            OSError: The same, found out in another way.
+            ProtocolError: A message is too long.
+        """
+        data = self.connection.recv(_AT_ONCE, socket.MSG_DONTWAIT)
+        if not data:
+            raise EOFError
+        received, begin = self._received, 0
+        received += data
+        while len(received) >= begin + wire.HEADER.size:
+            length, kind = wire.read_header(received, begin)
+            body = begin + wire.HEADER.size
+            if len(received) < body + length:
+                break
+            begin = body + length
+            yield kind, received[body:begin]
+        del received[:begin]
 
     def send(self, kind: int, *parts: bytes) -> bool:
         """Send a message, or return False: the program is gone."""
@@ -86,25 +117,18 @@ class _Program:
             self.connection.shutdown(socket.SHUT_RDWR)
 
 
-class _Stream(io.BufferedReader):
-    """Messages of a socket, read in large pieces."""
-
-    def recv_into(self, buffer: memoryview, _: int, __: int) -> int:
-        """Fill the buffer, as `socket.recv_into` does with MSG_WAITALL."""
-        return self.readinto(buffer)
-
-
 class Endpoint:
     """Socket of a run, for a single program at a time.
 
     All input is checked; a program that sends anything invalid is disconnected. When a program is
-    gone, another may connect: `wait` for it again. Its frames are numbered from 0.
+    gone, another may connect. Its frames are numbered from 0.
+
+    All functions given are called in the thread that reads.
 
     Args:
-        gone: Called once when the program is gone or is disconnected, with the reason; in the
-            thread that reads. Not after `close`.
-        logged: Called with each text for the log, unchecked and unlimited, in the thread that
-            reads.
+        gone: Called once when the program is gone or is disconnected, with the reason. Not after
+            `close`.
+        logged: Called with each text for the log, unchecked and unlimited.
     """
 
     def __init__(
@@ -114,10 +138,10 @@ class Endpoint:
         *,
         slots: int,  # unanswered frames of the program, at most
         slot_bytes: int,  # size of a frame's images, of which there are 16 at most
-        answered: Callable[[LinkAnswer], None],  # called with each answer, in the thread that reads
+        answered: Callable[[LinkAnswer], None],  # called with each answer
         gone: Callable[[str], None],
         logged: Callable[[bytearray], None],
-        skips: bool = False,  # whether an answer also frees the slots of all earlier frames
+        ready: Callable[[], None] = lambda: None,  # called when frames may be sent
         orders: bool = False,  # whether the program may send orders
     ) -> None:
         self._path = path
@@ -128,15 +152,15 @@ class Endpoint:
         self._slots = slots
         self._slot_bytes = slot_bytes + 16 * ALIGNMENT
         self._slot_bytes += -self._slot_bytes % mmap.PAGESIZE
-        self._answered, self._gone, self._logged = answered, gone, logged
-        self._skips = skips
+        self._answered, self._gone, self._logged, self._on_ready = answered, gone, logged, ready
         self._changed = threading.Condition()
         self._program: _Program | None = None
         self._problem = ""
         self._closed = False
         self._listener: socket.socket | None = None
-        self._programs: list[_Program] = []
-        self._threads: list[threading.Thread] = []
+        self._programs: list[_Program] = []  # all connections
+        self._selector = selectors.DefaultSelector()
+        self._reader = threading.Thread(target=self._read, name=f"link {path}", daemon=True)
         self._file = anonymous_file()
         os.ftruncate(self._file, slots * self._slot_bytes)
         self._memory = mmap.mmap(self._file, slots * self._slot_bytes)
@@ -148,7 +172,7 @@ class Endpoint:
             LinkError: The path is a living run's, or another file's, or no socket can be made.
         """
         self._listener = _bound(self._path)
-        self._start(self._accept)
+        self._reader.start()
 
     def wait(self, seconds: float) -> str:
         """Wait for a program to be ready for frames, and return its name.
@@ -160,10 +184,11 @@ class Endpoint:
             self._changed.wait_for(lambda: self._ready() or self._problem or self._closed, seconds)
             if program := self._ready():
                 return program.name
-            found, self._problem = self._problem or f"found none within {seconds:g} s", ""
+            problem, self._problem = self._problem or f"found none within {seconds:g} s", ""
             if self._program is not None:
-                found = f"found {self._program.name}, which did not say READY within {seconds:g} s"
-        raise LinkError(f"{self._path}: expected a program, {found}")
+                name = self._program.name
+                problem = f"found {name}, which did not say READY within {seconds:g} s"
+        raise LinkError(f"{self._path}: expected a program, {problem}")
 
     def send_input(self, number: int, arrived: int, rows: npt.NDArray[Any]) -> bool:
         """Send rows of an input, and return whether a program is there.
@@ -216,7 +241,7 @@ class Endpoint:
                 return False
             slot = program.free.pop(0)
             sequence, program.sequence = program.sequence, program.sequence + 1
-            program.owed[sequence] = stamp, slot
+            program.lent[sequence] = _Lent(stamp, slot, [])
         heads = [wire.FRAME_HEAD.pack(sequence, stamp, len(images), 0)]
         for (camera, kind, image), start in zip(images, starts.tolist(), strict=False):
             offset = slot * self._slot_bytes + start
@@ -225,6 +250,14 @@ class Endpoint:
             head = camera, wire.KINDS[kind][0], *image.shape[:2], place.strides[0], 0, offset
             heads.append(wire.IMAGE_HEAD.pack(*head))
         return program.send(wire.FRAME, *heads)
+
+    def release(self, stamp: int) -> None:
+        """Free the slots of all frames before a stamp (ns): the program has skipped them."""
+        with self._changed:
+            if (program := self._program) is not None:
+                for sequence in [n for n, lent in program.lent.items() if lent.stamp < stamp]:
+                    program.free.append(program.lent.pop(sequence).slot)
+                self._changed.notify_all()
 
     def close(self) -> None:
         """Say BYE, disconnect, and remove the socket; takes two seconds at most."""
@@ -236,65 +269,80 @@ class Endpoint:
         if self._listener is not None:
             if self._path.is_socket():
                 self._path.unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # wakes the thread that accepts
+            with contextlib.suppress(OSError):  # wakes the reader, which closes it
                 self._listener.shutdown(socket.SHUT_RDWR)
-            self._listener.close()
-        for program in list(self._programs):
-            program.end(wire.BYE)
-        deadline = time.monotonic() + 1.0
-        for thread in set(self._threads) - {threading.current_thread()}:
-            thread.join(max(deadline - time.monotonic(), 0.0))
+            for program in list(self._programs):
+                program.end(wire.BYE)
+            if self._reader is not threading.current_thread():
+                self._reader.join(1.0)
         os.close(self._file)
 
     def _ready(self) -> _Program | None:
-        return self._program if self._program is not None and self._program.pose_of else None
+        return self._program if self._program is not None and self._program.poses else None
 
-    def _start(self, run: Callable[[], None]) -> None:
-        self._threads = [thread for thread in self._threads if thread.is_alive()]
-        self._threads.append(threading.Thread(target=run, name=f"link {self._path}", daemon=True))
-        self._threads[-1].start()
+    # In the thread that reads.
 
-    def _accept(self) -> None:
+    def _read(self) -> None:
+        """Serve all connections until `close` has ended them."""
         assert self._listener is not None
-        with contextlib.suppress(OSError):  # closed
-            while True:
-                connection, _ = self._listener.accept()
-                self._start(functools.partial(self._serve, connection))
+        with self._listener, self._selector:
+            self._selector.register(self._listener, selectors.EVENT_READ)
+            while self._selector.get_map():
+                for key, _ in self._selector.select(_LOOK):
+                    if key.data is None:
+                        self._accept(self._listener)
+                    else:
+                        self._serve(key.data)
+                for program in [program for program in self._programs if not program.name]:
+                    if time.monotonic() > program.greeted_by:
+                        self._drop(program, "its connection has ended")
 
-    def _serve(self, connection: socket.socket) -> None:
+    def _accept(self, listener: socket.socket) -> None:
+        try:
+            connection, _ = listener.accept()
+        except OSError:  # closed
+            self._selector.unregister(listener)
+            return
         program = _Program(connection, self._slots)  # without a name: it only looks who is here
         self._programs.append(program)
-        problem, wrong = "its connection has ended", False
-        with connection:
-            try:
-                self._greet(program)
-                self._read(program)
-            except (LinkError, wire.ProtocolError) as error:
-                problem, wrong = str(error), True
-            except EOFError as error:
-                problem = str(error) or problem
-            except OSError:  # no HELLO in time, or the same as EOFError
-                pass
-            with self._changed:
-                program.gone = True
-                if self._program is program:
-                    self._program = None
-                if program.name and not program.pose_of and self._program is None:
-                    self._problem = f"found {program.name}: {problem}"
-                closed = self._closed
-                self._changed.notify_all()
-            refused = wrong and not program.pose_of
-            head = (wire.REFUSED, GREETING) if refused else (wire.BYE,)
-            program.end(*head, problem.encode())
-        self._programs.remove(program)
-        if program.pose_of and not closed:
-            self._gone(f"{program.name}: {problem}")
+        self._selector.register(connection, selectors.EVENT_READ, program)
 
-    def _greet(self, program: _Program) -> None:
-        """Read HELLO, take the program if there is no other, and send WELCOME."""
-        connection = program.connection
-        connection.settimeout(GREETING_TIME)
-        kind, body = wire.read_message(connection)
+    def _serve(self, program: _Program) -> None:
+        """Handle the messages that are here, or the end of the connection."""
+        try:
+            for kind, body in program.receive():
+                if program.name:
+                    self._handle(program, kind, body)
+                else:
+                    self._greet(program, kind, body)
+        except (LinkError, wire.ProtocolError) as error:
+            self._drop(program, str(error), wrong=True)
+        except EOFError as error:
+            self._drop(program, str(error) or "its connection has ended")
+        except OSError:
+            self._drop(program, "its connection has ended")
+
+    def _drop(self, program: _Program, why: str, wrong: bool = False) -> None:
+        """End a connection; `wrong` if the program broke the protocol."""
+        with self._changed:
+            program.gone = True
+            if self._program is program:
+                self._program = None
+            if program.name and not program.poses and self._program is None:
+                self._problem = f"found {program.name}: {why}"
+            closed = self._closed
+            self._changed.notify_all()
+        refused = wrong and not program.poses
+        head = (wire.REFUSED, GREETING) if refused else (wire.BYE,)
+        self._selector.unregister(program.connection)
+        program.end(*head, why.encode())
+        program.connection.close()
+        self._programs.remove(program)
+        if program.poses and not closed:
+            self._gone(f"{program.name}: {why}")
+
+    def _greet(self, program: _Program, kind: int, body: bytearray) -> None:
+        """Accept the program that says HELLO if there is no other, and send WELCOME."""
         magic, version, _ = wire.GREETING.unpack_from(body.ljust(wire.GREETING.size, b"\0"))
         if kind != wire.HELLO or magic != wire.MAGIC:
             raise LinkError(f"expected HELLO with {wire.MAGIC!r}, found type {kind} with {magic!r}")
@@ -307,90 +355,63 @@ class Endpoint:
             if self._program is not None:
                 raise LinkError(f"expected one program, found {self._program.name} connected")
             self._program, self._problem = program, ""
-        connection.settimeout(None)
         size = wire.MEMORY.pack(self._slots * self._slot_bytes)
         welcome = wire.message(wire.WELCOME, GREETING, size, self._description)
-        socket.send_fds(connection, [welcome[:8]], [self._file])
-        connection.sendall(welcome[8:])
+        socket.send_fds(program.connection, [welcome[:8]], [self._file])
+        program.connection.sendall(welcome[8:])
 
-    def _read(self, program: _Program) -> None:
-        """Read until the program is gone."""
-        stream = _Stream(socket.SocketIO(program.connection, "r"), _AT_ONCE)
-        while True:
-            kind, body = wire.read_message(stream)
-            if kind == wire.BYE:
-                raise EOFError(f"it said goodbye {_in_a_line(body)}".rstrip())
-            if kind == wire.LOG:
-                self._logged(body[: wire.LONGEST_TEXT])
-            elif kind == wire.READY and not program.pose_of:
-                if body[4:] != bytes(4) or bytes(body[:4]) not in POSE_OF:
-                    raise LinkError(f"READY.pose_of: expected 0 or 1, found {bytes(body)!r}")
-                pose_of = POSE_OF[bytes(body[:4])]
-                if pose_of == "camera" and self._body_from_camera is None:
-                    raise LinkError("READY.pose_of: expected 1, the body: there is no camera")
-                with self._changed:
-                    program.pose_of = pose_of
-                    self._changed.notify_all()
-            elif kind in READERS and program.pose_of:
-                self._take(program, READERS[kind](body))
-            else:
-                expected = "READY once, POSE, DONE, ORDER, LOG or BYE"
-                raise LinkError(f"expected {expected}, found type {kind}")
+    def _handle(self, program: _Program, kind: int, body: bytearray) -> None:
+        """Handle a message after HELLO."""
+        if kind == wire.BYE:
+            raise EOFError(f"it said goodbye {_in_a_line(body)}".rstrip())
+        if kind == wire.LOG:
+            self._logged(body[: wire.LONGEST_TEXT])
+        elif kind == wire.READY and not program.poses:
+            if body[4:] != bytes(4) or bytes(body[:4]) not in POSE_OF:
+                raise LinkError(f"READY.pose_of: expected 0 or 1, found {bytes(body)!r}")
+            pose_of = POSE_OF[bytes(body[:4])]
+            if pose_of == "camera" and self._body_from_camera is None:
+                raise LinkError("READY.pose_of: expected 1, the body: there is no camera")
+            with self._changed:
+                program.poses = CameraPoses(self._body_from_camera if pose_of == "body" else None)
+                self._changed.notify_all()
+            self._on_ready()
+        elif kind in READERS and program.poses:
+            self._record(program, program.poses, READERS[kind](body))
+        else:
+            expected = "READY once, POSE, DONE, ORDER, LOG or BYE"
+            raise LinkError(f"expected {expected}, found type {kind}")
 
-    def _take(self, program: _Program, answer: LinkAnswer | LinkOrder) -> None:
-        """Pass an answer on, with what came before it, and free the slot of its frame."""
-        further = not isinstance(answer, LinkAnswer) or answer.output > 0
-        if isinstance(answer, LinkAnswer):
-            if (output := answer.output) > self._outputs:
+    def _record(
+        self, program: _Program, poses: CameraPoses, message: LinkAnswer | LinkOrder
+    ) -> None:
+        """Report an answer with what came before it, and free the slot of its frame."""
+        if isinstance(message, LinkAnswer):
+            if (output := message.output) > self._outputs:
                 raise LinkError(f"POSE.output: expected at most {self._outputs}, found {output}")
-            if answer.pose is not None:
-                answer = self._of_the_camera(program, answer, answer.pose)
+            message = poses.of(message)
         elif not self._orders:
             raise LinkError("ORDER: expected none, as the program does not fly (pilot = true)")
+        n = message.sequence
         with self._changed:
-            n = answer.sequence
             if n >= program.sequence:
                 raise LinkError(f"sequence: expected below {program.sequence}, found {n}")
-            stamp, _ = program.owed.get(n, (answer.stamp, 0))
-            if stamp != answer.stamp:
-                raise LinkError(f"stamp: expected {stamp} of frame {n}, found {answer.stamp}")
-            if further:
-                if n not in program.owed:
+            lent = program.lent.get(n)
+            if lent is not None and lent.stamp != message.stamp:
+                raise LinkError(f"stamp: expected {lent.stamp} of frame {n}, found {message.stamp}")
+            if isinstance(message, LinkOrder) or message.output > 0:
+                if lent is None:
                     raise LinkError(f"expected it before the answer to frame {n}, found it after")
-                before = program.before.setdefault(n, [])
-                before.append(answer)
-                if len(before) > MOST_BEFORE:
+                lent.before.append(message)
+                if len(lent.before) > MOST_BEFORE:
                     raise LinkError(f"expected at most {MOST_BEFORE} outputs before an answer")
                 return
-            before = program.before.pop(n, [])
-            for other in [m for m in program.owed if m == n or (self._skips and m < n)]:
-                program.free.append(program.owed.pop(other)[1])
-                program.before.pop(other, None)
-            self._changed.notify_all()
-        assert isinstance(answer, LinkAnswer)
-        self._answered(msgspec.structs.replace(answer, before=tuple(before)) if before else answer)
-
-    def _of_the_camera(
-        self, program: _Program, answer: LinkAnswer, pose: npt.NDArray[np.float64]
-    ) -> LinkAnswer:
-        """Return an answer whose pose is the camera's, in the camera at the first pose."""
-        lever = np.zeros(3)  # from what the program has the pose of to the camera, in its frame
-        if program.pose_of == "body" and self._body_from_camera is not None:
-            of_body, pose = pose, pose @ self._body_from_camera
-            lever = pose[:3, 3] - of_body[:3, 3]
-        origin = program.origins.setdefault(answer.output, inverse(pose))
-        turn, covariance, velocity = origin[:3, :3], answer.covariance, answer.velocity
-        if covariance is not None:
-            moved = np.zeros((6, 6))
-            moved[:3, :3] = moved[3:, 3:] = turn
-            moved[:3, 3:] = -turn @ np.cross(np.eye(3), lever)  # a rotation moves the camera
-            covariance = moved @ covariance @ moved.T
-        return msgspec.structs.replace(
-            answer,
-            pose=origin @ pose,
-            covariance=covariance,
-            velocity=None if velocity is None else turn @ velocity,
-        )
+            if lent is not None:
+                del program.lent[n]
+                program.free.append(lent.slot)
+                self._changed.notify_all()
+        before = tuple(lent.before) if lent is not None else ()
+        self._answered(msgspec.structs.replace(message, before=before) if before else message)
 
 
 def _in_a_line(text: bytearray) -> str:

@@ -114,8 +114,8 @@ class ProcessConfig(EstimatorConfig):
         if self.feed == "ros2" and not self.command:
             raise ValueError("command: expected one for a program that ROS 2 feeds, found none")
         if self.feed == "link" and bool(self.images) == bool(self.asks):
-            found = f"asks = {self.asks!r} and images = {list(self.images)}"
-            raise ValueError(f"asks: expected images or the input that asks, found {found}")
+            settings = f"asks = {self.asks!r} and images = {list(self.images)}"
+            raise ValueError(f"asks: expected images or the input that asks, found {settings}")
         for name in ("images", "cameras", "reads", "outputs"):
             if len({*getattr(self, name)}) < len(getattr(self, name)):
                 raise ValueError(f"{name}: expected each once, found {getattr(self, name)}")
@@ -151,10 +151,10 @@ class Launch:
         # Where it has to connect: in its folder, if the path is not too long for one.
         self.socket = self.folder / "link.socket"
         if bridge is None:
-            self._ours = {}
+            self._of_ros = {}
         else:
             router = [*(bridge.listen or bridge.connect or ["tcp/localhost:7447"])]
-            self._ours = {
+            self._of_ros = {
                 "ROS_DOMAIN_ID": str(bridge.domain_id),
                 "RMW_IMPLEMENTATION": "rmw_zenoh_cpp",
                 "ZENOH_CONFIG_OVERRIDE": f"connect/endpoints={json.dumps(router)}",
@@ -175,10 +175,10 @@ class Launch:
         taken: list[int],  # those chosen by others; this program's are added
     ) -> str:
         """Choose the processors, the least used first; return an error if there are too few."""
-        there, wanted = sorted(os.sched_getaffinity(0), reverse=True), self._config.cpus
-        if wanted > len(there):
-            return f"cpus: expected at most the {len(there)} there are, found {wanted}"
-        self._processors = sorted(there, key=taken.count)[:wanted]
+        processors, count = sorted(os.sched_getaffinity(0), reverse=True), self._config.cpus
+        if count > len(processors):
+            return f"cpus: expected at most the {len(processors)} there are, found {count}"
+        self._processors = sorted(processors, key=taken.count)[:count]
         taken += self._processors
         return ""
 
@@ -222,8 +222,8 @@ class Launch:
             "VISNAV_INCLUDE": str(Path(native.__file__).parent),
             "VISNAV_PYTHON": sys.executable,
         }
-        own = {name: str(value) for name, value in self._config.environment.items()}
-        return {**os.environ, **places, **self._ours, **own}
+        settings = {name: str(value) for name, value in self._config.environment.items()}
+        return {**os.environ, **places, **self._of_ros, **settings}
 
     def _expanded(self, word: str) -> str:
         known = self.environment()
@@ -240,7 +240,7 @@ class Launch:
             ProgramError: A template is missing or wrong, or the calibration's format has no word
                 for the sensors.
         """
-        found: dict[Path, str] = {}
+        texts: dict[Path, str] = {}
         if form := self._config.calibration:
             if rig is None:
                 raise ProgramError("calibration: expected a camera, found none")
@@ -248,12 +248,12 @@ class Launch:
                 files = write_files(rig, form, topics=self._config.feed == "ros2")
             except ValueError as error:
                 raise ProgramError(f"calibration: {error}") from None
-            found = {self.folder / name: text for name, text in files.items()}
+            texts = {self.folder / name: text for name, text in files.items()}
         for file in self._config.files:
             template = Path(file.template)
             try:
                 ready = templates(template.parent).get_template(template.name)
-                found[self.folder / file.path] = ready.render(known)
+                texts[self.folder / file.path] = ready.render(known)
             except jinja2.TemplateNotFound as error:
                 missing = template.parent / str(error.name)
                 raise ProgramError(f"files: {missing}: expected a template, found none") from None
@@ -261,4 +261,4 @@ class Launch:
                 line = getattr(error, "lineno", None)
                 where = f"{template}: line {line}" if line else str(template)
                 raise ProgramError(f"files: {where}: {error}") from None
-        return found
+        return texts

@@ -81,7 +81,7 @@ class Process(Estimator[ProcessConfig]):
     """
 
     starts_programs = True
-    lenses = frozenset(COEFFICIENTS)  # the program is told the model
+    lenses = frozenset(COEFFICIENTS)  # the model is in the description
 
     setpoints = Output(Setpoint, when="pilot")
     commands = Output(Command, when="pilot")
@@ -105,7 +105,7 @@ class Process(Estimator[ProcessConfig]):
         self._named: dict[str, CameraAnnouncement] = {}
         self._imus: list[ImuAnnouncement] = []
         self._inputs = Inputs((*dict.fromkeys((*config.reads, *filter(None, [config.asks]))),))
-        self._asked = self._last = -1
+        self._asked = -1
         self._further: dict[int, Mount] = {}
         self._slots: dict[tuple[str, type], Slot] = {}
         self._feed: Feed | None = None
@@ -113,8 +113,10 @@ class Process(Estimator[ProcessConfig]):
         self._connected = self._closing = False
         self._pose: npt.NDArray[np.float64] = np.eye(4)
         self._unsent = 0
-        found = (s.config for s in self.siblings(Node) if isinstance(s.config, PublishingConfig))
-        self._bridge = next((each for each in found if hasattr(each, "domain_id")), None)
+        self._why_gone = ""
+        configs = (node.config for node in self.siblings(Node))
+        publishers = (config for config in configs if isinstance(config, PublishingConfig))
+        self._bridge = next((config for config in publishers if hasattr(config, "domain_id")), None)
         folder = None if self.out is None else self.out / "programs" / self.name
         self._show = Throttle(lambda line: self.log.info("%s", line))
         self._launch = Launch(config, self._bridge if config.feed == "ros2" else None, folder)
@@ -153,18 +155,18 @@ class Process(Estimator[ProcessConfig]):
         if config.feed == "ros2":
             return
         reads = (*sorted(self.needs), *config.reads)
-        for each in super().announce():
-            own = msgspec.structs.replace(each, reads=reads, vehicle=config.vehicle)
-            yield own
+        for announced in super().announce():
+            completed = msgspec.structs.replace(announced, reads=reads, vehicle=config.vehicle)
+            yield completed
             for name in config.outputs:
-                yield msgspec.structs.replace(own, source=f"{self.name}/{name}")
+                yield msgspec.structs.replace(completed, source=f"{self.name}/{name}")
         if config.pilot:
             yield PilotAnnouncement(stamp=0, source=self.name, vehicle=config.vehicle)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Choose the cameras, and note the other sensors."""
+        """Choose the cameras, and record the other sensors."""
         if announcement.source.partition("/")[0] != self.name:
-            self._inputs.announced(announcement)
+            self._inputs.record(announcement)
         if isinstance(announcement, ImuAnnouncement):
             self._imus.append(announcement)
         if not self.config.images:
@@ -220,15 +222,15 @@ class Process(Estimator[ProcessConfig]):
         self._loop = asyncio.get_running_loop()
         self._end: asyncio.Future[str] = self._loop.create_future()
         rig = self._rig()
-        for each in left_out(rig, config.calibration) if rig is not None else ():
-            self.log.warning("calibration: %s", each)
+        for sensor in left_out(rig, config.calibration) if rig is not None else ():
+            self.log.warning("calibration: %s", sensor)
         for path, text in launch.texts(self._known(), rig).items():
             path.parent.mkdir(parents=True, exist_ok=True)
             await self.offload(path.write_text, text, "utf-8")
         if config.feed == "link":
             self._feed = self._make_feed()
         if config.command:
-            start = self.offload(launch.start, config.command, self._show, self._note_end)
+            start = self.offload(launch.start, config.command, self._show, self._on_end)
             self._program = await start
         else:
             self.log.warning("start the program with VISNAV_SOCKET=%s", launch.socket)
@@ -263,20 +265,19 @@ class Process(Estimator[ProcessConfig]):
         self._hold: Hold[LinkAnswer] = self.hold(self.name, config.hold, config.latency)
         real = self.clock.kind == "real"
         slots = math.ceil(config.latency * cameras[0].rate) + 2 if cameras else _SLOTS
-        self._room = slots if real else math.inf
-        if config.hold.on_missing == "continue" and not real:
-            self._room = slots + _BEYOND
+        goes_on = config.hold.on_missing == "continue"
         pixels = sum(camera.info.height * camera.info.width for camera in cameras)
         described = [(c, kinds) for c in cameras], self._inputs.chosen, {"kind": self.clock.kind}
         return Feed(
             self._launch.socket,
             describe(*described, config.outputs),
             self._hold,
-            self._story,
             self._processes,
-            skips=config.hold.skips == "allowed" or real,
+            waits=not real,
+            room=slots if real else _BEYOND if goes_on else math.inf,
             slots=slots,
             slot_bytes=pixels * sum(KINDS[kind][1] for kind in config.images),
+            gone=self._disconnected,
             logged=self._show.take,
             orders=config.pilot,
         )
@@ -290,19 +291,18 @@ class Process(Estimator[ProcessConfig]):
 
     @on(Imu)
     def imu(self, event: Imu) -> None:
-        """Keep the samples of the IMU until the next frame."""
+        """Store the samples of the IMU until the next frame."""
         self.measurements(event)
 
     @on(*(k.event for k in sensor_kinds() if k.event is not Imu), PoseEstimate, TrackingLost)
     def measurements(self, event: Event) -> None:
-        """Keep an input until the next frame; ask for an answer, if it is the one that asks."""
-        name = self._inputs.take(event, self.clock.now())
+        """Store an input until the next frame; ask for an answer, if it is the one that asks."""
+        name = self._inputs.store(event, self.clock.now())
         if not name or name != self.config.asks or self._feed is None:
             return
         self._asked += 1
-        if self._asked % self.config.every == 0 and self.exposed_at(event) > self._last:
-            self._last = self.exposed_at(event)
-            self._ask(event, self._last, ())
+        if self._asked % self.config.every == 0 and self.exposed_at(event) > self._hold.newest:
+            self._ask(event, self.exposed_at(event), ())
 
     @on(Image, DepthImage)
     def frames(self, event: Image | DepthImage) -> None:
@@ -320,7 +320,7 @@ class Process(Estimator[ProcessConfig]):
         """Send a frame, with what came since the last, and await the answer."""
         assert self._feed is not None
         owed = self._hold.owe(stamp)
-        if not self._hold.expects or len(self._feed.unanswered) >= self._room:
+        if not self._hold.expects or self._feed.full:
             self._unsent += 1
             return
         self._feed.send(stamp, exposure, self._inputs.drain())
@@ -331,18 +331,18 @@ class Process(Estimator[ProcessConfig]):
         answer = await owed
         if answer is None:
             return
-        for each in answer.before:
-            if isinstance(each, LinkOrder):
-                self._order(each)
-            elif each.pose is not None:
-                self._publish_further(event, each, each.pose)
+        for message in answer.before:
+            if isinstance(message, LinkOrder):
+                self._order(message)
+            elif message.pose is not None:
+                self._publish_further(event, message, message.pose)
         if answer.status == "done":
             return
         lost = answer.pose is None
         self._pose = self._pose if answer.pose is None else answer.pose
         reason = "the program says so" if lost else ""
-        found = answer.points, answer.inliers, answer.velocity, answer.covariance
-        self.send_result(event, TrackingResult(self._pose, lost, reason, *found))
+        fields = answer.points, answer.inliers, answer.velocity, answer.covariance
+        self.send_result(event, TrackingResult(self._pose, lost, reason, *fields))
 
     def _publish_further(
         self, event: Event, answer: LinkAnswer, pose: npt.NDArray[np.float64]
@@ -377,10 +377,8 @@ class Process(Estimator[ProcessConfig]):
 
     async def on_shutdown(self) -> None:
         """Close the connection, and end the program if still running."""
-        if self._unsent:
-            self.log.warning(
-                "%d frames were not sent: the program was gone or had no room", self._unsent
-            )
+        if unsent := self._unsent + (self._feed.left_out if self._feed else 0):
+            self.log.warning("%d frames were not sent: the program was gone or had no room", unsent)
         if missed := sum(self._matcher.missed.values()) if self._slots else 0:
             self.log.warning("%d exposures lacked an image", missed)
         if dropped := self._inputs.dropped:
@@ -403,13 +401,18 @@ class Process(Estimator[ProcessConfig]):
     def _processes(self) -> list[int]:
         return [] if self._program is None else self._program.processes()
 
-    def _note_end(self, story: str) -> None:
+    def _disconnected(self, why: str) -> None:
+        """Report the end of the program's connection."""
+        self._why_gone = why
+        self._hold.gone(self._story(why))
+
+    def _on_end(self, story: str) -> None:
         """Report the program's end before the run's."""
-        if self._closing:  # as it was told
+        if self._closing:  # as was asked for
             return
         story = f"{self.config.command[0]} {story}"
         if self._feed is not None:
-            self._hold.gone("; ".join(filter(None, [self._feed.why_gone, story])))
+            self._hold.gone("; ".join(filter(None, [self._why_gone, story])))
             if not self._connected:
                 self._feed.close()
         elif self._ends_the_run():
@@ -419,8 +422,9 @@ class Process(Estimator[ProcessConfig]):
             self.log.warning("%s", story)
 
     def _ends_the_run(self) -> bool:
-        """Tell whether the bridge depends on the program's answers."""
-        held = [each.hold for each in getattr(self._bridge, "subscriptions", ()) if each.answers_to]
+        """Return whether the bridge depends on the program's answers."""
+        subscriptions = getattr(self._bridge, "subscriptions", ())
+        held = [topic.hold for topic in subscriptions if topic.answers_to]
         return not held or any(hold.on_missing == "error" for hold in held)
 
     def _story(self, why: str) -> str:
@@ -442,9 +446,10 @@ class Process(Estimator[ProcessConfig]):
         """Return the sensor of the pose: the camera, or the body itself."""
         if self.config.images:
             return super()._sensor()
-        of = next(each for name, _, each in self._inputs.chosen if name == self.config.asks)
+        asks = self.config.asks
+        of = next(announced for name, _, announced in self._inputs.chosen if name == asks)
         body = of.source.rpartition("/")[0] or self.config.vehicle
-        body = body or next((each.source for each in self._vehicles), self.name)
+        body = body or next((vehicle.source for vehicle in self._vehicles), self.name)
         frame = getattr(of, "parent_frame_id", "base_link")
         rate = getattr(of, "rate", 0.0)
         return SensorAnnouncement(stamp=0, source=f"{body}/", rate=rate, parent_frame_id=frame)
@@ -465,12 +470,12 @@ class Process(Estimator[ProcessConfig]):
         """Return the variables of the templates."""
 
         def topic(kind: TopicKind, source: str) -> str:
-            found = publication(kind, source, self._bridge or PublishingConfig())
-            return "" if found is None else found.name
+            topic = publication(kind, source, self._bridge or PublishingConfig())
+            return "" if topic is None else topic.name
 
         rig = self._rig()
-        vehicles = (each for each in self._vehicles if rig and each.source == rig.body)
-        own = {
+        vehicles = (vehicle for vehicle in self._vehicles if rig and vehicle.source == rig.body)
+        of_the_run = {
             "vehicle": next(vehicles, None),
             "topic": topic,
             "folder": str(self._launch.folder),
@@ -481,7 +486,7 @@ class Process(Estimator[ProcessConfig]):
             "imu": None,
             "stereo": False,
             **(variables(rig, topics=self.config.feed == "ros2") if rig else {}),
-            **own,
+            **of_the_run,
         }
 
 

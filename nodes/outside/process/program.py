@@ -44,6 +44,7 @@ from nodes.outside.native.rows import kind_of, row_kind, rows_of
 from runtime.channels.hold import Hold
 from runtime.errors import suggest
 from runtime.sensors import sensor_kinds
+from runtime.time.clock import SECOND
 from runtime.workers.output import Output, how_it_ended
 
 _AT_ONCE = 1 << 16  # bytes of a single read
@@ -110,12 +111,12 @@ class Program:
 
     def processes(self) -> list[int]:
         """Return the process IDs of the program and of its running descendants."""
-        found = [self._guard.pid]
-        for pid in found:
+        pids = [self._guard.pid]
+        for pid in pids:
             for thread in Path(f"/proc/{pid}/task").glob("*/children"):
                 with contextlib.suppress(OSError):
-                    found += map(int, thread.read_text("ascii").split())
-        return found[1:]
+                    pids += map(int, thread.read_text("ascii").split())
+        return pids[1:]
 
     def story(self) -> str:
         """Return how the program ended, or "still runs", and its last output."""
@@ -141,16 +142,16 @@ class Program:
         news = select.poll()
         news.register(output, select.POLLIN)
         news.register(control, select.POLLIN)
-        told, more = b"", b"\0"
+        exit_code, more = b"", b"\0"
         while more:
             ready = {number for number, _ in news.poll()}
             if output in ready and not self._read(output):
                 news.unregister(output)
             if control in ready:
                 more = self._control.recv(_AT_ONCE)
-                told += more
-                if not self._over.is_set() and (told.endswith(b"\n") or not more):
-                    self._note_end(output, told.decode().strip())
+                exit_code += more
+                if not self._over.is_set() and (exit_code.endswith(b"\n") or not more):
+                    self._report_end(output, exit_code.decode().strip())
         os.close(output)
         self._guard.wait()
         self._control.close()
@@ -163,15 +164,15 @@ class Program:
         self._output.take(data)
         return bool(data)
 
-    def _note_end(self, output: int, told: str) -> None:
+    def _report_end(self, output: int, exit_code: str) -> None:
         """Report the program's end, after its last output is read."""
         rest, until = select.poll(), time.monotonic() + _REST
         rest.register(output, select.POLLIN)
         while rest.poll(0) and time.monotonic() < until and self._read(output):
             pass
         with contextlib.suppress(ValueError):
-            self.code = int(told)
-        self._how = (told or "killed") if self.code is None else how_it_ended(self.code)
+            self.code = int(exit_code)
+        self._how = (exit_code or "killed") if self.code is None else how_it_ended(self.code)
         self._over.set()
         if not self._closing:
             self._ended(self.story())
@@ -198,13 +199,12 @@ Exposure = Sequence[tuple[int, str, Image | DepthImage]]
 
 
 class Feed:
-    """Sends exposures and measurements to a program, and takes its answers.
+    """Sends exposures and measurements to a program, and its answers to the hold.
 
     Args:
-        description: What the program is told; see `nodes.outside.native.describe`.
-        story: Called in a thread with why it is gone; returns what else is known.
+        description: Sent to the program; see `nodes.outside.native.describe`.
         processes: Returns the numbers of the program's processes, whose costs are measured.
-        options: Of the `Endpoint`: `slots`, `slot_bytes`, `logged`, `orders`.
+        options: Of the `Endpoint`: `slots`, `slot_bytes`, `gone`, `logged`, `orders`.
     """
 
     def __init__(
@@ -212,32 +212,34 @@ class Feed:
         path: Path,
         description: Mapping[str, Any],
         hold: Hold[LinkAnswer],
-        story: Callable[[str], str],
         processes: Callable[[], Sequence[int]],
         *,
-        skips: bool,  # whether an answer says that none will come for the frames before it
+        waits: bool,  # whether frames wait for a free slot, or are left out
+        room: float,  # frames waiting to be sent, at most
         **options: Any,
     ) -> None:
-        self.unanswered: dict[int, int] = {}
-        """Stamps of frames sent or about to be, with the real times of sending (ns)."""
-        self.why_gone = ""
-        self._hold, self._story, self._skips, self._processes = hold, story, skips, processes
+        self.left_out = 0  # number of frames without a free slot, or without a program
+        self._hold, self._processes, self._waits, self._room = hold, processes, waits, room
         self._initialised = self._closed = False
-        self._names = [each["name"] for each in description["inputs"]]
+        self._names = [row["name"] for row in description["inputs"]]
         self._outbox: queue.SimpleQueue[tuple[int, Exposure, Sequence[Message]] | None] = (
             queue.SimpleQueue()
         )
         self._endpoint = Endpoint(
-            path, description, answered=self._take, gone=self._lose, skips=skips, **options
+            path, description, answered=self._answer, ready=hold.back, **options
         )
         self._endpoint.listen()
         self.connect = self._endpoint.wait
         self._sender = threading.Thread(target=self._send_all, name=f"feed {path}", daemon=True)
         self._sender.start()
 
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for a frame."""
+        return self._outbox.qsize() >= self._room
+
     def send(self, stamp: int, exposure: Exposure, inputs: Sequence[Message]) -> None:
         """Have inputs sent, and then a frame of a stamp (ns); returns at once."""
-        self.unanswered[stamp] = time.monotonic_ns()
         self._outbox.put((stamp, exposure, inputs))
 
     def close(self) -> None:
@@ -252,39 +254,28 @@ class Feed:
             stamp, exposure, inputs = due
             images = [(camera, kind, _pixels(kind, event)) for camera, kind, event in exposure]
             try:
-                for each in inputs:
-                    if self._endpoint.send_input(*each):
-                        self._hold.sent(self._names[each.number], each.rows.tobytes())
-                if self._endpoint.send_frame(stamp, images):
-                    self._hold.sent("frames", stamp.to_bytes(8, "little", signed=True))
-                    for camera, kind, image in images:
-                        self._hold.sent(f"{kind} {camera}", image.data)
+                for message in inputs:
+                    if self._endpoint.send_input(*message):
+                        self._hold.sent(self._names[message.number], message.rows.tobytes())
+                if not self._endpoint.send_frame(stamp, images, self._waits):
+                    self.left_out += 1
+                    continue
+                self._hold.sent("frames", stamp.to_bytes(8, "little", signed=True))
+                for camera, kind, image in images:
+                    self._hold.sent(f"{kind} {camera}", image.data)
             except ValueError as error:  # an image is not as announced
                 self._hold.fail(LinkError(str(error)))
 
-    def _take(self, answer: LinkAnswer) -> None:
-        if sent := self.unanswered.get(answer.stamp):
-            costs = self._hold.answers.costs
-            costs.measure(time.monotonic_ns() - sent, self._processes())
-        earlier = [stamp for stamp in list(self.unanswered) if stamp < answer.stamp]
-        for stamp in (*(earlier if self._skips else ()), answer.stamp):
-            self.unanswered.pop(stamp, None)
+    def _answer(self, answer: LinkAnswer) -> None:
+        if (seconds := self._hold.waited(answer.stamp)) is not None:
+            self._hold.answers.costs.measure(round(seconds * SECOND), self._processes())
+        if self._hold.skips:
+            self._endpoint.release(answer.stamp)
         self._initialised = self._initialised or answer.pose is not None
         useful = answer.pose is not None or bool(answer.before)
         useful = useful or (answer.status == "lost" and self._initialised)
         says = answer.status if answer.status in ("initialising", "lost") else ""
         self._hold.answer(answer.stamp, answer if useful else None, says)
-
-    def _lose(self, why: str) -> None:
-        """Report the loss of the program, and wait for another in its place."""
-        self.why_gone = why
-        self._hold.gone(self._story(why))
-        while not self._closed:
-            with contextlib.suppress(LinkError):
-                self._endpoint.wait(1.0)
-                self.unanswered.clear()
-                self._hold.back()
-                return
 
 
 def _pixels(kind: str, event: Image | DepthImage) -> npt.NDArray[Any]:
@@ -323,8 +314,8 @@ class Inputs:
         self._bytes = 0
         self._frames: dict[str, list[str]] = {}  # of each estimator, in the order of their use
 
-    def announced(self, announcement: Announcement) -> None:
-        """Note a sensor or an estimator."""
+    def record(self, announcement: Announcement) -> None:
+        """Record a sensor or an estimator that may be chosen."""
         kinds = [sensor.announcement for sensor in sensor_kinds()]
         if isinstance(announcement, (EstimatorAnnouncement, *kinds)):
             self._announced.append(announcement)
@@ -337,33 +328,33 @@ class Inputs:
         """Choose among what was announced, and yield an error for each that is missing."""
         self.chosen = []
         for name in self._names:
-            found = self._find(name, body)
-            if found is None:
-                sources = [each.source for each in self._announced]
+            sensor = self._find(name, body)
+            if sensor is None:
+                sources = [announced.source for announced in self._announced]
                 known = f"found {', '.join(sources) or 'none'}{suggest(name, sources)}"
                 yield f"reads: expected a sensor or an estimator called {name}, {known}"
-            elif (other := next((n for n, _, each in self.chosen if each is found), "")) != "":
-                yield f"reads: expected each once, found {found.source} as {other} and as {name}"
+            elif other := next((n for n, _, chosen in self.chosen if chosen is sensor), ""):
+                yield f"reads: expected each once, found {sensor.source} as {other} and as {name}"
             else:
-                self.chosen.append((name, _kind(found), found))
-                body = body or found.source.rpartition("/")[0]
+                self.chosen.append((name, _kind(sensor), sensor))
+                body = body or sensor.source.rpartition("/")[0]
         if imu is not None and all(kind != "imu" for _, kind, _ in self.chosen):
             self.chosen.insert(0, ("imu", "imu", imu))
-        self._numbers = {each.source: number for number, (*_, each) in enumerate(self.chosen)}
+        self._numbers = {chosen.source: number for number, (*_, chosen) in enumerate(self.chosen)}
 
     def _find(self, name: str, body: str) -> Announcement | None:
-        sensor = next((each for each in sensor_kinds() if each.name == name), None)
-        for each in self._announced:
-            estimator = isinstance(each, EstimatorAnnouncement)
-            if sensor is not None and isinstance(each, sensor.announcement):
-                if body in ("", each.source.rpartition("/")[0]):
-                    return each
-            elif each.source == name or (not estimator and each.source.endswith(f"/{name}")):
-                return each
+        sensor = next((kind for kind in sensor_kinds() if kind.name == name), None)
+        for announced in self._announced:
+            source, estimator = announced.source, isinstance(announced, EstimatorAnnouncement)
+            if sensor is not None and isinstance(announced, sensor.announcement):
+                if body in ("", source.rpartition("/")[0]):
+                    return announced
+            elif source == name or (not estimator and source.endswith(f"/{name}")):
+                return announced
         return None
 
-    def take(self, event: Event, now: int) -> str:
-        """Keep an event until the next frame; return the name of its input, if that is news."""
+    def store(self, event: Event, now: int) -> str:
+        """Store an event until the next frame; return the name of its input, if that is news."""
         number = self._numbers.get(event.source)
         rows = None if number is None else self._rows(event, self.chosen[number][1])
         if number is None or rows is None:
@@ -377,16 +368,16 @@ class Inputs:
 
     def drain(self) -> list[Message]:
         """Return what has come since, in the order of arrival; rows of an input in one message."""
-        found = []
-        for number, together in itertools.groupby(self._waiting, lambda each: each.number):
+        rows_of_inputs = []
+        for number, together in itertools.groupby(self._waiting, lambda message: message.number):
             messages = [*together]
             scans = self.chosen[number][1] == "lidar_scan"
-            for some in [[each] for each in messages] if scans else [messages]:
-                rows = np.concatenate([each.rows for each in some])
-                found.append(Message(number, some[-1].arrived, rows))
+            for some in [[message] for message in messages] if scans else [messages]:
+                rows = np.concatenate([message.rows for message in some])
+                rows_of_inputs.append(Message(number, some[-1].arrived, rows))
         self._waiting.clear()
         self._bytes = 0
-        return found
+        return rows_of_inputs
 
     def _rows(self, event: Event, kind: str) -> npt.NDArray[Any] | None:
         """Return an event as rows of a kind; `None` if it is another's."""

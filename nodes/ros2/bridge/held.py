@@ -59,7 +59,6 @@ class HeldEstimator:
         images = [row.kind for row in PUBLISHED if row.image]
         publications = [publication(kind, self.subscription.answers_to, config) for kind in images]
         self._images = [row.name for row in publications if row is not None]
-        self._owed = -1  # stamp of the newest image
         self._sequences: dict[bytes, int] = {}  # by GID
         self._there: dict[str, None] = {}  # tokens of its publishers
         self._came = self._gone = False
@@ -83,9 +82,8 @@ class HeldEstimator:
 
     def owe(self, image: Event, matched: Callable[[], Sequence[str]]) -> Owed[Event] | None:
         """Return the answer owed to an image about to go out, the exposure's first, or `None`."""
-        if image.source != self.subscription.answers_to or image.stamp <= self._owed:
+        if image.source != self.subscription.answers_to or image.stamp <= self.hold.newest:
             return None
-        self._owed = image.stamp
         if self._gone and not self.missing(matched()):
             self._gone = False
             self._answerers.clear()
@@ -138,8 +136,8 @@ class HeldEstimator:
 
     def _miss(self) -> None:
         if not self._there:
-            self._gone = True
             self.hold.gone(f"nobody publishes {self._topics[0].topic.name} any more")
+            self._gone = True  # not before: `owe` reports it as back
 
 
 def held_estimators(

@@ -34,11 +34,11 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
 
 def test_the_digest_of_inputs_is_that_of_their_bytes_by_stream() -> None:
     first, second = Answers(), Answers()
-    first.took_in("image", b"abc")
-    first.took_in("imu", bytearray(b"d"))
-    second.took_in("imu", memoryview(b"d"))
-    second.took_in("image", b"abc")
+    first.record_input("image", b"abc")
+    first.record_input("imu", bytearray(b"d"))
+    second.record_input("imu", memoryview(b"d"))
+    second.record_input("image", b"abc")
     assert first.inputs() == second.inputs()
-    second.took_in("image", b"")
+    second.record_input("image", b"")
     assert first.inputs() != second.inputs()
     assert Answers().inputs() is None

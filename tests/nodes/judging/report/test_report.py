@@ -217,7 +217,7 @@ def test_a_system_that_lost_frames_is_told_at_the_top_and_in_a_table(tmp_path: P
     answers = Answers(latency=0.015)
     for stamp in range(3):
         answers.owed(stamp)
-        answers.took_in("images", bytes([stamp]))
+        answers.record_input("images", bytes([stamp]))
         answers.settled(Settled(stamp, stamp, "lost" if stamp == 1 else "answered", 0.004))
     answers.why_not["frames were lost after 10 s of real time"] = None
     truth = walk(2)

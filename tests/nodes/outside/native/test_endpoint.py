@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from events.geometry import inverse, pose_matrix
-from nodes.outside.native import LinkError
+from nodes.outside.native import LinkError, endpoint
 from nodes.outside.native.client import RECORDS, Frame, Link
 from tests.nodes.outside.native.samples_link import (
     CAMERA,
@@ -114,6 +114,35 @@ def test_a_second_program_is_refused_and_the_first_goes_on(run: Noted) -> None:
     assert run.reason() == "raw: its connection has ended"
 
 
+def test_one_that_is_slow_to_speak_holds_nobody_up(run: Noted) -> None:
+    """Of all who connect, each byte may come by itself."""
+    with program(run.path) as first, program(run.path) as other:
+        first.get_ready()
+        run.endpoint.wait(LIMIT)
+        assert run.endpoint.send_frame(5, images())
+        hello = struct.pack("<II", 20, 1) + b"VISNAVLK" + struct.pack("<II", 2, 0) + b"slow"
+        answer = struct.pack("<II", 16, 33) + done(0, 5)
+        for n in range(max(len(hello), len(answer))):
+            other.socket.sendall(hello[n : n + 1])
+            first.socket.sendall(answer[n : n + 1])
+        assert run.answer().stamp == 5
+        assert other.receive() == (
+            3,
+            b"VISNAVLK" + struct.pack("<II", 2, 0) + b"expected one program, found raw connected",
+        )
+
+
+def test_one_that_never_greets_is_disconnected(run: Noted, monkeypatch: pytest.MonkeyPatch) -> None:
+    with program(run.path) as first:
+        first.get_ready()
+        run.endpoint.wait(LIMIT)
+        monkeypatch.setattr(endpoint, "GREETING_TIME", 0.0)
+        monkeypatch.setattr(endpoint, "_LOOK", 0.01)
+        with program(run.path) as silent:
+            assert silent.receive() == (5, b"its connection has ended")
+        assert run.endpoint.send_frame(5, images())
+
+
 def test_a_socket_that_a_dead_run_left_is_replaced(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as dead:
         dead.bind(str(tmp_path / "s"))
@@ -162,16 +191,22 @@ def test_a_frame_waits_for_a_slot_and_answers_may_come_in_any_order(run: Noted) 
         assert not run.endpoint.send_frame(15, images(), wait=False)
 
 
-def test_with_skips_an_answer_frees_what_was_before_it(tmp_path: Path) -> None:
-    with listening(tmp_path / "s", slots=3, skips=True) as run, program(run.path) as raw:
+def test_what_was_skipped_frees_its_slots_and_nothing_else_does(tmp_path: Path) -> None:
+    with listening(tmp_path / "s", slots=3) as run, program(run.path) as raw:
         raw.get_ready()
         run.endpoint.wait(LIMIT)
         for stamp in range(3):
             assert run.endpoint.send_frame(stamp, images())
-        raw.send(33, done(2, 2))
-        assert run.answer().stamp == 2
-        for stamp in range(3, 6):
-            assert run.endpoint.send_frame(stamp, images(), wait=False)
+        raw.send(33, done(1, 1))
+        assert run.answer().stamp == 1
+        assert run.endpoint.send_frame(3, images(), wait=False)
+        assert not run.endpoint.send_frame(4, images(), wait=False)
+        run.endpoint.release(1)
+        assert run.endpoint.send_frame(4, images(), wait=False)
+        assert not run.endpoint.send_frame(5, images(), wait=False)  # 2, 3 and 4 are out
+        raw.send(33, done(0, 0))  # skipped, and answered after all
+        assert run.answer().stamp == 0
+        assert not run.endpoint.send_frame(5, images(), wait=False)
 
 
 @pytest.mark.parametrize("how", ["killed", "close"])

@@ -207,15 +207,15 @@ def test_each_scan_and_each_estimate_may_ask(tmp_path: Path) -> None:
 def test_a_lost_estimator_is_a_row_without_a_pose_and_a_new_map_another_frame() -> None:
     inputs = Inputs(["vio"])
     for announcement in announced():
-        inputs.announced(announcement)
+        inputs.record(announcement)
     assert not [*inputs.choose("others", None)]
     where: dict[str, Any] = {"position": (1, 2, 3), "orientation": (1, 0, 0, 0)}
     for n, frame in enumerate(["odom", "odom", "", "odom_1"]):
         event: Event = TrackingLost(stamp=n, source="vio")
         if frame:
             event = PoseEstimate(stamp=n, source="vio", frame_id=frame, **where)
-        assert inputs.take(event, n) == ("vio" if frame else "")
-    assert inputs.take(PoseEstimate(stamp=9, source="other", **where), 9) == ""
+        assert inputs.store(event, n) == ("vio" if frame else "")
+    assert inputs.store(PoseEstimate(stamp=9, source="other", **where), 9) == ""
     ((number, arrived, rows),) = inputs.drain()
     assert (number, arrived) == (0, 3)
     assert rows["frame"].tolist() == [0, 0, 0, 1]
@@ -228,7 +228,7 @@ def test_a_lost_estimator_is_a_row_without_a_pose_and_a_new_map_another_frame() 
 def test_what_no_frame_takes_along_is_dropped_and_counted() -> None:
     inputs = Inputs(["lidar"])
     for announcement in announced():
-        inputs.announced(announcement)
+        inputs.record(announcement)
     assert not [*inputs.choose("", None)]
     count = MOST_BYTES // 32 // 3
     scan = LidarScan(
@@ -241,7 +241,7 @@ def test_what_no_frame_takes_along_is_dropped_and_counted() -> None:
         rings=np.zeros(count, np.uint16),
     )
     for n in range(5):
-        assert inputs.take(scan, n) == "lidar"
+        assert inputs.store(scan, n) == "lidar"
     assert inputs.dropped == 2
     assert [row.arrived for row in inputs.drain()] == [2, 3, 4]  # scans stay apart
 
