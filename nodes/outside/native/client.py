@@ -164,9 +164,9 @@ class Link:
             self.description = self._welcome()
             self._kinds = {each["name"]: each["kind"] for each in self.description["inputs"]}
             self._records = RECORDS | {
-                each["kind"]: np.dtype([("stamp", "<i8"), *map(_column, each["row"])])
-                for each in self.description["inputs"]
-                if "row" in each  # of a kind that is not part of the protocol
+                entry["kind"]: np.dtype([("stamp", "<i8"), *map(_column, entry["row"])])
+                for entry in self.description["inputs"]
+                if "row" in entry  # of a kind that is not part of the protocol
             }
             unless_joined.pop_all()
 

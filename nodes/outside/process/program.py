@@ -352,7 +352,7 @@ class Inputs:
         self._numbers = {each.source: number for number, (*_, each) in enumerate(self.chosen)}
 
     def _find(self, name: str, body: str) -> Announcement | None:
-        sensor = next((each for each in sensor_kinds() if each.name == name), None)
+        sensor = next((kind for kind in sensor_kinds() if kind.name == name), None)
         for each in self._announced:
             estimator = isinstance(each, EstimatorAnnouncement)
             if sensor is not None and isinstance(each, sensor.announcement):
