@@ -47,7 +47,7 @@ class SensorPlatform(Simulator[P]):
 
     imu = Output(ev.Imu)
     # An output for each sensor of the table: the body of a class is a namespace to be written to.
-    locals().update({each.kind.group: Output(each.kind.event) for each in all_sensors()})
+    locals().update({model.kind.group: Output(model.kind.event) for model in all_sensors()})
     ranges = Output(ev.Range)
     lidar_scans = Output(ev.LidarScan)
 

@@ -44,8 +44,8 @@ class SensorsConfig(SimulatorConfig):
     imu_rate: Rate = _RATE
     imu: ImuParameters = ImuParameters()
     # A setting for each sensor of the table: the body of a class is a namespace to be written to.
-    __annotations__ |= {each.kind.name: each.spec_type | None for each in all_sensors()}
-    locals().update(dict.fromkeys([each.kind.name for each in all_sensors()]))
+    __annotations__ |= {model.kind.name: model.spec_type | None for model in all_sensors()}
+    locals().update(dict.fromkeys([model.kind.name for model in all_sensors()]))
     range_finders: tuple[RangeFinderSpec, ...] = ()
     lidars: tuple[LidarSpec, ...] = ()
 
@@ -72,7 +72,7 @@ class SensorsConfig(SimulatorConfig):
 
 
 SensorsConfig.__doc__ = str(SensorsConfig.__doc__).replace(
-    "{sensors}", "\n        ".join(f"{each.kind.name}: {each.meaning}" for each in all_sensors())
+    "{sensors}", "\n        ".join(f"{model.kind.name}: {model.meaning}" for model in all_sensors())
 )
 
 

@@ -20,8 +20,8 @@ PROGRAM = """
 from nodes.outside.native.client import Link
 
 with Link("ears") as link:
-    (said,) = [each for each in link.description["inputs"] if each["name"] == "airspeed"]
-    link.log(f"row {said['kind']} {said['row']} {said['row_bytes']}")
+    (entry,) = [row for row in link.description["inputs"] if row["name"] == "airspeed"]
+    link.log(f"row {entry['kind']} {entry['row']} {entry['row_bytes']}")
     link.ready("body")
     for frame in link:
         link.log(f"rows {frame.rows('airspeed')['airspeed'].tolist()}")
@@ -33,7 +33,7 @@ from nodes.data.replay.node import open_reader
 from nodes.data.replay.reader import Choice, ReplayConfig
 
 reader = open_reader(ReplayConfig(file="set"), "drone")
-(camera,) = [each for each in reader.announcements() if hasattr(each, "images")]
+(camera,) = [known for known in reader.announcements() if hasattr(known, "images")]
 print(camera.source, camera.images, camera.info.width, camera.info.height, camera.rate)
 for _, event in reader.events(0, None, Choice(("Event",))):
     what = event.position if hasattr(event, "position") else event.data.max()
@@ -78,8 +78,8 @@ def test_a_packages_sensor_world_node_and_command_fly(site: Path, tmp_path: Path
     done = python(["-m", "runtime", "run", "flight.toml", "--out", "run"], site, tmp_path)
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
-    announced = [each for each in summary["announcements"] if "Airspeed" in each["type"]]
-    assert [each["source"] for each in announced] == ["drone/airspeed"]
+    announced = [entry for entry in summary["announcements"] if "Airspeed" in entry["type"]]
+    assert [entry["source"] for entry in announced] == ["drone/airspeed"]
     log = (tmp_path / "run" / "log.txt").read_text(encoding="utf-8")
     assert "row airspeed [['airspeed', '<f8']] 16" in log
     assert re.search(r"rows \[\d", log)

@@ -482,9 +482,9 @@ def open_other(path: Path, config: ReplayConfig, vehicle: str) -> Dataset | None
     """
     for reader, whose in _others().items():
         try:
-            if (found := reader.find(path)) is not None:
+            if (place := reader.find(path)) is not None:
                 _check_calibration(reader, path, config)
-                return reader(found, config, vehicle)
+                return reader(place, config, vehicle)
         except ReplayError:
             raise
         except Exception as error:

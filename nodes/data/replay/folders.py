@@ -271,7 +271,7 @@ class Dataset(Reader):
 
     def _begin(self) -> None:
         """Choose time 0, cut the truth to the sensors' time, and announce the vehicle."""
-        others = [row[0] for each in self.others for row in each.rows]
+        others = [row[0] for table in self.others for row in table.rows]
         firsts = [files[0][0] for files in self.images.values() if files]
         lasts = [files[-1][0] for files in self.images.values() if files]
         if not firsts and not others:

@@ -51,11 +51,11 @@ def test_rows_of_the_protocol_are_those_of_the_sensors_of_the_table() -> None:
 def test_a_row_has_the_fields_of_the_event_that_the_description_names() -> None:
     announced = SensorAnnouncement(stamp=0, source="drone/sonar", rate=10.0)
     inputs = [("sonar", rows.kind_of(ECHO), announced)]
-    (said,) = json.loads(json.dumps(describe([], inputs, {})["inputs"]))
-    assert said["kind"] == "sonar_echo"
-    columns = [client._column(column) for column in said["row"]]
+    (entry,) = json.loads(json.dumps(describe([], inputs, {})["inputs"]))
+    assert entry["kind"] == "sonar_echo"
+    columns = [client._column(column) for column in entry["row"]]
     record = np.dtype([("stamp", "<i8"), *columns])
-    assert record.itemsize == said["row_bytes"] == 40
+    assert record.itemsize == entry["row_bytes"] == 40
     (row,) = np.frombuffer(rows.rows_of(ECHO).tobytes(), record)
     assert (row["stamp"], row["strength"], [*row["direction"]]) == (5, 0.5, [1.0, 2.0, 3.0])
 
