@@ -1,4 +1,4 @@
-"""What a change of each kind touches stays as little as CONTRIBUTING.md says."""
+"""What a change touches, and what an import brings, stays as little as CONTRIBUTING.md says."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.size import CHANGES, files_of
+from tools.size import CHANGES, closure, files_of
 
 ROOT = Path(__file__).parents[1]
 
@@ -25,3 +25,11 @@ def test_the_page_for_contributors_has_each_kind_with_its_files() -> None:
     for kind, change in CHANGES.items():
         (row,) = re.findall(rf"^\| {kind} \|.*$", page, re.MULTILINE)
         assert f"| {change.limit} |" in row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("module", "limit"), [("runtime.node", 7_000), ("runtime.run.execute", 11_000)]
+)
+def test_an_import_brings_few_lines(module: str, limit: int) -> None:
+    assert 1_000 < closure(module).lines <= limit

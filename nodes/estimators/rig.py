@@ -23,7 +23,8 @@ from events import (
     TrajectoryEstimate,
     VehicleAnnouncement,
 )
-from events.geometry import cross_matrix, moved_covariance, pose_matrix, pose_tuples
+from events.covariance import cross_matrix, moved_covariance
+from events.geometry import pose_matrix, pose_tuples
 from runtime.errors import suggest
 
 

@@ -7,15 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from events import Quaternion, Vector3
+from events.covariance import cross_matrix, moved_covariance
 from events.frames import from_rpy, rotate
-from events.geometry import (
-    cross_matrix,
-    inverse,
-    moved_covariance,
-    pose_matrix,
-    pose_tuples,
-    relative,
-)
+from events.geometry import inverse, pose_matrix, pose_tuples, relative
 
 numbers = st.floats(-1e3, 1e3)
 vectors = st.tuples(numbers, numbers, numbers)

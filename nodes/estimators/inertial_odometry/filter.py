@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from events.geometry import cross_matrix, inverse
+from events.covariance import cross_matrix
+from events.geometry import inverse
 from nodes.estimators.inertial_odometry.preintegration import (
     Floats,
     ImuModel,

@@ -17,7 +17,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from events import CameraInfo, ImuAnnouncement
-from events.geometry import cross_matrix, pose_matrix
+from events.covariance import cross_matrix
+from events.geometry import pose_matrix
 from nodes.estimators.images import Depth
 from nodes.estimators.pose import rays
 

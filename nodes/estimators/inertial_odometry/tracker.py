@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, ImuAnnouncement
-from events.geometry import cross_matrix, inverse, pose_matrix
+from events.covariance import cross_matrix
+from events.geometry import inverse, pose_matrix
 from nodes.estimators import EstimatorConfig, RgbdInertialFrame, StereoInertialFrame, TrackingResult
 from nodes.estimators.images import Depth, Grey
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Announcement, CameraAnnouncement
-from events.geometry import cross_matrix, inverse, moved_covariance, pose_matrix
+from events.covariance import cross_matrix, moved_covariance
+from events.geometry import inverse, pose_matrix
 from nodes.outside.native.client import (
     AXES,
     COVARIANCE,
