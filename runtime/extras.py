@@ -123,6 +123,7 @@ EXTENSIONS = {
     "foxglove": ("FoxgloveServer",),
     "machines": ("Peers",),
     "mavlink": ("Mavlink", "Px4"),
+    "rerun": ("RerunView",),
 }
 """What the extensions of this repository offer: nodes, suffixes of configuration files, commands,
 and the processes of a run beside this one."""

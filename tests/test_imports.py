@@ -25,6 +25,7 @@ MAY_IMPORT = {
     "visnav_estimators": {"events", "runtime", "runtime.tools", "nodes", "visnav_estimators"},
     "visnav_foxglove": {"events", "runtime", "nodes", "visnav_foxglove"},
     "visnav_machines": {"events", "runtime", "visnav_machines"},
+    "visnav_rerun": {"events", "runtime", "nodes", "visnav_rerun"},
     "visnav_mavlink": {"events", "runtime", "nodes", "visnav_mavlink"},
     "bench": {"events", "runtime", "runtime.tools", "sims", "nodes", "bench", "visnav_airsim"},
 }

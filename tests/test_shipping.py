@@ -217,7 +217,7 @@ def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
         )
         for wheel in built(extension.parent, tmp_path / extension.parent.name, "--wheel")
     ]
-    assert len(wheels) == 6
+    assert len(wheels) == 7
     done(bin_ / "pip", "install", "--quiet", *wheels)
     assert {"AirsimServer", "Mavlink", "OrbSlam3"} <= set(done(visnav, "nodes").split())
     measured = done(visnav, "bench", "small", "--nodes", "2", "--samples", "30", "--repeats", "1")

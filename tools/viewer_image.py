@@ -26,7 +26,7 @@ from typing import Any
 from PIL import Image
 from websockets.sync.client import ClientConnection, connect
 
-from nodes.viewers.rerun.sdk import program
+from visnav_rerun.sdk import program
 
 WIDTH, HEIGHT = 1440, 900
 TOP = 32  # height of the viewer's own bar, cut off, pixels

@@ -165,13 +165,6 @@ def test_the_data_sets_hold_equal_stamps(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_rerun_leaves_a_recording(tmp_path: Path) -> None:
-    """`rerun` writes a file with the whole flight in it."""
-    run("rerun", tmp_path, "run.duration=4s", "report.figures=[]")
-    assert (tmp_path / "flight.rrd").stat().st_size > 500_000
-
-
-@pytest.mark.slow
 def test_a_recording_takes_the_simulators_place(tmp_path: Path) -> None:
     """`replay` gives the estimates that `record` gave in flight, to the byte."""
     run("record", tmp_path / "live", "run.duration=4s", "report.figures=[]")

@@ -20,8 +20,6 @@ from events import (
     TrackingLost,
     Wind,
 )
-from nodes.viewers.rerun.node import Recorder
-from nodes.viewers.rerun.sdk import RerunConfig
 from tests.nodes.viewers.common.samples import (
     CAMERA,
     ESTIMATOR,
@@ -45,6 +43,8 @@ from tests.nodes.viewers.common.samples import (
     scan,
     score,
 )
+from visnav_rerun.node import Recorder
+from visnav_rerun.sdk import RerunConfig
 
 TRANSLATION, QUATERNION = "Transform3D:translation", "Transform3D:quaternion"
 

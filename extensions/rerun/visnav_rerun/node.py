@@ -40,11 +40,11 @@ from events import (
 )
 from nodes.trajectory_files import part_name
 from nodes.viewers.common import ImageSelection
-from nodes.viewers.rerun.entities import GROUPS, EntityLog, Eye, Numbered, Plots, layout
-from nodes.viewers.rerun.sdk import RerunConfig, Viewer, load
-from nodes.viewers.rerun.world import World
 from runtime import Node, Stream, on
 from runtime.sensors import measured
+from visnav_rerun.entities import GROUPS, EntityLog, Eye, Numbered, Plots, layout
+from visnav_rerun.sdk import RerunConfig, Viewer, load
+from visnav_rerun.world import World
 
 _GATHERED = 500  # events written into a file together
 _TIMEOUT = 3.0  # real seconds for a viewer to take data; else new ones are left out

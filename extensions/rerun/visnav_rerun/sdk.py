@@ -20,7 +20,6 @@ import msgspec
 
 from runtime import NodeConfig
 from runtime.errors import MissingDependencyError, VisnavError
-from runtime.extras import install_command
 from runtime.paths import OutputPath
 
 _Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
@@ -71,6 +70,7 @@ class RerunConfig(NodeConfig):
     update_rate: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 20.0
 
 
+_INSTALL = "pip install ./extensions/rerun"
 _TIMEOUT = 15.0  # real seconds until a server must listen
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")  # a terminal's codes for colours
 _PR_SET_PDEATHSIG = 1  # prctl(2) option: signal to a process at its parent's end
@@ -82,9 +82,7 @@ def load() -> Any:
         import rerun
         import rerun.blueprint
     except ImportError as error:
-        raise MissingDependencyError(
-            f"the view needs rerun ({error}): {install_command('rerun')}"
-        ) from error
+        raise MissingDependencyError(f"the view needs rerun ({error}): {_INSTALL}") from error
     return rerun
 
 
@@ -179,7 +177,7 @@ def program() -> str:
     """Return the path of the program in Rerun's library."""
     spec = importlib.util.find_spec("rerun_cli")
     if spec is None or not spec.submodule_search_locations:
-        raise MissingDependencyError(f"the view needs Rerun's program: {install_command('rerun')}")
+        raise MissingDependencyError(f"the view needs Rerun's program: {_INSTALL}")
     return str(Path(spec.submodule_search_locations[0]) / "rerun")
 
 

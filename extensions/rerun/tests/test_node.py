@@ -16,9 +16,6 @@ import numpy as np
 import pytest
 
 from events import Event
-from nodes.viewers.rerun import RerunView, sdk
-from nodes.viewers.rerun.node import Recorder
-from nodes.viewers.rerun.sdk import RerunConfig
 from runtime.errors import ConfigError, MissingDependencyError, VisnavError
 from runtime.testing import run_node
 from tests.nodes.viewers.common.samples import (
@@ -33,6 +30,9 @@ from tests.nodes.viewers.common.samples import (
     image,
     odometry,
 )
+from visnav_rerun import RerunView, sdk
+from visnav_rerun.node import Recorder
+from visnav_rerun.sdk import RerunConfig
 
 ROOT = Path(__file__).parents[4]
 
@@ -86,7 +86,7 @@ def test_settings_that_are_wrong_say_where(config: dict[str, Any], message: str)
 
 def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[rerun\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install \./extensions/rerun"):
         sdk.load()
 
 
@@ -136,7 +136,7 @@ def test_a_viewer_that_goes_away_is_survived() -> None:
 @pytest.mark.slow
 def test_a_viewer_that_stands_still_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """What it does not take is left out and counted; once it goes on, so does the view."""
-    monkeypatch.setattr("nodes.viewers.rerun.node._TIMEOUT", 0.3)
+    monkeypatch.setattr("visnav_rerun.node._TIMEOUT", 0.3)
     config = RerunConfig(mode="serve", port=free_port(), web_port=free_port(), jpeg_quality=0)
     noise = np.random.default_rng(0).integers(0, 255, (1000, 1000, 3), np.uint8)
     recorder = Recorder(config, "test", None)

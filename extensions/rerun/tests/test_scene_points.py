@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nodes.viewers.rerun.entities import ScenePoints
 from tests.nodes.viewers.common.samples import CAMERA, MS, camera_pose, depth, image
+from visnav_rerun.entities import ScenePoints
 
 
 def scene_points(rate: float = 2.0, max_height: float = 9.0) -> ScenePoints:

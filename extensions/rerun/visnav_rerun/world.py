@@ -43,9 +43,9 @@ from nodes.viewers.common import (
     moving_body,
     truth_colour,
 )
-from nodes.viewers.rerun import entities
-from nodes.viewers.rerun.entities import EntityLog, Numbered, ScenePoints
-from nodes.viewers.rerun.sdk import RerunConfig
+from visnav_rerun import entities
+from visnav_rerun.entities import EntityLog, Numbered, ScenePoints
+from visnav_rerun.sdk import RerunConfig
 
 CENTIMETRES = 100.0  # steps of a depth image per metre; finer ones would be noise
 _WIND_PERIOD = 100_000_000  # nanoseconds between two arrows of a vehicle's wind
