@@ -15,7 +15,7 @@ from nodes.judging.readers.source import Start
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_tum
 from runtime.errors import CommandError
-from runtime.extras import Offer, offers
+from runtime.extras import READERS, Offer, offers
 from tests.nodes.trajectory.samples import walk
 
 
@@ -33,7 +33,7 @@ class Package(Offer):
 @pytest.fixture
 def offered(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Package]]:
     """Yield a list for other packages' entry points."""
-    ours, others = offers(table.READERS), list[Package]()
+    ours, others = offers(READERS), list[Package]()
     monkeypatch.setattr("nodes.judging.readers.table.offers", lambda _: (*ours, *others))
     monkeypatch.setattr(table, "_complaints", {})
     table._loaded.cache_clear()
