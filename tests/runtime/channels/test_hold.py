@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from runtime.channels import hold as hold_module
 from runtime.channels.answers import Answers, Settled
 from runtime.channels.hold import BEHIND, IN_A_ROW, Hold, HoldConfig
 from runtime.errors import MissingAnswerError
@@ -163,6 +164,32 @@ class TestDelivery:
         assert [value for _, value in came] == ["0", "1", "2"]
         assert hold.answers.counts == {"answered": 3, "unknown": 6}
 
+    @pytest.mark.parametrize(("off", "outcome"), [(1000, "answered"), (1001, "unknown")])
+    def test_a_stamp_may_be_off_by_the_tolerance(self, off: int, outcome: str) -> None:
+        async def main() -> None:
+            for sign in (1, -1):
+                hold = hold_in(asyncio.get_running_loop(), Wall(), 0.0, tolerance_ns=1000)
+                hold.owe(0)
+                hold.answer(sign * off, "pose")
+                assert hold.answers.counts == {outcome: 1}
+                hold.close()
+
+        run_async(main())
+
+    def test_the_newest_settled_frames_are_remembered(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(hold_module, "_REMEMBERED", 2)
+
+        def act(hold: Hold[str], wall: Wall, number: int) -> None:
+            answer_all(hold, wall, number)
+            if number == 2:
+                for frame in range(3):
+                    answer_all(hold, wall, frame)
+
+        _, hold = fly(act, frames=3)
+        assert hold.answers.counts == {"answered": 3, "unknown": 1, "repeated": 2}
+
     def test_stamps_must_rise(self) -> None:
         async def main() -> None:
             hold = hold_in(asyncio.get_running_loop(), Wall(), 0.04)
@@ -216,6 +243,17 @@ class TestMissing:
         assert len(came) == 40
         assert hold.answers.counts == {"answered": 2, "lost": 38}
         assert hold._wall() <= 100 + 10.1 * (IN_A_ROW + 38)
+
+    def test_an_answer_ends_losses_in_a_row(self) -> None:
+        def act(hold: Hold[str], wall: Wall, number: int) -> None:
+            if number in {0, 1, 3, 4}:
+                wall.seconds += 10.1
+                hold.look()
+            else:
+                answer_all(hold, wall, number)
+
+        came, _ = fly(act, frames=6, latency=0.01, on_missing="lost")
+        assert [value for _, value in came] == [None, None, "2", None, None, "5"]
 
     def test_continue_waits_no_more_and_says_so(self) -> None:
         async def main() -> None:
@@ -288,11 +326,33 @@ class TestGone:
                 act(hold, wall, number)
                 answers.append(await owed)
             assert hold.answers.counts == {"answered": 3, "lost": 3}
-            assert "when it came back was up to real time" in hold.answers.why_not
+            why_not = ["when it came back was up to real time"]
+            assert (
+                list(hold.answers.why_not)
+                == ["it was gone for a while"] * (policy == "continue") + why_not
+            )
             hold.close()
             return answers
 
         assert run_in_lockstep(main()) == ["0", None, None, None, "4", "5"]
+
+    def test_who_is_back_may_initialise_anew(self) -> None:
+        async def main() -> None:
+            wall = Wall()
+            hold = hold_in(
+                asyncio.get_running_loop(), wall, 0.0, on_missing="lost", initialise=Duration(10)
+            )
+            hold.owe(0)
+            hold.answer(0, "pose")
+            hold.gone("killed")
+            hold.back()
+            hold.owe(PERIOD)
+            wall.seconds += BEHIND + 1.0
+            hold.look()
+            assert hold.answers.counts == {"answered": 1, "initialising": 1}
+            hold.close()
+
+        run_async(main())
 
     def test_a_failure_reaches_who_waits_and_the_next_frame(self) -> None:
         async def main() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from events import Event
 from runtime import Bundle, Input, Node, Output, on
+from runtime.channels.links import Link, LinkConfig
 from runtime.errors import ConfigError, NodeError
 from runtime.testing import run_nodes, spec
 
@@ -102,6 +103,18 @@ def test_jitter_keeps_order_and_bounds(node: type[Ear], port: str) -> None:
 def test_a_rate_thins_evenly(node: type[Ear], port: str) -> None:
     heard = listen(node, port, rate=10)
     assert [of // MS for of, _ in heard] == list(range(0, 1000, 100))
+
+
+def test_each_source_has_its_own_rate() -> None:
+    came: list[str] = []
+    clock: Any = None  # which only a delay needs
+    link = Link("ear.said", LinkConfig(rate=10), clock, seed=0)
+    offer = link.to(lambda event: came.append(event.source))
+    for stamp in range(0, 1000 * MS, 50 * MS):
+        for source in ("x", "y"):
+            offer(Said(stamp=stamp, source=source))
+    assert came == ["x", "y"] * 10
+    assert link.thinned == 20
 
 
 def test_a_handler_behind_a_delay_is_called_later() -> None:

@@ -113,6 +113,15 @@ def test_the_first_event_of_an_output_cannot_come_from_a_thread(
     assert sum(sender.sent().values()) == 1
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_who_is_watched_is_checked_however_often_it_has_sent_the_same(kind: str) -> None:
+    sender = connected(kind, Said, [])
+    for _ in range(2):
+        sender.send(said())
+    sender.watch()
+    assert isinstance(elsewhere(lambda: sender.send(said())), ChannelThreadError)
+
+
 class Careless(Node):
     """Sends from the loop, and then from a function that it offloads."""
 

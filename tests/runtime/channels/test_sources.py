@@ -7,9 +7,19 @@ from typing import Any
 
 import pytest
 
-from events import Announcement, Event, Imu, Odometry, PoseEstimate, TrackingLost
+from events import (
+    Announcement,
+    EstimatorAnnouncement,
+    Event,
+    Imu,
+    Odometry,
+    PilotAnnouncement,
+    PoseEstimate,
+    TrackingLost,
+)
 from runtime import Node, NodeConfig, Output
-from runtime.errors import NodeError
+from runtime.channels.sources import SourceOwners
+from runtime.errors import ChannelSourceError, NodeError
 from runtime.testing import any_source, run_nodes, spec
 from tests.runtime.samples_runs import supervise
 
@@ -152,3 +162,14 @@ def test_a_script_of_a_test_may_speak_for_anybody() -> None:
         linear_acceleration=(0.0, 0.0, 0.0),
     )
     assert [event.source for event in run_nodes(nodes, inputs=[imu]).sent] == ["drone", "y"]
+
+
+def test_a_source_is_announced_once_as_each_kind() -> None:
+    owners = SourceOwners(["a"])
+    estimator = EstimatorAnnouncement(stamp=0, source="a/x", method="")
+    owners.announce("a", estimator)
+    owners.announce("a", PilotAnnouncement(stamp=0, source="a/x"))
+    for _ in range(2):
+        owners.announce("a", Announcement(stamp=0, source="a/x"))
+    with pytest.raises(ChannelSourceError, match=r"^a: .* EstimatorAnnouncement of 'a/x' twice$"):
+        owners.announce("a", estimator)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from events import PoseEstimate
+from events import PoseEstimate, TrackingLost
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.record import (
     EstimatorRecord,
@@ -18,7 +18,9 @@ from nodes.judging.evaluation.record import (
     choose_frames,
     cover,
     seconds,
+    union,
 )
+from tests.nodes.judging.evaluation.flights import estimate
 from tests.nodes.judging.report.folders import walk
 
 MS = 1_000_000
@@ -56,6 +58,30 @@ def test_what_it_said_of_itself_counts_within_the_flight() -> None:
     ]
     coverage = cover(FRAMES, FRAMES, GAP, said)
     assert seconds(coverage.lost) == pytest.approx(1.0 + 1.0 + FRAMES[-1] / SECOND - 11.0)
+
+
+def test_images_missing_after_an_early_end_have_no_pose() -> None:
+    last = int(FRAMES[-1])
+    coverage = cover(FRAMES, FRAMES, GAP, planned=last + 3 * SECOND)
+    assert coverage.flight == (0, last + 3 * SECOND)
+    assert (coverage.frames, coverage.answered) == (len(FRAMES) + 60, len(FRAMES))
+    assert coverage.lost == [(last, last + 3 * SECOND)]
+    for planned in (None, last, last - SECOND):
+        assert cover(FRAMES, FRAMES, GAP, planned=planned) == cover(FRAMES, FRAMES, GAP)
+
+
+def test_intervals_that_touch_or_overlap_are_one() -> None:
+    intervals = [Interval(7, 8), Interval(1, 2), Interval(0, 1), Interval(4, 6), Interval(5, 5)]
+    assert union(intervals) == [(0, 2), (4, 6), (7, 8)]
+
+
+@pytest.mark.parametrize(("ahead", "future"), [(MS, 0), (MS + 1, 1)])
+def test_stamps_are_of_the_future_from_a_millisecond_on(ahead: int, future: int) -> None:
+    record = EstimatorRecord()
+    assert record.add(estimate(SECOND + ahead), SECOND) is not bool(future)
+    record.note(TrackingLost(stamp=2 * SECOND + ahead, source="est", reason=""), 2 * SECOND)
+    assert record.future == 2 * future
+    assert record.reported_lost(3 * SECOND) == [(2 * SECOND + MS, 3 * SECOND)]
 
 
 def test_images_are_answered_by_poses_of_their_time() -> None:

@@ -278,6 +278,32 @@ def test_to_say_less_never_looks_better(said: list[int], percent: float) -> None
     assert (np.diff(every) <= 0.05 * PATH / 100).all()  # of an image within the gap at the end
 
 
+def test_of_an_images_poses_the_worst_counts() -> None:
+    poses = np.sort(np.concatenate([FRAMES, FRAMES + MS]))
+    for errors in ([3.0, 1.0], [1.0, 3.0]):
+        held = held_errors(TRUTH, FRAMES, poses, np.tile(errors, len(FRAMES)), [])
+        assert (held == 3.0).all()
+
+
+def delayed(by: int, until: int = END) -> dict[str, Any]:
+    """Return the figures of an exact estimator with so long a delay (ns), silent from a time on."""
+    record = EstimatorRecord()
+    for stamp in FRAMES[until >= FRAMES].tolist():
+        record.add(estimate(stamp), stamp + by)
+    return judge(record, TRUTH, cameras={"c": FRAMES}).figures
+
+
+def test_more_than_five_images_late_is_not_causal() -> None:
+    assert delayed(5 * 50 * MS)["not_causal"] == 0
+    late = delayed(5 * 50 * MS + 1)
+    assert (late["not_causal"], late["not_causal_percent"]) == (len(FRAMES), 100.0)
+
+
+@pytest.mark.parametrize(("by", "lost"), [(300 * MS, 0.9), (2 * SECOND, 0.7)])
+def test_last_images_without_an_answer_are_forgiven_up_to_the_gap(by: int, lost: float) -> None:
+    assert delayed(by, END - 1200 * MS)["lost_seconds"] == pytest.approx(lost)
+
+
 def test_errors_of_no_image_are_none() -> None:
     none = FRAMES[:0]
     assert held_errors(TRUTH, none, FRAMES, np.zeros(len(FRAMES)), []).shape == (0,)
