@@ -210,6 +210,11 @@ class Animal(NamedTuple):
     rate: int = RATE
     asked: Fields | None = None
 
+    def telling(self) -> list[str]:
+        """Return the beginnings of all reasons for which it fails."""
+        default = [self.default] if isinstance(self.default, str) else self.default
+        return [reason for reason in (*default, self.standard, self.strict) if reason]
+
 
 def bad(sent: Later, default: str, standard: str = "", strict: str = "", **more: Any) -> Animal:
     """Return one that is failed at least by the same where more is asked for."""
@@ -292,6 +297,9 @@ BAD: dict[str, Animal] = {
     "silent for 4 s": bad(says(between((0, 4), (8, 99))), "coverage_percent"),
     "silent for 1 s": inexact(says(between((0, 4), (5, 99))), "lost_seconds"),
     "starts after 2 s": bad(says(between((2, 99))), "coverage_percent"),
+    "starts after 0.6 s": inexact(
+        says(between((0.6, 99))), "lost_seconds", "initialization_seconds"
+    ),
     "ends after 10 s": bad(says(between((0, 10))), "coverage_percent"),
     "the last second only": bad(says(between((11, 99))), "coverage_percent"),
     "every tenth image": inexact(says(stamps=FRAMES[::10]), "frame_coverage_percent"),
@@ -314,6 +322,12 @@ BAD: dict[str, Animal] = {
     "everything twice": bad(merged(says(), says()), "repeated_stamps"),
     "pairs in the wrong order": bad(by_pairs(FRAMES), "repeated_stamps"),
     "stamps of the future": bad(says(lambda t, p: p | {"stamp": t + SECOND}), "future_stamps"),
+    "stamps of another clock": bad(
+        says(lambda t, p: p | {"stamp": t - 1000 * SECOND}), "compared_percent"
+    ),
+    "stamped at its arrival": bad(
+        says(lambda t, p: p | {"stamp": t + LATE}), "stamped_at_images_percent"
+    ),
     "stamped at its arrival, and 2 ms on": bad(
         says(lambda t, p: p | {"stamp": t + LATE + 2 * MS}), "future_stamps"
     ),
@@ -332,8 +346,18 @@ BAD: dict[str, Animal] = {
     "mirrored": inexact(says(mapped(np.diag([1, -1, 1]))), "ate_percent", default=MOTION),
     "twice the scale": inexact(says(mapped(2 * np.eye(3))), "ate_percent", default=MOTION),
     "5 % of scale": inexact(says(mapped(1.05 * np.eye(3))), "ate_percent"),
-    "drift": inexact(says(moved(lambda t: (0.02 * t, 0, 0))), "ate_percent"),
-    "sinks": inexact(says(moved(lambda t: (0, 0, 0.02 * t))), "ate_percent"),
+    "drift": inexact(
+        says(moved(lambda t: (0.02 * t, 0, 0))),
+        "ate_percent",
+        "end_error_percent",
+        asked={"end_error_percent": 1.0},
+    ),
+    "sinks": inexact(
+        says(moved(lambda t: (0, 0, 0.02 * t))),
+        "ate_percent",
+        "ate_rmse_m",
+        asked={"ate_rmse_m": 0.1},
+    ),
     "noisy by 0.2 m": inexact(says(noisy(0.2)), "ate_percent"),
     "jitters by 3 cm": inexact(says(noisy(0.03)), "ate_percent", "rpe_1m_trans_percent"),
     "steps of half a metre": inexact(
@@ -397,7 +421,10 @@ BAD: dict[str, Animal] = {
         default="rot_rmse_deg",
     ),
     "rolls": inexact(
-        says(turned(lambda r, t: r * Rotation.from_rotvec([0.01 * t, 0, 0]))), "rot_rmse_deg"
+        says(turned(lambda r, t: r * Rotation.from_rotvec([0.01 * t, 0, 0]))),
+        "rot_rmse_deg",
+        "rpe_1m_rot_deg_per_m",
+        asked={"rpe_1m_rot_deg_per_m": 0.3},
     ),
     "the first pose of another origin": inexact(
         says(lambda t, p: elsewhere()(t, p) if t else p | {"frame_id": "odom"}),
@@ -442,6 +469,12 @@ BAD: dict[str, Animal] = {
         "not_causal",
         default="not_causal_percent",
     ),
+    "twice a second, all at once": inexact(
+        says(delayed(lambda t: SECOND // 2 - t % (SECOND // 2) + LATE)),
+        "latency_p99_ms",
+        "newest_pose_age_ms",
+        default="not_causal_percent",
+    ),
     # Covariances and velocities.
     "covariances of zero": bad(says(given(0, covariance=(0.0,) * 36)), "covariance_invalid"),
     "negative covariances": bad(says(given(0, covariance=covariance(-1e-4))), "covariance_invalid"),
@@ -453,6 +486,9 @@ BAD: dict[str, Animal] = {
     ),
     "covariances of the first 19": bad(
         says(first(19, covariance=covariance(1e-4))), "covariances_percent"
+    ),
+    "covariances of a kilometre": bad(
+        says(given(0, covariance=covariance(1e6))), "covariance_too_large_percent"
     ),
     "covariances where it is good": bad(
         says(
