@@ -15,7 +15,7 @@ OPENCV_TESTS := $(addprefix tests/,events sims/cameras sims/worlds nodes/calibra
 	runtime/tools/monitor)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-core test-slow test-pythons test-opencv4 test-all check fix size docs wheel peers bench bench-quick orbslam3 svo suite images clean
+.PHONY: help setup demo test test-core test-slow test-pythons test-opencv4 test-all check fix size mutants docs wheel peers bench bench-quick orbslam3 svo suite images clean
 
 # Setuptools warns at length of every editable install that folders here may hide packages.
 INSTALL = PYTHONWARNINGS='ignore:Editable installation' $(BIN)/python -m pip install --quiet
@@ -69,6 +69,10 @@ test-opencv4: $(READY) .venv-opencv4  ## Run the quick tests of what draws, sees
 	PYTHONPATH=.venv-opencv4 $(BIN)/python -m pytest -n 3 --dist loadfile -m 'not slow' $(OPENCV_TESTS)
 
 test-all: test test-slow test-pythons test-opencv4  ## Run all tests.
+
+# MODULE=runtime.channels.hold SAMPLE=40 TESTS='tests/further ...'; see tools/mutants.py.
+mutants: $(READY)  ## Plant small faults in a module, MODULE=..., that its quick tests have to notice.
+	$(BIN)/python -m tools.mutants $(MODULE) --sample $(or $(SAMPLE),0) --tests $(TESTS)
 
 check: $(READY)  ## Check style and types.
 	$(BIN)/ruff check .

@@ -1,0 +1,69 @@
+"""Mutation testing: the faults that are planted; those listed as equivalent are among them."""
+
+from __future__ import annotations
+
+import tomllib
+
+import pytest
+
+from tools.mutants import LIST, ROOT, equivalents, path_of
+from tools.mutations import mutants
+
+LISTED = tomllib.loads(LIST.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    ("line", "becomes"),
+    [
+        ("x = a < b", ["x = (a <= b)", "x = (a >= b)"]),
+        ("x = a is not b in c", ["x = (a is b in c)", "x = (a is not b not in c)"]),
+        ("x = not a or b", ["x = (not a and b)", "x = (a) or b"]),
+        ("-a + 2 * b", ["(-a - 2 * b)", "(a) + 2 * b", "-a + (2 / b)", "-a + 3 * b"]),
+        ("x = min(a, True)", ["x = (max(a, True))", "x = min(a, False)"]),
+        ("a.any() if b else c", ["a.any() if (not b) else c", "(a.all()) if b else c"]),
+        ("x = f('µ', 'left')", ["x = f('', 'left')", "x = f('µ', 'right')"]),
+        ("x += 1", ["x -= 1", "pass", "x += 2"]),
+        ("return x", ["return None"]),
+        ("raise x", ["pass"]),
+        ("f()", ["pass"]),
+        ("self.x = x", ["pass"]),
+        ("if x: f()", ["if (not x): f()", "if x: pass"]),
+        ("while x: break", ["while (not x): break", "while x: pass"]),
+        ("return None", []),
+        ("assert x > 0", []),
+        ('x: "A" = y', []),
+        ('f"{x + 1}"', []),
+        ('"""Text."""', []),
+        ('x = "a text for people"', []),
+    ],
+)  # fmt: skip
+def test_each_operator_changes_what_it_says(line: str, becomes: list[str]) -> None:
+    planted = [*mutants(f"class A:\n    def f(self):\n        {line}\n".encode())]
+    assert [mutant.becomes for mutant in planted] == becomes
+    for mutant in planted:
+        assert (mutant.function, mutant.lines, mutant.line) == ("A.f", range(3, 4), 3)
+        compile(mutant.source, line, "exec")
+
+
+def test_what_runs_at_import_is_of_all_tests_and_types_are_no_values() -> None:
+    source = b"""
+T = TypeVar("T")
+__all__ = ["f"]
+Kind = Literal["a"]
+LIMIT = 3
+class A:
+    limit: int = 4
+    def f(self, x: int = 5) -> int: ...
+"""
+    assert [(m.function, m.becomes, len(m.lines)) for m in mutants(source)] == [
+        ("", "LIMIT = 4", 0),
+        ("A", "limit: int = 5", 0),
+        ("A", "def f(self, x: int = 6) -> int: ...", 0),
+    ]
+
+
+@pytest.mark.parametrize("module", LISTED)
+def test_listed_mutants_exist_and_have_a_reason(module: str) -> None:
+    there = {mutant[:3] for mutant in mutants((ROOT / path_of(module)).read_bytes())}
+    assert not equivalents(module) - there
+    assert all(row["why"] for row in LISTED[module])
