@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from runtime.channels import hold as hold_module
 from runtime.channels.answers import Answers, Settled
-from runtime.channels.hold import BEHIND, IN_A_ROW, Hold, HoldConfig
+from runtime.channels.hold import BEHIND, IN_A_ROW, Hold, HoldConfig, future
 from runtime.errors import MissingAnswerError
 from runtime.summary import OUTSIDE_COLUMNS, OutsideSummary
 from runtime.testing import run_in_lockstep
@@ -26,6 +26,7 @@ from runtime.time.lockstep import LockstepClock, LockstepLoop
 from runtime.units import Duration
 
 MS = 1_000_000
+SECOND = 1000 * MS
 PERIOD = 33 * MS
 
 
@@ -40,10 +41,14 @@ class Wall:
 
 
 def hold_in(
-    loop: asyncio.AbstractEventLoop, wall: Wall, latency: float, **config: Any
+    loop: asyncio.AbstractEventLoop,
+    wall: Wall,
+    latency: float,
+    log: Callable[[str], None] = lambda _: None,
+    **config: Any,
 ) -> Hold[str]:
     assert isinstance(loop, LockstepLoop)
-    return Hold("slam", LockstepClock(loop), HoldConfig(**config), latency, wall=wall)
+    return Hold("slam", LockstepClock(loop), HoldConfig(**config), latency, log=log, wall=wall)
 
 
 def fly(
@@ -51,6 +56,7 @@ def fly(
     *,
     frames: int = 5,
     latency: float = 0.04,
+    log: Callable[[str], None] = lambda _: None,
     **config: Any,
 ) -> tuple[list[tuple[int, str | None]], Hold[str]]:
     """Send frames, and return what came at which simulated time (ns).
@@ -61,7 +67,7 @@ def fly(
 
     async def main() -> tuple[list[tuple[int, str | None]], Hold[str]]:
         loop = asyncio.get_running_loop()
-        hold = hold_in(loop, wall, latency, **config)
+        hold = hold_in(loop, wall, latency, log, **config)
         clock = LockstepClock(loop)  # type: ignore[arg-type]
         came: list[tuple[int, str | None]] = []
 
@@ -244,6 +250,41 @@ class TestMissing:
         assert hold.answers.counts == {"answered": 2, "lost": 38}
         assert hold._wall() <= 100 + 10.1 * (IN_A_ROW + 38)
 
+    def test_after_losses_in_a_row_all_frames_are_lost_at_once_until_an_answer(self) -> None:
+        async def main() -> None:
+            wall, log = Wall(), list[str]()
+            hold = hold_in(
+                asyncio.get_running_loop(), wall, 1.0, log.append, on_missing="lost", max_wait=9.0
+            )
+            for number in range(IN_A_ROW + 1):
+                hold.owe(number * PERIOD)
+            for losses in range(1, IN_A_ROW):
+                wall.seconds += 9.0
+                hold.look()
+                assert hold.answers.counts == {"lost": losses}
+                assert hold.expects
+            wall.seconds += 9.0
+            hold.look()
+            assert not hold.expects
+            assert log[-2:] == [
+                "slam: expected an answer to the frame of 0.066000 s within 9 s (max_wait), found "
+                "none: the frame is lost",
+                "slam: 3 frames in a row are lost: it is not waited for again before it answers",
+            ]
+            hold.owe(SECOND)
+            assert hold.answers.counts == {"lost": IN_A_ROW + 2}
+            hold.answer(0, "late")
+            assert log[-1] == "slam: it answers again"
+            hold.answer(0, "late")
+            assert log.count("slam: it answers again") == 1
+            assert hold.expects
+            hold.owe(2 * SECOND)
+            hold.look()
+            assert hold.answers.counts == {"lost": IN_A_ROW + 2, "late": 2}
+            hold.close()
+
+        run_async(main())
+
     def test_an_answer_ends_losses_in_a_row(self) -> None:
         def act(hold: Hold[str], wall: Wall, number: int) -> None:
             if number in {0, 1, 3, 4}:
@@ -354,6 +395,38 @@ class TestGone:
 
         run_async(main())
 
+    def test_the_log_says_when_it_goes_and_comes_back(self) -> None:
+        async def main() -> None:
+            log: list[str] = []
+            hold = hold_in(asyncio.get_running_loop(), Wall(), 0.0, log.append, on_missing="lost")
+            hold.back()
+            for _ in range(2):
+                hold.gone("killed")
+            hold.back()
+            assert log == ["slam: killed", "slam: it is there again"]
+            hold.close()
+
+        run_async(main())
+
+    def test_the_first_failure_counts_and_none_after_the_end(self) -> None:
+        async def main() -> None:
+            hold = hold_in(asyncio.get_running_loop(), Wall(), 0.01)
+            owed = hold.owe(0)
+            hold.fail(MissingAnswerError("first"))
+            hold.fail(MissingAnswerError("second"))
+            with pytest.raises(MissingAnswerError, match="first"):
+                await owed
+            with pytest.raises(MissingAnswerError, match="first"):
+                hold.owe(1)
+            hold.close()
+            ended = hold_in(asyncio.get_running_loop(), Wall(), 0.01)
+            owed = ended.owe(0)
+            ended.close()
+            ended.fail(MissingAnswerError("a gap"))
+            assert not owed.work.done()
+
+        run_async(main())
+
     def test_a_failure_reaches_who_waits_and_the_next_frame(self) -> None:
         async def main() -> None:
             hold = hold_in(asyncio.get_running_loop(), Wall(), 0.01)
@@ -410,6 +483,28 @@ class TestInitialising:
         assert [value for _, value in came] == [None, "1"]
         assert list(hold.answers.why_not) == ["its first answer came too late to be held for"]
 
+    def test_the_time_counts_from_the_first_frame_which_may_be_late_in_the_run(self) -> None:
+        async def main() -> None:
+            wall = Wall()
+            hold = hold_in(
+                asyncio.get_running_loop(), wall, 0.5, initialise=Duration(1), on_missing="lost"
+            )
+            for stamp in (4 * SECOND, 5 * SECOND - 1, 5 * SECOND):
+                hold.owe(stamp)
+            for lost, seconds in ((0, BEHIND + 0.49), (1, 0.01), (1, 0.98), (2, 0.02)):
+                wall.seconds += seconds
+                hold.look()
+                assert hold.answers.counts["initialising"] == lost
+            wall.seconds = 109.9
+            hold.look()
+            assert hold.answers.counts == {"initialising": 2}
+            wall.seconds = 110.0
+            hold.look()
+            assert hold.answers.counts == {"initialising": 2, "lost": 1}
+            hold.close()
+
+        run_async(main())
+
     def test_after_that_time_answers_are_owed_in_any_case(self) -> None:
         def act(hold: Hold[str], wall: Wall, number: int) -> None:
             wall.seconds += 11
@@ -433,6 +528,24 @@ def test_what_is_not_due_at_the_end_is_open_whether_it_was_answered_or_not() -> 
         assert await owed[0] == "answered already"
 
     run_async(main())
+
+
+def test_the_thread_that_watches_ends_with_the_hold() -> None:
+    async def main() -> None:
+        hold = hold_in(asyncio.get_running_loop(), Wall(), 0.04)
+        hold.owe(0)
+        hold.answer(0, "pose")
+        thread = hold._thread
+        assert thread is not None
+        hold.close()
+        thread.join(2.0)
+        assert not thread.is_alive()
+
+    run_async(main())
+
+
+def test_who_no_longer_waits_cancels_no_answer() -> None:
+    assert not future().cancel()
 
 
 class TestLatencies:
@@ -660,8 +773,12 @@ class TestTwoAnswers:
             hold.answer(number * PERIOD, "0")
             hold.answer(number * PERIOD, second)
 
-        came, hold = fly(act)
+        log: list[str] = []
+        came, hold = fly(act, log=log.append)
         assert {value for _, value in came} == {"0"}
+        assert [line.partition(",")[0] for line in log] == [
+            "slam: expected one answer to the frame of 0.000000 s"
+        ] * bool(why)
         kind = "contradicting" if why else "repeated"
         assert hold.answers.counts == {"answered": 5, kind: 5}
         assert [reason.partition(",")[0] for reason in hold.answers.why_not] == why
