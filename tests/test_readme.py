@@ -154,15 +154,16 @@ def test_the_file_flies_judges_and_ends(mine: bool, tmp_path: Path) -> None:
 
 
 def test_the_table_is_the_suites() -> None:
-    """Each estimator's errors, to two digits, and who failed."""
+    """Each estimator's errors, to two digits, who failed, and what exactness was worth."""
     rows = [row.strip("| ").split(" | ") for row in SUITE.splitlines() if row.startswith("| ")]
-    rows = [[cell.strip() for cell in row] for row in rows if len(row) == 9][1:]
+    rows = [[cell.strip() for cell in row] for row in rows if len(row) == 10][1:]
     assert len(rows) >= 12
-    for name, reads, _, *cells in rows:
+    for name, reads, _, *cells, worth in rows:
         (line,) = (text for text in README.splitlines() if text.startswith(f"| {name} |"))
         here = line.strip("| ").split(" | ")
         assert here[1] == reads
-        for cell, short in zip(cells, here[2:], strict=True):
+        assert float(here[-1].split()[1]) == pytest.approx(float(worth.split()[1]), rel=0.05)
+        for cell, short in zip(cells, here[2:-1], strict=True):
             assert ("failed" in cell) == ("**" in short), line
             if short == "**none**":  # nothing was said in any run
                 assert cell.startswith("**failed**")
