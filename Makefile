@@ -121,7 +121,7 @@ images: demo $(READY)  ## Make the documentation's images (needs ORB-SLAM3, eval
 	$(BIN)/python tools/readme_images.py
 	$(BIN)/python tools/gallery.py
 	$(BIN)/python -m runtime run extensions/rerun/examples/rerun.toml
-	$(BIN)/python tools/viewer_image.py runs/rerun/latest/flight.rrd extensions/rerun/docs/rerun.png
+	$(BIN)/python tools/viewer_image.py runs/rerun/latest/flight.rrd docs/images/rerun.png
 	$(BIN)/python tools/monitor_images.py
 
 clean:  ## Remove the environment, results and caches.

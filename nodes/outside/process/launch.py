@@ -18,7 +18,8 @@ from typing import Annotated, Any, Literal
 import jinja2
 import msgspec
 
-from nodes.calibration.formats import write_files
+from nodes.calibration.formats import left_out, write_files
+from nodes.calibration.kannala_brandt import with_kannala_brandt
 from nodes.data.dataset.recording import Rig, templates
 from nodes.estimators import EstimatorConfig
 from nodes.outside import native
@@ -76,7 +77,8 @@ class ProcessConfig(EstimatorConfig):
         pilot: Whether it flies the vehicle by orders.
         vehicle: Whose sensors are meant, and who gets the orders; if empty, the camera's or first.
         calibration: Format of the calibration's files (see ``export``), which are written into
-            ``$VISNAV_FOLDER``; if empty, none.
+            ``$VISNAV_FOLDER``; if empty, none. ``basalt_kb4`` is for a Basalt that knows no
+            radial-tangential lens: the nearest Kannala-Brandt lens takes its place.
         cpus: Processors that it may use, 0 for all; with 1, threads that share sums add up in the
             same order more often than not.
         method: Name of the method in the report; if empty, that of the program.
@@ -101,7 +103,7 @@ class ProcessConfig(EstimatorConfig):
     outputs: tuple[str, ...] = ()
     pilot: bool = False
     vehicle: str = ""
-    calibration: Literal["", "kalibr", "openvins", "vins", "basalt", "orbslam3"] = ""
+    calibration: Literal["", "kalibr", "openvins", "vins", "basalt", "basalt_kb4", "orbslam3"] = ""
     cpus: Annotated[int, msgspec.Meta(ge=0)] = 0
     method: str = ""
     scale_free: bool = False
@@ -126,6 +128,7 @@ ProcessConfig.__doc__ = str(ProcessConfig.__doc__).replace(
 )
 
 
+_KB4 = "basalt_kb4"
 _LONGEST = 100  # bytes of a socket's path; Linux allows 107
 
 
@@ -229,6 +232,14 @@ class Launch:
         known = self.environment()
         return re.sub(r"\$(?:(\w+)|{(\w+)})", lambda m: known.get(m[1] or m[2], m[0]), word)
 
+    def remarks(self, rig: Rig | None) -> list[str]:
+        """Return what the calibration's files do not say, or say otherwise, a sentence each."""
+        form = self._config.calibration
+        if rig is None or not form:
+            return []
+        fitted = with_kannala_brandt(rig)[1] if form == _KB4 else []
+        return [*left_out(rig, "basalt" if form == _KB4 else form), *fitted]
+
     def texts(self, known: Mapping[str, Any], rig: Rig | None) -> dict[Path, str]:
         """Return the texts of the program's files, by path.
 
@@ -245,6 +256,8 @@ class Launch:
             if rig is None:
                 raise ProgramError("calibration: expected a camera, found none")
             try:
+                if form == _KB4:
+                    rig, form = with_kannala_brandt(rig)[0], "basalt"
                 files = write_files(rig, form, topics=self._config.feed == "ros2")
             except ValueError as error:
                 raise ProgramError(f"calibration: {error}") from None

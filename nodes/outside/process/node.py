@@ -35,7 +35,7 @@ from events import (
     VelocitySetpoint,
 )
 from events.camera_info import COEFFICIENTS
-from nodes.calibration.formats import left_out, variables
+from nodes.calibration.formats import variables
 from nodes.data.dataset.recording import Rig
 from nodes.estimators import Estimator, Mount, TrackingResult
 from nodes.outside.native import LinkAnswer, LinkError, LinkOrder, describe
@@ -222,8 +222,8 @@ class Process(Estimator[ProcessConfig]):
         self._loop = asyncio.get_running_loop()
         self._end: asyncio.Future[str] = self._loop.create_future()
         rig = self._rig()
-        for sensor in left_out(rig, config.calibration) if rig is not None else ():
-            self.log.warning("calibration: %s", sensor)
+        for remark in launch.remarks(rig):
+            self.log.warning("calibration: %s", remark)
         for path, text in launch.texts(self._known(), rig).items():
             path.parent.mkdir(parents=True, exist_ok=True)
             await self.offload(path.write_text, text, "utf-8")

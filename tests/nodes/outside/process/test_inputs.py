@@ -34,12 +34,14 @@ from events import (
     TrackingLost,
     VelocitySetpoint,
 )
+from nodes.data.dataset.recording import Rig
 from nodes.outside.process.program import MOST_BYTES, Inputs
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from runtime.config.model import NodeSpec
 from runtime.errors import ConfigError, VisnavError
 from runtime.host import RunEnd
 from runtime.testing import spec
+from tests.nodes.calibration.samples import IMU, camera
 from tests.nodes.outside.process.rig import fly, program
 
 pytestmark = pytest.mark.timeout(120)
@@ -305,6 +307,21 @@ def test_the_calibration_is_written_and_the_processors_are_few(tmp_path: Path) -
     )
     assert "processors 1" in said(tmp_path)
     assert "T_imu_cam" in (tmp_path / "programs" / "slam" / "calibration.json").read_text()
+
+
+def test_a_lens_that_the_program_does_not_know_is_another_in_its_file() -> None:
+    """The files are those of ``basalt``, and what was put in the place of what is said."""
+    from nodes.outside.process.launch import Launch, ProcessConfig
+
+    rig = Rig("drone", (camera(lens="radtan4"),), IMU)
+    kinds: dict[Any, str] = {"basalt": "pinhole-radtan8", "basalt_kb4": "kb4"}
+    for form, kind in kinds.items():
+        launch = Launch(ProcessConfig(command=("true",), calibration=form), None, None)
+        (text,) = launch.texts({}, rig).values()
+        assert f'"camera_type": "{kind}"' in text
+        remarks = launch.remarks(rig)
+        assert len(remarks) == (kind == "kb4")
+    assert "drone/left: its lens is written as the nearest kb4, 0." in remarks[0]
 
 
 def test_each_program_has_processors_of_its_own() -> None:
