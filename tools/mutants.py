@@ -43,7 +43,15 @@ ROOT = Path(__file__).parents[1]
 LIST = ROOT / "tools" / "mutants.toml"
 NOT_COPIED = (".git", ".venv*", ".*cache", ".hypothesis", "runs", "sweeps", "build", "dist")
 ENVIRONMENT = {"CI": "1", "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"}
-OPTIONS = ("-qx", "-n0", "--assert=plain", "-pno:cacheprovider", "-mnot slow", "--timeout=30")
+OPTIONS = (
+    "-qx",
+    "-n0",
+    "--assert=plain",
+    "-pno:cacheprovider",
+    "-mnot slow",
+    "--timeout=30",
+    "--timeout-method=thread",
+)
 
 
 class Baseline(msgspec.Struct):

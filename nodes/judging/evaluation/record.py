@@ -203,7 +203,6 @@ class EstimatorRecord:
         self.rows = PoseRows()  # poses of the trajectory
         self.repeated = 0  # poses with a stamp not later than the last
         self.future = 0  # poses and tracking events stamped later than their arrival
-        self.elsewhere = 0  # poses in another frame than the first one
         self.restarts = 0  # number of changes to another frame, one after each loss of tracking
         self.bodies: Counter[str] = Counter()  # number of poses by body (`child_frame_id`)
         self.velocities = SampledRows(3)  # velocities of the poses that carry one: 3 numbers
@@ -237,7 +236,6 @@ class EstimatorRecord:
         self.restarts += event.frame_id not in {self.frame_id, self._last_frame}
         self._last_frame = event.frame_id
         if event.frame_id != self.frame_id:
-            self.elsewhere += 1
             return False
         self.rows.add(event.stamp, event.position, event.orientation)
         self.bodies[event.child_frame_id] += 1

@@ -177,7 +177,8 @@ def test_a_covariance_given_now_and_then_is_that_of_its_pose() -> None:
         (x, y, z), (qw, qx, qy, qz) = position, orientation
         given: dict[str, Any] = {}
         if k % 3 == 1:
-            given = {"covariance": tuple((np.eye(6) * 0.01).ravel().tolist())}
+            p = tuple((np.eye(6) * 0.01).ravel().tolist())
+            given = {"covariance": p, "velocity": tuple(truth.velocities()[k].tolist())}
         off = 0.1 if k % 3 == 1 else 5.0
         record.add(
             PoseEstimate(
@@ -186,7 +187,9 @@ def test_a_covariance_given_now_and_then_is_that_of_its_pose() -> None:
             ),
             stamp,
         )  # fmt: skip
-    assert judge(record, truth).figures["nees_position"] == pytest.approx(1.0)
+    figures = judge(record, truth).figures
+    assert figures["nees_position"] == pytest.approx(1.0)
+    assert figures["velocity_rmse_m_per_s"] < 1e-9
 
 
 def test_of_a_covariance_lengths_are_scaled_and_angles_are_not() -> None:
@@ -195,8 +198,10 @@ def test_of_a_covariance_lengths_are_scaled_and_angles_are_not() -> None:
     record = EstimatorRecord(scale_free=True)
     noise = np.random.default_rng(1).normal(0.0, 0.02, (300, 3))
     p = np.diag([0.02**2 * 16] * 3 + [1e-4] * 3)
+    turns = Rotation.from_rotvec(0.01 * (-1.0) ** np.arange(300)[:, None] * [0.0, 0.0, 1.0])
+    orientations = (truth.rotations() * turns).as_quat(scalar_first=True)
     for k, (x, y, z) in enumerate((4 * (truth.positions + noise)).tolist()):
-        qw, qx, qy, qz = truth.orientations[k].tolist()
+        qw, qx, qy, qz = orientations[k].tolist()
         event = PoseEstimate(
             stamp=int(truth.stamps[k]),
             source="e",
@@ -208,3 +213,4 @@ def test_of_a_covariance_lengths_are_scaled_and_angles_are_not() -> None:
     figures = judge(record, truth).figures
     assert figures["scale"] == pytest.approx(0.25, rel=0.02)
     assert figures["nees_position"] == pytest.approx(3.0, abs=0.4)
+    assert figures["nees_pose"] == pytest.approx(figures["nees_position"] + 1.0, abs=0.1)

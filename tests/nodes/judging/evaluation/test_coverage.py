@@ -70,6 +70,11 @@ def test_images_missing_after_an_early_end_have_no_pose() -> None:
         assert cover(FRAMES, FRAMES, GAP, planned=planned) == cover(FRAMES, FRAMES, GAP)
 
 
+def test_poses_before_and_after_the_flight_cover_nothing_of_it() -> None:
+    outside = np.array([-5 * SECOND, -MS, 20 * SECOND])
+    assert cover(FRAMES, outside, GAP).lost == [(0, FRAMES[-1])]
+
+
 def test_intervals_that_touch_or_overlap_are_one() -> None:
     intervals = [Interval(7, 8), Interval(1, 2), Interval(0, 1), Interval(4, 6), Interval(5, 5)]
     assert union(intervals) == [(0, 2), (4, 6), (7, 8)]
@@ -115,6 +120,9 @@ def test_the_camera_is_the_one_whose_stamps_the_poses_have() -> None:
         assert choose_camera(cameras, SLOW, {"quick"}) == "quick"
         assert choose_camera(cameras, QUICK, {"slow"}) == "slow"
         assert choose_camera(cameras, SLOW, {"of depth only"}) == "slow"
+    late = {"one is missing": np.append(SLOW, 10 * SECOND), "late": SLOW + 3 * MS}
+    assert choose_camera(late, SLOW + MS) == "one is missing"
+    assert choose_camera(late, SLOW + MS + 1) == "late"
     assert choose_camera({"c/grey": SLOW, "d": QUICK}, QUICK, {"c"}) == "c/grey"
     assert choose_camera({"c": SLOW[:0]}, SLOW) is choose_camera({}, SLOW) is None
     assert choose_frames(CAMERAS, SLOW) is SLOW

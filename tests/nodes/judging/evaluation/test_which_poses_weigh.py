@@ -78,6 +78,14 @@ def test_an_image_has_one_pose_and_a_pose_one_image(poses: list[int], count: int
         assert chosen.tolist() == [distances[near & (images == image), image].min()]
 
 
+@pytest.mark.parametrize(("burst", "count"), [(4, 40), (5, 10)])
+def test_bursts_are_more_than_four_poses_a_step(burst: int, count: int) -> None:
+    stamps = (np.arange(10)[:, None] * SECOND + np.arange(burst) * MS).ravel()
+    mask = one_a_step(stamps)
+    assert mask.sum() == count
+    assert mask[::burst].all()
+
+
 def test_key_frames_at_uneven_times_all_weigh() -> None:
     steps = np.random.default_rng(0).uniform(0.1, 2.0, 200)
     assert one_a_step(np.round(np.cumsum(steps) * 1e9).astype(np.int64)).all()

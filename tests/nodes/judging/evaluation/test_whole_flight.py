@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 
 from nodes.judging.evaluation.judging import held_errors, interpolated_errors, judge, to_planned_end
-from nodes.judging.evaluation.record import EstimatorRecord, cover
+from nodes.judging.evaluation.record import EstimatorRecord, Interval, cover
 from nodes.trajectory import Trajectory
 from tests.nodes.judging.evaluation.flights import (
     MS,
@@ -170,7 +170,9 @@ def test_poses_on_a_line_that_cannot_be_aligned_count_as_none() -> None:
         record.add(estimate(stamp, error=(share - x, -y, -z)), stamp + MS)
 
     figures = judged(along, scale_free=True)
-    assert "why" in figures
+    assert figures["alignment"] == "sim3"
+    assert figures["why"].startswith("alignment: expected ")
+    assert not figures["why"].endswith("None")
     assert figures["flight_ate_percent"] == pytest.approx(57.8, abs=0.1)
 
 
@@ -187,8 +189,10 @@ def test_relocalization_takes_until_there_is_a_pose_again_or_to_the_end() -> Non
     figures = judged(twice)
     assert figures["relocalization_max_seconds"] == pytest.approx(4.0, abs=0.11)
     assert figures["relocalization_p50_seconds"] == pytest.approx(3.0, abs=0.11)
-    figures = judged(until(0.25, drifts(0)))
-    assert figures["relocalization_max_seconds"] == pytest.approx(15.0, abs=0.11)
+    for share in (0.25, 1e-3):  # which is one pose
+        figures = judged(until(share, drifts(0)))
+        lasts = (1.0 - share) * SECONDS
+        assert figures["relocalization_max_seconds"] == pytest.approx(lasts, abs=0.11)
 
 
 def test_a_reported_loss_is_charged_only_where_there_is_no_pose() -> None:
@@ -276,6 +280,23 @@ def test_to_say_less_never_looks_better(said: list[int], percent: float) -> None
 
     every = [root(count) for count in range(len(poses) + 1)]
     assert (np.diff(every) <= 0.05 * PATH / 100).all()  # of an image within the gap at the end
+
+
+def test_within_a_loss_images_with_a_pose_of_their_own_have_its_error() -> None:
+    """Also those whose pose is of a little later."""
+    held = held_errors(TRUTH, FRAMES, FRAMES + 10 * MS, np.ones(len(FRAMES)), [Interval(0, END)])
+    assert (held == 1.0).all()
+
+
+def test_a_vehicle_that_stands_has_no_errors_in_percent() -> None:
+    stands = Trajectory(TRUTH.stamps, np.ones((len(TRUTH), 3)), TRUTH.orientations)
+    record = EstimatorRecord.of(stands)
+    record.frame_id = record.final_frame_id = "map"
+    record.final = stands
+    figures = judge(record, stands, cameras={"c": FRAMES}).figures
+    for prefix in ("", "final_", "flight_", "final_flight_"):
+        assert figures[f"{prefix}ate_rmse_m"] == 0.0
+        assert figures[f"{prefix}ate_percent"] is None
 
 
 def test_of_an_images_poses_the_worst_counts() -> None:
