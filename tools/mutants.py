@@ -49,7 +49,7 @@ OPTIONS = (
     "--assert=plain",
     "-pno:cacheprovider",
     "-mnot slow",
-    "--timeout=30",
+    "--timeout=15",
     "--timeout-method=thread",
 )
 

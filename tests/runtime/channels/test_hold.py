@@ -300,7 +300,8 @@ class TestMissing:
         async def main() -> None:
             loop = asyncio.get_running_loop()
             wall = Wall()
-            hold = hold_in(loop, wall, 0.01, on_missing="continue")
+            log: list[str] = []
+            hold = hold_in(loop, wall, 0.01, log.append, on_missing="continue")
             task = asyncio.create_task(_value(hold.owe(0)))
             await asyncio.sleep(0)
             wall.seconds += 11
@@ -309,6 +310,11 @@ class TestMissing:
             assert not task.done()
             hold.answer(0, "when it comes")
             assert await task == "when it comes"
+            assert log == [
+                "slam: expected an answer to the frame of 0.000000 s within 10 s (max_wait), found "
+                "none; the run goes on without",
+                "slam: it answers again",
+            ]
             assert list(hold.answers.why_not) == ["the run went on without an answer"]
             hold.close()
 
@@ -526,6 +532,32 @@ def test_what_is_not_due_at_the_end_is_open_whether_it_was_answered_or_not() -> 
         assert not +hold.answers.counts
         assert hold.answers.sent == 2
         assert await owed[0] == "answered already"
+
+    run_async(main())
+
+
+def test_what_it_is_sent_and_has_received_is_in_the_answers() -> None:
+    async def main() -> None:
+        hold = hold_in(asyncio.get_running_loop(), Wall(), 0.04)
+        assert (hold.answers.inputs(), hold.answers.received) == (None, None)
+        hold.sent("images", b"image")
+        for count in (1, 2):
+            hold.received(count)
+        expected = Answers()
+        expected.took_in("images", b"image")
+        assert (hold.answers.inputs(), hold.answers.received) == (expected.inputs(), 3)
+
+    run_async(main())
+
+
+def test_a_doubt_is_logged_once() -> None:
+    async def main() -> None:
+        log: list[str] = []
+        hold = hold_in(asyncio.get_running_loop(), Wall(), 0.04, log.append)
+        for _ in range(2):
+            hold.doubt("it is Monday")
+        assert log == ["slam: an equal run may differ: it is Monday"]
+        assert list(hold.answers.why_not) == ["it is Monday"]
 
     run_async(main())
 

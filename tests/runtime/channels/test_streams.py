@@ -168,6 +168,25 @@ def test_a_second_reader_is_refused_and_the_first_still_served(run: Run) -> None
     assert run(main()) == 1
 
 
+def test_streams_that_wait_on_futures_end_and_refuse_a_second_reader_too(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Stream, "__anext__", Stream._next_by_future)
+
+    async def main() -> list[int]:
+        stream, seen = Stream[int]("node.port"), list[int]()
+        reader = asyncio.create_task(collect(stream, seen))
+        await turns()
+        with pytest.raises(ChannelBusyError, match=r"node\.port: another coroutine"):
+            await stream.receive()
+        offer(stream, 1, 2)
+        stream.close()
+        await reader
+        return seen
+
+    assert run(main()) == [1, 2]
+
+
 def test_a_reader_that_never_runs_dry_lets_the_loop_turn(run: Run) -> None:
     async def main() -> int:
         stream, seen = Stream[int]("s", bound=3 * TURN), list[int]()
