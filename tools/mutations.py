@@ -82,6 +82,8 @@ def says_nothing(node: ast.AST) -> bool:
     match node:
         case ast.Assert() | ast.JoinedStr() | ast.Expr(ast.Constant()):
             return True
+        case ast.keyword("kw_only" | "frozen" | "gc" | "eq"):
+            return True
         case ast.Assign([ast.Name("__slots__" | "__all__")]) | ast.If(ast.Name("TYPE_CHECKING")):
             return True
         case ast.Assign([ast.Name()], ast.Subscript(ast.Name()) | ast.Call(ast.Name("TypeVar"))):

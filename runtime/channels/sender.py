@@ -312,7 +312,9 @@ def _circle(error: BaseException) -> str:
         trace = trace.tb_next
     steps = []
     for frame in frames:
-        deliver = frame.f_locals["deliver"]
+        deliver = frame.f_locals.get("deliver")
+        if deliver is None:  # the innermost one may have got no further
+            continue
         node = getattr(getattr(deliver, "__self__", None), "name", "?")
         handler = getattr(deliver, "__name__", "?")
         steps.append(f"{frame.f_locals['self'].name} → {node}.{handler}")

@@ -6,11 +6,13 @@ import asyncio
 import concurrent.futures
 import random
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -121,6 +123,14 @@ class TestDelivery:
         came, hold = fly(act, frames=len(numbers))
         assert came == [(n * PERIOD + 40 * MS, str(n)) for n in numbers]
         assert hold.answers.counts["answered"] == len(numbers)
+
+    def test_the_real_time_that_an_answer_took_is_measured(self) -> None:
+        def act(hold: Hold[str], wall: Wall, number: int) -> None:
+            wall.seconds += 0.25
+            answer_all(hold, wall, number)
+
+        _, hold = fly(act, latency=0.01)
+        assert hold.answers.latency_quantiles(0.0, 1.0) == [0.25, 0.25]
 
     def test_time_stands_until_the_answer_is_in(self) -> None:
         waiting = threading.Event()
@@ -281,6 +291,21 @@ class TestMissing:
             hold.owe(2 * SECOND)
             hold.look()
             assert hold.answers.counts == {"lost": IN_A_ROW + 2, "late": 2}
+            hold.close()
+
+        run_async(main())
+
+    def test_a_thread_gives_up_also_after_it_had_nothing_to_do(self) -> None:
+        async def main() -> None:
+            wall = Wall()
+            hold = hold_in(asyncio.get_running_loop(), wall, 0.01, on_missing="lost")
+            hold.owe(0)
+            hold.answer(0, "pose")
+            # Really: the thread has to see that nothing is owed.
+            time.sleep(0.05)  # noqa: ASYNC251
+            owed = hold.owe(PERIOD)
+            wall.seconds += 10.1
+            assert await owed is None
             hold.close()
 
         run_async(main())
@@ -574,6 +599,15 @@ def test_the_thread_that_watches_ends_with_the_hold() -> None:
         assert not thread.is_alive()
 
     run_async(main())
+
+
+def test_by_default_each_frame_is_to_be_answered_at_once() -> None:
+    assert HoldConfig() == HoldConfig(
+        skips="refused", initialise=Duration(0), max_wait=Duration(10), on_missing="error",
+        lost_allowed=0, tolerance_ns=1000, latencies="", latency_factor=1.0,
+    )  # fmt: skip
+    with pytest.raises(msgspec.ValidationError, match="unknown field `skip`"):
+        msgspec.convert({"skip": "allowed"}, HoldConfig)
 
 
 def test_who_no_longer_waits_cancels_no_answer() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any, NamedTuple
 
 import pytest
@@ -10,9 +11,11 @@ from events import Event
 from runtime import Bundle, Input, Node, Output, on
 from runtime.channels.links import Link, LinkConfig
 from runtime.errors import ConfigError, NodeError
-from runtime.testing import run_nodes, spec
+from runtime.testing import run_in_lockstep, run_nodes, spec
+from runtime.time.lockstep import LockstepClock
+from runtime.units import Latency
 
-MS = 1_000_000
+MS, SECOND = 1_000_000, 1_000_000_000
 
 
 class Said(Event):
@@ -131,6 +134,29 @@ def test_an_error_behind_a_delay_is_the_nodes() -> None:
 
     with pytest.raises(NodeError, match="bad: RuntimeError: no"):
         run_nodes([spec(Bad, "bad", links={"hear": {"delay": 0.1}})], inputs=EVENTS[:1])
+
+
+def test_an_error_behind_a_delay_is_raised_if_there_is_nobody_to_report_to() -> None:
+    def refuse(_: Said) -> None:
+        raise ValueError("no")
+
+    async def main() -> None:
+        clock = LockstepClock(asyncio.get_running_loop())  # type: ignore[arg-type]
+        link = Link("ear.said", LinkConfig(delay=Latency(0.5)), clock, seed=0)
+        faults: list[BaseException] = []
+        link.to(refuse, faults.append)(EVENTS[0])
+        assert clock.schedule.next_due() == 500 * MS
+        clock.schedule.run_first(SECOND)
+        assert [repr(fault) for fault in faults] == ["ValueError('no')"]
+        link.to(refuse)(EVENTS[0])
+        with pytest.raises(ValueError, match="no"):
+            clock.schedule.run_first(2 * SECOND)
+        link.close()
+        link.offer(EVENTS[0])
+        clock.schedule.run_first(3 * SECOND)
+        assert (link.lost, link.thinned) == (0, 0)
+
+    run_in_lockstep(main())
 
 
 def test_mistakes_in_the_file() -> None:

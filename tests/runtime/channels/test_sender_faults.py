@@ -7,7 +7,7 @@ import pytest
 from events import Event
 from runtime.channels.sender import Deliver, Listener, Sender
 from runtime.channels.streams import Stream
-from runtime.errors import ChannelFullError
+from runtime.errors import ChannelFullError, HandlerCircleError
 from tests.runtime.small_events import Said, Shouted, shouted
 
 # A source filter on one listener makes a sender take the longer of its two ways of delivery.
@@ -128,3 +128,41 @@ def test_a_nested_delivery_has_its_own_faults(source: str | None) -> None:
     outer.connect([handler(pass_on, source)], (), report)
     outer.send(shouted())
     assert (faults, log) == ([fail], ["passed on"])
+
+
+class Replies:
+    """Sends each event on; as a node, it has a name."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.out = Sender(f"{name}.out", Shouted)
+
+    def reply(self, event: Shouted) -> None:
+        self.out.send(event)
+
+
+@SOURCES
+def test_handlers_that_answer_one_another_are_one_error_of_the_first_delivery(
+    source: str | None,
+) -> None:
+    begins, a, b = map(Replies, ("begins", "a", "b"))
+    faults: list[tuple[Deliver, BaseException]] = []
+    for node, other in ((begins, a), (a, b), (b, a)):
+        listeners = [handler(other.reply, source)]
+        node.out.connect(listeners, (), lambda *fault: faults.append(fault))
+    begins.out.send(shouted())
+    ((deliver, error),) = faults
+    assert deliver == a.reply
+    assert isinstance(error, HandlerCircleError)
+    assert str(error).endswith(": a.out → b.reply, b.out → a.reply")
+
+
+def test_a_handler_that_calls_itself_for_ever_is_no_circle() -> None:
+    def recurse(event: Event) -> None:
+        recurse(event)
+
+    faults: list[str] = []
+    sender = Sender("n.p", Shouted)
+    sender.connect([handler(recurse)], (), lambda _, error: faults.append(type(error).__name__))
+    sender.send(shouted())
+    assert faults == ["RecursionError"]

@@ -13,9 +13,14 @@ from hypothesis import strategies as st
 
 from events import Event
 from runtime import Input, Node, Output, on
-from runtime.channels.sender import Listener, Sender
+from runtime.channels.sender import Listener, Sender, Voices
 from runtime.channels.streams import Stream
-from runtime.errors import ChannelThreadError, ChannelTypeError, NodeError
+from runtime.errors import (
+    ChannelSourceError,
+    ChannelThreadError,
+    ChannelTypeError,
+    NodeError,
+)
 from runtime.testing import run_nodes, spec
 from tests.runtime.small_events import Said, Shouted, Sung, said, shouted
 
@@ -30,7 +35,9 @@ def loud() -> Loud:
     return Loud(stamp=0, source="careless")
 
 
-def connected(kind: str, event: type[Event], heard: list[Any]) -> Sender[Any]:
+def connected(
+    kind: str, event: type[Event], heard: list[Any], voices: Voices | None = None
+) -> Sender[Any]:
     """Return a sender that delivers in one of the ways there are."""
     sender: Sender[Any] = Sender("n.out", event)
     stream: Stream[Any] = Stream("m.in")
@@ -41,7 +48,8 @@ def connected(kind: str, event: type[Event], heard: list[Any]) -> Sender[Any]:
         "nobody": [],
         "tapped": [],
     }[kind]
-    sender.connect(listeners, [lambda _, e: heard.append(e)] if kind == "tapped" else [])
+    taps = [lambda _, e: heard.append(e)] if kind == "tapped" else []
+    sender.connect(listeners, taps, voices=voices)
     return sender
 
 
@@ -68,6 +76,21 @@ def test_an_event_of_another_type_is_refused_whenever_it_comes(
                 sender.send(wrong)
         assert wrong not in heard
         assert sum(sender.sent().values()) == len(right_before)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("event", [Said, Loud])
+def test_the_source_of_each_event_is_checked(kind: str, event: type[Said]) -> None:
+    heard: list[Any] = []
+    sender = connected(kind, event, heard, Voices(["n", "drone"]))
+    for source in ("n", "n/below", "n"):
+        sender.send(event(stamp=0, source=source))
+    del heard[:]
+    for _ in range(2):
+        with pytest.raises(ChannelSourceError, match=r"^n\.out: .* 'drone', which is drone's$"):
+            sender.send(event(stamp=0, source="drone"))
+    assert not heard
+    assert sender.sources == {"n", "n/below"}
 
 
 def test_the_error_is_a_type_error_that_names_what_was_found() -> None:

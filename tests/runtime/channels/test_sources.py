@@ -22,6 +22,7 @@ from runtime.channels.sources import SourceOwners
 from runtime.errors import ChannelSourceError, NodeError
 from runtime.testing import any_source, run_nodes, spec
 from tests.runtime.samples_runs import supervise
+from tests.runtime.small_events import said
 
 PLACE: dict[str, Any] = {"position": (0.0, 0.0, 0.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
 POSE: dict[str, Any] = PLACE | {"frame_id": "odom", "child_frame_id": "body"}
@@ -58,7 +59,7 @@ class Speaker(Node[NamesConfig]):
                     self.anything.send(TrackingLost(stamp=0, source=source))
 
 
-def said(*sources: str, announced: tuple[str, ...] = (), kind: str = "estimate") -> list[str]:
+def sources_of(*sources: str, announced: tuple[str, ...] = (), kind: str = "estimate") -> list[str]:
     """Return the sources of what a node ``cheat`` sends beside ``drone`` and ``tracker``."""
     result = run_nodes(
         [
@@ -83,7 +84,7 @@ def test_a_node_speaks_for_itself_and_for_those_that_it_announces(
     sources: tuple[str, ...], announced: tuple[str, ...]
 ) -> None:
     for kind in ("truth", "estimate", "lost"):
-        assert said(*sources, announced=announced, kind=kind) == list(sources)
+        assert sources_of(*sources, announced=announced, kind=kind) == list(sources)
 
 
 @pytest.mark.slow
@@ -112,7 +113,7 @@ def test_a_node_that_speaks_for_another_fails_with_both_names(
         if announced and "nobody" in whose:
             continue
         with pytest.raises(NodeError) as caught:
-            said("cheat", source, announced=announced, kind=kind)
+            sources_of("cheat", source, announced=announced, kind=kind)
         text = str(caught.value)
         assert text.startswith(f"cheat: cheat.{port}")
         assert f"{source!r}, {whose}" in text
@@ -162,6 +163,26 @@ def test_a_script_of_a_test_may_speak_for_anybody() -> None:
         linear_acceleration=(0.0, 0.0, 0.0),
     )
     assert [event.source for event in run_nodes(nodes, inputs=[imu]).sent] == ["drone", "y"]
+
+
+def test_who_announces_a_star_sends_what_nobody_else_owns() -> None:
+    voices = Voices(["replay", "drone"], ["script"])
+    odd, below = (said(source=source) for source in ("odd", "drone/imu/raw"))
+    with pytest.raises(ChannelSourceError, match="'odd', which nobody announces"):
+        voices.check("replay.anything", odd)
+    voices.announce("replay", Announcement(stamp=0, source="*"))
+    voices.check("replay.anything", odd)
+    with pytest.raises(ChannelSourceError, match="'drone/imu/raw', which is drone's"):
+        voices.check("replay.anything", below)
+    with pytest.raises(ChannelSourceError, match="'odd', which nobody announces"):
+        voices.check("drone.anything", odd)
+    voices.check("script.anything", below)
+    voices.announce("script", Announcement(stamp=0, source="drone"))
+    assert [voices.owner(name) for name in ("drone/imu/raw", "odd", "dron")] == [
+        "drone",
+        None,
+        None,
+    ]
 
 
 def test_a_source_is_announced_once_as_each_kind() -> None:
