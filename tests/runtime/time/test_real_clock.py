@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import uvloop
@@ -94,3 +95,18 @@ def test_closing_gives_the_file_back() -> None:
 
     with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
         runner.run(main())
+
+
+def test_an_alarm_that_the_kernel_refuses_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        alarm = TimerFd(loop, lambda: None)
+        refuses = SimpleNamespace(timerfd_create=lambda *_: -1, timerfd_settime=lambda *_: -1)
+        monkeypatch.setattr("runtime.time.clock._libc", refuses)
+        with pytest.raises(OSError, match="timerfd_settime failed"):
+            alarm.set(1)
+        alarm.close()
+        with pytest.raises(OSError, match="timerfd_create failed"):
+            TimerFd(loop, lambda: None)
+
+    asyncio.run(main())

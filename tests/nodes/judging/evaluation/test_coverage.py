@@ -61,18 +61,40 @@ def test_what_it_said_of_itself_counts_within_the_flight() -> None:
 
 
 def test_images_missing_after_an_early_end_have_no_pose() -> None:
-    last = int(FRAMES[-1])
-    coverage = cover(FRAMES, FRAMES, GAP, planned=last + 3 * SECOND)
-    assert coverage.flight == (0, last + 3 * SECOND)
-    assert (coverage.frames, coverage.answered) == (len(FRAMES) + 60, len(FRAMES))
-    assert coverage.lost == [(last, last + 3 * SECOND)]
-    for planned in (None, last, last - SECOND):
-        assert cover(FRAMES, FRAMES, GAP, planned=planned) == cover(FRAMES, FRAMES, GAP)
+    frames = FRAMES + 7 * SECOND
+    last = int(frames[-1])
+    planned = last + 120 * SECOND
+    coverage = cover(frames, frames, GAP, planned=planned)
+    assert coverage.flight == (7 * SECOND, planned)
+    assert (coverage.frames, coverage.answered) == (len(frames) + 2400, len(frames))
+    assert coverage.lost == [(last, planned)]
+    for end in (None, last, last - SECOND):
+        assert cover(frames, frames, GAP, planned=end) == cover(frames, frames, GAP)
 
 
 def test_poses_before_and_after_the_flight_cover_nothing_of_it() -> None:
     outside = np.array([-5 * SECOND, -MS, 20 * SECOND])
     assert cover(FRAMES, outside, GAP).lost == [(0, FRAMES[-1])]
+
+
+def test_without_a_pose_nothing_is_covered_also_of_a_single_image() -> None:
+    for frames in (FRAMES, FRAMES[:1]):
+        nothing, everything = (cover(frames, poses, GAP) for poses in (FRAMES[:0], FRAMES))
+        assert (nothing.percent, nothing.frames_percent) == (0.0, 0.0)
+        assert (everything.percent, everything.frames_percent) == (100.0, 100.0)
+
+
+def test_the_trajectory_is_in_the_first_frame_and_only_that_grows_it() -> None:
+    record = EstimatorRecord()
+    grown = [
+        record.add(estimate(k * MS, frame_id=frame), k * MS)
+        for k, frame in enumerate(["odom", "odom", "map", "map", "odom", "map"])
+    ]
+    assert grown == [True, True, False, False, True, False]
+    assert (len(record), record.frame_id, record.restarts) == (3, "odom", 2)
+    assert record.bodies == {"base_link": 3}
+    assert record.add(estimate(5 * MS), 9 * MS) is False
+    assert record.repeated == 1
 
 
 def test_intervals_that_touch_or_overlap_are_one() -> None:
