@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 import tomllib
 
 import pytest
@@ -67,3 +70,13 @@ def test_listed_mutants_exist_and_have_a_reason(module: str) -> None:
     there = {mutant[:3] for mutant in mutants((ROOT / path_of(module)).read_bytes())}
     assert not equivalents(module) - there
     assert all(row["why"] for row in LISTED[module])
+
+
+@pytest.mark.slow
+def test_a_module_is_judged_in_a_copy() -> None:
+    before = (ROOT / "events" / "frames.py").read_bytes()
+    command = [sys.executable, "-m", "tools.mutants", "events.frames", "--sample=3", "--jobs=2"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^events\.frames: [123] of 3 killed", done.stdout, re.MULTILINE), done.stdout
+    assert (ROOT / "events" / "frames.py").read_bytes() == before

@@ -82,6 +82,7 @@ def test_without_a_pose_nothing_is_covered_also_of_a_single_image() -> None:
         nothing, everything = (cover(frames, poses, GAP) for poses in (FRAMES[:0], FRAMES))
         assert (nothing.percent, nothing.frames_percent) == (0.0, 0.0)
         assert (everything.percent, everything.frames_percent) == (100.0, 100.0)
+    assert cover(FRAMES[:1], FRAMES, GAP, planned=SECOND).flight == (0, 0)  # at no known rate
 
 
 def test_the_trajectory_is_in_the_first_frame_and_only_that_grows_it() -> None:
