@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+import asyncio
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import pytest
 
 from runtime import Input, Node, NodeConfig, Output
 from runtime.errors import ChannelClosedError
-from tests.runtime.small_events import Said, make, said
+from runtime.host import Host
+from tests.runtime.small_events import NoHost, Said, make, said
 
 C = TypeVar("C", bound=NodeConfig)
 
@@ -87,3 +92,18 @@ def test_random_numbers_depend_on_the_seed_and_the_name_only() -> None:
     assert draw(One, "a", 1) == draw(Other, "a", 1)
     assert draw(One, "a", 1) != draw(One, "b", 1)
     assert draw(One, "a", 1) != draw(One, "a", 2)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda host: host.start(None, None),
+        lambda host: host.every(None, 1.0, print, "node.print"),
+        lambda host: asyncio.run(host.worker(None, print, ())),
+        lambda host: host.hold(None, "slam", None, 0.0),
+        lambda host: host.offload(None, None),
+    ],
+)
+def test_a_host_that_runs_nothing_says_so(use: Callable[[Host], Any]) -> None:
+    with pytest.raises(NotImplementedError):
+        use(NoHost())

@@ -58,6 +58,8 @@ def test_what_it_said_of_itself_counts_within_the_flight() -> None:
     ]
     coverage = cover(FRAMES, FRAMES, GAP, said)
     assert seconds(coverage.lost) == pytest.approx(1.0 + 1.0 + FRAMES[-1] / SECOND - 11.0)
+    instants = [Interval(5 * SECOND, 5 * SECOND), Interval(-2, -1), Interval(10**15, 10**16)]
+    assert cover(FRAMES, FRAMES, GAP, instants).lost == []
 
 
 def test_images_missing_after_an_early_end_have_no_pose() -> None:
@@ -68,6 +70,8 @@ def test_images_missing_after_an_early_end_have_no_pose() -> None:
     assert coverage.flight == (7 * SECOND, planned)
     assert (coverage.frames, coverage.answered) == (len(frames) + 2400, len(frames))
     assert coverage.lost == [(last, planned)]
+    flown = float(np.ptp(FRAMES)) / SECOND
+    assert coverage.percent == pytest.approx(100.0 * flown / (flown + 120.0))
     for end in (None, last, last - SECOND):
         assert cover(frames, frames, GAP, planned=end) == cover(frames, frames, GAP)
 
@@ -106,7 +110,7 @@ def test_intervals_that_touch_or_overlap_are_one() -> None:
 @pytest.mark.parametrize(("ahead", "future"), [(MS, 0), (MS + 1, 1)])
 def test_stamps_are_of_the_future_from_a_millisecond_on(ahead: int, future: int) -> None:
     record = EstimatorRecord()
-    assert record.add(estimate(SECOND + ahead), SECOND) is not bool(future)
+    assert record.add(estimate(SECOND + ahead), SECOND) is (not future)
     record.note(TrackingLost(stamp=2 * SECOND + ahead, source="est", reason=""), 2 * SECOND)
     assert record.future == 2 * future
     assert record.reported_lost(3 * SECOND) == [(2 * SECOND + MS, 3 * SECOND)]
