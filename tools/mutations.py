@@ -82,7 +82,7 @@ def says_nothing(node: ast.AST) -> bool:
     match node:
         case ast.Assert() | ast.JoinedStr() | ast.Expr(ast.Constant()):
             return True
-        case ast.keyword("kw_only" | "frozen" | "gc" | "eq"):
+        case ast.keyword("kw_only" | "frozen" | "gc" | "eq" | "strict"):
             return True
         case ast.Assign([ast.Name("__slots__" | "__all__")]) | ast.If(ast.Name("TYPE_CHECKING")):
             return True

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from events import Event, LidarScan, TrajectoryEstimate
+from events import Event, LidarScan, PoseEstimate, TrajectoryEstimate
 from nodes.judging.evaluation import Evaluation
 from nodes.judging.evaluation.judging import Judgement, errors_at_ticks, judge
 from nodes.judging.evaluation.record import EstimatorRecord
@@ -156,6 +156,34 @@ def test_the_node_judges_it_and_leaves_it_for_the_report(tmp_path: Path) -> None
     assert read.name == "est"
     assert read.final is not None
     np.testing.assert_allclose(read.final.positions, poses.positions, atol=1e-8)
+
+
+@pytest.mark.parametrize(("scale", "scale_free"), [(1.0, False), (0.2, True)])
+def test_a_final_trajectory_of_another_clock_is_told(scale: float, scale_free: bool) -> None:
+    late = moved(TRUTH, scale=scale)
+    late = Trajectory(late.stamps + 100 * MS, late.positions, late.orientations)
+    note = judged(final(late, "odom"), scale_free=scale_free).note
+    assert "after loop closures: with -0.1000 s added to its stamps it would fit far" in note
+
+
+def test_of_an_estimate_of_another_clock_and_unit_the_offset_is_told() -> None:
+    scaled = moved(TRUTH, scale=0.2)
+    late = Trajectory(scaled.stamps + 10**12, scaled.positions, scaled.orientations)
+    why = judge(EstimatorRecord.of(late), TRUTH).figures["why"]
+    assert why.endswith("; with -1000.0000 s added to its stamps it would fit")
+
+
+def test_of_a_short_flight_each_tick_is_kept_and_what_is_too_short_is_told() -> None:
+    short = walk(11)
+    record = EstimatorRecord()
+    for stamp, position, orientation in short.poses():
+        pose: dict[str, Any] = {"position": (*position,), "orientation": (*orientation,)}
+        record.add(PoseEstimate(stamp=stamp, source="est", frame_id="map", **pose), stamp)
+    judgement = judge(record, short, rate=100.0)
+    assert judgement.tick_errors is not None
+    assert len(judgement.tick_errors.stamps) == 1 + round(100 * short.seconds)
+    assert judgement.figures["why"].startswith("relative error: expected poses 1 m apart")
+    assert judgement.figures["ate_percent"] == 0.0
 
 
 def scans(period: int) -> list[Event]:

@@ -147,6 +147,10 @@ def test_a_turn_is_told_only_where_it_is_constant() -> None:
     orientations = examine(TRUTH, oriented(TRUTH.rotations() * turn * shakes))
     assert orientations is not None
     assert orientations.kind == "turned"
+    figures = judge(EstimatorRecord.of(oriented(TRUTH.rotations() * turn * shakes)), TRUTH).figures
+    assert figures["orientations"] == "turned"
+    assert figures["body_rotation_deg"] == pytest.approx(orientations.degrees)
+    assert figures["body_rotation_spread_deg"] == pytest.approx(orientations.spread)
     wide = Rotation.from_rotvec(np.random.default_rng(3).normal(0.0, 0.08, (len(TRUTH), 3)))
     orientations = examine(TRUTH, oriented(TRUTH.rotations() * turn * wide))
     assert orientations is not None

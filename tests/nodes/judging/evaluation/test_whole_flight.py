@@ -179,6 +179,10 @@ def test_poses_on_a_line_that_cannot_be_aligned_count_as_none() -> None:
 def test_initialization_takes_until_the_first_pose_or_the_whole_flight() -> None:
     assert judged(drifts(0))["initialization_seconds"] == 0.0
     assert judged(after(0.25, drifts(0)))["initialization_seconds"] == pytest.approx(5.0)
+    record = EstimatorRecord.of(TRUTH.take(TRUTH.stamps >= 6 * SECOND))
+    later = FRAMES[FRAMES >= 5 * SECOND]
+    figures = judge(record, TRUTH, cameras={"c": later}).figures
+    assert figures["initialization_seconds"] == pytest.approx(1.0)
     assert judged(nothing)["initialization_seconds"] == pytest.approx(SECONDS, abs=0.1)
 
 
@@ -280,6 +284,25 @@ def test_to_say_less_never_looks_better(said: list[int], percent: float) -> None
 
     every = [root(count) for count in range(len(poses) + 1)]
     assert (np.diff(every) <= 0.05 * PATH / 100).all()  # of an image within the gap at the end
+
+
+SPEED = PATH / SECONDS
+
+
+def test_an_image_without_a_pose_has_the_error_of_the_nearest_the_earlier_of_two() -> None:
+    poses = FRAMES[::10]
+    held = held_errors(TRUTH, FRAMES, poses, np.arange(len(poses), dtype=float), [])
+    assert held.tolist() == [(k + 4) // 10 for k in range(len(FRAMES))]
+    assert (held_errors(TRUTH, FRAMES, poses[:1], np.full(1, 2.0), []) == 2.0).all()
+
+
+def test_while_lost_the_path_is_added_to_the_last_error_and_before_the_first_to_none() -> None:
+    poses, flown = FRAMES[[100, 200]], SPEED * FRAMES / SECOND
+    lost_all = [Interval(0, END)]
+    held = held_errors(TRUTH, FRAMES, poses, np.array([2.0, 3.0]), lost_all)
+    np.testing.assert_allclose(held[:100], flown[:100], atol=1e-3)
+    np.testing.assert_allclose(held[100:200], 2.0 + flown[:100], atol=1e-3)
+    np.testing.assert_allclose(held[200:], 3.0 + flown[:201], atol=1e-3)
 
 
 def test_within_a_loss_images_with_a_pose_of_their_own_have_its_error() -> None:
