@@ -569,7 +569,7 @@ def test_what_it_is_sent_and_has_received_is_in_the_answers() -> None:
         for count in (1, 2):
             hold.received(count)
         expected = Answers()
-        expected.took_in("images", b"image")
+        expected.record_input("images", b"image")
         assert (hold.answers.inputs(), hold.answers.received) == (expected.inputs(), 3)
 
     run_async(main())

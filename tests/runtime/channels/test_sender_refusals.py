@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from events import Event
 from runtime import Input, Node, Output, on
-from runtime.channels.sender import Listener, Sender, Voices
+from runtime.channels.sender import Listener, Sender
+from runtime.channels.sources import SourceOwners
 from runtime.channels.streams import Stream
 from runtime.errors import (
     ChannelSourceError,
@@ -36,7 +37,7 @@ def loud() -> Loud:
 
 
 def connected(
-    kind: str, event: type[Event], heard: list[Any], voices: Voices | None = None
+    kind: str, event: type[Event], heard: list[Any], owners: SourceOwners | None = None
 ) -> Sender[Any]:
     """Return a sender that delivers in one of the ways there are."""
     sender: Sender[Any] = Sender("n.out", event)
@@ -49,7 +50,7 @@ def connected(
         "tapped": [],
     }[kind]
     taps = [lambda _, e: heard.append(e)] if kind == "tapped" else []
-    sender.connect(listeners, taps, voices=voices)
+    sender.connect(listeners, taps, owners=owners)
     return sender
 
 
@@ -82,7 +83,7 @@ def test_an_event_of_another_type_is_refused_whenever_it_comes(
 @pytest.mark.parametrize("event", [Said, Loud])
 def test_the_source_of_each_event_is_checked(kind: str, event: type[Said]) -> None:
     heard: list[Any] = []
-    sender = connected(kind, event, heard, Voices(["n", "drone"]))
+    sender = connected(kind, event, heard, SourceOwners(["n", "drone"]))
     for source in ("n", "n/below", "n"):
         sender.send(event(stamp=0, source=source))
     del heard[:]

@@ -166,19 +166,19 @@ def test_a_script_of_a_test_may_speak_for_anybody() -> None:
 
 
 def test_who_announces_a_star_sends_what_nobody_else_owns() -> None:
-    voices = Voices(["replay", "drone"], ["script"])
+    owners = SourceOwners(["replay", "drone"], ["script"])
     odd, below = (said(source=source) for source in ("odd", "drone/imu/raw"))
     with pytest.raises(ChannelSourceError, match="'odd', which nobody announces"):
-        voices.check("replay.anything", odd)
-    voices.announce("replay", Announcement(stamp=0, source="*"))
-    voices.check("replay.anything", odd)
+        owners.check("replay.anything", odd)
+    owners.announce("replay", Announcement(stamp=0, source="*"))
+    owners.check("replay.anything", odd)
     with pytest.raises(ChannelSourceError, match="'drone/imu/raw', which is drone's"):
-        voices.check("replay.anything", below)
+        owners.check("replay.anything", below)
     with pytest.raises(ChannelSourceError, match="'odd', which nobody announces"):
-        voices.check("drone.anything", odd)
-    voices.check("script.anything", below)
-    voices.announce("script", Announcement(stamp=0, source="drone"))
-    assert [voices.owner(name) for name in ("drone/imu/raw", "odd", "dron")] == [
+        owners.check("drone.anything", odd)
+    owners.check("script.anything", below)
+    owners.announce("script", Announcement(stamp=0, source="drone"))
+    assert [owners.owner(name) for name in ("drone/imu/raw", "odd", "dron")] == [
         "drone",
         None,
         None,
