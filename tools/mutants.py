@@ -44,6 +44,7 @@ LIST = ROOT / "tools" / "mutants.toml"
 NOT_COPIED = (".git", ".venv*", ".*cache", ".hypothesis", "runs", "sweeps", "build", "dist")
 ENVIRONMENT = {"CI": "1", "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"}
 OPTIONS = ("-qx", "-n0", "--assert=plain", "-pno:cacheprovider", "--timeout=0", "-mnot slow")
+MOST_LINES = 10_000  # of a module
 PATIENCE = 15  # real seconds for a test
 
 
@@ -86,6 +87,8 @@ class Plugin:
         try:
             return (yield)
         finally:
+            if sys.gettrace() is None:  # Python has given up, as where the stack is full
+                lines.update(range(MOST_LINES))
             sys.settrace(None)
             threading.settrace(None)
 

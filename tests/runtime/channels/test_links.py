@@ -136,6 +136,26 @@ def test_an_error_behind_a_delay_is_the_nodes() -> None:
         run_nodes([spec(Bad, "bad", links={"hear": {"delay": 0.1}})], inputs=EVENTS[:1])
 
 
+@pytest.mark.parametrize(
+    ("config", "ended"),
+    [
+        (LinkConfig(), [True, True]),
+        (LinkConfig(loss=1.0), [False, False]),
+        (LinkConfig(rate=1.0), [True, False]),
+        (LinkConfig(delay=Latency(0.5)), [False, False]),
+    ],
+)
+def test_only_an_event_that_was_handled_at_once_ends_a_delivery(
+    config: LinkConfig, ended: list[bool]
+) -> None:
+    async def main() -> None:
+        clock = LockstepClock(asyncio.get_running_loop())  # type: ignore[arg-type]
+        offer = Link("ear.hear", config, clock, seed=0).to(lambda _: True)
+        assert [offer(event) for event in EVENTS[:2]] == ended
+
+    run_in_lockstep(main())
+
+
 def test_an_error_behind_a_delay_is_raised_if_there_is_nobody_to_report_to() -> None:
     def refuse(_: Said) -> None:
         raise ValueError("no")

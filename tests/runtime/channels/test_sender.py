@@ -132,6 +132,15 @@ def test_events_are_routed_by_type_and_subclasses_come_too() -> None:
     ]
 
 
+def test_a_listener_to_several_types_hears_those_that_the_output_can_send() -> None:
+    log: list[Event] = []
+    sender = a_sender(Said)
+    sender.connect([handler(log.append, Shouted, Sung)])
+    sender.send(said())
+    sender.send(shouted())
+    assert log == [shouted()]
+
+
 def test_events_are_counted_by_type(connect: Ways) -> None:
     sender = a_sender()
     connect(sender, [handler(lambda _: True)])

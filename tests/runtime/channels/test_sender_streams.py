@@ -176,3 +176,17 @@ def test_a_reader_that_wants_it_soon_gets_it_soon_beside_one_that_does_not(ours:
         return at_once, log
 
     assert ours(main()) == (["now x"], ["now x", "soon x"])
+
+
+def test_readers_that_all_want_it_soon_get_it_after_the_sender_went_on(ours: Run) -> None:
+    async def main() -> list[str]:
+        soon, log = Stream[Shouted]("soon", soon=True), list[str]()
+        task = reading(soon, log)
+        await turns()
+        connected(soon).send(shouted("x"))
+        log.append("sent x")
+        await turns()
+        task.cancel()
+        return log
+
+    assert ours(main()) == ["sent x", "soon x"]
