@@ -44,7 +44,9 @@ LIST = ROOT / "tools" / "mutants.toml"
 NOT_COPIED = (".git", ".venv*", ".*cache", ".hypothesis", "runs", "sweeps", "build", "dist")
 ENVIRONMENT = {"CI": "1", "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"}
 OPTIONS = ("-qx", "-n0", "--assert=plain", "-pno:cacheprovider", "--timeout=0", "-mnot slow")
+KILLED = ("killed", "timed out")
 MOST_LINES = 10_000  # of a module
+MOST_BYTES = 8 << 30  # of memory
 PATIENCE = 15  # real seconds for a test
 
 
@@ -106,6 +108,7 @@ def start(copy: Path, module: str, places: Sequence[str], plugin: Plugin, second
     os.dup2(output, 1)
     os.dup2(output, 2)
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
     os.environ.update(ENVIRONMENT, PYTHONPATH=str(copy))
     sys.dont_write_bytecode = True
     sys.path[:] = [str(copy), *(path for path in sys.path if path not in {"", str(ROOT)})]
@@ -222,10 +225,10 @@ def main() -> None:
     results = Counter[str]()
     for mutant, result in run_mutants(asked.module, chosen, places, asked.jobs):
         results[result] += 1
-        if result != "killed":
+        if result not in KILLED:
             where = f"{asked.module}:{mutant.line} {mutant.function}"
             print(f"{result}: {where}\n  - {mutant.was}\n  + {mutant.becomes}", flush=True)
-    killed = results["killed"] + results["timed out"]
+    killed = sum(results[result] for result in KILLED)
     percent = 100 * killed / max(len(chosen), 1)
     print(
         f"{asked.module}: {killed} of {len(chosen)} killed ({percent:.0f} %; "

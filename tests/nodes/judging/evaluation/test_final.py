@@ -171,6 +171,10 @@ def test_of_an_estimate_of_another_clock_and_unit_the_offset_is_told() -> None:
     late = Trajectory(scaled.stamps + 10**12, scaled.positions, scaled.orientations)
     why = judge(EstimatorRecord.of(late), TRUTH).figures["why"]
     assert why.endswith("; with -1000.0000 s added to its stamps it would fit")
+    backwards = Trajectory(late.stamps, late.positions[::-1].copy(), late.orientations)
+    stands = Trajectory(late.stamps, np.ones((len(late), 3)), late.orientations)
+    for other in (backwards, stands):
+        assert "would fit" not in judge(EstimatorRecord.of(other), TRUTH).figures["why"]
 
 
 def test_of_a_short_flight_each_tick_is_kept_and_what_is_too_short_is_told() -> None:
