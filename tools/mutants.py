@@ -102,6 +102,16 @@ def start(copy: Path, module: str, places: Sequence[str], plugin: Plugin, second
     """
     if child := os.fork():
         return child
+    code = 3  # of pytest, for errors of its own
+    try:
+        code = run_tests(copy, module, places, plugin, seconds)
+        sys.stdout.flush()
+    finally:
+        os._exit(code)  # whatever happened: it is a copy of a process that has more to do
+
+
+def run_tests(copy: Path, module: str, places: Sequence[str], plugin: Plugin, seconds: int) -> int:
+    """Run tests in this process, and return pytest's exit code; 99 if they use another file."""
     os.setsid()
     os.chdir(copy)
     output = os.open("output", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -112,7 +122,7 @@ def start(copy: Path, module: str, places: Sequence[str], plugin: Plugin, second
     os.environ.update(ENVIRONMENT, PYTHONPATH=str(copy))
     sys.dont_write_bytecode = True
     sys.path[:] = [str(copy), *(path for path in sys.path if path not in {"", str(ROOT)})]
-    code: int = pytest.main([*OPTIONS, f"--rootdir={copy}", *places], plugins=[plugin])
+    code = int(pytest.main([*OPTIONS, f"--rootdir={copy}", *places], plugins=[plugin]))
     if not plugin.chosen:
         used = resource.getrusage(resource.RUSAGE_SELF)
         plugin.baseline.seconds = used.ru_utime + used.ru_stime
@@ -121,10 +131,8 @@ def start(copy: Path, module: str, places: Sequence[str], plugin: Plugin, second
             if "site-packages" in str(getattr(loaded, "__file__", "")) and "pytest" not in name
         ]  # fmt: skip
         Path("baseline").write_bytes(msgspec.json.encode(plugin.baseline))
-    if code == 0 and getattr(sys.modules.get(module), "__file__", "") != plugin.file:
-        code = 99  # the tests have used another file
-    sys.stdout.flush()
-    os._exit(code)
+    used_file = getattr(sys.modules.get(module), "__file__", "")
+    return 99 if code == 0 and used_file != plugin.file else code
 
 
 def run_baseline(copy: Path, module: str, places: Sequence[str]) -> Baseline:

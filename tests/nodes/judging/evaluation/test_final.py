@@ -214,6 +214,16 @@ def test_who_reads_a_lidar_answers_scans(tmp_path: Path) -> None:
     assert camera["frame_coverage_percent"] < 50.0
 
 
+def test_a_pose_is_the_newest_from_the_tick_of_its_arrival_on() -> None:
+    stamps = np.arange(3) * SECOND
+    there = Trajectory(stamps, np.eye(3), np.eye(4)[[0, 0, 0]])
+    rows, _ = errors_at_ticks(there, there.take(slice(2)), stamps[:2], 1.0, SECOND)
+    assert rows is not None
+    assert rows.stamps.tolist() == stamps.tolist()
+    assert rows.since.tolist() == [0, SECOND, SECOND]
+    assert errors_at_ticks(there, there, stamps + 10 * SECOND, 1.0, SECOND) == (None, {})
+
+
 def test_of_many_ticks_the_figures_are_those_of_all_and_a_few_rows_are_kept() -> None:
     """A pose that is never replaced, of a body that moves along x at 1 m/s for 800 s."""
     ends = np.array([0, 800 * SECOND])

@@ -299,6 +299,8 @@ def test_an_image_without_a_pose_has_the_error_of_the_nearest_the_earlier_of_two
 def test_while_lost_the_path_is_added_to_the_last_error_and_before_the_first_to_none() -> None:
     poses, flown = FRAMES[[100, 200]], SPEED * FRAMES / SECOND
     lost_all = [Interval(0, END)]
+    never = held_errors(TRUTH, FRAMES[100:], poses[:0], np.zeros(0), lost_all)
+    np.testing.assert_allclose(never, flown[:301], atol=1e-3)
     held = held_errors(TRUTH, FRAMES, poses, np.array([2.0, 3.0]), lost_all)
     np.testing.assert_allclose(held[:100], flown[:100], atol=1e-3)
     np.testing.assert_allclose(held[100:200], 2.0 + flown[:100], atol=1e-3)
