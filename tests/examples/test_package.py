@@ -46,9 +46,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the package installed in it."""
     folder = tmp_path_factory.mktemp("package")
     source = shutil.copytree(PACKAGE, folder / "source")  # its build leaves files beside it
-    options = ["--no-deps", "--no-build-isolation", "--no-index", "--target", str(folder / "site")]
+    options = ["--no-deps", "--target", str(folder / "site")]
     command = [sys.executable, "-m", "pip", "install", "--quiet", *options, str(source)]
-    subprocess.run(command, check=True, capture_output=True, timeout=50)
+    subprocess.run(command, check=True, capture_output=True, timeout=200)
     return folder / "site"
 
 
@@ -66,6 +66,7 @@ def python(words: list[str], site: Path, folder: Path) -> subprocess.CompletedPr
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_packages_sensor_world_node_and_command_fly(site: Path, tmp_path: Path) -> None:
     """The measurements are recorded, exported, scored, and input of a program in its own rows."""
     (tmp_path / "ears.py").write_text(PROGRAM)
@@ -94,6 +95,7 @@ def test_a_packages_sensor_world_node_and_command_fly(site: Path, tmp_path: Path
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_packages_data_set_is_read(site: Path, tmp_path: Path) -> None:
     """Also images and depth images in a format that no other data set has."""
     for name, dtype in (("grey", np.uint8), ("depth", np.float32)):
@@ -116,6 +118,7 @@ def test_a_packages_data_set_is_read(site: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_package_that_is_torn_is_named(site: Path, tmp_path: Path) -> None:
     torn = shutil.copytree(site, tmp_path / "torn")
     (torn / "air_data" / "airspeed.py").write_text("import nowhere\n")

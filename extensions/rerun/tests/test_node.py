@@ -34,7 +34,7 @@ from visnav_rerun import RerunView, sdk
 from visnav_rerun.node import Recorder
 from visnav_rerun.sdk import RerunConfig
 
-ROOT = Path(__file__).parents[4]
+ROOT = Path(__file__).parents[3]
 
 
 def flight(seconds: float) -> list[Event]:
@@ -166,9 +166,10 @@ def test_a_viewer_that_stands_still_is_not_waited_for(monkeypatch: pytest.Monkey
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_the_file_is_complete_after_ctrl_c(tmp_path: Path) -> None:
-    """Ctrl-C in the middle of `examples/rerun.toml`: all that was said until then can be read."""
+    """Ctrl-C in the middle of the example: all that was said until then can be read."""
+    example = "extensions/rerun/examples/rerun.toml"
     process = subprocess.Popen(
-        [*(sys.executable, "-m", "runtime", "run", "examples/rerun.toml"), "--out", str(tmp_path)],
+        [*(sys.executable, "-m", "runtime", "run", example), "--out", str(tmp_path)],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
     )
