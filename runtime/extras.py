@@ -168,6 +168,12 @@ class Offer(NamedTuple):
 
 
 @cache
+def _installed() -> Any:
+    """Return the entry points of all packages, which take milliseconds to read."""
+    return entry_points()
+
+
+@cache
 def offers(group: str) -> tuple[Offer, ...]:
     """Return the entry points of a group: the core's, the extensions', other packages' by name.
 
@@ -179,7 +185,7 @@ def offers(group: str) -> tuple[Offer, ...]:
     """
     offered = [
         Offer(point.dist.name if point.dist else "?", point.name, point.value)
-        for point in entry_points(group=group)
+        for point in _installed().select(group=group)
     ]
     offered.sort(key=lambda o: (o.package != OURS, not is_ours(o.package), o.package))
     ours = _declared(group) or [offer for offer in offered if offer.package == OURS]
@@ -202,7 +208,7 @@ def extension(group: str, name: str) -> Any:
     Raises:
         CommandError: It is not installed, or cannot be imported.
     """
-    for offer in entry_points(group=group, name=name):
+    for offer in _installed().select(group=group, name=name):
         return Offer(offer.dist.name if offer.dist else "?", name, offer.value).load()
     raise CommandError(f"expected {missing_extension(name)}, found no {group} installed")
 

@@ -39,7 +39,24 @@ def write(
     if (out / "config.toml").exists():
         raise ResultsError(f"{out}: expected no run's folder: name another with --out")
     with results.Folder(out) as folder:
-        page = _write(out, truth, judgements, verdict, notes)
+        write_results(out, {}, judgements, msgspec.to_builtins(verdict))
+        write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
+        for name, judgement in judgements.items():
+            assert judgement.estimate is not None
+            path = out / "trajectories" / f"{source_file(name)}.tum"
+            write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
+        files = {"truth": truth.file, **{k: j.figures["method"] for k, j in judgements.items()}}
+        facts = Facts(
+            name=out.name,
+            verdict=verdict,
+            environment={**environment(), "command": command_line(), "commit": commit()},
+            judged=files,
+            judged_hashes={name: _hash(file) for name, file in files.items()},
+            notes=list(notes),
+        )
+        text = msgspec.json.format(msgspec.json.encode(facts), indent=2)
+        results.write(out / "summary.json", text + b"\n")
+        page = write_report(out)
         folder.flown()
     return page
 
@@ -75,33 +92,6 @@ def in_memory(
         log=[],
         missing=list(notes),
     )
-
-
-def _write(
-    out: Path,
-    truth: Source,
-    judgements: dict[str, Judgement],
-    verdict: Verdict,
-    notes: Sequence[str],
-) -> Path:
-    write_results(out, {}, judgements, msgspec.to_builtins(verdict))
-    write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
-    for name, judgement in judgements.items():
-        assert judgement.estimate is not None
-        path = out / "trajectories" / f"{source_file(name)}.tum"
-        write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
-    files = {"truth": truth.file, **{k: j.figures["method"] for k, j in judgements.items()}}
-    facts = Facts(
-        name=out.name,
-        verdict=verdict,
-        environment={**environment(), "command": command_line(), "commit": commit()},
-        judged=files,
-        judged_hashes={name: _hash(file) for name, file in files.items()},
-        notes=list(notes),
-    )
-    text = msgspec.json.format(msgspec.json.encode(facts), indent=2)
-    results.write(out / "summary.json", text + b"\n")
-    return write_report(out)
 
 
 def _hash(file: str) -> str:

@@ -66,7 +66,7 @@ def test_a_node_of_an_extension_that_is_missing_is_told(monkeypatch: pytest.Monk
 
 
 def test_an_extension_that_a_run_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extras, "entry_points", lambda **_: ())
+    monkeypatch.setattr(extras, "_installed", lambda: importlib.metadata.EntryPoints())
     expected = r"expected the extension visnav-machines: pip install \./extensions/machines"
     with pytest.raises(CommandError, match=expected):
         extras.extension(extras.PROCESSES, "Peers")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any
 
@@ -155,7 +155,7 @@ def test_an_installed_package_is_found_by_its_metadata(
     point = EntryPoint("run", "runtime.tools.cli.run:run", COMMANDS)
     vars(point).update(dist=Distribution)
     monkeypatch.setattr(extras, "_PROJECT", tmp_path / "pyproject.toml")
-    monkeypatch.setattr(extras, "entry_points", lambda group: [point])
+    monkeypatch.setattr(extras, "_installed", lambda: EntryPoints([point]))
     assert offers(COMMANDS) == (Offer(OURS, "run", "runtime.tools.cli.run:run"),)
 
 
@@ -165,6 +165,6 @@ def test_a_project_of_somebody_else_around_ours_is_not_taken_for_it(
 ) -> None:
     (tmp_path / "pyproject.toml").write_text("[project]\nname = 'theirs'\n")
     monkeypatch.setattr(extras, "_PROJECT", tmp_path / "pyproject.toml")
-    monkeypatch.setattr(extras, "entry_points", lambda group: [])
+    monkeypatch.setattr(extras, "_installed", lambda: EntryPoints())
     with pytest.raises(CommandError, match=r"expected the package visnav-runtime to be installed"):
         offers(COMMANDS)
