@@ -1,0 +1,1 @@
+"""Worlds from meshes: scans, models of other programs, Gazebo's worlds."""
