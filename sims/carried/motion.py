@@ -11,7 +11,7 @@ from events import Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD, cross, from_rpy, inverse, rotate_inverse
 from runtime.recorded import RecordedMotion
 from sims.cameras import pose_to_qpos
-from sims.carried.placing import products
+from sims.carried.placing import EASE, products
 from sims.carried.spline import Moment, MotionSpline
 from sims.sensors.imu import ImuParameters
 from sims.vehicle import State
@@ -80,7 +80,8 @@ class CarriedMotion:
 
     Args:
         name: Of the node, whose body `add_free_camera` put into the world as ``name/base_link``.
-        thrust: Of imagined rotors, 0 to 1 of their greatest, for the IMU's vibration.
+        rest: Seconds before the motion, in which imagined rotors stand still.
+        thrust: Theirs in motion, 0 to 1 of their greatest, for the IMU's vibration.
     """
 
     def __init__(
@@ -89,10 +90,11 @@ class CarriedMotion:
         name: str,
         spline: MotionSpline,
         imu: ImuParameters,
+        rest: float = 0.0,
         thrust: float = 0.0,
     ) -> None:
         self.model = world.model
-        self.thrusts = np.full(4, thrust)
+        self._rest, self._thrust = rest, thrust
         self._world = world
         self._spline = spline
         self._imu = imu
@@ -105,6 +107,12 @@ class CarriedMotion:
     def time_ns(self) -> int:
         """Time up to which the world's physics are stepped, ns; 0 if it has none."""
         return 0 if self._world.simulation is None else self._world.simulation.time_ns
+
+    @property
+    def thrusts(self) -> Floats:
+        """Thrust of each imagined rotor at the time last asked for, 0 to 1 of its greatest."""
+        moving = (self._last[0] / 1e9 - self._rest) / EASE if self._rest else 1.0
+        return np.full(4, self._thrust * min(max(moving, 0.0), 1.0))
 
     @property
     def gravity(self) -> float:

@@ -52,7 +52,7 @@ class CarriedConfig(PlatformConfig):
             file. Or ``{ position, heading, scale }`` of its start.
         speed: Speed of the playback; 0.5 is half as fast, and all that the IMU feels is as then.
         margin: Distance of a solid, metres, below which the run warns.
-        thrust: Thrust of imagined rotors, 0 to 1, for the IMU's vibration.
+        thrust: Thrust of imagined rotors, 0 to 1, for the IMU's vibration; none while at rest.
     """
 
     trajectory: InputPath = ""
@@ -96,7 +96,12 @@ class Carried(SensorPlatform[CarriedConfig]):
             raise MotionError(str(error)) from None
         self.doing = ""
         self._carried = CarriedMotion(
-            world, self.name, self._spline, self.config.imu, self.config.thrust
+            world,
+            self.name,
+            self._spline,
+            self.config.imu,
+            float(self.config.rest),
+            self.config.thrust,
         )
         world.starts.setdefault(self.name, self._carried.state(0))
         return self._carried

@@ -160,6 +160,16 @@ def test_the_run_ends_with_the_motion_and_as_planned(folder: Path) -> None:
     assert fast == pytest.approx(2.0 * RADIUS * RATE, rel=0.1)
 
 
+def test_imagined_rotors_start_with_the_motion(folder: Path) -> None:
+    imu = {"vibration": {"amplitude": 2.0}}
+    samples = carry(folder, 3.5, rest=1.0, thrust=0.5, imu=imu).of(Imu)
+    size = {e.stamp: math.hypot(*e.linear_acceleration) for e in samples}
+    at_rest = [size[s] for s in size if s < 0.9 * SECOND]
+    moving = [size[s] for s in size if s > 2.5 * SECOND]
+    assert np.std(at_rest) < 0.05
+    assert np.std(moving) > 0.3
+
+
 def test_it_announces_a_vehicle_without_motors_and_its_sensors(folder: Path) -> None:
     result = carry(folder, 0.5, imu={}, barometer={"position": [0.1, 0, 0]}, place={
         "position": [1.0, 2.0, -1.5], "heading": 90.0
