@@ -1,7 +1,7 @@
 """Solids of a mesh: the voxels that its triangles touch, merged into boxes; and its floor.
 
-All lengths are metres, z is up. Cells are counted by integers and computed by elementwise operations
-alone, so that every machine gives the same boxes.
+All lengths are metres, z is up. Cells are counted by integers, and computed by operations on single
+elements: every machine gives the same boxes.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import permutations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
 
@@ -24,6 +25,9 @@ GROUP = 3  # of geoms: met by vehicles and path checks, seen by no camera and no
 LIMIT = 4_000_000
 """Most cells that a mesh may fill, as estimated from its area: 200 × 200 m at 0.1 m."""
 
+_COLOUR = (0.5, 0.5, 0.5, 1.0)
+_LAYER, _COLUMN = 0.1, 0.5  # height and least width of the cells in which the floor is looked for
+_FLAT, _LOWER = 3, 20  # a floor: a third of the ground at least, a twentieth at most below it
 _BATCH = 500_000  # rows or columns of cells that are tested at once
 
 
@@ -94,8 +98,98 @@ def voxelise(points: Floats, corners: Corners, voxel: float, level: float = 0.0)
     return Voxels(cells, voxel, level)
 
 
+def add_solids(world: Any, boxes: Floats, floor: float | None = None) -> None:
+    """Add boxes to a `mujoco.MjSpec`, as geoms ``solid0``, ``solid1``, …, and a plane ``floor``.
+
+    They are of the world's own body: a body of theirs costs the physics twice as much.
+    """
+    middles, halves = (boxes[:, :3] + boxes[:, 3:]) / 2.0, (boxes[:, 3:] - boxes[:, :3]) / 2.0
+    for number, (middle, half) in enumerate(zip(middles, halves, strict=True)):
+        world.worldbody.add_geom(
+            name=f"solid{number}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=middle,
+            size=half,
+            group=GROUP,
+            rgba=_COLOUR,
+        )
+    if floor is not None:
+        world.worldbody.add_geom(
+            name="floor",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            pos=(0.0, 0.0, floor),
+            size=(0.0, 0.0, 1.0),
+            group=GROUP,
+            rgba=_COLOUR,
+        )
+
+
+class Floor(NamedTuple):
+    """Height of the ground, or the reason why no plane can stand for it."""
+
+    height: float | None
+    reason: str = ""
+
+
+def floor_height(points: Floats, corners: Corners) -> float | None:
+    """Return the height of a mesh's floor; `None` if it has none, for a reason of `find_floor`."""
+    return find_floor(points, corners).height
+
+
+def find_floor(points: Floats, corners: Corners) -> Floor:
+    """Return the lowest level that is ground: what a plane may stand for, and hide nothing below.
+
+    The ground is the lowest surface that faces up, in each column of a grid: under a table top, and
+    under the floor above, it is the floor. A third of it or more is at its floor's level, within a
+    layer or two of 0.1 m, and no more than a twentieth below that. So noise of some centimetres,
+    steps and stray triangles do not matter; terrain has no such level.
+    """
+    triangles = points[corners]
+    normals = _normals(triangles)
+    # Less steep than 60°, of which noise makes no walls.
+    upward = 2.0 * normals[:, 2] > _lengths(normals)
+    if not upward.any():
+        return Floor(None, "no surface faces up")
+    triangles, areas = triangles[upward], normals[upward, 2]
+    extent = np.ptp(triangles[:, :, :2], axis=(0, 1)).max()
+    column = max(_COLUMN, float(extent) / 500.0)
+    numbers = np.arange(triangles.size // 3, dtype=np.int32).reshape(-1, 3)
+    scaled = triangles.reshape(-1, 3) / (column, column, _LAYER) + 0.5
+    cells = _touched(scaled, numbers, _LAYER)
+    first = np.append(True, (cells[1:, :2] != cells[:-1, :2]).any(axis=1))
+    layers = cells[first, 2]
+    base = int(layers.min())
+    counts = np.bincount(layers - base)
+    pairs = counts + np.append(counts[1:], 0)
+    levels = np.flatnonzero(pairs * _FLAT >= len(layers))
+    if not len(levels):
+        share = pairs.max() / len(layers)
+        return Floor(None, f"the ground is nowhere level: {share:.0%} of it within 0.2 m of height")
+    level = int(levels[0])
+    while level + 1 < len(pairs) and pairs[level + 1] > pairs[level]:
+        level += 1
+    lower = int(counts[:level].sum())
+    if lower * _LOWER > len(layers):
+        return Floor(None, f"{lower / len(layers):.0%} of the ground is below its lowest level")
+    heights = (triangles[:, 0, 2] + triangles[:, 1, 2] + triangles[:, 2, 2]) / 3.0
+    within = abs(heights - (base + level + 0.5) * _LAYER) <= _LAYER
+    order = np.argsort(heights[within], kind="stable")
+    shares = np.cumsum(areas[within][order])
+    if not len(shares):
+        return Floor(None, "the ground is of triangles that are tilted")
+    middle = int(np.searchsorted(shares, shares[-1] / 2.0))
+    return Floor(float(heights[within][order[middle]]))
+
+
+def _lengths(vectors: Floats) -> Floats:
+    x, y, z = vectors.T
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
+
+
 def _touched(places: Floats, corners: Corners, voxel: float) -> Integers:
     """Return the cells of unit size that triangles touch, ascending."""
+    if not len(corners):
+        return np.zeros((0, 3), np.int64)
     triangles = places[corners]  # (m, corner, axis)
     if not np.isfinite(triangles).all():
         raise MeshError("points: expected finite coordinates, found others")
@@ -107,8 +201,8 @@ def _touched(places: Floats, corners: Corners, voxel: float) -> Integers:
             f"{voxel:g} m, at which it fills {area:,.0f}: try {_rounded_up(voxel, area):g} m"
         )
     low, high = np.floor(triangles.min(axis=1)), np.floor(triangles.max(axis=1))
-    base = low.min(axis=0, initial=0.0)
-    sides = [int(side) for side in high.max(axis=0, initial=0.0) + 1.0 - base]
+    base = low.min(axis=0)
+    sides = [int(side) for side in high.max(axis=0) - base + 1.0]
     if math.prod(sides) > 2**62:
         raise MeshError(f"points: expected a mesh of up to 10⁶ voxels a side, found {sides}")
     steepest = np.where((normals != 0.0).any(axis=1), abs(normals).argmax(axis=1), -1)
@@ -126,7 +220,7 @@ def _touched(places: Floats, corners: Corners, voxel: float) -> Integers:
     keys = np.unique(np.concatenate(parts))
     rest, z = np.divmod(keys, sides[2])
     x, y = np.divmod(rest, sides[1])
-    return np.stack([x, y, z], axis=1) + base.astype(np.int64)
+    return np.asarray(np.stack([x, y, z], axis=1) + base.astype(np.int64))
 
 
 def _rounded_up(voxel: float, area: float) -> float:
@@ -202,7 +296,7 @@ def _row(triangles: Floats, u: Floats, last: Floats) -> tuple[Floats, Floats]:
                 v + share * (other - v),
             )
             first, final = np.fmin(first, at), np.fmax(final, at)
-    return (np.clip(np.floor(part), 0.0, last) for part in (first - 1e-9, final + 1e-9))
+    return _clipped(first - 1e-9, last), _clipped(final + 1e-9, last)
 
 
 def _depths(
@@ -217,7 +311,11 @@ def _depths(
         - slopes[:, 1] * (v + 0.5 - corner[:, 1])
     )
     half = (abs(slopes[:, 0]) + abs(slopes[:, 1])) / 2.0
-    return tuple(np.clip(np.floor(part), 0.0, last) for part in (middle - half, middle + half))
+    return _clipped(middle - half, last), _clipped(middle + half, last)
+
+
+def _clipped(places: Floats, last: Floats) -> Floats:
+    return np.asarray(np.clip(np.floor(places), 0.0, last))
 
 
 def _edges(triangles: Floats, normals: Floats, a: int, b: int, c: int) -> Floats:
@@ -237,7 +335,8 @@ def _edges(triangles: Floats, normals: Floats, a: int, b: int, c: int) -> Floats
 def _overlaps(edges: Floats, number: Integers, a: Floats, b: Floats) -> npt.NDArray[np.bool_]:
     """Return whether unit squares from (a, b) on are on the inner side of all three edges."""
     x, y, offset = np.moveaxis(edges[number], 2, 0)
-    return (x * a[:, None] + y * b[:, None] + offset >= 0.0).all(axis=1)
+    beyond = x * a[:, None] + y * b[:, None] + offset < 0.0
+    return np.asarray(~beyond.any(axis=1))
 
 
 def merged(cells: Integers) -> Integers:
@@ -254,7 +353,7 @@ def merged(cells: Integers) -> Integers:
         if least is None or len(boxes) < len(least):
             least = boxes
     assert least is not None
-    return least
+    return np.asarray(least)
 
 
 def _joined(boxes: Integers, axis: int) -> Integers:
@@ -267,6 +366,6 @@ def _joined(boxes: Integers, axis: int) -> Integers:
     same &= boxes[1:, axis] == boxes[:-1, axis + 3]
     ends = np.flatnonzero(np.append(~same, True))
     starts = np.append(0, ends[:-1] + 1)
-    joined = boxes[starts]
+    joined: Integers = boxes[starts]
     joined[:, axis + 3] = boxes[ends, axis + 3]
     return joined
