@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -18,6 +18,7 @@ from sims.worlds import Dynamics
 Floats = npt.NDArray[np.float64]
 
 _TYPES = mujoco.mjtGeom
+_PAIRS = 10_000  # of points and boxes, whose distances are computed at once
 
 
 class Clearance:
@@ -50,6 +51,9 @@ class Clearance:
             for geom in self._geoms
             if (kind := int(model.geom_type[geom])) in _MODELLED
         }
+        is_box = (model.geom_type == _TYPES.mjGEOM_BOX).tolist()
+        self._boxes = np.array([geom for geom in self._geoms if is_box[geom]], np.intp)
+        self._others = [geom for geom in self._geoms if not is_box[geom]]
 
     def __bool__(self) -> bool:
         return bool(self._geoms)
@@ -69,7 +73,9 @@ class Clearance:
         """Return metres to the nearest solid, and its number; ``inf`` and -1 in an empty world."""
         nwu = points * (1.0, -1.0, -1.0)
         least, geoms = np.full(len(points), np.inf), np.full(len(points), -1, np.intp)
-        for geom in self._geoms:
+        if len(self._boxes):
+            self._to_boxes(nwu, np.arange(len(points)), self._boxes, least, geoms)
+        for geom in self._others:
             away = nwu - self._places[geom]
             turn = self._axes[geom]
             local = [
@@ -81,9 +87,49 @@ class Clearance:
                 distance = self._modelled[geom](local)
             else:
                 distance = _DISTANCES[int(self._model.geom_type[geom])](local, size)
-            nearer = distance < least
+            nearer = (distance < least) | ((distance == least) & (geom < geoms))
             least[nearer], geoms[nearer] = distance[nearer], geom
         return least, geoms
+
+    def _to_boxes(
+        self,
+        nwu: Floats,
+        rows: npt.NDArray[np.intp],
+        boxes: npt.NDArray[np.intp],
+        least: Floats,
+        geoms: npt.NDArray[np.intp],
+    ) -> None:
+        """Write, for rows of points, the distance to the nearest of boxes, and its number.
+
+        Points are halved until boxes are few. About the middle of points, boxes are left out that
+        are farther than another by more than the points' width: at none of them are they nearest.
+        """
+        points = nwu[rows]
+        if len(rows) > 1 and len(rows) * len(boxes) > _PAIRS:
+            low, high = points.min(axis=0), points.max(axis=0)
+            middle, (x, y, z) = (low + high) / 2.0, (high - low).tolist()
+            distances = self._from_boxes(middle[None], boxes)[0]
+            near = distances.min() + math.sqrt(x * x + y * y + z * z) + 1e-6
+            boxes = boxes[distances <= near]
+            if len(rows) * len(boxes) > _PAIRS:
+                order = points[:, (x, y, z).index(max(x, y, z))].argsort(kind="stable")
+                for half in np.array_split(rows[order], 2):
+                    self._to_boxes(nwu, half, boxes, least, geoms)
+                return
+        distances = self._from_boxes(points, boxes)
+        nearest = distances.argmin(axis=1)
+        least[rows] = distances[np.arange(len(rows)), nearest]
+        geoms[rows] = boxes[nearest]
+
+    def _from_boxes(self, points: Floats, boxes: npt.NDArray[np.intp]) -> Floats:
+        """Return distances of points, shape (n, 3), from boxes, (m,): shape (n, m)."""
+        away = [points[:, k, None] - self._places[boxes, k] for k in range(3)]
+        turn = self._axes[boxes]
+        local = [
+            away[0] * turn[:, 0, k] + away[1] * turn[:, 1, k] + away[2] * turn[:, 2, k]
+            for k in range(3)
+        ]
+        return _to_box(local, list(self._model.geom_size[boxes].T))
 
     def covered(self, point: Vector3) -> bool:
         """Return whether anything is above a point, m NED: whether it is indoors, as a rule."""
@@ -133,7 +179,7 @@ def _to_capsule(local: list[Floats], size: list[float]) -> Floats:
     return np.asarray(np.sqrt(local[0] ** 2 + local[1] ** 2 + along**2) - size[0])
 
 
-def _to_box(local: list[Floats], size: list[float]) -> Floats:
+def _to_box(local: list[Floats], size: Sequence[Any]) -> Floats:
     beyond = [abs(part) - half for part, half in zip(local, size, strict=True)]
     return _outside(beyond)
 

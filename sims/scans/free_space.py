@@ -103,8 +103,8 @@ class _Grid:
         self.step = voxels.size * self._factor
         air = math.ceil((max(HEIGHTS) + ENOUGH) / self.step)
         shape = -(-sides // self._factor) + (0, 0, 1 + air)
-        lowest = np.add(low, (-0.5, -0.5, 0.5)) * voxels.size
-        self.origin = lowest + (0.0, 0.0, voxels.level)
+        self.origin: Floats = np.add(low, (-0.5, -0.5, 0.5)) * voxels.size
+        self.origin[2] += voxels.level
         self.solid: Mask = np.zeros(shape, np.bool_)
         self.shown: Mask = np.zeros(shape[:2], np.bool_)  # columns with a surface below a tour
         x, y, z = (voxels.cells - low).T
