@@ -115,8 +115,6 @@ class _Grid:
         inside = z >= 0
         self.solid[x[inside], y[inside], z[inside]] = True
         if floor is not None:
-            if self.solid[:, :, 0].mean() < 0.05:  # of walls only
-                self.shown[:] = True
             self.solid[:, :, 0] = True
         self.shown = _closed(self.shown, math.ceil(0.5 / self.step))
         # Metres from the middle of a cell to that of the nearest solid one.
@@ -274,10 +272,10 @@ def _ground(solid: Mask, room: int) -> Integers:
 
 
 def _closed(shown: Mask, radius: int) -> Mask:
-    """Return columns with gaps of up to two radii filled."""
+    """Return columns with gaps of up to two radii, and what is enclosed, filled."""
     wide = ndimage.distance_transform_edt(np.pad(~shown, radius, constant_values=True)) <= radius
     closed = ndimage.distance_transform_edt(wide) > radius
-    return np.asarray(closed[radius:-radius, radius:-radius] | shown)
+    return np.asarray(ndimage.binary_fill_holes(closed[radius:-radius, radius:-radius] | shown))
 
 
 def _measured(path: list[Vector3], grid: _Grid) -> Tour:
