@@ -1,0 +1,78 @@
+"""Reading of mesh files by their suffix: a `MeshFile`, or an error that names what is wrong."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from sims.scans.gltf import read_gltf
+from sims.scans.mesh_file import MeshError, MeshFile, Piece
+
+SUFFIXES: dict[str, Callable[[Path], MeshFile]] = {
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+}
+
+_MALFORMED = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+"""What a reader meets where a file has another kind of value than its format says."""
+
+
+def read(path: Path) -> MeshFile:
+    """Read a file of triangles; its points are finite, and its corners within its points.
+
+    Raises:
+        MeshError: There is no such file, it cannot be read, or it has no triangles.
+        MissingDependencyError: Its format needs a library that is not installed.
+    """
+    reader = SUFFIXES.get(path.suffix.lower())
+    if reader is None:
+        raise MeshError(
+            f"{path}: expected a mesh file ({', '.join(SUFFIXES)}), found {path.suffix or 'no'!r}"
+        )
+    try:
+        with np.errstate(all="ignore"):  # points that overflow are refused below
+            mesh = reader(path)
+    except MeshError:
+        raise
+    except OSError as error:
+        raise MeshError(f"{path}: expected a file to read, found: {error.strerror}") from error
+    except _MALFORMED as error:
+        raise MeshError(
+            f"{path}: expected a file as its format says, found something else inside: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    if not sum(len(piece.corners) for piece in mesh.pieces):
+        left_out = f"; left out: {'; '.join(mesh.left_out)}" if mesh.left_out else ""
+        raise MeshError(f"{path}: expected triangles, found none{left_out}")
+    for piece in (*mesh.pieces, *mesh.solids):
+        _check(path, piece)
+    return mesh
+
+
+def _check(path: Path, piece: Piece) -> None:
+    bad = np.flatnonzero(~np.isfinite(piece.points).all(axis=1))
+    if len(bad):
+        raise MeshError(
+            f"{path}: {piece.object}: expected finite points, found {len(bad)} others, the first "
+            f"at {bad[0]}: {piece.points[bad[0]].tolist()}"
+        )
+    if not len(piece.corners):
+        return
+    least, most = int(piece.corners.min()), int(piece.corners.max())
+    if least < 0 or most >= len(piece.points):
+        raise MeshError(
+            f"{path}: {piece.object}: expected corners from 0 to {len(piece.points) - 1}, found "
+            f"{least} to {most}"
+        )
