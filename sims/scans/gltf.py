@@ -23,16 +23,8 @@ import numpy.typing as npt
 from runtime.errors import MissingDependencyError
 from runtime.extras import install_command
 from sims.scans.images import Image, decode, opaque, to_srgb
-from sims.scans.mesh_file import (
-    Floats,
-    LeftOut,
-    Material,
-    MeshError,
-    MeshFile,
-    Piece,
-    check_size,
-    unique_name,
-)
+from sims.scans.mesh_file import Floats, Material, MeshError, MeshFile, Piece
+from sims.scans.parsing import LeftOut, check_size, unique_name, unit_normals
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -620,12 +612,7 @@ def _turned(normals: npt.NDArray[Any] | None, matrix: Floats) -> npt.NDArray[np.
     """Return unit normals in the scene; None where some are missing or the transform is flat."""
     if normals is None or abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
         return None
-    turned = normals.astype(np.float64) @ np.linalg.inv(matrix[:3, :3])
-    length = np.sqrt(np.einsum("ij,ij->i", turned, turned))
-    if not np.isfinite(length).all() or (length == 0).any():
-        return None
-    unit: npt.NDArray[np.float32] = (turned / length[:, None]).astype(np.float32)
-    return unit
+    return unit_normals(normals.astype(np.float64) @ np.linalg.inv(matrix[:3, :3]))
 
 
 def _colours(colours: npt.NDArray[Any] | None, mode: str) -> npt.NDArray[np.uint8] | None:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sims.scans.mesh_file import MeshError
+from sims.scans.parsing import LeftOut
 
 Image = npt.NDArray[np.uint8]
 
@@ -82,6 +83,32 @@ def find(name: str, folders: Iterable[Path]) -> Path | None:
                 if path.name.lower() == last and _is_file(path):
                     return path
     return None
+
+
+class Images:
+    """Images that a mesh names, each decoded once; one that cannot be shown is left out."""
+
+    def __init__(self, folders: Iterable[Path], left_out: LeftOut) -> None:
+        self._folders = tuple(folders)
+        self._left_out = left_out
+        self._images: dict[str, Image | None] = {}
+
+    def load(self, name: str) -> Image | None:
+        """Return the image of a name as the mesh has it, or None."""
+        if name not in self._images:
+            self._images[name] = self._decoded(name)
+        return self._images[name]
+
+    def _decoded(self, name: str) -> Image | None:
+        path = find(name, self._folders)
+        if path is None:
+            self._left_out.note(f"image {name!r}", "not found; drawn in the material's colour")
+            return None
+        try:
+            return decode(path.read_bytes(), str(path))
+        except (MeshError, OSError) as error:
+            self._left_out.note(f"image {name!r}", f"drawn in the material's colour: {error}")
+            return None
 
 
 def _is_file(path: Path) -> bool:

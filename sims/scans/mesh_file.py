@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -52,41 +51,3 @@ class MeshFile(NamedTuple):
     lit: bool = False  # whether the file has lights of its own
     solids: tuple[Piece, ...] = ()  # the file's collision meshes; empty if it has none
     left_out: tuple[str, ...] = ()  # sentences: what is not drawn, how often, and what to do
-
-
-class LeftOut:
-    """Count of what a reader leaves out, by what it is and what that means for the image."""
-
-    def __init__(self) -> None:
-        self._counts: dict[tuple[str, str], int] = {}
-
-    def note(self, what: str, then: str = "not drawn", count: int = 1) -> None:
-        """Count it, as in ``("normal maps", "not drawn", 3)``; a count of 0 is none."""
-        if count:
-            self._counts[what, then] = self._counts.get((what, then), 0) + count
-
-    def sentences(self) -> tuple[str, ...]:
-        """Return ``normal maps (3): not drawn`` and so on, in order."""
-        counts = sorted(self._counts.items())
-        return tuple(f"{what} ({count}): {then}" for (what, then), count in counts)
-
-
-MOST_TRIANGLES = 50_000_000
-
-
-def check_size(path: Path, triangles: int) -> None:
-    """Raise a `MeshError` if a file has more triangles than memory bears, as a damaged one may."""
-    if triangles > MOST_TRIANGLES:
-        raise MeshError(
-            f"{path}: expected at most {MOST_TRIANGLES:,} triangles, found more: simplify the mesh"
-        )
-
-
-def unique_name(name: str, taken: set[str]) -> str:
-    """Return a name, with a number behind it if it is taken, and add it to `taken`."""
-    unique, number = name, 1
-    while unique in taken:
-        number += 1
-        unique = f"{name}_{number}"
-    taken.add(unique)
-    return unique

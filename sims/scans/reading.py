@@ -10,10 +10,12 @@ import numpy as np
 
 from sims.scans.gltf import read_gltf
 from sims.scans.mesh_file import MeshError, MeshFile, Piece
+from sims.scans.obj import read_obj
 
 SUFFIXES: dict[str, Callable[[Path], MeshFile]] = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
+    ".obj": read_obj,
 }
 
 _MALFORMED = (
