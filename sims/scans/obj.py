@@ -16,7 +16,15 @@ import numpy.typing as npt
 
 from sims.scans.images import Image, Images, find, opaque
 from sims.scans.mesh_file import Colour, Floats, Material, MeshError, MeshFile, Piece
-from sims.scans.parsing import LeftOut, check_size, fan, parse_numbers, refuse_cloud, unit_normals
+from sims.scans.parsing import (
+    LeftOut,
+    check_size,
+    fan,
+    join,
+    parse_numbers,
+    refuse_cloud,
+    unit_normals,
+)
 
 Integers = npt.NDArray[np.int64]
 
@@ -135,14 +143,8 @@ class _Reader:
         points, colours, places, normals = vectors
         point, place, normal = faces.points[corners], faces.places[corners], faces.normals[corners]
         placed, turned = bool((place >= 0).any()), bool((normal >= 0).all())
-        keys = point
-        if placed:
-            keys = keys * (len(places) + 1) + place + 1
-        if turned:
-            if placed:
-                keys = np.unique(keys, return_inverse=True)[1]
-            keys = keys * len(normals) + normal
-        _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+        columns = [point, *([place] if placed else []), *([normal] if turned else [])]
+        first, vertex = join(*columns)
         where: npt.NDArray[np.float32] | None = None
         if placed:
             self._left_out.note(
@@ -160,7 +162,7 @@ class _Reader:
             object=name,
             material=material,
             points=points[point[first]],
-            corners=inverse.astype(np.int32).reshape(-1, 3),
+            corners=vertex.reshape(-1, 3),
             normals=unit_normals(normals[normal[first]]) if turned else None,
             places=where,
             colours=None if colours is None else colours[point[first]],

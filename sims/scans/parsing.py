@@ -83,6 +83,23 @@ def fan(counts: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.intp], npt.NDAr
     return np.stack([first, first + along + 1, first + along + 2], axis=1), polygon
 
 
+def join(*numbers: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.int32]]:
+    """Make vertices of corners that name their point, their normal and so on apart.
+
+    Args:
+        numbers: Of each corner, at least -1, each of shape (n,).
+
+    Returns:
+        A corner of each vertex, shape (v,), and the vertex of each corner, shape (n,).
+    """
+    keys = numbers[0].astype(np.int64)
+    for column in numbers[1:]:
+        keys = np.unique(keys, return_inverse=True)[1]
+        keys = keys * (int(column.max(initial=0)) + 2) + column + 1
+    _, first, vertex = np.unique(keys, return_index=True, return_inverse=True)
+    return first, vertex.astype(np.int32)
+
+
 def parse_numbers(text: bytes, dtype: type[Any], count: int, where: str) -> npt.NDArray[Any]:
     """Return the numbers of a text, which are separated by white space.
 

@@ -11,11 +11,15 @@ import numpy as np
 from sims.scans.gltf import read_gltf
 from sims.scans.mesh_file import MeshError, MeshFile, Piece
 from sims.scans.obj import read_obj
+from sims.scans.ply import read_ply
+from sims.scans.stl import read_stl
 
 SUFFIXES: dict[str, Callable[[Path], MeshFile]] = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
     ".obj": read_obj,
+    ".ply": read_ply,
+    ".stl": read_stl,
 }
 
 _MALFORMED = (
