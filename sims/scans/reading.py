@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sims.scans.collada import read_collada
 from sims.scans.gltf import read_gltf
 from sims.scans.mesh_file import MeshError, MeshFile, Piece
 from sims.scans.obj import read_obj
@@ -15,6 +16,7 @@ from sims.scans.ply import read_ply
 from sims.scans.stl import read_stl
 
 SUFFIXES: dict[str, Callable[[Path], MeshFile]] = {
+    ".dae": read_collada,
     ".glb": read_gltf,
     ".gltf": read_gltf,
     ".obj": read_obj,
