@@ -23,6 +23,7 @@ from sims.scans.parsing import (
     fan,
     join,
     parse_numbers,
+    rotation,
     unique_name,
     unit_normals,
 )
@@ -101,7 +102,7 @@ class _Reader:
         self._left_out.note(
             "animations",
             "the scene stands as it is stored",
-            len(self._root.findall("library_animations/animation")),
+            len(self._root.findall("library_animations//channel")),
         )
         return MeshFile(
             pieces=tuple(pieces),
@@ -173,7 +174,7 @@ class _Reader:
         elif element.tag == "scale":
             matrix[[0, 1, 2], [0, 1, 2]] = values
         elif element.tag == "rotate":
-            matrix[:3, :3] = _rotation(values[:3], math.radians(values[3]))
+            matrix[:3, :3] = rotation(values[:3], math.radians(values[3]))
         else:  # lookat
             eye, interest, up = values.reshape(3, 3)
             back = eye - interest
@@ -497,16 +498,6 @@ class _Reader:
 
 _TRANSFORMS = {"lookat": 9, "matrix": 16, "rotate": 4, "scale": 3, "translate": 3}
 """How many numbers each has."""
-
-
-def _rotation(axis: Floats, angle: float) -> Floats:
-    length = float(np.linalg.norm(axis))
-    if length == 0:
-        return np.eye(3)
-    x, y, z = axis / length
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turned: Floats = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
-    return turned
 
 
 def _texture(effect: ET.Element, key: str) -> ET.Element:

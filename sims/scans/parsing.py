@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
-from sims.scans.mesh_file import MeshError
+from sims.scans.mesh_file import Floats, MeshError
 
 
 class LeftOut:
@@ -98,6 +99,17 @@ def join(*numbers: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.intp], npt.N
         keys = keys * (int(column.max(initial=0)) + 2) + column + 1
     _, first, vertex = np.unique(keys, return_index=True, return_inverse=True)
     return first, vertex.astype(np.int32)
+
+
+def rotation(axis: Floats, angle: float) -> Floats:
+    """Return the matrix of a turn by an angle, rad, around an axis of any length (Rodrigues)."""
+    length = float(np.linalg.norm(axis))
+    if length == 0:
+        return np.eye(3)
+    x, y, z = axis / length
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turned: Floats = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
+    return turned
 
 
 def parse_numbers(text: bytes, dtype: type[Any], count: int, where: str) -> npt.NDArray[Any]:

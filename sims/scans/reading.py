@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sims.scans.collada import read_collada
+from sims.scans.gazebo import read_world
 from sims.scans.gltf import read_gltf
 from sims.scans.mesh_file import MeshError, MeshFile, Piece
 from sims.scans.obj import read_obj
@@ -21,7 +22,9 @@ SUFFIXES: dict[str, Callable[[Path], MeshFile]] = {
     ".gltf": read_gltf,
     ".obj": read_obj,
     ".ply": read_ply,
+    ".sdf": lambda path: read_world(path, read),
     ".stl": read_stl,
+    ".world": lambda path: read_world(path, read),
 }
 
 _MALFORMED = (
@@ -55,7 +58,8 @@ def read(path: Path) -> MeshFile:
     except MeshError:
         raise
     except OSError as error:
-        raise MeshError(f"{path}: expected a file to read, found: {error.strerror}") from error
+        name = error.filename or path
+        raise MeshError(f"{name}: expected a file to read, found: {error.strerror}") from error
     except _MALFORMED as error:
         raise MeshError(
             f"{path}: expected a file as its format says, found something else inside: "

@@ -1,0 +1,549 @@
+"""Reader of Gazebo's worlds and models (SDF 1.4 to 1.11): what stands in them, at rest.
+
+Meshes are placed as Gazebo places them: COLLADA's unit is applied, its axis that points up is not.
+A visual's own colour replaces that of a mesh, but not a mesh's image.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sims.scans.collada import parse_xml
+from sims.scans.images import Images, opaque
+from sims.scans.mesh_file import Colour, Floats, Material, MeshError, MeshFile, Piece
+from sims.scans.parsing import LeftOut, check_size, rotation, unique_name, unit_normals
+
+_PATHS = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "IGN_GAZEBO_RESOURCE_PATH")
+_ROUND = 32
+"""Sides of a cylinder, and meridians of a sphere."""
+
+_NOT_READ = {
+    "actor": "actors",
+    "model_state": "states of models",
+    "plugin": "plugins",
+    "population": "populations",
+    "road": "roads",
+    "sensor": "sensors",
+    "state": "saved states",
+}
+_MOST_MODELS = 100_000
+"""Of a world: a few models that include each other may stand for any number."""
+
+_Reads = Callable[[Path], MeshFile]
+
+
+def read_world(path: Path, read_mesh: _Reads) -> MeshFile:
+    """Read a ``.world`` or ``.sdf`` with its models and their meshes; collisions are its solids.
+
+    Args:
+        read_mesh: Reads the mesh files that it names.
+
+    Raises:
+        MeshError: It is damaged, a model or mesh is missing, or a pose is relative to what is not
+            in its model.
+    """
+    return _Reader(path, read_mesh).read()
+
+
+class _Place(NamedTuple):
+    """Where a part of the world stands."""
+
+    matrix: Floats  # to the world
+    path: Path  # file that it is in
+    name: str = ""  # of the object that it belongs to: a model that is in no other
+    depth: int = 0
+    static: bool = False
+
+
+class _Shape(NamedTuple):
+    """Triangles in the frame of a geometry."""
+
+    points: Floats
+    corners: npt.NDArray[np.int32]
+    normals: Floats | None = None
+
+
+class _Scope:
+    """Frames of a model or world by name: links, joints, frames, and models in it."""
+
+    def __init__(self, path: Path, element: ET.Element) -> None:
+        self._path = path
+        self._elements = {
+            child.get("name") or (child.findtext("name") or "").strip(): child
+            for child in element
+            if child.tag in ("link", "frame", "joint", "model", "include")
+        }
+        self._resolving: set[str] = set()
+
+    def pose(self, element: ET.Element, default: str = "") -> Floats:
+        """Return an element's pose in this scope's frame."""
+        pose = element.find("pose")
+        base = default
+        if pose is not None:
+            base = pose.get("relative_to") or pose.get("frame") or default
+        return self._frame(base) @ _matrix(self._path, pose)
+
+    def _frame(self, name: str) -> Floats:
+        if name in ("", "__model__", "world"):
+            return np.eye(4)
+        element = self._elements.get(name)
+        if element is None or name in self._resolving:
+            raise MeshError(
+                f"{self._path}: a pose is relative to {name!r}: expected one of "
+                f"{', '.join(self._elements)} in the same model, and no circle"
+            )
+        self._resolving.add(name)
+        base = {
+            "frame": element.get("attached_to") or "",
+            "joint": (element.findtext("child") or "").strip(),
+        }.get(element.tag, "")
+        matrix = self.pose(element, base)
+        self._resolving.remove(name)
+        return matrix
+
+
+class _Reader:
+    def __init__(self, path: Path, read_mesh: _Reads) -> None:
+        self._path = path
+        self._read_mesh = read_mesh
+        self._left_out = LeftOut()
+        self._told: dict[str, None] = {}  # sentences of meshes
+        self._pieces: list[Piece] = []
+        self._solids: list[Piece] = []
+        self._materials: list[Material] = []
+        self._meshes: dict[Path, tuple[MeshFile, int]] = {}  # with the place of its materials
+        self._documents: dict[Path, ET.Element] = {}
+        self._missing: dict[str, None] = {}
+        self._names: set[str] = set()
+        self._models = 0
+        self._triangles = 0
+        self._lit = False
+
+    def read(self) -> MeshFile:
+        root = parse_xml(self._path)
+        if root.tag not in ("sdf", "gazebo"):
+            raise MeshError(f"{self._path}: expected SDF, found <{root.tag}>")
+        worlds = root.findall("world")
+        self._left_out.note("further worlds", "not drawn", max(len(worlds) - 1, 0))
+        self._contents(worlds[0] if worlds else root, _Place(np.eye(4), self._path))
+        if self._missing:
+            raise MeshError(
+                f"{self._path}: expected {', '.join(self._missing)} beside it, in models/, in a "
+                f"folder above or in one of ${' $'.join(_PATHS)}, found none"
+            )
+        return MeshFile(
+            pieces=tuple(self._pieces),
+            materials=tuple(self._materials),
+            up="z",
+            unit=1.0,
+            lit=self._lit,
+            solids=tuple(self._solids),
+            left_out=(*self._left_out.sentences(), *self._told),
+        )
+
+    # Models.
+
+    def _contents(self, element: ET.Element, place: _Place) -> None:
+        """Read what is in a world or model."""
+        scope = _Scope(place.path, element)
+        for child in element:
+            match child.tag:
+                case "model":
+                    matrix = place.matrix @ scope.pose(child)
+                    self._model(child, place._replace(matrix=matrix), child.get("name"))
+                case "include":
+                    self._include(child, place, scope)
+                case "link":
+                    self._link(child, place, scope)
+                case "light":
+                    self._lit = True
+                case tag if tag in _NOT_READ:
+                    self._left_out.note(_NOT_READ[tag], "not read")
+                case _:
+                    pass
+
+    def _model(self, model: ET.Element, place: _Place, name: str | None) -> None:
+        self._models += 1
+        if place.depth > 20 or self._models > _MOST_MODELS:
+            raise MeshError(
+                f"{place.path}: expected at most 20 models in each other and {_MOST_MODELS} in "
+                "all, found more"
+            )
+        if model.get("placement_frame"):
+            raise MeshError(f"{place.path}: {name}: expected a model without placement_frame")
+        static = place.static or (model.findtext("static") or "").strip() in ("1", "true")
+        if not static and model.find("link") is not None:
+            self._left_out.note("models that are not static", "they stand still")
+        title = place.name or unique_name(name or "model", self._names)
+        inner = place._replace(name=title, depth=place.depth + 1, static=static)
+        self._contents(model, inner)
+
+    def _include(self, include: ET.Element, place: _Place, scope: _Scope) -> None:
+        uri = (include.findtext("uri") or "").strip()
+        if include.find("placement_frame") is not None:
+            raise MeshError(f"{place.path}: {uri}: expected an include without placement_frame")
+        folder = self._find(uri, place.path.parent)
+        if folder is None:
+            name = uri.rstrip("/").rpartition("/")[2].lower().replace(" ", "_")
+            if name == "sun":
+                self._lit = True
+            elif name == "ground_plane":
+                self._ground(place.matrix @ scope.pose(include), place.name)
+            else:
+                self._missing[uri] = None
+            return
+        file = _model_file(folder)
+        if file not in self._documents:
+            self._documents[file] = parse_xml(file)
+        root = self._documents[file]
+        self._lit = self._lit or root.find("light") is not None
+        for model in root.findall("model"):
+            placed = include.find("pose") is not None  # which replaces the model's own
+            pose = scope.pose(include) if placed else _Scope(file, root).pose(model)
+            inner = place._replace(path=file, matrix=place.matrix @ pose)
+            name = (include.findtext("name") or "").strip() or model.get("name") or "model"
+            self._model(model, inner, name)
+
+    def _ground(self, matrix: Floats, name: str) -> None:
+        """Add Gazebo's own model of a plane, which lies in no folder of the user's."""
+        shape = _placed(_plane(100.0, 100.0, np.array([0.0, 0.0, 1.0])), matrix)
+        material = self._add_material(Material("ground_plane", (0.8, 0.8, 0.8, 1.0)))
+        title = name or unique_name("ground_plane", self._names)
+        self._add(shape, title, material, self._pieces)
+        self._add(shape, title, material, self._solids)
+
+    def _find(self, uri: str, folder: Path) -> Path | None:
+        """Return the file or folder of a URI, or None; a model is also sought in paths."""
+        scheme, separator, name = uri.partition("://")
+        if not separator:
+            scheme, name = "", uri
+        if not name or "\0" in uri or scheme not in ("", "file", "model", "package"):
+            return None
+        roots = [folder]
+        if scheme in ("model", "package", "file"):
+            for above in (self._path.parent.resolve(), *self._path.parent.resolve().parents):
+                roots += [above, above / "models"]
+            for variable in _PATHS:
+                roots += [Path(item) for item in os.environ.get(variable, "").split(":") if item]
+            roots += list(folder.resolve().parents)
+        for root in roots:
+            try:
+                if (root / name).exists():
+                    return root / name
+            except OSError:  # a name that is too long
+                return None
+        return None
+
+    # Links.
+
+    def _link(self, link: ET.Element, place: _Place, scope: _Scope) -> None:
+        for child in link:
+            match child.tag:
+                case "visual" | "collision":
+                    matrix = place.matrix @ scope.pose(child, link.get("name", ""))
+                    self._geometry(child, place._replace(matrix=matrix), child.tag == "collision")
+                case "light":
+                    self._lit = True
+                case tag if tag in _NOT_READ:
+                    self._left_out.note(_NOT_READ[tag], "not read")
+                case _:
+                    pass
+
+    def _geometry(self, element: ET.Element, place: _Place, solid: bool) -> None:
+        shapes = element.find("geometry")
+        for shape in () if shapes is None else shapes:
+            if shape.tag == "empty":
+                continue
+            if shape.tag == "mesh":
+                self._mesh(element, shape, place, solid)
+                continue
+            triangles = _triangles(place.path, shape)
+            if triangles is None:
+                self._left_out.note(f"{'solid' if solid else 'drawn'} {shape.tag}s", "not read")
+                continue
+            placed = _placed(triangles, place.matrix)
+            if solid:
+                self._add(placed, place.name, 0, self._solids)
+            else:
+                grey = Material(place.name, (0.7, 0.7, 0.7, 1.0))
+                material = self._add_material(self._look(element, place.path, grey))
+                self._add(placed, place.name, material, self._pieces)
+
+    def _add(self, shape: _Shape, name: str, material: int, pieces: list[Piece]) -> None:
+        self._triangles += len(shape.corners)
+        check_size(self._path, self._triangles)
+        normals = None if shape.normals is None else unit_normals(shape.normals)
+        pieces.append(Piece(name, material, shape.points, shape.corners, normals))
+
+    def _mesh(self, element: ET.Element, shape: ET.Element, place: _Place, solid: bool) -> None:
+        matrix, path, name, *_ = place
+        uri = (shape.findtext("uri") or "").strip()
+        file = self._find(uri, path.parent)
+        if file is None:
+            self._missing[uri] = None
+            return
+        file = file.resolve()
+        if file not in self._meshes:
+            self._meshes[file] = self._read_mesh(file), -1
+        mesh, first = self._meshes[file]
+        if first < 0 and not solid:
+            first = len(self._materials)
+            self._meshes[file] = mesh, first
+            self._materials += mesh.materials
+            self._told |= dict.fromkeys(f"{file.name}: {text}" for text in mesh.left_out)
+        scale = _numbers(path, shape.find("scale"), 3, (1.0, 1.0, 1.0)) * (mesh.unit or 1.0)
+        matrix = matrix @ np.diag([*scale, 1.0])
+        pieces = mesh.pieces
+        submesh = (shape.findtext("submesh/name") or "").strip()
+        if submesh:
+            pieces = tuple(piece for piece in pieces if piece.object == submesh)
+            if not pieces:
+                raise MeshError(
+                    f"{path}: {name}: expected a submesh of {file.name} "
+                    f"({', '.join(sorted({piece.object for piece in mesh.pieces}))}), found "
+                    f"{submesh!r}"
+                )
+            if (shape.findtext("submesh/center") or "").strip() in ("1", "true"):
+                points = np.concatenate([piece.points for piece in pieces])
+                centre = np.eye(4)
+                centre[:3, 3] = -(points.min(axis=0) + points.max(axis=0)) / 2
+                matrix = matrix @ centre
+        changed: dict[int, int] = {}
+        for piece in pieces:
+            normals = None if piece.normals is None else piece.normals.astype(np.float64)
+            placed = _placed(_Shape(piece.points, piece.corners, normals), matrix)
+            if solid:
+                self._add(placed, name, 0, self._solids)
+                continue
+            number = first + piece.material
+            if number not in changed:
+                own = self._materials[number]
+                look = self._look(element, path, own)
+                changed[number] = number if look is own else self._add_material(look)
+            self._add(placed, name, changed[number], self._pieces)
+            self._pieces[-1] = self._pieces[-1]._replace(places=piece.places, colours=piece.colours)
+
+    # Materials.
+
+    def _add_material(self, material: Material) -> int:
+        self._materials.append(material)
+        return len(self._materials) - 1
+
+    def _look(self, visual: ET.Element, path: Path, own: Material) -> Material:
+        """Return a mesh's own material as a visual changes it, the same object if it does not."""
+        look = own
+        material = visual.find("material")
+        if material is not None:
+            script = (material.findtext("script/name") or "").strip()
+            albedo = (material.findtext("pbr/metal/albedo_map") or "").strip()
+            if script:
+                self._left_out.note(
+                    f"material script {script}", "not read; drawn in its own colour"
+                )
+            if albedo:
+                file = self._find(albedo, path.parent)
+                image = None
+                if file is not None:
+                    image = Images([file.parent], self._left_out).load(file.name)
+                else:
+                    self._left_out.note(f"image {albedo!r}", "not found")
+                if image is not None:
+                    look = look._replace(image=opaque(image), colour=(1.0, 1.0, 1.0, 1.0))
+            diffuse = material.find("diffuse")
+            if diffuse is not None and look.image is None:
+                look = look._replace(colour=_colour(path, diffuse))
+            if (material.findtext("double_sided") or "").strip() in ("1", "true"):
+                look = look._replace(double_sided=True)
+        clear = float(_numbers(path, visual.find("transparency"), 1, (0.0,))[0])
+        if clear > 0:
+            red, green, blue, alpha = look.colour
+            look = look._replace(colour=(red, green, blue, alpha * (1 - min(clear, 1.0))))
+        return look if look is own else look._replace(blend=look.colour[3] < 1)
+
+
+def _model_file(folder: Path) -> Path:
+    """Return the newest SDF of a model's folder."""
+    if folder.is_file():
+        return folder
+    config = folder / "model.config"
+    if not config.is_file():
+        return folder / "model.sdf"
+    versions: list[tuple[tuple[int, ...], str]] = []
+    for element in parse_xml(config).findall("sdf"):
+        digits = [part for part in (element.get("version") or "0").split(".") if part.isdecimal()]
+        versions.append((tuple(map(int, digits)), (element.text or "").strip()))
+    return folder / (max(versions)[1] if versions else "model.sdf")
+
+
+def _numbers(
+    path: Path, element: ET.Element | None, count: int, default: tuple[float, ...]
+) -> Floats:
+    if element is None or not (element.text or "").strip():
+        return np.array(default)
+    try:
+        values = np.array([float(word) for word in (element.text or "").split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not np.isfinite(values).all():
+        raise MeshError(
+            f"{path}: <{element.tag}>: expected {count} numbers, found "
+            f"{(element.text or '')[:60]!r}"
+        )
+    return values
+
+
+def _colour(path: Path, element: ET.Element) -> Colour:
+    words = len((element.text or "").split())
+    values = _numbers(path, element, min(max(words, 3), 4), (1.0, 1.0, 1.0, 1.0))
+    red, green, blue, *alpha = (min(max(float(value), 0.0), 1.0) for value in values)
+    return red, green, blue, alpha[0] if alpha else 1.0
+
+
+def _matrix(path: Path, pose: ET.Element | None) -> Floats:
+    """Return the transform of a pose: x y z and roll, pitch, yaw, or a quaternion."""
+    if pose is None:
+        return np.eye(4)
+    matrix = np.eye(4)
+    if pose.get("rotation_format") == "quat_xyzw":
+        values = _numbers(path, pose, 7, (0.0,) * 6 + (1.0,))
+        x, y, z, w = values[3:] / (np.linalg.norm(values[3:]) or 1.0)
+        angle = 2 * math.atan2(math.sqrt(x * x + y * y + z * z), w)
+        matrix[:3, :3] = rotation(np.array([x, y, z]), angle)
+    else:
+        values = _numbers(path, pose, 6, (0.0,) * 6)
+        angles = np.radians(values[3:]) if pose.get("degrees") in ("1", "true") else values[3:]
+        roll, pitch, yaw = (
+            rotation(axis, float(angle)) for axis, angle in zip(np.eye(3), angles, strict=True)
+        )
+        matrix[:3, :3] = yaw @ pitch @ roll
+    matrix[:3, 3] = values[:3]
+    return matrix
+
+
+def _placed(shape: _Shape, matrix: Floats) -> _Shape:
+    linear = matrix[:3, :3]
+    determinant = float(np.linalg.det(linear))
+    normals = shape.normals
+    if normals is not None:
+        normals = normals @ np.linalg.inv(linear) if abs(determinant) > 1e-30 else None
+    corners = shape.corners if determinant >= 0 else np.ascontiguousarray(shape.corners[:, ::-1])
+    return _Shape(shape.points @ linear.T + matrix[:3, 3], corners, normals)
+
+
+# Shapes.
+
+
+def _triangles(path: Path, shape: ET.Element) -> _Shape | None:
+    """Return the triangles of a primitive, or None for a kind that is not drawn."""
+
+    def number(tag: str, default: float = 1.0) -> float:
+        return float(_numbers(path, shape.find(tag), 1, (default,))[0])
+
+    match shape.tag:
+        case "box":
+            return _box(_numbers(path, shape.find("size"), 3, (1.0,) * 3))
+        case "plane":
+            normal = _numbers(path, shape.find("normal"), 3, (0.0, 0.0, 1.0))
+            width, length = _numbers(path, shape.find("size"), 2, (100.0, 100.0))
+            return _plane(float(width), float(length), normal)
+        case "sphere":
+            return _sphere(np.full(3, number("radius")), 0.0)
+        case "ellipsoid":
+            return _sphere(_numbers(path, shape.find("radii"), 3, (1.0,) * 3), 0.0)
+        case "capsule":
+            return _sphere(np.full(3, number("radius")), number("length"))
+        case "cylinder":
+            return _cylinder(number("radius"), number("length"))
+        case _:
+            return None
+
+
+def _grid(points: Floats, normals: Floats) -> _Shape:
+    """Return the triangles of points in rows and columns, shape (rows, columns, 3)."""
+    rows, columns, _ = points.shape
+    number = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    corners = np.stack([a, b, d, a, d, c], axis=-1).reshape(-1, 3)
+    return _Shape(points.reshape(-1, 3), corners, normals.reshape(-1, 3))
+
+
+def _together(shapes: list[_Shape]) -> _Shape:
+    starts = np.cumsum([0, *(len(shape.points) for shape in shapes)])
+    return _Shape(
+        np.concatenate([shape.points for shape in shapes]),
+        np.concatenate(
+            [shape.corners + start for shape, start in zip(shapes, starts, strict=False)]
+        ).astype(np.int32),
+        np.concatenate([shape.normals for shape in shapes if shape.normals is not None]),
+    )
+
+
+def _plane(width: float, length: float, normal: Floats) -> _Shape:
+    up = normal / (np.linalg.norm(normal) or 1.0)
+    side = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [0.0, 0.0, 1.0], up)
+    side /= np.linalg.norm(side)
+    along = np.cross(up, side)
+    u, v = np.meshgrid([-width / 2, width / 2], [-length / 2, length / 2])
+    points = u[..., None] * side + v[..., None] * along
+    return _grid(points, np.broadcast_to(up, points.shape))
+
+
+def _box(size: Floats) -> _Shape:
+    sides = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            normal = np.eye(3)[axis] * sign
+            first, second = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3] * sign
+            u, v = np.meshgrid([-0.5, 0.5], [-0.5, 0.5])
+            points = (u[..., None] * first + v[..., None] * second + normal / 2) * size
+            sides.append(_grid(points, np.broadcast_to(normal, points.shape)))
+    return _together(sides)
+
+
+def _sphere(radii: Floats, length: float) -> _Shape:
+    """Return an ellipsoid whose halves are `length` apart."""
+    around = np.linspace(0, 2 * math.pi, _ROUND + 1)
+    half = np.linspace(0, math.pi / 2, _ROUND // 4 + 1)
+    latitude = np.concatenate([half - math.pi / 2, half])
+    rise = np.repeat([-length / 2, length / 2], len(half))
+    normals = np.stack(
+        [
+            np.cos(latitude)[:, None] * np.cos(around),
+            np.cos(latitude)[:, None] * np.sin(around),
+            np.broadcast_to(np.sin(latitude)[:, None], (len(latitude), len(around))),
+        ],
+        axis=-1,
+    )
+    points = normals * radii
+    points[..., 2] += rise[:, None]
+    return _without_flat(_grid(points, normals / radii))
+
+
+def _cylinder(radius: float, length: float) -> _Shape:
+    around = np.linspace(0, 2 * math.pi, _ROUND + 1)
+    circle = np.stack([np.cos(around), np.sin(around), np.zeros_like(around)], axis=-1)
+    up = np.array([0.0, 0.0, length / 2])
+    side = _grid(np.stack([circle * radius - up, circle * radius + up]), np.stack([circle, circle]))
+    caps = [
+        _grid(
+            np.stack([order * radius + sign * up, order * 0 + sign * up]),
+            np.broadcast_to([0.0, 0.0, sign], (2, len(around), 3)),
+        )
+        for sign, order in ((1.0, circle), (-1.0, circle[::-1]))
+    ]
+    return _without_flat(_together([side, *caps]))
+
+
+def _without_flat(shape: _Shape) -> _Shape:
+    """Return a shape without the triangles that a pole makes flat."""
+    a, b, c = (shape.points[shape.corners[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return shape._replace(corners=shape.corners[area > 1e-9 * float(area.max(initial=0.0))])
