@@ -115,7 +115,7 @@ class _Reader:
         self._path = path
         self._read_mesh = read_mesh
         self._left_out = LeftOut()
-        self._told: dict[str, None] = {}  # sentences of meshes
+        self._told: dict[str, list[str]] = {}  # sentences of meshes, and of which
         self._pieces: list[Piece] = []
         self._solids: list[Piece] = []
         self._materials: list[Material] = []
@@ -146,7 +146,10 @@ class _Reader:
             unit=1.0,
             lit=self._lit,
             solids=tuple(self._solids),
-            left_out=(*self._left_out.sentences(), *self._told),
+            left_out=(
+                *self._left_out.sentences(),
+                *(f"{', '.join(names)}: {sentence}" for sentence, names in self._told.items()),
+            ),
         )
 
     # Models.
@@ -298,7 +301,8 @@ class _Reader:
             first = len(self._materials)
             self._meshes[file] = mesh, first
             self._materials += mesh.materials
-            self._told |= dict.fromkeys(f"{file.name}: {text}" for text in mesh.left_out)
+            for sentence in mesh.left_out:
+                self._told.setdefault(sentence, []).append(file.name)
         scale = _numbers(path, shape.find("scale"), 3, (1.0, 1.0, 1.0)) * (mesh.unit or 1.0)
         matrix = matrix @ np.diag([*scale, 1.0])
         pieces = mesh.pieces
