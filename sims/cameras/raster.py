@@ -19,12 +19,14 @@ import numpy.typing as npt
 from events import CameraInfo
 from events.camera_info import srgb_light
 from runtime.typed import override
+from sims.cameras.layouts import GEOM, LIGHT, POSE, VIEW
+from sims.cameras.layouts import address as _at
 from sims.cameras.meshes import Mesh, mesh_of, narrow, shape_of
 from sims.cameras.optics import pixel_rays
+from sims.cameras.shadows import ShadowMaps
 from sims.cameras.stage import (
     NEAR,
     RANGE,
-    SHADOW_SIZE,
     Changing,
     Drawn,
     Floats,
@@ -34,35 +36,10 @@ from sims.cameras.stage import (
     object_numbers,
 )
 
-GEOM = np.dtype(
-    [
-        ("mesh", "i4"), ("texture", "i4"), ("number", "i4"), ("rgba", "f4", 4), ("emission", "f4"),
-        ("specular", "f4"), ("shininess", "f4"), ("repeat", "f4", 2), ("offset", "f4"),
-        ("cube", "f4", 3),
-    ]
-)  # fmt: skip
-POSE = np.dtype([("position", "f8", 3), ("turn", "f8", 9)])
-LIGHT = np.dtype(
-    [
-        ("kind", "i4"), ("size", "i4"), ("ambient", "f4", 3), ("diffuse", "f4", 3),
-        ("specular", "f4", 3), ("attenuation", "f4", 3), ("cutoff", "f4"), ("exponent", "f4"),
-        ("position", "f8", 3), ("direction", "f8", 3), ("map", "u8"), ("step", "f8"), ("eye", POSE),
-    ]
-)  # fmt: skip
-VIEW = np.dtype(
-    [
-        ("width", "i4"), ("height", "i4"), ("first", "i4"), ("last", "i4"), ("sky", "i4"),
-        ("fogged", "i4"), ("poses", "i4"), ("threads", "i4"), ("near", "f4"), ("far", "f4"),
-        ("fog", "f4", 3), ("fog_start", "f4"), ("fog_end", "f4"), ("unused", "f4"),
-    ]
-)  # fmt: skip
-"""Layouts of the structures of ``rasteriser/types.hpp``."""
-
 _Kind = mujoco.mjtGeom
 _OPTICAL = np.tile([1.0, -1.0, -1.0], 3)  # MuJoCo's camera looks along -z, with y up
 MOST_TRIANGLES = 1 << 24  # of all geoms: the rasteriser numbers them with 24 bits
 FROM_BEHIND = 0.3  # factor on the opacity of a plane that is seen from behind, as MuJoCo's
-SUN_AWAY = 200.0  # distance at which a directional light's map is drawn, in half widths of it
 _GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing is said
 
 
@@ -77,10 +54,6 @@ def libraries() -> dict[str, Any]:
             if library.raster_runs():
                 rasterisers[name] = library
     return rasterisers
-
-
-def _at(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if array is None else array.ctypes.data)
 
 
 class Raster(Stage):
@@ -108,14 +81,6 @@ class Raster(Stage):
         super().__init__(model, dynamics)
         self._threads = threads
         self._colours = b""  # those that the geoms have
-        size = int(model.vis.quality.shadowsize)
-        # MuJoCo leaves out the outermost pixels of a map: it throws no shadows with two.
-        self._map_size = min(size, SHADOW_SIZE) if size > 2 else 0
-        self._maps: list[npt.NDArray[Any]] = []  # of the lights that throw shadows
-        self._mapped: list[bytes] = []  # what each shows
-        self._map_lenses: dict[float, int] = {}
-        # Metres; a sun whose map covers nothing throws no shadows.
-        self._sun_reach = float(model.stat.extent) * float(model.vis.map.shadowclip)
         self._kept: list[tuple[npt.NDArray[Any], npt.NDArray[Any]]] = []  # poses of eye and geoms
         for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
             if count:
@@ -132,6 +97,7 @@ class Raster(Stage):
             )
         self._library = libraries()[instructions or next(iter(libraries()))]
         self._world = ctypes.c_void_p(self._library.raster_new())
+        self._shadows = ShadowMaps(self._library, self._world, model, threads)
         self._textures = [self._add_texture(number) for number in range(model.ntex)]
         skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = self._textures[skies[0]] if skies.size else -1
@@ -209,7 +175,7 @@ class Raster(Stage):
         geoms, lights = self._coloured(), self._lights()
         eye, places = self._kept[len(self._kept) // 2]
         if colour:
-            self._draw_shadows(lights, geoms, places)
+            self._shadows.draw(lights, geoms, places)
         geoms = self._from_behind(geoms, places, eye["position"][0])
         self._kept = []
         self._library.raster_draw(
@@ -258,56 +224,8 @@ class Raster(Stage):
             if to["kind"] or of.diffuse.any() or of.specular.any():
                 to["position"], to["direction"] = of.pos, of.dir
                 if throws:
-                    self._cast(to, of, int((rows["size"] > 0).sum()))
+                    self._shadows.add(to, of, int((rows["size"] > 0).sum()))
         return rows
-
-    def _cast(self, light: Any, of: Any, number: int) -> None:
-        """Have a light throw shadows, by a map (of this number) of what MuJoCo's map covers."""
-        ahead = of.dir.astype(float)
-        length = float(np.linalg.norm(ahead))
-        angle = of.cutoff if 0.0 <= of.cutoff <= 80.0 else 80.0
-        reach, back = math.tan(math.radians(angle)), 0.0
-        if light["kind"] == 0:  # rays of a sun are parallel: seen from far away
-            reach, back = 1.0 / SUN_AWAY, SUN_AWAY * self._sun_reach
-        covers = reach > 1e-6 and (light["kind"] != 0 or 0.0 < back < math.inf)
-        if not (self._map_size and covers and 0.0 < length < math.inf):
-            return
-        ahead /= length
-        aside = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
-        aside /= np.linalg.norm(aside)
-        light["size"], light["step"] = self._map_size, 2.0 * reach / self._map_size
-        if number == len(self._maps):
-            self._maps.append(np.empty((self._map_size, self._map_size), np.float32))
-            self._mapped.append(b"")
-        light["map"] = self._maps[number].ctypes.data
-        light["eye"]["position"] = of.pos - back * ahead
-        light["eye"]["turn"] = np.stack([aside, np.cross(ahead, aside), ahead], axis=1).ravel()
-
-    def _draw_shadows(self, lights: Any, geoms: Any, poses: Any) -> None:
-        """Draw what each light that throws shadows sees, unless it has seen just that before."""
-        size = self._map_size
-        casting = lights[lights["size"] > 0]
-        for number, (light, depth) in enumerate(zip(casting, self._maps, strict=False)):
-            seen = b"".join(
-                array.tobytes() for array in (light[["eye", "step"]], geoms["rgba"], poses)
-            )
-            if seen == self._mapped[number]:
-                continue
-            self._mapped[number] = seen
-            frame = np.zeros(1, VIEW)
-            frame["width"] = frame["height"] = frame["last"] = size
-            frame["sky"], frame["poses"], frame["threads"] = -1, 1, self._threads
-            frame["near"], frame["far"] = NEAR, np.inf
-            if (step := float(light["step"])) not in self._map_lenses:
-                rays = ((np.arange(size) - 0.5 * (size - 1)) * step).astype(np.float32)
-                self._map_lenses[step] = self._library.raster_lens(
-                    self._world, size, size, _at(rays), _at(rays), None
-                )
-            eye = np.array([light["eye"]], POSE)
-            self._library.raster_draw(
-                self._world, self._map_lenses[step], _at(frame), _at(eye), len(geoms),
-                _at(geoms), _at(poses), len(lights), _at(lights), None, _at(depth), None,
-            )  # fmt: skip
 
     def _from_behind(self, geoms: Any, poses: Any, eye: Floats) -> Any:
         """Return the geoms, of planes that an eye is behind the other side, see-through."""

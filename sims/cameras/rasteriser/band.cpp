@@ -253,6 +253,16 @@ void Band::cover(const Triangle& triangle, std::int32_t number) {
     over(triangle, number, found);
 }
 
+void Band::shadow(const Triangle& triangle) {
+    const auto nearer = [map = images_.depth, size = std::size_t(lens_.width)](
+                            int y, int x, iv inside, fv q) __attribute__((always_inline)) {
+        float* here = map + y * size + x;
+        const fv before = load<fv>(here), depth = 1.0f / q;
+        store(here, inside & (depth < before) ? depth : before);
+    };
+    over(triangle, 0, nearer);
+}
+
 // Whether a pixel on an edge is the triangle's, and not that of the one beyond.
 static bool owns(const Triangle& triangle, Vec3f ray) {
     const f4 at = triangle.planes(ray);

@@ -9,6 +9,7 @@ class Band {
   public:
     Band(Scene& scene, int first, int last, const Images& images);
     void draw();           // all but what needs the rows of other bands
+    void shadow(const Triangle& triangle);  // the depth of one triangle alone, into a square image
     void find_outlines();  // when all bands are drawn
     void finish();         // when all have found theirs
 

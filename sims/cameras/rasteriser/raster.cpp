@@ -79,5 +79,14 @@ void raster_draw(Scene* scene, int lens, const View* view, const Pose* eyes, int
                 {rgb, depth, numbers});
 }
 
+// Lay moving geoms over a shadow map, as `Scene::shadow` does it. After the map's pixels there are
+// as many as a vector has, which are written as they are.
+void raster_shadow(Scene* scene, int lens, float near, const Pose* eye, int geoms, const Geom* geom,
+                   const Pose* poses, int moving_count, const std::int32_t* moving,
+                   const float* still, float* map, Box* covered) {
+    scene->shadow(*scene->lenses[lens], near, *eye, geom, poses, geoms, moving, moving_count, still,
+                  map, covered);
+}
+
 #pragma GCC visibility pop
 }  // extern "C"

@@ -196,6 +196,12 @@ class Scene {
               const Pose* poses, int count, const Light* lights, int light_count,
               const Images& images);
 
+    // Lay some geoms that move over a light's map of those that stand still: depths, by row. Of all
+    // geoms, `covered` says where the map is not `still`, before and then.
+    void shadow(const Lens& lens, float near, const Pose& eye, const Geom* geoms, const Pose* poses,
+                int count, const std::int32_t* moving, int moving_count, const float* still,
+                float* map, Box* covered);
+
   private:
     friend class Band;
 

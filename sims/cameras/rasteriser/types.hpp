@@ -159,7 +159,7 @@ struct Matrix {  // 3 x 3, row by row
     }
 };
 
-// The following have the layout of NumPy's structured arrays in `raster.py`.
+// The following have the layout of NumPy's structured arrays in `layouts.py`.
 
 struct Geom {
     std::int32_t mesh, texture;  // numbers of theirs; texture -1 for none
@@ -173,6 +173,10 @@ struct Geom {
 struct Pose {
     double position[3];  // in the world, metres
     Matrix turn;         // from its axes to the world's: of an eye, from the optical frame's
+};
+
+struct Box {  // pixels: to right - 1 and bottom - 1
+    std::int32_t left, right, top, bottom;
 };
 
 struct Light {
