@@ -26,6 +26,8 @@ class _Map:
     """Shadow map of a light.
 
     Attributes:
+        settings: What MuJoCo says of the light's place, direction and cone.
+        eye: Pixel size and pose by these; None if the map covers nothing.
         depth: Distance along the light's axis to what is nearest, ``inf`` for nothing, metres,
             row by row, and some more elements for vectors.
         still: The same of the geoms that stand still.
@@ -36,8 +38,10 @@ class _Map:
         version: `ShadowMaps.version` that `depth` shows.
     """
 
-    def __init__(self, size: int) -> None:
-        self.depth = np.empty(size * size + _ROOM, np.float32)
+    def __init__(self) -> None:
+        self.settings: Any = None
+        self.eye: tuple[float, Any] | None = None
+        self.depth = np.empty(0, np.float32)
         self.still = np.empty(0, np.float32)
         self.covered = np.zeros((0, 4), np.int32)
         self.view = b""
@@ -76,6 +80,22 @@ class ShadowMaps:
             light: Row of `layouts.LIGHT` to fill in; stays as it is if the map covers nothing.
             source: MuJoCo's light of the scene.
         """
+        settings = (
+            int(light["kind"]), float(source.cutoff), source.pos.tobytes(), source.dir.tobytes()
+        )  # fmt: skip
+        if number == len(self._maps):
+            self._maps.append(_Map())
+        shadow = self._maps[number]
+        if shadow.settings != settings:
+            shadow.settings, shadow.eye = settings, self._eye(light, source)
+        if shadow.eye is not None:
+            if not shadow.depth.size:
+                shadow.depth = np.empty(self._size * self._size + _ROOM, np.float32)
+            light["size"], light["map"] = self._size, shadow.depth.ctypes.data
+            light["step"], light["eye"] = shadow.eye
+
+    def _eye(self, light: Any, source: Any) -> tuple[float, Any] | None:
+        """Return a light's pixel size and pose; None if its map covers nothing."""
         ahead = source.dir.astype(float)
         length = float(np.linalg.norm(ahead))
         angle = source.cutoff if 0.0 <= source.cutoff <= 80.0 else 80.0
@@ -84,16 +104,14 @@ class ShadowMaps:
             reach, back = 1.0 / SUN_AWAY, SUN_AWAY * self._sun_reach
         covers = reach > 1e-6 and (light["kind"] != 0 or 0.0 < back < math.inf)
         if not (self._size and covers and 0.0 < length < math.inf):
-            return
+            return None
         ahead /= length
         aside = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
         aside /= np.linalg.norm(aside)
-        light["size"], light["step"] = self._size, 2.0 * reach / self._size
-        if number == len(self._maps):
-            self._maps.append(_Map(self._size))
-        light["map"] = self._maps[number].depth.ctypes.data
-        light["eye"]["position"] = source.pos - back * ahead
-        light["eye"]["turn"] = np.stack([aside, np.cross(ahead, aside), ahead], axis=1).ravel()
+        eye = np.zeros((), POSE)
+        eye["position"] = source.pos - back * ahead
+        eye["turn"] = np.stack([aside, np.cross(ahead, aside), ahead], axis=1).ravel()
+        return 2.0 * reach / self._size, eye[()]
 
     def draw(self, lights: Any, geoms: Any, poses: Any) -> None:
         """Draw what each light that throws shadows sees, as far as that has changed.

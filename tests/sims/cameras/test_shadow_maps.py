@@ -1,0 +1,108 @@
+"""A shadow map of parts, drawn at other times, is that of all geoms drawn together, to the bit."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from sims.cameras import CameraSpec, add_free_camera
+from sims.cameras.raster import Raster, libraries
+from sims.cameras.shadows import ShadowMaps
+from sims.cameras.spec import camera_info
+from sims.cameras.stage import View
+
+CAMERA = CameraSpec(name="eye", width=40, height=30, fov=90.0, position=(0.0, 0.0, 0.0))
+VIEW = View(camera_info(CAMERA))
+SHAPES = ("box", "sphere", "cylinder", "capsule", "ellipsoid")
+FAR = (300.0, 1.0, 1.0)  # a place that no light's map shows
+
+
+def scene(pick: Any, size: int, reach: float = 0.6) -> Any:
+    """Return a model of bodies that fly about a floor, under a sun, two spots, and one on a body."""
+    spec = mujoco.MjSpec.from_string(f"""
+<mujoco>
+  <statistic extent="4"/>
+  <visual><quality shadowsize="{size}" numslices="8" numstacks="6"/></visual>
+  <worldbody>
+    <light type="directional" pos="0 0 5" dir="-.3 -.2 -1"/>
+    <light pos="1 1 4" dir="-.3 -.25 -1" cutoff="35"/>
+    <light name="low" pos="0 0 .3" dir="1 .2 .1" cutoff="75"/>
+    <geom type="plane" size="4 4 .1"/>
+  </worldbody>
+</mujoco>""")
+    for number in range(7):
+        body = spec.worldbody.add_body(name=f"body{number}")
+        if number < 5:  # the others stand still until the model is changed
+            body.add_freejoint()
+        body.pos = pick.uniform((-2, -2, 0), (2, 2, 2))
+        for _ in range(2):
+            body.add_geom(
+                type=getattr(mujoco.mjtGeom, f"mjGEOM_{pick.choice(SHAPES).upper()}"),
+                size=pick.uniform(0.02, reach, 3),
+                pos=pick.uniform(-0.3, 0.3, 3),
+                quat=pick.normal(size=4),
+                mass=1.0,
+            )
+        if number == 0:
+            light = body.add_light(cutoff=40.0, dir=(0.3, 0.0, -1.0), pos=(0.0, 0.0, 1.0))
+            light.mode = mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY
+            light.targetbody = "body1"
+    add_free_camera(spec, "free", (CAMERA,))
+    return spec.compile()
+
+
+def maps(raster: Any) -> list[Any]:
+    """Return a stage's shadow maps, shape (size, size) each."""
+    shadows = raster._shadows
+    size = shadows._size
+    return [shadow.depth[: size * size].reshape(size, size) for shadow in shadows._maps]
+
+
+def draw(raster: Any, qpos: Any) -> Any:
+    raster.look(raster.model.camera("free/eye").id, qpos)
+    return raster.draw(VIEW, True, False, False).colours
+
+
+def together(raster: Any, qpos: Any) -> Any:
+    """Draw all maps anew, of all geoms together, and an image by them."""
+    raster._shadows = ShadowMaps(raster._library, raster._world, raster.model, raster._threads)
+    return draw(raster, qpos)
+
+
+SETS = list(itertools.product(libraries(), (1, 3), (50, 128)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("instructions", "threads", "size"), SETS)
+def test_maps_of_parts_are_those_of_all(
+    instructions: str, threads: int, size: int, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Geoms move, rest, vanish, come back and turn see-through; lights move, with or without them."""
+    monkeypatch.setattr("sims.cameras.shadows.PAUSE", 2)
+    pick = np.random.default_rng(seed)
+    model = scene(pick, size, 0.03 if seed == 1 else 0.6)
+    parts, whole = (Raster(model, None, threads, instructions) for _ in range(2))
+    qpos, redrawn = model.qpos0.copy(), 0
+    for _ in range(12):
+        before = parts._shadows.still_version
+        for body in np.flatnonzero(pick.random(5) < pick.choice((0.1, 0.5))):
+            place = pick.uniform((-3, -3, 0), (3, 3, 3)) if pick.random() < 0.8 else FAR
+            qpos[7 * body : 7 * body + 7] = *place, *pick.normal(size=4)
+        if pick.random() < 0.3:
+            model.geom_rgba[pick.integers(model.ngeom), 3] = pick.choice((0.0, 0.5, 1.0))
+        if pick.random() < 0.2:
+            model.body_pos[-2] = pick.uniform((-2, -2, 0), (2, 2, 2))  # of body 6
+        if pick.random() < 0.2:
+            model.light("low").pos[:] = pick.uniform((-1, -1, 0.1), (1, 1, 2))
+        images = [step(stage, qpos) for step, stage in ((draw, parts), (together, whole))]
+        for one, other in zip(maps(parts), maps(whole), strict=True):
+            np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(*images)
+        redrawn += parts._shadows.still_version > before
+    assert 0 < redrawn < 12
+    parts.close()
+    whole.close()
