@@ -32,6 +32,11 @@ class Band {
     };
     static constexpr int most_side_by_side = 16;
 
+    struct Tile {  // of a light's map, as a triangle's shade sees it
+        std::int32_t number, place, state;
+    };
+    static constexpr int tile_side = 8, tiles_known = 1024, all_lit = 1, all_dark = 2;
+
     // A mipmap's level whose texels are as large as a pixel blurs more than the pixel; so many 256ths
     // below it are nearer to the mean of 16 samples. 128 would be nearest, but too far from MuJoCo's.
     static constexpr int sharper = 64;
@@ -67,6 +72,8 @@ class Band {
     void place(int y);
     template <bool pinhole>
     void place(const Span& span, int y, const float* nearest);
+    fv reaches(const Light& light, std::int32_t number, fv x, fv y, fv z, int count);
+    int tile(const Light& light, std::int32_t number, int column, int row);
     void place_sky(int y, int left, int right);
     void plain(int x);
     Colours colours(int x);
@@ -105,6 +112,7 @@ class Band {
     std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
     std::vector<Surface> surfaces_;
     std::vector<Shade> shades_;
+    std::vector<Tile> tiles_;  // some of those of which it is known
     std::vector<std::vector<std::int32_t>> surface_of_;  // by part and triangle; -1: none yet
 };
 

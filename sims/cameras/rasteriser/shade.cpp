@@ -97,6 +97,10 @@ std::int32_t Band::surface(std::int32_t number, int y) {
     made.shades = static_cast<std::int32_t>(shades_.size());
     for (const Light& caster : scene_.casters_) {
         light += slot.light.size() / (1 + scene_.casters_.size());
+        const Vec3f a = light[corners[0]], b = light[corners[1]], c = light[corners[2]];
+        Shade& shade = shades_.emplace_back();
+        shade.shines = a.x + a.y + a.z + b.x + b.y + b.z + c.x + c.y + c.z > 0;
+        if (!shade.shines) continue;
         Vec3 at[3];  // of the corners, seen from the light
         for (int k = 0; k < 3; ++k) {
             const Vec3f p = mesh.points[corners[k]];
@@ -106,10 +110,7 @@ std::int32_t Band::surface(std::int32_t number, int y) {
                                    turned.y + (pose.position[1] - eye.position[1]),
                                    turned.z + (pose.position[2] - eye.position[2])});
         }
-        const Vec3f a = light[corners[0]], b = light[corners[1]], c = light[corners[2]];
         const Corners from(at);
-        Shade shade;
-        shade.shines = a.x + a.y + a.z + b.x + b.y + b.z + c.x + c.y + c.z > 0;
         plane(shade.light[0], a.x, b.x, c.x);
         plane(shade.light[1], a.y, b.y, c.y);
         plane(shade.light[2], a.z, b.z, c.z);
@@ -117,15 +118,16 @@ std::int32_t Band::surface(std::int32_t number, int y) {
         plane(shade.place[1], at[0].y, at[1].y, at[2].y);
         plane(shade.place[2], at[0].z, at[1].z, at[2].z);
         put(shade.depth, (from.edge(0) + from.edge(1) + from.edge(2)) * inverse(from.away()));
-        shades_.push_back(shade);
     }
     return index;
 }
 
 // How much of a light reaches points, which are seen from it: of four pixels of its map about each,
 // those that see nothing before the triangle's plane, weighted by their distance. So no surface is
-// in its own shadow, however steep.
-static fv reaches(const Light& light, const Shade& shade, fv x, fv y, fv z) {
+// in its own shadow, however steep. Of `count` points side by side on a large triangle, mostly in
+// one or two tiles of the map that are lit or dark as a whole, no pixel is looked at.
+fv Band::reaches(const Light& light, std::int32_t number, fv x, fv y, fv z, int count) {
+    const Shade& shade = shades_[number];
     const auto step = static_cast<float>(light.step), per_step = static_cast<float>(1 / light.step);
     const float middle = 0.5f * static_cast<float>(light.size - 1);
     const fv inverse = per_step / z, column = x * inverse + middle, row = y * inverse + middle;
@@ -133,8 +135,25 @@ static fv reaches(const Light& light, const Shade& shade, fv x, fv y, fv z) {
                       (row < 2 * middle) & (z > 0.0f);
     const fv left = floored(inside ? column : fv{}), top = floored(inside ? row : fv{});
     const fv right_share = column - left, lower_share = row - top;
+    const fv left_share = 1.0f - right_share, upper_share = 1.0f - lower_share;
+    const fv shares[4] = {left_share * upper_share, right_share * upper_share,
+                          left_share * lower_share, right_share * lower_share};
+    const iv columns = as_whole(left), rows = as_whole(top);
+    if (count >= lanes && view_.poses == 1) {
+        const iv across = columns / tile_side, down = rows / tile_side;
+        const int c = across[0], r = down[0], d = across[lanes - 1], s = down[lanes - 1];
+        if (!any(~(((across == c) | (across == d)) & ((down == r) | (down == s))))) {
+            int found = tile(light, number, c, r);
+            if (c != d) found &= tile(light, number, d, r);
+            if (r != s) found &= tile(light, number, c, s);
+            if (c != d && r != s) found &= tile(light, number, d, s);
+            if (found & all_lit)
+                return inside ? shares[0] + shares[1] + shares[2] + shares[3] : fv{} + 1.0f;
+            if (found & all_dark) return inside ? fv{} : fv{} + 1.0f;
+        }
+    }
     std::int32_t first[lanes];
-    store(first, as_whole(top) * light.size + as_whole(left));
+    store(first, rows * light.size + columns);
     fv lit{};
     for (int k = 0; k < 4; ++k) {
         const int right = k & 1, lower = k >> 1;
@@ -143,11 +162,39 @@ static fv reaches(const Light& light, const Shade& shade, fv x, fv y, fv z) {
             depths[lane] = light.map[first[lane] + right + lower * light.size];
         const fv across = (left + (right - middle)) * step, down = (top + (lower - middle)) * step;
         const fv plane = across * shade.depth[0] + (down * shade.depth[1] + shade.depth[2]);
-        const fv share = (right ? right_share : 1.0f - right_share) *
-                         (lower ? lower_share : 1.0f - lower_share);
-        lit += load<fv>(depths) * plane < 1.0f - rounding ? fv{} : share;
+        lit += load<fv>(depths) * plane < 1.0f - rounding ? fv{} : shares[k];
     }
     return inside ? lit : fv{} + 1.0f;
+}
+
+// What is known of the pixels of a tile of a light's map, and those to its right and below it, on a
+// triangle: `all_lit`, `all_dark` or 0, by the same arithmetic as above.
+int Band::tile(const Light& light, std::int32_t number, int column, int row) {
+    if (tiles_.empty()) tiles_.assign(tiles_known, {-1, 0, 0});
+    const std::int32_t place = row << 16 | column;
+    Tile& known = tiles_[(column + 37 * row + 211 * number) & (tiles_known - 1)];
+    if (known.number == number && known.place == place) return known.state;
+    const Shade& shade = shades_[number];
+    const auto step = static_cast<float>(light.step);
+    const float middle = 0.5f * static_cast<float>(light.size - 1);
+    fv count{};
+    for (int lane = 0; lane < lanes; ++lane) count[lane] = static_cast<float>(lane);
+    const int left = column * tile_side, top = row * tile_side;
+    const int bottom = std::min(top + tile_side, light.size - 1);
+    iv lit{}, dark{};
+    for (int x = 0; x <= tile_side; x += lanes) {
+        const int first = left + std::min(x, tile_side + 1 - lanes);
+        const fv across = (count + (first - middle)) * step * shade.depth[0];
+        const float* depths = light.map + std::size_t(top) * light.size + first;
+        for (int y = top; y <= bottom; ++y, depths += light.size) {
+            const float down = (y - middle) * step;
+            const fv plane = across + (down * shade.depth[1] + shade.depth[2]);
+            const iv is_dark = load<fv>(depths) * plane < 1.0f - rounding;
+            dark |= is_dark, lit |= ~is_dark;
+        }
+    }
+    known = {number, place, any(dark) ? any(lit) ? 0 : all_dark : all_lit};
+    return known.state;
 }
 
 // Find the levels of mipmaps whose texels are as large as a pixel in the middle of each span.
@@ -245,12 +292,12 @@ void Band::place(const Span& span, int y, const float* nearest) {
         } else {
             fv light[3];
             for (int k = 0; k < 3; ++k) light[k] = times(surface.light[k]);
-            const Shade* shade = shades_.data() + surface.shades;
+            std::int32_t number = surface.shades - 1;
             for (const Light& caster : scene_.casters_) {
-                const Shade& of = *shade++;
+                const Shade& of = shades_[++number];
                 if (!of.shines) continue;
-                const fv lit = reaches(caster, of, times(of.place[0]), times(of.place[1]),
-                                       times(of.place[2]));
+                const fv lit = reaches(caster, number, times(of.place[0]), times(of.place[1]),
+                                       times(of.place[2]), end - x);
                 for (int k = 0; k < 3; ++k) light[k] += lit * times(of.light[k]);
             }
             taps_.set(Taps::red_blue, x, share(light[0]) | share(light[2]) << 16);

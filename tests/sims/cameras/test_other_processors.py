@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sims.cameras.raster import GEOM, LIGHT, POSE, VIEW, Raster, libraries
+from sims.cameras.layouts import GEOM, LIGHT, POSE, VIEW
+from sims.cameras.raster import Raster, libraries
 from tests.sims.cameras.scenes import fresh
 from tests.sims.cameras.test_raster import SPECS, compiled, drawn, places
 
