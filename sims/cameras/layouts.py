@@ -20,7 +20,8 @@ LIGHT = np.dtype(
     [
         ("kind", "i4"), ("size", "i4"), ("ambient", "f4", 3), ("diffuse", "f4", 3),
         ("specular", "f4", 3), ("attenuation", "f4", 3), ("cutoff", "f4"), ("exponent", "f4"),
-        ("position", "f8", 3), ("direction", "f8", 3), ("map", "u8"), ("step", "f8"), ("eye", POSE),
+        ("position", "f8", 3), ("direction", "f8", 3), ("map", "u8"), ("changes", "u8"),
+        ("step", "f8"), ("eye", POSE),
     ]
 )  # fmt: skip
 VIEW = np.dtype(

@@ -19,6 +19,7 @@ from sims.cameras.stage import NEAR, SHADOW_SIZE
 
 SUN_AWAY = 200.0  # distance at which a directional light's map is drawn, in half widths of it
 PAUSE = 100  # changes of the scene after which a geom that moved counts as standing still again
+_TILE = 8  # pixels of a tile's side
 _ROOM = 8  # elements after a map that vectors at its end may write back as they are
 
 
@@ -30,7 +31,9 @@ class _Map:
         eye: Pixel size and pose by these; None if the map covers nothing.
         depth: Distance along the light's axis to what is nearest, ``inf`` for nothing, metres,
             row by row, and some more elements for vectors.
-        still: The same of the geoms that stand still.
+        changes: Of each tile of `depth`, row by row, how often it was drawn: what the rasteriser
+            knows of a tile is true until then.
+        still: The same depth of the geoms that stand still.
         covered: Columns and rows where a geom makes `depth` differ from `still`: left, right, top,
             bottom, shape (geoms, 4).
         view: The light's pose and pixel size, as bytes.
@@ -42,6 +45,7 @@ class _Map:
         self.settings: Any = None
         self.eye: tuple[float, Any] | None = None
         self.depth = np.empty(0, np.float32)
+        self.changes = np.zeros(0, np.uint32)
         self.still = np.empty(0, np.float32)
         self.covered = np.zeros((0, 4), np.int32)
         self.view = b""
@@ -91,7 +95,9 @@ class ShadowMaps:
         if shadow.eye is not None:
             if not shadow.depth.size:
                 shadow.depth = np.empty(self._size * self._size + _ROOM, np.float32)
+                shadow.changes = np.zeros(((self._size + _TILE - 1) // _TILE) ** 2, np.uint32)
             light["size"], light["map"] = self._size, shadow.depth.ctypes.data
+            light["changes"] = shadow.changes.ctypes.data
             light["step"], light["eye"] = shadow.eye
 
     def _eye(self, light: Any, source: Any) -> tuple[float, Any] | None:
@@ -134,18 +140,20 @@ class ShadowMaps:
             if view != shadow.view:  # perhaps it moves on: all is drawn together
                 shadow.view, shadow.still_version = view, -1
                 self._draw(light, lights, geoms, self._solid, shadow.depth)
+                shadow.changes += 1
                 continue
             if shadow.still_version != self.still_version:
                 shadow.still_version = self.still_version
                 shadow.still = np.empty_like(shadow.depth)
                 self._draw(light, lights, geoms, self._solid & ~self._moves, shadow.still)
                 shadow.depth[:] = shadow.still
+                shadow.changes += 1
                 shadow.covered = np.zeros((len(geoms), 4), np.int32)
             self._library.raster_shadow(
                 self._world, self._lens(light), ctypes.c_float(NEAR),
                 address(np.array([light["eye"]], POSE)), len(geoms), address(geoms), address(poses),
                 len(moving), address(moving), address(shadow.still), address(shadow.depth),
-                address(shadow.covered),
+                address(shadow.changes), address(shadow.covered),
             )  # fmt: skip
 
     def _compare(self, solid: npt.NDArray[np.bool_], poses: Any) -> None:

@@ -9,10 +9,10 @@ namespace raster {
 constexpr int parts_from = 24;  // bit of a triangle's number; those before count within its part
 constexpr std::int32_t clear_part = 1 << 30;
 
-Band::Band(Scene& scene, int first, int last, const Images& images)
+Band::Band(Scene& scene, int first, int last, const Images& images, std::vector<Tile>* tiles)
     : scene_(scene), lens_(*scene.lens_), view_(scene.view_), first_(first), last_(last),
       images_(images), end_(images.rgb ? row(last) : nullptr), nearest_(scene.nearest_.data()),
-      visible_(scene.visible_.data()), taps_(lens_.stride, scene.texels.data()),
+      visible_(scene.visible_.data()), tiles_(tiles), taps_(lens_.stride, scene.texels.data()),
       farthest_(lens_.pinhole ? 0 : leaf(0, last + Lens::smallest)) {}
 
 const Triangle& Band::triangle(std::int32_t number) const {

@@ -7,7 +7,7 @@ namespace raster {
 
 class Band {
   public:
-    Band(Scene& scene, int first, int last, const Images& images);
+    Band(Scene& scene, int first, int last, const Images& images, std::vector<Tile>* tiles);
     void draw();           // all but what needs the rows of other bands
     void shadow(const Triangle& triangle);  // the depth of one triangle alone, into a square image
     void find_outlines();  // when all bands are drawn
@@ -31,11 +31,7 @@ class Band {
         float nearest;  // inverse depth in the middle
     };
     static constexpr int most_side_by_side = 16;
-
-    struct Tile {  // of a light's map, as a triangle's shade sees it
-        std::int32_t number, place, state;
-    };
-    static constexpr int tile_side = 8, tiles_known = 1024, all_lit = 1, all_dark = 2;
+    static constexpr int all_lit = 1, all_dark = 2;  // of tiles
 
     // A mipmap's level whose texels are as large as a pixel blurs more than the pixel; so many 256ths
     // below it are nearer to the mean of 16 samples. 128 would be nearest, but too far from MuJoCo's.
@@ -72,8 +68,8 @@ class Band {
     void place(int y);
     template <bool pinhole>
     void place(const Span& span, int y, const float* nearest);
-    fv reaches(const Light& light, std::int32_t number, fv x, fv y, fv z, int count);
-    int tile(const Light& light, std::int32_t number, int column, int row);
+    fv reaches(std::int32_t caster, const Shade& shade, fv x, fv y, fv z, int count);
+    int tile(std::int32_t caster, const Shade& shade, int column, int row, bool look);
     void place_sky(int y, int left, int right);
     void plain(int x);
     Colours colours(int x);
@@ -105,6 +101,7 @@ class Band {
     std::uint8_t* const end_;  // of its rows of colours
     float* const nearest_;     // of the frame
     std::int32_t* const visible_;
+    std::vector<Tile>* const tiles_;  // that are known
     Taps taps_;
     std::vector<Outline> outlines_;
     std::size_t first_row_ = 0;  // how many are within its first row
@@ -112,7 +109,6 @@ class Band {
     std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
     std::vector<Surface> surfaces_;
     std::vector<Shade> shades_;
-    std::vector<Tile> tiles_;  // some of those of which it is known
     std::vector<std::vector<std::int32_t>> surface_of_;  // by part and triangle; -1: none yet
 };
 

@@ -83,9 +83,9 @@ void raster_draw(Scene* scene, int lens, const View* view, const Pose* eyes, int
 // as many as a vector has, which are written as they are.
 void raster_shadow(Scene* scene, int lens, float near, const Pose* eye, int geoms, const Geom* geom,
                    const Pose* poses, int moving_count, const std::int32_t* moving,
-                   const float* still, float* map, Box* covered) {
+                   const float* still, float* map, std::uint32_t* changes, Box* covered) {
     scene->shadow(*scene->lenses[lens], near, *eye, geom, poses, geoms, moving, moving_count, still,
-                  map, covered);
+                  map, changes, covered);
 }
 
 #pragma GCC visibility pop

@@ -145,6 +145,14 @@ struct Shade {  // of a light that throws shadows, on a triangle: all but `depth
     float light[3][3];
     float place[3][3];  // seen from the light
     float depth[3];     // inverse depth, times a ray of the light's
+    std::uint32_t spread;  // where the tiles are that are known of it, in a table
+};
+
+struct Tile {  // of a light's map, as the plane of a triangle sees it
+    std::int32_t caster = -1, place;
+    std::uint32_t change;
+    float depth[3];  // of the plane
+    int state;
 };
 
 struct Surface {  // what is interpolated on a triangle, each times the ray
@@ -200,7 +208,7 @@ class Scene {
     // geoms, `covered` says where the map is not `still`, before and then.
     void shadow(const Lens& lens, float near, const Pose& eye, const Geom* geoms, const Pose* poses,
                 int count, const std::int32_t* moving, int moving_count, const float* still,
-                float* map, Box* covered);
+                float* map, std::uint32_t* changes, Box* covered);
 
   private:
     friend class Band;
@@ -241,6 +249,7 @@ class Scene {
     std::vector<Slot> slots_;
     Triangles solid_, clear_;  // of these rows, in parts
     Movings solid_moving_, clear_moving_;
+    std::vector<std::vector<Tile>> tiles_;  // those known of lights' maps, by band
     std::vector<Triangle> before_;  // solid ones of the rows before these, while all moves
     std::vector<Moving> before_moving_;
     std::vector<float> nearest_;         // inverse depth of the nearest surface; 0 for nothing

@@ -118,6 +118,9 @@ std::int32_t Band::surface(std::int32_t number, int y) {
         plane(shade.place[1], at[0].y, at[1].y, at[2].y);
         plane(shade.place[2], at[0].z, at[1].z, at[2].z);
         put(shade.depth, (from.edge(0) + from.edge(1) + from.edge(2)) * inverse(from.away()));
+        std::uint32_t words[3];
+        std::memcpy(words, shade.depth, sizeof words);
+        shade.spread = (words[0] + 31 * words[1] + 961 * words[2]) * 2654435761u >> 16;
     }
     return index;
 }
@@ -126,8 +129,8 @@ std::int32_t Band::surface(std::int32_t number, int y) {
 // those that see nothing before the triangle's plane, weighted by their distance. So no surface is
 // in its own shadow, however steep. Of `count` points side by side on a large triangle, mostly in
 // one or two tiles of the map that are lit or dark as a whole, no pixel is looked at.
-fv Band::reaches(const Light& light, std::int32_t number, fv x, fv y, fv z, int count) {
-    const Shade& shade = shades_[number];
+fv Band::reaches(std::int32_t caster, const Shade& shade, fv x, fv y, fv z, int count) {
+    const Light& light = scene_.casters_[caster];
     const auto step = static_cast<float>(light.step), per_step = static_cast<float>(1 / light.step);
     const float middle = 0.5f * static_cast<float>(light.size - 1);
     const fv inverse = per_step / z, column = x * inverse + middle, row = y * inverse + middle;
@@ -139,18 +142,19 @@ fv Band::reaches(const Light& light, std::int32_t number, fv x, fv y, fv z, int 
     const fv shares[4] = {left_share * upper_share, right_share * upper_share,
                           left_share * lower_share, right_share * lower_share};
     const iv columns = as_whole(left), rows = as_whole(top);
-    if (count >= lanes && view_.poses == 1) {
-        const iv across = columns / tile_side, down = rows / tile_side;
-        const int c = across[0], r = down[0], d = across[lanes - 1], s = down[lanes - 1];
-        if (!any(~(((across == c) | (across == d)) & ((down == r) | (down == s))))) {
-            int found = tile(light, number, c, r);
-            if (c != d) found &= tile(light, number, d, r);
-            if (r != s) found &= tile(light, number, c, s);
-            if (c != d && r != s) found &= tile(light, number, d, s);
-            if (found & all_lit)
-                return inside ? shares[0] + shares[1] + shares[2] + shares[3] : fv{} + 1.0f;
-            if (found & all_dark) return inside ? fv{} : fv{} + 1.0f;
-        }
+    const int last = std::min(count, lanes) - 1;
+    const iv across = columns / tile_side, down = rows / tile_side;
+    const int c = across[0], r = down[0], d = across[last], s = down[last];
+    const iv others = ~(((across == c) | (across == d)) & ((down == r) | (down == s)));
+    if (!(bits(others) & ((2 << last) - 1))) {
+        const bool look = count >= lanes;
+        int found = tile(caster, shade, c, r, look);
+        if (c != d) found &= tile(caster, shade, d, r, look);
+        if (r != s) found &= tile(caster, shade, c, s, look);
+        if (c != d && r != s) found &= tile(caster, shade, d, s, look);
+        if (found & all_lit)
+            return inside ? shares[0] + shares[1] + shares[2] + shares[3] : fv{} + 1.0f;
+        if (found & all_dark) return inside ? fv{} : fv{} + 1.0f;
     }
     std::int32_t first[lanes];
     store(first, rows * light.size + columns);
@@ -168,13 +172,19 @@ fv Band::reaches(const Light& light, std::int32_t number, fv x, fv y, fv z, int 
 }
 
 // What is known of the pixels of a tile of a light's map, and those to its right and below it, on a
-// triangle: `all_lit`, `all_dark` or 0, by the same arithmetic as above.
-int Band::tile(const Light& light, std::int32_t number, int column, int row) {
-    if (tiles_.empty()) tiles_.assign(tiles_known, {-1, 0, 0});
-    const std::int32_t place = row << 16 | column;
-    Tile& known = tiles_[(column + 37 * row + 211 * number) & (tiles_known - 1)];
-    if (known.number == number && known.place == place) return known.state;
-    const Shade& shade = shades_[number];
+// triangle: `all_lit`, `all_dark` or 0, by the same arithmetic as above; 0 if that is not known and
+// not worth a look. It stays known until the map is drawn there.
+int Band::tile(std::int32_t caster, const Shade& shade, int column, int row, bool look) {
+    constexpr std::uint32_t known = 8192;
+    const Light& light = scene_.casters_[caster];
+    const std::int32_t place = row * tiles_across(light.size) + column;
+    const std::uint32_t change = light.changes[place];
+    if (tiles_->empty()) tiles_->resize(known);
+    Tile& tile = (*tiles_)[(shade.spread + 64 * row + column) & (known - 1)];
+    if (tile.place == place && tile.caster == caster && tile.change == change &&
+        !std::memcmp(tile.depth, shade.depth, sizeof shade.depth))
+        return tile.state;
+    if (!look) return 0;
     const auto step = static_cast<float>(light.step);
     const float middle = 0.5f * static_cast<float>(light.size - 1);
     fv count{};
@@ -193,8 +203,9 @@ int Band::tile(const Light& light, std::int32_t number, int column, int row) {
             dark |= is_dark, lit |= ~is_dark;
         }
     }
-    known = {number, place, any(dark) ? any(lit) ? 0 : all_dark : all_lit};
-    return known.state;
+    tile = {caster, place, change, {}, any(dark) ? any(lit) ? 0 : all_dark : all_lit};
+    std::memcpy(tile.depth, shade.depth, sizeof shade.depth);
+    return tile.state;
 }
 
 // Find the levels of mipmaps whose texels are as large as a pixel in the middle of each span.
@@ -292,11 +303,11 @@ void Band::place(const Span& span, int y, const float* nearest) {
         } else {
             fv light[3];
             for (int k = 0; k < 3; ++k) light[k] = times(surface.light[k]);
-            std::int32_t number = surface.shades - 1;
-            for (const Light& caster : scene_.casters_) {
-                const Shade& of = shades_[++number];
+            const auto casters = static_cast<std::int32_t>(scene_.casters_.size());
+            for (std::int32_t caster = 0; caster < casters; ++caster) {
+                const Shade& of = shades_[surface.shades + caster];
                 if (!of.shines) continue;
-                const fv lit = reaches(caster, number, times(of.place[0]), times(of.place[1]),
+                const fv lit = reaches(caster, of, times(of.place[0]), times(of.place[1]),
                                        times(of.place[2]), end - x);
                 for (int k = 0; k < 3; ++k) light[k] += lit * times(of.light[k]);
             }

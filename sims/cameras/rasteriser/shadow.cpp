@@ -33,13 +33,20 @@ bool holds_pixel(const Lens::Pixel (&at)[3]) {
 
 void Scene::shadow(const Lens& lens, float near, const Pose& eye, const Geom* geoms,
                    const Pose* poses, int count, const std::int32_t* moving, int moving_count,
-                   const float* still, float* map, Box* covered) {
+                   const float* still, float* map, std::uint32_t* changes, Box* covered) {
     const int size = lens.width;
+    const auto touch = [&](const Box& box) {  // also tiles to whose right or below which it is
+        if (box.left >= box.right) return;
+        for (int y = std::max(box.top - 1, 0) / tile_side; y * tile_side < box.bottom; ++y)
+            for (int x = std::max(box.left - 1, 0) / tile_side; x * tile_side < box.right; ++x)
+                ++changes[y * tiles_across(size) + x];
+    };
     for (Box* box = covered; box < covered + count; ++box) {
         for (int y = box->top; y < box->bottom; ++y) {
             const std::size_t row = std::size_t(y) * size;
             std::copy(still + row + box->left, still + row + box->right, map + row + box->left);
         }
+        touch(*box);
         *box = {};
     }
     lens_ = &lens;
@@ -49,7 +56,7 @@ void Scene::shadow(const Lens& lens, float near, const Pose& eye, const Geom* ge
     view_.near = near;
     first_ = 0, last_ = size;
     if (placed_.size() < std::size_t(count)) placed_.resize(count);
-    Band band(*this, 0, size, {nullptr, map, nullptr});
+    Band band(*this, 0, size, {nullptr, map, nullptr}, nullptr);
     const double per_step[2] = {1.0 / lens.step[0], 1.0 / lens.step[1]};
     for (const std::int32_t* index = moving; index < moving + moving_count; ++index) {
         Placed& placed = placed_[*index];
@@ -82,7 +89,9 @@ void Scene::shadow(const Lens& lens, float near, const Pose& eye, const Geom* ge
             box.top = std::min(box.top, triangle.top);
             box.bottom = std::max(box.bottom, triangle.bottom);
         }
-        if (box.left < box.right) covered[*index] = box;
+        if (box.left >= box.right) continue;
+        touch(box);
+        covered[*index] = box;
     }
 }
 

@@ -179,6 +179,9 @@ struct Box {  // pixels: to right - 1 and bottom - 1
     std::int32_t left, right, top, bottom;
 };
 
+constexpr int tile_side = 8;  // pixels of a light's map
+inline int tiles_across(int size) { return (size + tile_side - 1) / tile_side; }
+
 struct Light {
     std::int32_t kind;  // 0 directional, 1 point, 2 spot
     std::int32_t size;  // of its map: columns and rows; 0 if it throws no shadows
@@ -186,6 +189,7 @@ struct Light {
     float cutoff, exponent;  // cosine of the cone's half angle
     double position[3], direction[3];
     const float* map;  // depth of what is nearest to an eye at the light, by row and column
+    std::uint32_t* changes;  // of each tile of the map, by row and column: how often it was drawn
     double step;       // a pixel's width and height at z = 1
     Pose eye;
 };

@@ -105,13 +105,15 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
     });
     const int rows = last - first, bands = std::min(pieces, rows);
     std::vector<std::unique_ptr<Band>> drawn(bands);
+    if (tiles_.size() < std::size_t(bands)) tiles_.resize(bands);
     spread(bands, [&](int band) {
         const auto edge = [&](int number) {  // between the smallest squares of a lens
             if (number == 0 || number == bands) return number ? last : first;
             return std::max((first + rows * number / bands) / Lens::smallest * Lens::smallest, first);
         };
         if (edge(band) >= edge(band + 1)) return;
-        drawn[band] = std::make_unique<Band>(*this, edge(band), edge(band + 1), images);
+        drawn[band] = std::make_unique<Band>(*this, edge(band), edge(band + 1), images,
+                                             &tiles_[band]);
         drawn[band]->draw();
     });
     const auto each = [&](auto step) {
