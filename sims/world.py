@@ -26,6 +26,7 @@ from runtime.typed import TypeVar
 from sims.cameras import CameraSpec, model_to_bytes
 from sims.cameras.rig import CameraOutputs, CameraRig
 from sims.cameras.stage import RendererName
+from sims.scans.settings import MeshSpec
 from sims.vehicle import Simulation, State
 from sims.vehicle.physics import Air
 from sims.vehicle.simulation import Influence
@@ -79,6 +80,7 @@ class SharedWorld:
         named = [inhabitant for inhabitant in inhabitants if inhabitant.config.world]
         self.name = named[0].config.world if named else "hall"
         self.named_by = named[0].name if named else ""
+        self.mesh = named[0].config.mesh if named else MeshSpec()
         self._inhabitants = inhabitants
         self.vehicles = [inhabitant.name for inhabitant in inhabitants if inhabitant.node.vehicle]
         # State of each vehicle and free camera at its start, once that node has started up.
@@ -149,7 +151,7 @@ class SharedWorld:
         return tuple(np.flatnonzero(self.model.geom_bodyid == self.model.body(body).id).tolist())
 
     def _build(self) -> None:
-        spec, dynamics = load_scene(self.name, bare=self._bare)
+        spec, dynamics = load_scene(self.name, bare=self._bare, mesh=self.mesh)
         wind = None
         for inhabitant in self._inhabitants:
             node: type[Inhabitant] = inhabitant.node
@@ -191,6 +193,11 @@ async def join_world(node: Any) -> SharedWorld:
             f'world: expected "{world.name}", in which {world.named_by} is, since all vehicles of '
             f'a run share one world, found "{node.config.world}"'
         )
+    if node.config.mesh not in (MeshSpec(), world.mesh):
+        raise WorldError(
+            f"mesh: expected the settings of {world.named_by or 'none'}, which names the world, or "
+            f"none, found others"
+        )
     origins = {i.config.origin for i in inhabitants if hasattr(i.config, "origin")}
     if len(origins) > 1:
         raise WorldError(
@@ -205,6 +212,7 @@ class WorldConfig(NodeConfig):
 
     Attributes:
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.
+        mesh: How the world is made of a mesh file; of the node that names the world.
         wind: The wind.
         bodies: Self-moving bodies.
         lights: Lights that change in time.
@@ -213,6 +221,7 @@ class WorldConfig(NodeConfig):
     """
 
     world: NameOrPath = ""
+    mesh: MeshSpec = MeshSpec()
     wind: WindSpec = WindSpec()
     bodies: tuple[BodySpec, ...] = ()
     lights: tuple[LightSpec, ...] = ()
@@ -306,9 +315,11 @@ class SimulatorConfig(NodeConfig):
 
     Attributes:
         world: Built-in world (``hall``, ``yard``, ``corridor``, ``office``, ``night``, ``forest``)
-            or path of an MJCF file; empty for the other vehicles', or ``hall``. In MJCF x is north,
-            y west, z up; in all settings and events x is north, y east, z down (NED): ``pos="1 2
-            3"`` is (1, -2, -3) in ``map``.
+            or path of an MJCF or mesh file (.glb, .gltf, .obj, .ply, .stl, .dae, a Gazebo .world or
+            .sdf); empty for the other vehicles', or ``hall``. In MJCF x is north, y west, z up; in
+            all settings and events x is north, y east, z down (NED): ``pos="1 2 3"`` is (1, -2, -3)
+            in ``map``.
+        mesh: How the world is made of a mesh file; of the node that names the world.
         origin: Where the origin of ``map`` is on the earth: latitude and longitude, degrees north
             and east, and altitude, metres above the WGS 84 ellipsoid, which here is sea level too.
         cameras: The cameras that are carried.
@@ -320,6 +331,7 @@ class SimulatorConfig(NodeConfig):
     """
 
     world: NameOrPath = ""
+    mesh: MeshSpec = MeshSpec()
     origin: tuple[Latitude, Longitude, float] = (47.641468, -122.140165, 122.0)
     cameras: tuple[CameraSpec, ...] = ()
     camera_processes: Count = 2

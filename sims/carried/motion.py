@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -93,7 +93,7 @@ class CarriedMotion:
         rest: float = 0.0,
         thrust: float = 0.0,
     ) -> None:
-        self.model = world.model
+        self.model: Any = world.model
         self._rest, self._thrust = rest, thrust
         self._world = world
         self._spline = spline

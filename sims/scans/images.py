@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from sims.scans.files import content
 from sims.scans.mesh_file import MeshError
 from sims.scans.parsing import LeftOut
 
@@ -105,7 +106,7 @@ class Images:
             self._left_out.note(f"image {name!r}", "not found; drawn in the material's colour")
             return None
         try:
-            return decode(path.read_bytes(), str(path))
+            return decode(content(path), str(path))
         except (MeshError, OSError) as error:
             self._left_out.note(f"image {name!r}", f"drawn in the material's colour: {error}")
             return None

@@ -15,7 +15,11 @@ class VehicleMotion(Protocol):
     """
 
     model: Any  # the compiled world
-    thrusts: Any  # thrust of each rotor, 0 to 1 of its greatest, at present; zeros without rotors
+
+
+    @property
+    def thrusts(self) -> Any:
+        """Thrust of each rotor at present, 0 to 1 of its greatest; zeros without rotors."""
 
     @property
     def time_ns(self) -> int:

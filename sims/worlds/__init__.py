@@ -1,4 +1,4 @@
-"""Worlds to fly in, found by name or path: geometry, materials, lights; no vehicles, no cameras.
+"""Worlds to fly in, by name or path: geometry, materials, lights; no vehicles, no cameras.
 
 A built-in world costs physics little (primitives, all in the world body) and is made to be seen:
 textures are drawn from a seed, and nothing repeats for long. A package adds its own by entry points
@@ -19,6 +19,8 @@ from runtime import VisnavError
 from runtime.errors import CommandError
 from runtime.extras import WORLDS as GROUP
 from runtime.extras import others
+from sims.scans.mesh_file import MeshError
+from sims.scans.settings import SUFFIXES, USUAL, MeshSpec
 from sims.worlds.builder import CLEARANCE, TOURS
 from sims.worlds.dynamics import Dynamics, Motion, Scene
 from sims.worlds.forest import forest
@@ -50,24 +52,29 @@ def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
     return load_scene(name_or_path, seed, bare=bare).spec
 
 
-def load_scene(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> Scene:
+def load_scene(
+    name_or_path: str | Path, seed: int = 0, *, bare: bool = False, mesh: MeshSpec = USUAL
+) -> Scene:
     """Return a world, ready for vehicles and cameras; MuJoCo's warnings go to the log from then on.
 
     Args:
-        name_or_path: A name in `WORLDS` or of another package's world, or the path of an MJCF file
-            (what ends in ``.xml``, contains a slash, or is a `Path`).
+        name_or_path: A name in `WORLDS` or of another package's world, or the path of an MJCF or
+            mesh file (what has such a suffix, contains a slash, or is a `Path`).
         seed: Seed of a built-in world's textures, and of what lies on shelves. A file has none.
-        bare: Leave out a built-in world's images.
+        bare: Leave out a built-in world's images, and all of a mesh that is only seen.
+        mesh: How a mesh file becomes a world.
 
     Raises:
-        WorldError: No such name or file, the file is no MJCF that compiles, or a package's world
-            cannot be built; the message names the package.
+        WorldError: No such name or file, the file is no MJCF that compiles and no mesh of use, or a
+            package's world cannot be built; the message names the package.
     """
     # Else they would go to a file of MuJoCo's in whatever folder the run was started.
     mujoco.set_mju_user_warning(logging.getLogger("visnav.mujoco").warning)
     text = str(name_or_path)
-    is_path = isinstance(name_or_path, Path) or "/" in text or text.lower().endswith(".xml")
-    if is_path:
+    suffix = Path(text).suffix.lower()
+    if suffix in SUFFIXES:
+        return Scene(_from_mesh(Path(name_or_path), mesh, bare))
+    if isinstance(name_or_path, Path) or "/" in text or suffix == ".xml":
         return Scene(_from_file(Path(name_or_path)))
     built = WORLDS[text](seed, bare) if text in WORLDS else _from_package(text, seed, bare)
     return built if isinstance(built, Scene) else Scene(built)
@@ -80,7 +87,7 @@ def _from_package(name: str, seed: int, bare: bool) -> mujoco.MjSpec | Scene:
         near = difflib.get_close_matches(name, known, n=2, cutoff=0.5)
         hint = f"; did you mean {' or '.join(near)}?" if near else ""
         raise WorldError(
-            f"world: expected one of {', '.join(known)}, or a path to an .xml file, "
+            f"world: expected one of {', '.join(known)}, or a path to an .xml or mesh file, "
             f'found "{name}"{hint}'
         )
     whose = f"world: {name} of the package {offers[name].package}"
@@ -93,6 +100,15 @@ def _from_package(name: str, seed: int, bare: bool) -> mujoco.MjSpec | Scene:
     if not isinstance(built, mujoco.MjSpec | Scene):
         raise WorldError(f"{whose}: expected a mujoco.MjSpec or a Scene, found {built!r}")
     return built
+
+
+def _from_mesh(path: Path, mesh: MeshSpec, bare: bool) -> Any:
+    from sims.scans.world import mesh_world  # reading meshes takes libraries that few runs need
+
+    try:
+        return mesh_world(path, mesh, bare=bare)
+    except MeshError as error:
+        raise WorldError(f"world: {error}") from error
 
 
 def _from_file(path: Path) -> Any:

@@ -23,6 +23,7 @@ from runtime.time.stepping import Stepping
 from sims.cameras.stage import RendererName
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
+from sims.scans.settings import MeshSpec
 from sims.world import Count, Inhabitant, Simulator, join_world
 from sims.worlds import Dynamics, Scene
 from visnav_airsim.server.cameras import Cameras, Images, ServedCamera
@@ -72,6 +73,7 @@ class AirsimServerConfig(NodeConfig):
         default_vehicle: Vehicle that an empty name stands for; empty for the first by name.
         abandoned: Real time after which the run ends if time stands since the last client has left.
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.
+        mesh: How the world is made of a mesh file; of the node that names the world.
         estimators: Estimators in clients' scripts, whose poses are judged.
         settings: The settings.json for clients: text, or a file; empty to describe the run.
         cameras: Cameras for clients besides the vehicles' and AirSim's default ones.
@@ -93,6 +95,7 @@ class AirsimServerConfig(NodeConfig):
     default_vehicle: str = ""
     abandoned: Duration = Duration(600.0)  # immutable
     world: NameOrPath = ""
+    mesh: MeshSpec = MeshSpec()
     estimators: tuple[ScriptEstimator, ...] = ()
     settings: JsonOrPath = ""
     cameras: tuple[ServedCamera, ...] = ()
