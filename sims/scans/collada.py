@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sims.scans.files import content
 from sims.scans.images import Image, Images, opaque
 from sims.scans.mesh_file import Colour, Floats, Material, MeshError, MeshFile, Piece
 from sims.scans.parsing import (
@@ -48,7 +47,7 @@ def parse_xml(path: Path) -> ET.Element:
     Raises:
         MeshError: It is no XML, or it defines entities, which may stand for any size of text.
     """
-    data = content(path)
+    data = path.read_bytes()
     if b"<!ENTITY" in data:
         raise MeshError(f"{path}: expected XML without entities of its own")
     try:

@@ -22,7 +22,6 @@ import numpy.typing as npt
 
 from runtime.errors import MissingDependencyError
 from runtime.extras import install_command
-from sims.scans.files import content
 from sims.scans.images import Image, decode, opaque, to_srgb
 from sims.scans.mesh_file import Floats, Material, MeshError, MeshFile, Piece
 from sims.scans.parsing import LeftOut, check_size, unique_name, unit_normals
@@ -66,7 +65,7 @@ def read_gltf(path: Path) -> MeshFile:
 
 def _split(path: Path) -> tuple[dict[str, Any], bytes | None]:
     """Return a file's JSON, and the binary part of a ``.glb``."""
-    data = content(path)
+    data = path.read_bytes()
     binary: bytes | None = None
     text = data
     if data[:4] == b"glTF":
@@ -571,7 +570,7 @@ class _Reader:
                 raise MeshError(f"{where}: expected base64, found: {error}") from error
         for name in (unquote(uri), uri):
             try:
-                return content(self._path.parent / name)
+                return (self._path.parent / name).read_bytes()
             except (OSError, ValueError):  # no such file, or no name of a file
                 continue
         raise MeshError(

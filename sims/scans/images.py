@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sims.scans.files import content
 from sims.scans.mesh_file import MeshError
 from sims.scans.parsing import LeftOut
 
@@ -106,7 +105,7 @@ class Images:
             self._left_out.note(f"image {name!r}", "not found; drawn in the material's colour")
             return None
         try:
-            return decode(content(path), str(path))
+            return decode(path.read_bytes(), str(path))
         except (MeshError, OSError) as error:
             self._left_out.note(f"image {name!r}", f"drawn in the material's colour: {error}")
             return None

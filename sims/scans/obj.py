@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sims.scans.files import content
 from sims.scans.images import Image, Images, find, opaque
 from sims.scans.mesh_file import Colour, Floats, Material, MeshError, MeshFile, Piece
 from sims.scans.parsing import (
@@ -80,7 +79,7 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._left_out = LeftOut()
-        text = content(path)
+        text = path.read_bytes()
         if b"\\\n" in text or b"\\\r\n" in text:
             text = re.sub(rb"\\\r?\n", b" ", text)
         if b"\n" not in text:
@@ -410,7 +409,7 @@ def _entries(path: Path) -> dict[str, dict[str, str]]:
     """Return the values of each material of an MTL file by their keyword in small letters."""
     entries: dict[str, dict[str, str]] = {}
     entry: dict[str, str] = {}
-    for line in content(path).decode("utf-8", "replace").splitlines():
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         keyword, _, value = line.strip().replace("\t", " ").partition(" ")
         if keyword.lower() == "newmtl":
             entry = entries.setdefault(value.strip(), {})

@@ -13,7 +13,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sims.scans.files import content
 from sims.scans.images import Images, opaque
 from sims.scans.mesh_file import Floats, Material, MeshError, MeshFile, Piece
 from sims.scans.parsing import (
@@ -76,7 +75,7 @@ def read_ply(path: Path) -> MeshFile:
     Raises:
         MeshError: It is damaged, or a cloud of points.
     """
-    data = content(path)
+    data = path.read_bytes()
     order, elements, images, start = _header(path, data)
     body = _Text(path, data[start:]) if order == "=" else _Binary(path, data, start, order)
     left_out = LeftOut()

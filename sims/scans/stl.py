@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sims.scans.files import content
 from sims.scans.mesh_file import Floats, Material, MeshError, MeshFile, Piece
 from sims.scans.parsing import check_size, parse_numbers
 
@@ -17,7 +16,7 @@ _TRIANGLE = np.dtype([("normal", "<f4", 3), ("points", "<f4", (3, 3)), ("attribu
 
 def read_stl(path: Path) -> MeshFile:
     """Read an ``.stl``; its normals are those of its triangles, and are not taken from it."""
-    data = content(path)
+    data = path.read_bytes()
     points = _binary(data)
     if points is None:
         points = _text(path, data)
