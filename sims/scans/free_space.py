@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ _MOST = 2_000_000  # cells of the grid; larger meshes have larger cells
 _SLACK = 1.1  # cells from a point near a cell's middle to the surface of another, more than between
 _SPACING = 0.3  # of the points between which paths are looked for, metres
 _PLACES = 16  # that a tour may lead by
+_DETOUR = 0.5  # by a waypoint of a tour, least, metres
 _SAMPLING = 0.05  # of a tour whose clearance is measured, metres
 
 
@@ -92,7 +94,9 @@ class _Grid:
     """
 
     def __init__(self, voxels: Voxels, floor: float | None) -> None:
-        self.floor, self.voxels = floor, voxels
+        self.floor = floor
+        self.margin = 0.0 if floor is None else voxels.size / 2.0  # from the floor to layer 1
+        self.boxes = (voxels if floor is None else voxels.above_floor()).boxes()
         low = voxels.cells.min(axis=0)
         if floor is not None:
             low[2] = 0
@@ -161,8 +165,7 @@ class _Level(NamedTuple):
     def of(cls, grid: _Grid, height: float, clearance: float) -> _Level | None:
         """Return the largest part of a level at a height above the best start's ground."""
         step = grid.step
-        margin = 0.0 if grid.floor is None else grid.voxels.size / 2.0
-        up = round((height - margin) / step - 0.5)
+        up = round((height - grid.margin) / step - 0.5)
         ground = _ground(grid.solid, up + 1 + math.ceil(HALF_WIDTH / step))
         ground[~grid.shown] = -1
         # The floor is a plane; other ground may be uneven by a cell.
@@ -210,7 +213,7 @@ class _Level(NamedTuple):
         for number, place in enumerate(places[1:], 1):
             legs = zip(order, [*order[1:], 0], strict=True)
             extra = [ways[a][place] + ways[number][places[b]] - ways[a][places[b]] for a, b in legs]
-            if length + min(extra) <= 1.05 * LENGTH:  # what follows shortens it
+            if length + min(extra) <= 1.1 * LENGTH:  # what follows shortens it
                 length += min(extra)
                 order.insert(extra.index(min(extra)) + 1, number)
         path: list[Cell] = []
@@ -219,6 +222,7 @@ class _Level(NamedTuple):
             while leg[-1] != places[a]:
                 leg.append(int(before[a][leg[-1]]))
             path += self._straight([(i, j) for i, j in cells[leg[::-1]].tolist()])
+        path = self._smooth(path)
         return _measured([self.grid.middle(i, j, self.layer) for i, j in path], self.grid)
 
     def _graph(self) -> tuple[Integers, Any]:
@@ -251,6 +255,16 @@ class _Level(NamedTuple):
                 n for n in range(len(path) - 1, k, -1) if n == k + 1 or self._sees(path[k], path[n])
             )
         return corners or path
+
+    def _smooth(self, path: list[Cell]) -> list[Cell]:
+        """Return a closed path without the corners that hardly lengthen it."""
+        corners = path[:1]
+        for place, after in pairwise([*path[1:], path[0]]):
+            before = corners[-1]
+            detour = math.dist(before, place) + math.dist(place, after) - math.dist(before, after)
+            if detour * self.grid.step > _DETOUR or not self._sees(before, after):
+                corners.append(place)
+        return corners
 
     def _sees(self, a: Cell, b: Cell) -> bool:
         """Return whether all cells on the line between two are clear."""
@@ -287,8 +301,7 @@ def _measured(path: list[Vector3], grid: _Grid) -> Tour:
         start + np.linspace(0.0, 1.0, 2 + int(length / _SAMPLING))[:, None] * (end - start)
         for start, end, length in zip(points, ends, lengths, strict=True)
     ])  # fmt: skip
-    voxels = grid.voxels if grid.floor is None else grid.voxels.above_floor()
-    boxes = voxels.boxes()
+    boxes = grid.boxes
     least = math.inf if grid.floor is None else float(points[:, 2].min()) - grid.floor
     near = (boxes[:, :3] < samples.max(axis=0) + 3.0) & (boxes[:, 3:] > samples.min(axis=0) - 3.0)
     for box in boxes[near.all(axis=1)]:

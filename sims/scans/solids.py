@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from sims.scans.mesh_file import MeshError
 
@@ -24,6 +25,8 @@ Corners = npt.NDArray[np.int32]
 GROUP = 3  # of geoms: met by vehicles and path checks, seen by no camera and no lidar
 LIMIT = 4_000_000
 """Most cells that a mesh may fill, as estimated from its area: 200 × 200 m at 0.1 m."""
+
+GAP = 0.3  # metres, between solids, into which no vehicle flies
 
 _COLOUR = (0.5, 0.5, 0.5, 1.0)
 _LAYER, _COLUMN = 0.1, 0.5  # height and least width of the cells in which the floor is looked for
@@ -48,15 +51,30 @@ class Voxels(NamedTuple):
         up = np.array((0.0, 0.0, self.level))
         return np.hstack([(part - 0.5) * self.size + up for part in (ranges[:, :3], ranges[:, 3:])])
 
+    def filled(self, gap: float = GAP) -> Voxels:
+        """Return the cells and all between them where no cube fits that is wider than `gap`.
+
+        Shelves, cables and rough surfaces are a quarter of the boxes then. The cells of a grid of
+        more than 10⁸ are returned as they are.
+        """
+        width = math.floor(gap / self.size + 1e-9) + 1
+        low = self.cells.min(axis=0, initial=0) - width
+        sides = self.cells.max(axis=0, initial=0) - low + 1 + width
+        if width == 1 or math.prod(sides.tolist()) > 10**8:
+            return self
+        solid = np.zeros(sides, np.uint8)
+        solid[tuple((self.cells - low).T)] = 1
+        return self._replace(cells=np.argwhere(ndimage.grey_closing(solid, width)) + low)
+
     def above_floor(self) -> Voxels:
         """Return the cells above the layer of the floor, which is layer 0: a plane stands there."""
         return self._replace(cells=self.cells[self.cells[:, 2] > 0])
 
 
 def voxel_boxes(
-    points: Floats, corners: Corners, voxel: float, floor: float | None = None
+    points: Floats, corners: Corners, voxel: float, floor: float | None = None, gap: float = GAP
 ) -> Floats:
-    """Return boxes that contain all triangles: low and high corners, shape (k, 6).
+    """Return disjoint boxes that contain all triangles: low and high corners, shape (k, 6).
 
     They are the merged voxels that a triangle touches, so that surfaces stand up to one voxel too
     far out: a door of 0.9 m is at least 0.7 m wide at voxels of 0.1 m.
@@ -68,13 +86,14 @@ def voxel_boxes(
         floor: Height of a plane that is added to the world. Voxels are then centred on it, and what
             is less than half a voxel above it or anywhere below has no box: else a vehicle
             would stand above the floor that is seen.
+        gap: Width up to which gaps are filled, see `Voxels.filled`; at 0, boxes are exactly the
+            voxels.
 
     Raises:
         MeshError: The triangles touch too many voxels; the message says which size would do.
     """
-    if floor is None:
-        return voxelise(points, corners, voxel).boxes()
-    return voxelise(points, corners, voxel, floor).above_floor().boxes()
+    voxels = voxelise(points, corners, voxel, 0.0 if floor is None else floor).filled(gap)
+    return (voxels if floor is None else voxels.above_floor()).boxes()
 
 
 def voxelise(points: Floats, corners: Corners, voxel: float, level: float = 0.0) -> Voxels:

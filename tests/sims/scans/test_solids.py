@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from sims.scans.mesh_file import MeshError
 from sims.scans.solids import (
+    Voxels,
     add_solids,
     find_floor,
     floor_height,
@@ -53,7 +54,7 @@ EIGHTHS = st.integers(-20, 20).map(lambda number: number / 8.0)
 TRIANGLES = st.lists(st.tuples(*[EIGHTHS] * 9), min_size=1, max_size=3)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(numbers=TRIANGLES, voxel=st.sampled_from([1.0, 0.25]))
 def test_voxels_are_those_that_triangles_touch(
     numbers: list[tuple[float, ...]], voxel: float
@@ -100,13 +101,40 @@ def test_a_large_triangle_is_as_its_halves() -> None:
     np.testing.assert_array_equal(whole, parts)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(cells=st.sets(st.tuples(*[st.integers(-3, 2)] * 3), max_size=60))
 def test_boxes_are_disjoint_and_fill_the_cells(cells: set[tuple[int, int, int]]) -> None:
     boxes = merged(np.array(sorted(cells), np.int64).reshape(-1, 3))
     filled = [cell for box in boxes.tolist() for cell in product(*map(range, box[:3], box[3:]))]
     assert len(filled) == len(set(filled))
     assert set(filled) == cells
+
+
+@settings(max_examples=15)
+@given(
+    cells=st.sets(st.tuples(*[st.integers(0, 7)] * 3), max_size=60),
+    gap=st.sampled_from([0.0, 0.05, 0.1, 0.2, 0.3]),
+)
+def test_what_is_filled_is_where_no_cube_fits(cells: set[tuple[int, int, int]], gap: float) -> None:
+    """By trying all cubes that are a voxel wider than the gap."""
+    array = np.array(sorted(cells), np.int64).reshape(-1, 3)
+    filled = Voxels(array, 0.1).filled(gap)
+    width = 1 + round(gap / 0.1 - 0.1)
+    solid = np.zeros((20, 20, 20), np.bool_)
+    solid[tuple((array + 6).T)] = True
+    windows = np.lib.stride_tricks.sliding_window_view(solid, (width,) * 3)
+    cubes = np.asarray(~windows.any(axis=(3, 4, 5)))
+    free, count = np.zeros_like(solid), len(cubes)
+    for x, y, z in product(range(width), repeat=3):
+        free[x : x + count, y : y + count, z : z + count] |= cubes
+    np.testing.assert_array_equal(filled.cells, np.argwhere(~free) - 6)
+
+
+def test_shelves_are_filled_and_doors_are_not() -> None:
+    boards = [block((0.0, 0.0, z), (2.0, 0.4, z + 0.02)) for z in (0.2, 0.5, 0.8, 1.1)]
+    assert len(voxel_boxes(*together(*boards), 0.1)) == 1
+    boxes = voxel_boxes(*together(*boards), 0.1, gap=0.0)
+    assert len(boxes) == 4
 
 
 def test_a_block_is_six_boxes_at_most_and_the_order_of_triangles_does_not_matter() -> None:
