@@ -31,6 +31,7 @@ GAP = 0.3  # metres, between solids, into which no vehicle flies
 _COLOUR = (0.5, 0.5, 0.5, 1.0)
 _LAYER, _COLUMN = 0.1, 0.5  # height and least width of the cells in which the floor is looked for
 _FLAT, _LOWER = 3, 20  # a floor: a third of the ground at least, a twentieth at most below it
+_DENSE = 20_000_000  # cells of a grid that are looked at at once
 _BATCH = 500_000  # rows or columns of cells that are tested at once
 
 
@@ -54,17 +55,25 @@ class Voxels(NamedTuple):
     def filled(self, gap: float = GAP) -> Voxels:
         """Return the cells and all between them where no cube fits that is wider than `gap`.
 
-        Shelves, cables and rough surfaces are a quarter of the boxes then. The cells of a grid of
-        more than 10⁸ are returned as they are.
+        A third of the boxes fill a warehouse's shelves then, and a quarter a rough scan.
         """
         width = math.floor(gap / self.size + 1e-9) + 1
-        low = self.cells.min(axis=0, initial=0) - width
-        sides = self.cells.max(axis=0, initial=0) - low + 1 + width
-        if width == 1 or math.prod(sides.tolist()) > 10**8:
+        if width == 1 or not len(self.cells):
             return self
-        solid = np.zeros(sides, np.uint8)
-        solid[tuple((self.cells - low).T)] = 1
-        return self._replace(cells=np.argwhere(ndimage.grey_closing(solid, width)) + low)
+        low = self.cells.min(axis=0) - width
+        sides = self.cells.max(axis=0) - low + 1 + width
+        # In slices with margins, as far as a cell depends on others.
+        count = min(int(sides[0]), max(1, _DENSE // int(sides[1] * sides[2])))
+        margin, parts = 2 * width, []
+        x, y, z = (self.cells - low).T
+        for first in range(0, int(sides[0]), count):
+            row = x - first + margin
+            near = (row >= 0) & (row < count + 2 * margin)
+            solid = np.zeros((count + 2 * margin, *sides[1:]), np.uint8)
+            solid[row[near], y[near], z[near]] = 1
+            closed = ndimage.grey_closing(solid, width)[margin:-margin]
+            parts.append(np.argwhere(closed) + low + (first, 0, 0))
+        return self._replace(cells=np.concatenate(parts))
 
     def above_floor(self) -> Voxels:
         """Return the cells above the layer of the floor, which is layer 0: a plane stands there."""

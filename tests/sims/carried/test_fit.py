@@ -207,6 +207,23 @@ def test_distances_are_those_of_the_shapes() -> None:
     assert names[6:] == ["the ground", "the ground"]
 
 
+def test_of_many_boxes_those_near_many_points_are_the_nearest() -> None:
+    """The same bits as of one point after the other, and the first of those that are as near."""
+    random = np.random.default_rng(3)
+    spec = mujoco.MjSpec.from_string(BOXES)
+    for place in [*np.round(random.uniform(-9.0, 9.0, (300, 3))), *random.normal(size=(50, 3))]:
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=random.integers(1, 5, 3) / 4.0, pos=place,
+            quat=(1.0, 0.0, 0.0, 0.0) if random.random() < 0.7 else random.normal(size=4),
+        )  # fmt: skip
+    clearance = Clearance(spec.compile())
+    points = np.round(random.uniform(-12.0, 12.0, (500, 3)) * 2.0) / 2.0
+    distances, geoms = clearance.nearest(points)
+    alone = [clearance.nearest(point[None]) for point in points]
+    np.testing.assert_array_equal(distances, [distance for (distance,), _ in alone])
+    np.testing.assert_array_equal(geoms, [geom for _, (geom,) in alone])
+
+
 def test_a_distance_from_a_mesh_is_that_of_its_hull() -> None:
     corners = "1 0 0 -1 0 0 0 1 0 0 -1 0 0 0 1 0 0 -1"
     xml = (

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sims.scans import solids
 from sims.scans.mesh_file import MeshError
 from sims.scans.solids import (
     Voxels,
@@ -54,6 +55,9 @@ EIGHTHS = st.integers(-20, 20).map(lambda number: number / 8.0)
 TRIANGLES = st.lists(st.tuples(*[EIGHTHS] * 9), min_size=1, max_size=3)
 
 
+HALL = room(6.25, 5.3, 3.1, block((2.0, 2.0, 0.0), (3.2, 2.7, 0.6)))
+
+
 @settings(max_examples=25)
 @given(numbers=TRIANGLES, voxel=st.sampled_from([1.0, 0.25]))
 def test_voxels_are_those_that_triangles_touch(
@@ -90,6 +94,14 @@ def test_voxels_are_those_that_triangles_touch(
             assert empty or within.any()
 
 
+def test_far_from_the_origin_all_is_the_same() -> None:
+    """As at coordinates of a map's grid."""
+    points, corners = HALL
+    far = np.array((400_000.0, 5_800_000.0, 300.0))
+    boxes = voxel_boxes(points, corners, 0.5)
+    np.testing.assert_allclose(voxel_boxes(points + far, corners, 0.5), boxes + np.tile(far, 2))
+
+
 def test_a_large_triangle_is_as_its_halves() -> None:
     """Of 800 cells a side, tilted; and of a sliver along it."""
     points = np.array([(0.0, 0.0, 0.0), (80.1, 7.2, 33.3), (11.4, 70.7, -20.6), (80.15, 7.2, 33.3)])
@@ -114,11 +126,16 @@ def test_boxes_are_disjoint_and_fill_the_cells(cells: set[tuple[int, int, int]])
 @given(
     cells=st.sets(st.tuples(*[st.integers(0, 7)] * 3), max_size=60),
     gap=st.sampled_from([0.0, 0.05, 0.1, 0.2, 0.3]),
+    dense=st.sampled_from([1, 500, 10**6]),
 )
-def test_what_is_filled_is_where_no_cube_fits(cells: set[tuple[int, int, int]], gap: float) -> None:
-    """By trying all cubes that are a voxel wider than the gap."""
+def test_what_is_filled_is_where_no_cube_fits(
+    cells: set[tuple[int, int, int]], gap: float, dense: int
+) -> None:
+    """By trying all cubes that are a voxel wider than the gap; in slices, too."""
     array = np.array(sorted(cells), np.int64).reshape(-1, 3)
-    filled = Voxels(array, 0.1).filled(gap)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solids, "_DENSE", dense)
+        filled = Voxels(array, 0.1).filled(gap)
     width = 1 + round(gap / 0.1 - 0.1)
     solid = np.zeros((20, 20, 20), np.bool_)
     solid[tuple((array + 6).T)] = True
