@@ -23,10 +23,9 @@ from sims.scans.parsing import (
     fan,
     join,
     parse_numbers,
-    rotation,
     unique_name,
-    unit_normals,
 )
+from sims.scans.transforms import compose, moved, rotation, scaling, seen, translation, turned, unit
 
 Integers = npt.NDArray[np.int64]
 
@@ -135,7 +134,7 @@ class _Reader:
         matrix = parent
         for element in node:
             if element.tag in _TRANSFORMS:
-                matrix = matrix @ self._transform(element)
+                matrix = compose(matrix, self._transform(element))
         name = node.get("name") or node.get("id") or "node"
         for element in node:
             match element.tag:
@@ -159,30 +158,29 @@ class _Reader:
                     pass
 
     def _transform(self, element: ET.Element) -> Floats:
-        values = self._list(element, np.float64)
+        values: Floats = self._list(element, np.float64)
         expected = _TRANSFORMS[element.tag]
         if len(values) != expected or not np.isfinite(values).all():
             raise MeshError(
                 f"{self._path}: <{element.tag}>: expected {expected} finite numbers, found "
                 f"{(element.text or '')[:60]!r}"
             )
-        matrix = np.eye(4)
-        if element.tag == "matrix":
-            matrix = values.reshape(4, 4)
-        elif element.tag == "translate":
-            matrix[:3, 3] = values
-        elif element.tag == "scale":
-            matrix[[0, 1, 2], [0, 1, 2]] = values
-        elif element.tag == "rotate":
-            matrix[:3, :3] = rotation(values[:3], math.radians(values[3]))
-        else:  # lookat
-            eye, interest, up = values.reshape(3, 3)
-            back = eye - interest
-            side = np.cross(up, back)
-            axes = [side, np.cross(back, side), back]
-            matrix[:3, :3] = np.stack([axis / np.linalg.norm(axis) for axis in axes], axis=1)
-            matrix[:3, 3] = eye
-        return matrix
+        match element.tag:
+            case "matrix":
+                return values.reshape(4, 4)
+            case "translate":
+                return translation(values)
+            case "scale":
+                return scaling(values)
+            case "rotate":
+                return rotation(values[:3], math.radians(values[3]))
+            case _:  # lookat
+                eye, interest, up = values.reshape(3, 3)
+                back = unit(eye - interest)
+                side = unit(np.cross(up, back))
+                matrix = translation(eye)
+                matrix[:3, :3] = np.stack([side, np.cross(back, side), back], axis=1)
+                return matrix
 
     def _skin(self, name: str, instance: ET.Element, matrix: Floats) -> Iterator[Piece]:
         controller = self._target(instance)
@@ -194,7 +192,7 @@ class _Reader:
         bind = skin.find("bind_shape_matrix")
         if bind is not None:
             values = self._list(bind, np.float64)
-            matrix = matrix @ values[:16].reshape(4, 4)
+            matrix = compose(matrix, values[:16].reshape(4, 4))
         yield from self._geometry(name, instance, self._target(skin, "source"), matrix)
 
     # Meshes.
@@ -273,12 +271,6 @@ class _Reader:
         points, normals = values("POSITION", 3), values("NORMAL", 3)
         places, colours = values("TEXCOORD", 2), values("COLOR", 3)
         assert points is not None
-        corners = vertex.reshape(-1, 3)
-        determinant = np.linalg.det(matrix[:3, :3])
-        if determinant < 0:
-            corners = np.ascontiguousarray(corners[:, ::-1])
-        if normals is not None and abs(determinant) > 1e-30:
-            normals = normals[:, :3] @ np.linalg.inv(matrix[:3, :3])
         if places is not None:
             if not np.isfinite(places).all():
                 raise MeshError(f"{self._path}: {name}: expected finite texture coordinates")
@@ -294,9 +286,9 @@ class _Reader:
         return Piece(
             object=name,
             material=material,
-            points=points[:, :3] @ matrix[:3, :3].T + matrix[:3, 3],
-            corners=corners,
-            normals=None if normals is None else unit_normals(normals),
+            points=moved(points[:, :3], matrix),
+            corners=seen(vertex.reshape(-1, 3), matrix),
+            normals=None if normals is None else turned(normals, matrix),
             places=None if places is None else places.astype(np.float32),
             colours=shades,
         )

@@ -19,7 +19,18 @@ import numpy.typing as npt
 from sims.scans.collada import parse_xml
 from sims.scans.images import Images, opaque
 from sims.scans.mesh_file import Colour, Floats, Material, MeshError, MeshFile, Piece
-from sims.scans.parsing import LeftOut, check_size, rotation, unique_name, unit_normals
+from sims.scans.parsing import LeftOut, check_size, unique_name
+from sims.scans.transforms import (
+    compose,
+    moved,
+    quaternion,
+    rotation,
+    scaling,
+    seen,
+    translation,
+    turned,
+    unit,
+)
 
 _PATHS = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "IGN_GAZEBO_RESOURCE_PATH")
 _ROUND = 32
@@ -68,7 +79,7 @@ class _Shape(NamedTuple):
 
     points: Floats
     corners: npt.NDArray[np.int32]
-    normals: Floats | None = None
+    normals: npt.NDArray[np.floating] | None = None
 
 
 class _Scope:
@@ -89,7 +100,7 @@ class _Scope:
         base = default
         if pose is not None:
             base = pose.get("relative_to") or pose.get("frame") or default
-        return self._frame(base) @ _matrix(self._path, pose)
+        return compose(self._frame(base), _matrix(self._path, pose))
 
     def _frame(self, name: str) -> Floats:
         if name in ("", "__model__", "world"):
@@ -160,7 +171,7 @@ class _Reader:
         for child in element:
             match child.tag:
                 case "model":
-                    matrix = place.matrix @ scope.pose(child)
+                    matrix = compose(place.matrix, scope.pose(child))
                     self._model(child, place._replace(matrix=matrix), child.get("name"))
                 case "include":
                     self._include(child, place, scope)
@@ -199,7 +210,7 @@ class _Reader:
             if name == "sun":
                 self._lit = True
             elif name == "ground_plane":
-                self._ground(place.matrix @ scope.pose(include), place.name)
+                self._ground(compose(place.matrix, scope.pose(include)), place.name)
             else:
                 self._missing[uri] = None
             return
@@ -211,7 +222,7 @@ class _Reader:
         for model in root.findall("model"):
             placed = include.find("pose") is not None  # which replaces the model's own
             pose = scope.pose(include) if placed else _Scope(file, root).pose(model)
-            inner = place._replace(path=file, matrix=place.matrix @ pose)
+            inner = place._replace(path=file, matrix=compose(place.matrix, pose))
             name = (include.findtext("name") or "").strip() or model.get("name") or "model"
             self._model(model, inner, name)
 
@@ -251,7 +262,7 @@ class _Reader:
         for child in link:
             match child.tag:
                 case "visual" | "collision":
-                    matrix = place.matrix @ scope.pose(child, link.get("name", ""))
+                    matrix = compose(place.matrix, scope.pose(child, link.get("name", "")))
                     self._geometry(child, place._replace(matrix=matrix), child.tag == "collision")
                 case "light":
                     self._lit = True
@@ -283,7 +294,7 @@ class _Reader:
     def _add(self, shape: _Shape, name: str, material: int, pieces: list[Piece]) -> None:
         self._triangles += len(shape.corners)
         check_size(self._path, self._triangles)
-        normals = None if shape.normals is None else unit_normals(shape.normals)
+        normals = None if shape.normals is None else shape.normals.astype(np.float32)
         pieces.append(Piece(name, material, shape.points, shape.corners, normals))
 
     def _mesh(self, element: ET.Element, shape: ET.Element, place: _Place, solid: bool) -> None:
@@ -304,7 +315,7 @@ class _Reader:
             for sentence in mesh.left_out:
                 self._told.setdefault(sentence, []).append(file.name)
         scale = _numbers(path, shape.find("scale"), 3, (1.0, 1.0, 1.0)) * (mesh.unit or 1.0)
-        matrix = matrix @ np.diag([*scale, 1.0])
+        matrix = compose(matrix, scaling(scale))
         pieces = mesh.pieces
         submesh = (shape.findtext("submesh/name") or "").strip()
         if submesh:
@@ -317,13 +328,11 @@ class _Reader:
                 )
             if (shape.findtext("submesh/center") or "").strip() in ("1", "true"):
                 points = np.concatenate([piece.points for piece in pieces])
-                centre = np.eye(4)
-                centre[:3, 3] = -(points.min(axis=0) + points.max(axis=0)) / 2
-                matrix = matrix @ centre
+                middle = (points.min(axis=0) + points.max(axis=0)) / 2
+                matrix = compose(matrix, translation(-middle))
         changed: dict[int, int] = {}
         for piece in pieces:
-            normals = None if piece.normals is None else piece.normals.astype(np.float64)
-            placed = _placed(_Shape(piece.points, piece.corners, normals), matrix)
+            placed = _placed(_Shape(piece.points, piece.corners, piece.normals), matrix)
             if solid:
                 self._add(placed, name, 0, self._solids)
                 continue
@@ -415,31 +424,21 @@ def _matrix(path: Path, pose: ET.Element | None) -> Floats:
     """Return the transform of a pose: x y z and roll, pitch, yaw, or a quaternion."""
     if pose is None:
         return np.eye(4)
-    matrix = np.eye(4)
     if pose.get("rotation_format") == "quat_xyzw":
         values = _numbers(path, pose, 7, (0.0,) * 6 + (1.0,))
-        x, y, z, w = values[3:] / (np.linalg.norm(values[3:]) or 1.0)
-        angle = 2 * math.atan2(math.sqrt(x * x + y * y + z * z), w)
-        matrix[:3, :3] = rotation(np.array([x, y, z]), angle)
-    else:
-        values = _numbers(path, pose, 6, (0.0,) * 6)
-        angles = np.radians(values[3:]) if pose.get("degrees") in ("1", "true") else values[3:]
-        roll, pitch, yaw = (
-            rotation(axis, float(angle)) for axis, angle in zip(np.eye(3), angles, strict=True)
-        )
-        matrix[:3, :3] = yaw @ pitch @ roll
-    matrix[:3, 3] = values[:3]
+        x, y, z, w = values[3:].tolist()
+        return compose(translation(values[:3]), quaternion(x, y, z, w))
+    values = _numbers(path, pose, 6, (0.0,) * 6)
+    angles = np.radians(values[3:]) if pose.get("degrees") in ("1", "true") else values[3:]
+    matrix = translation(values[:3])
+    for axis in (2, 1, 0):
+        matrix = compose(matrix, rotation(np.eye(3)[axis], float(angles[axis])))
     return matrix
 
 
 def _placed(shape: _Shape, matrix: Floats) -> _Shape:
-    linear = matrix[:3, :3]
-    determinant = float(np.linalg.det(linear))
-    normals = shape.normals
-    if normals is not None:
-        normals = normals @ np.linalg.inv(linear) if abs(determinant) > 1e-30 else None
-    corners = shape.corners if determinant >= 0 else np.ascontiguousarray(shape.corners[:, ::-1])
-    return _Shape(shape.points @ linear.T + matrix[:3, 3], corners, normals)
+    normals = None if shape.normals is None else turned(shape.normals, matrix)
+    return _Shape(moved(shape.points, matrix), seen(shape.corners, matrix), normals)
 
 
 # Shapes.
@@ -470,6 +469,16 @@ def _triangles(path: Path, shape: ET.Element) -> _Shape | None:
             return None
 
 
+def _cos(angles: Floats) -> Floats:
+    cosines: Floats = np.cos(angles)
+    return cosines.round(12)
+
+
+def _sin(angles: Floats) -> Floats:
+    sines: Floats = np.sin(angles)
+    return sines.round(12)
+
+
 def _grid(points: Floats, normals: Floats) -> _Shape:
     """Return the triangles of points in rows and columns, shape (rows, columns, 3)."""
     rows, columns, _ = points.shape
@@ -491,9 +500,8 @@ def _together(shapes: list[_Shape]) -> _Shape:
 
 
 def _plane(width: float, length: float, normal: Floats) -> _Shape:
-    up = normal / (np.linalg.norm(normal) or 1.0)
-    side = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [0.0, 0.0, 1.0], up)
-    side /= np.linalg.norm(side)
+    up = unit(normal)
+    side = unit(np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [0.0, 0.0, 1.0], up))
     along = np.cross(up, side)
     u, v = np.meshgrid([-width / 2, width / 2], [-length / 2, length / 2])
     points = u[..., None] * side + v[..., None] * along
@@ -520,9 +528,9 @@ def _sphere(radii: Floats, length: float) -> _Shape:
     rise = np.repeat([-length / 2, length / 2], len(half))
     normals = np.stack(
         [
-            np.cos(latitude)[:, None] * np.cos(around),
-            np.cos(latitude)[:, None] * np.sin(around),
-            np.broadcast_to(np.sin(latitude)[:, None], (len(latitude), len(around))),
+            _cos(latitude)[:, None] * _cos(around),
+            _cos(latitude)[:, None] * _sin(around),
+            np.broadcast_to(_sin(latitude)[:, None], (len(latitude), len(around))),
         ],
         axis=-1,
     )
@@ -533,7 +541,7 @@ def _sphere(radii: Floats, length: float) -> _Shape:
 
 def _cylinder(radius: float, length: float) -> _Shape:
     around = np.linspace(0, 2 * math.pi, _ROUND + 1)
-    circle = np.stack([np.cos(around), np.sin(around), np.zeros_like(around)], axis=-1)
+    circle = np.stack([_cos(around), _sin(around), np.zeros_like(around)], axis=-1)
     up = np.array([0.0, 0.0, length / 2])
     side = _grid(np.stack([circle * radius - up, circle * radius + up]), np.stack([circle, circle]))
     caps = [

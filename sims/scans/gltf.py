@@ -24,7 +24,8 @@ from runtime.errors import MissingDependencyError
 from runtime.extras import install_command
 from sims.scans.images import Image, decode, opaque, to_srgb
 from sims.scans.mesh_file import Floats, Material, MeshError, MeshFile, Piece
-from sims.scans.parsing import LeftOut, check_size, unique_name, unit_normals
+from sims.scans.parsing import LeftOut, check_size, unique_name
+from sims.scans.transforms import compose, moved, quaternion, scaling, seen, translation, turned
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -206,7 +207,7 @@ class _Reader:
                     "circle, found it twice in the scene"
                 )
             seen.add(number)
-            matrix = parent @ self._matrix(number, node)
+            matrix = compose(parent, self._matrix(number, node))
             if "mesh" in node:
                 mesh = self._get("meshes", node["mesh"])
                 name = node.get("name") or mesh.get("name") or f"node{number}"
@@ -217,19 +218,11 @@ class _Reader:
         if "matrix" in node:
             matrix = np.array(node["matrix"], float).reshape(4, 4).T
         else:
-            x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), float)
-            length = math.sqrt(x * x + y * y + z * z + w * w) or 1.0
-            x, y, z, w = x / length, y / length, z / length, w / length
-            rotation = np.array(
-                [
-                    [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                    [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                    [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-                ]
+            x, y, z, w = map(float, node.get("rotation", (0, 0, 0, 1)))
+            matrix = compose(
+                translation(node.get("translation", (0, 0, 0))),
+                compose(quaternion(x, y, z, w), scaling(node.get("scale", (1, 1, 1)))),
             )
-            matrix = np.eye(4)
-            matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), float)
-            matrix[:3, 3] = node.get("translation", (0, 0, 0))
         if not np.isfinite(matrix).all():
             raise MeshError(f"{self._path}: nodes[{number}]: expected a finite transform")
         return matrix
@@ -286,18 +279,17 @@ class _Reader:
         if not np.isfinite(points).all():
             raise MeshError(f"{where}: expected finite points, found others")
         corners = _corners(indices.astype(np.int32), mode)
-        if np.linalg.det(matrix[:3, :3]) < 0:
-            corners = corners[:, ::-1]
         if not len(corners):
             return None
         look = self._look(primitive.get("material"))
         places = self._places(look, values, where)
+        normals = values("NORMAL", (3,))
         return Piece(
             object=name,
             material=look.number,
-            points=points.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3],
-            corners=np.ascontiguousarray(corners),
-            normals=_turned(values("NORMAL", (3,)), matrix),
+            points=moved(points, matrix),
+            corners=seen(np.ascontiguousarray(corners), matrix),
+            normals=None if normals is None else turned(normals, matrix),
             places=places,
             colours=_colours(values("COLOR_0", (3, 4)), look.mode),
         )
@@ -317,7 +309,8 @@ class _Reader:
                 "primitives with texture coordinates and no image", "drawn in their colour"
             )
         if look.transform is not None:
-            places = places @ look.transform[:, :2].T + look.transform[:, 2]
+            u, v = places.astype(np.float64).T
+            places = np.stack([a * u + b * v + c for a, b, c in look.transform.tolist()], axis=1)
         if not np.isfinite(places).all():
             raise MeshError(f"{where}: expected finite texture coordinates")
         if not look.repeats and ((places < -1e-3) | (places > 1.001)).any():
@@ -608,13 +601,6 @@ def _corners(indices: npt.NDArray[np.int32], mode: int) -> npt.NDArray[np.int32]
     return corners
 
 
-def _turned(normals: npt.NDArray[Any] | None, matrix: Floats) -> npt.NDArray[np.float32] | None:
-    """Return unit normals in the scene; None where some are missing or the transform is flat."""
-    if normals is None or abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
-        return None
-    return unit_normals(normals.astype(np.float64) @ np.linalg.inv(matrix[:3, :3]))
-
-
 def _colours(colours: npt.NDArray[Any] | None, mode: str) -> npt.NDArray[np.uint8] | None:
     """Convert linear vertex colours to sRGB; alpha counts where the material is not opaque."""
     if colours is None:
@@ -634,7 +620,7 @@ def _transform(texture: dict[str, Any]) -> tuple[Floats | None, int]:
         return None, int(coordinates)
     (across, down) = map(float, extension.get("scale", (1, 1)))
     angle = float(extension.get("rotation", 0))
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos, sin = round(math.cos(angle), 12), round(math.sin(angle), 12)
     offset = extension.get("offset", (0, 0))
     matrix = np.array(  # counter-clockwise where v points down
         [[cos * across, sin * down, offset[0]], [-sin * across, cos * down, offset[1]]], float

@@ -126,7 +126,10 @@ def opaque(image: Image) -> Image:
 def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Convert linear light from 0 to 1 to sRGB values (IEC 61966-2-1); what is outside is cut."""
     light = np.clip(np.nan_to_num(np.asarray(linear, np.float64)), 0.0, 1.0)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    srgb: npt.NDArray[np.float64] = np.where(
+        light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055
+    )
+    return srgb.round(9)  # powers differ in their last bits from one machine to the next
 
 
 def _size(encoded: bytes) -> tuple[int, int]:

@@ -23,8 +23,8 @@ from sims.scans.parsing import (
     join,
     parse_numbers,
     refuse_cloud,
-    unit_normals,
 )
+from sims.scans.transforms import turned
 
 Integers = npt.NDArray[np.int64]
 
@@ -142,8 +142,8 @@ class _Reader:
         """Return the triangles of some corners; what differs in any number is its own vertex."""
         points, colours, places, normals = vectors
         point, place, normal = faces.points[corners], faces.places[corners], faces.normals[corners]
-        placed, turned = bool((place >= 0).any()), bool((normal >= 0).all())
-        columns = [point, *([place] if placed else []), *([normal] if turned else [])]
+        placed, lit = bool((place >= 0).any()), bool((normal >= 0).all())
+        columns = [point, *([place] if placed else []), *([normal] if lit else [])]
         first, vertex = join(*columns)
         where: npt.NDArray[np.float32] | None = None
         if placed:
@@ -163,7 +163,7 @@ class _Reader:
             material=material,
             points=points[point[first]],
             corners=vertex.reshape(-1, 3),
-            normals=unit_normals(normals[normal[first]]) if turned else None,
+            normals=turned(normals[normal[first]], np.eye(4)) if lit else None,
             places=where,
             colours=None if colours is None else colours[point[first]],
         )

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
-from sims.scans.mesh_file import Floats, MeshError
+from sims.scans.mesh_file import MeshError
 
 
 class LeftOut:
@@ -58,15 +57,6 @@ def unique_name(name: str, taken: set[str]) -> str:
     return unique
 
 
-def unit_normals(normals: npt.NDArray[np.floating]) -> npt.NDArray[np.float32] | None:
-    """Return normals of length 1, or None if one has no direction."""
-    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-    if not np.isfinite(length).all() or (length == 0).any():
-        return None
-    unit: npt.NDArray[np.float32] = (normals / length[:, None]).astype(np.float32)
-    return unit
-
-
 def fan(counts: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Cut polygons into triangles around their first corner.
 
@@ -99,17 +89,6 @@ def join(*numbers: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.intp], npt.N
         keys = keys * (int(column.max(initial=0)) + 2) + column + 1
     _, first, vertex = np.unique(keys, return_index=True, return_inverse=True)
     return first, vertex.astype(np.int32)
-
-
-def rotation(axis: Floats, angle: float) -> Floats:
-    """Return the matrix of a turn by an angle, rad, around an axis of any length (Rodrigues)."""
-    length = float(np.linalg.norm(axis))
-    if length == 0:
-        return np.eye(3)
-    x, y, z = axis / length
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turned: Floats = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
-    return turned
 
 
 def parse_numbers(text: bytes, dtype: type[Any], count: int, where: str) -> npt.NDArray[Any]:

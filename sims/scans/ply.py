@@ -21,8 +21,8 @@ from sims.scans.parsing import (
     fan,
     parse_numbers,
     refuse_cloud,
-    unit_normals,
 )
+from sims.scans.transforms import turned
 
 _TYPES = {
     "char": "i1",
@@ -113,7 +113,7 @@ def read_ply(path: Path) -> MeshFile:
             places = _columns(vertices, names).astype(np.float64)
     normals: npt.NDArray[np.float32] | None = None
     if {"nx", "ny", "nz"} <= vertices.keys():
-        normals = unit_normals(_columns(vertices, ("nx", "ny", "nz")).astype(np.float64))
+        normals = turned(_columns(vertices, ("nx", "ny", "nz")), np.eye(4))
     vertex = numbers[corners]
     wedges = faces.get("texcoord")
     if isinstance(wedges, _List) and (wedges.counts == 2 * polygons.counts).all():
