@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 # Where images are drawn, read, written or tracked.
-OPENCV_TESTS := $(addprefix tests/,events sims/cameras sims/worlds nodes/calibration nodes/data/dataset \
+OPENCV_TESTS := $(addprefix tests/,events sims/cameras sims/scans sims/worlds nodes/calibration nodes/data/dataset \
 	nodes/data/replay nodes/estimators nodes/judging/report nodes/mapping nodes/ros2/messages nodes/viewers \
 	runtime/tools/monitor)
 

@@ -31,7 +31,7 @@ Integers = npt.NDArray[np.int64]
 
 _UPS = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 _PRIMITIVES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
-_MOST_NODES = 100_000
+_MOST_NODES = 10_000
 """Of a scene: a few nodes that are instances of each other may stand for any number."""
 
 

@@ -45,7 +45,7 @@ _NOT_READ = {
     "sensor": "sensors",
     "state": "saved states",
 }
-_MOST_MODELS = 100_000
+_MOST_MODELS = 10_000
 """Of a world: a few models that include each other may stand for any number."""
 
 _Reads = Callable[[Path], MeshFile]

@@ -49,9 +49,8 @@ def read(path: Path) -> MeshFile:
     """
     reader = SUFFIXES.get(path.suffix.lower())
     if reader is None:
-        raise MeshError(
-            f"{path}: expected a mesh file ({', '.join(SUFFIXES)}), found {path.suffix or 'no'!r}"
-        )
+        suffix = repr(path.suffix) if path.suffix else "no suffix"
+        raise MeshError(f"{path}: expected a mesh file ({', '.join(SUFFIXES)}), found {suffix}")
     try:
         with np.errstate(all="ignore"):  # points that overflow are refused below
             mesh = reader(path)
