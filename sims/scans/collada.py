@@ -109,6 +109,7 @@ class _Reader:
             up=_UPS.get((self._root.findtext("asset/up_axis") or "Y_UP").strip(), "y"),
             unit=metres,
             lit=self._lit,
+            sources=tuple(self._images.paths),
             left_out=self._left_out.sentences(),
         )
 

@@ -137,6 +137,7 @@ class _Reader:
         self._models = 0
         self._triangles = 0
         self._lit = False
+        self._sources: dict[Path, None] = {}
 
     def read(self) -> MeshFile:
         root = parse_xml(self._path)
@@ -157,6 +158,7 @@ class _Reader:
             unit=1.0,
             lit=self._lit,
             solids=tuple(self._solids),
+            sources=tuple(self._sources),
             left_out=(
                 *self._left_out.sentences(),
                 *(f"{', '.join(names)}: {sentence}" for sentence, names in self._told.items()),
@@ -214,7 +216,7 @@ class _Reader:
             else:
                 self._missing[uri] = None
             return
-        file = _model_file(folder)
+        file = self._model_file(folder)
         if file not in self._documents:
             self._documents[file] = parse_xml(file)
         root = self._documents[file]
@@ -225,6 +227,22 @@ class _Reader:
             inner = place._replace(path=file, matrix=compose(place.matrix, pose))
             name = (include.findtext("name") or "").strip() or model.get("name") or "model"
             self._model(model, inner, name)
+
+    def _model_file(self, folder: Path) -> Path:
+        """Return the newest SDF of a model's folder."""
+        config = folder / "model.config"
+        file = folder if folder.is_file() else folder / "model.sdf"
+        if config.is_file():
+            self._sources[config] = None
+            versions: list[tuple[list[int], str]] = []
+            for element in parse_xml(config).findall("sdf"):
+                parts = (element.get("version") or "0").split(".")
+                numbers = [int(part) for part in parts if part.isdecimal()]
+                versions.append((numbers, (element.text or "").strip()))
+            if versions:
+                file = folder / max(versions)[1]
+        self._sources[file] = None
+        return file
 
     def _ground(self, matrix: Floats, name: str) -> None:
         """Add Gazebo's own model of a plane, which lies in no folder of the user's."""
@@ -307,6 +325,7 @@ class _Reader:
         file = file.resolve()
         if file not in self._meshes:
             self._meshes[file] = self._read_mesh(file), -1
+            self._sources |= dict.fromkeys(self._meshes[file][0].sources)
         mesh, first = self._meshes[file]
         if first < 0 and not solid:
             first = len(self._materials)
@@ -366,6 +385,7 @@ class _Reader:
                 image = None
                 if file is not None:
                     image = Images([file.parent], self._left_out).load(file.name)
+                    self._sources[file] = None
                 else:
                     self._left_out.note(f"image {albedo!r}", "not found")
                 if image is not None:
@@ -380,20 +400,6 @@ class _Reader:
             red, green, blue, alpha = look.colour
             look = look._replace(colour=(red, green, blue, alpha * (1 - min(clear, 1.0))))
         return look if look is own else look._replace(blend=look.colour[3] < 1)
-
-
-def _model_file(folder: Path) -> Path:
-    """Return the newest SDF of a model's folder."""
-    if folder.is_file():
-        return folder
-    config = folder / "model.config"
-    if not config.is_file():
-        return folder / "model.sdf"
-    versions: list[tuple[tuple[int, ...], str]] = []
-    for element in parse_xml(config).findall("sdf"):
-        digits = [part for part in (element.get("version") or "0").split(".") if part.isdecimal()]
-        versions.append((tuple(map(int, digits)), (element.text or "").strip()))
-    return folder / (max(versions)[1] if versions else "model.sdf")
 
 
 def _numbers(

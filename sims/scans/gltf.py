@@ -125,6 +125,7 @@ class _Reader:
         self._looks: dict[int | None, _Look] = {}
         self._materials: list[Material] = []
         self._left_out = LeftOut()
+        self._sources: list[Path] = []
         self._most = 16 * path.stat().st_size + 2**20  # of zeros that an accessor stands for
 
     def read(self) -> MeshFile:
@@ -155,6 +156,7 @@ class _Reader:
             up="y",
             unit=1.0,
             lit=bool(lights),
+            sources=tuple(self._sources),
             left_out=self._left_out.sentences(),
         )
 
@@ -562,10 +564,13 @@ class _Reader:
             except binascii.Error as error:
                 raise MeshError(f"{where}: expected base64, found: {error}") from error
         for name in (unquote(uri), uri):
+            path = self._path.parent / name
             try:
-                return (self._path.parent / name).read_bytes()
+                data = path.read_bytes()
             except (OSError, ValueError):  # no such file, or no name of a file
                 continue
+            self._sources.append(path)
+            return data
         raise MeshError(
             f"{where}: expected a file {uri[:200]!r} in {self._path.parent}, found none"
         )

@@ -92,6 +92,7 @@ class Images:
         self._folders = tuple(folders)
         self._left_out = left_out
         self._images: dict[str, Image | None] = {}
+        self.paths: list[Path] = []  # of the images that were found
 
     def load(self, name: str) -> Image | None:
         """Return the image of a name as the mesh has it, or None."""
@@ -104,6 +105,7 @@ class Images:
         if path is None:
             self._left_out.note(f"image {name!r}", "not found; drawn in the material's colour")
             return None
+        self.paths.append(path)
         try:
             return decode(path.read_bytes(), str(path))
         except (MeshError, OSError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -50,4 +51,5 @@ class MeshFile(NamedTuple):
     unit: float = 0.0  # metres of its unit; 0 if the file does not say
     lit: bool = False  # whether the file has lights of its own
     solids: tuple[Piece, ...] = ()  # the file's collision meshes; empty if it has none
+    sources: tuple[Path, ...] = ()  # all files that it was read from; the first is the file itself
     left_out: tuple[str, ...] = ()  # sentences: what is not drawn, how often, and what to do

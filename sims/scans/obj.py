@@ -79,6 +79,7 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._left_out = LeftOut()
+        self._sources: list[Path] = []  # of materials and images
         text = path.read_bytes()
         if b"\\\n" in text or b"\\\r\n" in text:
             text = re.sub(rb"\\\r?\n", b" ", text)
@@ -134,7 +135,12 @@ class _Reader:
             index, material = divmod(int(number), len(names))
             corners = triangles[rows].reshape(-1)
             pieces.append(self._piece(objects[index], material, corners, faces, vectors))
-        return MeshFile(tuple(pieces), tuple(materials), left_out=self._left_out.sentences())
+        return MeshFile(
+            pieces=tuple(pieces),
+            materials=tuple(materials),
+            sources=tuple(self._sources),
+            left_out=self._left_out.sentences(),
+        )
 
     def _piece(
         self, name: str, material: int, corners: Integers, faces: _Faces, vectors: _Vectors
@@ -353,12 +359,15 @@ class _Reader:
         unknown = [name for name in names if name and name not in known]
         self._left_out.note("materials that no file describes", "drawn white", len(unknown))
         images = {path: Images([path.parent, folder], self._left_out) for path, _ in known.values()}
-        return [
+        materials = [
             self._material(known[name][0], name, known[name][1], images[known[name][0]])
             if name in known
             else Material(name)
             for name in names
         ]
+        for path, source in images.items():
+            self._sources += [path, *source.paths]
+        return materials
 
     def _material(self, path: Path, name: str, values: dict[str, str], images: Images) -> Material:
         for keyword in values.keys() & _MAPS.keys():
@@ -368,6 +377,8 @@ class _Reader:
             alpha = _number(path, name, "d", values["d"].removeprefix("-halo"))
         elif "tr" in values:
             alpha = 1 - _number(path, name, "Tr", values["tr"])
+        if not 0 < alpha < 1:  # MeshLab means "opaque" by "Tr 1", by which others mean "invisible"
+            alpha = 1.0
         image: Image | None = None
         mask: Image | None = None
         if values.get("map_kd"):
@@ -382,7 +393,7 @@ class _Reader:
         if image is not None and mask is not None:
             shades = mask[..., 3:] if mask.shape[2] == 4 else mask[..., :1]
             image = np.concatenate([image, shades], axis=2)
-        colour: Colour = (1.0, 1.0, 1.0, min(max(alpha, 0.0), 1.0))
+        colour: Colour = (1.0, 1.0, 1.0, alpha)
         shade = values.get("kd", "").split()
         if image is None and len(shade) >= 3:
             red, green, blue = (

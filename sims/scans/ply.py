@@ -156,7 +156,12 @@ def read_ply(path: Path) -> MeshFile:
                 colours=colours,
             )
         )
-    return MeshFile(tuple(pieces), tuple(materials), left_out=left_out.sentences())
+    return MeshFile(
+        pieces=tuple(pieces),
+        materials=tuple(materials),
+        sources=tuple(sources.paths),
+        left_out=left_out.sentences(),
+    )
 
 
 def _header(path: Path, data: bytes) -> tuple[str, list[_Element], list[str], int]:

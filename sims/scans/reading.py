@@ -69,7 +69,7 @@ def read(path: Path) -> MeshFile:
         raise MeshError(f"{path}: expected triangles, found none{left_out}")
     for piece in (*mesh.pieces, *mesh.solids):
         _check(path, piece)
-    return mesh
+    return mesh._replace(sources=(path, *mesh.sources))
 
 
 def _check(path: Path, piece: Piece) -> None:

@@ -108,6 +108,25 @@ def test_the_same_file_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
         assert one.corners.tobytes() == other.corners.tobytes()
 
 
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("u2.glb", {"u2.glb"}),
+        ("beside.gltf", {"beside.gltf", "beside.bin"}),
+        ("room.obj", {"room.obj", "room.mtl", "wall.png", "tiles.png"}),
+        ("room.dae", {"room.dae", "wall.png", "tiles.png"}),
+        ("room.world", {"room.world", "model.config", "model.sdf", "room.dae", "wall.png",
+                        "tiles.png"}),
+    ],
+)  # fmt: skip
+def test_all_files_that_a_mesh_is_of_are_named(tmp_path: Path, name: str, files: set[str]) -> None:
+    path = write(tmp_path, name)
+    sources = read(path).sources
+    assert sources[0] == path
+    assert {source.name for source in sources} == files
+    assert all(source.is_file() for source in sources)
+
+
 def test_a_suffix_may_be_in_capitals(tmp_path: Path) -> None:
     path = tmp_path / "ROOM.STL"
     path.write_bytes(kit.stl(SCENE))

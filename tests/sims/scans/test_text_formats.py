@@ -127,6 +127,15 @@ def test_an_alpha_map_cuts_its_image(reads: Reads, tmp_path: Path) -> None:
     assert np.array_equal(look.image, IMAGE)
 
 
+@pytest.mark.parametrize(
+    ("line", "alpha"), [("d 0.5", 0.5), ("Tr 0.25", 0.75), ("d 1", 1.0), ("Tr 1", 1.0)]
+)
+def test_nothing_is_invisible(reads: Reads, line: str, alpha: float) -> None:
+    mesh = reads(f"mtllib mesh.mtl\n{POINTS}usemtl a\nf 1 2 3\n", mtl=f"newmtl a\n{line}\n")
+    look = mesh.materials[mesh.pieces[0].material]
+    assert (look.colour[3], look.blend) == (alpha, alpha < 1)
+
+
 def test_what_an_obj_loses_is_told(reads: Reads) -> None:
     mesh = reads(
         f"mtllib gone.mtl mesh.mtl\n{POINTS}usemtl a\nf 1/7 2/7 3/7\nf 1 2\nl 1 2\n"
