@@ -31,7 +31,6 @@ class Band {
         float nearest;  // inverse depth in the middle
     };
     static constexpr int most_side_by_side = 16;
-    static constexpr int all_lit = 1, all_dark = 2;  // of tiles
 
     // A mipmap's level whose texels are as large as a pixel blurs more than the pixel; so many 256ths
     // below it are nearer to the mean of 16 samples. 128 would be nearest, but too far from MuJoCo's.
@@ -68,7 +67,7 @@ class Band {
     void place(int y);
     template <bool pinhole>
     void place(const Span& span, int y, const float* nearest);
-    fv reaches(std::int32_t caster, const Shade& shade, fv x, fv y, fv z, int count);
+    Area area(std::int32_t caster, const Shade& shade, const Span& span, int y);
     int tile(std::int32_t caster, const Shade& shade, int column, int row, bool look);
     void place_sky(int y, int left, int right);
     void plain(int x);
@@ -109,6 +108,7 @@ class Band {
     std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
     std::vector<Surface> surfaces_;
     std::vector<Shade> shades_;
+    std::vector<Area> areas_;  // of the lights, for a span
     std::vector<std::vector<std::int32_t>> surface_of_;  // by part and triangle; -1: none yet
 };
 

@@ -148,6 +148,13 @@ struct Shade {  // of a light that throws shadows, on a triangle: all but `depth
     std::uint32_t spread;  // where the tiles are that are known of it, in a table
 };
 
+constexpr int all_lit = 1, all_dark = 2;
+
+struct Area {  // of a light's map, pixels; state 0 if it is not known
+    int state;
+    float left, right, top, bottom;
+};
+
 struct Tile {  // of a light's map, as the plane of a triangle sees it
     std::int32_t caster = -1, place;
     std::uint32_t change;

@@ -127,37 +127,34 @@ std::int32_t Band::surface(std::int32_t number, int y) {
 
 // How much of a light reaches points, which are seen from it: of four pixels of its map about each,
 // those that see nothing before the triangle's plane, weighted by their distance. So no surface is
-// in its own shadow, however steep. Of `count` points side by side on a large triangle, mostly in
-// one or two tiles of the map that are lit or dark as a whole, no pixel is looked at.
-fv Band::reaches(std::int32_t caster, const Shade& shade, fv x, fv y, fv z, int count) {
-    const Light& light = scene_.casters_[caster];
+// in its own shadow, however steep. Where the first `count` points are in an area that is lit or
+// dark as a whole, no pixel is looked at.
+static fv reaches(const Light& light, const Shade& shade, const Area& area, fv x, fv y, fv z,
+                  int count) {
     const auto step = static_cast<float>(light.step), per_step = static_cast<float>(1 / light.step);
     const float middle = 0.5f * static_cast<float>(light.size - 1);
     const fv inverse = per_step / z, column = x * inverse + middle, row = y * inverse + middle;
-    const iv inside = (column >= 0.0f) & (column < 2 * middle) & (row >= 0.0f) &
-                      (row < 2 * middle) & (z > 0.0f);
-    const fv left = floored(inside ? column : fv{}), top = floored(inside ? row : fv{});
-    const fv right_share = column - left, lower_share = row - top;
-    const fv left_share = 1.0f - right_share, upper_share = 1.0f - lower_share;
-    const fv shares[4] = {left_share * upper_share, right_share * upper_share,
-                          left_share * lower_share, right_share * lower_share};
-    const iv columns = as_whole(left), rows = as_whole(top);
-    const int last = std::min(count, lanes) - 1;
-    const iv across = columns / tile_side, down = rows / tile_side;
-    const int c = across[0], r = down[0], d = across[last], s = down[last];
-    const iv others = ~(((across == c) | (across == d)) & ((down == r) | (down == s)));
-    if (!(bits(others) & ((2 << last) - 1))) {
-        const bool look = count >= lanes;
-        int found = tile(caster, shade, c, r, look);
-        if (c != d) found &= tile(caster, shade, d, r, look);
-        if (r != s) found &= tile(caster, shade, c, s, look);
-        if (c != d && r != s) found &= tile(caster, shade, d, s, look);
-        if (found & all_lit)
-            return inside ? shares[0] + shares[1] + shares[2] + shares[3] : fv{} + 1.0f;
-        if (found & all_dark) return inside ? fv{} : fv{} + 1.0f;
+    const auto within = [&](float left, float right, float top, float bottom) {
+        return (column >= left) & (column < right) & (row >= top) & (row < bottom) & (z > 0.0f);
+    };
+    const auto shares = [](fv right, fv lower, fv (&to)[4]) {
+        const fv left = 1.0f - right, upper = 1.0f - lower;
+        to[0] = left * upper, to[1] = right * upper, to[2] = left * lower, to[3] = right * lower;
+    };
+    fv share[4];
+    if (area.state) {
+        const iv there = within(area.left, area.right, area.top, area.bottom);
+        if (!(~bits(there) & ((1 << std::min(count, lanes)) - 1))) {
+            if (area.state == all_dark) return fv{};
+            shares(column - floored(column), row - floored(row), share);
+            return share[0] + share[1] + share[2] + share[3];
+        }
     }
+    const iv inside = within(0, 2 * middle, 0, 2 * middle);
+    const fv left = floored(inside ? column : fv{}), top = floored(inside ? row : fv{});
+    shares(column - left, row - top, share);
     std::int32_t first[lanes];
-    store(first, rows * light.size + columns);
+    store(first, as_whole(top) * light.size + as_whole(left));
     fv lit{};
     for (int k = 0; k < 4; ++k) {
         const int right = k & 1, lower = k >> 1;
@@ -166,16 +163,53 @@ fv Band::reaches(std::int32_t caster, const Shade& shade, fv x, fv y, fv z, int 
             depths[lane] = light.map[first[lane] + right + lower * light.size];
         const fv across = (left + (right - middle)) * step, down = (top + (lower - middle)) * step;
         const fv plane = across * shade.depth[0] + (down * shade.depth[1] + shade.depth[2]);
-        lit += load<fv>(depths) * plane < 1.0f - rounding ? fv{} : shares[k];
+        lit += load<fv>(depths) * plane < 1.0f - rounding ? fv{} : share[k];
     }
     return inside ? lit : fv{} + 1.0f;
+}
+
+// The tiles of a light's map about the two ends of a span, if they are few and it is known of them
+// all that they are lit, or dark.
+Area Band::area(std::int32_t caster, const Shade& shade, const Span& span, int y) {
+    const Light& light = scene_.casters_[caster];
+    const float middle = 0.5f * static_cast<float>(light.size - 1), end = 2 * middle;
+    const auto per_step = static_cast<float>(1 / light.step);
+    float low[2] = {end, end}, high[2] = {0, 0};
+    for (const int x : {span.x, span.x + span.count - 1}) {
+        const Vec3f ray = lens_.ray(x, y);
+        const auto times = [&](int k) {
+            const float(&plane)[3] = shade.place[k];
+            return ray.x * plane[0] + (ray.y * plane[1] + ray.z * plane[2]);
+        };
+        const float share = per_step / times(2);
+        for (int k = 0; k < 2; ++k) {
+            const float at = times(k) * share + middle;
+            if (!(at >= 0 && at < end)) return {};
+            low[k] = std::min(low[k], at), high[k] = std::max(high[k], at);
+        }
+    }
+    constexpr int most = 6;
+    constexpr float near = 0.01f;  // a little more, for rounding
+    int from[2], to[2];
+    for (int k = 0; k < 2; ++k) {
+        from[k] = static_cast<int>(std::max(low[k] - near, 0.0f)) / tile_side;
+        to[k] = static_cast<int>(high[k] + near) / tile_side + 1;
+    }
+    if ((to[0] - from[0]) * (to[1] - from[1]) > most) return {};
+    int state = all_lit | all_dark;
+    const bool look = span.count >= lanes;
+    for (int row = from[1]; row < to[1]; ++row)
+        for (int column = from[0]; column < to[0]; ++column)
+            if (!(state &= tile(caster, shade, column, row, look))) return {};
+    const auto edge = [&](int tiles) { return std::min(float(tiles * tile_side), end); };
+    return {state, edge(from[0]), edge(to[0]), edge(from[1]), edge(to[1])};
 }
 
 // What is known of the pixels of a tile of a light's map, and those to its right and below it, on a
 // triangle: `all_lit`, `all_dark` or 0, by the same arithmetic as above; 0 if that is not known and
 // not worth a look. It stays known until the map is drawn there.
 int Band::tile(std::int32_t caster, const Shade& shade, int column, int row, bool look) {
-    constexpr std::uint32_t known = 8192;
+    constexpr std::uint32_t known = 4096;
     const Light& light = scene_.casters_[caster];
     const std::int32_t place = row * tiles_across(light.size) + column;
     const std::uint32_t change = light.changes[place];
@@ -280,6 +314,11 @@ void Band::place(const Span& span, int y, const float* nearest) {
     const Texture* texture = surface.texture;
     const int level = span.level;
     int x = span.x;
+    const auto casters = static_cast<std::int32_t>(scene_.casters_.size());
+    areas_.resize(casters);
+    for (std::int32_t caster = 0; caster < casters; ++caster)
+        if (const Shade& shade = shades_[surface.shades + caster]; shade.shines)
+            areas_[caster] = area(caster, shade, span, y);
     const std::size_t row = pinhole ? 0 : std::size_t(y) * lens_.stride;
     for (const int end = x + span.count; x < end; x += lanes, nearest += lanes) {
         const fv inverse = 1.0f / load<fv>(nearest);
@@ -303,12 +342,12 @@ void Band::place(const Span& span, int y, const float* nearest) {
         } else {
             fv light[3];
             for (int k = 0; k < 3; ++k) light[k] = times(surface.light[k]);
-            const auto casters = static_cast<std::int32_t>(scene_.casters_.size());
             for (std::int32_t caster = 0; caster < casters; ++caster) {
                 const Shade& of = shades_[surface.shades + caster];
                 if (!of.shines) continue;
-                const fv lit = reaches(caster, of, times(of.place[0]), times(of.place[1]),
-                                       times(of.place[2]), end - x);
+                const fv lit =
+                    reaches(scene_.casters_[caster], of, areas_[caster], times(of.place[0]),
+                            times(of.place[1]), times(of.place[2]), end - x);
                 for (int k = 0; k < 3; ++k) light[k] += lit * times(of.light[k]);
             }
             taps_.set(Taps::red_blue, x, share(light[0]) | share(light[2]) << 16);

@@ -179,7 +179,7 @@ struct Box {  // pixels: to right - 1 and bottom - 1
     std::int32_t left, right, top, bottom;
 };
 
-constexpr int tile_side = 8;  // pixels of a light's map
+constexpr int tile_side = 16;  // pixels of a light's map
 inline int tiles_across(int size) { return (size + tile_side - 1) / tile_side; }
 
 struct Light {
