@@ -160,8 +160,9 @@ def test_commands_name_what_there_is(words: str) -> None:
     assert help_.returncode == 0, help_.stderr
     for option in (word for word in arguments if word.startswith("--")):
         assert option in help_.stdout, option
-    files = [word for word in arguments if word.endswith(".toml")]
     pairs = list(itertools.pairwise(arguments))
+    written = [value for option, value in pairs if option == "--config"]
+    files = [word for word in arguments if word.endswith(".toml") and word not in written]
     changes = [value for option, value in pairs if option == "--set"]
     changes += [value.split(",")[0] for option, value in pairs if option == "--vary"]
     if name == "demo":

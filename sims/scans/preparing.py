@@ -18,6 +18,7 @@ from sims.scans.textures import extended, fitted
 MOST_TRIANGLES = 4000  # of a part: what is out of view or hidden is left out part by part
 MOST_OBJECTS = 1000  # that are told apart: each costs physics some time
 FARTHEST = 20_000.0  # metres from the origin, where float32 still tells 2 mm apart
+MANY_BOXES = 10_000  # 0.15 ms a step of the physics
 ALPHA_CUTOFF = 0.5  # of images whose alpha is opacity
 _UP = {  # rows of the turn from a file's axes to x north, y west, z up
     "x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
@@ -85,6 +86,11 @@ def prepare(file: MeshFile, spec: MeshSpec, solids: MeshFile | None = None) -> P
     elif spec.solid == "voxels":
         touched = _joined(collision) if collision else (points, corners)
         boxes = voxel_boxes(*touched, spec.voxel, floor)
+        if len(boxes) > MANY_BOXES:
+            notes.append(
+                f"solid: {len(boxes):,} boxes, which slow the physics; a voxel of "
+                f"{2.0 * spec.voxel:g} m makes fewer"
+            )
     return Prepared(
         parts, tuple(_materials(file, spec, notes)), hulls, boxes, floor, baked, extent,
         tuple(notes),

@@ -200,7 +200,7 @@ def find_floor(points: Floats, corners: Corners) -> Floor:
     if lower * _LOWER > len(layers):
         return Floor(None, f"{lower / len(layers):.0%} of the ground is below its lowest level")
     heights = (triangles[:, 0, 2] + triangles[:, 1, 2] + triangles[:, 2, 2]) / 3.0
-    within = abs(heights - (base + level + 0.5) * _LAYER) <= _LAYER
+    within = abs(heights - (base + level + 0.5) * _LAYER) <= 1.001 * _LAYER
     order = np.argsort(heights[within], kind="stable")
     shares = np.cumsum(areas[within][order])
     if not len(shares):

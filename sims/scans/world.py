@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from sims.scans.files import content, recorded
 from sims.scans.images import Image, decode
 from sims.scans.kept import kept
 from sims.scans.mesh_file import Material, MeshError, MeshFile
@@ -44,19 +43,20 @@ def prepared_mesh(path: Path, mesh: MeshSpec = USUAL) -> Prepared:
         )
 
     def make() -> tuple[Prepared, Sequence[Path]]:
-        with recorded() as files:
-            file = read(path)
-            solids = read(other) if other is not None else None
-            if mesh.image:
-                file = _with_image(file, _image(Path(mesh.image)))
-        return prepare(file, mesh, solids), files
+        file = read(path)
+        solids = read(other) if other is not None else None
+        sources = [*file.sources, *(solids.sources if solids else ())]
+        if mesh.image:
+            sources.append(Path(mesh.image))
+            file = _with_image(file, _image(Path(mesh.image)))
+        return prepare(file, mesh, solids), sources
 
     return kept(path, mesh, make)
 
 
 def _image(path: Path) -> Image:
     try:
-        return decode(content(path), str(path))
+        return decode(path.read_bytes(), str(path))
     except OSError as error:
         raise MeshError(f"{path}: expected an image to read, found: {error.strerror}") from None
 

@@ -16,7 +16,6 @@ class VehicleMotion(Protocol):
 
     model: Any  # the compiled world
 
-
     @property
     def thrusts(self) -> Any:
         """Thrust of each rotor at present, 0 to 1 of its greatest; zeros without rotors."""

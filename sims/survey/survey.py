@@ -22,12 +22,12 @@ from events.frames import from_rpy
 from runtime.errors import CommandError
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.cameras.renderer import Shot
-from sims.scans.free_space import find_free_space
 from sims.scans.mesh_file import Floats
 from sims.scans.settings import MeshSpec
 from sims.scans.solids import voxelise
 from sims.scans.world import build, prepared_mesh
 from sims.sensors.rays import Rays
+from sims.survey.free_space import find_free_space
 from sims.worlds.dynamics import Dynamics
 
 Image = npt.NDArray[np.uint8]
@@ -90,7 +90,7 @@ class Survey:
         model = spec.compile()
         self._stage = CameraRenderer(model_to_bytes(model), (CAMERA,), prefix, 0, 1)
         self.load_seconds = time.process_time() - start
-        self._voxels = voxelise(*self._triangles(), mesh.voxel, self.prepared.floor or 0.0)
+        self._voxels = voxelise(*self._triangles(), mesh.voxel, self.prepared.floor or 0.0).filled()
         self.space = find_free_space(self._voxels, self.prepared.floor)
         self._rays = Rays(model, Dynamics(), "survey")
         self._images: list[Image] = []

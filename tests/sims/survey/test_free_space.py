@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sims.carried.clearance import Clearance
-from sims.scans.free_space import LENGTH, FreeSpace, find_free_space
 from sims.scans.solids import add_solids, find_floor, voxelise
+from sims.survey.free_space import LENGTH, FreeSpace, find_free_space
 from sims.vehicle import STANDING_HEIGHT, attach_vehicle
 from sims.vehicle import autopilot as vehicles
 from sims.worlds import CLEARANCE

@@ -33,7 +33,7 @@ def world(
     """
     from runtime.config.overrides import override
     from runtime.config.reading import parse
-    from sims.scans.survey import Survey
+    from sims.survey.survey import Survey
     from sims.world import WorldConfig
 
     table = {"nodes": [{"name": "scan", "type": "World", "world": str(file.absolute())}]}

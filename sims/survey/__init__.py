@@ -1,0 +1,1 @@
+"""A mesh file as a world, looked at before anybody flies in it."""
