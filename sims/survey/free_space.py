@@ -26,6 +26,7 @@ HEIGHTS = (1.5, 1.25, 1.75, 1.0, 2.0)  # of a tour above the ground, metres, by 
 HALF_WIDTH = 0.33  # of a vehicle, to the tips of its propellers, metres
 ENOUGH = 1.5  # metres of clearance of which more is not looked for
 
+_ROUGH = 0.2  # metres that scanned ground may be above the plane that stands for it
 _MOST = 2_000_000  # cells of the grid; larger meshes have larger cells
 _SLACK = 1.1  # cells from a point near a cell's middle to the surface of another, more than between
 _SPACING = 0.3  # of the points between which paths are looked for, metres
@@ -82,9 +83,8 @@ def find_free_space(voxels: Voxels, floor: float | None = None) -> FreeSpace | N
     level, tour = best
     i, j = level.start
     x, y, _ = grid.middle(i, j, 0)
-    ground = grid.height(int(level.ground[i, j])) if floor is None else floor
     volume = grid.reachable((i, j, level.layer))
-    return FreeSpace(volume, (x, y, round(ground, 3)), tour)
+    return FreeSpace(volume, (x, y, round(level.ground_at_start(), 3)), tour)
 
 
 class _Grid:
@@ -168,18 +168,19 @@ class _Level(NamedTuple):
         up = round((height - grid.margin) / step - 0.5)
         ground = _ground(grid.solid, up + 1 + math.ceil(HALF_WIDTH / step))
         ground[~grid.shown] = -1
-        # The floor is a plane; other ground may be uneven by a cell.
-        if grid.floor is None:
-            least, most = (f(ground, 3) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
-            level = (least >= 0) & (most - least <= 1)
-        else:
-            level = ground == 1
-        aside = ndimage.distance_transform_edt(np.pad(level, 1), step)[1:-1, 1:-1]
         layers = np.maximum(ground + up, 0)
         least_room = clearance + _SLACK * step
         rooms = np.take_along_axis(grid.room, layers[:, :, None], axis=2)[:, :, 0]
-        fits = level & (aside >= grid.fit) & (rooms >= least_room)
-        if not fits.any():
+        least, most = (f(ground, 3) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+        flat = ground == 1 if grid.floor is not None else (least >= 0) & (most == least)
+        # A rough scan's floor, or terrain, may be nowhere flat: then uneven by a cell.
+        highest = grid.solid.shape[2] if grid.floor is None else 1.0 + _ROUGH / step
+        for level in (flat, (least >= 0) & (most - least <= 1) & (most <= highest)):
+            aside = ndimage.distance_transform_edt(np.pad(level, 1), step)[1:-1, 1:-1]
+            fits = (aside >= grid.fit) & (rooms >= least_room)
+            if fits.any():
+                break
+        else:
             return None
         middle = np.argwhere(grid.shown).mean(axis=0)
         away = np.sqrt(((np.indices(fits.shape).T - middle) ** 2).sum(axis=-1)).T * step
@@ -195,6 +196,14 @@ class _Level(NamedTuple):
         score[~clear] = -np.inf
         i, j = np.unravel_index(int(score.argmax()), score.shape)
         return cls(grid, layer, clear, (int(i), int(j)), ground)
+
+    def ground_at_start(self) -> float:
+        """Return the height of the highest ground below a vehicle at the start."""
+        (i, j), reach = self.start, math.ceil(HALF_WIDTH / self.grid.step)
+        i, j = max(i - reach, 0), max(j - reach, 0)
+        layer = int(self.ground[i : i + 2 * reach + 1, j : j + 2 * reach + 1].max())
+        floor = self.grid.floor
+        return self.grid.height(layer) if floor is None or layer > 1 else floor
 
     def tour(self) -> Tour:
         """Return a tour from above the start, by places far from each other, and back."""

@@ -110,6 +110,15 @@ def test_outside_of_a_house_nothing_is_to_be_seen() -> None:
     assert ((y < 2.6) | (x < 0.0)).all()
 
 
+def test_a_floor_that_is_rough_is_stood_on() -> None:
+    """All over it are voxels above the plane, some of two layers."""
+    points, corners = ground(8.0, 160, lambda x, y: 0.0)
+    noise = np.random.default_rng(1).normal(0.0, 0.03, len(points))
+    mesh = together((points + noise[:, None] * (0.0, 0.0, 1.0), corners), room(8.0, 8.0, 3.0))
+    space = explored(mesh, 0.1)
+    assert space.start[2] in (0.15, 0.25)
+
+
 def test_hills_are_flown_over_at_one_height() -> None:
     space = explored(ground(40.0, 30, lambda x, y: 1.5 * np.sin(x / 6.0) * np.cos(y / 7.0)), 0.3)
     assert space.tour.length > 0.75 * LENGTH
