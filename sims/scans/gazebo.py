@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sims.scans.collada import parse_xml
-from sims.scans.images import Images, opaque
+from sims.scans.images import Image, Images, opaque
 from sims.scans.mesh_file import Colour, Floats, Material, MeshError, MeshFile, Piece
 from sims.scans.parsing import LeftOut, check_size, unique_name
 from sims.scans.transforms import (
@@ -48,6 +48,24 @@ _NOT_READ = {
 _MOST_MODELS = 10_000
 """Of a world: a few models that include each other may stand for any number."""
 
+_COLOURS: dict[str, Colour] = {
+    "Gazebo/Black": (0.0, 0.0, 0.0, 1.0),
+    "Gazebo/Blue": (0.0, 0.0, 1.0, 1.0),
+    "Gazebo/DarkGrey": (0.175, 0.175, 0.175, 1.0),
+    "Gazebo/DarkYellow": (0.7, 0.7, 0.0, 1.0),
+    "Gazebo/FlatBlack": (0.1, 0.1, 0.1, 1.0),
+    "Gazebo/Green": (0.0, 1.0, 0.0, 1.0),
+    "Gazebo/Grey": (0.7, 0.7, 0.7, 1.0),
+    "Gazebo/Orange": (1.0, 0.5088, 0.0468, 1.0),
+    "Gazebo/Purple": (1.0, 0.0, 1.0, 1.0),
+    "Gazebo/Red": (1.0, 0.0, 0.0, 1.0),
+    "Gazebo/SkyBlue": (0.13, 0.44, 0.7, 1.0),
+    "Gazebo/Turquoise": (0.0, 1.0, 1.0, 1.0),
+    "Gazebo/White": (1.0, 1.0, 1.0, 1.0),
+    "Gazebo/Yellow": (1.0, 1.0, 0.0, 1.0),
+}
+"""Plain ones of Gazebo's own scripts, which lie in no folder of the user's."""
+
 _Reads = Callable[[Path], MeshFile]
 
 
@@ -72,14 +90,6 @@ class _Place(NamedTuple):
     name: str = ""  # of the object that it belongs to: a model that is in no other
     depth: int = 0
     static: bool = False
-
-
-class _Shape(NamedTuple):
-    """Triangles in the frame of a geometry."""
-
-    points: Floats
-    corners: npt.NDArray[np.int32]
-    normals: npt.NDArray[np.floating] | None = None
 
 
 class _Scope:
@@ -309,11 +319,10 @@ class _Reader:
                 material = self._add_material(self._look(element, place.path, grey))
                 self._add(placed, place.name, material, self._pieces)
 
-    def _add(self, shape: _Shape, name: str, material: int, pieces: list[Piece]) -> None:
-        self._triangles += len(shape.corners)
+    def _add(self, piece: Piece, name: str, material: int, pieces: list[Piece]) -> None:
+        self._triangles += len(piece.corners)
         check_size(self._path, self._triangles)
-        normals = None if shape.normals is None else shape.normals.astype(np.float32)
-        pieces.append(Piece(name, material, shape.points, shape.corners, normals))
+        pieces.append(piece._replace(object=name, material=material))
 
     def _mesh(self, element: ET.Element, shape: ET.Element, place: _Place, solid: bool) -> None:
         matrix, path, name, *_ = place
@@ -351,7 +360,7 @@ class _Reader:
                 matrix = compose(matrix, translation(-middle))
         changed: dict[int, int] = {}
         for piece in pieces:
-            placed = _placed(_Shape(piece.points, piece.corners, piece.normals), matrix)
+            placed = _placed(piece, matrix)
             if solid:
                 self._add(placed, name, 0, self._solids)
                 continue
@@ -361,7 +370,6 @@ class _Reader:
                 look = self._look(element, path, own)
                 changed[number] = number if look is own else self._add_material(look)
             self._add(placed, name, changed[number], self._pieces)
-            self._pieces[-1] = self._pieces[-1]._replace(places=piece.places, colours=piece.colours)
 
     # Materials.
 
@@ -374,25 +382,17 @@ class _Reader:
         look = own
         material = visual.find("material")
         if material is not None:
-            script = (material.findtext("script/name") or "").strip()
             albedo = (material.findtext("pbr/metal/albedo_map") or "").strip()
-            if script:
-                self._left_out.note(
-                    f"material script {script}", "not read; drawn in its own colour"
-                )
-            if albedo:
-                file = self._find(albedo, path.parent)
-                image = None
-                if file is not None:
-                    image = Images([file.parent], self._left_out).load(file.name)
-                    self._sources[file] = None
-                else:
-                    self._left_out.note(f"image {albedo!r}", "not found")
-                if image is not None:
-                    look = look._replace(image=opaque(image), colour=(1.0, 1.0, 1.0, 1.0))
             diffuse = material.find("diffuse")
-            if diffuse is not None and look.image is None:
-                look = look._replace(colour=_colour(path, diffuse))
+            script = material.find("script")
+            colour = None if diffuse is None else _colour(path, diffuse)
+            image = self._image(albedo, [path.parent]) if albedo else None
+            if script is not None and image is None:
+                colour, image = self._script(script, path, colour)
+            if image is not None:
+                look = look._replace(image=opaque(image), colour=(1.0, 1.0, 1.0, 1.0))
+            elif colour is not None and look.image is None:
+                look = look._replace(colour=colour)
             if (material.findtext("double_sided") or "").strip() in ("1", "true"):
                 look = look._replace(double_sided=True)
         clear = float(_numbers(path, visual.find("transparency"), 1, (0.0,))[0])
@@ -400,6 +400,57 @@ class _Reader:
             red, green, blue, alpha = look.colour
             look = look._replace(colour=(red, green, blue, alpha * (1 - min(clear, 1.0))))
         return look if look is own else look._replace(blend=look.colour[3] < 1)
+
+    def _image(self, name: str, folders: list[Path]) -> Image | None:
+        """Return an image by a URI or by its name in some folders."""
+        file = self._find(name, folders[0])
+        if file is not None and file.is_file():
+            name, folders = file.name, [file.parent]
+        images = Images(folders, self._left_out)
+        image = images.load(name)
+        self._sources |= dict.fromkeys(images.paths)
+        return image
+
+    def _script(
+        self, script: ET.Element, path: Path, colour: Colour | None
+    ) -> tuple[Colour | None, Image | None]:
+        """Return the colour and the image of a material of OGRE's scripts: the first of each."""
+        name = (script.findtext("name") or "").strip()
+        uris = [(element.text or "").strip() for element in script.findall("uri")]
+        folders = [file for file in (self._find(uri, path.parent) for uri in uris) if file]
+        for folder in folders:
+            files = [folder] if folder.is_file() else sorted(folder.glob("*.material"))
+            for file in files:
+                block = _block(file.read_text(encoding="utf-8", errors="replace"), name)
+                if block is None:
+                    continue
+                self._sources[file] = None
+                texture = re.search(r"\stexture\s+(\S+)", block)
+                diffuse = re.search(r"\sdiffuse((?:\s+[\d.]+){3})", block)
+                if diffuse is not None and colour is None:
+                    red, green, blue = (min(float(word), 1.0) for word in diffuse[1].split())
+                    colour = (red, green, blue, 1.0)
+                near = [*(f if f.is_dir() else f.parent for f in folders), file.parent]
+                return colour, self._image(texture[1], near) if texture else None
+        if name not in _COLOURS:
+            self._left_out.note(f"material script {name}", "not found; drawn in its own colour")
+        return colour or _COLOURS.get(name), None
+
+
+def _block(text: str, name: str) -> str | None:
+    """Return what stands between the braces of a material in one of OGRE's scripts."""
+    text = re.sub(r"//[^\n]*", "", text)
+    head = re.search(
+        rf"^\s*material\s+{re.escape(name)}(?:\s*:[^\n{{]*)?\s*\{{", text, re.MULTILINE
+    )
+    if head is None or not name:
+        return None
+    depth, start = 1, head.end()
+    for brace in re.finditer(r"[{}]", text[start:]):
+        depth += 1 if brace[0] == "{" else -1
+        if depth == 0:
+            return text[start : start + brace.start()]
+    return text[start:]
 
 
 def _numbers(
@@ -442,15 +493,18 @@ def _matrix(path: Path, pose: ET.Element | None) -> Floats:
     return matrix
 
 
-def _placed(shape: _Shape, matrix: Floats) -> _Shape:
-    normals = None if shape.normals is None else turned(shape.normals, matrix)
-    return _Shape(moved(shape.points, matrix), seen(shape.corners, matrix), normals)
+def _placed(piece: Piece, matrix: Floats) -> Piece:
+    return piece._replace(
+        points=moved(piece.points, matrix),
+        corners=seen(piece.corners, matrix),
+        normals=None if piece.normals is None else turned(piece.normals, matrix),
+    )
 
 
 # Shapes.
 
 
-def _triangles(path: Path, shape: ET.Element) -> _Shape | None:
+def _triangles(path: Path, shape: ET.Element) -> Piece | None:
     """Return the triangles of a primitive, or None for a kind that is not drawn."""
 
     def number(tag: str, default: float = 1.0) -> float:
@@ -485,27 +539,39 @@ def _sin(angles: Floats) -> Floats:
     return sines.round(12)
 
 
-def _grid(points: Floats, normals: Floats) -> _Shape:
-    """Return the triangles of points in rows and columns, shape (rows, columns, 3)."""
+def _grid(points: Floats, normals: Floats) -> Piece:
+    """Return the triangles of points in rows and columns, shape (rows, columns, 3).
+
+    Their image fills the grid; its upper edge is at the last row.
+    """
     rows, columns, _ = points.shape
     number = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
-    corners = np.stack([a, b, d, a, d, c], axis=-1).reshape(-1, 3)
-    return _Shape(points.reshape(-1, 3), corners, normals.reshape(-1, 3))
-
-
-def _together(shapes: list[_Shape]) -> _Shape:
-    starts = np.cumsum([0, *(len(shape.points) for shape in shapes)])
-    return _Shape(
-        np.concatenate([shape.points for shape in shapes]),
-        np.concatenate(
-            [shape.corners + start for shape, start in zip(shapes, starts, strict=False)]
-        ).astype(np.int32),
-        np.concatenate([shape.normals for shape in shapes if shape.normals is not None]),
+    u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(1, 0, rows))
+    return Piece(
+        object="",
+        material=0,
+        points=points.reshape(-1, 3),
+        corners=np.stack([a, b, d, a, d, c], axis=-1).reshape(-1, 3),
+        normals=normals.reshape(-1, 3).astype(np.float32),
+        places=np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float32),
     )
 
 
-def _plane(width: float, length: float, normal: Floats) -> _Shape:
+def _together(pieces: list[Piece]) -> Piece:
+    starts = np.cumsum([0, *(len(piece.points) for piece in pieces[:-1])])
+    corners = [piece.corners + start for piece, start in zip(pieces, starts, strict=True)]
+    return Piece(
+        object="",
+        material=0,
+        points=np.concatenate([piece.points for piece in pieces]),
+        corners=np.concatenate(corners).astype(np.int32),
+        normals=np.concatenate([piece.normals for piece in pieces if piece.normals is not None]),
+        places=np.concatenate([piece.places for piece in pieces if piece.places is not None]),
+    )
+
+
+def _plane(width: float, length: float, normal: Floats) -> Piece:
     up = unit(normal)
     side = unit(np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [0.0, 0.0, 1.0], up))
     along = np.cross(up, side)
@@ -514,7 +580,7 @@ def _plane(width: float, length: float, normal: Floats) -> _Shape:
     return _grid(points, np.broadcast_to(up, points.shape))
 
 
-def _box(size: Floats) -> _Shape:
+def _box(size: Floats) -> Piece:
     sides = []
     for axis in range(3):
         for sign in (1.0, -1.0):
@@ -526,7 +592,7 @@ def _box(size: Floats) -> _Shape:
     return _together(sides)
 
 
-def _sphere(radii: Floats, length: float) -> _Shape:
+def _sphere(radii: Floats, length: float) -> Piece:
     """Return an ellipsoid whose halves are `length` apart."""
     around = np.linspace(0, 2 * math.pi, _ROUND + 1)
     half = np.linspace(0, math.pi / 2, _ROUND // 4 + 1)
@@ -542,10 +608,12 @@ def _sphere(radii: Floats, length: float) -> _Shape:
     )
     points = normals * radii
     points[..., 2] += rise[:, None]
-    return _without_flat(_grid(points, normals / radii))
+    slopes = normals / radii
+    length = np.sqrt((slopes * slopes).sum(axis=-1))[..., None]
+    return _without_flat(_grid(points, slopes / length))
 
 
-def _cylinder(radius: float, length: float) -> _Shape:
+def _cylinder(radius: float, length: float) -> Piece:
     around = np.linspace(0, 2 * math.pi, _ROUND + 1)
     circle = np.stack([_cos(around), _sin(around), np.zeros_like(around)], axis=-1)
     up = np.array([0.0, 0.0, length / 2])
@@ -560,7 +628,7 @@ def _cylinder(radius: float, length: float) -> _Shape:
     return _without_flat(_together([side, *caps]))
 
 
-def _without_flat(shape: _Shape) -> _Shape:
+def _without_flat(shape: Piece) -> Piece:
     """Return a shape without the triangles that a pole makes flat."""
     a, b, c = (shape.points[shape.corners[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)

@@ -266,7 +266,8 @@ class _Reader:
                     f"{' or '.join(map(str, widths))} numbers, found {raw.shape[0]} of "
                     f"{raw.shape[1]}"
                 )
-            return _floats(raw, accessor.get("normalized", False))
+            # Colours are normalized whatever is said: else all but 0 would be white.
+            return _floats(raw, accessor.get("normalized", False) or name == "COLOR_0")
 
         vertices = 0
         points = values("POSITION", (3,))

@@ -159,6 +159,66 @@ def test_an_albedo_map_is_an_image(tmp_path: Path) -> None:
     assert np.array_equal(look.image, image)
 
 
+SCRIPT = """
+import * from "common.material"
+material crate/other { technique { pass { diffuse 1 0 0 } } }
+// material crate/wood { }
+material crate/wood : parent
+{
+  technique { pass { ambient 0.1 0.1 0.1 1
+      diffuse 0.25 0.5 2.0 1.0
+      texture_unit { texture wood.png
+        scale 1 1 } } }
+}
+material crate/last { technique { pass { diffuse 0 1 0 } } }
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "colour", "image"),
+    [
+        ("crate/wood", (1, 1, 1, 1), True),
+        ("crate/other", (1, 0, 0, 1), False),
+        ("crate/last", (0, 1, 0, 1), False),
+    ],
+)
+@pytest.mark.parametrize("folder", [True, False])
+def test_material_scripts(
+    tmp_path: Path, name: str, colour: tuple[float, ...], image: bool, folder: bool
+) -> None:
+    scripts, textures = (tmp_path / "crate" / "materials" / n for n in ("scripts", "textures"))
+    scripts.mkdir(parents=True)
+    textures.mkdir()
+    (scripts / "crate.material").write_text(SCRIPT)
+    (textures / "wood.png").write_bytes(kit.png(np.zeros((2, 2, 3), np.uint8)))
+    uri = "model://crate/materials/scripts"
+    uris = [uri, "model://crate/materials/textures"] if folder else [f"{uri}/crate.material"]
+    tags = "".join(f"<uri>{uri}</uri>" for uri in uris)
+    script = f"<material><script>{tags}<name>{name}</name></script></material>"
+    mesh = world(tmp_path, f"<model><static>1</static>{link(BOX + script)}</model>")
+    assert mesh.materials[0].colour == colour
+    assert (mesh.materials[0].image is not None) == image
+    assert mesh.left_out == ()
+
+
+def test_gazebos_own_colours_need_no_script(tmp_path: Path) -> None:
+    script = "<material><script><name>Gazebo/Orange</name></script></material>"
+    mesh = world(tmp_path, f"<model><static>1</static>{link(BOX + script)}</model>")
+    assert mesh.materials[0].colour == (1.0, 0.5088, 0.0468, 1.0)
+    assert mesh.left_out == ()
+
+
+def test_shapes_are_filled_by_their_image(tmp_path: Path) -> None:
+    plane = "<geometry><plane><normal>0 0 1</normal><size>4 6</size></plane></geometry>"
+    (piece,) = world(tmp_path, f"<model>{link(plane)}</model>").pieces
+    assert piece.places is not None
+    corners = {
+        (*point[:2], *place)
+        for point, place in zip(piece.points.tolist(), piece.places.tolist(), strict=True)
+    }
+    assert corners == {(-2, -3, 0, 1), (2, -3, 1, 1), (2, 3, 1, 0), (-2, 3, 0, 0)}
+
+
 # Models of other files.
 
 
@@ -217,7 +277,7 @@ def test_all_that_is_missing_is_named(tmp_path: Path) -> None:
 
 
 def test_what_is_not_read_is_told(tmp_path: Path) -> None:
-    script = "<material><script><name>Gazebo/Grey</name></script></material>"
+    script = "<material><script><name>Gazebo/Wood</name></script></material>"
     heights = "<geometry><heightmap/></geometry>"
     collision = f"<link name='x'><collision name='c'>{heights}</collision><sensor/></link>"
     mesh = world(
@@ -228,7 +288,7 @@ def test_what_is_not_read_is_told(tmp_path: Path) -> None:
     assert mesh.left_out == (
         "actors (1): not read",
         "drawn heightmaps (1): not read",
-        "material script Gazebo/Grey (1): not read; drawn in its own colour",
+        "material script Gazebo/Wood (1): not found; drawn in its own colour",
         "plugins (1): not read",
         "saved states (1): not read",
         "sensors (1): not read",
