@@ -45,6 +45,9 @@ _NOT_READ = {
     "sensor": "sensors",
     "state": "saved states",
 }
+_FUEL = re.compile(r"https?://([^/]+)/1\.0/([^/]+)/models/([^/]+)(?:/(?:\d+|tip)/files/(.*))?")
+"""Address of a model or of a file of it on Gazebo's server."""
+
 _MOST_MODELS = 10_000
 """Of a world: a few models that include each other may stand for any number."""
 
@@ -157,9 +160,11 @@ class _Reader:
         self._left_out.note("further worlds", "not drawn", max(len(worlds) - 1, 0))
         self._contents(worlds[0] if worlds else root, _Place(np.eye(4), self._path))
         if self._missing:
+            fuel = next((uri for uri in self._missing if _FUEL.match(uri)), "")
             raise MeshError(
                 f"{self._path}: expected {', '.join(self._missing)} beside it, in models/, in a "
                 f"folder above or in one of ${' $'.join(_PATHS)}, found none"
+                + (f": gz fuel download -u '{fuel}'" if fuel else "")
             )
         return MeshFile(
             pieces=tuple(self._pieces),
@@ -264,6 +269,9 @@ class _Reader:
 
     def _find(self, uri: str, folder: Path) -> Path | None:
         """Return the file or folder of a URI, or None; a model is also sought in paths."""
+        fuel = _FUEL.match(uri)
+        if fuel is not None:
+            return _downloaded(*fuel.groups())
         scheme, separator, name = uri.partition("://")
         if not separator:
             scheme, name = "", uri
@@ -435,6 +443,17 @@ class _Reader:
         if name not in _COLOURS:
             self._left_out.note(f"material script {name}", "not found; drawn in its own colour")
         return colour or _COLOURS.get(name), None
+
+
+def _downloaded(host: str, owner: str, name: str, rest: str | None) -> Path | None:
+    """Return where ``gz fuel download`` has put the newest version of a model, or None."""
+    for folder in (".gz", ".ignition"):
+        model = Path.home() / folder / "fuel" / host / owner.lower() / "models" / name.lower()
+        if model.is_dir():
+            versions = [path for path in model.iterdir() if path.name.isdecimal()]
+            if versions:
+                return max(versions, key=lambda path: int(path.name)) / (rest or "")
+    return None
 
 
 def _block(text: str, name: str) -> str | None:

@@ -251,6 +251,24 @@ def test_models_are_found_in_gazebos_paths(
     assert middle(world(tmp_path / "worlds", INCLUDE)) == [1, 2, 3]
 
 
+def test_models_of_gazebos_server_are_found_where_they_are_downloaded_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    address = "https://fuel.gazebosim.org/1.0/OpenRobotics/models/Oak Tree"
+    include = f"<include><uri>{address}</uri></include>"
+    with pytest.raises(MeshError, match=f"found none: gz fuel download -u '{address}'"):
+        world(tmp_path, include)
+    folder = tmp_path / ".gz" / "fuel" / "fuel.gazebosim.org" / "openrobotics" / "models"
+    for version in ("2", "10"):
+        save_model(folder / "oak tree", version)
+    assert world(tmp_path, include).pieces[0].object == "10"
+    mesh = f"<geometry><mesh><uri>{address}/1/files/a/room.obj</uri></mesh></geometry>"
+    (folder / "oak tree" / "10" / "a").mkdir()
+    kit.write_obj(kit.room(), folder / "oak tree" / "10" / "a" / "room.obj")
+    assert len(world(tmp_path, f"<model>{link(mesh)}</model>").pieces) == 3
+
+
 def test_a_models_file_is_a_world_too(tmp_path: Path) -> None:
     save_model(tmp_path)
     assert [piece.object for piece in read(tmp_path / "crate" / "model.sdf").pieces] == ["crate"]
