@@ -30,6 +30,7 @@ class Figure(msgspec.Struct, frozen=True):
         plot: Title of its panel in the plots of a sweep; "" if there is none.
         of_flight: Whether it says how the vehicle flew; a missed threshold fails the flight, and
             not the estimators.
+        heading: Head of its column in a table, without the unit; "" for the name in words.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Figure(msgspec.Struct, frozen=True):
     sweep: int = 0
     plot: str = ""
     of_flight: bool = False
+    heading: str = ""
 
     @property
     def of_orientation(self) -> bool:
@@ -54,6 +56,33 @@ class Figure(msgspec.Struct, frozen=True):
     def unit(self) -> str:
         """Of its values; "" if they have none."""
         return next((unit for end, unit in _UNITS.items() if self.name.endswith(end)), "")
+
+    @property
+    def column(self) -> str:
+        """Head of its column, without the unit: ``ATE``."""
+        end = next((end for end in _UNITS if self.name.endswith(end)), "")
+        return self.heading or self.name.removesuffix(end).replace("_", " ")
+
+    @property
+    def better(self) -> Literal["", "less", "more"]:
+        """Which of two values is better; "" if that is not known, as of NEES, where 3 is right."""
+        if self.name.startswith("nees_"):
+            return ""
+        if self.limit:
+            return "more" if self.limit == "least" else "less"
+        return "less" if self.name.startswith(_LESS_IS_BETTER) else ""
+
+    @property
+    def after_alignment(self) -> bool:
+        """Whether it is an error after the alignment that the verdict names.
+
+        Shares, times, the flight's own figures, and those whose name has an alignment are not.
+        """
+        if self.of_flight or {"se3", "sim3"} & {*self.name.split("_")}:
+            return False
+        if self.unit == "%":
+            return self.limit != "least"
+        return self.unit in {"m", "m²", "°", "°/m", "m/s"}
 
     @property
     def side(self) -> str:
@@ -94,9 +123,14 @@ def is_off(limit: float | None) -> bool:
 _OF_ORIENTATION = (
     "rpe_", "rot_", "heading_", "final_rot_", "newest_pose_rot_", "end_error_", "nees_pose",
 )  # fmt: skip
+_LESS_IS_BETTER = (
+    "ate_", "flight_ate_", "final_ate_", "final_flight_ate_", "final_rot_", "rpe_", "heading_",
+    "newest_pose_", "latency_p", "lost_", "relocalization_", "plan_", "cpu_", "peak_rss_",
+)  # fmt: skip
+"""Begin names of figures without a threshold of which less is better."""
 _UNITS = {
     "_percent": "%", "_deg_per_m": "°/m", "_m_per_s": "m/s", "_deg": "°", "_ms": "ms", "_hz": "Hz",
-    "_m": "m", "_seconds": "s",
+    "_m": "m", "_seconds": "s", "_mb": "MB",
 }  # fmt: skip
 
 
@@ -147,10 +181,13 @@ _TABLE = (
     _detail("compared", "poses for whose time a true pose is known"),
     _share("compared_percent", "share of the poses near a compared one", default=50.0, report=""),
     _detail("path_m", "length of the true path in the flight"),
-    _error("ate_rmse_m", "absolute trajectory error (ATE), RMS", report="head", sweep=1),
+    _error(
+        "ate_rmse_m", "absolute trajectory error (ATE), RMS", report="head", sweep=1,
+        heading="ATE",
+    ),
     _error(
         "ate_percent", "ATE in percent of the path", report="head", sweep=2,
-        plot="trajectory error (% of the path)",
+        plot="trajectory error (% of the path)", heading="ATE",
     ),
     _detail("ate_mean_m", "ATE, mean"),
     _detail("ate_median_m", "ATE, median"),
@@ -163,39 +200,43 @@ _TABLE = (
     _detail("flight_ate_rmse_m", "ATE over the whole flight, lost time as 100 % drift, RMS"),
     _error(
         "flight_ate_percent", "ATE over the whole flight, lost time as 100 % drift", report="head",
-        sweep=3,
+        sweep=3, heading="ATE, whole flight",
     ),
     _detail("final_poses", "poses of the trajectory after loop closures"),
-    Figure("final_ate_rmse_m", "ATE after loop closures", report="head"),
+    Figure("final_ate_rmse_m", "ATE after loop closures", report="head", heading="ATE, final"),
     _error(
-        "final_ate_percent", "ATE after loop closures, in percent of the path", report="head"
+        "final_ate_percent", "ATE after loop closures, in percent of the path", report="head",
+        heading="ATE, final",
     ),
     _detail("final_rot_rmse_deg", "rotation error after loop closures, RMS"),
     _detail("final_flight_ate_rmse_m", "ATE after loop closures over the whole flight, RMS"),
     Figure("final_flight_ate_percent", "the same over the whole flight", report="head"),
     _detail("why_not_final", "why the trajectory after loop closures was not judged"),
     _error("ate_max_m", "greatest position error"),
-    _error("rot_rmse_deg", "rotation error, RMS", default=15.0, if_known=True),
+    _error("rot_rmse_deg", "rotation error, RMS", default=15.0, if_known=True, heading="rotation"),
     _error(
         "rpe_1m_trans_percent", "relative pose error (RPE) over 1 m, position, RMS", default=75.0,
-        if_known=True, sweep=4,
+        if_known=True, sweep=4, heading="RPE, 1 m",
     ),
-    _error("rpe_1m_rot_deg_per_m", "relative pose error (RPE) over 1 m, rotation, RMS", sweep=5),
+    _error(
+        "rpe_1m_rot_deg_per_m", "relative pose error (RPE) over 1 m, rotation, RMS", sweep=5,
+        heading="RPE, 1 m",
+    ),
     *_segments(),
     _detail("rpe_frame_trans_m", "RPE from each pose to the next, position, RMS"),
     _detail("rpe_frame_rot_deg", "RPE from each pose to the next, rotation, RMS"),
     _error("end_error_percent", "error of the last pose seen from the first, % of the path"),
-    _error("lost_seconds", "time without a pose", sweep=7, plot="lost (s)"),
+    _error("lost_seconds", "time without a pose", sweep=7, plot="lost (s)", heading="lost"),
     Figure("lost_count", "times lost"),
-    _error("initialization_seconds", "time before the first pose"),
+    _error("initialization_seconds", "time before the first pose", heading="first pose"),
     _detail("relocalization_p50_seconds", "time to have a pose again, median"),
     Figure("relocalization_max_seconds", "longest time to have a pose again"),
     _detail("latency", "whether latencies are declared by the file, or measured"),
-    Figure("latency_p50_ms", "latency, median", sweep=9),
+    Figure("latency_p50_ms", "latency, median", sweep=9, heading="latency"),
     _error("latency_p99_ms", "latency, 99th percentile"),
     _error(
         "newest_pose_rmse_m", "error of the newest pose at control ticks, RMS", sweep=10,
-        plot="error of the newest pose (m)",
+        plot="error of the newest pose (m)", heading="newest pose",
     ),
     Figure("newest_pose_rot_rmse_deg", "rotation error of the same, RMS"),
     _error("newest_pose_age_ms", "age of the newest pose at control ticks, mean", report=""),
@@ -206,7 +247,8 @@ _TABLE = (
     ),
     Figure("heading_rmse_deg", "heading error, RMS"),
     _error(
-        "nees_position", "NEES of the position, 3 if consistent", default=1000.0, optional=True
+        "nees_position", "NEES of the position, 3 if consistent", default=1000.0, optional=True,
+        heading="NEES (3 is right)",
     ),
     Figure("nees_pose", "NEES of the pose, 6 if consistent"),
     _detail("nees_position_inside_percent", "share of the positions within 95 % bounds of NEES"),
@@ -221,7 +263,8 @@ _TABLE = (
     ),
     Figure("plan_max_m", "greatest distance of the flight from its plan", of_flight=True),
     _share(
-        "coverage_percent", "share of the flight with poses", default=90.0, report="head", sweep=6
+        "coverage_percent", "share of the flight with poses", default=90.0, report="head", sweep=6,
+        heading="coverage",
     ),
     _share("frame_coverage_percent", "share of the images with a pose"),
     _share("velocities_percent", "share of the poses with a velocity", all_or_none=95.0),

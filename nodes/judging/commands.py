@@ -17,7 +17,17 @@ import msgspec
 import numpy as np
 import typer
 
-from runtime.tools.cli.commands import Json, JUnit, of_verdict, writing
+from runtime.tools.cli.commands import (
+    Columns,
+    Csv,
+    Json,
+    JUnit,
+    Latex,
+    Markdown,
+    chosen_format,
+    of_verdict,
+    writing,
+)
 
 
 def judge(
@@ -65,6 +75,10 @@ def judge(
     name: Annotated[str, typer.Option(help="Of the folder, and of the page.")] = "trajectories",
     junit: JUnit = None,
     json: Json = None,
+    latex: Latex = False,
+    markdown: Markdown = False,
+    csv: Csv = False,
+    figure: Columns = None,
 ) -> None:
     """Judge trajectories computed elsewhere, as a run judges its estimators.
 
@@ -93,9 +107,10 @@ def judge(
     from runtime.config.overrides import given
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
-    from runtime.tools.cli.brief import print_verdict, verdict_table
+    from runtime.tools.cli.brief import print_typeset, print_verdict, verdict_table
     from runtime.tools.cli.commands import warn
 
+    form = chosen_format(latex=latex, markdown=markdown, csv=csv, figures=figure)
     with writing(name, junit, json) as outcomes:
         try:
             settings = {
@@ -133,6 +148,9 @@ def judge(
             raise ConfigError(str(error)) from None
     for note in notes:
         warn(note)
+    if form is not None:
+        print_typeset(verdict, form, figure or [])
+        raise typer.Exit(1 if verdict.passed is False else 0)
     console = Console()
     console.print(verdict_table(verdict))
     print_verdict(verdict)

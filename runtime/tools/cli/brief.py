@@ -20,13 +20,14 @@ from rich.table import Table
 from runtime.errors import ResultsError
 from runtime.summary import Summary, Verdict
 from runtime.time.clock import SECOND
-from runtime.tools.cli.commands import NOBODY
+from runtime.tools.cli.commands import NOBODY, Columns, Csv, Latex, Markdown, chosen_format
 from runtime.units import significant
 
 if TYPE_CHECKING:
     from runtime.config.model import RunConfig
     from runtime.run.execute import Watch
     from runtime.run.supervisor import Supervisor
+    from runtime.tools.paper.typeset import Format
 
 _WORDS = {
     True: "[green]PASSED[/green]",
@@ -37,13 +38,26 @@ _WORDS = {
 
 def show(
     folder: Annotated[Path, typer.Argument(help="Folder of the run: runs/tour for its latest.")],
+    latex: Latex = False,
+    markdown: Markdown = False,
+    csv: Csv = False,
+    figure: Columns = None,
 ) -> None:
-    """Show all figures of a finished run: verdict, channels, ticks, workers, stalls."""
+    """Show all figures of a finished run: verdict, channels, ticks, workers, stalls.
+
+    With --latex, --markdown or --csv it prints a table of the estimators instead, for a paper; of a
+    judgement's folder, too.
+    """
     from runtime.run.results import run_folder
 
+    form = chosen_format(latex=latex, markdown=markdown, csv=csv, figures=figure)
     folder = run_folder(folder)
     file = folder / "summary.json"
     try:
+        if form is not None:
+            results = msgspec.json.decode(file.read_bytes(), type=_Results)
+            print_typeset(results.verdict, form, figure or [], results.error)
+            return
         summary = msgspec.json.decode(file.read_bytes(), type=Summary)
     except OSError as error:
         raise ResultsError(f"{file}: expected a run's summary, found: {error.strerror}") from None
@@ -51,6 +65,24 @@ def show(
         raise ResultsError(f"{file}: expected a run's summary, found: {error}") from None
     print_tables(summary)
     print_lines(summary, folder)
+
+
+class _Results(msgspec.Struct):
+    """Of a run, or of a judgement."""
+
+    verdict: Verdict | None = None
+    error: str | None = None
+
+
+def print_typeset(
+    verdict: Verdict | None, form: Format, figures: Sequence[str], error: str | None = None
+) -> None:
+    """Print the figures of a single run's estimators as a table for a paper."""
+    from runtime.tools.paper.typeset import columns_of, combinations_of, figures_table, typeset
+
+    columns = columns_of(figures, (verdict.estimators if verdict else {}).values())
+    rows = combinations_of(verdict, columns, error)
+    print(typeset(figures_table(rows, (), columns), form), end="")
 
 
 def runs(folder: Annotated[Path, typer.Argument(help="Folder of runs.")] = Path("runs")) -> None:

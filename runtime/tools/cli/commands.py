@@ -30,6 +30,7 @@ from runtime.extras import COMMANDS, Offer, is_ours, missing_extension, offers
 
 if TYPE_CHECKING:
     from runtime.summary import Verdict
+    from runtime.tools.paper.typeset import Format
     from runtime.tools.sweep import Row
 
 
@@ -182,6 +183,44 @@ JUnit = Annotated[
 Json = Annotated[
     Path | None, typer.Option("--json", help="Write who passed, with all figures, as JSON.")
 ]
+
+Latex = Annotated[
+    bool,
+    typer.Option("--latex", help="Print the table in LaTeX (booktabs), and nothing else."),
+]
+Markdown = Annotated[
+    bool, typer.Option("--markdown", help="Print the table in Markdown, and nothing else.")
+]
+Csv = Annotated[
+    bool, typer.Option("--csv", help="Print the table in CSV, with all digits, and nothing else.")
+]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--figure",
+        metavar="FIGURE",
+        help="Column of that table, as ate_percent; the main figures if not given. May be "
+        "repeated.",
+    ),
+]
+
+
+def chosen_format(
+    *, latex: bool, markdown: bool, csv: bool, figures: Sequence[str] | None = None
+) -> Format | None:
+    """Return the format of a table that is printed instead of all else; `None` if none is.
+
+    Raises:
+        CommandError: Several are given, or figures without any.
+    """
+    options = {"latex": latex, "markdown": markdown, "csv": csv}
+    given: list[Any] = [name for name, wanted in options.items() if wanted]
+    if len(given) > 1:
+        raise CommandError(f"expected one format of the table, found --{' and --'.join(given)}")
+    if figures and not given:
+        raise CommandError("--figure: expected --latex, --markdown or --csv beside it, found none")
+    return given[0] if given else None
+
 
 State = Literal["passed", "failed", "crashed", "not judged"]
 

@@ -19,12 +19,17 @@ import typer
 
 from runtime.run.results import write
 from runtime.tools.cli.commands import (
+    Columns,
     ConfigFile,
+    Csv,
     Json,
     JUnit,
+    Latex,
+    Markdown,
     Outcome,
     Overrides,
     State,
+    chosen_format,
     of_rows,
     warn,
     writing,
@@ -79,6 +84,10 @@ def sweep(
     ] = False,
     junit: JUnit = None,
     json: Json = None,
+    latex: Latex = False,
+    markdown: Markdown = False,
+    csv: Csv = False,
+    figure: Columns = None,
 ) -> None:
     """Run a file with every combination of some settings, and compare the results.
 
@@ -96,8 +105,11 @@ def sweep(
     from runtime.config.reading import load_configuration
     from runtime.tools import sweep as sweeping
     from runtime.tools.cli.run import look_at
+    from runtime.tools.paper.typeset import columns_of, figures_table, typeset
     from runtime.tools.sweep.console import print_summary
+    from runtime.tools.sweep.tables import summarise
 
+    form = chosen_format(latex=latex, markdown=markdown, csv=csv, figures=figure)
     with writing(config.stem, junit, json) as outcomes:
         plan = sweeping.make_plan(
             config,
@@ -116,6 +128,14 @@ def sweep(
     sweeping.write_tables(plan, rows)
     sweeping.draw_plots(plan, rows)
     page = sweeping.write_page(plan, rows)
+    if form is not None:
+        judged = (figures for row in rows for figures in row["estimators"].values())
+        columns = columns_of(figure or [], judged)
+        paths = [parameter.path for parameter in plan.parameters]
+        table = figures_table(summarise(plan, rows, columns), paths, columns)
+        print(typeset(table, form), end="")
+        end(rows)
+        return
     console = Console()
     print_summary(console, plan, sweeping.summarise(plan, rows))
     console.print(
@@ -244,6 +264,9 @@ def compare(
     json: Annotated[
         Path | None, typer.Option("--json", help="Write the comparisons as JSON.")
     ] = None,
+    latex: Latex = False,
+    markdown: Markdown = False,
+    csv: Csv = False,
 ) -> None:
     """Tell whether B is better than A, over equal flights, with confidence.
 
@@ -258,7 +281,9 @@ def compare(
     after Ctrl-C.
     """
     from runtime.tools.comparison import compare as compare_all
+    from runtime.tools.paper.typeset import comparison_table, typeset
 
+    form = chosen_format(latex=latex, markdown=markdown, csv=csv)
     with writing("compare", junit, None) as outcomes:
         compared = compare_all(
             what,
@@ -274,7 +299,10 @@ def compare(
         )
         for row in compared.rows:
             outcomes += of_comparison(row, margin)
-    print_table(compared)
+    if form is None:
+        print_table(compared)
+    else:
+        print(typeset(comparison_table(compared.rows), form), end="")
     for note in compared.notes:
         warn(note)
     if json is not None:

@@ -315,7 +315,7 @@ def compare_rows(
         one = compare_values(label, metric, pairs, margin=margin, error=error / len(wanted))
         alignments = [(_alignments(a[key], name), _alignments(b[key], other)) for key in common]
         differing = sorted({text for x, y in alignments if x and y and x != y for text in x | y})
-        if differing and _after_alignment(metric):
+        if differing and figure(metric).after_alignment:
             one = msgspec.structs.replace(
                 one, verdict="not comparable", more=0, alignments=tuple(differing)
             )
@@ -354,17 +354,6 @@ def _alone(
 def _alignments(rows: Sequence[Row], estimator: str) -> set[str]:
     verdicts = (row["estimators"].get(estimator, {}) for row in rows)
     return {str(verdict["alignment"]) for verdict in verdicts if verdict.get("alignment")}
-
-
-def _after_alignment(name: str) -> bool:
-    """Return whether a figure is an error after the alignment that the verdict names.
-
-    Shares, times, the flight's own figures, and those whose name has an alignment are not.
-    """
-    row = figure(name)
-    if row.of_flight or {"se3", "sim3"} & set(name.split("_")):
-        return False
-    return row.unit in {"m", "m²", "°", "°/m", "m/s"} or (row.unit == "%" and row.limit != "least")
 
 
 def _some(side: Mapping[Key, object]) -> str:

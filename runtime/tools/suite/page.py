@@ -11,13 +11,25 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
+import msgspec
 import numpy as np
 import typer
 
 from runtime.channels.wire import combined
 from runtime.errors import ConfigError
 from runtime.run.results import write
-from runtime.tools.cli.commands import Json, JUnit, of_rows, writing
+from runtime.tools.cli.commands import (
+    Columns,
+    Csv,
+    Json,
+    JUnit,
+    Latex,
+    Markdown,
+    chosen_format,
+    of_rows,
+    writing,
+)
+from runtime.tools.paper.typeset import Table, columns_of, figures_table, typeset
 from runtime.tools.suite.plan import EXACT, FOLDER, Suite
 from runtime.tools.sweep.plan import Job, Plan
 from runtime.tools.sweep.plots import template
@@ -50,6 +62,10 @@ def suite(
     ] = False,
     junit: JUnit = None,
     json: Json = None,
+    latex: Latex = False,
+    markdown: Markdown = False,
+    csv: Csv = False,
+    figure: Columns = None,
 ) -> None:
     """Judge all installed estimators in scenarios from easy to brutal.
 
@@ -62,6 +78,7 @@ def suite(
     from runtime.tools.cli.sweep import carry_out, end
     from runtime.tools.suite.plan import make_plan, read_suite
 
+    form = chosen_format(latex=latex, markdown=markdown, csv=csv, figures=figure)
     with writing("suite", junit, json) as outcomes:
         chosen = (read_suite(file) if file else read_suite()).only(scenario or [], estimator or [])
         plan = make_plan(chosen, out=out.absolute(), seeds=seeds, repeats=repeat)
@@ -69,7 +86,9 @@ def suite(
         outcomes += of_rows(map(str, plan.jobs), rows)
     path = page or out / "SUITE.md"
     write_page(chosen, plan, rows, path, command_line())
-    typer.echo(f"{len(rows)} runs   the page is {path}")
+    if form is not None:
+        typer.echo(typeset(table_of(plan, rows, figure or []), form), nl=False)
+    typer.echo(f"{len(rows)} runs   the page is {path}", err=form is not None)
     end(rows, judged=False)
 
 
@@ -107,7 +126,9 @@ def short(cell: Combination) -> str:
     return words if cell.passed == cell.runs else f"{words} {verdict(cell)}".strip()
 
 
-def cells(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Combination]]:
+def cells(
+    plan: Plan, rows: Sequence[Row], figures: Sequence[str] = tuple(COLUMNS)
+) -> dict[str, dict[str, Combination]]:
     """Return each estimator's results over all seeds and repeats, by scenario and estimator.
 
     A run equal to another to the bit adds nothing, and is left out. A run that crashed before it
@@ -118,16 +139,38 @@ def cells(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Combination]]:
     for job, row in in_order(plan, rows):
         scenario, name = (text for _, text in job.settings)
         different = groups.setdefault((scenario, name), {})
-        figures = row["estimators"].get(name, {}) | _costs(name, row)
         key = job.seed, row.get("digests", {}).get(name, job.id)
-        different[key] = row | {"estimators": {name: figures}}
+        different[key] = row | {"estimators": {name: _with_costs(name, row)}}
         for index, error in enumerate(row.get("crashes", [])):
             different[job.seed, job.id, index] = crashed(job, error)
     table: dict[str, dict[str, Combination]] = {}
     for (scenario, name), group in groups.items():
-        cell = combine((scenario, name), name, [*group.values()], COLUMNS)
+        cell = combine((scenario, name), name, [*group.values()], figures)
         table.setdefault(scenario, {})[name] = cell
     return table
+
+
+def table_of(plan: Plan, rows: Sequence[Row], chosen: Sequence[str]) -> Table:
+    """Return the table for a paper: a row for each scenario and estimator, the best by scenario.
+
+    Args:
+        chosen: Its figures; those of the page if none.
+    """
+    judged = [
+        _with_costs(name, row)
+        for job, row in in_order(plan, rows)
+        for name in [dict(job.settings)["estimator"]]
+    ]
+    figures = columns_of(chosen, judged)
+    if not chosen:
+        known = {name for own in judged for name, value in own.items() if value is not None}
+        figures = [name for name in COLUMNS if name in known]
+    table = [
+        msgspec.structs.replace(cell, settings=(scenario,))
+        for scenario, row in cells(plan, rows, figures).items()
+        for cell in row.values()
+    ]
+    return figures_table(table, ["scenario"], figures, groups=1)
 
 
 def worth(plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
@@ -204,6 +247,10 @@ def flaws(plan: Plan, rows: Sequence[Row]) -> dict[str, tuple[str, ...]]:
                 words = f"seed {job.seed}, {vehicle}: {reason}"
                 by_scenario.setdefault(dict(job.settings)["scenario"], {})[words] = None
     return {scenario: tuple(reasons) for scenario, reasons in by_scenario.items()}
+
+
+def _with_costs(name: str, row: Row) -> dict[str, Any]:
+    return row["estimators"].get(name, {}) | _costs(name, row)
 
 
 def _costs(name: str, row: Row) -> dict[str, float | None]:

@@ -321,7 +321,9 @@ def in_order(plan: Plan, rows: Iterable[Row]) -> list[tuple[Job, Row]]:
     return [(job, known[job.id]) for job in plan.jobs if job.id in known]
 
 
-def summarise(plan: Plan, rows: Iterable[Row]) -> list[Combination]:
+def summarise(
+    plan: Plan, rows: Iterable[Row], wanted: Sequence[str] = IN_SWEEPS
+) -> list[Combination]:
     """Sum up the seeds of each combination and estimator, in a stable order."""
     own = in_order(plan, rows)
     groups: dict[tuple[str, ...], list[Row]] = {}
@@ -329,7 +331,7 @@ def summarise(plan: Plan, rows: Iterable[Row]) -> list[Combination]:
         groups.setdefault(tuple(text for _, text in job.settings), []).append(row)
     names = list(dict.fromkeys(name for _, row in own for name in row["estimators"]))
     return [
-        combine(settings, name, group)
+        combine(settings, name, group, wanted)
         for settings, group in groups.items()
         for name in [n for n in names if any(n in row["estimators"] for row in group)] or [""]
     ]
