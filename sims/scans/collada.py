@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.parsers import expat
 
 import numpy as np
 import numpy.typing as npt
@@ -41,21 +42,32 @@ def read_collada(path: Path) -> MeshFile:
 
 
 def parse_xml(path: Path) -> ET.Element:
-    """Return an XML file's root; tags have no namespaces.
+    """Return an XML file's root; names have no prefixes, of which some that are used are not bound.
 
     Raises:
         MeshError: It is no XML, or it defines entities, which may stand for any size of text.
     """
-    data = path.read_bytes()
-    if b"<!ENTITY" in data:
+
+    def refuse(*_: object) -> None:
         raise MeshError(f"{path}: expected XML without entities of its own")
+
+    builder = ET.TreeBuilder()
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.buffer_size = 2**20
+    parser.EntityDeclHandler = refuse
+    parser.StartElementHandler = lambda tag, attributes: builder.start(
+        tag.rpartition(":")[2], {key.rpartition(":")[2]: v for key, v in attributes.items()}
+    )
+    parser.EndElementHandler = lambda tag: builder.end(tag.rpartition(":")[2])
+    parser.CharacterDataHandler = builder.data
     try:
-        root = ET.fromstring(data)  # noqa: S314  # entities are refused above
-    except (ET.ParseError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
+        parser.Parse(path.read_bytes(), True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: of an encoding
+        if isinstance(error, MeshError):
+            raise
         raise MeshError(f"{path}: expected XML, found: {error}") from error
-    for element in root.iter():
-        element.tag = str(element.tag).rpartition("}")[2]
-    return root
 
 
 class _Source(NamedTuple):

@@ -102,9 +102,10 @@ class _Scope:
         self._path = path
         self._elements = {
             child.get("name") or (child.findtext("name") or "").strip(): child
-            for child in element
-            if child.tag in ("link", "frame", "joint", "model", "include")
+            for tag in ("include", "model", "joint", "frame", "link")  # of two, the last counts
+            for child in element.iterfind(tag)
         }
+        self._elements.pop("", None)
         self._resolving: set[str] = set()
 
     def pose(self, element: ET.Element, default: str = "") -> Floats:
@@ -122,7 +123,7 @@ class _Scope:
         if element is None or name in self._resolving:
             raise MeshError(
                 f"{self._path}: a pose is relative to {name!r}: expected one of "
-                f"{', '.join(self._elements)} in the same model, and no circle"
+                f"{', '.join(sorted(self._elements))} in the same model, and no circle"
             )
         self._resolving.add(name)
         base = {
@@ -221,7 +222,7 @@ class _Reader:
         uri = (include.findtext("uri") or "").strip()
         if include.find("placement_frame") is not None:
             raise MeshError(f"{place.path}: {uri}: expected an include without placement_frame")
-        folder = self._find(uri, place.path.parent)
+        folder = self._find(uri if "://" in uri else f"model://{uri}", place.path.parent)
         if folder is None:
             name = uri.rstrip("/").rpartition("/")[2].lower().replace(" ", "_")
             if name == "sun":

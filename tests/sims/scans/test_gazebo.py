@@ -46,6 +46,11 @@ def middle(mesh: MeshFile) -> list[float]:
         ("<pose rotation_format='quat_xyzw'>0 0 5 0 0 0.7071068 0.7071068</pose>"
          f"{link(pose='<pose>1 0 0 0 0 0</pose>')}", [0, 1, 5]),
         (f"<frame name='f'><pose>1 0 0 0 0 0</pose></frame>{link(pose=RELATIVE)}", [1, 1, 0]),
+        # A joint of a link's name, as PX4's rover has it.
+        (f"{link(pose=RELATIVE)}<link name='f'><pose>0 0 2 0 0 0</pose></link>"
+         "<joint name='f'><child>f</child></joint>", [0, 1, 2]),
+        # A prefix that is not bound, as PX4's optical flow has it.
+        (f"{link()}<gz:system gz:a='1'><gz:b/></gz:system>", [0, 0, 0]),
         ("<frame name='f' attached_to='g'><pose>1 0 0 0 0 0</pose></frame>"
          "<frame name='g'><pose>0 0 7 0 0 0</pose></frame>"
          "<joint name='j'><child>f</child><pose>0 2 0 0 0 0</pose></joint>"
@@ -232,11 +237,12 @@ INCLUDE = "<include><uri>model://crate</uri><name>c</name><pose>1 2 3 0 0 0</pos
 
 
 @pytest.mark.parametrize("place", [".", "models", "..", "../models"])
-def test_models_are_found_around_the_world(tmp_path: Path, place: str) -> None:
+@pytest.mark.parametrize("scheme", ["model://", ""])
+def test_models_are_found_around_the_world(tmp_path: Path, place: str, scheme: str) -> None:
     folder = tmp_path / "worlds"
     folder.mkdir()
     save_model(folder / place)
-    mesh = world(folder, INCLUDE)
+    mesh = world(folder, INCLUDE.replace("model://", scheme))
     assert middle(mesh) == [1, 2, 3]
     assert mesh.pieces[0].object == "c"
 
