@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
@@ -253,6 +254,7 @@ def real(value: float) -> str:
     return f"{digits if '.' in digits else digits + '.0'}{e}{exponent}"
 
 
+@functools.lru_cache(8)  # of its templates, which take ten milliseconds each to compile
 def templates(folder: Path) -> jinja2.Environment:
     """Return the template environment of a folder, with filters ``real`` and ``row``."""
     environment = jinja2.Environment(
