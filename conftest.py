@@ -33,9 +33,12 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
 
 
+# Objects are made and dropped by the million: the usual 700 between collections are too few.
+gc.set_threshold(20_000, 20, 10)
+
 # A deadline is real time, of which a busy machine may take any amount.
-settings.register_profile("without deadlines", deadline=None)
+settings.register_profile("without deadlines", deadline=None, max_examples=50)
 settings.register_profile("thorough", deadline=None, max_examples=2000)  # --hypothesis-profile=…
 # Where a change is judged, the same examples each time: new ones are found at the desk.
-settings.register_profile("judging", deadline=None, derandomize=True)
+settings.register_profile("judging", deadline=None, derandomize=True)  # 100 examples
 settings.load_profile("judging" if os.environ.get("CI") else "without deadlines")
