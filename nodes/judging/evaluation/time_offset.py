@@ -12,7 +12,6 @@ import math
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import correlate
 
 from nodes.judging.evaluation.alignment import umeyama
 from nodes.judging.evaluation.metrics import interpolated, rms
@@ -102,6 +101,8 @@ def _correlated(truth: Trajectory, estimate: Trajectory, start: float) -> float 
         if len(speed) < _LEAST_ROWS or not speed.std() > _CHANGES * speed.mean():
             return None
         lengths.append((int(grid[0]), speed - speed.mean()))
+    from scipy.signal import correlate  # half a second, which only runs that are judged need
+
     (first, a), (second, b) = lengths
     products = correlate(a, b, method="fft")
     squares = correlate(a * a, np.ones(len(b)), method="fft")
