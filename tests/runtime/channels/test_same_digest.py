@@ -45,8 +45,7 @@ links.hear = {{ jitter = "5ms", loss = 0.1, rate = 300 }}
 def digest(file: Path, seed: int) -> tuple[str, dict[str, int]]:
     """Run the file in a process of its own, with a hash seed."""
     out = file.parent / f"{seed}"
-    code = "import sys, visnav; visnav.run(sys.argv[1], out=sys.argv[2], quiet=True)"
-    command = [sys.executable, "-c", code, str(file), str(out)]
+    command = [sys.executable, "-m", "runtime", "run", str(file), "--quiet", "--out", str(out)]
     subprocess.run(
         command,
         check=True,
