@@ -132,7 +132,7 @@ SHOTS = st.tuples(
 )
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(shots=st.lists(SHOTS, min_size=2, max_size=5))
 @example(shots=[(angle, 0.0, PINHOLE, False, (True, True, True)) for angle in (0.0, 1.5)])
 def test_an_image_does_not_depend_on_those_drawn_before(shots: list[Any]) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.signal import butter, lfilter
 
 from sims.multirotor import MultirotorConfig
 from sims.sensors.bandwidth import LowPass
@@ -24,6 +23,8 @@ def test_the_filter_is_butterworths_of_second_order(share: float, rate: float) -
     low_pass = LowPass(share * rate, rate)
     low_pass((0.0, 0.0, 0.0))
     steps = np.array([low_pass((1.0, 2.0, -3.0)) for _ in range(40)])
+    from scipy.signal import butter, lfilter  # half a second, which few tests have to pay
+
     expected = lfilter(*butter(2, share * rate, fs=rate), np.r_[0.0, np.ones(40)])[1:]
     np.testing.assert_allclose(steps, expected[:, None] * (1.0, 2.0, -3.0), atol=1e-9)
 

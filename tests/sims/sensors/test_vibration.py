@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import welch
 
 from sims.presets import IMUS
 from sims.sensors.imu import ImuModel, ImuParameters
@@ -27,13 +26,21 @@ def samples(vibration: Vibration, rate: float, thrust: float, seconds: float) ->
     return np.array(rows).reshape(-1, 6)
 
 
+def spectrum(rows: np.ndarray, rate: float, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies (Hz) and the power spectral density of each column."""
+    from scipy.signal import welch  # half a second, which one process of the tests has to pay
+
+    frequencies, power = welch(rows, rate, nperseg=length, axis=0)
+    return frequencies, power
+
+
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
 @pytest.mark.parametrize("corner", [0.0, 30.0])
 def test_the_noise_has_the_stated_density_at_any_rate(rate: float, corner: float) -> None:
     vibration = Vibration(density=0.1, angular_density=2e-3, corner=corner)
     rows = samples(vibration, rate, 0.5, 12_000.0 / rate)
     for columns, density in ((rows[:, 3:], 0.1), (rows[:, :3], 2e-3)):
-        frequencies, power = welch(columns, rate, nperseg=512, axis=0)
+        frequencies, power = spectrum(columns, rate, 512)
         low = (frequencies > 2.0) & (frequencies < (8.0 if corner else rate / 2))
         assert math.sqrt(power[low].mean() / 2) == pytest.approx(0.5 * density, rel=0.1)
     if corner and rate > 500.0:
@@ -63,7 +70,7 @@ def test_what_shakes_goes_nowhere() -> None:
     )
     fast, slow = (np.abs(rows[:, 3:].sum(axis=0) / 200.0).mean() for rows in (open_, bound))
     assert slow < 0.02 < 0.3 < fast  # velocities, m/s
-    frequencies, power = welch(bound[:, 3:], 200.0, nperseg=512, axis=0)
+    frequencies, power = spectrum(bound[:, 3:], 200.0, 512)
     for frequency in (5.0, 20.0):
         near = np.abs(frequencies - frequency) < 1.0
         ratio = (frequency / 10.0) ** 2
@@ -98,7 +105,7 @@ def test_the_flight_preset_shakes_as_the_imu_of_euroc_in_flight() -> None:
     rows = np.array(
         [model.measure(ZERO, (0.0, 0.0, -9.81), [HOVER] * 4) for _ in range(6_000)]
     ).reshape(-1, 6)
-    frequencies, power = welch(rows - rows.mean(axis=0), 200.0, nperseg=1024, axis=0)
+    frequencies, power = spectrum(rows - rows.mean(axis=0), 200.0, 1024)
     high = frequencies > 20.0
     width = frequencies[1]
     deviations = np.sqrt(power[high].sum(axis=0) * width)
