@@ -161,8 +161,8 @@ def test_commands_name_what_there_is(words: str) -> None:
     for option in (word for word in arguments if word.startswith("--")):
         assert option in help_.stdout, option
     pairs = list(itertools.pairwise(arguments))
-    written = [value for option, value in pairs if option == "--config"]
-    files = [word for word in arguments if word.endswith(".toml") and word not in written]
+    others = [value for option, value in pairs if option in {"--config", "--style"}]
+    files = [word for word in arguments if word.endswith(".toml") and word not in others]
     changes = [value for option, value in pairs if option == "--set"]
     changes += [value.split(",")[0] for option, value in pairs if option == "--vary"]
     if name == "demo":

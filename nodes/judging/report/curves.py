@@ -51,8 +51,8 @@ def draw_errors(run: Run) -> Plot | None:
     lost = any(estimator.lost for estimator in run.estimators)
     for axis in axes if lost else ():
         _shade(run, axis)
-    _scale(axes[0], [e.position for _, e in known], "y")
-    _scale(axes[1], [np.degrees(e.rotation) for _, e in known], "y")
+    scale_axis(axes[0], [e.position for _, e in known], "y")
+    scale_axis(axes[1], [np.degrees(e.rotation) for _, e in known], "y")
     axes[0].set_ylabel("position error (m)")
     axes[1].set(ylabel="rotation error (°)", xlabel="time (s)")
     axes[0].margins(x=0.01)
@@ -144,7 +144,7 @@ def draw_distributions(run: Run) -> Plot | None:
                 )
             name = None
     for axis, both in zip(axes, series, strict=True):
-        _scale(axis, both, "x", _SHOWN)
+        scale_axis(axis, both, "x", _SHOWN)
         axis.set_ylim(0, 101)
     axes[0].set(xlabel="position error (m)", ylabel="share of poses below (%)")
     axes[1].set(xlabel="rotation error (°)")
@@ -234,7 +234,7 @@ def draw_relative(run: Run) -> Plot | None:
         for estimator in dict.fromkeys(estimator for estimator, *_ in boxes):
             own = [box for box in boxes if box[0] is estimator]
             _boxes(axis, estimator, [(where, width, v[row]) for _, where, width, _, v in own])
-        _scale(axis, [values[row] for *_, values in boxes], "y", 95)
+        scale_axis(axis, [values[row] for *_, values in boxes], "y", 95)
         axis.set_xticks(range(len(LENGTHS)), [f"{length:g}" for length in LENGTHS])
         axis.set(xlabel="length of path (m)", xlim=(-0.6, len(LENGTHS) - 0.4))
         axis.grid(visible=False, axis="x")
@@ -273,7 +273,7 @@ def _boxes(axis: Any, estimator: Estimator, boxes: list[tuple[float, float, Floa
     drawn["boxes"][0].set_label(label(estimator.name))
 
 
-def _scale(axis: Any, series: list[Floats], which: str, share: float = 100.0) -> None:
+def scale_axis(axis: Any, series: list[Floats], which: str, share: float = 100.0) -> None:
     """Start an axis (``x``, ``y``) at 0, or make it logarithmic for series of very unlike size."""
     top = 1.05 * max((float(np.nanpercentile(v, share)) for v in series if len(v)), default=1.0)
     if not wide_range(series):

@@ -191,14 +191,25 @@ class Report(Node[ReportConfig]):
 
 def report(
     run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name> for the latest.")],
+    format_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--format",
+            help="Of the figures, beside png: svg or pdf. May be repeated; svg if not given.",
+        ),
+    ] = None,
 ) -> None:
     """Write a run's report.html and its figures (plots/*) anew.
 
-    The page names what a killed or unjudged run lacks.
+    The page names what a killed or unjudged run lacks. It is HTML whatever the format of the
+    figures; a browser prints it as PDF.
     """
-    from runtime.errors import ConfigError
+    from runtime.errors import CommandError, ConfigError, expect_known
 
+    for name in format_ or ():
+        message = f"--format: expected png, svg or pdf, found {name}"
+        expect_known(name, ("png", "svg", "pdf"), message, CommandError)
     try:
-        print(write_report(run_folder(run)))
+        print(write_report(run_folder(run), ("png", *(format_ or ("svg",)))))
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -359,9 +359,9 @@ class Plot(msgspec.Struct, frozen=True, eq=False):
 
 
 @contextlib.contextmanager
-def drawing() -> Iterator[None]:
-    """Draw in the report's style while the block runs."""
-    with mpl.rc_context(_STYLE), warnings.catch_warnings():
+def drawing(settings: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Draw in the report's style, with other settings of matplotlib, while the block runs."""
+    with mpl.rc_context(_STYLE | dict(settings or {})), warnings.catch_warnings():
         # A name may have letters that the font lacks; they are drawn as boxes.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         yield

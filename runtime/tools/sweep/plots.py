@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import msgspec
@@ -20,6 +20,9 @@ from runtime.figures import FIGURES
 from runtime.run.results import write
 from runtime.tools.sweep.plan import Parameter, Plan, axis
 from runtime.tools.sweep.tables import MAIN, Row, Spread, in_order, numbers, summarise
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PLOTTED = {figure.name: figure.plot for figure in FIGURES.values() if figure.plot}
 """Axis label of each plotted figure."""
@@ -50,17 +53,24 @@ def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
     last panel has the share of the runs crashed, and of those failed. A figure that is 0
     throughout has no panel, and a parameter with a single value no plot.
     """
-    own = [row for _, row in in_order(plan, rows)]
     drawn = []
+    for name, figure in figures_of(plan, rows):
+        path = plan.out / "plots" / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=120)
+        drawn.append(path)
+    return drawn
+
+
+def figures_of(plan: Plan, rows: Sequence[Row]) -> Iterator[tuple[str, Figure]]:
+    """Yield a name for files and the plot of each parameter, as `draw_plots` draws it."""
+    own = [row for _, row in in_order(plan, rows)]
     for parameter in plan.parameters:
         by_figure = {name: lines(plan, own, parameter, name) for name in PLOTTED}
         by_figure = {name: curves for name, curves in by_figure.items() if any(map(_seen, curves))}
         if by_figure and len(parameter.texts) > 1:
-            path = plan.out / "plots" / (re.sub(r"[^\w.-]", "_", parameter.path) + ".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            _draw(parameter, by_figure, _shares(parameter, own), path)
-            drawn.append(path)
-    return drawn
+            name = re.sub(r"[^\w.-]", "_", parameter.path)
+            yield name, _draw(parameter, by_figure, _shares(parameter, own))
 
 
 def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) -> list[Line]:
@@ -120,8 +130,8 @@ def _percent(outcomes: Iterable[bool]) -> float:
 
 
 def _draw(
-    parameter: Parameter, lines: dict[str, list[Line]], shares: dict[str, list[float]], path: Path
-) -> None:
+    parameter: Parameter, lines: dict[str, list[Line]], shares: dict[str, list[float]]
+) -> Figure:
     from matplotlib.figure import Figure
 
     scale = axis(parameter.texts)
@@ -175,7 +185,7 @@ def _draw(
         figure.legend(
             list(handles.values()), labels, loc="outside lower center", fontsize=8, ncols=across
         )
-    figure.savefig(path, dpi=120)
+    return figure
 
 
 def decades(values: Sequence[float]) -> bool:

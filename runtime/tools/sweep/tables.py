@@ -315,6 +315,23 @@ def records(rows: Iterable[Row]) -> list[dict[str, Any]]:
     ]
 
 
+def plan_from(rows: Iterable[Row], out: Path) -> tuple[Plan, list[Row]]:
+    """Return the plan of finished runs, without their settings, and its rows.
+
+    Of a folder with several sweeps it is that of the runs that vary the same as the last one.
+    """
+    own = [*rows]
+    own = [row for row in own if row["parameters"].keys() == own[-1]["parameters"].keys()]
+    jobs = [
+        Job(
+            id=row["id"], text="", folder="", settings=tuple(row["parameters"].items()),
+            seed=row["seed"], out="", repeat=row.get("repeat", 1),
+        )
+        for row in own
+    ]  # fmt: skip
+    return Plan(jobs=tuple(jobs), out=out), own
+
+
 def in_order(plan: Plan, rows: Iterable[Row]) -> list[tuple[Job, Row]]:
     """Return the rows of a plan's jobs, in their order."""
     known = {row["id"]: row for row in rows}
