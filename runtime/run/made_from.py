@@ -163,6 +163,27 @@ def code_of(spec: NodeSpec, folder: Path | None = None) -> str:
     return key_of(collector.parts())
 
 
+def program_of(line: CommandLine) -> Path | None:
+    """Return the file of a program; `None` if there is none."""
+    environment = {**os.environ, "VISNAV_PYTHON": sys.executable, **dict(line.environment)}
+    word = _expanded(line.words[0], environment) if line.words else ""
+    place = shutil.which(Path(line.folder, word) if "/" in word else word)
+    return None if place is None else Path(place).absolute()
+
+
+def files_of(spec: NodeSpec) -> dict[str, Path]:
+    """Return the files of a node's class and its local imports by name, but none of this project.
+
+    Names are relative to the folder in which the module is looked for.
+    """
+    sources = find_sources(Finder([]), [spec.node.__module__], ours=_of_nodes)
+    return {
+        name: Path(min(paths))
+        for name, paths in sorted(sources.files.items())
+        if name.partition("/")[0] not in OURS and name not in sources.named
+    }
+
+
 def _of_nodes(module: str) -> bool:
     return module.partition(".")[0] not in {"events", "runtime"}
 
@@ -391,7 +412,7 @@ class _Collector:
             elif kind == "program" and libraries:
                 self._add_libraries(path, line)
             elif path.suffix == ".xml":
-                todo += _included(path)
+                todo += included(path)
             elif kind == "text":
                 for named in _named_in(path, [path.parent, *bases]):
                     if named.is_dir():
@@ -598,7 +619,7 @@ def _libraries(program: Path, search: str | None) -> list[str]:
     return _LINKED[key]
 
 
-def _included(path: Path) -> list[Path]:
+def included(path: Path) -> list[Path]:
     """Return the files that a MuJoCo model and the models that it includes name."""
     included, todo, folders = {path}, [path], {path.parent}
     while todo:

@@ -343,9 +343,9 @@ def plot(
 
     Of runs the panels are the trajectories from above, and the position errors over time and over
     the distance flown; of a sweep there is a plot for each setting that was varied, in a file of
-    its own if there are several. The style file has any of size_mm = [88, 60], font, font_size,
-    line_width, colours, truth (a colour), grid, legend, and a table [labels], which has another
-    text for a text of the plot: "runs/a" = "ours". A file that is there is replaced.
+    its own if there are several. The style file has any of size_mm (width, height),
+    font, font_size, line_width, colours, truth (a colour), grid, legend, and a table labels, which
+    has another text for a text of the plot: "a: vo" = "ours". A file that is there is replaced.
     """
     if out.suffix not in _DATES:
         raise CommandError(f"--out {out}: expected a file .svg or .pdf, found {out.suffix!r}")

@@ -48,21 +48,15 @@ def show(
     With --latex, --markdown or --csv it prints a table of the estimators instead, for a paper; of a
     judgement's folder, too.
     """
-    from runtime.run.results import run_folder
+    from runtime.run.results import read_summary, run_folder
 
     form = chosen_format(latex=latex, markdown=markdown, csv=csv, figures=figure)
     folder = run_folder(folder)
-    file = folder / "summary.json"
-    try:
-        if form is not None:
-            results = msgspec.json.decode(file.read_bytes(), type=_Results)
-            print_typeset(results.verdict, form, figure or [], results.error)
-            return
-        summary = msgspec.json.decode(file.read_bytes(), type=Summary)
-    except OSError as error:
-        raise ResultsError(f"{file}: expected a run's summary, found: {error.strerror}") from None
-    except msgspec.MsgspecError as error:
-        raise ResultsError(f"{file}: expected a run's summary, found: {error}") from None
+    if form is not None:
+        results = read_summary(folder, _Results)
+        print_typeset(results.verdict, form, figure or [], results.error)
+        return
+    summary = read_summary(folder, Summary)
     print_tables(summary)
     print_lines(summary, folder)
 

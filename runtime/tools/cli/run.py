@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from runtime.tools.cli.commands import (
-    ConfigFile,
     Json,
     JUnit,
     Overrides,
@@ -53,7 +52,18 @@ class Log(Enum):
 
 
 def run(
-    config: ConfigFile,
+    config: Annotated[
+        Path | None, typer.Argument(help="The file that says what to run; none with --from.")
+    ] = None,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="BUNDLE",
+            help="Repeat the run of a bundle, and say whether the digests agree; exit code 1 if "
+            "they do not.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for results; runs/<name>/<time> if not given.")
     ] = None,
@@ -106,9 +116,11 @@ def run(
     renamed to FOLDER.<its time>. Printed is who passed, and how well; --verbose and `show` print
     all else. Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
     immediate); with 1 if a threshold of the run was not met, or it was run twice and differed; with
-    2 if something failed.
+    2 if something failed. With --from it ends with 0 if all digests agree, whatever the thresholds;
+    a bundle runs the programs and the code that it names: repeat those that you trust.
     """
     from runtime.config.reading import load_configuration
+    from runtime.errors import CommandError
     from runtime.run.execute import execute
     from runtime.run.results import Folder
     from runtime.tools.cli.brief import print_failures, print_lines, print_tables
@@ -121,8 +133,24 @@ def run(
     changes = list(overrides or [])
     if log is not None and log is not Log.events:
         changes.append(f"run.log={log.value}")
-    with writing(config.stem, junit, json) as outcomes:
-        settings = load_configuration(config, changes)
+    bundled = None
+    with writing((config or bundle or Path("run")).stem, junit, json) as outcomes:
+        if config is not None and bundle is None:
+            settings = load_configuration(config, changes)
+        elif bundle is not None and config is None and only is None:
+            from runtime.tools.paper.repeat import configuration, read_bundle
+
+            bundled = read_bundle(bundle)
+            settings, notes = configuration(bundled, changes)
+            for note in notes:
+                warn(note)
+        else:
+            options = {"a file": config, "--from": bundle, "--only": only}
+            given = [name for name, value in options.items() if value is not None]
+            raise CommandError(
+                "run: expected a file, or a bundle with --from and without --only, found "
+                f"{' and '.join(given) or 'neither'}"
+            )
         nodes_here = chosen(settings, only)
         look_at(settings, nodes_here)
         name = "-".join([settings.run.name, *nodes_here[:1]])
@@ -151,6 +179,13 @@ def run(
     else:
         print_lines(summary, folder.path)
     code = 1 if summary.verdict is not None and summary.verdict.passed is False else 0
+    if bundled is not None:
+        from runtime.tools.paper.repeat import compare_runs
+
+        agreement = compare_runs(bundled, summary)
+        code = 0 if agreement.agrees else 1
+        for line in () if quiet and agreement.agrees else agreement.lines:
+            print(line)
     if summary.twice is not None and not summary.twice.repeats:
         code = 1
     leave_behind(code)
