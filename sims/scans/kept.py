@@ -92,14 +92,17 @@ def _write(entry: Path, prepared: Prepared, files: Sequence[Path]) -> None:
             for field in _ARRAYS:
                 if (values := getattr(part, field)) is not None:
                     arrays[f"{group}.{number}.{field}"] = values
-    for number, material in enumerate(prepared.materials):
-        if material.image is not None:
-            arrays[f"image.{number}"] = material.image
+    images = {id(m.image): m.image for m in prepared.materials if m.image is not None}
+    arrays |= {f"image.{number}": image for number, image in enumerate(images.values())}
+    numbers = [
+        [*images].index(id(m.image)) if id(m.image) in images else -1 for m in prepared.materials
+    ]
     about = {
         "files": {str(path): _digest(path) for path in files},
         "floor": prepared.floor,
         "baked": prepared.baked,
         "notes": prepared.notes,
+        "images": numbers,
         "materials": [material._replace(image=None) for material in prepared.materials],
         **parts,
     }
@@ -130,10 +133,11 @@ def _read(entry: Path) -> Prepared:
                 for number, (name, material) in enumerate(about[group])
             )  # fmt: skip
         materials = []
-        for number, row in enumerate(about["materials"]):
+        images = [arrays[f"image.{k}"] for k in range(max(about["images"], default=-1) + 1)]
+        for number, row in zip(about["images"], about["materials"], strict=True):
             material = Material(*row)
             r, g, b, a = material.colour  # a list
-            image = arrays[key] if (key := f"image.{number}") in arrays else None
+            image = images[number] if number >= 0 else None
             materials.append(material._replace(colour=(r, g, b, a), image=image))
         return Prepared(
             groups["parts"], tuple(materials), groups["hulls"], arrays["boxes"], about["floor"],

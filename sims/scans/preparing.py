@@ -84,8 +84,10 @@ def prepare(file: MeshFile, spec: MeshSpec, solids: MeshFile | None = None) -> P
     elif spec.solid == "hulls":
         hulls = tuple(_parts(collision, math.inf))
     elif spec.solid == "voxels":
-        touched = _joined(collision) if collision else (points, corners)
-        boxes = voxel_boxes(*touched, spec.voxel, floor)
+        points, corners = _joined(collision) if collision else (points, corners)
+        if floor is not None:  # a plane stands for the ground, which may be kilometres wide
+            corners = corners[points[corners, 2].max(axis=1) > floor + 0.5 * spec.voxel]
+        boxes = voxel_boxes(points, corners, spec.voxel, floor)
         if len(boxes) > MANY_BOXES:
             notes.append(
                 f"solid: {len(boxes):,} boxes, which slow the physics; a voxel of "
@@ -274,24 +276,32 @@ def _part(
 
 
 def _materials(file: MeshFile, spec: MeshSpec, notes: list[str]) -> Iterator[Material]:
-    """Yield the materials with images as they are drawn."""
-    corners: dict[int, list[npt.NDArray[np.float32]]] = {}
+    """Yield the materials with images as they are drawn; equal images stay one array."""
+    corners: dict[int, list[npt.NDArray[np.float32]]] = {}  # by the image
+    placed = set()
     for piece in file.pieces:
         if piece.places is not None:
-            corners.setdefault(piece.material, []).append(piece.places[piece.corners])
+            placed.add(piece.material)
+            image = file.materials[piece.material].image
+            corners.setdefault(id(image), []).append(piece.places[piece.corners])
+    drawn: dict[tuple[int, bool], npt.NDArray[np.uint8]] = {}
     smaller = seen_through = 0
     for number, material in enumerate(file.materials):
-        if material.image is None or number not in corners:
+        if material.image is None or number not in placed:
             yield material._replace(image=None)
             continue
-        image, cutoff = fitted(material.image, spec.texture_size), material.cutoff
-        smaller += image.shape != material.image.shape
-        if image.shape[2] == 4 and not cutoff and material.blend and image[..., 3].min() < 250:
+        cutoff, key = material.cutoff, id(material.image)
+        alpha = material.image.shape[2] == 4
+        if alpha and not cutoff and material.blend and material.image[..., 3].min() < 250:
             cutoff, seen_through = ALPHA_CUTOFF, seen_through + 1
-        if not cutoff:
-            image = np.ascontiguousarray(image[..., :3])
-            image = extended(image, np.concatenate(corners[number]))
-        yield material._replace(image=image, cutoff=cutoff)
+        if (key, bool(cutoff)) not in drawn:
+            image = fitted(material.image, spec.texture_size)
+            smaller += image.shape != material.image.shape
+            if not cutoff:
+                image = np.ascontiguousarray(image[..., :3])
+                image = extended(image, np.concatenate(corners[key]))
+            drawn[key, bool(cutoff)] = image
+        yield material._replace(image=drawn[key, bool(cutoff)], cutoff=cutoff)
     if smaller:
         notes.append(f"{smaller} images were made smaller, to texture_size = {spec.texture_size}")
     if seen_through:

@@ -132,11 +132,12 @@ def _add_light(spec: Any, prepared: Prepared) -> None:
 def _add_looks(spec: Any, prepared: Prepared, bare: bool, solid: bool) -> None:
     """Add the drawn parts with their materials."""
     materials: set[int] = set()
+    images: dict[int, str] = {}  # names of textures by image
     for part in prepared.parts:
         material = prepared.materials[part.material]
         if part.material not in materials and not bare:
             materials.add(part.material)
-            _add_material(spec, part.material, material, prepared.baked)
+            _add_material(spec, part.material, material, prepared.baked, images)
         _add_mesh(spec, part, part.name, solid)
         if part.colours is not None and not bare:
             _add_colours(spec, part)
@@ -148,16 +149,20 @@ def _add_looks(spec: Any, prepared: Prepared, bare: bool, solid: bool) -> None:
         )  # fmt: skip
 
 
-def _add_material(spec: Any, number: int, material: Material, baked: bool) -> None:
+def _add_material(
+    spec: Any, number: int, material: Material, baked: bool, images: dict[int, str]
+) -> None:
     *rgb, alpha = material.colour
     added = spec.add_material(
         name=f"m{number}", rgba=[*rgb, alpha if material.blend else 1.0], specular=0.0,
         shininess=0.0, reflectance=0.0, emission=float(baked),
     )  # fmt: skip
     if material.image is not None:
-        _add_image(spec, f"m{number}", material.image)
+        if id(material.image) not in images:
+            images[id(material.image)] = f"m{number}"
+            _add_image(spec, f"m{number}", material.image)
         textures = list(added.textures)
-        textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = f"m{number}"
+        textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = images[id(material.image)]
         added.textures = textures
 
 

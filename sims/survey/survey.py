@@ -36,6 +36,7 @@ VIEWS = 8  # along the tour, of which every other one is drawn
 CAMERA = CameraSpec(
     name="camera", images=("rgb", "depth"), width=752, height=480, position=(0.0, 0.0, 0.0)
 )
+WIDEST = 100.0  # metres, of a triangle of what is surveyed
 CHANNELS, COLUMNS = 16, 1024  # of the lidar whose turn is timed
 
 _CONFIGURATION = """\
@@ -164,7 +165,10 @@ class Survey:
         starts = np.cumsum([0, *(len(part.points) for part in parts)])
         corners = [part.corners + start for part, start in zip(parts, starts, strict=False)]
         points = np.concatenate([part.points for part in parts]).astype(np.float64)
-        return points, np.concatenate(corners).astype(np.int32)
+        joined = np.concatenate(corners).astype(np.int32)
+        # A plane that stands for the ground may be kilometres wide, and is none of the room.
+        wide = np.ptp(points[joined][:, :, :2], axis=1).max(axis=1) > WIDEST
+        return points, joined[~wide] if self.prepared.floor is not None else joined
 
     def _tour(self) -> list[Vector3]:
         """Return the tour's waypoints, NED."""

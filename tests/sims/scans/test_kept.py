@@ -25,8 +25,9 @@ def whole() -> Prepared:
     colours = np.arange(16, dtype=np.uint8).reshape(4, 4)
     piece = quad(normals=NORMALS, places=PLACES, colours=colours)
     image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-    materials = (Material("paint", (0.5, 0.25, 1.0, 0.5), image, 0.0, True, True, True),)
-    table = Piece("table", 0, piece.points + np.array((0.0, 0.0, 1.0)), QUAD)
+    paint = Material("paint", (0.5, 0.25, 1.0, 0.5), image, 0.0, True, True, True)
+    materials = (paint, Material(image=image), Material("plain"))
+    table = Piece("table", 1, piece.points + np.array((0.0, 0.0, 1.0)), QUAD, places=PLACES)
     return prepare(
         MeshFile((piece, table), materials, left_out=("a note",)), MeshSpec(solid="hulls")
     )
@@ -58,6 +59,8 @@ def test_what_is_read_back_is_what_was_made(tmp_path: Path) -> None:
     assert same(kept(file, MeshSpec(), make), first)
     assert make.calls == 1
     assert same(first, whole())
+    again = kept(file, MeshSpec(), make)
+    assert again.materials[0].image is again.materials[1].image
 
 
 def test_it_is_made_anew_for_other_content_settings_and_files(tmp_path: Path, cache: Path) -> None:

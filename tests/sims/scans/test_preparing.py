@@ -199,3 +199,17 @@ def test_vertices_that_a_part_lacks_take_no_room() -> None:
     assert len(parts) == 2
     assert sum(len(part.points) for part in parts) < len(piece.points) * 1.1
     assert math.isclose(float(max(p.points.max() for p in parts)), 60.0)
+
+
+def test_an_image_of_two_materials_is_prepared_once() -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    pieces = quad(places=PLACES), quad("other", z=1.0, places=PLACES, material=1)
+    materials = (Material("a", image=image), Material("b", image=image))
+    first, second = prepare(file_of(*pieces, materials=materials), MeshSpec(solid="none")).materials
+    assert first.image is second.image is not None
+
+
+def test_a_ground_of_kilometres_is_a_plane_and_no_voxels() -> None:
+    prepared = prepare(file_of(quad(size=2000.0), quad("table", z=0.8, size=1.0)), MeshSpec())
+    assert prepared.floor == 0.0
+    assert len(prepared.boxes) == 1

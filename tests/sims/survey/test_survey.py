@@ -32,6 +32,7 @@ def test_a_room_is_described_drawn_and_flown(room: Path) -> None:
     assert 60.0 < float(lines["free"].removesuffix(" m³")) < 8.0 * 6.0 * 3.0
     assert lines["images"] == "my room-world.png"
     sheet = cv2.imdecode(np.fromfile("my room-world.png", np.uint8), cv2.IMREAD_COLOR)
+    assert sheet is not None
     assert sheet.shape[0] == 720
     settings = load(Path("fly.toml"))
     assert settings.run.name == "my_room"
