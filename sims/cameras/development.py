@@ -32,8 +32,8 @@ import numpy.typing as npt
 from events import CameraInfo
 from events.camera_info import response_light, srgb_light, vignette_map
 from sims.cameras.optics import defocused, grey_of, read_response
-from sims.cameras.raster import libraries
 from sims.cameras.spec import CameraSpec, DepthSensor, camera_info
+from sims.compiled import libraries
 
 Image = npt.NDArray[np.uint8]
 Codes = npt.NDArray[np.uint16]

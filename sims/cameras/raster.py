@@ -7,9 +7,7 @@ textures and lights that it takes. Every lens is drawn directly, without pinhole
 from __future__ import annotations
 
 import ctypes
-import functools
 import math
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -35,25 +33,13 @@ from sims.cameras.stage import (
     View,
     object_numbers,
 )
+from sims.compiled import libraries
 
 _Kind = mujoco.mjtGeom
 _OPTICAL = np.tile([1.0, -1.0, -1.0], 3)  # MuJoCo's camera looks along -z, with y up
 MOST_TRIANGLES = 1 << 24  # of all geoms: the rasteriser numbers them with 24 bits
 FROM_BEHIND = 0.3  # factor on the opacity of a plane that is seen from behind, as MuJoCo's
 _GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing is said
-
-
-@functools.cache
-def libraries() -> dict[str, Any]:
-    """Return the compiled rasterisers that run here, by instruction set, the quickest first."""
-    rasterisers = {}
-    for name in ("avx2", "sse4", "any"):
-        for path in Path(__file__).parent.glob(f"_raster_{name}.*"):
-            library = ctypes.CDLL(str(path))
-            library.raster_new.restype = ctypes.c_void_p
-            if library.raster_runs():
-                rasterisers[name] = library
-    return rasterisers
 
 
 class Raster(Stage):

@@ -22,6 +22,7 @@ from sims.cameras import raster as rasters
 from sims.cameras.optics import pixel_rays
 from sims.cameras.raster import Raster
 from sims.cameras.stage import View
+from sims.compiled import libraries
 
 KINDS = ("plane", "box", "sphere", "ellipsoid", "cylinder", "capsule", "mesh", "hfield")
 NUMBERS = (
@@ -191,7 +192,7 @@ def images_of(seed: int, instructions: str) -> list[bytes]:
 
 def main(path: str, first: int, count: int) -> int:
     """Draw the scenes; return 1 if an image differs from that of an installed build."""
-    builds = rasters.libraries()
+    builds = libraries()
     installed = list(builds)
     checked = ctypes.CDLL(path)
     checked.raster_new.restype = ctypes.c_void_p

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from events import CameraInfo
 from events.frames import from_rpy
 from sims.cameras.opengl import OpenGL
-from sims.cameras.raster import Raster, libraries
+from sims.cameras.raster import Raster
 from sims.cameras.spec import camera_info
 from sims.cameras.stage import View
+from sims.compiled import libraries
 from tests.sims.cameras.hostile import Fog
 from tests.sims.cameras.test_raster import (
     PINHOLE,

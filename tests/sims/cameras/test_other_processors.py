@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from sims.cameras.layouts import GEOM, LIGHT, POSE, VIEW
-from sims.cameras.raster import Raster, libraries
+from sims.cameras.raster import Raster
+from sims.compiled import libraries
 from tests.sims.cameras.scenes import fresh
 from tests.sims.cameras.test_raster import SPECS, compiled, drawn, places
 

@@ -26,9 +26,10 @@ from events.frames import from_rpy
 from sims.cameras import CameraSpec, GraphicsError, add_free_camera, pose_to_qpos
 from sims.cameras.opengl import OpenGL
 from sims.cameras.optics import Lens, pixel_rays
-from sims.cameras.raster import Raster, libraries
+from sims.cameras.raster import Raster
 from sims.cameras.spec import camera_info
 from sims.cameras.stage import Drawn, Stage, View
+from sims.compiled import libraries
 from sims.worlds import TOURS, WORLDS
 from tests.opencv import drawn_by_5
 from tests.sims.cameras.scenes import fresh

@@ -24,8 +24,8 @@ from runtime.testing import NodeResult, run_node
 from sims.cameras import CameraSpec
 from sims.cameras.development import Development, Passes, _at, _quantiles, noise_key, random_words
 from sims.cameras.optics import generator
-from sims.cameras.raster import libraries
 from sims.cameras.spec import DepthSensor
+from sims.compiled import libraries
 from sims.computer_vision import FreeCamera
 
 GREY = np.full((400, 400, 3), 128, np.uint8)

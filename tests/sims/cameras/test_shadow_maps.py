@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from sims.cameras import CameraSpec, add_free_camera
-from sims.cameras.raster import Raster, libraries
+from sims.cameras.raster import Raster
 from sims.cameras.spec import camera_info
 from sims.cameras.stage import View
+from sims.compiled import libraries
 
 CAMERA = CameraSpec(name="eye", width=40, height=30, fov=90.0, position=(0.0, 0.0, 0.0))
 VIEW = View(camera_info(CAMERA))
