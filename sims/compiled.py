@@ -1,4 +1,4 @@
-"""The compiled library of the simulators: the rasteriser, the cameras' noise, rays that meet meshes.
+"""The simulators' compiled library: the rasteriser, the cameras' noise, rays that meet meshes.
 
 Its sources are in ``sims/cameras/rasteriser``; all of its builds give the same bytes.
 """

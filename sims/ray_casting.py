@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import weakref
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
@@ -126,6 +126,11 @@ def _in_groups(group: npt.NDArray[np.int32], groups: Groups | None) -> npt.NDArr
     return np.asarray(groups[np.clip(group, 0, len(groups) - 1)] != 0)
 
 
+def met_by_trees(model: Any) -> npt.NDArray[np.bool_]:
+    """Return a mask of the geoms that are not left to MuJoCo, shape (ngeom,)."""
+    return np.asarray((model.geom_type == _MESH) & bool(libraries()))
+
+
 class MeshRays:
     """Trees over the triangles of a model's mesh geoms, built at the first cast that wants them.
 
@@ -140,12 +145,11 @@ class MeshRays:
         instructions: One of `libraries`; the quickest by default.
     """
 
-    _of_models: weakref.WeakKeyDictionary[Any, MeshRays] = weakref.WeakKeyDictionary()
+    _of_models: ClassVar[weakref.WeakKeyDictionary[Any, MeshRays]] = weakref.WeakKeyDictionary()
 
     def __init__(self, model: Any, instructions: str = "") -> None:
-        self._library = libraries().get(instructions or next(iter(libraries()), ""))
-        met = model.geom_type == _MESH
-        self.geoms = np.flatnonzero(met if self._library is not None else ~met & met)
+        self._library: Any = libraries().get(instructions or next(iter(libraries()), ""))
+        self.geoms = np.flatnonzero(met_by_trees(model))
         self._trees: ctypes.c_void_p | None = None
 
     @classmethod
@@ -192,7 +196,7 @@ class MeshRays:
         )  # fmt: skip
 
     def _build(self, model: Any) -> None:
-        library: Any = self._library
+        library = self._library
         trees = ctypes.c_void_p(library.rays_new())
         weakref.finalize(self, library.rays_free, trees)
         meshes = model.geom_dataid[self.geoms]

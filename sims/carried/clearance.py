@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from events import Vector3
 from events.frames import flip_yz
+from sims.ray_casting import cast_ray
 from sims.vehicle.simulation import mover_of, name_of
 from sims.worlds import Dynamics
 
@@ -133,10 +134,9 @@ class Clearance:
 
     def covered(self, point: Vector3) -> bool:
         """Return whether anything is above a point, m NED: whether it is indoors, as a rule."""
-        hit = np.zeros(1, np.int32)
         origin, upwards = np.array(flip_yz(point)), np.array((0.0, 0.0, 1.0))
-        distance = mujoco.mj_ray(self._model, self._data, origin, upwards, None, 1, -1, hit)
-        return float(distance) >= 0.0
+        distance, _ = cast_ray(self._model, self._data, origin, upwards)
+        return distance >= 0.0
 
     def name_of(self, geom: int) -> str:
         """Return the name of a solid for a reader."""

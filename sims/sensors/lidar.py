@@ -20,6 +20,7 @@ from sims.cameras.renderer import model_from_bytes
 from sims.cameras.rig import DrawnWorld
 from sims.cameras.stage import object_numbers
 from sims.presets import LIDARS
+from sims.ray_casting import met_by_trees
 from sims.sensors.calibration import LIDAR_SIZES, USUAL_LIDAR, LidarCalibrationError
 from sims.sensors.rays import Floats, Rays
 from sims.sensors.sensor import Mounted, Name, NonNegative, Positive, SensorSpec
@@ -192,7 +193,7 @@ class Scanner:
         self._pose = slice(pose, pose + 7)
         met = solids(model) & (model.geom_bodyid != model.body(f"{vehicle}/base_link").id)
         greys = reflectivities(model)
-        order = _put_first(model, met)
+        order = _put_first(model, met & ~met_by_trees(model))
         self._hidden, self._reflectivity = ~met[order], greys[order]
         # Whatever may move, and planes, whose bound is 0, are always looked at.
         self._bounded = (model.geom_bodyid == 0) & (model.geom_rbound > 0.0)
@@ -315,7 +316,7 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def _put_first(model: Any, met: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-    """Hide the world's own geoms not met by light from MuJoCo's ray casting.
+    """Hide all of the world's own geoms but those met from MuJoCo's ray casting.
 
     For each ray it goes through all geoms of a body, the first `body_geomnum` of its own. Returned
     are the old numbers, to which names lead still.

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from events import Quaternion, Range
 from events.frames import flip_yz, flip_yz_rotation, multiply, rotate
 from events.sensors import SENSOR_KINDS
+from sims.ray_casting import cast_rays
 from sims.sensors.sensor import Name, NonNegative, Place, Positive, Sensor, SensorSpec, Truth
 from sims.worlds import Dynamics
 
@@ -55,23 +56,12 @@ class Rays:
         reach: float,
         groups: npt.NDArray[np.uint8] = DRAWN,
     ) -> Hits:
-        """Cast rays from a point, shape (3,), along unit vectors, (n, 3); NWU, metres."""
-        count = len(directions)
-        geoms, distances = np.empty(count, np.int32), np.empty(count)
-        normals = np.empty((count, 3))
-        mujoco.mj_multiRay(
-            self.model,
-            self.data,
-            origin,
-            np.ascontiguousarray(directions).ravel(),
-            groups,
-            1,
-            self._body,
-            geoms,
-            distances,
-            normals.reshape(-1),
-            count,
-            mujoco.mjMAXVAL,  # not `reach`: a plane whose middle is farther would not be met
+        """Cast rays from a point, shape (3,), along unit vectors, (n, 3); NWU, metres.
+
+        What is see-through, or masked out by a texture's alpha, is met as if it were solid.
+        """
+        distances, geoms, normals = cast_rays(
+            self.model, self.data, origin, directions, groups, self._body
         )
         distances[(geoms < 0) | (distances > reach)] = np.inf
         return Hits(distances, geoms, normals)

@@ -38,6 +38,7 @@ import numpy as np
 import events as ev
 from events import Vector3
 from events.frames import flip_yz, yaw_of
+from sims.ray_casting import cast_ray
 from sims.vehicle.control import Controller, Motors, Setpoint, fault
 from sims.vehicle.physics import State
 from sims.vehicle.position import Gains, Limits
@@ -328,16 +329,14 @@ class Clearance:
             return None, None
         x, y, z = (component / length for component in way)
         origin, direction = np.array(flip_yz(start)), np.array(flip_yz((x, y, z)))
-        hit = np.zeros(1, np.int32)
         groups = self._model.geom_group.copy()
         self._model.geom_group[:] = self._no_hits
         try:
-            distance = mujoco.mj_ray(
-                self._model, self._data, origin, direction, _SOLIDS, 1, self._body, hit
+            distance, geom = cast_ray(
+                self._model, self._data, origin, direction, _SOLIDS, self._body
             )
         finally:
             self._model.geom_group[:] = groups
-        geom = int(hit[0])
         return (None, None) if geom < 0 or distance >= length else (geom, distance)
 
     def _name_of(self, geom: int) -> str:

@@ -349,11 +349,7 @@ struct Beam {
     }
 };
 
-#ifdef __AVX2__
 inline unsigned which(iv mask) { return static_cast<unsigned>(bits(mask)); }
-#else
-inline unsigned which(iv mask) { return static_cast<unsigned>(bits(mask)); }
-#endif
 
 }  // namespace
 
@@ -518,7 +514,9 @@ private:
                     const Vec3 from{line.origin.x - pose.position[0],
                                     line.origin.y - pose.position[1],
                                     line.origin.z - pose.position[2]};
-                    const Line own(pose.turn.back(from), pose.turn.back(line.direction));
+                    const Vec3 along = pose.turn.back(line.direction);
+                    if (!Line::is_one(pose.turn.back(from), along)) continue;
+                    const Line own(pose.turn.back(from), along);
                     through(*rays.trees_[rays.bodies_[body].mesh], line, own, body, best);
                 }
             }
@@ -541,6 +539,13 @@ private:
         std::memcpy(pose.position, positions + 3 * geom, sizeof pose.position);
         std::memcpy(pose.turn.m, turns + 9 * geom, sizeof pose.turn.m);
         return pose;
+    }
+
+    static bool is_pose(const Pose& pose) {
+        bool inside = true;  // and no number is NaN
+        for (const double place : pose.position) inside &= std::fabs(place) <= farthest;
+        for (const double turn : pose.turn.m) inside &= std::fabs(turn) < 1.5;
+        return inside;
     }
 
     Triangle triangle_of(std::int32_t mesh, std::int32_t triangle, const Pose& pose) const {
@@ -576,7 +581,7 @@ private:
         int lane = wide;
         for (const int body : moving_) {
             const Tree& tree = *trees_[bodies_[body].mesh];
-            if (!wanted[body] || tree.nodes().empty()) continue;
+            if (!wanted[body] || tree.nodes().empty() || !is_pose(poses[body])) continue;
             if (lane == wide) {
                 lane = 0;
                 Node& node = nodes.emplace_back();

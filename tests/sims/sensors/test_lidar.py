@@ -24,7 +24,7 @@ from events import LidarScan
 from runtime import Tick
 from sims.cameras import model_to_bytes
 from sims.sensors.lidar import LATE, LidarRig, LidarSpec, Scanner, pattern_of, solids
-from sims.sensors.rays import Rays
+from sims.sensors.rays import DRAWN, Rays
 from sims.vehicle import Physics, attach_vehicle
 from sims.worlds import Dynamics, Motion, load_scene
 from tests.sims.vehicle.flight import compiled
@@ -306,11 +306,17 @@ def test_a_turn_costs_less_than_its_rays_cast_one_millisecond_after_the_other(wo
     plain = Rays(compiled, scene.dynamics, "drone/base_link")
     states = np.tile(compiled.qpos0, (101, 1))
     directions = pattern_of(spec, 0.0).directions.reshape(-1, 3)
+    own = compiled.body("drone/base_link").id
     plain.look(states[0], 0.0)
 
     def cast() -> None:
         for begin in range(0, len(directions), 164):
-            plain.cast(states[0, :3], directions[begin : begin + 164], spec.max_range)
+            part = directions[begin : begin + 164]
+            geoms, distances = np.empty(len(part), np.int32), np.empty(len(part))
+            mujoco.mj_multiRay(
+                compiled, plain.data, states[0, :3], part.ravel(), DRAWN, 1, own, geoms,
+                distances, np.empty(part.size), len(part), mujoco.mjMAXVAL,
+            )  # fmt: skip
 
     times: list[list[float]] = [[], []]
     for _ in range(12):

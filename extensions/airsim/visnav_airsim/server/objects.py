@@ -21,6 +21,7 @@ from events import Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_geodetic
 from runtime.logs import NodeLogger
 from sims.cameras.stage import LOOK
+from sims.ray_casting import cast_ray
 from sims.vehicle.simulation import mover_of
 from sims.world import SharedWorld
 from sims.worlds.dynamics import check_strength
@@ -347,9 +348,7 @@ class Scenery:
         length = float(np.linalg.norm(way))
         if not 1e-9 < length < math.inf:
             return length <= 1e-9
-        geom_id = np.zeros(1, np.int32)
-        ray = begin, way / length, None, 1, body, geom_id
-        distance: float = mujoco.mj_ray(model, data, *ray)
+        distance, _ = cast_ray(model, data, begin, way / length, None, body)
         return distance < 0.0 or distance >= length
 
     def _in_map(self, point: GeoPoint) -> Vector3:
