@@ -449,7 +449,7 @@ private:
         float before;  // not less than the distance, along the line's z
         void bound(double length) {
             before = hit.distance * length < farthest * farthest
-                         ? above(hit.distance * length) * slack
+                         ? static_cast<float>(hit.distance * length) * slack
                          : infinite;
         }
     };
@@ -471,33 +471,44 @@ private:
                 std::int32_t child;
             } open[most_open];
             int count = 0;
-            open[count++] = {0, 0};
+            std::int32_t child = 0;
             float before = best.before * scale;
-            while (count) {
-                const Open next = open[--count];
-                if (next.entered > before) continue;
-                if (next.child < 0) {
-                    const Block& block = tree.blocks()[-2 - next.child];
+            for (;;) {
+                if (child >= 0) {
+                    const Node& node = tree.nodes()[child];
+                    fv entered;
+                    unsigned left = which(beam.enters(node, before, entered));
+                    if (left) {
+                        int lane = __builtin_ctz(left);
+                        Open nearest{entered[lane], node.child[lane]};
+                        const int first = count;
+                        while (left &= left - 1) {
+                            lane = __builtin_ctz(left);
+                            Open other{entered[lane], node.child[lane]};
+                            if (other.entered < nearest.entered) std::swap(other, nearest);
+                            int place = count++;  // the nearest of the rest is the last
+                            for (; place > first && open[place - 1].entered < other.entered;
+                                 --place)
+                                open[place] = open[place - 1];
+                            open[place] = other;
+                        }
+                        child = nearest.child;
+                        continue;
+                    }
+                } else {
+                    const Block& block = tree.blocks()[-2 - child];
                     for (unsigned left = which(beam.may_meet(block, before)); left;
                          left &= left - 1) {
                         const int lane = __builtin_ctz(left);
                         meet(line, body < 0 ? block.geom[lane] : body, block.triangle[lane], best);
                         before = best.before * scale;
                     }
-                    continue;
                 }
-                const Node& node = tree.nodes()[next.child];
-                fv entered;
-                const int first = count;
-                for (unsigned left = which(beam.enters(node, before, entered)); left;
-                     left &= left - 1) {
-                    const int lane = __builtin_ctz(left);
-                    const Open child{entered[lane], node.child[lane]};
-                    int place = count++;  // the nearest is the last
-                    for (; place > first && open[place - 1].entered < child.entered; --place)
-                        open[place] = open[place - 1];
-                    open[place] = child;
-                }
+                do {
+                    if (!count) return;
+                    --count;
+                } while (open[count].entered > before);
+                child = open[count].child;
             }
         }
 
