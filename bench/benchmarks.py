@@ -191,7 +191,8 @@ _LATE = (
 )
 _TICK = " | ".join(f"tick {column}" for column in _LATE.split(" | "))
 
-_TIME, _IMAGES, _BESIDE = "Simulated time", "Images", "Between processes, and beside the loop"
+_TIME, _IMAGES, _RAYS = "Simulated time", "Images", "Rays"
+_BESIDE = "Between processes, and beside the loop"
 
 SECTIONS = {
     "Stalls": "",
@@ -200,6 +201,7 @@ SECTIONS = {
         "Both renderers in turns, from the same places of each world's tour, in a flight that "
         "turns."
     ),
+    _RAYS: "",
     "Throughput": "",
     _BESIDE: "Each of these tables is a run of its own, whose sides were measured in turns.",
 }
@@ -283,6 +285,19 @@ BENCHMARKS = (
         _IMAGES,
         options=(Option("repeats", 5, "Starts of each run.", quick=1),),
         command="frame",
+    ),
+    Benchmark(
+        "rays",
+        "rays:measure",
+        "A lidar's turn of 16 × 1024 rays in a room of triangles, on one core: the project's "
+        "trees, MuJoCo and Embree (float32; not the same bits everywhere)",
+        "triangles: triangles ,d | µs a ray: ours_us us | MuJoCo's: mujoco_us us | "
+        "Embree's: embree_us us | ratio to Embree's: ratio .2f | seconds of the build: "
+        "seconds .2f | Embree's: embree_seconds .2f",
+        _RAYS,
+        "Measure rays that meet meshes, beside MuJoCo and Embree (embreex).",
+        (Option("rounds", 9, "Turns from each of three places.", quick=2),),
+        texts=0,
     ),
     Benchmark(
         "bridge",

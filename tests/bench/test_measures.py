@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import frame, lockstep, outside, stall, throughput
+from bench import frame, lockstep, outside, rays, stall, throughput
 
 
 @pytest.mark.slow
@@ -116,3 +116,12 @@ def test_frames_are_drawn_by_both_renderers_and_the_first_image_comes(
         assert row["mujoco_ms"] is not None
         assert row["ratio"] == pytest.approx(row["mujoco_ms"] / row["raster_ms"])
     assert [row["world"] for row in frame.measure_first_image(repeats=1)] == ["hall", "yard"]
+
+
+def test_rays_of_all_sides_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rays, "CELLS", {500: 1})
+    (row,) = rays.measure(rounds=1)
+    assert row["triangles"] == 500
+    assert row["ours_us"] < row["mujoco_us"]
+    if "embree_us" in row:
+        assert row["ratio"] == pytest.approx(row["ours_us"] / row["embree_us"])
