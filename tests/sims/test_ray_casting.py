@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import weakref
 from typing import Any
 
@@ -100,9 +101,11 @@ def test_the_nearest_of_all_triangles_is_met() -> None:
     corners = np.concatenate([corners, [[0, 0, 1], [3, 3, 3], [0, 1, 2]], corners[::-7, [1, 0, 2]]])
     corners = corners.astype(np.int32)
     exact = points.astype(np.float64)
-    origins = random.uniform(-2.0, 2.0, (4, 3)), [(1.0, 0.0, 0.0)], exact[corners[4]].mean(axis=0)
+    surface = exact[corners[4]].mean(axis=0)
     library = next(iter(libraries().values()))
-    for origin in np.concatenate([*origins[:2], origins[2][None], exact[:1], [[-50.0, 0.0, 0.0]]]):
+    inside, outside, before = [1.0, 0.0, 0.0], [-50.0, 0.0, 0.0], surface * (1.0 + 1e-9)
+    somewhere = random.uniform(-2.0, 2.0, (3, 3))
+    for origin in (*somewhere, np.array(inside), surface, before, exact[0], np.array(outside)):
         ways = directions(random, points, corners, origin, 12_500)
         met = meet(library, points, corners, origin, ways)
         distances = np.where(met.triangles < 0, np.inf, met.distances)
@@ -115,6 +118,38 @@ def test_the_nearest_of_all_triangles_is_met() -> None:
         normals = np.cross(plane[:, 1] - plane[:, 0], plane[:, 2] - plane[:, 0])
         normals /= np.linalg.norm(normals, axis=1)[:, None]
         np.testing.assert_allclose(met.normals[there], normals, atol=1e-12)
+
+
+@pytest.mark.parametrize("middle", [(0.0, 0.0, 0.0), (5000.0, -3000.0, 100.0)])
+def test_far_from_the_middle_of_the_world_rounding_leaves_nothing_out(middle: Vector3) -> None:
+    """Triangles of a millimetre, or the eye, at kilometres: there, floats are half of one apart."""
+    random = np.random.default_rng(9)
+    points, corners = torus(12, 8)
+    points = points * np.float32(0.004)
+    turns = np.linalg.qr(random.standard_normal((6, 3, 3)))[0]
+    places = np.array(middle) + random.uniform(-0.01, 0.01, (6, 3))
+    exact = np.concatenate(
+        [points.astype(np.float64) @ turn.T + at for turn, at in zip(turns, places, strict=True)]
+    )
+    everything = np.concatenate([corners + len(points) * k for k in range(len(places))])
+    for origin in (places[0], places[0] + (0.05, 0.02, 0.01), np.array([5000.0003, 20.0, 5.0])):
+        ways = directions(random, exact, everything, origin, 500)
+        distances = tried(exact, everything, origin, ways, -1e-9)
+        for moves, library in itertools.product((0, 3), libraries().values()):
+            met = meet(library, points, corners, origin, ways, places, turns, moves=moves)
+            there = np.where(met.geoms < 0, np.inf, met.distances)
+            assert (there <= distances * (1.0 + 1e-6)).all()
+
+
+def test_beside_a_needle_its_plane_is_not_met() -> None:
+    """It rises a metre in a nanometre, and the ray passes by 50 of them: it is met at its edge, at
+    1.25 m, or not at all."""
+    points = np.array([[0, 0, 1], [1, 0, 2], [0.5, 1e-9, 2.5]], np.float32)
+    corners = np.array([[0, 1, 2]], np.int32)
+    origin, ways = np.array([0.25, 5e-8, 0.0]), np.array([[0.0, 0.0, 1.0]])
+    for library in libraries().values():
+        met = meet(library, points, corners, origin, ways)
+        assert met.geoms[0] == -1 or met.distances[0] == pytest.approx(1.25, abs=0.01)
 
 
 def test_all_builds_give_the_same_bits() -> None:

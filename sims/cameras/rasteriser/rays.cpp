@@ -270,9 +270,7 @@ struct Line {
                                       std::fabs(b.y), std::fabs(c.x), std::fabs(c.y)});
         if (!(area > 0x1p-46 * size * size)) return none;  // seen from its edge, or none at all
         const double ahead = (u * a.z + v * b.z + w * c.z) / area;
-        const double bounded =
-            std::clamp(ahead, std::min({a.z, b.z, c.z}), std::max({a.z, b.z, c.z}));
-        return bounded >= 0 ? bounded / length : none;
+        return ahead >= 0 ? ahead / length : none;
     }
 };
 
@@ -357,12 +355,11 @@ inline unsigned which(iv mask) { return static_cast<unsigned>(bits(mask)); }
 class Rays {
 public:
     int add_mesh(int vertices, const float* points, int triangles, const std::int32_t* corners) {
-        Surface surface;
-        surface.points.resize(vertices);
-        surface.corners.resize(triangles);
-        std::memcpy(surface.points.data(), points, sizeof(Vec3f) * vertices);
-        std::memcpy(surface.corners.data(), corners, sizeof(std::int32_t) * 3 * triangles);
-        surfaces_.push_back(std::move(surface));
+        Surface& surface = surfaces_.emplace_back();
+        for (int k = 0; k < vertices; ++k)
+            surface.points.push_back({points[3 * k], points[3 * k + 1], points[3 * k + 2]});
+        for (int k = 0; k < triangles; ++k)
+            surface.corners.push_back({corners[3 * k], corners[3 * k + 1], corners[3 * k + 2]});
         return static_cast<int>(surfaces_.size()) - 1;
     }
 

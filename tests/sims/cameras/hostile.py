@@ -1,7 +1,8 @@
 """Scenes of hostile numbers, drawn by a given build of the rasteriser (`test_hostile.py`).
 
 ``python -m tests.sims.cameras.hostile LIBRARY FIRST COUNT`` draws the scenes of seeds FIRST to
-FIRST + COUNT - 1, names each on stderr before it is drawn, and compares with an installed build.
+FIRST + COUNT - 1, and casts rays at hostile triangles, names each scene on stderr before, and
+compares with an installed build.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from sims.cameras.optics import pixel_rays
 from sims.cameras.raster import Raster
 from sims.cameras.stage import View
 from sims.compiled import libraries
+from tests.sims.triangles import meet
 
 KINDS = ("plane", "box", "sphere", "ellipsoid", "cylinder", "capsule", "mesh", "hfield")
 NUMBERS = (
@@ -190,6 +192,24 @@ def images_of(seed: int, instructions: str) -> list[bytes]:
     return images
 
 
+def hits_of(seed: int, library: Any) -> bytes:
+    """Return what rays of hostile numbers meet of such triangles, at such poses."""
+    pick = random.Random(seed)
+    count = pick.choice((0, 1, 3, 40, 400))
+    numbers = np.random.default_rng(seed)
+    points = numbers.uniform(-2.0, 2.0, (3 * count + 3, 3)).astype(np.float32)
+    corners = numbers.integers(0, len(points), (count, 3), np.int32)
+    positions, turns = numbers.uniform(-3.0, 3.0, (4, 3)), np.tile(np.eye(3), (4, 1, 1))
+    origin, directions = numbers.uniform(-3.0, 3.0, 3), numbers.standard_normal((60, 3))
+    for array, share in ((points, 0.05), (positions, 0.1), (turns, 0.02), (directions, 0.2)):
+        spoil(pick, array, pick.choice((0.0, share)))
+    spoil(pick, origin, pick.choice((0.0, 0.0, 0.2)))
+    met = meet(
+        library, points, corners, origin, directions, positions, turns, moves=pick.randrange(5)
+    )
+    return b"".join(part.tobytes() for part in met)
+
+
 def main(path: str, first: int, count: int) -> int:
     """Draw the scenes; return 1 if an image differs from that of an installed build."""
     builds = libraries()
@@ -205,6 +225,9 @@ def main(path: str, first: int, count: int) -> int:
         name = installed[seed % len(installed)]
         if images_of(seed, name) != images_of(seed, "checked"):
             print(f"scene {seed}: {name} draws other bytes", file=sys.stderr)
+            same = False
+        if hits_of(seed, builds[name]) != hits_of(seed, checked):
+            print(f"scene {seed}: {name} meets others", file=sys.stderr)
             same = False
     return int(not same)
 
