@@ -188,14 +188,17 @@ class MeshRays:
             triangles: Filled in with numbers in the meshes, -1 where no mesh is met; shape (n,).
         """
         if self._trees is None:
-            self._build(model)
+            self.build(model)
         self._library.rays_cast(
             self._trees, _at(data.geom_xpos), _at(data.geom_xmat), _at(wanted), _at(origin),
             len(directions), _at(directions), _at(hits.distances), _at(hits.geoms),
             _at(hits.normals), _at(triangles),
         )  # fmt: skip
 
-    def _build(self, model: Any) -> None:
+    def build(self, model: Any) -> None:
+        """Build the trees with all geoms where they are at first; the first cast does it, too."""
+        if not self.geoms.size:
+            return
         library = self._library
         trees = ctypes.c_void_p(library.rays_new())
         weakref.finalize(self, library.rays_free, trees)

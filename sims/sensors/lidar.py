@@ -20,7 +20,7 @@ from sims.cameras.renderer import model_from_bytes
 from sims.cameras.rig import DrawnWorld
 from sims.cameras.stage import object_numbers
 from sims.presets import LIDARS
-from sims.ray_casting import met_by_trees
+from sims.ray_casting import MeshRays, met_by_trees
 from sims.sensors.calibration import LIDAR_SIZES, USUAL_LIDAR, LidarCalibrationError
 from sims.sensors.rays import Floats, Rays
 from sims.sensors.sensor import Mounted, Name, NonNegative, Positive, SensorSpec
@@ -155,12 +155,13 @@ _DEFAULT = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 
 
 class _Boxes:
-    """The boxes around a world's geoms, as they are at the start."""
+    """The boxes around some of a world's geoms, as they are at the start."""
 
-    def __init__(self, rays: Rays) -> None:
+    def __init__(self, rays: Rays, geoms: npt.NDArray[np.intp]) -> None:
         rays.look(rays.model.qpos0, 0.0)
-        aabb, axes = rays.model.geom_aabb, rays.data.geom_xmat.reshape(-1, 3, 3)
-        centres = rays.data.geom_xpos + np.einsum("gij,gj->gi", axes, aabb[:, :3])
+        aabb = rays.model.geom_aabb[geoms]
+        axes = rays.data.geom_xmat[geoms].reshape(-1, 3, 3)
+        centres = rays.data.geom_xpos[geoms] + np.einsum("gij,gj->gi", axes, aabb[:, :3])
         self._centres = np.ascontiguousarray(centres.T)
         self._edges = [
             np.ascontiguousarray((axes[:, :, i] * aabb[:, 3 + i, None]).T) for i in range(3)
@@ -193,11 +194,13 @@ class Scanner:
         self._pose = slice(pose, pose + 7)
         met = solids(model) & (model.geom_bodyid != model.body(f"{vehicle}/base_link").id)
         greys = reflectivities(model)
-        order = _put_first(model, met & ~met_by_trees(model))
+        by_trees = met & met_by_trees(model)
+        order = _put_first(model, met & ~by_trees, build=bool(by_trees.any()))
         self._hidden, self._reflectivity = ~met[order], greys[order]
         # Whatever may move, and planes, whose bound is 0, are always looked at.
-        self._bounded = (model.geom_bodyid == 0) & (model.geom_rbound > 0.0)
-        self._boxes = _Boxes(self._rays)
+        bounded = (model.geom_bodyid == 0) & (model.geom_rbound > 0.0)
+        self._bounded = np.flatnonzero(bounded & ~self._hidden & ~met_by_trees(model))
+        self._boxes = _Boxes(self._rays, self._bounded)
 
     def scan(self, name: str, start: int, states: Floats) -> LidarScan:
         """Return the scan of a turn from `start` (ns) on. The same arguments give the same bits.
@@ -277,7 +280,9 @@ class Scanner:
         aside = (farthest < 0.0) | (nearest > reach)
         for axis, slope in zip((right, -right, up, -up), slopes, strict=True):
             aside |= self._boxes.extents(axis - slope * ahead, origins)[0] > 0.0
-        return np.asarray(aside & narrow[:, None] & self._bounded)
+        hidden = np.zeros((len(origins), len(self._hidden)), np.bool_)
+        hidden[:, self._bounded] = aside & narrow[:, None]
+        return hidden
 
     def _measured(
         self,
@@ -315,7 +320,7 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)[:, None])
 
 
-def _put_first(model: Any, met: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+def _put_first(model: Any, met: npt.NDArray[np.bool_], build: bool) -> npt.NDArray[np.intp]:
     """Hide all of the world's own geoms but those met from MuJoCo's ray casting.
 
     For each ray it goes through all geoms of a body, the first `body_geomnum` of its own. Returned
@@ -328,6 +333,8 @@ def _put_first(model: Any, met: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
         array = getattr(model, name)
         if name.startswith("geom_") and len(array) == model.ngeom:
             array[:] = array[order]
+    if build:
+        MeshRays.of(model).build(model)  # from below on MuJoCo does not compute their positions
     model.body_geomnum[0] = met[world].sum()
     return order
 

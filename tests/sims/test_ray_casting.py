@@ -16,9 +16,11 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from events import Vector3
+from sims.cameras.renderer import model_to_bytes
 from sims.carried.clearance import Clearance as CarriedClearance
 from sims.compiled import libraries
 from sims.ray_casting import MeshRays, RayHits, cast_ray, cast_rays
+from sims.sensors.lidar import LidarSpec, Scanner
 from sims.sensors.rays import DRAWN, Rays
 from sims.vehicle import attach_vehicle
 from sims.vehicle.autopilot import Clearance
@@ -124,10 +126,10 @@ def test_the_nearest_of_all_triangles_is_met() -> None:
 def test_far_from_the_middle_of_the_world_rounding_leaves_nothing_out(middle: Vector3) -> None:
     """Triangles of a millimetre, or the eye, at kilometres: there, floats are half of one apart."""
     random = np.random.default_rng(9)
-    points, corners = torus(12, 8)
+    points, corners = torus(6, 4)
     points = points * np.float32(0.004)
-    turns = np.linalg.qr(random.standard_normal((6, 3, 3)))[0]
-    places = np.array(middle) + random.uniform(-0.01, 0.01, (6, 3))
+    turns = np.linalg.qr(random.standard_normal((3, 3, 3)))[0]
+    places = np.array(middle) + random.uniform(-0.01, 0.01, (3, 3))
     exact = np.concatenate(
         [points.astype(np.float64) @ turn.T + at for turn, at in zip(turns, places, strict=True)]
     )
@@ -135,7 +137,7 @@ def test_far_from_the_middle_of_the_world_rounding_leaves_nothing_out(middle: Ve
     for origin in (places[0], places[0] + (0.05, 0.02, 0.01), np.array([5000.0003, 20.0, 5.0])):
         ways = directions(random, exact, everything, origin, 500)
         distances = tried(exact, everything, origin, ways, -1e-9)
-        for moves, library in itertools.product((0, 3), libraries().values()):
+        for moves, library in itertools.product((0, 2), libraries().values()):
             met = meet(library, points, corners, origin, ways, places, turns, moves=moves)
             there = np.where(met.geoms < 0, np.inf, met.distances)
             assert (there <= distances * (1.0 + 1e-6)).all()
@@ -401,3 +403,35 @@ def test_paths_range_finders_and_roofs_meet_meshes_through_trees(
     assert hits.normals[0] == pytest.approx([1.0, 0.0, 0.0], abs=1e-7)
     assert RayHits(*hits).geoms.tolist() == [walled.geom("wall").id]
     assert casts[4:] == [1]
+
+
+def test_a_lidar_has_the_points_that_it_has_without_trees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a ring of meshes, with a box before it, a solid that is not seen, and one that moves."""
+    spec = mujoco.MjSpec()
+    for number, piece in enumerate(np.array_split(torus(24, 8)[1], 3)):
+        add_mesh(spec, f"m{number}", torus(24, 8)[0] * np.float32(4.0), piece)
+        spec.worldbody.add_geom(type=MESH, meshname=f"m{number}", group=number)
+    for group, place in ((3, [1.0, 0.0, 0.0]), (0, [0.0, 2.0, 0.0])):
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.5, 0.5], pos=place, group=group
+        )
+    body = spec.worldbody.add_body(name="b", pos=[0.0, -2.0, 0.0])
+    body.add_freejoint()
+    add_mesh(spec, "knot", *torus(7, 3))
+    body.add_geom(type=MESH, meshname="knot", rgba=[0.9, 0.1, 0.1, 1.0])
+    attach_vehicle(spec, "drone", (0.0, 0.0, 0.0), 0.0)
+    model = spec.compile()
+    states = np.tile(model.qpos0, (101, 1))
+    states[:, 1] += np.linspace(0.0, 0.3, 101)
+    lidar = LidarSpec(name="lidar", columns=90, min_intensity=0.01)
+    scans = []
+    for _ in range(2):
+        scanner = Scanner(model_to_bytes(model), Dynamics(), (lidar,), "drone", 0)
+        scans.append(scanner.scan("lidar", 0, states))
+        monkeypatch.setattr("sims.ray_casting.libraries", dict)
+    ours, mujocos = scans
+    assert len(ours.points) > 1000
+    np.testing.assert_allclose(ours.points, mujocos.points, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(ours.intensities, mujocos.intensities, rtol=1e-4)
+    distances = np.linalg.norm(ours.points, axis=1)
+    assert (distances < 2.5).sum() > 100
