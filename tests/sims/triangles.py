@@ -38,7 +38,6 @@ def meet(
     met = Met(
         np.full(n, -1.0), np.full(n, -1, np.int32), np.zeros((n, 3)), np.full(n, -1, np.int32)
     )
-    library.rays_new.restype = ctypes.c_void_p
     trees = ctypes.c_void_p(library.rays_new())
     library.rays_mesh(trees, len(points), _at(points), len(corners), _at(corners))
     numbers, meshes = np.arange(count, dtype=np.int32), np.zeros(count, np.int32)

@@ -12,14 +12,14 @@
 
 #include "types.hpp"
 
-namespace raster {
+namespace raster::rays {
 namespace {
 
-constexpr int wide = lanes;       // children of a node, triangles of a block
-constexpr int bins = 16;          // places where a node may be split, along each axis
-constexpr int deepest = 48;       // from there on nodes are split into halves
-constexpr int most_open = 1024;   // nodes left for later: 7 at a level, of at most 48 + 31
-constexpr double farthest = 1e10;  // triangles beyond it are left out, as MuJoCo's numbers end there
+constexpr int wide = lanes;         // children of a node, triangles of a block
+constexpr int bins = 16;            // places where a node may be split, along each axis
+constexpr int deepest = 48;         // from there on nodes are split into halves
+constexpr int most_open = 1024;     // nodes left for later: 7 at a level, of at most 48 + 31
+constexpr double farthest = 1e10;   // triangles beyond it are left out: MuJoCo's numbers end there
 constexpr float slack = 1.000001f;  // times a bound of a quotient: more than its rounding
 constexpr float infinite = std::numeric_limits<float>::infinity();
 
@@ -624,9 +624,9 @@ private:
     Tree still_;
 };
 
-}  // namespace raster
+}  // namespace raster::rays
 
-using raster::Rays;
+using raster::rays::Rays;
 
 extern "C" {
 #pragma GCC visibility push(default)

@@ -215,7 +215,7 @@ def main(path: str, first: int, count: int) -> int:
     builds = libraries()
     installed = list(builds)
     checked = ctypes.CDLL(path)
-    checked.raster_new.restype = ctypes.c_void_p
+    checked.raster_new.restype = checked.rays_new.restype = ctypes.c_void_p
     builds["checked"] = checked
     vars(rasters)["pixel_rays"] = functools.cache(pixel_rays)
     warnings.simplefilter("error")

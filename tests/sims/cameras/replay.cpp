@@ -1,4 +1,4 @@
-// Calls the rasteriser as a recording says (`test_other_processors.py`), and writes its images.
+// Calls the library as a recording says (`test_other_processors.py`), and writes images and hits.
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
@@ -11,6 +11,11 @@ int raster_mesh(void*, int, const void*, const void*, const void*, int, const vo
 int raster_lens(void*, int, int, const void*, const void*, const void*);
 void raster_draw(void*, int, const void*, const void*, int, const void*, const void*, int,
                  const void*, void*, void*, void*);
+void* rays_new();
+int rays_mesh(void*, int, const void*, int, const void*);
+void rays_build(void*, int, const void*, const void*, const void*, const void*, const void*);
+void rays_cast(void*, const void*, const void*, const void*, const void*, int, const void*, void*,
+               void*, void*, void*);
 }
 
 static std::int32_t number() {
@@ -27,6 +32,7 @@ static std::vector<char> bytes() {  // their count, and they; kept, as the scene
 
 int main() {
     void* scene = raster_new();
+    void* trees = nullptr;
     for (;;) {
         switch (number()) {
             case 0: {
@@ -56,6 +62,34 @@ int main() {
                             lights, light.data(), rgb.data(), depth.data(), numbers.data());
                 for (const auto* image : {&rgb, &depth, &numbers})
                     std::fwrite(image->data(), 1, image->size(), stdout);
+                break;
+            }
+            case 4: {
+                const int vertices = number(), triangles = number();
+                const auto points = bytes(), corners = bytes();
+                trees = rays_new();
+                rays_mesh(trees, vertices, points.data(), triangles, corners.data());
+                break;
+            }
+            case 5: {
+                const int geoms = number();
+                const auto numbers = bytes(), meshes = bytes(), moves = bytes();
+                const auto positions = bytes(), turns = bytes();
+                rays_build(trees, geoms, numbers.data(), meshes.data(), moves.data(),
+                           positions.data(), turns.data());
+                break;
+            }
+            case 6: {
+                const int rays = number();
+                const auto positions = bytes(), turns = bytes(), wanted = bytes();
+                const auto origin = bytes(), directions = bytes();
+                auto distances = bytes(), geoms = bytes();
+                std::vector<char> normals(24 * rays), triangles(4 * rays);
+                rays_cast(trees, positions.data(), turns.data(), wanted.data(), origin.data(), rays,
+                          directions.data(), distances.data(), geoms.data(), normals.data(),
+                          triangles.data());
+                for (const auto* part : {&distances, &geoms, &normals, &triangles})
+                    std::fwrite(part->data(), 1, part->size(), stdout);
             }
         }
     }

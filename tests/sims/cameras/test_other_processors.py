@@ -1,4 +1,4 @@
-"""Other processors draw the same bytes, in an emulator."""
+"""Other processors draw the same bytes and meet the same triangles, in an emulator."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from sims.cameras.raster import Raster
 from sims.compiled import libraries
 from tests.sims.cameras.scenes import fresh
 from tests.sims.cameras.test_raster import SPECS, compiled, drawn, places
+from tests.sims.test_ray_casting import directions, torus
+from tests.sims.triangles import meet
 
 HERE = Path(__file__).parent
 SOURCES = HERE.parents[2] / "sims" / "cameras" / "rasteriser"
@@ -25,7 +27,7 @@ FLAGS = ["-std=c++17", "-O2", "-static", "-pthread", "-ffp-contract=off", "-fno-
 
 
 class Recorder:
-    """A rasteriser's library that also writes down all calls, for ``replay.cpp``."""
+    """The compiled library, which also writes down all calls, for ``replay.cpp``."""
 
     def __init__(self, library: Any) -> None:
         self._library = library
@@ -84,6 +86,54 @@ class Recorder:
         self._note((light, lights * LIGHT.itemsize))
         self._library.raster_draw(world, lens, view, eyes, *rest)
 
+    def rays_new(self) -> Any:
+        return self._library.rays_new()
+
+    def rays_free(self, trees: Any) -> None:
+        self._library.rays_free(trees)
+
+    def rays_mesh(self, trees: Any, vertices: int, points: Any, count: int, corners: Any) -> None:
+        self._note(4, vertices, count, (points, 12 * vertices), (corners, 12 * count))
+        self._library.rays_mesh(trees, vertices, points, count, corners)
+
+    def rays_build(self, trees: Any, geoms: int, *arrays: Any) -> None:
+        sizes = (4, 4, 1, 24, 72)
+        self._note(5, geoms, *((at, n * geoms) for at, n in zip(arrays, sizes, strict=True)))
+        self._geoms = geoms
+        self._library.rays_build(trees, geoms, *arrays)
+
+    def rays_cast(self, trees: Any, *arrays: Any) -> None:
+        positions, turns, wanted, origin, rays, directions, distances, geoms, *_ = arrays
+        self._note(6, rays, (positions, 24 * self._geoms), (turns, 72 * self._geoms))
+        self._note((wanted, self._geoms), (origin, 24), (directions, 24 * rays))
+        self._note((distances, 8 * rays), (geoms, 4 * rays))
+        self._library.rays_cast(trees, *arrays)
+
+
+def replayed(calls: bytes, folder: Path) -> bytes:
+    """Return what a program for a 64-bit ARM writes that makes the calls."""
+    if shutil.which(COMPILER) is None or shutil.which(EMULATOR) is None:
+        pytest.skip("needs apt-get install g++-aarch64-linux-gnu qemu-user")
+    program = folder / "replay"
+    sources = [HERE / "replay.cpp", *SOURCES.glob("*.cpp")]
+    subprocess.run([COMPILER, *FLAGS, *map(str, sources), "-o", str(program)], check=True)
+    return subprocess.run(
+        [EMULATOR, str(program)], input=calls, capture_output=True, check=True
+    ).stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_64_bit_arm_meets_the_same(tmp_path: Path) -> None:
+    recorder, random = Recorder(next(iter(libraries().values()))), np.random.default_rng(4)
+    points, corners = torus(40, 20)
+    turns = np.linalg.qr(random.standard_normal((30, 3, 3)))[0]
+    places = random.uniform(-4.0, 4.0, (30, 3))
+    ways = directions(random, points, corners, places[0], 2000)
+    met = meet(recorder, points, corners, np.zeros(3), ways, places, turns, moves=10)
+    assert (met.geoms >= 0).sum() > 1000
+    assert replayed(bytes(recorder.calls), tmp_path) == b"".join(part.tobytes() for part in met)
+
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
@@ -92,11 +142,6 @@ def test_a_64_bit_arm_draws_the_same(
     world: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pinhole and a fisheye, colour, depth and numbers, in a static program under qemu."""
-    if shutil.which(COMPILER) is None or shutil.which(EMULATOR) is None:
-        pytest.skip("needs apt-get install g++-aarch64-linux-gnu qemu-user")
-    program = tmp_path / "replay"
-    sources = [HERE / "replay.cpp", *SOURCES.glob("*.cpp")]
-    subprocess.run([COMPILER, *FLAGS, *map(str, sources), "-o", str(program)], check=True)
     recorder = Recorder(next(iter(libraries().values())))
     monkeypatch.setattr("sims.cameras.raster.libraries", lambda: {"recorder": recorder})
     raster, expected = Raster(compiled(fresh(world))), b""
@@ -106,8 +151,6 @@ def test_a_64_bit_arm_draws_the_same(
                 assert image is not None
                 expected += image.tobytes()
     raster.close()
-    done = subprocess.run(
-        [EMULATOR, str(program)], input=bytes(recorder.calls), capture_output=True, check=True
-    )
-    assert len(done.stdout) == len(expected)
-    assert done.stdout == expected
+    images = replayed(bytes(recorder.calls), tmp_path)
+    assert len(images) == len(expected)
+    assert images == expected
