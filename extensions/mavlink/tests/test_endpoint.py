@@ -22,30 +22,66 @@ from tests.runtime.tools.samples_cli import ROOT, command_here
 from visnav_mavlink.endpoint import MavlinkEndpoint
 from visnav_mavlink.links import BURST, MOST_PEERS, Links
 from visnav_mavlink.node import Mavlink, Px4
-from visnav_mavlink.settings import MavlinkConfig
+from visnav_mavlink.settings import RATE, MavlinkConfig
 
 SECOND = 1_000_000_000
 ORIGIN = (47.0, 8.0, 400.0)
 GROUND = (1.0, 2.0, -0.1)
 
 
-class Outside:
-    """A program at the other end of an endpoint's link, and the vehicle behind it."""
+class Program:
+    """A program with a UDP link of its own to an endpoint; by its address and its numbers."""
 
-    def __init__(self, **changes: Any) -> None:
+    endpoint: MavlinkEndpoint
+
+    def __init__(self, system: int = 245, component: int = 190) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
-        link = f"udp://127.0.0.1:{self._socket.getsockname()[1]}"
+        self.link = f"udp://127.0.0.1:{self._socket.getsockname()[1]}"
+        self.parser = mav.MAVLink(None, system, component)
+
+    def say(self, *messages: Any) -> list[Any]:
+        """Let the endpoint hear messages; return what it answers at once."""
+        self.hear()
+        for message in messages:
+            self.hand_in(message if isinstance(message, bytes) else message.pack(self.parser))
+        return self.hear()
+
+    def hand_in(self, data: bytes) -> None:
+        links = self.endpoint._links
+        (peer,) = (peer for peer in links.peers if peer.name == self.link)
+        self._socket.sendto(data, peer.end.getsockname())
+        links.hear(peer)
+
+    def hear(self) -> list[Any]:
+        messages: list[Any] = []
+        while True:
+            try:
+                data = self._socket.recv(65535)
+            except BlockingIOError:
+                return messages
+            messages += self.parser.parse_buffer(data) or []
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class Outside(Program):
+    """A program at the other end of an endpoint's link, and the vehicle behind it."""
+
+    def __init__(self, *others: Program, **changes: Any) -> None:
+        super().__init__()
         self.now = SECOND
         self.acts: list[Any] = []
         self.seen: list[dict[str, Any]] = []
-        config = MavlinkConfig(endpoints=(link,), **changes)
+        config = MavlinkConfig(endpoints=(self.link, *(other.link for other in others)), **changes)
         self.endpoint = MavlinkEndpoint(
             config, ORIGIN, self._act, self._see, lambda: self.now, NodeLogger("mavlink")
         )
         self.endpoint.open()
-        self.parser = mav.MAVLink(None, 245, 190)
+        for other in others:
+            other.endpoint = self.endpoint
         if config.signing_key:
             self.parser.signing.secret_key = bytes.fromhex(config.signing_key)
             self.parser.signing.sign_outgoing = True
@@ -75,42 +111,20 @@ class Outside:
         self.at((1.0, 2.0, -2.0))
         self.acts.clear()
 
-    def say(self, *messages: Any) -> list[Any]:
-        """Let the endpoint hear messages; return what it answers at once."""
-        self.hear()
-        for message in messages:
-            data = message if isinstance(message, bytes) else message.pack(self.parser)
-            self._hand_in(data)
-        return self.hear()
-
-    def _hand_in(self, data: bytes) -> None:
-        (peer,) = self.endpoint._links.peers
-        self._socket.sendto(data, peer.end.getsockname())
-        self.endpoint._links.hear(peer)
-
     def passes(self, seconds: float, heartbeat: bool = True) -> list[Any]:
         """Let time pass, as the node does; return what is sent."""
         heard: list[Any] = []
-        for step in range(round(seconds * 50)):
-            if heartbeat and step % 50 == 0:
-                self._hand_in(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(self.parser))
-            self.now += SECOND // 50
+        for step in range(round(seconds * RATE)):
+            if heartbeat and step % RATE == 0:
+                self.hand_in(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(self.parser))
+            self.now += round(SECOND / RATE)
             self.endpoint.update(self.now, self.now / SECOND)
             heard += self.hear()
         return heard
 
-    def hear(self) -> list[Any]:
-        messages: list[Any] = []
-        while True:
-            try:
-                data = self._socket.recv(65535)
-            except BlockingIOError:
-                return messages
-            messages += self.parser.parse_buffer(data) or []
-
     def close(self) -> None:
         self.endpoint.close()
-        self._socket.close()
+        super().close()
 
 
 @pytest.fixture
@@ -175,6 +189,42 @@ async def test_rates_are_those_that_are_asked_for(outside: Outside) -> None:
     assert of("ATTITUDE", outside.passes(1.0)) == []
     unknown = mav.MAV_RESULT_UNSUPPORTED
     assert results(outside.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 9999, 1e5))) == [unknown]
+
+
+async def test_sequence_numbers_rise_by_one_message_after_message(outside: Outside) -> None:
+    """As every program's meter of losses counts them: per link, system and component."""
+    numbers = [message.get_seq() for message in outside.passes(3.0)]
+    assert len(numbers) > 256
+    assert numbers == [index % 256 for index in range(len(numbers))]
+
+
+async def test_a_rate_that_is_accepted_comes(outside: Outside) -> None:
+    """At 100 Hz exactly; beyond that the answer says what comes instead."""
+    interval = mav.MAV_CMD_SET_MESSAGE_INTERVAL
+    for microseconds, count in ((10_000, 200), (33_333, 60), (20_000, 100)):
+        outside.passes(0.1)
+        assert results(outside.say(command(interval, 30, microseconds))) == [0]
+        outside.passes(0.1)
+        assert len(of("ATTITUDE", outside.passes(2.0))) == pytest.approx(count, abs=1)
+    answers = outside.say(command(interval, 30, 2000))
+    assert results(answers) == [0]
+    (text,) = of("STATUSTEXT", answers)
+    assert text.text == "ATTITUDE: expected at most 100 Hz, which now comes"
+    (told,) = of("MESSAGE_INTERVAL", outside.say(command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, 30)))
+    assert told.interval_us == 10_000
+    assert len(of("ATTITUDE", outside.passes(2.0))) == pytest.approx(200, abs=1)
+
+
+async def test_rates_are_of_the_peer_that_asks() -> None:
+    """A station that wants no heartbeat takes it from nobody else."""
+    outside = Outside(other := Program())
+    assert results(outside.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, -1))) == [0]
+    sent = outside.passes(2.0)
+    assert of("HEARTBEAT", sent) == []
+    assert of("ATTITUDE", sent)
+    assert len(of("HEARTBEAT", other.hear())) == 2
+    other.close()
+    outside.close()
 
 
 async def test_every_command_is_acknowledged(outside: Outside) -> None:
@@ -346,7 +396,7 @@ async def test_streams_are_so_many_are_answered_and_end() -> None:
     ping = mav.MAVLink_ping_message(0, 1, 0, 0)
     ends[0].sendall(ping.pack(mav.MAVLink(None, 245, 190)))
     await polled()
-    assert [(system, component) for system, component, _ in heard] == [(245, 190)]
+    assert [sender for _, sender, _ in heard] == [(245, 190)]
     assert len(links.peers) == MOST_PEERS
     assert links.counts["connections refused"] == 1
     links.send(ping)

@@ -11,7 +11,7 @@ import numpy as np
 from events.frames import Geodetic, from_rpy
 from runtime.logs import NodeLogger
 from visnav_mavlink.flight import Flight
-from visnav_mavlink.links import Links, mav
+from visnav_mavlink.links import Links, Peer, mav
 from visnav_mavlink.settings import MavlinkConfig
 from visnav_mavlink.vehicle import SECOND, Missions, Parameters, Telemetry, Vehicle
 
@@ -45,10 +45,10 @@ class MavlinkEndpoint:
         self._links = Links(ids, bytes.fromhex(config.signing_key), self._hear, log)
         self._send = send = self._links.send
         self.vehicle = vehicle = Vehicle(origin, config.gps)
-        self._telemetry = Telemetry(vehicle, send)
+        self._telemetry = Telemetry(vehicle, self._links, self._tell)
         self._parameters = Parameters(send, self._tell)
         self._missions = Missions(send, lambda item: self.flight.refused(item), self._tell)
-        parts = self._telemetry, self._missions, self._parameters
+        parts = self._missions, self._parameters
         self.flight = Flight(vehicle, *parts, act, self._tell, self._once)
 
     def open(self) -> None:
@@ -78,15 +78,17 @@ class MavlinkEndpoint:
         """Close the links."""
         self._links.close()
 
-    def _hear(self, system: int, component: int, message: Any) -> None:
+    def _hear(self, peer: Peer, sender: tuple[int, int], message: Any) -> None:
         """Give a message to whom it is for."""
         target = getattr(message, "target_system", 0)
         part = getattr(message, "target_component", 0)
         if target not in {0, self._config.system_id} or part not in {0, 1}:
             return
-        now, sender, kind = self._now(), (system, component), message.get_type()
+        now, kind = self._now(), message.get_type()
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
-            result = self.flight.command(message, now)
+            result = self._telemetry.command(peer, message, now)
+            if result is None:
+                result = self.flight.command(message, now)
             self._send(mav.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
         elif kind.startswith("SET_POSITION_TARGET") or kind == "SET_ATTITUDE_TARGET":
             self.flight.offboard(message, now)

@@ -10,7 +10,7 @@ import events as ev
 from events import Setpoint, Vector3
 from events.frames import from_geodetic, yaw_of
 from visnav_mavlink.links import mav
-from visnav_mavlink.vehicle import MODES, SECOND, Item, Missions, Parameters, Telemetry, Vehicle
+from visnav_mavlink.vehicle import MODES, SECOND, Item, Missions, Parameters, Vehicle
 
 OFFBOARD_TIMEOUT = SECOND // 2  # PX4's COM_OF_LOSS_T: without a set-point for longer it holds
 ARRIVED = 0.3  # metres from a place at which it is reached
@@ -40,15 +40,13 @@ class Flight:
     def __init__(
         self,
         vehicle: Vehicle,
-        telemetry: Telemetry,
         missions: Missions,
         parameters: Parameters,
         act: Callable[..., None],
         tell: Callable[[str], None],
         once: Callable[[str], None],
     ) -> None:
-        self._vehicle, self._telemetry = vehicle, telemetry
-        self._missions, self._parameters = missions, parameters
+        self._vehicle, self._missions, self._parameters = vehicle, missions, parameters
         self._act, self._tell, self._once = act, tell, once
         self._goal: tuple[Vector3, float] | None = None  # place and heading
         self._carrot: Vector3 = (0.0, 0.0, 0.0)  # goes there at the cruising speed
@@ -66,14 +64,6 @@ class Flight:
             mav.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
             mav.MAV_CMD_MISSION_START: lambda p, now: self.set_mode("mission", now),  # noqa: ARG005
             mav.MAV_CMD_DO_SET_MISSION_CURRENT: lambda p, _: self._missions.jump(p[0]),
-            mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-            mav.MAV_CMD_REQUEST_MESSAGE: lambda p, now: self._request(p[0], now),
-            mav.MAV_CMD_GET_HOME_POSITION: lambda _, now: self._request(
-                mav.MAVLINK_MSG_ID_HOME_POSITION, now
-            ),
-            mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: lambda _, now: self._request(
-                mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, now
-            ),
         }
 
     def command(self, message: Any, now: int) -> int:
@@ -224,15 +214,6 @@ class Flight:
             return int(_NO)
         self._speed = numbers[1]
         return int(_OK)
-
-    def _set_interval(self, numbers: Sequence[float], now: int) -> int:  # noqa: ARG002
-        number = numbers[0]
-        known = math.isfinite(number) and self._telemetry.set_period(int(number), numbers[1])
-        return int(_OK if known else _UNKNOWN)
-
-    def _request(self, number: float, now: int) -> int:
-        known = math.isfinite(number) and self._telemetry.tell(int(number), now)
-        return int(_OK if known else _UNKNOWN)
 
     def _reposition(self, message: Any, now: int) -> int:
         if message.get_type() == "COMMAND_INT":

@@ -27,6 +27,7 @@ mav: Any = common
 BURST = 400  # messages of all peers that are read in a period; the kernel drops the rest
 MOST_PEERS = 8  # programs on one TCP port
 LONGEST_QUEUE = 1 << 20  # bytes not yet taken by a program, beyond which it is hung up on
+MOST_ERRORS = 10  # tracebacks in the log
 _EPOCH_2015 = 1_420_070_400  # signatures' time begins there (mavlink.io, message signing)
 
 SLICE = 0.2  # real seconds between two looks at whether the run has ended
@@ -34,8 +35,8 @@ STARTING = 0.004  # real seconds that PX4's answer may take before the first one
 _IMU, _MAGNETOMETER, _BAROMETER = 0b111111, 0b111000000, 0b1101000000000
 MOTORS = 4
 
-Receive = Callable[[int, int, Any], None]
-"""Called with a sender's system, its component, and the message."""
+Receive = Callable[["Peer", tuple[int, int], Any], None]
+"""Called with the link's peer, the sender's system and component, and the message."""
 
 
 class Peer:
@@ -53,6 +54,10 @@ class Peer:
             signing = self.parser.signing
             signing.secret_key, signing.sign_outgoing = key, True
             signing.timestamp = int((time.time() - _EPOCH_2015) * 1e5)
+
+    def pack(self, message: Any) -> bytes:
+        """Return a message's bytes, with the link's next sequence number and signature."""
+        return _packed(message, self.parser)
 
     def messages(self, data: bytes) -> list[Any]:
         """Return the messages in some bytes; a datagram goes on from nothing before it."""
@@ -96,16 +101,20 @@ class Links:
             self._loop.add_reader(end, self._accept, end)
 
     def send(self, message: Any) -> None:
-        """Send a message to every peer, with its sequence number and signature."""
+        """Send a message to every peer."""
         for peer in [*self.peers]:
-            data = message.pack(peer.parser)
-            if peer.is_stream:
-                self._send_on(peer, data)
-                continue
-            try:
-                peer.end.send(data)
-            except OSError:  # nobody listens, or its buffer is full: datagrams may get lost
-                self.counts["datagrams not taken"] += 1
+            self.send_to(peer, message)
+
+    def send_to(self, peer: Peer, message: Any) -> None:
+        """Send a message to a peer."""
+        data = peer.pack(message)
+        if peer.is_stream:
+            self._send_on(peer, data)
+            return
+        try:
+            peer.end.send(data)
+        except OSError:  # nobody listens, or its buffer is full: datagrams may get lost
+            self.counts["datagrams not taken"] += 1
 
     def quiet_for(self, now: float) -> float:
         """Return the seconds since any peer was heard; infinite if never."""
@@ -166,12 +175,23 @@ class Links:
             else:
                 self.counts["messages"] += 1
                 peer.heard = self._now
-                self._receive(message.get_srcSystem(), message.get_srcComponent(), message)
+                self._deliver(peer, message)
             self._left -= 1
         if self._left <= 0 and peer in self.peers:
             self.counts["pauses in a flood"] += 1
             self._loop.remove_reader(peer.end)
             self._muted.append(peer)
+
+    def _deliver(self, peer: Peer, message: Any) -> None:
+        """Hand a message on; an error in its handler must not lose those read with it."""
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        try:
+            self._receive(peer, sender, message)
+        except Exception:
+            self.counts["errors"] += 1
+            if self.counts["errors"] <= MOST_ERRORS:
+                kind = message.get_type()
+                self._log.exception("%s of system %d, component %d: not handled", kind, *sender)
 
     def _send_on(self, peer: Peer, data: bytes) -> None:
         peer.unsent += data
@@ -242,7 +262,7 @@ class Wire:
             return None
         self._peer.settimeout(patience)
         try:
-            self._peer.sendall(b"".join(message.pack(self._parser) for message in messages))
+            self._peer.sendall(b"".join(_packed(message, self._parser) for message in messages))
         except TimeoutError:
             raise
         except OSError as error:
@@ -275,6 +295,13 @@ class Wire:
         self._listener.close()
         if self._peer is not None:
             self._peer.close()
+
+
+def _packed(message: Any, parser: Any) -> bytes:
+    """Return a message's bytes, and raise the sequence number, which `pack` leaves as it is."""
+    data: bytes = message.pack(parser)
+    parser.seq = (parser.seq + 1) % 256
+    return data
 
 
 def sensors(imu: Imu, field: MagneticField | None, pressure: FluidPressure | None) -> Any:

@@ -28,14 +28,13 @@ from events import (
 from nodes.pilots.pilot import VehicleController, VehicleControllerConfig
 from runtime import Duration, Input, Node, Output, Tick, every, on
 from runtime.errors import MissingDependencyError
-from visnav_mavlink.settings import MavlinkConfig
+from visnav_mavlink.settings import RATE, MavlinkConfig
 
 if TYPE_CHECKING:
     from visnav_mavlink.endpoint import MavlinkEndpoint
     from visnav_mavlink.links import Wire
 
 
-RATE = 50.0  # of telemetry, and of set-points on the way to a place, Hz
 ORIGIN = (47.397742, 8.545594, 488.0)  # PX4's in simulations, for vehicles that have none
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 

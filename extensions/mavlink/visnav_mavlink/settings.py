@@ -10,6 +10,9 @@ import msgspec
 from nodes.pilots.pilot import VehicleControllerConfig
 from runtime import Duration
 
+RATE = 100.0
+"""Highest rate of telemetry, and of set-points on the way to a place, Hz."""
+
 
 class MavlinkConfig(VehicleControllerConfig):
     """Settings of the endpoint.

@@ -6,12 +6,15 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 from events import Odometry, PoseEstimate, Quaternion, Vector3
 from events.frames import Geodetic, rotate, rotate_inverse, to_geodetic, yaw_of
-from visnav_mavlink.links import mav
+from visnav_mavlink.links import Links, Peer, mav
+from visnav_mavlink.settings import RATE
 
 SECOND = 1_000_000_000
+LEAST_PERIOD = round(SECOND / RATE)  # of a message
 
 MODES = {
     "manual": (1, 0),
@@ -242,40 +245,103 @@ TELEMETRY: dict[int, tuple[float, Make]] = {
 """Message's number to its rate, Hz (0: only if asked for), and its maker from `Vehicle` and ms."""
 
 
+@dataclass
+class Timer:
+    """Period of a message, and when it is due (ns)."""
+
+    period: int
+    due: int = 0
+
+    def take(self, now: int) -> bool:
+        """Return whether it is due; then it is due again a period later, not sooner after a gap."""
+        if now < self.due:
+            return False
+        self.due = (self.due if now - self.due < self.period else now) + self.period
+        return True
+
+
 class Telemetry:
-    """Sends messages, each at its rate."""
+    """Sends messages to each peer at the rates that this peer has asked for."""
 
-    def __init__(self, vehicle: Vehicle, send: Callable[[Any], None]) -> None:
-        self._vehicle, self._send = vehicle, send
-        self._periods = {n: round(SECOND / hz) for n, (hz, _) in TELEMETRY.items() if hz}
-        self._due = dict.fromkeys(self._periods, 0)
+    def __init__(self, vehicle: Vehicle, links: Links, tell: Callable[[str], None]) -> None:
+        self._vehicle, self._links, self._tell = vehicle, links, tell
+        self._timers: WeakKeyDictionary[Peer, dict[int, Timer]] = WeakKeyDictionary()
+        request, version = self._request, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        home = mav.MAVLINK_MSG_ID_HOME_POSITION
+        self._commands: dict[int, Callable[[Peer, Any, int], bool]] = {
+            mav.MAV_CMD_SET_MESSAGE_INTERVAL: lambda peer, m, _: self.set_period(
+                peer, m.param1, m.param2
+            ),
+            mav.MAV_CMD_GET_MESSAGE_INTERVAL: lambda peer, m, _: self._tell_period(peer, m.param1),
+            mav.MAV_CMD_REQUEST_MESSAGE: lambda peer, m, now: (
+                self._tell_period(peer, m.param2)
+                if m.param1 == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL
+                else request(peer, m.param1, now)
+            ),
+            mav.MAV_CMD_GET_HOME_POSITION: lambda peer, _, now: request(peer, home, now),
+            mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: lambda peer, _, now: request(
+                peer, version, now
+            ),
+        }
 
-    def set_period(self, number: int, microseconds: float) -> bool:
+    def command(self, peer: Peer, message: Any, now: int) -> int | None:
+        """Carry out a command about messages; return its ``MAV_RESULT``, `None` for others."""
+        if (do := self._commands.get(message.command)) is None:
+            return None
+        done = do(peer, message, now)
+        return int(mav.MAV_RESULT_ACCEPTED if done else mav.MAV_RESULT_UNSUPPORTED)
+
+    def set_period(self, peer: Peer, number: float, microseconds: float) -> bool:
         """Set a message's period; 0 its own, below never; `False` if there is no such message."""
         if number not in TELEMETRY or not math.isfinite(microseconds):
             return False
-        own = TELEMETRY[number][0]
+        own, timers = TELEMETRY[int(number)][0], self._of(peer)
         if microseconds < 0 or (microseconds == 0 and not own):
-            self._periods.pop(number, None)
-        else:
-            self._periods[number] = round(SECOND / own if not microseconds else microseconds * 1e3)
-            self._due.setdefault(number, 0)
+            timers.pop(int(number), None)
+            return True
+        period = round(microseconds * 1e3 if microseconds else SECOND / own)
+        if period < LEAST_PERIOD:
+            name = mav.mavlink_map[number].msgname
+            self._tell(f"{name}: expected at most {RATE:g} Hz, which now comes")
+            period = LEAST_PERIOD
+        timers.setdefault(int(number), Timer(period)).period = period
         return True
 
     def update(self, now: int) -> None:
         """Send all that is due at a stamp (ns)."""
-        for number, period in self._periods.items():
-            if now >= self._due[number]:
-                self._due[number] = max(self._due[number] + period, now - period)
-                self.tell(number, now)
+        made: dict[int, Any] = {}
+        for peer in [*self._links.peers]:
+            for number, timer in self._of(peer).items():
+                if not timer.take(now):
+                    continue
+                if number not in made:
+                    made[number] = self._make(number, now)
+                if made[number] is not None:
+                    self._links.send_to(peer, made[number])
 
-    def tell(self, number: int, now: int) -> bool:
-        """Send a message now; `False` if there is none."""
-        entry = TELEMETRY.get(number)
-        message = entry[1](self._vehicle, now // 1_000_000 % 2**32) if entry else None
+    def _of(self, peer: Peer) -> dict[int, Timer]:
+        if (timers := self._timers.get(peer)) is None:
+            rates = {number: hz for number, (hz, _) in TELEMETRY.items() if hz}
+            timers = {number: Timer(round(SECOND / hz)) for number, hz in rates.items()}
+            self._timers[peer] = timers
+        return timers
+
+    def _make(self, number: int, now: int) -> Any:
+        return TELEMETRY[number][1](self._vehicle, now // 1_000_000 % 2**32)
+
+    def _request(self, peer: Peer, number: float, now: int) -> bool:
+        message = self._make(int(number), now) if number in TELEMETRY else None
         if message is not None:
-            self._send(message)
+            self._links.send_to(peer, message)
         return message is not None
+
+    def _tell_period(self, peer: Peer, number: float) -> bool:
+        if not (math.isfinite(number) and 0 <= number <= 65535):
+            return False
+        timer = self._of(peer).get(int(number))
+        period = 0 if number not in TELEMETRY else timer.period // 1000 if timer else -1
+        self._links.send_to(peer, mav.MAVLink_message_interval_message(int(number), period))
+        return True
 
 
 MOST_ITEMS = 1000
