@@ -21,6 +21,7 @@ from tests.nodes.pilots.test_pilot import Vehicle
 from tests.runtime.tools.samples_cli import ROOT, command_here
 from visnav_mavlink.endpoint import MavlinkEndpoint
 from visnav_mavlink.links import BURST, MOST_PEERS, Links
+from visnav_mavlink.messages import ROWS, TREATMENTS, table
 from visnav_mavlink.node import Mavlink, Px4
 from visnav_mavlink.settings import RATE, MavlinkConfig
 
@@ -163,6 +164,17 @@ def of(kind: str, messages: list[Any]) -> list[Any]:
     return [message for message in messages if message.get_type() == kind]
 
 
+def texts(messages: list[Any]) -> list[str]:
+    """Return the sentences of ``STATUSTEXT``, which come in pieces of 50 characters."""
+    joined: dict[int, str] = {}
+    single = 0
+    for message in of("STATUSTEXT", messages):
+        single -= 1
+        key = message.id or single
+        joined[key] = joined.get(key, "") + message.text
+    return [*joined.values()]
+
+
 def results(answers: list[Any]) -> list[int]:
     return [message.result for message in of("COMMAND_ACK", answers)]
 
@@ -261,8 +273,7 @@ async def test_offboard_needs_setpoints_and_ends_without(outside: Outside) -> No
     assert outside.acts[-1].frame_id == "heading"
     outside.say(mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], 0.1, 0, 0, 0.5))
     assert outside.acts[-1].angular_velocity == pytest.approx((0.1, 0.0, 0.0))
-    texts = [message.text for message in of("STATUSTEXT", outside.passes(1.0))]
-    assert "offboard: no set-point for 0.5 s: holding" in texts
+    assert "offboard: no set-point for 0.5 s: holding" in texts(outside.passes(1.0))
     assert isinstance(outside.acts[-1], ev.Hover)
     assert outside.endpoint.vehicle.mode == "hold"
 
@@ -328,7 +339,11 @@ async def test_parameters_are_listed_read_and_set(outside: Outside) -> None:
     assert now.param_value == 4.0
     kept = outside.say(mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", math.nan, real))
     assert [message.param_value for message in of("PARAM_VALUE", kept)] == [4.0]
-    assert outside.say(mav.MAVLink_param_request_read_message(1, 1, b"CAL_GYRO0_ID", -1)) == []
+    unknown = mav.MAVLink_param_request_read_message(1, 1, b"CAL_GYRO0_ID", -1)
+    text = "a parameter of 245/190 has no effect: CAL_GYRO0_ID is unknown here"
+    assert texts(outside.say(unknown, unknown)) == [text]
+    whole = mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", 3.0, mav.MAV_PARAM_TYPE_INT32)
+    assert of("PARAM_VALUE", outside.say(whole))[0].param_value == 4.0
 
 
 async def test_who_is_not_heard_any_more_is_missed(outside: Outside) -> None:
@@ -500,6 +515,125 @@ def hostile(draw: st.DrawFn) -> bytes:
 def _sizes(kind: Any) -> list[int]:
     by_order = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
     return [by_order[name] for name in kind.fieldnames]
+
+
+def generic(kind: Any) -> Any:
+    """Return a message of this kind for the vehicle, its fields all ones or halves."""
+    values: list[Any] = []
+    for what, size in zip(kind.fieldtypes, _sizes(kind), strict=True):
+        one = 0.5 if what in {"float", "double"} else 1
+        values.append(b"1" if what == "char" else [one] * size if size else one)
+    return kind(*values)
+
+
+ANSWERED = {
+    "COMMAND_LONG": {"COMMAND_ACK"}, "COMMAND_INT": {"COMMAND_ACK"},
+    "MISSION_COUNT": {"MISSION_ACK"}, "MISSION_CLEAR_ALL": {"MISSION_ACK"},
+    "MISSION_REQUEST_LIST": {"MISSION_COUNT"}, "MISSION_REQUEST": {"MISSION_ACK"},
+    "MISSION_REQUEST_INT": {"MISSION_ACK"}, "PARAM_REQUEST_LIST": {"PARAM_VALUE"},
+    "PARAM_REQUEST_READ": {"PARAM_VALUE"}, "LOG_REQUEST_LIST": {"LOG_ENTRY"},
+    "LOG_REQUEST_DATA": {"LOG_DATA"}, "FILE_TRANSFER_PROTOCOL": {"FILE_TRANSFER_PROTOCOL"},
+    "PARAM_EXT_SET": {"PARAM_EXT_ACK"}, "MISSION_REQUEST_PARTIAL_LIST": {"MISSION_ACK"},
+    "MISSION_WRITE_PARTIAL_LIST": {"MISSION_ACK"}, "SET_GPS_GLOBAL_ORIGIN": {"GPS_GLOBAL_ORIGIN"},
+}  # fmt: skip
+"""Answers to one message of each kind, besides words; nothing to all others."""
+TREATED_WITH_WORDS = {"MISSION_COUNT", "PARAM_SET", "REQUEST_DATA_STREAM", "MISSION_SET_CURRENT"}
+"""Kinds that are obeyed, but whose generic message cannot be, and is told so."""
+
+
+async def test_each_kind_of_message_is_treated_as_the_table_has_it() -> None:
+    """What is refused is told once to each sender; nothing raises, and nothing is unknown."""
+    outside = Outside(vision=True)
+    counts, acts = outside.endpoint._links.counts, outside.acts
+    for kind in mav.mavlink_map.values():
+        name, message = kind.msgname, generic(kind)
+        if name in {"TIMESYNC", "PING"}:
+            continue  # generic ones are answers themselves
+        row, poses = TREATMENTS.get(name), len(outside.seen)
+        answers = outside.say(message)
+        others = {answer.get_type() for answer in answers} - {"STATUSTEXT"}
+        assert others == ANSWERED.get(name, set()), name
+        refusal = [text for text in texts(answers) if text.startswith(f"{name} of 245/190 has no")]
+        if row is None or row.treatment == "refused":
+            assert len(refusal) == 1, name
+            assert texts(outside.say(message)) == [], name
+        elif row.treatment == "not for a vehicle":
+            assert answers == [], name
+        elif name not in TREATED_WITH_WORDS and others != {"MISSION_ACK"}:
+            assert refusal == [], name
+        assert (len(outside.seen) > poses) == (row is not None and row.treatment == "judged"), name
+        assert acts == [], name
+    assert counts["errors"] == 0
+    outside.close()
+
+
+async def test_the_table_is_what_is_done_and_what_the_page_shows(outside: Outside) -> None:
+    done = {kind for kind, row in TREATMENTS.items() if row.treatment in {"obeyed", "judged"}}
+    answered = {kind for kind, row in TREATMENTS.items() if row.treatment == "answered"}
+    assert {*outside.endpoint._handlers} == (done | answered) - {"HEARTBEAT", "TIMESYNC", "PING"}
+    assert sum(len(row.kinds.split()) for row in ROWS) == len(TREATMENTS)
+    page = (ROOT / "extensions/mavlink/docs/mavlink.md").read_text()
+    assert table() in page
+
+
+async def test_a_message_of_another_dialect_is_told_once(outside: Outside) -> None:
+    from pymavlink.dialects.v20 import ardupilotmega
+
+    message = ardupilotmega.MAVLink_fence_point_message(1, 1, 0, 0, 47.0, 8.0)
+    data = message.pack(ardupilotmega.MAVLink(None, 245, 190))
+    text = "UNKNOWN_160 of 245/190 has no effect: it is not known here"
+    assert texts(outside.say(data, data)) == [text]
+
+
+async def test_an_error_loses_nothing_else_of_a_read(outside: Outside) -> None:
+    def fails(*_: Any) -> None:
+        raise OverflowError
+
+    outside.endpoint._handlers["PARAM_SET"] = fails
+    both = b"".join(
+        message.pack(outside.parser)
+        for message in (
+            mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", 4.0, 9),
+            mav.MAVLink_param_request_list_message(1, 1),
+        )
+    )
+    assert len(of("PARAM_VALUE", outside.say(both))) == 3
+    assert outside.endpoint._links.counts["errors"] == 1
+
+
+async def test_another_vehicle_behind_the_same_link_is_not_taken_for_an_estimator() -> None:
+    outside = Outside(vision=True)
+    pose = mav.MAVLink_vision_position_estimate_message(1, *[0.0] * 6, [0.0] * 21, 0)
+    value = mav.MAVLink_param_value_message(b"MIS_TAKEOFF_ALT", 1.0, 9, 3, 0)
+    outside.parser = mav.MAVLink(None, 2, 1)
+    assert outside.say(pose, value) == []
+    assert outside.seen == []
+    outside.parser = mav.MAVLink(None, 2, 191)
+    outside.say(pose)
+    assert len(outside.seen) == 1
+    outside.close()
+
+
+async def test_streams_of_rates_are_set(outside: Outside) -> None:
+    assert outside.say(mav.MAVLink_request_data_stream_message(1, 1, 10, 4, 1)) == []
+    outside.passes(1.0)
+    assert len(of("ATTITUDE", outside.passes(2.0))) == pytest.approx(8, abs=1)
+    assert texts(outside.say(mav.MAVLink_request_data_stream_message(1, 1, 3, 4, 1))) == [
+        "REQUEST_DATA_STREAM of 245/190 has no effect: stream 3 has no messages here"
+    ]
+
+
+async def test_a_failed_pose_is_not_judged() -> None:
+    outside = Outside(vision=True)
+    for quality in (-1, 0, 50):
+        unknown = [math.nan] + [0.0] * 20
+        outside.say(
+            mav.MAVLink_odometry_message(
+                0, 1, 12, 0, 0, 0, [1, 0, 0, 0], *[0.0] * 6, unknown, unknown, 0, 0, quality
+            )
+        )
+    assert len(outside.seen) == 2
+    outside.close()
 
 
 @pytest.mark.slow

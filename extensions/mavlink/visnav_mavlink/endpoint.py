@@ -10,14 +10,19 @@ import numpy as np
 
 from events.frames import Geodetic, from_rpy
 from runtime.logs import NodeLogger
+from visnav_mavlink.answers import ANSWERS, Sender
 from visnav_mavlink.flight import Flight
 from visnav_mavlink.links import Links, Peer, mav
+from visnav_mavlink.messages import TREATMENTS
 from visnav_mavlink.settings import MavlinkConfig
 from visnav_mavlink.vehicle import SECOND, Missions, Parameters, Telemetry, Vehicle
 
 OLDEST = 10 * SECOND  # age of a vision stamp beyond which its clock is not ours
 MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it
 _COVARIANCE = np.triu_indices(6)
+
+Handler = Callable[[Peer, Sender, Any, int], None]
+"""Takes the link's peer, the sender, the message and the time (ns)."""
 
 
 class MavlinkEndpoint:
@@ -50,6 +55,22 @@ class MavlinkEndpoint:
         self._missions = Missions(send, lambda item: self.flight.refused(item), self._tell)
         parts = self._missions, self._parameters
         self.flight = Flight(vehicle, *parts, act, self._tell, self._once)
+        by_handler: dict[Handler, str] = {
+            self._command: "COMMAND_LONG COMMAND_INT",
+            self._set_mode: "SET_MODE",
+            self._offboard: "SET_POSITION_TARGET_LOCAL_NED SET_POSITION_TARGET_GLOBAL_INT "
+            "SET_ATTITUDE_TARGET",
+            self._mission: "MISSION_COUNT MISSION_ITEM MISSION_ITEM_INT MISSION_ACK "
+            "MISSION_CLEAR_ALL MISSION_SET_CURRENT MISSION_REQUEST_LIST MISSION_REQUEST "
+            "MISSION_REQUEST_INT",
+            self._parameter: "PARAM_REQUEST_LIST PARAM_REQUEST_READ PARAM_SET",
+            self._set_rates: "REQUEST_DATA_STREAM",
+            self._see: "ODOMETRY VISION_POSITION_ESTIMATE VICON_POSITION_ESTIMATE ATT_POS_MOCAP "
+            "GLOBAL_VISION_POSITION_ESTIMATE",
+        }
+        self._handlers = {
+            kind: handle for handle, kinds in by_handler.items() for kind in kinds.split()
+        }
 
     def open(self) -> None:
         """Open the links; a `ValueError` if one cannot be."""
@@ -78,79 +99,117 @@ class MavlinkEndpoint:
         """Close the links."""
         self._links.close()
 
-    def _hear(self, peer: Peer, sender: tuple[int, int], message: Any) -> None:
-        """Give a message to whom it is for."""
+    def _hear(self, peer: Peer, sender: Sender, message: Any) -> None:
+        """Treat a message as the table of messages has it."""
         target = getattr(message, "target_system", 0)
         part = getattr(message, "target_component", 0)
         if target not in {0, self._config.system_id} or part not in {0, 1}:
             return
         now, kind = self._now(), message.get_type()
-        if kind in {"COMMAND_LONG", "COMMAND_INT"}:
-            result = self._telemetry.command(peer, message, now)
-            if result is None:
-                result = self.flight.command(message, now)
-            self._send(mav.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
-        elif kind.startswith("SET_POSITION_TARGET") or kind == "SET_ATTITUDE_TARGET":
-            self.flight.offboard(message, now)
-        elif kind == "SET_MODE":
-            mode = message.custom_mode
-            self.flight.set_px4_mode(mode >> 16 & 255, mode >> 24 & 255, now)
-        elif kind.startswith("MISSION_"):
-            self._missions.hear(sender, message, now)
-        elif kind.startswith("PARAM_"):
-            self._parameters.hear(message)
-        elif kind == "TIMESYNC" and message.tc1 == 0:
-            self._send(mav.MAVLink_timesync_message(now, message.ts1))
-        elif kind == "PING" and target == 0:
-            self._send(mav.MAVLink_ping_message(message.time_usec, message.seq, *sender))
-        elif kind in {"ODOMETRY", "VISION_POSITION_ESTIMATE"}:
-            self._see(message, now)
+        is_vehicle = not target and sender[1] == mav.MAV_COMP_ID_AUTOPILOT1
+        row = TREATMENTS.get(kind)
+        if row is None:
+            self._refuse(kind, sender, "it is not known here")
+        elif row.treatment == "refused" and not is_vehicle:
+            self._refuse(kind, sender, row.words)
+        elif is_vehicle and row.treatment == "judged":
+            self._once("{} of system {}, component {} is another vehicle's".format(kind, *sender))
+        elif kind in self._handlers:
+            self._handlers[kind](peer, sender, message, now)
+        if answer := kind in ANSWERS and ANSWERS[kind](message, sender, now, self.vehicle):
+            self._links.send_to(peer, answer)
 
-    def _see(self, message: Any, now: int) -> None:
+    def _command(self, peer: Peer, sender: Sender, message: Any, now: int) -> None:
+        result = self._telemetry.command(peer, message, now)
+        if result is None:
+            result = self.flight.command(message, now)
+        self._send(mav.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
+
+    def _offboard(self, _peer: Peer, _sender: Sender, message: Any, now: int) -> None:
+        self.flight.offboard(message, now)
+
+    def _mission(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
+        self._missions.hear(sender, message, now)
+
+    def _parameter(self, _: Peer, sender: Sender, message: Any, now: int) -> None:  # noqa: ARG002
+        if (name := self._parameters.hear(message)) is not None:
+            self._refuse("a parameter", sender, f"{name} is unknown here")
+
+    def _set_mode(self, _peer: Peer, _sender: Sender, message: Any, now: int) -> None:
+        mode = message.custom_mode
+        self.flight.set_px4_mode(mode >> 16 & 255, mode >> 24 & 255, now)
+
+    def _set_rates(self, peer: Peer, sender: Sender, message: Any, _: int) -> None:
+        rate = message.req_message_rate if message.start_stop else 0
+        if not self._telemetry.set_stream(peer, message.req_stream_id, rate):
+            words = f"stream {message.req_stream_id} has no messages here"
+            self._refuse("REQUEST_DATA_STREAM", sender, words)
+
+    def _see(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
         """Publish a pose from outside as an estimate."""
+        kind, counts = message.get_type(), self._links.counts
         if not self._config.vision:
-            self._once("poses from outside come, and are not judged: vision is false")
+            self._refuse(kind, sender, "vision is false")
             return
-        if message.get_type() == "ODOMETRY":
+        if kind == "ODOMETRY":
             frame = message.frame_id
             if frame not in {mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD}:
-                self._once(f"ODOMETRY: expected frame_id LOCAL_NED or LOCAL_FRD, found {frame}")
+                words = f"expected frame_id LOCAL_NED or LOCAL_FRD, found {frame}"
+                self._refuse(kind, sender, words)
                 return
-            stamp, covariance, q = message.time_usec, message.pose_covariance, message.q
-            size = math.hypot(*q)
-            orientation = tuple(value / size for value in q) if 0.5 < size < 2.0 else ()
+            if getattr(message, "quality", 0) < 0:
+                counts["poses of failed quality, not judged"] += 1
+                self._refuse(kind, sender, "its quality says failed; others are judged")
+                return
+        if kind in {"ODOMETRY", "ATT_POS_MOCAP"}:
+            size = math.hypot(*message.q)
+            orientation = tuple(part / size for part in message.q) if 0.5 < size < 2.0 else ()
         else:
-            stamp, covariance = message.usec, message.covariance
             angles = message.roll, message.pitch, message.yaw
             orientation = from_rpy(*angles) if all(map(math.isfinite, angles)) else ()
         position = message.x, message.y, message.z
         if not orientation or not all(map(math.isfinite, position)):
-            self._once("a pose from outside with numbers that are none: not taken")
+            counts["poses with numbers that are none, not judged"] += 1
+            self._refuse(kind, sender, "its numbers are none; others are judged")
             return
-        stamp *= 1000
+        stamp = 1000 * (message.time_usec if hasattr(message, "time_usec") else message.usec)
         if not now - OLDEST < stamp <= now:
+            counts["poses with stamps of another clock, stamped at arrival"] += 1
             self._once(
                 "poses from outside have stamps of another clock, where those of TIMESYNC's were "
                 "expected: their arrival counts"
             )
             stamp = now
-        frame = f"odom_{message.reset_counter}" if message.reset_counter else "odom"
+        counter = getattr(message, "reset_counter", 0)
+        covariance = message.pose_covariance if kind == "ODOMETRY" else message.covariance
         full: tuple[float, ...] = ()
         if np.isfinite(covariance).all() and np.any(covariance):
             matrix = np.zeros((6, 6))
             matrix[_COVARIANCE] = covariance
             full = tuple((matrix + np.triu(matrix, 1).T).ravel().tolist())
+        counts["poses judged"] += 1
         self._see_pose(
             stamp=stamp,
-            frame_id=frame,
+            frame_id=f"odom_{counter}" if counter else "odom",
             position=position,
             orientation=orientation,
             covariance=full,
         )
 
+    def _refuse(self, kind: str, sender: Sender, words: str) -> None:
+        """Tell why messages have no effect, once for each kind, sender and reason."""
+        text = "{} of {}/{} has no effect: {}".format(kind, *sender, words)
+        if self._is_new(text):
+            self._tell(text)
+
+    def _is_new(self, words: str) -> bool:
+        if words in self._said or len(self._said) >= MOST_SAID:
+            return False
+        self._said.add(words)
+        return True
+
     def _once(self, words: str) -> None:
-        if words not in self._said and len(self._said) < MOST_SAID:
-            self._said.add(words)
+        if self._is_new(words):
             self._log.warning("%s", words)
 
     def _tell(self, text: str) -> None:

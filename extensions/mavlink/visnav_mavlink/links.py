@@ -170,7 +170,7 @@ class Links:
         for message in peer.messages(data):
             if message.get_type() == "BAD_DATA":
                 self.counts["pieces of garbage"] += 1
-            elif (message.get_srcSystem(), message.get_srcComponent()) == self._ids:
+            elif _sender(message) == self._ids:
                 self.counts["messages in our own name"] += 1
             else:
                 self.counts["messages"] += 1
@@ -184,7 +184,7 @@ class Links:
 
     def _deliver(self, peer: Peer, message: Any) -> None:
         """Hand a message on; an error in its handler must not lose those read with it."""
-        sender = message.get_srcSystem(), message.get_srcComponent()
+        sender = _sender(message)
         try:
             self._receive(peer, sender, message)
         except Exception:
@@ -295,6 +295,13 @@ class Wire:
         self._listener.close()
         if self._peer is not None:
             self._peer.close()
+
+
+def _sender(message: Any) -> tuple[int, int]:
+    """Return the system and component, which pymavlink does not read of kinds it does not know."""
+    data = message.get_msgbuf()
+    system, component = data[3:5] if data[0] == mav.PROTOCOL_MARKER_V1 else data[5:7]
+    return system, component
 
 
 def _packed(message: Any, parser: Any) -> bytes:

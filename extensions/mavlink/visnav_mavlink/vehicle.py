@@ -245,6 +245,27 @@ TELEMETRY: dict[int, tuple[float, Make]] = {
 """Message's number to its rate, Hz (0: only if asked for), and its maker from `Vehicle` and ms."""
 
 
+STREAMS: dict[int, tuple[int, ...]] = {
+    mav.MAV_DATA_STREAM_ALL: tuple(
+        number
+        for number, (rate, _) in TELEMETRY.items()
+        if rate and number != mav.MAVLINK_MSG_ID_HEARTBEAT
+    ),
+    mav.MAV_DATA_STREAM_EXTENDED_STATUS: (
+        mav.MAVLINK_MSG_ID_SYS_STATUS,
+        mav.MAVLINK_MSG_ID_GPS_RAW_INT,
+    ),
+    mav.MAV_DATA_STREAM_POSITION: (
+        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    ),
+    mav.MAV_DATA_STREAM_EXTRA1: (mav.MAVLINK_MSG_ID_ATTITUDE,),
+    mav.MAV_DATA_STREAM_EXTRA2: (mav.MAVLINK_MSG_ID_VFR_HUD,),
+    mav.MAV_DATA_STREAM_EXTRA3: (mav.MAVLINK_MSG_ID_BATTERY_STATUS,),
+}
+"""Messages of ``REQUEST_DATA_STREAM``'s streams, as ArduPilot groups them."""
+
+
 @dataclass
 class Timer:
     """Period of a message, and when it is due (ns)."""
@@ -306,6 +327,13 @@ class Telemetry:
             period = LEAST_PERIOD
         timers.setdefault(int(number), Timer(period)).period = period
         return True
+
+    def set_stream(self, peer: Peer, stream: int, hertz: int) -> bool:
+        """Set the rates of a stream's messages; `False` if it has none."""
+        numbers = STREAMS.get(stream, ())
+        for number in numbers:
+            self.set_period(peer, number, 1e6 / hertz if hertz else -1)
+        return bool(numbers)
 
     def update(self, now: int) -> None:
         """Send all that is due at a stamp (ns)."""
@@ -512,27 +540,31 @@ class Parameters(dict[str, float]):
         super().__init__({name: value for name, (value, *_) in PARAMETERS.items()})
         self._send, self._tell = send, tell
 
-    def hear(self, message: Any) -> None:
-        """Answer a message of the parameter protocol."""
-        kind = message.get_type()
+    def hear(self, message: Any) -> str | None:
+        """Answer a request of the parameter protocol; return a name that is unknown."""
+        kind, names = message.get_type(), [*self]
         if kind == "PARAM_REQUEST_LIST":
-            for name in self:
+            for name in names:
                 self._give(name)
-            return
-        names = [*self]
-        if kind == "PARAM_REQUEST_READ" and 0 <= message.param_index < len(names):
+            return None
+        if kind == "PARAM_REQUEST_READ" and message.param_index >= 0:
+            if message.param_index >= len(names):
+                return f"number {message.param_index}"
             self._give(names[message.param_index])
-            return
+            return None
         name = message.param_id.rstrip("\0")
         if name not in self:
-            return  # as PX4: who asks for it learns by silence
+            return str(name)
         if kind == "PARAM_SET":
             _, least, most = PARAMETERS[name]
-            if least <= message.param_value <= most:
+            if message.param_type != mav.MAV_PARAM_TYPE_REAL32:
+                self._tell(f"{name}: expected a REAL32, found type {message.param_type}")
+            elif least <= message.param_value <= most:
                 self[name] = message.param_value
             else:
                 self._tell(f"{name}: expected {least:g} to {most:g}")
         self._give(name)
+        return None
 
     def _give(self, name: str) -> None:
         real, index = mav.MAV_PARAM_TYPE_REAL32, [*self].index(name)
