@@ -292,6 +292,104 @@ async def test_a_place_is_approached_at_the_cruising_speed(outside: Outside) -> 
     assert outside.acts[-1].position == pytest.approx((0.0, 0.0, -4.1), abs=0.02)
 
 
+def placed(number: int, x: int, y: int, z: float, frame: int = 6, p1: float = -1) -> Any:
+    nan = math.nan
+    return mav.MAVLink_command_int_message(1, 1, frame, number, 0, 0, p1, 1, 0, nan, x, y, z)
+
+
+UNKNOWN_PLACE = 2**31 - 1
+
+
+async def test_a_reposition_without_a_place_holds(outside: Outside) -> None:
+    """As ground stations pause; what is unknown of a place is where the vehicle is."""
+    reposition = mav.MAV_CMD_DO_REPOSITION
+    outside.flies()
+    pause = command(reposition, -1, 1, 0)
+    assert results(outside.say(pause)) == [0]
+    assert [type(act) for act in outside.acts] == [ev.Hover]
+    outside.passes(0.5)
+    assert len(outside.acts) == 1
+    for higher in (
+        command(reposition, -1, 1, 0, math.nan, math.nan, math.nan, 403.9),
+        placed(reposition, UNKNOWN_PLACE, UNKNOWN_PLACE, 3.8),
+    ):
+        assert results(outside.say(higher)) == [0]
+        outside.passes(3.0)
+        assert outside.acts[-1].position == pytest.approx((1.0, 2.0, -3.9), abs=1e-3)
+    assert results(outside.say(placed(reposition, 30_000, 40_000, math.nan, frame=1))) == [0]
+    outside.passes(3.0)
+    assert outside.acts[-1].position == pytest.approx((3.0, 4.0, -2.0))
+
+
+async def test_a_refused_place_says_why(outside: Outside) -> None:
+    reposition = mav.MAV_CMD_DO_REPOSITION
+    denied = [mav.MAV_RESULT_DENIED]
+    answers = outside.say(command(reposition))
+    assert results(answers) == denied
+    assert texts(answers) == ["reposition denied: expected an armed vehicle, found it disarmed"]
+    outside.flies()
+    for wrong, words in (
+        (placed(reposition, 480000000, 80000000, 3.0), "expected a place within 10 km of the"),
+        (
+            placed(reposition, 1, 1, 3.0, frame=20),
+            "expected a local or global frame, found frame 20",
+        ),
+        (placed(reposition, 910000000 * 2, 0, 3.0), "expected latitude, longitude and altitude"),
+    ):
+        answers = outside.say(wrong)
+        assert results(answers) == denied
+        assert words in texts(answers)[0]
+    assert outside.acts == []
+
+
+async def test_it_lands_where_it_is_told_to(outside: Outside) -> None:
+    land = mav.MAV_CMD_NAV_LAND
+    outside.flies()
+    for here in (command(land), command(land, 0, 0, 0, 0, 0, 0, 0)):
+        outside.say(mode(4, 3))
+        assert results(outside.say(here)) == [0]
+        assert isinstance(outside.acts[-1], ev.Land)
+    outside.say(mode(4, 3), placed(land, 50_000, 20_000, 0, frame=1))
+    outside.passes(1.0)
+    assert not isinstance(outside.acts[-1], ev.Land)
+    assert outside.endpoint.vehicle.mode == "hold"
+    outside.at((5.0, 2.0, -2.0))
+    outside.passes(2.0)
+    assert isinstance(outside.acts[-1], ev.Land)
+
+
+async def test_a_takeoff_that_cannot_be_says_why(outside: Outside) -> None:
+    take_off = mav.MAV_CMD_NAV_TAKEOFF
+    outside.say(arm(1))
+    answers = outside.say(command(take_off, 0, 0, 0, math.nan, math.nan, math.nan, 10.0))
+    assert results(answers) == [mav.MAV_RESULT_DENIED]
+    assert texts(answers) == [
+        "takeoff denied: expected an altitude 0.3 m or more above the vehicle, found 10 m above "
+        "sea level, which is 390.1 m below it"
+    ]
+    assert results(outside.say(placed(take_off, 0, 0, 3.0))) == [0]  # above home, by its frame
+    assert outside.acts[-1].altitude == pytest.approx(3.0, abs=1e-3)
+    outside.at((1.0, 2.0, -3.1))
+    outside.say(mode(4, 6))
+    for where in ("landing", "in the air"):
+        answers = outside.say(command(take_off))
+        assert results(answers) == [mav.MAV_RESULT_TEMPORARILY_REJECTED]
+        assert f"found it {where}" in texts(answers)[0]
+        assert isinstance(outside.acts[-1], ev.Land if where == "landing" else ev.Hover)
+        outside.say(mode(4, 3))
+
+
+async def test_a_return_goes_on_when_its_program_has_ended(outside: Outside) -> None:
+    outside.flies()
+    outside.passes(0.1)
+    outside.say(command(mav.MAV_CMD_NAV_RETURN_TO_LAUNCH))
+    outside.passes(5.0, heartbeat=False)
+    assert outside.endpoint.vehicle.mode == "return"
+    outside.at((1.0, 2.0, -2.6))
+    outside.passes(1.0, heartbeat=False)
+    assert isinstance(outside.acts[-1], ev.Land)
+
+
 async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> None:
     asked = outside.say(mav.MAVLink_mission_count_message(1, 1, 3, 0))
     assert [message.get_type() for message in asked] == ["MISSION_REQUEST_INT"]
@@ -537,7 +635,9 @@ ANSWERED = {
     "MISSION_WRITE_PARTIAL_LIST": {"MISSION_ACK"}, "SET_GPS_GLOBAL_ORIGIN": {"GPS_GLOBAL_ORIGIN"},
 }  # fmt: skip
 """Answers to one message of each kind, besides words; nothing to all others."""
-TREATED_WITH_WORDS = {"MISSION_COUNT", "PARAM_SET", "REQUEST_DATA_STREAM", "MISSION_SET_CURRENT"}
+TREATED_WITH_WORDS = {
+    "MISSION_COUNT", "PARAM_SET", "REQUEST_DATA_STREAM", "SET_POSITION_TARGET_GLOBAL_INT"
+}  # fmt: skip
 """Kinds that are obeyed, but whose generic message cannot be, and is told so."""
 
 

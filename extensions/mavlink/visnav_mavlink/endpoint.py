@@ -125,8 +125,11 @@ class MavlinkEndpoint:
             result = self.flight.command(message, now)
         self._send(mav.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
 
-    def _offboard(self, _peer: Peer, _sender: Sender, message: Any, now: int) -> None:
-        self.flight.offboard(message, now)
+    def _offboard(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
+        try:
+            self.flight.offboard(message, now)
+        except ValueError as error:
+            self._refuse(message.get_type(), sender, str(error))
 
     def _mission(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
         self._missions.hear(sender, message, now)

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import events as ev
-from events import Setpoint, Vector3
-from events.frames import from_geodetic, yaw_of
+from events import Vector3
+from events.frames import yaw_of
 from visnav_mavlink.links import mav
-from visnav_mavlink.vehicle import MODES, SECOND, Item, Missions, Parameters, Vehicle
+from visnav_mavlink.setpoints import Offboard
+from visnav_mavlink.vehicle import (
+    GLOBAL_FRAMES,
+    LOCAL_SCALE,
+    MODES,
+    SECOND,
+    Item,
+    Missions,
+    Parameters,
+    Vehicle,
+)
 
 OFFBOARD_TIMEOUT = SECOND // 2  # PX4's COM_OF_LOSS_T: without a set-point for longer it holds
 ARRIVED = 0.3  # metres from a place at which it is reached
-FARTHEST = 1e4  # metres from the origin that a place may be
+LEAST_CLIMB = 0.3  # metres
 FORCED = 21196  # param2 of a disarming in the air (mavlink.io, MAV_CMD_COMPONENT_ARM_DISARM)
-YAW_GAIN = 1.5  # of a heading that is asked for beside a velocity, 1/s
 _OK, _NO = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_DENIED
 _LATER, _UNKNOWN = mav.MAV_RESULT_TEMPORARILY_REJECTED, mav.MAV_RESULT_UNSUPPORTED
-_BODY = {mav.MAV_FRAME_BODY_NED, mav.MAV_FRAME_BODY_OFFSET_NED, mav.MAV_FRAME_BODY_FRD}
-_GLOBAL = {
-    mav.MAV_FRAME_GLOBAL: False,
-    mav.MAV_FRAME_GLOBAL_INT: False,
-    mav.MAV_FRAME_GLOBAL_RELATIVE_ALT: True,
-    mav.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: True,
-}  # whether altitudes are above home
+_UNKNOWN_PLACE = 2**31 - 1  # of an integer coordinate, as NaN is of a number
 
 
 class Flight:
@@ -54,37 +57,35 @@ class Flight:
         self._lands_there = False
         self._followed: int | None = None  # stamp of the carrot's last step
         self._wait_until = 0
-        self._offboard = -(1 << 62)  # stamp of the newest set-point
-        self._commands: dict[int, Callable[[Sequence[float], int], int]] = {
+        self._offboard = Offboard(vehicle)
+        self._commands: dict[int, Callable[[Any, int], int]] = {
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             mav.MAV_CMD_NAV_TAKEOFF: self._take_off,
-            mav.MAV_CMD_NAV_LAND: lambda p, now: self.set_mode("land", now),  # noqa: ARG005
-            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda p, now: self.set_mode("return", now),  # noqa: ARG005
-            mav.MAV_CMD_DO_SET_MODE: self._do_set_mode,
-            mav.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
-            mav.MAV_CMD_MISSION_START: lambda p, now: self.set_mode("mission", now),  # noqa: ARG005
-            mav.MAV_CMD_DO_SET_MISSION_CURRENT: lambda p, _: self._missions.jump(p[0]),
+            mav.MAV_CMD_NAV_LAND: self._land,
+            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _, now: self.set_mode("return", now),
+            mav.MAV_CMD_DO_SET_MODE: lambda m, now: self.set_px4_mode(m.param2, m.param3, now),
+            mav.MAV_CMD_DO_CHANGE_SPEED: lambda m, _: self._change_speed(m.param2),
+            mav.MAV_CMD_DO_REPOSITION: self._reposition,
+            mav.MAV_CMD_MISSION_START: lambda _, now: self.set_mode("mission", now),
+            mav.MAV_CMD_DO_SET_MISSION_CURRENT: lambda m, _: self._missions.jump(m.param1),
         }
 
     def command(self, message: Any, now: int) -> int:
         """Carry out a ``COMMAND_LONG`` or ``COMMAND_INT``; return its ``MAV_RESULT``."""
         number = message.command
-        numbers = [message.param1, message.param2, message.param3, message.param4]
-        if number == mav.MAV_CMD_DO_REPOSITION:
-            return self._reposition(message, now)
-        if message.get_type() == "COMMAND_INT":
-            numbers += [message.x, message.y, message.z]
-        else:
-            numbers += [message.param5, message.param6, message.param7]
         if (do := self._commands.get(number)) is None:
             self._once(f"command {number} is not supported")
             return int(_UNKNOWN)
-        return int(do(numbers, now))
+        return int(do(message, now))
 
-    def set_mode(self, mode: str, now: int) -> int:
-        """Go over to a mode; return a ``MAV_RESULT``."""
+    def set_mode(self, mode: str, now: int, climb: float = math.nan) -> int:
+        """Go over to a mode; return a ``MAV_RESULT``.
+
+        Args:
+            climb: Metres of a take-off; those of the parameter if NaN.
+        """
         vehicle = self._vehicle
-        if mode == "offboard" and now - self._offboard > OFFBOARD_TIMEOUT:
+        if mode == "offboard" and now - self._offboard.stamp > OFFBOARD_TIMEOUT:
             self._tell("offboard: expected set-points before, found none of the last 0.5 s")
             return int(_LATER)
         if mode == "mission" and not self._missions.items:
@@ -93,13 +94,18 @@ class Flight:
         if mode in {"takeoff", "return"} and not vehicle.armed:
             self._tell(f"{mode} denied: expected an armed vehicle, found it disarmed")
             return int(_LATER)
-        self._goal, self._lands_there, self._wait_until = None, False, 0
         flies = vehicle.armed and vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
+        if mode == "takeoff" and (flies or vehicle.mode == "land"):
+            doing = "landing" if vehicle.mode == "land" else "in the air"
+            self._tell(f"takeoff denied: expected a vehicle on the ground, found it {doing}")
+            return int(_LATER)
+        self._goal, self._lands_there, self._wait_until = None, False, 0
         if vehicle.mode in {"takeoff", "land"} and mode != vehicle.mode and flies:
             self._act(ev.Hover)  # else its set-points would not count
         vehicle.mode = mode
         if mode == "takeoff":
-            self._act(ev.Takeoff, altitude=self._parameters["MIS_TAKEOFF_ALT"])
+            usual = self._parameters["MIS_TAKEOFF_ALT"]
+            self._act(ev.Takeoff, altitude=usual if math.isnan(climb) else climb)
         elif mode == "land" and vehicle.armed:
             self._act(ev.Land)
         elif mode in {"hold", "position", "manual"} and flies:
@@ -132,53 +138,43 @@ class Flight:
             vehicle.mode = "hold"
 
     def offboard(self, message: Any, now: int) -> None:
-        """Take a set-point of position, velocity, attitude or rates; sent on in offboard mode."""
-        made = self._setpoint(message)
-        if made is None:
-            return
-        self._offboard = now
+        """Take a set-point of position, velocity, attitude or rates; sent on in offboard mode.
+
+        A `ValueError` says why it cannot be followed.
+        """
+        made = self._offboard.take(message, now)
+        if made.dropped:
+            self._once(f"{message.get_type()}: {made.dropped} are not followed")
         if self._vehicle.mode == "offboard":
-            kind, fields = made
-            self._act(kind, **fields)
+            self._act(made.kind, **made.fields)
 
     def update(self, now: int) -> None:
         """Go on with what is under way."""
         vehicle = self._vehicle
-        if vehicle.mode == "offboard" and now - self._offboard > OFFBOARD_TIMEOUT:
+        if vehicle.mode == "offboard" and now - self._offboard.stamp > OFFBOARD_TIMEOUT:
             self._tell("offboard: no set-point for 0.5 s: holding")
             self.set_mode("hold", now)
+        elif vehicle.mode == "offboard" and (made := self._offboard.again(now)):
+            self._act(made.kind, **made.fields)
         if vehicle.mode == "mission" and self._goal is None and now >= self._wait_until:
             self._next_item(now)
         if self._goal is not None and vehicle.armed:
             self._follow(now)
 
     def lost(self, action: str, now: int) -> None:
-        """Do what is to be done without any program in the air: ``hold`` or ``land``."""
+        """Do what is to be done without any program in the air: ``hold`` or ``land``.
+
+        A return or a landing goes on.
+        """
+        if self._lands_there:
+            return
         if self._vehicle.landed_state == mav.MAV_LANDED_STATE_IN_AIR:
             self._tell(f"no program is heard any more: {action}")
             self.set_mode(action, now)
 
-    def position_of(self, frame: int, x: float, y: float, z: float) -> Vector3 | None:
-        """Return a message's place in ``map``, metres; `None` if nobody can fly there.
-
-        `x` and `y` are 1e-7 degrees in global frames.
-        """
+    def _arm(self, message: Any, now: int) -> int:  # noqa: ARG002
         vehicle = self._vehicle
-        if frame in _GLOBAL:
-            home = vehicle.home or (0.0, 0.0, 0.0)
-            above = vehicle.origin[2] - home[2] if _GLOBAL[frame] else 0.0
-            if not (math.isfinite(z) and abs(x) <= 9e8 and abs(y) <= 18e8):
-                return None
-            position = from_geodetic((x * 1e-7, y * 1e-7, z + above), vehicle.origin)
-        elif frame == mav.MAV_FRAME_LOCAL_NED:
-            position = (x, y, z)
-        else:
-            return None
-        return position if all(abs(coordinate) <= FARTHEST for coordinate in position) else None
-
-    def _arm(self, numbers: Sequence[float], now: int) -> int:  # noqa: ARG002
-        vehicle = self._vehicle
-        if numbers[0] == 1:
+        if message.param1 == 1:
             if not vehicle.ready:
                 self._tell("arming denied: expected a pose of the vehicle, found none yet")
                 return int(_LATER)
@@ -187,49 +183,77 @@ class Flight:
                 vehicle.armed = True  # a take-off may come before its event does
             return int(_OK)
         in_air = vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
-        if numbers[0] != 0 or (in_air and numbers[1] != FORCED):
+        if message.param1 != 0 or (in_air and message.param2 != FORCED):
             self._tell("disarming denied: in the air")
             return int(_NO)
         self._act(ev.Disarm)
         return int(_OK)
 
-    def _take_off(self, numbers: Sequence[float], now: int) -> int:
-        vehicle, altitude = self._vehicle, numbers[6]
-        if math.isfinite(altitude) and vehicle.armed and vehicle.home:  # above sea level
-            height = altitude - (vehicle.origin[2] - vehicle.home[2])
-            if not 0.3 <= height <= FARTHEST:
-                self._tell(f"takeoff denied: expected 0.3 m or more above home, found {height:g}")
-                return int(_NO)
-            self.set_mode("hold", now)
-            vehicle.mode = "takeoff"
-            self._act(ev.Takeoff, altitude=height)
-            return int(_OK)
-        return self.set_mode("takeoff", now)
+    def _take_off(self, message: Any, now: int) -> int:
+        vehicle, (frame, x, y, z) = self._vehicle, _location(message)
+        if math.isnan(z) or not vehicle.armed:
+            return self.set_mode("takeoff", now)
+        try:
+            place = vehicle.place_of(frame, math.nan, math.nan, z)
+        except ValueError as error:
+            return self._denied("takeoff", error)
+        height = vehicle.position[2] - place[2]
+        if height < LEAST_CLIMB:
+            above = "home" if GLOBAL_FRAMES.get(frame) else "sea level"
+            shown = f"{z:g} m above {above}" if frame in GLOBAL_FRAMES else f"{z:g} m down"
+            return self._denied(
+                "takeoff",
+                f"expected an altitude {LEAST_CLIMB:g} m or more above the vehicle, found {shown}, "
+                f"which is {-height:.1f} m below it",
+            )
+        if math.isfinite(x) and math.isfinite(y) and (x or y):
+            self._once("takeoff: its place is not flown to: it goes straight up")
+        return self.set_mode("takeoff", now, climb=height)
 
-    def _do_set_mode(self, numbers: Sequence[float], now: int) -> int:
-        return self.set_px4_mode(numbers[1], numbers[2], now)
+    def _land(self, message: Any, now: int) -> int:
+        frame, x, y, _ = _location(message)
+        return self._land_at(frame, x, y, now)
 
-    def _change_speed(self, numbers: Sequence[float], now: int) -> int:  # noqa: ARG002
-        if not (math.isfinite(numbers[1]) and numbers[1] > 0):
-            return int(_NO)
-        self._speed = numbers[1]
+    def _land_at(self, frame: int, x: float, y: float, now: int) -> int:
+        """Land at a place; here if its coordinates are NaN, or zeros of a global frame."""
+        vehicle = self._vehicle
+        flies = vehicle.armed and vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
+        here = math.isnan(x) or math.isnan(y) or (frame in GLOBAL_FRAMES and not (x or y))
+        if here or not flies:
+            return self.set_mode("land", now)
+        try:
+            place = vehicle.place_of(frame, x, y, math.nan)
+        except ValueError as error:
+            return self._denied("land", error)
+        self.set_mode("hold", now)
+        self._go(place)
+        self._lands_there = True
+        return int(_OK)
+
+    def _denied(self, what: str, why: object) -> int:
+        self._tell(f"{what} denied: {why}")
+        return int(_NO)
+
+    def _change_speed(self, speed: float) -> int:
+        if not (math.isfinite(speed) and speed > 0):
+            return self._denied("speed", f"expected a positive one, found {speed:g}")
+        self._speed = speed
         return int(_OK)
 
     def _reposition(self, message: Any, now: int) -> int:
-        if message.get_type() == "COMMAND_INT":
-            frame, x, y, z = message.frame, message.x, message.y, message.z
-        else:
-            frame, z = mav.MAV_FRAME_GLOBAL, message.param7
-            x, y = message.param5 * 1e7, message.param6 * 1e7
-        place = self.position_of(frame, x, y, z)
-        vehicle = self._vehicle
-        if place is None or not vehicle.armed or vehicle.home is None:
-            self._tell("reposition denied: expected a vehicle in the air, and a place")
-            return int(_NO)
+        """Go to a place; hold if it is where the vehicle is, as ground stations pause."""
+        vehicle, place = self._vehicle, _location(message)
+        if not vehicle.armed or vehicle.home is None:
+            return self._denied("reposition", "expected an armed vehicle, found it disarmed")
+        try:
+            goal = vehicle.place_of(*place)
+        except ValueError as error:
+            return self._denied("reposition", error)
         self.set_mode("hold", now)
         if math.isfinite(message.param1) and message.param1 > 0:
             self._speed = message.param1
-        self._go(place, message.param4)
+        if not all(map(math.isnan, (*place[1:], message.param4))):
+            self._go(goal, message.param4)
         return int(_OK)
 
     def _go(self, place: Vector3, yaw: float = math.nan) -> None:
@@ -272,13 +296,12 @@ class Flight:
         if kind == mav.MAV_CMD_NAV_WAYPOINT or kind == mav.MAV_CMD_NAV_TAKEOFF:
             if not vehicle.armed:
                 return
-            place = self.position_of(item.frame, item.x, item.y, item.z)
-            assert place is not None  # which `Missions` has made sure of
+            place = vehicle.place_of(item.frame, item.x, item.y, item.z)
             if kind == mav.MAV_CMD_NAV_TAKEOFF:
                 place = (*vehicle.position[:2], place[2])
             self._go(place, math.radians(item.params[3]))
         elif kind == mav.MAV_CMD_DO_CHANGE_SPEED:
-            self._change_speed(item.params, now)
+            self._change_speed(item.params[1])
             self._missions.reached()
         elif kind == mav.MAV_CMD_NAV_DELAY:
             self._wait_until = now + round(item.params[0] * SECOND)
@@ -290,7 +313,11 @@ class Flight:
     def refused(self, item: Item) -> bool:
         """Tell whether a mission's item cannot be flown."""
         if item.command in {mav.MAV_CMD_NAV_WAYPOINT, mav.MAV_CMD_NAV_TAKEOFF}:
-            return self.position_of(item.frame, item.x, item.y, item.z) is None
+            try:
+                self._vehicle.place_of(item.frame, item.x, item.y, item.z)
+            except ValueError:
+                return True
+            return False
         if item.command == mav.MAV_CMD_NAV_DELAY:
             return not 0 <= item.params[0] <= 3600
         return item.command not in {
@@ -299,50 +326,15 @@ class Flight:
             mav.MAV_CMD_NAV_RETURN_TO_LAUNCH,
         }
 
-    def _setpoint(self, message: Any) -> tuple[type[Setpoint], dict[str, Any]] | None:
-        """Return the set-point that a message asks for; `None` if it cannot be followed."""
-        mask, kind = message.type_mask, message.get_type()
-        if kind == "SET_ATTITUDE_TARGET":
-            return self._attitude(message, mask)
-        frame = message.coordinate_frame
-        no_place, no_speed = mask & 0b111 == 0b111, mask & 0b111000 == 0b111000
-        velocity = tuple(0.0 if math.isnan(v) else v for v in (message.vx, message.vy, message.vz))
-        turn = 0.0 if mask & 2048 or math.isnan(message.yaw_rate) else message.yaw_rate
-        own = yaw_of(self._vehicle.orientation)
-        yaw = own if mask & 1024 or math.isnan(message.yaw) else message.yaw
-        if not all(map(math.isfinite, (*velocity, turn, yaw))):
-            return self._no_setpoint(f"{kind} with numbers that are none")
-        if not no_place:
-            if kind == "SET_POSITION_TARGET_GLOBAL_INT":
-                place = self.position_of(frame, message.lat_int, message.lon_int, message.alt)
-            else:
-                place = self.position_of(frame, message.x, message.y, message.z)
-            if place is None:
-                return self._no_setpoint(f"{kind} with a place in frame {frame}")
-            ahead = {} if no_speed else {"velocity": velocity}
-            return ev.PositionSetpoint, {"position": place, "yaw": yaw, "yaw_rate": turn} | ahead
-        if no_speed:
-            return self._no_setpoint(f"{kind} with neither position nor velocity")
-        if mask & 1024 == 0:
-            turn += YAW_GAIN * math.remainder(yaw - own, math.tau)
-        frame_id = "heading" if frame in _BODY else "map"
-        return ev.VelocitySetpoint, {
-            "velocity": velocity, "yaw_rate": turn, "frame_id": frame_id
-        }  # fmt: skip
 
-    def _attitude(self, message: Any, mask: int) -> tuple[type[Setpoint], dict[str, Any]] | None:
-        thrust = message.thrust
-        rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
-        if mask & 128:
-            if not all(map(math.isfinite, (*rates, thrust))):
-                return self._no_setpoint("SET_ATTITUDE_TARGET with numbers that are none")
-            return ev.BodyRateSetpoint, {"angular_velocity": rates, "thrust": thrust}
-        size = math.hypot(*message.q)
-        if not (math.isfinite(size) and math.isfinite(thrust) and size > 0.5):
-            return self._no_setpoint("SET_ATTITUDE_TARGET with no attitude")
-        turned = tuple(part / size for part in message.q)
-        return ev.AttitudeSetpoint, {"orientation": turned, "thrust": thrust}
-
-    def _no_setpoint(self, what: str) -> tuple[type[Setpoint], dict[str, Any]] | None:
-        self._once(f"{what} is not followed")
-        return None
+def _location(message: Any) -> tuple[int, float, float, float]:
+    """Return a command's frame and place, as `Vehicle.place_of` takes it."""
+    if message.get_type() == "COMMAND_LONG":
+        x, y = message.param5 * 1e7, message.param6 * 1e7
+        return mav.MAV_FRAME_GLOBAL, x, y, message.param7
+    scale = 1 if message.frame in GLOBAL_FRAMES else LOCAL_SCALE
+    x, y = (
+        math.nan if coordinate == _UNKNOWN_PLACE else coordinate * scale
+        for coordinate in (message.x, message.y)
+    )
+    return message.frame, x, y, message.z

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 from events import Odometry, PoseEstimate, Quaternion, Vector3
-from events.frames import Geodetic, rotate, rotate_inverse, to_geodetic, yaw_of
+from events.frames import Geodetic, from_geodetic, rotate, rotate_inverse, to_geodetic, yaw_of
 from visnav_mavlink.links import Links, Peer, mav
 from visnav_mavlink.settings import RATE
 
@@ -28,6 +28,16 @@ MODES = {
 }
 """Name to PX4's main and sub mode, which programs read from and write into ``custom_mode``."""
 
+GLOBAL_FRAMES = {
+    mav.MAV_FRAME_GLOBAL: False,
+    mav.MAV_FRAME_GLOBAL_INT: False,
+    mav.MAV_FRAME_GLOBAL_RELATIVE_ALT: True,
+    mav.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: True,
+}
+"""Frames of latitude and longitude, and whether their altitudes are above home."""
+
+LOCAL_SCALE = 1e-4  # metres per unit of a local coordinate sent as an integer
+FARTHEST = 1e4  # metres from the origin that a place may be
 ON_GROUND = 0.15  # metres above the start below which an armed vehicle stands
 _HEALTHY = (
     mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -99,6 +109,37 @@ class Vehicle:
             "land": mav.MAV_LANDED_STATE_LANDING,
         }
         return int(states.get(self.mode, mav.MAV_LANDED_STATE_IN_AIR))
+
+    def place_of(self, frame: int, x: float, y: float, z: float) -> Vector3:
+        """Return a message's place in ``map``, metres; NaN means where the vehicle is.
+
+        `x` and `y` are 1e-7 degrees in global frames, metres in the local one; `z` is an altitude,
+        or metres down. A `ValueError` says why nobody can fly there.
+        """
+        if frame == mav.MAV_FRAME_LOCAL_NED:
+            position = (x, y, z)
+        elif frame in GLOBAL_FRAMES:
+            above = 0.0
+            if GLOBAL_FRAMES[frame] and self.home is not None:
+                above = self.origin[2] - self.home[2]
+            latitude, longitude, altitude = self.place(self.position)
+            degrees = (latitude if math.isnan(x) else x, longitude if math.isnan(y) else y)
+            up = altitude * 1e-3 if math.isnan(z) else z + above
+            if not (math.isfinite(up) and abs(degrees[0]) <= 9e8 and abs(degrees[1]) <= 18e8):
+                raise ValueError("expected latitude, longitude and altitude, found no such place")
+            position = from_geodetic((degrees[0] * 1e-7, degrees[1] * 1e-7, up), self.origin)
+        else:
+            raise ValueError(f"expected a local or global frame, found frame {frame}")
+        north, east, down = (
+            own if math.isnan(value) else coordinate
+            for own, value, coordinate in zip(self.position, (x, y, z), position, strict=True)
+        )
+        if not all(abs(coordinate) <= FARTHEST for coordinate in (north, east, down)):
+            raise ValueError(
+                "expected a place within {:g} km of the vehicle's origin, {:.6f}, {:.6f}, {:.0f} m;"
+                " found it farther".format(FARTHEST / 1000, *self.origin)
+            )
+        return north, east, down
 
     def place(self, position: Vector3) -> tuple[int, int, int]:
         """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a place in ``map``."""
