@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from visnav_mavlink.links import mav
+from visnav_mavlink.links import Sender, mav
 from visnav_mavlink.vehicle import Vehicle
 
 _FTP_ANSWERS = 128  # opcode from which on it is an answer
 _FTP_NAK, _FTP_UNKNOWN_COMMAND = 129, 7  # mavlink.io, File Transfer Protocol
-
-Sender = tuple[int, int]
-"""System and component."""
 
 
 def _timesync(message: Any, sender: Sender, now: int, _: Vehicle) -> Any:  # noqa: ARG001

@@ -10,12 +10,13 @@ import numpy as np
 
 from events.frames import Geodetic, from_rpy
 from runtime.logs import NodeLogger
-from visnav_mavlink.answers import ANSWERS, Sender
+from visnav_mavlink.answers import ANSWERS
 from visnav_mavlink.flight import Flight
-from visnav_mavlink.links import Links, Peer, mav
+from visnav_mavlink.links import Links, Peer, Sender, mav
 from visnav_mavlink.messages import TREATMENTS
+from visnav_mavlink.missions import Missions
 from visnav_mavlink.settings import MavlinkConfig
-from visnav_mavlink.vehicle import SECOND, Missions, Parameters, Telemetry, Vehicle
+from visnav_mavlink.vehicle import SECOND, Parameters, Telemetry, Vehicle
 
 OLDEST = 10 * SECOND  # age of a vision stamp beyond which its clock is not ours
 MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it
@@ -52,7 +53,12 @@ class MavlinkEndpoint:
         self.vehicle = vehicle = Vehicle(origin, config.gps)
         self._telemetry = Telemetry(vehicle, self._links, self._tell)
         self._parameters = Parameters(send, self._tell)
-        self._missions = Missions(send, lambda item: self.flight.refused(item), self._tell)
+        self._missions = Missions(
+            send,
+            lambda item: self.flight.why_not(item),
+            self._tell,
+            lambda: self.flight.drop_item(),
+        )
         parts = self._missions, self._parameters
         self.flight = Flight(vehicle, *parts, act, self._tell, self._once)
         by_handler: dict[Handler, str] = {
@@ -132,7 +138,8 @@ class MavlinkEndpoint:
             self._refuse(message.get_type(), sender, str(error))
 
     def _mission(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
-        self._missions.hear(sender, message, now)
+        if words := self._missions.hear(sender, message, now):
+            self._refuse(message.get_type(), sender, words)
 
     def _parameter(self, _: Peer, sender: Sender, message: Any, now: int) -> None:  # noqa: ARG002
         if (name := self._parameters.hear(message)) is not None:

@@ -10,17 +10,9 @@ import events as ev
 from events import Vector3
 from events.frames import yaw_of
 from visnav_mavlink.links import mav
+from visnav_mavlink.missions import Item, Missions, is_speed
 from visnav_mavlink.setpoints import Offboard
-from visnav_mavlink.vehicle import (
-    GLOBAL_FRAMES,
-    LOCAL_SCALE,
-    MODES,
-    SECOND,
-    Item,
-    Missions,
-    Parameters,
-    Vehicle,
-)
+from visnav_mavlink.vehicle import GLOBAL_FRAMES, LOCAL_SCALE, MODES, SECOND, Parameters, Vehicle
 
 OFFBOARD_TIMEOUT = SECOND // 2  # PX4's COM_OF_LOSS_T: without a set-point for longer it holds
 ARRIVED = 0.3  # metres from a place at which it is reached
@@ -28,6 +20,14 @@ LEAST_CLIMB = 0.3  # metres
 FORCED = 21196  # param2 of a disarming in the air (mavlink.io, MAV_CMD_COMPONENT_ARM_DISARM)
 _OK, _NO = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_DENIED
 _LATER, _UNKNOWN = mav.MAV_RESULT_TEMPORARILY_REJECTED, mav.MAV_RESULT_UNSUPPORTED
+LONGEST_STAY = 3600  # at a mission's item, seconds
+_PLACES = {mav.MAV_CMD_NAV_WAYPOINT, mav.MAV_CMD_NAV_TAKEOFF}
+_ITEMS = _PLACES | {
+    mav.MAV_CMD_DO_CHANGE_SPEED,
+    mav.MAV_CMD_NAV_DELAY,
+    mav.MAV_CMD_NAV_LAND,
+    mav.MAV_CMD_NAV_RETURN_TO_LAUNCH,
+}
 _UNKNOWN_PLACE = 2**31 - 1  # of an integer coordinate, as NaN is of a number
 
 
@@ -56,7 +56,7 @@ class Flight:
         self._speed: float | None = None
         self._lands_there = False
         self._followed: int | None = None  # stamp of the carrot's last step
-        self._wait_until = 0
+        self._wait_until: int | None = None  # of a mission's item: once its place is reached
         self._offboard = Offboard(vehicle)
         self._commands: dict[int, Callable[[Any, int], int]] = {
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
@@ -66,7 +66,7 @@ class Flight:
             mav.MAV_CMD_DO_SET_MODE: lambda m, now: self.set_px4_mode(m.param2, m.param3, now),
             mav.MAV_CMD_DO_CHANGE_SPEED: lambda m, _: self._change_speed(m.param2),
             mav.MAV_CMD_DO_REPOSITION: self._reposition,
-            mav.MAV_CMD_MISSION_START: lambda _, now: self.set_mode("mission", now),
+            mav.MAV_CMD_MISSION_START: self._start_mission,
             mav.MAV_CMD_DO_SET_MISSION_CURRENT: lambda m, _: self._missions.jump(m.param1),
         }
 
@@ -78,11 +78,12 @@ class Flight:
             return int(_UNKNOWN)
         return int(do(message, now))
 
-    def set_mode(self, mode: str, now: int, climb: float = math.nan) -> int:
+    def set_mode(self, mode: str, now: int, climb: float = math.nan, resumes: bool = True) -> int:
         """Go over to a mode; return a ``MAV_RESULT``.
 
         Args:
             climb: Metres of a take-off; those of the parameter if NaN.
+            resumes: Whether a mission goes on, or from its first item after its last.
         """
         vehicle = self._vehicle
         if mode == "offboard" and now - self._offboard.stamp > OFFBOARD_TIMEOUT:
@@ -94,12 +95,14 @@ class Flight:
         if mode in {"takeoff", "return"} and not vehicle.armed:
             self._tell(f"{mode} denied: expected an armed vehicle, found it disarmed")
             return int(_LATER)
-        flies = vehicle.armed and vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
+        flies = self._flies
         if mode == "takeoff" and (flies or vehicle.mode == "land"):
             doing = "landing" if vehicle.mode == "land" else "in the air"
             self._tell(f"takeoff denied: expected a vehicle on the ground, found it {doing}")
             return int(_LATER)
-        self._goal, self._lands_there, self._wait_until = None, False, 0
+        if mode == "mission" and resumes:
+            self._missions.resume()
+        self._drop_goal()
         if vehicle.mode in {"takeoff", "land"} and mode != vehicle.mode and flies:
             self._act(ev.Hover)  # else its set-points would not count
         vehicle.mode = mode
@@ -156,10 +159,18 @@ class Flight:
             self.set_mode("hold", now)
         elif vehicle.mode == "offboard" and (made := self._offboard.again(now)):
             self._act(made.kind, **made.fields)
-        if vehicle.mode == "mission" and self._goal is None and now >= self._wait_until:
-            self._next_item(now)
+        if vehicle.mode == "mission":
+            self._go_on_with_mission(now)
         if self._goal is not None and vehicle.armed:
             self._follow(now)
+
+    def drop_item(self) -> None:
+        """Give up a mission's item under way: another one is to be flown."""
+        if self._vehicle.mode == "mission":
+            self._drop_goal()
+
+    def _drop_goal(self) -> None:
+        self._goal, self._lands_there, self._wait_until = None, False, None
 
     def lost(self, action: str, now: int) -> None:
         """Do what is to be done without any program in the air: ``hold`` or ``land``.
@@ -211,34 +222,43 @@ class Flight:
         return self.set_mode("takeoff", now, climb=height)
 
     def _land(self, message: Any, now: int) -> int:
-        frame, x, y, _ = _location(message)
-        return self._land_at(frame, x, y, now)
-
-    def _land_at(self, frame: int, x: float, y: float, now: int) -> int:
-        """Land at a place; here if its coordinates are NaN, or zeros of a global frame."""
-        vehicle = self._vehicle
-        flies = vehicle.armed and vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
-        here = math.isnan(x) or math.isnan(y) or (frame in GLOBAL_FRAMES and not (x or y))
-        if here or not flies:
-            return self.set_mode("land", now)
         try:
-            place = vehicle.place_of(frame, x, y, math.nan)
+            place = self._landing_place(*_location(message)[:3])
         except ValueError as error:
             return self._denied("land", error)
+        if place is None or not self._flies:
+            return self.set_mode("land", now)
         self.set_mode("hold", now)
         self._go(place)
         self._lands_there = True
         return int(_OK)
+
+    def _landing_place(self, frame: int, x: float, y: float) -> Vector3 | None:
+        """Return where to go before landing; `None` for NaN, and zeros of a global frame: here."""
+        if math.isnan(x) or math.isnan(y) or (frame != mav.MAV_FRAME_LOCAL_NED and not (x or y)):
+            return None
+        return self._vehicle.place_of(frame, x, y, math.nan)
+
+    @property
+    def _flies(self) -> bool:
+        vehicle = self._vehicle
+        return vehicle.armed and vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
 
     def _denied(self, what: str, why: object) -> int:
         self._tell(f"{what} denied: {why}")
         return int(_NO)
 
     def _change_speed(self, speed: float) -> int:
-        if not (math.isfinite(speed) and speed > 0):
+        if not is_speed(speed):
             return self._denied("speed", f"expected a positive one, found {speed:g}")
-        self._speed = speed
+        if speed != -1:
+            self._speed = speed if speed > 0 else None
         return int(_OK)
+
+    def _start_mission(self, message: Any, now: int) -> int:
+        if self._missions.items and (why := self._missions.start(message.param1, message.param2)):
+            return self._denied("mission", why)
+        return self.set_mode("mission", now, resumes=False)
 
     def _reposition(self, message: Any, now: int) -> int:
         """Go to a place; hold if it is where the vehicle is, as ground stations pause."""
@@ -276,55 +296,72 @@ class Flight:
         self._act(ev.PositionSetpoint, position=self._carrot, yaw=heading)
         if part < 1.0 or math.dist(self._vehicle.position, place) > ARRIVED:
             return
-        self._goal = None
-        if self._lands_there:
+        self._goal, item = None, self._missions.current()
+        if self._vehicle.mode == "mission" and item is not None and not self._lands_there:
+            stay = item.params[0] if item.command == mav.MAV_CMD_NAV_WAYPOINT else 0
+            self._wait_until = now + (round(stay * SECOND) if 0 < stay <= LONGEST_STAY else 0)
+        elif self._lands_there:
+            if self._vehicle.mode == "mission":
+                self._missions.reached()
             self.set_mode("land", now)
-        elif self._vehicle.mode == "mission" and (item := self._missions.current()):
-            stay = item.params[0]
-            self._wait_until = now + round(stay * SECOND) if 0 < stay <= 3600 else 0
-            self._missions.reached()
 
-    def _next_item(self, now: int) -> None:
-        """Begin with a mission's next item."""
-        vehicle = self._vehicle
-        item = self._missions.current()
+    def _go_on_with_mission(self, now: int) -> None:
+        """Begin with a mission's item, or see whether it has been stayed at for long enough."""
+        if self._wait_until is not None:
+            if now < self._wait_until:
+                return
+            self._wait_until = None
+            self._missions.reached()
+        if self._goal is None:
+            self._begin_item(now)
+
+    def _begin_item(self, now: int) -> None:
+        vehicle, item = self._vehicle, self._missions.current()
         if item is None:
-            self._tell("mission finished")
+            self._tell("mission finished" if self._missions.items else "mission cleared: holding")
             self.set_mode("hold", now)
             return
         kind = item.command
-        if kind == mav.MAV_CMD_NAV_WAYPOINT or kind == mav.MAV_CMD_NAV_TAKEOFF:
-            if not vehicle.armed:
-                return
-            place = vehicle.place_of(item.frame, item.x, item.y, item.z)
+        try:
+            landing = None
+            if kind == mav.MAV_CMD_NAV_LAND and self._flies:
+                landing = self._landing_place(*item.place[:3])
+            place = vehicle.place_of(*item.place) if kind in _PLACES else landing
+        except ValueError as error:  # as of a place known in part, once the vehicle is far away
+            self._tell(f"mission: {error}: holding")
+            self.set_mode("hold", now)
+            return
+        if kind in _PLACES and not vehicle.armed:
+            return
+        if place is not None:
             if kind == mav.MAV_CMD_NAV_TAKEOFF:
                 place = (*vehicle.position[:2], place[2])
-            self._go(place, math.radians(item.params[3]))
+            self._go(place, math.nan if landing else math.radians(item.params[3]))
+            self._lands_there = landing is not None
         elif kind == mav.MAV_CMD_DO_CHANGE_SPEED:
             self._change_speed(item.params[1])
             self._missions.reached()
         elif kind == mav.MAV_CMD_NAV_DELAY:
             self._wait_until = now + round(item.params[0] * SECOND)
-            self._missions.reached()
         else:
             self._missions.reached()
             self.set_mode("land" if kind == mav.MAV_CMD_NAV_LAND else "return", now)
 
-    def refused(self, item: Item) -> bool:
-        """Tell whether a mission's item cannot be flown."""
-        if item.command in {mav.MAV_CMD_NAV_WAYPOINT, mav.MAV_CMD_NAV_TAKEOFF}:
-            try:
-                self._vehicle.place_of(item.frame, item.x, item.y, item.z)
-            except ValueError:
-                return True
-            return False
-        if item.command == mav.MAV_CMD_NAV_DELAY:
-            return not 0 <= item.params[0] <= 3600
-        return item.command not in {
-            mav.MAV_CMD_DO_CHANGE_SPEED,
-            mav.MAV_CMD_NAV_LAND,
-            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH,
-        }
+    def why_not(self, item: Item) -> str:
+        """Return why a mission's item cannot be flown; empty if it can."""
+        kind = item.command
+        try:
+            if kind in _PLACES:
+                self._vehicle.place_of(*item.place)
+            elif kind == mav.MAV_CMD_NAV_LAND:
+                self._landing_place(*item.place[:3])
+        except ValueError as error:
+            return str(error)
+        if kind == mav.MAV_CMD_NAV_DELAY and not 0 <= item.params[0] <= LONGEST_STAY:
+            return f"expected a delay of 0 to {LONGEST_STAY} s, found {item.params[0]:g}"
+        if kind == mav.MAV_CMD_DO_CHANGE_SPEED and not is_speed(item.params[1]):
+            return f"expected a positive speed, found {item.params[1]:g}"
+        return "" if kind in _ITEMS else f"command {kind} is not supported"
 
 
 def _location(message: Any) -> tuple[int, float, float, float]:

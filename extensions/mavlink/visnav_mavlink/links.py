@@ -35,8 +35,11 @@ STARTING = 0.004  # real seconds that PX4's answer may take before the first one
 _IMU, _MAGNETOMETER, _BAROMETER = 0b111111, 0b111000000, 0b1101000000000
 MOTORS = 4
 
-Receive = Callable[["Peer", tuple[int, int], Any], None]
-"""Called with the link's peer, the sender's system and component, and the message."""
+Sender = tuple[int, int]
+"""System and component."""
+
+Receive = Callable[["Peer", Sender, Any], None]
+"""Called with the link's peer, the message's sender, and the message."""
 
 
 class Peer:
@@ -297,7 +300,7 @@ class Wire:
             self._peer.close()
 
 
-def _sender(message: Any) -> tuple[int, int]:
+def _sender(message: Any) -> Sender:
     """Return the system and component, which pymavlink does not read of kinds it does not know."""
     data = message.get_msgbuf()
     system, component = data[3:5] if data[0] == mav.PROTOCOL_MARKER_V1 else data[5:7]

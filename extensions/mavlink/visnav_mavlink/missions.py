@@ -1,0 +1,299 @@
+"""The vehicle's mission: uploaded, downloaded, gone through; how far it is stands here alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from visnav_mavlink.links import Sender, mav
+from visnav_mavlink.vehicle import GLOBAL_FRAMES, LOCAL_SCALE, SECOND
+
+MOST_ITEMS = 1000
+PATIENCE, TRIES = SECOND, 5  # until an item that does not come is asked for again; how often
+GUIDED = 2  # of a MISSION_ITEM's `current`: ArduPilot's way to say where to go at once
+_MISSION, _ALL = mav.MAV_MISSION_TYPE_MISSION, mav.MAV_MISSION_TYPE_ALL
+_OTHERS = {mav.MAV_MISSION_TYPE_FENCE, mav.MAV_MISSION_TYPE_RALLY}
+_LARGEST = 2**31 - 1
+
+
+class Item(NamedTuple):
+    """An item of a mission: a place in its frame, or something to do.
+
+    Attributes:
+        x: 1e-7 degrees of latitude, or 1e-4 m in local frames; `y` as well.
+    """
+
+    command: int
+    frame: int
+    params: tuple[float, float, float, float]
+    x: int
+    y: int
+    z: float
+    autocontinue: int
+
+    @property
+    def place(self) -> tuple[int, float, float, float]:
+        """Frame and coordinates, as `Vehicle.place_of` takes them."""
+        scale = 1 if self.frame in GLOBAL_FRAMES else LOCAL_SCALE
+        return self.frame, self.x * scale, self.y * scale, self.z
+
+
+@dataclass
+class Upload:
+    """An upload under way.
+
+    Attributes:
+        asked: When the next item was asked for (ns), and `tries` how often.
+        by_int: Whether items are asked for by ``MISSION_REQUEST_INT``, as some programs want.
+    """
+
+    sender: Sender
+    count: int
+    asked: int = 0
+    tries: int = 0
+    by_int: bool = False
+    items: list[Item] = field(default_factory=list)
+
+
+class Missions:
+    """The vehicle's mission.
+
+    Args:
+        send: Sends a message to all programs, who know by its target whether it is for them.
+        why_not: Returns why an item cannot be flown; empty if it can.
+        changed: Called when another item than the next one is to be flown.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[Any], None],
+        why_not: Callable[[Item], str],
+        tell: Callable[[str], None],
+        changed: Callable[[], None],
+    ) -> None:
+        self._send, self._why_not = send, why_not
+        self._tell, self._changed = tell, changed
+        self.items: list[Item] = []
+        self._next = self._end = 0  # the item under way, and the one before which it ends
+        self._upload: Upload | None = None
+        self._done: tuple[Sender, int] | None = None  # of the last upload, and its last item
+
+    def current(self) -> Item | None:
+        """Return the item to fly; `None` after the last."""
+        return self.items[self._next] if self._next < self._end else None
+
+    def reached(self) -> None:
+        """Go on to the next item, and say so."""
+        self._send(mav.MAVLink_mission_item_reached_message(self._next))
+        self._next += 1
+        self._progress()
+
+    def resume(self) -> None:
+        """Go on where it was left; from the first item after the last one."""
+        self._end = len(self.items)
+        if self._next >= self._end:
+            self._next = 0
+            self._progress()
+
+    def start(self, first: float, last: float) -> str:
+        """Go on from an item until another one; return why not.
+
+        Args:
+            first: Number of an item; below zero, or NaN: where it was left.
+            last: Number of the last one; zero, or beyond the last: all.
+        """
+        if not self.items:
+            return "expected a mission, found none: upload it first"
+        if not first >= 0:
+            self.resume()
+        elif not first < len(self.items):
+            return f"expected a first item below {len(self.items)}, found {first:g}"
+        elif 0 < last < int(first):
+            return f"expected a last item after the first, found {first:g} and {last:g}"
+        else:
+            self._go_to(int(first))
+        if 0 < last < len(self.items):
+            self._end = int(last) + 1
+        return ""
+
+    def jump(self, number: float) -> int:
+        """Go on with an item, -1 for the one under way; return a ``MAV_RESULT``."""
+        if number == -1:
+            return int(mav.MAV_RESULT_ACCEPTED)
+        if not 0 <= number < len(self.items):
+            self._tell(f"mission: expected an item below {len(self.items)}, found {number:g}")
+            return int(mav.MAV_RESULT_DENIED)
+        self._go_to(int(number))
+        return int(mav.MAV_RESULT_ACCEPTED)
+
+    def hear(self, sender: Sender, message: Any, now: int) -> str:
+        """Answer a message of the mission protocol; return why it has no effect, if so."""
+        kind, which = message.get_type(), getattr(message, "mission_type", _MISSION)
+        if kind == "MISSION_SET_CURRENT":
+            self.jump(message.seq)
+        elif which != _MISSION and not (kind == "MISSION_CLEAR_ALL" and which == _ALL):
+            return self._hear_other(sender, kind, which)
+        elif kind == "MISSION_COUNT":
+            return self._begin(sender, message.count, now)
+        elif kind in {"MISSION_ITEM_INT", "MISSION_ITEM"}:
+            return self._hear_item(sender, message, now)
+        elif kind == "MISSION_REQUEST_LIST":
+            self._send(mav.MAVLink_mission_count_message(*sender, len(self.items), _MISSION))
+        elif kind in {"MISSION_REQUEST_INT", "MISSION_REQUEST"}:
+            self._give(sender, message.seq, kind == "MISSION_REQUEST_INT")
+        elif kind == "MISSION_CLEAR_ALL":
+            if self._is_busy(sender):
+                return "another program uploads"
+            self._upload = None
+            self._replace([])
+            self._ack(sender, mav.MAV_MISSION_ACCEPTED, which)
+        elif kind == "MISSION_ACK":
+            self._hear_ack(sender, message.type, now)
+        return ""
+
+    def update(self, now: int) -> None:
+        """Ask again for an item that did not come."""
+        upload = self._upload
+        if upload is None or now - upload.asked < PATIENCE:
+            return
+        upload.tries += 1
+        if upload.tries > TRIES:
+            self._tell(f"mission: expected item {len(upload.items)}, it never came")
+            self._finish(upload, mav.MAV_MISSION_OPERATION_CANCELLED)
+        else:
+            self._ask(upload, now)
+
+    def _hear_other(self, sender: Sender, kind: str, which: int) -> str:
+        """Answer what is about a fence or rally points, of which there are none."""
+        if kind == "MISSION_ACK":
+            return ""
+        if which in _OTHERS and kind == "MISSION_REQUEST_LIST":
+            self._send(mav.MAVLink_mission_count_message(*sender, 0, which))
+        elif which in _OTHERS and kind == "MISSION_CLEAR_ALL":
+            self._ack(sender, mav.MAV_MISSION_ACCEPTED, which)
+        else:
+            self._ack(sender, mav.MAV_MISSION_UNSUPPORTED, which)
+            return "fences and rally points are not supported"
+        return ""
+
+    def _is_busy(self, sender: Sender) -> bool:
+        """Refuse to disturb another program's upload."""
+        if self._upload is None or self._upload.sender == sender:
+            return False
+        self._ack(sender, mav.MAV_MISSION_DENIED)
+        return True
+
+    def _begin(self, sender: Sender, count: int, now: int) -> str:
+        if self._is_busy(sender):
+            return "another program uploads"
+        if count > MOST_ITEMS:
+            self._ack(sender, mav.MAV_MISSION_NO_SPACE)
+            return f"expected at most {MOST_ITEMS} items, found {count}"
+        self._upload = upload = Upload(sender, count)
+        if count:
+            self._ask(upload, now)
+        else:
+            self._finish(upload, mav.MAV_MISSION_ACCEPTED)
+        return ""
+
+    def _hear_item(self, sender: Sender, message: Any, now: int) -> str:
+        upload = self._upload
+        if self._is_busy(sender):
+            return "another program uploads"
+        if upload is None and self._done == (sender, message.seq):  # the answer got lost
+            self._ack(sender, mav.MAV_MISSION_ACCEPTED)
+        elif upload is None and message.current == GUIDED:
+            self._ack(sender, mav.MAV_MISSION_UNSUPPORTED)
+            return "guided places are ArduPilot's: send DO_REPOSITION"
+        elif upload is None:
+            self._ack(sender, mav.MAV_MISSION_ERROR)
+            return "expected MISSION_COUNT first"
+        elif message.seq == len(upload.items):  # else it came twice
+            self._take(upload, message, now)
+        return ""
+
+    def _take(self, upload: Upload, message: Any, now: int) -> None:
+        if message.get_type() == "MISSION_ITEM_INT":
+            upload.by_int, scale = True, 1.0
+        else:
+            scale = 1e7 if message.frame in GLOBAL_FRAMES else 1 / LOCAL_SCALE
+        x, y = message.x * scale, message.y * scale
+        if not (abs(x) <= _LARGEST and abs(y) <= _LARGEST):
+            self._tell(f"mission refused: item {message.seq}: its place is none")
+            self._finish(upload, mav.MAV_MISSION_INVALID)
+            return
+        numbers = message.param1, message.param2, message.param3, message.param4
+        place = round(x), round(y), message.z
+        item = Item(message.command, message.frame, numbers, *place, message.autocontinue)
+        if why := self._why_not(item):
+            self._tell(f"mission refused: item {message.seq}: {why}")
+            self._finish(upload, mav.MAV_MISSION_UNSUPPORTED)
+            return
+        upload.items.append(item)
+        upload.tries = 0
+        if len(upload.items) < upload.count:
+            self._ask(upload, now)
+        else:
+            self._finish(upload, mav.MAV_MISSION_ACCEPTED)
+
+    def _hear_ack(self, sender: Sender, result: int, now: int) -> None:
+        """Ask by integers if an uploading program wants it so; end if it gives up."""
+        upload = self._upload
+        if upload is None or upload.sender != sender:
+            return
+        if result == mav.MAV_MISSION_UNSUPPORTED and not upload.by_int:
+            upload.by_int = True
+            self._ask(upload, now)
+        elif result == mav.MAV_MISSION_OPERATION_CANCELLED:
+            self._upload = None
+
+    def _give(self, sender: Sender, seq: int, by_int: bool) -> None:
+        if not 0 <= seq < len(self.items):
+            self._ack(sender, mav.MAV_MISSION_INVALID_SEQUENCE)
+            return
+        item = self.items[seq]
+        head = *sender, seq, item.frame, item.command, int(seq == self._next), item.autocontinue
+        if by_int:
+            place: tuple[float, float] = item.x, item.y
+            kind = mav.MAVLink_mission_item_int_message
+        else:
+            scale = 1e-7 if item.frame in GLOBAL_FRAMES else LOCAL_SCALE
+            place = item.x * scale, item.y * scale
+            kind = mav.MAVLink_mission_item_message
+        self._send(kind(*head, *item.params, *place, item.z, _MISSION))
+
+    def _ask(self, upload: Upload, now: int) -> None:
+        upload.asked = now
+        by_int, plain = mav.MAVLink_mission_request_int_message, mav.MAVLink_mission_request_message
+        kind = by_int if upload.by_int else plain
+        self._send(kind(*upload.sender, len(upload.items), _MISSION))
+
+    def _finish(self, upload: Upload, result: int) -> None:
+        self._upload = None
+        if result == mav.MAV_MISSION_ACCEPTED:
+            self._done = upload.sender, upload.count - 1
+            self._replace(upload.items)
+        self._ack(upload.sender, result)
+
+    def _replace(self, items: list[Item]) -> None:
+        self.items = items
+        self._go_to(0)
+
+    def _go_to(self, number: int) -> None:
+        self._next, self._end = number, len(self.items)
+        self._progress()
+        self._changed()
+
+    def _ack(self, sender: Sender, result: int, which: int = _MISSION) -> None:
+        self._send(mav.MAVLink_mission_ack_message(*sender, result, which))
+
+    def _progress(self) -> None:
+        last = max(len(self.items) - 1, 0)
+        self._send(mav.MAVLink_mission_current_message(min(self._next, last), len(self.items)))
+
+
+def is_speed(value: float) -> bool:
+    """Return whether it is a speed, or one of the signs for none (-1) and the usual one (-2)."""
+    return value in {-1, -2} or (math.isfinite(value) and value > 0)
