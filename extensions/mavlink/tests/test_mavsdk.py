@@ -65,7 +65,7 @@ def test_the_script_of_the_example_flies(tmp_path: Path) -> None:
 def test_an_estimator_outside_is_judged(tmp_path: Path) -> None:
     """By pymavlink's own connection: its poses are one percent too long, and hardly late."""
     port = free_udp_port()
-    script = "extensions/mavlink/examples/external_vision.py", f"udpin:127.0.0.1:{port}", "3"
+    script = "extensions/mavlink/examples/external_vision.py", f"udpin:127.0.0.1:{port}", "10"
     printed, ended = flown(tmp_path, port, *script, example="external_vision", node="vision")
     figures = ended["verdict"]["estimators"]["vision"]
     assert printed == f"{figures['estimates']} poses\n"
