@@ -281,7 +281,7 @@ async def test_poses_from_outside_are_estimates_of_their_stamp() -> None:
     covariance = [float(n) for n in range(1, 22)]
     outside.say(
         mav.MAVLink_vision_position_estimate_message(99_900_000, *pose, covariance, 2),
-        mav.MAVLink_vision_position_estimate_message(1, *pose, [math.nan] * 21, 0),
+        mav.MAVLink_vision_position_estimate_message(99_950_000, *pose, [math.nan] * 21, 0),
         mav.MAVLink_vision_position_estimate_message(1, math.nan, *pose[1:], covariance, 0),
     )
     first, second = outside.seen
@@ -289,10 +289,57 @@ async def test_poses_from_outside_are_estimates_of_their_stamp() -> None:
     assert first["frame_id"] == "odom_2"
     assert first["orientation"] == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
     assert first["covariance"][:8] == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 2.0, 7.0)
-    assert second["stamp"] == outside.now  # of another clock
+    assert second["stamp"] == 99_950_000_000
     assert second["covariance"] == ()
     (sync,) = outside.say(mav.MAVLink_timesync_message(0, 77))
     assert (sync.tc1, sync.ts1) == (outside.now, 77)
+    outside.close()
+
+
+def vision(stamp: int) -> Any:
+    return mav.MAVLink_vision_position_estimate_message(stamp // 1000, *[0.0] * 6, [0.0] * 21, 0)
+
+
+@pytest.mark.parametrize("behind", [8.0, -3.0])
+async def test_stamps_of_another_clock_are_corrected_from_the_first_pose_on(behind: float) -> None:
+    """By the earliest arrival, so that their distances stay; and it is told."""
+    outside = Outside(vision=True)
+    told: list[str] = []
+    outside.now = 100 * SECOND
+    start, offset = outside.now, round(behind * SECOND)
+    latencies = [round(ms * 1e6) for ms in (60, 90, 40, 120)]
+    for number, latency in enumerate(latencies):
+        taken = start + number * SECOND // 10
+        outside.now = taken + latency
+        told += texts(outside.say(vision(taken - offset)))
+    stamps = [pose["stamp"] - start for pose in outside.seen]
+    late = [latencies[0], latencies[0], latencies[2], latencies[2]]  # of the earliest until then
+    expected = [number * SECOND // 10 + late[number] for number in range(4)]
+    assert stamps == pytest.approx(expected, abs=1e3)
+    word = "behind" if behind > 0 else "ahead"
+    (text,) = told
+    assert text.startswith("poses of 245/190: stamps are ")
+    assert text.endswith(f"s {word}, of another clock: corrected by the earliest arrival")
+    outside.close()
+
+
+async def test_a_clock_that_answers_is_measured() -> None:
+    """Then the poses' latency is right; without a difference nothing is told."""
+    outside = Outside(vision=True)
+    outside.now = 100 * SECOND
+    (asked,) = of("TIMESYNC", outside.passes(0.1, heartbeat=False))
+    outside.now = asked.ts1 + SECOND // 100
+    answer = mav.MAVLink_timesync_message(asked.ts1 + SECOND // 200 - 8 * SECOND, asked.ts1)
+    assert outside.say(answer) == []
+    taken = outside.now
+    outside.now += SECOND // 5
+    (text,) = texts(outside.say(vision(taken - 8 * SECOND)))
+    assert text.endswith("stamps are 8.0 s behind, of another clock: corrected by TIMESYNC")
+    assert outside.seen[-1]["stamp"] == pytest.approx(taken, abs=1e3)
+    other = Outside(vision=True)
+    assert other.say(vision(other.now - SECOND // 2)) == []
+    assert other.seen[-1]["stamp"] == pytest.approx(other.now - SECOND // 2, abs=1e3)
+    other.close()
     outside.close()
 
 
@@ -459,7 +506,8 @@ ANSWERED = {
 }  # fmt: skip
 """Answers to one message of each kind, besides words; nothing to all others."""
 TREATED_WITH_WORDS = {
-    "MISSION_COUNT", "PARAM_SET", "REQUEST_DATA_STREAM", "SET_POSITION_TARGET_GLOBAL_INT"
+    "SET_MODE", "MISSION_COUNT", "PARAM_SET", "REQUEST_DATA_STREAM",
+    "SET_POSITION_TARGET_GLOBAL_INT",
 }  # fmt: skip
 """Kinds that are obeyed, but whose generic message cannot be, and is told so."""
 
@@ -493,7 +541,7 @@ async def test_each_kind_of_message_is_treated_as_the_table_has_it() -> None:
 async def test_the_table_is_what_is_done_and_what_the_page_shows(outside: Outside) -> None:
     done = {kind for kind, row in TREATMENTS.items() if row.treatment in {"obeyed", "judged"}}
     answered = {kind for kind, row in TREATMENTS.items() if row.treatment == "answered"}
-    assert {*outside.endpoint._handlers} == (done | answered) - {"HEARTBEAT", "TIMESYNC", "PING"}
+    assert {*outside.endpoint._handlers} == (done | answered) - {"HEARTBEAT", "PING"}
     assert sum(len(row.kinds.split()) for row in ROWS) == len(TREATMENTS)
     page = (ROOT / "extensions/mavlink/docs/mavlink.md").read_text()
     assert table() in page

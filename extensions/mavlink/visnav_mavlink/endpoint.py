@@ -11,14 +11,14 @@ import numpy as np
 from events.frames import Geodetic, from_rpy
 from runtime.logs import NodeLogger
 from visnav_mavlink.answers import ANSWERS
+from visnav_mavlink.clocks import Clocks
 from visnav_mavlink.flight import Flight
 from visnav_mavlink.links import Links, Peer, Sender, mav
 from visnav_mavlink.messages import TREATMENTS
 from visnav_mavlink.missions import Missions
 from visnav_mavlink.settings import MavlinkConfig
-from visnav_mavlink.vehicle import SECOND, Parameters, Telemetry, Vehicle
+from visnav_mavlink.vehicle import Parameters, Telemetry, Vehicle
 
-OLDEST = 10 * SECOND  # age of a vision stamp beyond which its clock is not ours
 MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it
 _COVARIANCE = np.triu_indices(6)
 
@@ -51,6 +51,7 @@ class MavlinkEndpoint:
         self._links = Links(ids, bytes.fromhex(config.signing_key), self._hear, log)
         self._send = send = self._links.send
         self.vehicle = vehicle = Vehicle(origin, config.gps)
+        self._clocks = Clocks(send, self._tell_once)
         self._telemetry = Telemetry(vehicle, self._links, self._tell)
         self._parameters = Parameters(send, self._tell)
         self._missions = Missions(
@@ -71,6 +72,7 @@ class MavlinkEndpoint:
             "MISSION_REQUEST_INT",
             self._parameter: "PARAM_REQUEST_LIST PARAM_REQUEST_READ PARAM_SET",
             self._set_rates: "REQUEST_DATA_STREAM",
+            self._timesync: "TIMESYNC",
             self._see: "ODOMETRY VISION_POSITION_ESTIMATE VICON_POSITION_ESTIMATE ATT_POS_MOCAP "
             "GLOBAL_VISION_POSITION_ESTIMATE",
         }
@@ -95,6 +97,8 @@ class MavlinkEndpoint:
         self._links.refill(wall)
         self._telemetry.update(now)
         self._missions.update(now)
+        if config.vision:
+            self._clocks.update(now)
         self.flight.update(now)
         is_lost = self._links.quiet_for(wall) > config.link_timeout
         if is_lost and not self._is_lost and config.link_loss != "nothing":
@@ -145,9 +149,14 @@ class MavlinkEndpoint:
         if (name := self._parameters.hear(message)) is not None:
             self._refuse("a parameter", sender, f"{name} is unknown here")
 
-    def _set_mode(self, _peer: Peer, _sender: Sender, message: Any, now: int) -> None:
+    def _set_mode(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
         mode = message.custom_mode
-        self.flight.set_px4_mode(mode >> 16 & 255, mode >> 24 & 255, now)
+        main, sub = mode >> 16 & 255, mode >> 24 & 255
+        if self.flight.set_px4_mode(main, sub, now) == mav.MAV_RESULT_UNSUPPORTED:
+            self._refuse("SET_MODE", sender, f"mode {main}, {sub} of PX4 is not supported")
+
+    def _timesync(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
+        self._clocks.hear(sender, message, now)
 
     def _set_rates(self, peer: Peer, sender: Sender, message: Any, _: int) -> None:
         rate = message.req_message_rate if message.start_stop else 0
@@ -183,13 +192,9 @@ class MavlinkEndpoint:
             self._refuse(kind, sender, "its numbers are none; others are judged")
             return
         stamp = 1000 * (message.time_usec if hasattr(message, "time_usec") else message.usec)
-        if not now - OLDEST < stamp <= now:
-            counts["poses with stamps of another clock, stamped at arrival"] += 1
-            self._once(
-                "poses from outside have stamps of another clock, where those of TIMESYNC's were "
-                "expected: their arrival counts"
-            )
-            stamp = now
+        corrected = self._clocks.stamp(sender, stamp, now)
+        if corrected != stamp:
+            counts["poses with stamps of another clock, corrected"] += 1
         counter = getattr(message, "reset_counter", 0)
         covariance = message.pose_covariance if kind == "ODOMETRY" else message.covariance
         full: tuple[float, ...] = ()
@@ -199,7 +204,7 @@ class MavlinkEndpoint:
             full = tuple((matrix + np.triu(matrix, 1).T).ravel().tolist())
         counts["poses judged"] += 1
         self._see_pose(
-            stamp=stamp,
+            stamp=corrected,
             frame_id=f"odom_{counter}" if counter else "odom",
             position=position,
             orientation=orientation,
@@ -208,7 +213,9 @@ class MavlinkEndpoint:
 
     def _refuse(self, kind: str, sender: Sender, words: str) -> None:
         """Tell why messages have no effect, once for each kind, sender and reason."""
-        text = "{} of {}/{} has no effect: {}".format(kind, *sender, words)
+        self._tell_once("{} of {}/{} has no effect: {}".format(kind, *sender, words))
+
+    def _tell_once(self, text: str) -> None:
         if self._is_new(text):
             self._tell(text)
 

@@ -166,6 +166,7 @@ def _sys_status(v: Vehicle, _: int) -> Any:
     there = _HEALTHY | (mav.MAV_SYS_STATUS_SENSOR_GPS if v.gps else 0)
     there |= mav.MAV_SYS_STATUS_SENSOR_VISION_POSITION
     health = there if v.ready else there & ~mav.MAV_SYS_STATUS_PREARM_CHECK
+    health |= mav.MAV_SYS_STATUS_GEOFENCE  # not there; MAVProxy takes an unhealthy one for a breach
     return mav.MAVLink_sys_status_message(there, there, health, 0, 16200, -1, 100, 0, 0, 0, 0, 0, 0)
 
 

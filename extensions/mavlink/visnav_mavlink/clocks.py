@@ -1,0 +1,103 @@
+"""Clocks of programs outside: whether stamps are ours, and by how much others' are off.
+
+A stamp may be of our clock (which our answers to ``TIMESYNC`` tell), or of the program's own, which
+its answers to our ``TIMESYNC`` tell. What makes the first pose younger counts. If neither can be,
+the earliest arrival counts as at once, and all stamps keep their distances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from visnav_mavlink.links import Sender, mav
+from visnav_mavlink.vehicle import SECOND
+
+LATEST = 2 * SECOND  # age of a first pose that may still be late by itself
+OLDEST = 10 * SECOND  # age of a later one
+EARLIEST = -SECOND // 10  # age that is an error of a synchronized clock
+QUICK = SECOND // 50  # round trip of a quick answer
+PERIOD = SECOND  # of requests for programs' clocks
+MOST_CLOCKS = 64
+
+
+@dataclass
+class Clock:
+    """A program's clock.
+
+    Attributes:
+        way: What its stamps are corrected by; empty before the first.
+        correction: What is added to its stamps, ns.
+        offset: Ours less its own by ``TIMESYNC``, ns, whose answer took `round_trip`.
+    """
+
+    way: Literal["", "nothing", "TIMESYNC", "the earliest arrival"] = ""
+    correction: int = 0
+    offset: int = 0
+    round_trip: int | None = None
+
+
+class Clocks:
+    """All programs' clocks.
+
+    Args:
+        send: Sends a message to all programs.
+        tell: Says a sentence, the first time, to all programs and to the log.
+    """
+
+    def __init__(self, send: Callable[[Any], None], tell: Callable[[str], None]) -> None:
+        self._send, self._tell = send, tell
+        self._clocks: dict[Sender, Clock] = {}
+        self._due = 0
+
+    def update(self, now: int) -> None:
+        """Ask for all clocks, now and then."""
+        if now >= self._due:
+            self._due = now + PERIOD
+            self._send(mav.MAVLink_timesync_message(0, now))
+
+    def hear(self, sender: Sender, answer: Any, now: int) -> None:
+        """Take a quick answer to a request; the newest, for clocks drift if a run falls behind."""
+        round_trip, clock = now - answer.ts1, self._of(sender)
+        longest = SECOND if clock.round_trip is None else max(2 * clock.round_trip, QUICK)
+        if answer.tc1 and 0 <= round_trip <= longest:
+            clock.offset = answer.ts1 + round_trip // 2 - answer.tc1
+            clock.round_trip = round_trip
+
+    def stamp(self, sender: Sender, stamp: int, now: int) -> int:
+        """Return a stamp of a sender's (ns) in our clock, at its arrival."""
+        age, clock = now - stamp, self._of(sender)
+        if clock.way == "the earliest arrival":
+            clock.correction = min(clock.correction, age)
+        elif clock.way == "TIMESYNC":
+            clock.correction = clock.offset
+        if (
+            not clock.way
+            or (clock.way == "the earliest arrival" and clock.round_trip is not None)
+            or not EARLIEST <= age - clock.correction < OLDEST
+        ):
+            self._decide(sender, clock, age)
+        return min(stamp + clock.correction, now)
+
+    def _decide(self, sender: Sender, clock: Clock, age: int) -> None:
+        before = clock.way
+        clock.way, clock.correction = "the earliest arrival", age
+        youngest = LATEST
+        if EARLIEST <= age < youngest:
+            clock.way, clock.correction, youngest = "nothing", 0, age
+        if clock.round_trip is not None and EARLIEST <= age - clock.offset < youngest:
+            clock.way, clock.correction = "TIMESYNC", clock.offset
+        if clock.correction and clock.way != before:
+            system, component = sender
+            off = abs(clock.correction) / SECOND
+            where = "behind" if clock.correction > 0 else "ahead"
+            self._tell(
+                f"poses of {system}/{component}: stamps are {off:.1f} s {where}, of another clock: "
+                f"corrected by {clock.way}"
+            )
+
+    def _of(self, sender: Sender) -> Clock:
+        if sender not in self._clocks and len(self._clocks) >= MOST_CLOCKS:
+            self._clocks.clear()
+        return self._clocks.setdefault(sender, Clock())
