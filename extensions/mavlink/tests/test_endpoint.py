@@ -135,6 +135,27 @@ async def test_offboard_needs_setpoints_and_ends_without(outside: Outside) -> No
     assert outside.endpoint.vehicle.mode == "hold"
 
 
+async def test_sticks_fly_in_their_modes_alone(outside: Outside) -> None:
+    def sticks(x: int, y: int, z: int, r: int, target: int = 1) -> Any:
+        return mav.MAVLink_manual_control_message(target, x, y, z, r, 0)
+
+    words = "expected an armed vehicle in mode POSCTL or ALTCTL"
+    assert texts(outside.say(sticks(0, 0, 500, 0), sticks(0, 0, 500, 0))) == [
+        f"MANUAL_CONTROL of 245/190 has no effect: {words}"
+    ]
+    outside.say(arm(1), mode(3, 0), sticks(0, 0, 0, 0))
+    assert [type(act) for act in outside.acts] == [ev.Arm]  # the ground is not flown into
+    outside.say(sticks(0, 0, 1000, 0))
+    assert outside.acts[-1].velocity == (0.0, 0.0, -1.0)
+    outside.flies()
+    for main in (2, 3):
+        outside.say(mode(main, 0), sticks(1000, -500, 250, 500), sticks(0, 0, 0, 0, target=2))
+        assert outside.acts[-1].velocity == (2.0, -1.0, 0.5)
+        assert (outside.acts[-1].yaw_rate, outside.acts[-1].frame_id) == (0.5, "heading")
+    outside.say(sticks(32767, 32767, 32767, 32767))
+    assert outside.acts[-1].velocity == (0.0, 0.0, 0.0)
+
+
 async def test_a_place_is_approached_at_the_cruising_speed(outside: Outside) -> None:
     outside.flies()
     place = mav.MAVLink_command_int_message(
@@ -507,7 +528,7 @@ ANSWERED = {
 """Answers to one message of each kind, besides words; nothing to all others."""
 TREATED_WITH_WORDS = {
     "SET_MODE", "MISSION_COUNT", "PARAM_SET", "REQUEST_DATA_STREAM",
-    "SET_POSITION_TARGET_GLOBAL_INT",
+    "SET_POSITION_TARGET_GLOBAL_INT", "MANUAL_CONTROL",
 }  # fmt: skip
 """Kinds that are obeyed, but whose generic message cannot be, and is told so."""
 

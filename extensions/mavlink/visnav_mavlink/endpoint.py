@@ -67,6 +67,7 @@ class MavlinkEndpoint:
             self._set_mode: "SET_MODE",
             self._offboard: "SET_POSITION_TARGET_LOCAL_NED SET_POSITION_TARGET_GLOBAL_INT "
             "SET_ATTITUDE_TARGET",
+            self._sticks: "MANUAL_CONTROL",
             self._mission: "MISSION_COUNT MISSION_ITEM MISSION_ITEM_INT MISSION_ACK "
             "MISSION_CLEAR_ALL MISSION_SET_CURRENT MISSION_REQUEST_LIST MISSION_REQUEST "
             "MISSION_REQUEST_INT",
@@ -111,7 +112,7 @@ class MavlinkEndpoint:
 
     def _hear(self, peer: Peer, sender: Sender, message: Any) -> None:
         """Treat a message as the table of messages has it."""
-        target = getattr(message, "target_system", 0)
+        target = getattr(message, "target_system", getattr(message, "target", 0))
         part = getattr(message, "target_component", 0)
         if target not in {0, self._config.system_id} or part not in {0, 1}:
             return
@@ -140,6 +141,10 @@ class MavlinkEndpoint:
             self.flight.offboard(message, now)
         except ValueError as error:
             self._refuse(message.get_type(), sender, str(error))
+
+    def _sticks(self, _: Peer, sender: Sender, message: Any, now: int) -> None:  # noqa: ARG002
+        if words := self.flight.move_sticks(message):
+            self._refuse(message.get_type(), sender, words)
 
     def _mission(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
         if words := self._missions.hear(sender, message, now):

@@ -20,6 +20,8 @@ LEAST_CLIMB = 0.3  # metres
 FORCED = 21196  # param2 of a disarming in the air (mavlink.io, MAV_CMD_COMPONENT_ARM_DISARM)
 _OK, _NO = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_DENIED
 _LATER, _UNKNOWN = mav.MAV_RESULT_TEMPORARILY_REJECTED, mav.MAV_RESULT_UNSUPPORTED
+STICK_CLIMB, STICK_TURN = 1.0, 1.0  # at the end of a stick: metres, and radians per second
+_STICKS, _NO_STICK = {"position", "altitude"}, 2**15 - 1
 LONGEST_STAY = 3600  # at a mission's item, seconds
 _PLACES = {mav.MAV_CMD_NAV_WAYPOINT, mav.MAV_CMD_NAV_TAKEOFF}
 _ITEMS = _PLACES | {
@@ -111,7 +113,7 @@ class Flight:
             self._act(ev.Takeoff, altitude=usual if math.isnan(climb) else climb)
         elif mode == "land" and vehicle.armed:
             self._act(ev.Land)
-        elif mode in {"hold", "position", "manual"} and flies:
+        elif mode in {"hold", "manual", *_STICKS} and flies:
             self._act(ev.Hover)
         elif mode == "return" and vehicle.home is not None and flies:
             x, y, z = vehicle.home
@@ -150,6 +152,22 @@ class Flight:
             self._once(f"{message.get_type()}: {made.dropped} are not followed")
         if self._vehicle.mode == "offboard":
             self._act(made.kind, **made.fields)
+
+    def move_sticks(self, message: Any) -> str:
+        """Fly by a ``MANUAL_CONTROL``; return why it has no effect, if so."""
+        if self._vehicle.mode not in _STICKS or not self._vehicle.armed:
+            return "expected an armed vehicle in mode POSCTL or ALTCTL"
+        forward, right, turn = (_stick(value) for value in (message.x, message.y, message.r))
+        up = 0.0 if message.z == _NO_STICK else min(max(message.z / 500 - 1, -1.0), 1.0)
+        if self._flies or up > 0.0:
+            speed = self._speed or self._parameters["MPC_XY_CRUISE"]
+            self._act(
+                ev.VelocitySetpoint,
+                velocity=(forward * speed, right * speed, -up * STICK_CLIMB),
+                yaw_rate=turn * STICK_TURN,
+                frame_id="heading",
+            )
+        return ""
 
     def update(self, now: int) -> None:
         """Go on with what is under way."""
@@ -362,6 +380,11 @@ class Flight:
         if kind == mav.MAV_CMD_DO_CHANGE_SPEED and not is_speed(item.params[1]):
             return f"expected a positive speed, found {item.params[1]:g}"
         return "" if kind in _ITEMS else f"command {kind} is not supported"
+
+
+def _stick(value: int) -> float:
+    """Return a stick's position, -1 to 1; the middle if there is no such stick."""
+    return 0.0 if value == _NO_STICK else min(max(value / 1000, -1.0), 1.0)
 
 
 def _location(message: Any) -> tuple[int, float, float, float]:

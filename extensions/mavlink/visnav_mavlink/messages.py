@@ -38,6 +38,11 @@ ROWS = (
         "of type MISSION; fences and rally points are refused, and clearing them clears nothing",
     ),
     Row("obeyed", "PARAM_SET", "of the parameters below"),
+    Row(
+        "obeyed",
+        "MANUAL_CONTROL",
+        "in PX4's modes POSCTL and ALTCTL, as velocities along and across the heading",
+    ),
     Row("obeyed", "REQUEST_DATA_STREAM", "sets the rates of a stream's messages for this link"),
     Row("obeyed", "HEARTBEAT", "the link lives, as by any other message"),
     Row(
@@ -52,7 +57,11 @@ ROWS = (
         "PARAM_REQUEST_READ TIMESYNC PING",
         "by what they ask for",
     ),
-    Row("refused", "MANUAL_CONTROL MANUAL_SETPOINT RC_CHANNELS_OVERRIDE", "sticks do not fly here"),
+    Row(
+        "refused",
+        "MANUAL_SETPOINT RC_CHANNELS_OVERRIDE",
+        "sticks fly by MANUAL_CONTROL",
+    ),
     Row(
         "refused",
         "VISION_SPEED_ESTIMATE VISION_POSITION_DELTA",

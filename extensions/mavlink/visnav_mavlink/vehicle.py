@@ -18,6 +18,7 @@ LEAST_PERIOD = round(SECOND / RATE)  # of a message
 
 MODES = {
     "manual": (1, 0),
+    "altitude": (2, 0),
     "position": (3, 0),
     "takeoff": (4, 2),
     "hold": (4, 3),
