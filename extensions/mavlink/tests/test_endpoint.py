@@ -281,10 +281,24 @@ async def test_parameters_are_listed_read_and_set(outside: Outside) -> None:
     kept = outside.say(mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", math.nan, real))
     assert [message.param_value for message in of("PARAM_VALUE", kept)] == [4.0]
     unknown = mav.MAVLink_param_request_read_message(1, 1, b"CAL_GYRO0_ID", -1)
-    text = "a parameter of 245/190 has no effect: CAL_GYRO0_ID is unknown here"
+    text = "PARAM_REQUEST_READ of 245/190 has no effect: parameter CAL_GYRO0_ID is unknown here"
     assert texts(outside.say(unknown, unknown)) == [text]
     whole = mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", 3.0, mav.MAV_PARAM_TYPE_INT32)
     assert of("PARAM_VALUE", outside.say(whole))[0].param_value == 4.0
+
+
+async def test_parameters_without_effect_are_kept_and_told_so(outside: Outside) -> None:
+    """With their type, whose bytes stand in the value; they are listed with the others."""
+    whole = mav.MAV_PARAM_TYPE_INT32
+    setting = mav.MAVLink_param_set_message(1, 1, b"COM_RCL_EXCEPT", 5.6e-45, whole)
+    answers = outside.say(setting, setting)
+    given = [(value.param_value, value.param_type) for value in of("PARAM_VALUE", answers)]
+    assert given == [(pytest.approx(5.6e-45), whole)] * 2
+    (text,) = texts(answers)
+    assert text.endswith("no effect: COM_RCL_EXCEPT is kept, but nothing here is set by it")
+    assert len(outside.say(mav.MAVLink_param_request_list_message(1, 1))) == 4
+    by_number = mav.MAVLink_param_request_read_message(1, 1, b"", 3)
+    assert outside.say(by_number)[0].param_id == "COM_RCL_EXCEPT"
 
 
 async def test_who_is_not_heard_any_more_is_missed(outside: Outside) -> None:

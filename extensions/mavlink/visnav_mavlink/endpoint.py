@@ -151,8 +151,8 @@ class MavlinkEndpoint:
             self._refuse(message.get_type(), sender, words)
 
     def _parameter(self, _: Peer, sender: Sender, message: Any, now: int) -> None:  # noqa: ARG002
-        if (name := self._parameters.hear(message)) is not None:
-            self._refuse("a parameter", sender, f"{name} is unknown here")
+        if (words := self._parameters.hear(message)) is not None:
+            self._refuse(message.get_type(), sender, words)
 
     def _set_mode(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
         mode = message.custom_mode

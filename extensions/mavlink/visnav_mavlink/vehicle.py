@@ -421,31 +421,40 @@ PARAMETERS = {
     "RTL_RETURN_ALT": (2.5, 0.0, 100.0),
 }
 """PX4's name to value, least and most: metres above home; metres per second."""
+KEPT, MOST_KEPT = ("EKF2_", "COM_", "NAV_"), 500  # beginnings of names without effect; how many
 
 
 class Parameters(dict[str, float]):
-    """Parameters that have a meaning here, by PX4's names; sent as 32-bit floats."""
+    """Parameters that have a meaning here, by PX4's names; sent as 32-bit floats.
+
+    Those of PX4's filter and safety that programs set before a flight are kept, and given back as
+    they came, but have no effect.
+    """
 
     def __init__(self, send: Callable[[Any], None], tell: Callable[[str], None]) -> None:
         super().__init__({name: value for name, (value, *_) in PARAMETERS.items()})
         self._send, self._tell = send, tell
+        self._kept: dict[str, tuple[float, int]] = {}  # value as sent, and its type
 
     def hear(self, message: Any) -> str | None:
-        """Answer a request of the parameter protocol; return a name that is unknown."""
-        kind, names = message.get_type(), [*self]
+        """Answer a request of the parameter protocol; return what is wrong with it, if so."""
+        kind, names = message.get_type(), [*self, *self._kept]
         if kind == "PARAM_REQUEST_LIST":
             for name in names:
                 self._give(name)
             return None
         if kind == "PARAM_REQUEST_READ" and message.param_index >= 0:
             if message.param_index >= len(names):
-                return f"number {message.param_index}"
+                return f"parameter {message.param_index} is unknown here"
             self._give(names[message.param_index])
             return None
         name = message.param_id.rstrip("\0")
-        if name not in self:
-            return str(name)
-        if kind == "PARAM_SET":
+        words = None
+        if kind == "PARAM_SET" and name.startswith(KEPT) and len(self._kept) < MOST_KEPT:
+            if name not in self._kept:
+                words = f"{name} is kept, but nothing here is set by it"
+            self._kept[name] = message.param_value, message.param_type
+        elif kind == "PARAM_SET" and name in self:
             _, least, most = PARAMETERS[name]
             if message.param_type != mav.MAV_PARAM_TYPE_REAL32:
                 self._tell(f"{name}: expected a REAL32, found type {message.param_type}")
@@ -453,11 +462,16 @@ class Parameters(dict[str, float]):
                 self[name] = message.param_value
             else:
                 self._tell(f"{name}: expected {least:g} to {most:g}")
+        if name not in self and name not in self._kept:
+            return f"parameter {name} is unknown here"
         self._give(name)
-        return None
+        return words
 
     def _give(self, name: str) -> None:
-        real, index = mav.MAV_PARAM_TYPE_REAL32, [*self].index(name)
+        real, names = mav.MAV_PARAM_TYPE_REAL32, [*self, *self._kept]
+        value, kind = self._kept.get(name) or (self[name], real)
         self._send(
-            mav.MAVLink_param_value_message(name.encode(), self[name], real, len(self), index)
+            mav.MAVLink_param_value_message(
+                name.encode(), value, kind, len(names), names.index(name)
+            )
         )
