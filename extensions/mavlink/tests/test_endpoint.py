@@ -483,6 +483,11 @@ KINDS = [
     mav.MAVLink_mission_request_int_message, mav.MAVLink_param_request_read_message,
     mav.MAVLink_set_mode_message, mav.MAVLink_vision_position_estimate_message,
     mav.MAVLink_odometry_message, mav.MAVLink_set_attitude_target_message,
+    mav.MAVLink_manual_control_message, mav.MAVLink_att_pos_mocap_message,
+    mav.MAVLink_param_set_message, mav.MAVLink_request_data_stream_message,
+    mav.MAVLink_mission_ack_message, mav.MAVLink_mission_set_current_message,
+    mav.MAVLink_mission_request_message, mav.MAVLink_timesync_message,
+    mav.MAVLink_file_transfer_protocol_message, mav.MAVLink_param_ext_set_message,
 ]  # fmt: skip
 NUMBERS = {
     "uint8_t": 0xFF, "uint16_t": 0xFFFF, "uint32_t": 0xFFFFFFFF, "uint64_t": 2**64 - 1,
@@ -503,7 +508,9 @@ def hostile(draw: st.DrawFn) -> bytes:
         if name.startswith("target"):
             one = st.sampled_from([0, 1])
         elif name == "command":
-            one = st.sampled_from([16, 20, 21, 22, 176, 178, 192, 300, 400, 511, 512, 9])
+            one = st.sampled_from(
+                [16, 20, 21, 22, 176, 178, 192, 224, 300, 400, 410, 510, 511, 512, 9]
+            )
         if what == "char":
             values.append(draw(st.binary(max_size=16)))
         elif size:
@@ -655,5 +662,6 @@ async def test_no_message_breaks_the_endpoint(data: list[bytes]) -> None:
         assert results(outside.say(command(2500))) == [mav.MAV_RESULT_UNSUPPORTED]
         outside.passes(1.0)
         assert outside.endpoint._links.counts["messages"] >= 1
+        assert outside.endpoint._links.counts["errors"] == 0
     finally:
         outside.close()
