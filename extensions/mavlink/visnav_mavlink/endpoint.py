@@ -15,7 +15,7 @@ from visnav_mavlink.clocks import Clocks
 from visnav_mavlink.flight import Flight
 from visnav_mavlink.links import Links, Peer, Sender, mav
 from visnav_mavlink.messages import TREATMENTS
-from visnav_mavlink.missions import Missions
+from visnav_mavlink.missions import Guided, Missions
 from visnav_mavlink.settings import MavlinkConfig
 from visnav_mavlink.vehicle import Parameters, Telemetry, Vehicle
 
@@ -50,7 +50,7 @@ class MavlinkEndpoint:
         ids = config.system_id, int(mav.MAV_COMP_ID_AUTOPILOT1)
         self._links = Links(ids, bytes.fromhex(config.signing_key), self._hear, log)
         self._send = send = self._links.send
-        self.vehicle = vehicle = Vehicle(origin, config.gps)
+        self.vehicle = vehicle = Vehicle(origin, config.gps, config.autopilot == "ardupilot")
         self._clocks = Clocks(send, self._tell_once)
         self._telemetry = Telemetry(vehicle, self._links, self._tell)
         self._parameters = Parameters(send, self._tell)
@@ -59,6 +59,9 @@ class MavlinkEndpoint:
             lambda item: self.flight.why_not(item),
             self._tell,
             lambda: self.flight.drop_item(),
+            Guided(vehicle, lambda item, now: self.flight.go_to(item, now))
+            if vehicle.is_copter
+            else None,
         )
         parts = self._missions, self._parameters
         self.flight = Flight(vehicle, *parts, act, self._tell, self._once)
@@ -156,9 +159,8 @@ class MavlinkEndpoint:
 
     def _set_mode(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
         mode = message.custom_mode
-        main, sub = mode >> 16 & 255, mode >> 24 & 255
-        if self.flight.set_px4_mode(main, sub, now) == mav.MAV_RESULT_UNSUPPORTED:
-            self._refuse("SET_MODE", sender, f"mode {main}, {sub} of PX4 is not supported")
+        if self.flight.set_custom_mode(mode, now) == mav.MAV_RESULT_UNSUPPORTED:
+            self._refuse("SET_MODE", sender, f"custom_mode {mode:#x} is not supported")
 
     def _timesync(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
         self._clocks.hear(sender, message, now)

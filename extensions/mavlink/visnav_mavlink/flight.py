@@ -12,8 +12,17 @@ from events.frames import yaw_of
 from visnav_mavlink.links import mav
 from visnav_mavlink.missions import Item, Missions, is_speed
 from visnav_mavlink.setpoints import Offboard
-from visnav_mavlink.vehicle import GLOBAL_FRAMES, LOCAL_SCALE, MODES, SECOND, Parameters, Vehicle
+from visnav_mavlink.vehicle import (
+    COPTER_MODES,
+    GLOBAL_FRAMES,
+    LOCAL_SCALE,
+    MODES,
+    SECOND,
+    Parameters,
+    Vehicle,
+)
 
+COPTER_TIMEOUT = 3 * SECOND  # as long as Copter follows a velocity
 OFFBOARD_TIMEOUT = SECOND // 2  # PX4's COM_OF_LOSS_T: without a set-point for longer it holds
 ARRIVED = 0.3  # metres from a place at which it is reached
 LEAST_CLIMB = 0.3  # metres
@@ -65,7 +74,7 @@ class Flight:
             mav.MAV_CMD_NAV_TAKEOFF: self._take_off,
             mav.MAV_CMD_NAV_LAND: self._land,
             mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _, now: self.set_mode("return", now),
-            mav.MAV_CMD_DO_SET_MODE: lambda m, now: self.set_px4_mode(m.param2, m.param3, now),
+            mav.MAV_CMD_DO_SET_MODE: self._set_mode,
             mav.MAV_CMD_DO_CHANGE_SPEED: lambda m, _: self._change_speed(m.param2),
             mav.MAV_CMD_DO_REPOSITION: self._reposition,
             mav.MAV_CMD_MISSION_START: self._start_mission,
@@ -122,12 +131,31 @@ class Flight:
             self._lands_there = True
         return int(_OK)
 
-    def set_px4_mode(self, main: float, sub: float, now: int) -> int:
-        """Go over to a mode by PX4's numbers; return a ``MAV_RESULT``."""
+    def set_custom_mode(self, number: int, now: int) -> int:
+        """Go over to a mode by a ``custom_mode``; return a ``MAV_RESULT``."""
+        if self._vehicle.is_copter:
+            return self._set_copter_mode(number, now)
+        return self._set_px4_mode(number >> 16 & 255, number >> 24 & 255, now)
+
+    def _set_mode(self, message: Any, now: int) -> int:
+        if self._vehicle.is_copter:
+            return self._set_copter_mode(message.param2, now)
+        return self._set_px4_mode(message.param2, message.param3, now)
+
+    def _set_px4_mode(self, main: float, sub: float, now: int) -> int:
         for mode, numbers in MODES.items():
             if numbers == (main, sub):
                 return self.set_mode(mode, now)
         self._once(f"mode {main:g}, {sub:g} is not supported")
+        return int(_UNKNOWN)
+
+    def _set_copter_mode(self, number: float, now: int) -> int:
+        if number == COPTER_MODES[self._vehicle.mode]:
+            return int(_OK)
+        for mode, other in COPTER_MODES.items():
+            if other == number:
+                return self.set_mode(mode, now)
+        self._once(f"mode {number:g} of Copter is not supported")
         return int(_UNKNOWN)
 
     def noted(self, event: ev.VehicleEvent) -> None:
@@ -150,6 +178,8 @@ class Flight:
         made = self._offboard.take(message, now)
         if made.dropped:
             self._once(f"{message.get_type()}: {made.dropped} are not followed")
+        if self._vehicle.is_copter and self._vehicle.mode == "hold" and self._flies:
+            self.set_mode("offboard", now)
         if self._vehicle.mode == "offboard":
             self._act(made.kind, **made.fields)
 
@@ -172,15 +202,36 @@ class Flight:
     def update(self, now: int) -> None:
         """Go on with what is under way."""
         vehicle = self._vehicle
-        if vehicle.mode == "offboard" and now - self._offboard.stamp > OFFBOARD_TIMEOUT:
-            self._tell("offboard: no set-point for 0.5 s: holding")
-            self.set_mode("hold", now)
-        elif vehicle.mode == "offboard" and (made := self._offboard.again(now)):
-            self._act(made.kind, **made.fields)
+        if vehicle.mode == "offboard":
+            self._go_on_with_setpoint(now)
         if vehicle.mode == "mission":
             self._go_on_with_mission(now)
         if self._goal is not None and vehicle.armed:
             self._follow(now)
+
+    def _go_on_with_setpoint(self, now: int) -> None:
+        """Hold when set-points end; Copter's end later, and its places stay."""
+        is_copter = self._vehicle.is_copter
+        made = self._offboard.again(now, all_of_them=is_copter)
+        stays = is_copter and made is not None and made.kind is ev.PositionSetpoint
+        timeout = COPTER_TIMEOUT if is_copter else OFFBOARD_TIMEOUT
+        if now - self._offboard.stamp > timeout and not stays:
+            self._tell(f"offboard: no set-point for {timeout / SECOND:g} s: holding")
+            self.set_mode("hold", now)
+        elif made is not None:
+            self._act(made.kind, **made.fields)
+
+    def go_to(self, item: Item, now: int) -> str:
+        """Go to an item's place at once; return why not."""
+        if not self._flies:
+            return "expected a vehicle in the air"
+        try:
+            place = self._vehicle.place_of(*item.place)
+        except ValueError as error:
+            return str(error)
+        self.set_mode("hold", now)
+        self._go(place)
+        return ""
 
     def drop_item(self) -> None:
         """Give up a mission's item under way: another one is to be flown."""
@@ -219,7 +270,7 @@ class Flight:
         return int(_OK)
 
     def _take_off(self, message: Any, now: int) -> int:
-        vehicle, (frame, x, y, z) = self._vehicle, _location(message)
+        vehicle, (frame, x, y, z) = self._vehicle, self._location(message)
         if math.isnan(z) or not vehicle.armed:
             return self.set_mode("takeoff", now)
         try:
@@ -241,7 +292,7 @@ class Flight:
 
     def _land(self, message: Any, now: int) -> int:
         try:
-            place = self._landing_place(*_location(message)[:3])
+            place = self._landing_place(*self._location(message)[:3])
         except ValueError as error:
             return self._denied("land", error)
         if place is None or not self._flies:
@@ -280,7 +331,7 @@ class Flight:
 
     def _reposition(self, message: Any, now: int) -> int:
         """Go to a place; hold if it is where the vehicle is, as ground stations pause."""
-        vehicle, place = self._vehicle, _location(message)
+        vehicle, place = self._vehicle, self._location(message)
         if not vehicle.armed or vehicle.home is None:
             return self._denied("reposition", "expected an armed vehicle, found it disarmed")
         try:
@@ -365,6 +416,19 @@ class Flight:
             self._missions.reached()
             self.set_mode("land" if kind == mav.MAV_CMD_NAV_LAND else "return", now)
 
+    def _location(self, message: Any) -> tuple[int, float, float, float]:
+        """Return a command's frame and place, as `Vehicle.place_of` takes it."""
+        if message.get_type() == "COMMAND_LONG":
+            above_home, above_sea = mav.MAV_FRAME_GLOBAL_RELATIVE_ALT, mav.MAV_FRAME_GLOBAL
+            frame = above_home if self._vehicle.is_copter else above_sea
+            return frame, message.param5 * 1e7, message.param6 * 1e7, message.param7
+        scale = 1 if message.frame in GLOBAL_FRAMES else LOCAL_SCALE
+        x, y = (
+            math.nan if coordinate == _UNKNOWN_PLACE else coordinate * scale
+            for coordinate in (message.x, message.y)
+        )
+        return message.frame, x, y, message.z
+
     def why_not(self, item: Item) -> str:
         """Return why a mission's item cannot be flown; empty if it can."""
         kind = item.command
@@ -385,16 +449,3 @@ class Flight:
 def _stick(value: int) -> float:
     """Return a stick's position, -1 to 1; the middle if there is no such stick."""
     return 0.0 if value == _NO_STICK else min(max(value / 1000, -1.0), 1.0)
-
-
-def _location(message: Any) -> tuple[int, float, float, float]:
-    """Return a command's frame and place, as `Vehicle.place_of` takes it."""
-    if message.get_type() == "COMMAND_LONG":
-        x, y = message.param5 * 1e7, message.param6 * 1e7
-        return mav.MAV_FRAME_GLOBAL, x, y, message.param7
-    scale = 1 if message.frame in GLOBAL_FRAMES else LOCAL_SCALE
-    x, y = (
-        math.nan if coordinate == _UNKNOWN_PLACE else coordinate * scale
-        for coordinate in (message.x, message.y)
-    )
-    return message.frame, x, y, message.z

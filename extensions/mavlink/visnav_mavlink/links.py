@@ -314,6 +314,13 @@ def _packed(message: Any, parser: Any) -> bytes:
     return data
 
 
+def ardupilot_dialect() -> Any:
+    """Return ArduPilot's dialect, whose import takes a while, and is for nobody else."""
+    from pymavlink.dialects.v20 import ardupilotmega
+
+    return ardupilotmega
+
+
 def sensors(imu: Imu, field: MagneticField | None, pressure: FluidPressure | None) -> Any:
     """Return a ``HIL_SENSOR`` of an IMU's sample, and of what else is new."""
     gauss = (0.0, 0.0, 0.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from visnav_mavlink.links import Sender, mav
-from visnav_mavlink.vehicle import GLOBAL_FRAMES, LOCAL_SCALE, SECOND
+from visnav_mavlink.vehicle import GLOBAL_FRAMES, LOCAL_SCALE, SECOND, Vehicle
 
 MOST_ITEMS = 1000
 PATIENCE, TRIES = SECOND, 5  # until an item that does not come is asked for again; how often
@@ -57,6 +57,24 @@ class Upload:
     items: list[Item] = field(default_factory=list)
 
 
+class Guided(NamedTuple):
+    """Conventions of ArduPilot: items that are flown to at once, and home as a mission's first.
+
+    Attributes:
+        go_to: Flies to an item's place at a time (ns); returns why not.
+    """
+
+    vehicle: Vehicle
+    go_to: Callable[[Item, int], str]
+
+    @property
+    def home(self) -> Item:
+        """The first item of every mission."""
+        x, y, altitude = self.vehicle.place(self.vehicle.home or (0.0, 0.0, 0.0))
+        command, frame = mav.MAV_CMD_NAV_WAYPOINT, mav.MAV_FRAME_GLOBAL
+        return Item(command, frame, (0.0, 0.0, 0.0, 0.0), x, y, altitude * 1e-3, 1)
+
+
 class Missions:
     """The vehicle's mission.
 
@@ -64,6 +82,7 @@ class Missions:
         send: Sends a message to all programs, who know by its target whether it is for them.
         why_not: Returns why an item cannot be flown; empty if it can.
         changed: Called when another item than the next one is to be flown.
+        guided: ArduPilot's conventions, if those count.
     """
 
     def __init__(
@@ -72,10 +91,12 @@ class Missions:
         why_not: Callable[[Item], str],
         tell: Callable[[str], None],
         changed: Callable[[], None],
+        guided: Guided | None = None,
     ) -> None:
         self._send, self._why_not = send, why_not
         self._tell, self._changed = tell, changed
         self.items: list[Item] = []
+        self._guided, self._first = guided, int(guided is not None)
         self._next = self._end = 0  # the item under way, and the one before which it ends
         self._upload: Upload | None = None
         self._done: tuple[Sender, int] | None = None  # of the last upload, and its last item
@@ -94,7 +115,7 @@ class Missions:
         """Go on where it was left; from the first item after the last one."""
         self._end = len(self.items)
         if self._next >= self._end:
-            self._next = 0
+            self._next = self._first
             self._progress()
 
     def start(self, first: float, last: float) -> str:
@@ -140,7 +161,7 @@ class Missions:
         elif kind in {"MISSION_ITEM_INT", "MISSION_ITEM"}:
             return self._hear_item(sender, message, now)
         elif kind == "MISSION_REQUEST_LIST":
-            self._send(mav.MAVLink_mission_count_message(*sender, len(self.items), _MISSION))
+            self._send(mav.MAVLink_mission_count_message(*sender, self._count, _MISSION))
         elif kind in {"MISSION_REQUEST_INT", "MISSION_REQUEST"}:
             self._give(sender, message.seq, kind == "MISSION_REQUEST_INT")
         elif kind == "MISSION_CLEAR_ALL":
@@ -202,11 +223,10 @@ class Missions:
         upload = self._upload
         if self._is_busy(sender):
             return "another program uploads"
+        if upload is None and message.current == GUIDED:
+            return self._go_at_once(sender, message, now)
         if upload is None and self._done == (sender, message.seq):  # the answer got lost
             self._ack(sender, mav.MAV_MISSION_ACCEPTED)
-        elif upload is None and message.current == GUIDED:
-            self._ack(sender, mav.MAV_MISSION_UNSUPPORTED)
-            return "guided places are ArduPilot's: send DO_REPOSITION"
         elif upload is None:
             self._ack(sender, mav.MAV_MISSION_ERROR)
             return "expected MISSION_COUNT first"
@@ -214,20 +234,22 @@ class Missions:
             self._take(upload, message, now)
         return ""
 
+    def _go_at_once(self, sender: Sender, message: Any, now: int) -> str:
+        words, item = "guided places are ArduPilot's: send DO_REPOSITION", _item(message)
+        if self._guided is not None:
+            words = "its place is none" if item is None else self._guided.go_to(item, now)
+        self._ack(sender, mav.MAV_MISSION_UNSUPPORTED if words else mav.MAV_MISSION_ACCEPTED)
+        return words
+
     def _take(self, upload: Upload, message: Any, now: int) -> None:
-        if message.get_type() == "MISSION_ITEM_INT":
-            upload.by_int, scale = True, 1.0
-        else:
-            scale = 1e7 if message.frame in GLOBAL_FRAMES else 1 / LOCAL_SCALE
-        x, y = message.x * scale, message.y * scale
-        if not (abs(x) <= _LARGEST and abs(y) <= _LARGEST):
+        upload.by_int = upload.by_int or message.get_type() == "MISSION_ITEM_INT"
+        item = _item(message)
+        if item is None:
             self._tell(f"mission refused: item {message.seq}: its place is none")
             self._finish(upload, mav.MAV_MISSION_INVALID)
             return
-        numbers = message.param1, message.param2, message.param3, message.param4
-        place = round(x), round(y), message.z
-        item = Item(message.command, message.frame, numbers, *place, message.autocontinue)
-        if why := self._why_not(item):
+        is_home = message.seq < self._first
+        if not is_home and (why := self._why_not(item)):
             self._tell(f"mission refused: item {message.seq}: {why}")
             self._finish(upload, mav.MAV_MISSION_UNSUPPORTED)
             return
@@ -250,10 +272,10 @@ class Missions:
             self._upload = None
 
     def _give(self, sender: Sender, seq: int, by_int: bool) -> None:
-        if not 0 <= seq < len(self.items):
+        if not 0 <= seq < self._count:
             self._ack(sender, mav.MAV_MISSION_INVALID_SEQUENCE)
             return
-        item = self.items[seq]
+        item = self._guided.home if self._guided and seq == 0 else self.items[seq]
         head = *sender, seq, item.frame, item.command, int(seq == self._next), item.autocontinue
         if by_int:
             place: tuple[float, float] = item.x, item.y
@@ -282,9 +304,13 @@ class Missions:
         self._go_to(0)
 
     def _go_to(self, number: int) -> None:
-        self._next, self._end = number, len(self.items)
+        self._next, self._end = max(number, self._first), len(self.items)
         self._progress()
         self._changed()
+
+    @property
+    def _count(self) -> int:
+        return max(len(self.items), self._first)
 
     def _ack(self, sender: Sender, result: int, which: int = _MISSION) -> None:
         self._send(mav.MAVLink_mission_ack_message(*sender, result, which))
@@ -292,6 +318,19 @@ class Missions:
     def _progress(self) -> None:
         last = max(len(self.items) - 1, 0)
         self._send(mav.MAVLink_mission_current_message(min(self._next, last), len(self.items)))
+
+
+def _item(message: Any) -> Item | None:
+    """Return an item as sent by either message; `None` if its place is none."""
+    scale = 1.0
+    if message.get_type() == "MISSION_ITEM":
+        scale = 1e7 if message.frame in GLOBAL_FRAMES else 1 / LOCAL_SCALE
+    x, y = message.x * scale, message.y * scale
+    if not (abs(x) <= _LARGEST and abs(y) <= _LARGEST):
+        return None
+    numbers = message.param1, message.param2, message.param3, message.param4
+    place = round(x), round(y), message.z
+    return Item(message.command, message.frame, numbers, *place, message.autocontinue)
 
 
 def is_speed(value: float) -> bool:

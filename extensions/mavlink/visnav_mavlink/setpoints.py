@@ -54,13 +54,13 @@ class Offboard:
         self._message, self.stamp = message, now
         return made
 
-    def again(self, now: int) -> Made | None:
-        """Return the newest message's set-point anew if it depends on the vehicle's state."""
+    def again(self, now: int, all_of_them: bool = False) -> Made | None:
+        """Return the newest message's set-point anew, if it depends on the vehicle's state."""
         try:
             made = None if self._message is None else self._made(self._message, now)
         except ValueError:  # it was followed, but the vehicle is too far away by now
             return None
-        return made if made is not None and made.depends else None
+        return made if made is not None and (all_of_them or made.depends) else None
 
     def _made(self, message: Any, now: int) -> Made:
         if message.get_type() == "SET_ATTITUDE_TARGET":

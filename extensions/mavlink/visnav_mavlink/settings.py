@@ -21,6 +21,8 @@ class MavlinkConfig(VehicleControllerConfig):
         vehicle: Vehicle to fly; may be left out if there is only one.
         endpoints: ``udp://HOST:PORT`` sends to who listens there; ``tcp://HOST:PORT`` listens.
             Whoever reaches one flies the vehicle.
+        autopilot: Whose modes and conventions programs find: PX4's, or those of ArduPilot's Copter
+            (one mode GUIDED, altitudes above home, a mission's first item is home).
         system_id: MAVLink's number of the vehicle: another one for each of a run.
         telemetry: Source of the pose in the telemetry: empty for the true one, or an estimator.
         gps: Whether the telemetry has a global position.
@@ -33,6 +35,7 @@ class MavlinkConfig(VehicleControllerConfig):
     """
 
     endpoints: tuple[str, ...] = ("udp://127.0.0.1:14540", "udp://127.0.0.1:14550")
+    autopilot: Literal["px4", "ardupilot"] = "px4"
     system_id: Annotated[int, msgspec.Meta(ge=1, le=254)] = 1
     telemetry: str = ""
     gps: bool = True

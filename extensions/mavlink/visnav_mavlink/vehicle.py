@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 from events import Odometry, PoseEstimate, Quaternion, Vector3
 from events.frames import Geodetic, from_geodetic, rotate, rotate_inverse, to_geodetic, yaw_of
-from visnav_mavlink.links import Links, Peer, mav
+from visnav_mavlink.links import Links, Peer, ardupilot_dialect, mav
 from visnav_mavlink.settings import RATE
 
 SECOND = 1_000_000_000
@@ -28,6 +28,19 @@ MODES = {
     "offboard": (6, 0),
 }
 """Name to PX4's main and sub mode, which programs read from and write into ``custom_mode``."""
+
+COPTER_MODES = {
+    "manual": 0,
+    "altitude": 2,
+    "mission": 3,
+    "hold": 4,
+    "takeoff": 4,
+    "offboard": 4,
+    "position": 5,
+    "return": 6,
+    "land": 9,
+}
+"""Name to the mode of ArduPilot's Copter: all that a program steers is GUIDED, 4."""
 
 GLOBAL_FRAMES = {
     mav.MAV_FRAME_GLOBAL: False,
@@ -56,6 +69,7 @@ _ESTIMATED = (
     | mav.ESTIMATOR_POS_VERT_ABS
     | mav.ESTIMATOR_PRED_POS_HORIZ_REL
 )
+_PREDICTED = mav.ESTIMATOR_PRED_POS_HORIZ_ABS
 
 
 @dataclass
@@ -66,10 +80,12 @@ class Vehicle:
         origin: Place of ``map``'s origin.
         home: Where it stood at first, metres in ``map``.
         gps: Whether it has a global position.
+        is_copter: Whether it is seen as ArduPilot's Copter, not as PX4.
     """
 
     origin: Geodetic
     gps: bool
+    is_copter: bool = False
     home: Vector3 | None = None
     stamp: int = 0
     position: Vector3 = (0.0, 0.0, 0.0)
@@ -150,14 +166,17 @@ class Vehicle:
 
 def _heartbeat(v: Vehicle, _: int) -> Any:
     main, sub = MODES[v.mode]
+    autopilot, custom = mav.MAV_AUTOPILOT_PX4, main << 16 | sub << 24
+    if v.is_copter:
+        autopilot, custom = mav.MAV_AUTOPILOT_ARDUPILOTMEGA, COPTER_MODES[v.mode]
     flags = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mav.MAV_MODE_FLAG_STABILIZE_ENABLED
     flags |= mav.MAV_MODE_FLAG_GUIDED_ENABLED if main in {4, 6} else 0
     flags |= mav.MAV_MODE_FLAG_SAFETY_ARMED if v.armed else 0
     return mav.MAVLink_heartbeat_message(
         mav.MAV_TYPE_QUADROTOR,
-        mav.MAV_AUTOPILOT_PX4,
+        autopilot,
         flags,
-        main << 16 | sub << 24,
+        custom,
         mav.MAV_STATE_ACTIVE if v.armed else mav.MAV_STATE_STANDBY,
         3,
     )
@@ -248,6 +267,15 @@ def _estimator_status(v: Vehicle, ms: int) -> Any:
     )
 
 
+def _ekf_status(v: Vehicle, _: int) -> Any:
+    if not v.is_copter:
+        return None
+    flags = _ESTIMATED | (mav.ESTIMATOR_POS_HORIZ_ABS | _PREDICTED if v.gps else 0)
+    return ardupilot_dialect().MAVLink_ekf_status_report_message(
+        flags if v.ready else 0, 0.1, 0.1, 0.1, 0.1, 0.1
+    )
+
+
 def _autopilot_version(v: Vehicle, _: int) -> Any:  # noqa: ARG001
     can = (
         mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
@@ -268,6 +296,7 @@ def _heading(v: Vehicle) -> int:
     return round(math.degrees(yaw_of(v.orientation)) % 360 * 100) % 36000
 
 
+_EKF_STATUS_REPORT = 193  # of ArduPilot's dialect
 Make = Callable[[Vehicle, int], Any]
 TELEMETRY: dict[int, tuple[float, Make]] = {
     mav.MAVLINK_MSG_ID_HEARTBEAT: (1.0, _heartbeat),
@@ -283,6 +312,7 @@ TELEMETRY: dict[int, tuple[float, Make]] = {
     mav.MAVLINK_MSG_ID_VFR_HUD: (5.0, _vfr_hud),
     mav.MAVLINK_MSG_ID_BATTERY_STATUS: (1.0, _battery),
     mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: (1.0, _estimator_status),
+    _EKF_STATUS_REPORT: (1.0, _ekf_status),
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: (0.0, _autopilot_version),
 }
 """Message's number to its rate, Hz (0: only if asked for), and its maker from `Vehicle` and ms."""
@@ -365,7 +395,7 @@ class Telemetry:
             return True
         period = round(microseconds * 1e3 if microseconds else SECOND / own)
         if period < LEAST_PERIOD:
-            name = mav.mavlink_map[number].msgname
+            name = getattr(mav.mavlink_map.get(number), "msgname", f"message {number:g}")
             self._tell(f"{name}: expected at most {RATE:g} Hz, which now comes")
             period = LEAST_PERIOD
         timers.setdefault(int(number), Timer(period)).period = period
