@@ -41,6 +41,7 @@ async def test_it_is_seen_as_an_autopilot_that_can_fly(outside: Outside) -> None
     assert (heard["HEARTBEAT"].get_srcSystem(), heard["HEARTBEAT"].get_srcComponent()) == (1, 1)
     assert heard["SYS_STATUS"].onboard_control_sensors_health & mav.MAV_SYS_STATUS_PREARM_CHECK
     assert heard["HOME_POSITION"].x == 1.0
+    assert heard["SYSTEM_TIME"].time_boot_ms == pytest.approx(outside.now / 1e6, abs=1000)
     assert heard["GLOBAL_POSITION_INT"].lat > 470000000
     assert heard["LOCAL_POSITION_NED"].y == 2.0
     assert "AUTOPILOT_VERSION" not in heard  # which comes when it is asked for
@@ -79,8 +80,8 @@ async def test_a_rate_that_is_accepted_comes(outside: Outside) -> None:
     assert results(answers) == [0]
     (text,) = of("STATUSTEXT", answers)
     assert text.text == "ATTITUDE: expected at most 100 Hz, which now comes"
-    (told,) = of("MESSAGE_INTERVAL", outside.say(command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, 30)))
-    assert told.interval_us == 10_000
+    (period,) = of("MESSAGE_INTERVAL", outside.say(command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, 30)))
+    assert period.interval_us == 10_000
     assert len(of("ATTITUDE", outside.passes(2.0))) == pytest.approx(200, abs=1)
 
 
@@ -337,22 +338,22 @@ def vision(stamp: int) -> Any:
 
 @pytest.mark.parametrize("behind", [8.0, -3.0])
 async def test_stamps_of_another_clock_are_corrected_from_the_first_pose_on(behind: float) -> None:
-    """By the earliest arrival, so that their distances stay; and it is told."""
+    """By the earliest arrival, so that their distances stay; and the program is told."""
     outside = Outside(vision=True)
-    told: list[str] = []
+    sentences: list[str] = []
     outside.now = 100 * SECOND
     start, offset = outside.now, round(behind * SECOND)
     latencies = [round(ms * 1e6) for ms in (60, 90, 40, 120)]
     for number, latency in enumerate(latencies):
         taken = start + number * SECOND // 10
         outside.now = taken + latency
-        told += texts(outside.say(vision(taken - offset)))
+        sentences += texts(outside.say(vision(taken - offset)))
     stamps = [pose["stamp"] - start for pose in outside.seen]
     late = [latencies[0], latencies[0], latencies[2], latencies[2]]  # of the earliest until then
     expected = [number * SECOND // 10 + late[number] for number in range(4)]
     assert stamps == pytest.approx(expected, abs=1e3)
     word = "behind" if behind > 0 else "ahead"
-    (text,) = told
+    (text,) = sentences
     assert text.startswith("poses of 245/190: stamps are ")
     assert text.endswith(f"s {word}, of another clock: corrected by the earliest arrival")
     outside.close()

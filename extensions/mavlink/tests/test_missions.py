@@ -50,14 +50,14 @@ def start(first: float = -1, last: float = 0) -> Any:
 
 def fly(outside: Outside, seconds: float, follows: bool = True) -> tuple[list[int], list[str]]:
     """Let a vehicle follow its set-points; return what is reached, and what is told."""
-    reached, told = [], []
+    reached, sentences = [], []
     for _ in range(round(10 * seconds)):
         messages = outside.passes(0.1)
         reached += [message.seq for message in of("MISSION_ITEM_REACHED", messages)]
-        told += texts(messages)
+        sentences += texts(messages)
         if follows and outside.acts and isinstance(outside.acts[-1], ev.PositionSetpoint):
             outside.at(outside.acts[-1].position)
-    return reached, told
+    return reached, sentences
 
 
 async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> None:
@@ -213,9 +213,9 @@ async def test_what_is_jumped_over_is_not_reached(outside: Outside, by_command: 
         jump = mav.MAVLink_mission_set_current_message(1, 1, 2)
     outside.say(jump)
     outside.passes(0.1)
-    reached, told = fly(outside, 15.0)
+    reached, sentences = fly(outside, 15.0)
     assert reached == [2, 3]
-    assert told == ["mission finished"]
+    assert sentences == ["mission finished"]
     assert texts(outside.say(mav.MAVLink_mission_set_current_message(1, 1, 9))) == [
         "mission: expected an item below 4, found 9"
     ]
@@ -239,9 +239,9 @@ async def test_an_upload_in_flight_is_flown_from_its_first_item(outside: Outside
     outside.say(start())
     fly(outside, 4.0)
     upload(outside, place(0, 1.0), place(1, 1.5))
-    reached, told = fly(outside, 12.0)
+    reached, sentences = fly(outside, 12.0)
     assert reached == [0, 1]
-    assert told == ["mission finished"]
+    assert sentences == ["mission finished"]
     outside.say(start(), mav.MAVLink_mission_clear_all_message(1, 1, 0))
     assert fly(outside, 1.0) == ([], ["mission cleared: holding"])
     assert isinstance(outside.acts[-1], ev.Hover)

@@ -44,8 +44,8 @@ class MavlinkEndpoint:
         log: NodeLogger,
     ) -> None:
         self._config, self._see_pose, self._now, self._log = config, see, now, log
-        self._said: set[str] = set()
-        self._told = 0
+        self._sentences: set[str] = set()
+        self._text_number = 0
         self._is_lost = True  # until the first is heard
         ids = config.system_id, int(mav.MAV_COMP_ID_AUTOPILOT1)
         self._links = Links(ids, bytes.fromhex(config.signing_key), self._hear, log)
@@ -227,9 +227,9 @@ class MavlinkEndpoint:
             self._tell(text)
 
     def _is_new(self, words: str) -> bool:
-        if words in self._said or len(self._said) >= MOST_SAID:
+        if words in self._sentences or len(self._sentences) >= MOST_SAID:
             return False
-        self._said.add(words)
+        self._sentences.add(words)
         return True
 
     def _once(self, words: str) -> None:
@@ -240,8 +240,8 @@ class MavlinkEndpoint:
         self._log.warning("%s", text)
         data = text.encode("ascii", "replace")
         parts = [data[begin : begin + 50] for begin in range(0, len(data), 50)]
-        self._told = self._told % 65535 + 1
-        number = self._told if len(parts) > 1 else 0
+        self._text_number = self._text_number % 65535 + 1
+        number = self._text_number if len(parts) > 1 else 0
         for index, part in enumerate(parts):
             level = mav.MAV_SEVERITY_WARNING
             self._send(mav.MAVLink_statustext_message(level, part, number, index))

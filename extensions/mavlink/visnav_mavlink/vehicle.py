@@ -190,6 +190,10 @@ def _sys_status(v: Vehicle, _: int) -> Any:
     return mav.MAVLink_sys_status_message(there, there, health, 0, 16200, -1, 100, 0, 0, 0, 0, 0, 0)
 
 
+def _system_time(v: Vehicle, ms: int) -> Any:  # noqa: ARG001
+    return mav.MAVLink_system_time_message(0, ms)  # no date: a run has none
+
+
 def _battery(v: Vehicle, _: int) -> Any:  # noqa: ARG001
     cells = [4050] * 4 + [65535] * 6
     return mav.MAVLink_battery_status_message(0, 0, 0, 32767, cells, -1, -1, -1, 100)
@@ -301,6 +305,7 @@ Make = Callable[[Vehicle, int], Any]
 TELEMETRY: dict[int, tuple[float, Make]] = {
     mav.MAVLINK_MSG_ID_HEARTBEAT: (1.0, _heartbeat),
     mav.MAVLINK_MSG_ID_SYS_STATUS: (2.0, _sys_status),
+    mav.MAVLINK_MSG_ID_SYSTEM_TIME: (1.0, _system_time),
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: (5.0, _extended_sys_state),
     mav.MAVLINK_MSG_ID_ATTITUDE: (20.0, _attitude),
     mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: (20.0, _attitude_quaternion),
@@ -451,7 +456,7 @@ PARAMETERS = {
     "RTL_RETURN_ALT": (2.5, 0.0, 100.0),
 }
 """PX4's name to value, least and most: metres above home; metres per second."""
-KEPT, MOST_KEPT = ("EKF2_", "COM_", "NAV_"), 500  # beginnings of names without effect; how many
+INERT, MOST_INERT = ("EKF2_", "COM_", "NAV_"), 500  # beginnings of names without effect; how many
 
 
 class Parameters(dict[str, float]):
@@ -464,11 +469,11 @@ class Parameters(dict[str, float]):
     def __init__(self, send: Callable[[Any], None], tell: Callable[[str], None]) -> None:
         super().__init__({name: value for name, (value, *_) in PARAMETERS.items()})
         self._send, self._tell = send, tell
-        self._kept: dict[str, tuple[float, int]] = {}  # value as sent, and its type
+        self._inert: dict[str, tuple[float, int]] = {}  # value as sent, and its type
 
     def hear(self, message: Any) -> str | None:
         """Answer a request of the parameter protocol; return what is wrong with it, if so."""
-        kind, names = message.get_type(), [*self, *self._kept]
+        kind, names = message.get_type(), [*self, *self._inert]
         if kind == "PARAM_REQUEST_LIST":
             for name in names:
                 self._give(name)
@@ -480,10 +485,10 @@ class Parameters(dict[str, float]):
             return None
         name = message.param_id.rstrip("\0")
         words = None
-        if kind == "PARAM_SET" and name.startswith(KEPT) and len(self._kept) < MOST_KEPT:
-            if name not in self._kept:
+        if kind == "PARAM_SET" and name.startswith(INERT) and len(self._inert) < MOST_INERT:
+            if name not in self._inert:
                 words = f"{name} is kept, but nothing here is set by it"
-            self._kept[name] = message.param_value, message.param_type
+            self._inert[name] = message.param_value, message.param_type
         elif kind == "PARAM_SET" and name in self:
             _, least, most = PARAMETERS[name]
             if message.param_type != mav.MAV_PARAM_TYPE_REAL32:
@@ -492,14 +497,14 @@ class Parameters(dict[str, float]):
                 self[name] = message.param_value
             else:
                 self._tell(f"{name}: expected {least:g} to {most:g}")
-        if name not in self and name not in self._kept:
+        if name not in self and name not in self._inert:
             return f"parameter {name} is unknown here"
         self._give(name)
         return words
 
     def _give(self, name: str) -> None:
-        real, names = mav.MAV_PARAM_TYPE_REAL32, [*self, *self._kept]
-        value, kind = self._kept.get(name) or (self[name], real)
+        real, names = mav.MAV_PARAM_TYPE_REAL32, [*self, *self._inert]
+        value, kind = self._inert.get(name) or (self[name], real)
         self._send(
             mav.MAVLink_param_value_message(
                 name.encode(), value, kind, len(names), names.index(name)
