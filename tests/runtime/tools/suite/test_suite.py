@@ -340,7 +340,7 @@ def test_the_command_runs_a_suite_and_runs_it_on(small: Path, tmp_path: Path) ->
     assert "2 runs are finished already, 0 to do" in again.stderr
 
 
-@pytest.mark.parametrize("file", ["suite.toml", "calibration.toml"])
+@pytest.mark.parametrize("file", ["suite.toml", "calibration.toml", "carried.toml"])
 def test_programs_are_those_of_the_checkout(file: str) -> None:
     folders = [e.node["folder"] for e in read_suite(FOLDER / file).estimators if "folder" in e.node]
     root = Path(__file__).parents[4]
