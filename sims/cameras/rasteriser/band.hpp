@@ -108,6 +108,7 @@ class Band {
     std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
     std::vector<Surface> surfaces_;
     std::vector<Shade> shades_;
+    std::vector<Vec3f> light_;  // of a triangle's corners, by light and corner
     std::vector<Area> areas_;  // of the lights, for a span
     std::vector<std::vector<std::int32_t>> surface_of_;  // by part and triangle; -1: none yet
 };

@@ -224,7 +224,7 @@ class Scene {
         Geom geom;
         Pose pose;
         int frame;
-        std::vector<Vec3f> light;
+        std::vector<Vec3f> light;  // none while it moves
     };
     using Triangles = std::vector<std::vector<Triangle>>;
     using Movings = std::vector<std::vector<Moving>>;
@@ -240,6 +240,7 @@ class Scene {
     bool bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels, int count,
                  bool turns) const;
     void light(const Geom& geom, const Pose& pose, Slot& slot) const;
+    void light(const Slot& slot, int vertex, Vec3f* to, std::size_t apart) const;
     void spread(int parts, const std::function<void(int)>& work) const;
 
     const Lens* lens_ = nullptr;

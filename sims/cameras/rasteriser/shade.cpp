@@ -8,29 +8,33 @@ namespace raster {
 
 constexpr float rounding = 2e-6f;  // of a depth by the inverse depth of the plane that it is on
 
-// Light on a geom's vertices; that of before, if nothing has moved.
+// Light on a geom's vertices; that of before, if nothing has moved. Of what moves, few triangles may
+// be seen, and only their corners are lit then (`Band::surface`).
 void Scene::light(const Geom& geom, const Pose& pose, Slot& slot) const {
-    if (slot.frame == frame_ && !slot.light.empty()) return;
+    if (slot.frame == frame_) return;
     slot.frame = frame_;
-    const Mesh& mesh = *meshes[geom.mesh];
     bool shines = false;
     for (const Light& each : lights_)
         shines |= geom.specular > 0 && (each.specular[0] + each.specular[1] + each.specular[2]) > 0;
-    const std::size_t count = mesh.points.size();
-    if (!shines && slot.light.size() == count * (1 + casters_.size()) &&
-        !std::memcmp(&slot.geom, &geom, sizeof geom) &&
-        !std::memcmp(&slot.pose, &pose, sizeof pose))
-        return;
+    const bool rests = !std::memcmp(&slot.geom, &geom, sizeof geom) &&
+                       !std::memcmp(&slot.pose, &pose, sizeof pose);
+    slot.geom = geom, slot.pose = pose;
+    if (!rests) slot.light.clear();
+    const std::size_t count = meshes[geom.mesh]->points.size();
+    if ((!rests && view_.poses == 1) || (!shines && !slot.light.empty())) return;
+    slot.light.resize(count * (1 + casters_.size()));
+    for (std::size_t k = 0; k < count; ++k) light(slot, static_cast<int>(k), &slot.light[k], count);
+}
+
+// Light on one vertex; after it, so far apart, that of each light that throws shadows.
+void Scene::light(const Slot& slot, int vertex, Vec3f* to, std::size_t apart) const {
+    const Mesh& mesh = *meshes[slot.geom.mesh];
+    const Pose& pose = slot.pose;
     const Vec3 eye{middle_eye_.position[0], middle_eye_.position[1], middle_eye_.position[2]};
     const Vec3 origin{pose.position[0], pose.position[1], pose.position[2]};
-    slot.light.resize(count * (1 + casters_.size()));
-    for (std::size_t k = 0; k < count; ++k) {
-        const Vec3f p = mesh.points[k], n = mesh.normals[k];
-        const Vec3 normal = unit(pose.turn * Vec3{n.x, n.y, n.z});
-        const Vec3 point = pose.turn * Vec3{p.x, p.y, p.z} + origin;
-        lit(geom, lights_, point, normal, eye, &slot.light[k], count);
-    }
-    slot.geom = geom, slot.pose = pose;
+    const Vec3f p = mesh.points[vertex], n = mesh.normals[vertex];
+    const Vec3 normal = unit(pose.turn * Vec3{n.x, n.y, n.z});
+    lit(slot.geom, lights_, pose.turn * Vec3{p.x, p.y, p.z} + origin, normal, eye, to, apart);
 }
 
 // Number of a triangle's surface: the planes of all that is interpolated on it, computed when its
@@ -82,7 +86,15 @@ std::int32_t Band::surface(std::int32_t number, int y) {
     }
     const Scene::Slot& slot = scene_.slots_[triangle.geom];
     const Vec3f* light = slot.light.data();
-    const Vec3f l[3] = {light[corners[0]], light[corners[1]], light[corners[2]]};
+    std::size_t apart = mesh.points.size();
+    std::int32_t of[3] = {corners[0], corners[1], corners[2]};
+    if (slot.light.empty()) {
+        apart = 3;
+        light_.resize(apart * (1 + scene_.casters_.size()));
+        for (int k = 0; k < 3; ++k) scene_.light(slot, corners[k], &light_[k], apart), of[k] = k;
+        light = light_.data();
+    }
+    const Vec3f l[3] = {light[of[0]], light[of[1]], light[of[2]]};
     made.flat = !std::memcmp(&l[0], &l[1], sizeof l[0]) &&
                 !std::memcmp(&l[0], &l[2], sizeof l[0]) && scene_.casters_.empty();
     if (made.flat) {
@@ -96,8 +108,8 @@ std::int32_t Band::surface(std::int32_t number, int y) {
     }
     made.shades = static_cast<std::int32_t>(shades_.size());
     for (const Light& caster : scene_.casters_) {
-        light += slot.light.size() / (1 + scene_.casters_.size());
-        const Vec3f a = light[corners[0]], b = light[corners[1]], c = light[corners[2]];
+        light += apart;
+        const Vec3f a = light[of[0]], b = light[of[1]], c = light[of[2]];
         Shade& shade = shades_.emplace_back();
         shade.shines = a.x + a.y + a.z + b.x + b.y + b.z + c.x + c.y + c.z > 0;
         if (!shade.shines) continue;

@@ -8,25 +8,22 @@ namespace raster {
 
 namespace {
 
-// Whether a triangle's image may hold the middle of a pixel; columns and rows of its corners.
+// Whether a triangle's image may hold the middle of a pixel; columns and rows of its corners, not a
+// number of those that are too near.
 //
-// An edge is off by no more than 4e-4 pixels of a map of 1024², for rounding, and a corner by the
-// inverse of its sine times that. What is too thin to be told so is drawn.
-bool holds_pixel(const Lens::Pixel (&at)[3]) {
+// An edge is off by no more than 4e-4 pixels of a map of 1024², for rounding, and a corner by that
+// over the sine of its angle. What is too thin to be told so is drawn.
+inline bool holds_pixel(Lens::Pixel a, Lens::Pixel b, Lens::Pixel c) {
     constexpr double more = 0.05, least_sine = 0.02;
-    const auto low = [](double a, double b, double c) { return std::min(std::min(a, b), c); };
-    const auto high = [](double a, double b, double c) { return std::max(std::max(a, b), c); };
-    const double left = low(at[0].column, at[1].column, at[2].column) - more;
-    const double right = high(at[0].column, at[1].column, at[2].column) + more;
-    const double top = low(at[0].row, at[1].row, at[2].row) - more;
-    const double bottom = high(at[0].row, at[1].row, at[2].row) + more;
+    const double left = std::min(std::min(a.column, b.column), c.column) - more;
+    const double right = std::max(std::max(a.column, b.column), c.column) + more;
+    const double top = std::min(std::min(a.row, b.row), c.row) - more;
+    const double bottom = std::max(std::max(a.row, b.row), c.row) + more;
     if (std::floor(right) >= left && std::floor(bottom) >= top) return true;
-    double x[3], y[3], longest = 0;
-    for (int k = 0; k < 3; ++k) {
-        x[k] = at[(k + 1) % 3].column - at[k].column, y[k] = at[(k + 1) % 3].row - at[k].row;
-        longest = std::max(longest, x[k] * x[k] + y[k] * y[k]);
-    }
-    return !(std::abs(x[0] * y[1] - x[1] * y[0]) >= least_sine * longest);
+    const double area = (b.column - a.column) * (c.row - a.row) -
+                        (c.column - a.column) * (b.row - a.row);
+    const double wide = right - left - 2 * more, high = bottom - top - 2 * more;
+    return !(std::abs(area) >= least_sine * (wide * wide + high * high));
 }
 
 }  // namespace
@@ -58,25 +55,26 @@ void Scene::shadow(const Lens& lens, float near, const Pose& eye, const Geom* ge
     if (placed_.size() < std::size_t(count)) placed_.resize(count);
     Band band(*this, 0, size, {nullptr, map, nullptr}, nullptr);
     const double per_step[2] = {1.0 / lens.step[0], 1.0 / lens.step[1]};
+    std::vector<Lens::Pixel> at;
     for (const std::int32_t* index = moving; index < moving + moving_count; ++index) {
         Placed& placed = placed_[*index];
         place(geoms[*index], poses[*index], eye, placed);
         if (beyond(placed)) continue;
         see(placed);
+        at.clear();
+        for (std::size_t k = 0; k < placed.seen.size(); ++k) {
+            const double share = placed.seen[k].z >= near ? 1.0 : std::nan("");
+            at.push_back({(placed.pixels[k].column - lens.x[0]) * per_step[0] * share,
+                          (placed.pixels[k].row - lens.y[0]) * per_step[1] * share});
+        }
         Box box{size, 0, size, 0};
         const std::vector<std::int32_t>& corners = placed.mesh->corners;
         for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
             const std::int32_t* of = &corners[corner];
+            if (!holds_pixel(at[of[0]], at[of[1]], at[of[2]])) continue;
             const Lens::Pixel rays[3] = {placed.pixels[of[0]], placed.pixels[of[1]],
                                          placed.pixels[of[2]]};
             const Vec3 points[3] = {placed.seen[of[0]], placed.seen[of[1]], placed.seen[of[2]]};
-            if (points[0].z >= near && points[1].z >= near && points[2].z >= near) {
-                Lens::Pixel at[3];
-                for (int k = 0; k < 3; ++k)
-                    at[k] = {(rays[k].column - lens.x[0]) * per_step[0],
-                             (rays[k].row - lens.y[0]) * per_step[1]};
-                if (!holds_pixel(at)) continue;
-            }
             const Corners from(points);
             if (!(from.away() < 0)) continue;
             Triangle triangle;
