@@ -27,7 +27,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import tomli_w
@@ -38,8 +38,6 @@ from runtime.paths import not_utf8
 from runtime.summary import Summary
 
 log = logging.getLogger("visnav.runtime")
-
-S = TypeVar("S", bound=msgspec.Struct)
 
 MARKER = ".visnav-run"
 LATEST = "latest"
@@ -273,17 +271,6 @@ def write_summary(out: Path, summary: Summary) -> None:
         if not out.is_dir():
             claim(out)
         write(out / "summary.json", encoded + b"\n")
-
-
-def read_summary(folder: Path, type_: type[S]) -> S:
-    """Read the summary in a run's folder, or a part of it; else raise `ResultsError`."""
-    file = folder / "summary.json"
-    try:
-        return msgspec.json.decode(file.read_bytes(), type=type_)
-    except OSError as error:
-        raise ResultsError(f"{file}: expected a run's summary, found: {error.strerror}") from None
-    except msgspec.MsgspecError as error:
-        raise ResultsError(f"{file}: expected a run's summary, found: {error}") from None
 
 
 @contextlib.contextmanager

@@ -48,7 +48,8 @@ def show(
     With --latex, --markdown or --csv it prints a table of the estimators instead, for a paper; of a
     judgement's folder, too.
     """
-    from runtime.run.results import read_summary, run_folder
+    from runtime.run.results import run_folder
+    from runtime.tools.summaries import read_summary
 
     form = chosen_format(latex=latex, markdown=markdown, csv=csv, figures=figure)
     folder = run_folder(folder)

@@ -30,9 +30,10 @@ def bundle(
     is not in it stands there by size and hash, and is printed. Equal folders give equal archives.
     """
     from runtime.errors import CommandError
-    from runtime.run.results import read_summary, run_folder
+    from runtime.run.results import run_folder
     from runtime.summary import Summary
     from runtime.tools.paper.bundle import size_of, write_bundle
+    from runtime.tools.summaries import read_summary
 
     folder = run_folder(run)
     path = out or Path(f"{read_summary(folder, Summary).name}.zip")

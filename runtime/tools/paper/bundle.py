@@ -40,9 +40,10 @@ from runtime.run.made_from import (
     program_of,
     roots_of,
 )
-from runtime.run.results import MARKER, read_summary, replacing, time_of
+from runtime.run.results import MARKER, replacing, time_of
 from runtime.summary import Summary
 from runtime.tools.paper.typeset import combinations_of, figures_table, typeset
+from runtime.tools.summaries import read_summary
 from runtime.units import plain
 
 FORMAT = 1
