@@ -1,4 +1,4 @@
-"""Make the example of a scan, examples/hall.glb: the hall as one mesh for each thing, unlit."""
+"""Make the example of a scan: examples/hall.glb, the hall as many meshes, and its image."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import mujoco
 import numpy as np
 
 from sims.cameras.meshes import mesh_of, shape_of
+from sims.scans.settings import MeshSpec
+from sims.survey.survey import Survey
 from sims.worlds import load_world
 
-FILE = Path("examples/hall.glb")
+FILE, IMAGE = Path("examples/hall.glb"), Path("docs/images/scan.jpg")
+WIDTH = 1120  # of the image
 SHARE, QUALITY = 0.6, 75  # of the images' size; of JPEG
 UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # z up to y up
 
@@ -64,8 +68,6 @@ def main() -> None:
                 "pbrMetallicRoughness": {"baseColorTexture": {"index": number}},
             }
         )  # fmt: skip
-    import mujoco
-
     data: Any = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for geom in np.flatnonzero(model.geom_group < 3).tolist():
@@ -97,6 +99,18 @@ def main() -> None:
     )  # fmt: skip
 
 
+def draw() -> None:
+    """Draw what `python -m runtime world` draws of the file."""
+    survey = Survey(FILE, MeshSpec())
+    for line in survey.lines():
+        print(line)
+    sheet = survey.sheet()
+    size = WIDTH, round(sheet.shape[0] * WIDTH / sheet.shape[1])
+    small = cv2.resize(sheet, size, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    IMAGE.write_bytes(data.tobytes())
+
+
 def jpeg(model: Any, texture: int) -> bytes:
     """Return a texture of the model as JPEG."""
     width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
@@ -110,3 +124,4 @@ def jpeg(model: Any, texture: int) -> bytes:
 
 if __name__ == "__main__":
     main()
+    draw()

@@ -128,15 +128,17 @@ class Survey:
         yield f"lidar turn of {CHANNELS} x {COLUMNS}: {self._turn_ms():.1f} ms"
         yield from self._free()
 
-    def draw(self, path: Path) -> None:
-        """Draw four views along the tour, and the plan, as an image; after `lines`."""
+    def sheet(self) -> Image:
+        """Return four views along the tour and the plan, as an image (BGR); after `lines`."""
         views = [
-            cv2.resize(image, (564, 360), interpolation=cv2.INTER_AREA) for image in self._images
+            cv2.resize(view, (564, 360), interpolation=cv2.INTER_AREA) for view in self._images
         ]
-        rows = [np.hstack(views[k : k + 4 : 2]) for k in (0, 4)]
-        sheet = np.vstack(rows)
-        plan = self._plan(sheet.shape[0])
-        _, data = cv2.imencode(".png", np.hstack([sheet, plan]))
+        sheet = np.vstack([np.hstack(views[k : k + 4 : 2]) for k in (0, 4)])
+        return np.hstack([sheet, self._plan(sheet.shape[0])])
+
+    def draw(self, path: Path) -> None:
+        """Write the sheet as a PNG; `CommandError` if that cannot be."""
+        _, data = cv2.imencode(".png", self.sheet())
         try:
             path.write_bytes(data.tobytes())
         except OSError as error:
