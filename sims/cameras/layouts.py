@@ -12,7 +12,7 @@ GEOM = np.dtype(
     [
         ("mesh", "i4"), ("texture", "i4"), ("number", "i4"), ("rgba", "f4", 4), ("emission", "f4"),
         ("specular", "f4"), ("shininess", "f4"), ("repeat", "f4", 2), ("offset", "f4"),
-        ("cube", "f4", 3),
+        ("cube", "f4", 3), ("double_sided", "i4"), ("cutoff", "f4"),
     ]
 )  # fmt: skip
 POSE = np.dtype([("position", "f8", 3), ("turn", "f8", 9)])

@@ -9,6 +9,8 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from sims.cameras.surfaces import vertex_colours
+
 Floats = npt.NDArray[np.float64]
 Corners = npt.NDArray[np.int64]
 
@@ -39,15 +41,18 @@ class Mesh:
         normals: npt.ArrayLike,
         corners: npt.ArrayLike,
         places: npt.ArrayLike,
+        colours: npt.NDArray[np.float32] | None = None,
     ) -> None:
         self.points = narrow(points)  # metres, shape (n, 3)
         self.normals = narrow(normals)  # shape (n, 3)
         self.corners = np.ascontiguousarray(corners, np.int32)  # of triangles, shape (m, 3)
         self.places = narrow(places)  # u and v, shape (n, 2)
+        # Factors on the colour: red, green, blue, opacity, shape (n, 4); None: 1.
+        self.colours = None if colours is None else narrow(colours)
 
     def turned(self) -> Mesh:
         """Return the same triangles, to be seen from their other side, with the same normals."""
-        return Mesh(self.points, self.normals, self.corners[:, ::-1], self.places)
+        return Mesh(self.points, self.normals, self.corners[:, ::-1], self.places, self.colours)
 
 
 def shape_of(model: Any, geom: int) -> tuple[Any, ...]:
@@ -267,20 +272,48 @@ def _own_mesh(model: Any, number: int) -> Mesh:
     corners = model.mesh_face[faces][:count]
     vertices = model.mesh_vert[int(model.mesh_vertadr[number]) :]
     points = vertices[corners].reshape(-1, 3)
-    normals = model.mesh_normal[int(model.mesh_normaladr[number]) :][
-        model.mesh_facenormal[faces][:count]
-    ].reshape(-1, 3)
+    index = model.mesh_facenormal[faces][:count]
+    kinds = [corners.ravel(), index.ravel()]
+    normals = model.mesh_normal[int(model.mesh_normaladr[number]) :][index].reshape(-1, 3)
     one, other, third = points.reshape(-1, 3, 3).transpose(1, 0, 2).astype(np.float64)
     flat = np.cross(other - one, third - one)
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     flat = np.repeat(flat, 3, axis=0)
-    sharp = (flat * normals).sum(axis=1) < SMOOTH
-    normals = np.where(sharp[:, None], flat, normals).astype(np.float32)
+    sharp = np.flatnonzero((flat * normals).sum(axis=1) < SMOOTH)
+    normals = normals.astype(np.float32)
+    normals[sharp] = flat[sharp]
     places = _above(points).astype(np.float32)
     if textured:
         at = model.mesh_texcoord[int(model.mesh_texcoordadr[number]) :]
-        places = at[model.mesh_facetexcoord[faces][:count]].reshape(-1, 2)
-    kinds, index = np.unique(
-        np.concatenate([points, normals, places], axis=1), axis=0, return_inverse=True
+        index = model.mesh_facetexcoord[faces][:count]
+        kinds.append(index.ravel())
+        places = at[index].reshape(-1, 2)
+    chosen, vertex = _merged(kinds, sharp)
+    colours = vertex_colours(model, number)
+    return Mesh(
+        points[chosen],
+        normals[chosen],
+        vertex.reshape(-1, 3),
+        places[chosen],
+        None if colours is None else colours[kinds[0][chosen]],
     )
-    return Mesh(kinds[:, :3], kinds[:, 3:6], index.reshape(-1, 3), kinds[:, 6:])
+
+
+def _merged(kinds: list[Corners], apart: Corners) -> tuple[Corners, Corners]:
+    """Return the first corner of each kind, and the number of each corner's kind.
+
+    Args:
+        kinds: Whole numbers of all corners, shape (m,) each; corners with the same ones are one.
+        apart: Corners that are kinds of their own.
+    """
+    key = kinds[0].astype(np.int64)
+    for other in kinds[1:]:
+        if not np.array_equal(other, kinds[0]):
+            key = np.unique(key * (int(other.max(initial=0)) + 1) + other, return_inverse=True)[1]
+    key[apart] = int(key.max(initial=0)) + 1 + np.arange(len(apart))
+    first = np.full(int(key.max(initial=-1)) + 1, -1)
+    first[key[::-1]] = np.arange(len(key))[::-1]
+    chosen = np.flatnonzero(first >= 0)
+    number = np.zeros(len(first), np.int64)
+    number[chosen] = np.arange(len(chosen))
+    return first[chosen], number[key]

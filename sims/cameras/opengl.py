@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import logging
 import math
 import os
 from typing import Any
@@ -35,6 +36,7 @@ from sims.cameras.stage import (
     looked_up,
     object_numbers,
 )
+from sims.cameras.surfaces import undrawn_by_mujoco
 
 INSTALL = "apt-get install libegl1 libgl1 libgl1-mesa-dri"
 
@@ -107,6 +109,10 @@ class OpenGL(Stage):
         dynamics: Changing | None = None,
     ) -> None:
         super().__init__(model, dynamics)
+        if undrawn := undrawn_by_mujoco(model):
+            logging.getLogger("visnav.cameras").warning(
+                'renderer = "mujoco" does not draw %s; "raster" does', ", ".join(undrawn)
+            )
         width, height = _largest(infos)
         self._context: Any = None
         self._axes: Floats | None = None

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from events.camera_info import srgb_light
 from runtime.typed import override
 from sims.cameras.layouts import GEOM, LIGHT, POSE, VIEW
 from sims.cameras.layouts import address as _at
@@ -33,6 +32,7 @@ from sims.cameras.stage import (
     View,
     object_numbers,
 )
+from sims.cameras.surfaces import colours_texture, geom_numbers, texture_bytes
 from sims.compiled import libraries
 
 _Kind = mujoco.mjtGeom
@@ -84,12 +84,19 @@ class Raster(Stage):
         self._library = libraries()[instructions or next(iter(libraries()))]
         self._world = ctypes.c_void_p(self._library.raster_new())
         self._shadows = ShadowMaps(self._library, self._world, model, threads)
-        self._textures = [self._add_texture(number) for number in range(model.ntex)]
+        colours = {colours_texture(model, mesh) for mesh in range(model.nmesh)}
+        colours -= set(model.mat_texid.ravel().tolist())
+        self._textures = [
+            -1 if number in colours else self._add_texture(number) for number in range(model.ntex)
+        ]
         skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = self._textures[skies[0]] if skies.size else -1
         self._drawn = np.flatnonzero(model.geom_group < 3)
         self._geoms = np.zeros(len(self._drawn), GEOM)
-        self._planes = np.flatnonzero(model.geom_type[self._drawn] == _Kind.mjGEOM_PLANE)
+        self._geoms["double_sided"] = geom_numbers(model, "double_sided")[self._drawn] != 0.0
+        self._geoms["cutoff"] = narrow(geom_numbers(model, "alpha_cutoff")[self._drawn])
+        planes = model.geom_type[self._drawn] == _Kind.mjGEOM_PLANE
+        self._planes = np.flatnonzero(planes & (self._geoms["double_sided"] == 0))
         self._behind: dict[int, int] = {}  # by a plane's mesh, that of its other side
         meshes: dict[Any, tuple[int, int]] = {}  # numbers, and how many triangles
         triangles = 0
@@ -304,13 +311,11 @@ class Raster(Stage):
     def _add_texture(self, number: int) -> int:
         model = self.model
         width, height = int(model.tex_width[number]), int(model.tex_height[number])
-        channels, start = int(model.tex_nchannel[number]), int(model.tex_adr[number])
-        data = np.ascontiguousarray(model.tex_data[start : start + width * height * channels])
-        if model.tex_colorspace[number] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
-            data = np.rint(srgb_light() * 255.0).astype(np.uint8)[data]  # as OpenGL decodes it
+        data = texture_bytes(model, number)
+        channels = data.shape[1]
         cube = model.tex_type[number] != mujoco.mjtTexture.mjTEXTURE_2D
         if cube and height == width:  # all of its faces
-            data, height = np.tile(data, 6), 6 * height
+            data, height = np.tile(data, (6, 1)), 6 * height
         texture = int(
             self._library.raster_texture(self._world, width, height, channels, _at(data), int(cube))
         )
@@ -323,12 +328,15 @@ class Raster(Stage):
 
     def _add_mesh(self, mesh: Mesh) -> int:
         points, corners = mesh.points, mesh.corners
-        return int(
+        number = int(
             self._library.raster_mesh(
                 self._world, len(points), _at(points), _at(mesh.normals), _at(mesh.places),
                 len(corners), _at(corners),
             )
         )  # fmt: skip
+        if mesh.colours is not None:
+            self._library.raster_colours(self._world, number, _at(mesh.colours))
+        return number
 
     def _lens(self, info: CameraInfo) -> int:
         if info not in self._lenses:

@@ -71,7 +71,7 @@ class ShadowMaps:
         self._maps: list[_Map] = []
         self._lenses: dict[float, int] = {}  # by the size of their pixels
         self._poses = np.empty(0, POSE)  # the geoms' last ones
-        self._solid = np.empty(0, np.bool_)  # geoms that throw shadows: opaque ones
+        self._solid = np.empty(0, np.bool_)  # geoms that throw shadows: opaque and cut-out ones
         self._moves = np.empty(0, np.bool_)  # geoms that are laid over what stands still
         self._moved = np.empty(0, np.int64)  # version in which each geom was last found changed
         self.version = 0  # of all geoms' poses and opacities
@@ -130,7 +130,7 @@ class ShadowMaps:
         casting = lights[lights["size"] > 0]
         if not casting.size:
             return
-        self._compare(geoms["rgba"][:, 3] >= 1.0, poses)
+        self._compare((geoms["rgba"][:, 3] >= 1.0) | (geoms["cutoff"] > 0.0), poses)
         moving = np.flatnonzero(self._moves & self._solid).astype(np.int32)
         for light, shadow in zip(casting, self._maps, strict=False):
             view = light["eye"].tobytes() + light["step"].tobytes()

@@ -6,6 +6,7 @@ import ctypes
 import functools
 import itertools
 import math
+import re
 from abc import ABC, abstractmethod
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -48,6 +49,7 @@ FAR = 20_000.0
 SHADOW_SIZE = 1024  # pixels; the most columns and rows of a light's map of what it shines on
 
 LOOK = ".look"  # suffix of looks: geom `<name>.look` is the image of geom `<name>`, with its number
+CHUNK = re.compile(r"\.chunk\d+$")  # suffix of an object's parts: all have the number of the first
 
 
 class Changing(Protocol):
@@ -187,14 +189,19 @@ class Stage(ABC):
 
 
 def object_numbers(model: Any) -> npt.NDArray[np.int32]:
-    """Return each geom's object number: its own id, or for a look its solid's."""
+    """Return each geom's object number: its own id, a look's solid's, or that of ``.chunk0``."""
     numbers = np.arange(model.ngeom, dtype=np.int32)
     for geom in range(model.ngeom):
         name = model.geom(geom).name
         if name.endswith(LOOK):
-            solid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name.removesuffix(LOOK))
-            if solid >= 0:
-                numbers[geom] = solid
+            first = name.removesuffix(LOOK)
+        elif (chunk := CHUNK.search(name)) is not None:
+            first = f"{name[: chunk.start()]}.chunk0"
+        else:
+            continue
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, first)
+        if number >= 0:
+            numbers[geom] = number
     return numbers
 
 

@@ -1,5 +1,6 @@
 // Which triangle each pixel of a band sees.
 #include "band.hpp"
+#include "lighting.hpp"
 
 #include <algorithm>
 #include <limits>
@@ -30,11 +31,11 @@ Corners Band::between_poses(std::int32_t number, int y) const {
     return {moving.from, moving.to, share(y)};
 }
 
-// A triangle's planes as a row sees it; false if it does not.
-bool Band::seen(Planes& planes, std::int32_t number, int y) const {
+// Makes a triangle as a row sees it; false if it does not.
+bool Band::seen(Triangle& row, std::int32_t number, int y) const {
     const Corners corners = between_poses(number, y);
-    planes = Planes(corners);
-    return !(corners.away() >= 0);
+    row.planes = Planes(corners), row.behind = corners.away() > 0;
+    return !(corners.away() >= 0) || (row.behind && scene_.placed_[row.geom].geom->double_sided);
 }
 
 std::int32_t& Band::surface_of(std::int32_t number) {
@@ -97,12 +98,14 @@ inline void Band::over(const Triangle& triangle, std::int32_t number, Found foun
     constexpr int most = 32;  // rows whose planes are found together: that is quicker
     Planes planes[most];
     bool met[most];
+    const bool double_sided = placed.geom->double_sided;
     const int end = std::min(triangle.bottom, last_);
     for (int y = std::max(triangle.top, first_); y < end; y += most) {
         const int count = std::min(end - y, most);
         for (int k = 0; k < count; ++k) {
             const Corners corners(moving.from, moving.to, share(y + k));
             planes[k] = Planes(corners), met[k] = !(corners.away() >= 0);
+            met[k] |= double_sided && corners.away() > 0;
         }
         for (int k = 0; k < count; ++k)
             if (row.planes = planes[k]; met[k]) scan_frame(row, y + k, y + k + 1, found);
@@ -199,7 +202,7 @@ inline void Band::over_leaf(const Triangle& triangle, std::int32_t number, bool 
     } else {
         Triangle row = triangle;
         for (int y = from; y < to; ++y)
-            if (seen(row.planes, number, y)) touched |= scan_pixels(row, false, left, right, y, y + 1, found);
+            if (seen(row, number, y)) touched |= scan_pixels(row, false, left, right, y, y + 1, found);
     }
     if (!touched) return;
     fv least = fv{} + 1e30f;
@@ -240,6 +243,7 @@ inline bool Band::scan_pixels(const Triangle& triangle, bool whole, int left, in
 }
 
 void Band::cover(const Triangle& triangle, std::int32_t number) {
+    if (scene_.placed_[triangle.geom].thresholds) return cover_cut(triangle, number);
     const iv mine = iv{} + number;
     const auto found = [mine, nearest = nearest_, visible = visible_, first = view_.first,
                         stride = std::size_t(lens_.stride)](int y, int x, iv inside, fv q)
@@ -254,6 +258,7 @@ void Band::cover(const Triangle& triangle, std::int32_t number) {
 }
 
 void Band::shadow(const Triangle& triangle) {
+    if (scene_.placed_[triangle.geom].thresholds) return shadow_cut(triangle);
     const auto nearer = [map = images_.depth, size = std::size_t(lens_.width)](
                             int y, int x, iv inside, fv q) __attribute__((always_inline)) {
         float* here = map + y * size + x;
@@ -261,6 +266,116 @@ void Band::shadow(const Triangle& triangle) {
         store(here, inside & (depth < before) ? depth : before);
     };
     over(triangle, 0, nearer);
+}
+
+// What decides where a triangle with a cutoff is drawn, seen so.
+Band::Opacity Band::opacity(const Triangle& triangle, const Corners& seen) const {
+    const Placed& placed = scene_.placed_[triangle.geom];
+    const Geom& geom = *placed.geom;
+    const Mesh& mesh = *placed.mesh;
+    const std::int32_t* corners = mesh.corners.data() + triangle.corner;
+    const double share = inverse(seen.away());
+    const d4 weights[3] = {seen.edge(1) * share, seen.edge(2) * share, seen.edge(0) * share};
+    Opacity made{};
+    made.thresholds = placed.thresholds;
+    put(made.depth, weights[0] + weights[1] + weights[2]);
+    const auto plane = [&](float (&to)[3], auto at) {
+        put(to, weights[0] * double(at(corners[0])) + weights[1] * double(at(corners[1])) +
+                    weights[2] * double(at(corners[2])));
+    };
+    made.by_vertices = !mesh.colours.empty();
+    if (made.by_vertices) plane(made.vertices, [&](int k) { return mesh.colours[4 * k + 3]; });
+    const Texture* texture = geom.texture < 0 ? nullptr : scene_.textures[geom.texture].get();
+    if (!texture || !texture->has_opacity || texture->is_cube) return made;
+    made.texture = texture, made.sizes = placed.sizes;
+    for (int axis = 0; axis < 2; ++axis)
+        plane(axis ? made.v : made.u, [&](int k) {
+            return mesh.places[2 * k + axis] * geom.repeat[axis] + geom.offset;
+        });
+    return made;
+}
+
+// Where pixels from x on with these inverse depths are not below the cutoff, among those asked for.
+iv Band::is_opaque(const Opacity& of, int x, int y, iv asked, fv nearest) const {
+    const bool pinhole = lens_.pinhole;
+    const fv inverse = 1.0f / (asked ? nearest : fv{} + 1.0f);
+    const std::size_t row = pinhole ? 0 : std::size_t(y) * lens_.stride;
+    struct Rays { fv x, y, z; };
+    const auto rays = [&](std::size_t at) {
+        return Rays{load<fv>(&lens_.x[at]), load<fv>(&lens_.y[at]), load<fv>(&lens_.z[at])};
+    };
+    const Rays here = pinhole ? Rays{load<fv>(&lens_.x[x]), fv{} + lens_.y[y], fv{} + 1.0f}
+                              : rays(row + x);
+    const auto times = [](const float(&plane)[3], const Rays& ray) {
+        return ray.x * plane[0] + (ray.y * plane[1] + ray.z * plane[2]);
+    };
+    fv opacity = of.by_vertices ? times(of.vertices, here) * inverse : fv{} + 1.0f;
+    fv least = fv{} + of.thresholds[0];
+    if (!of.texture) return asked & (opacity >= least);
+    const fv u = times(of.u, here) * inverse, v = times(of.v, here) * inverse;
+    const auto step = [&](const Rays& ray) {  // how far a step moves, squared, texels
+        const fv dq = times(of.depth, ray);
+        const fv across = (times(of.u, ray) - u * dq) * inverse * float(of.texture->width());
+        const fv down = (times(of.v, ray) - v * dq) * inverse * float(of.texture->height());
+        return across * across + down * down;
+    };
+    Rays right{fv{} + float(lens_.step[0]), fv{}, fv{}}, below{fv{}, fv{} + float(lens_.step[1]), fv{}};
+    if (!pinhole) {
+        const auto less = [](Rays a, const Rays& b) { return Rays{a.x - b.x, a.y - b.y, a.z - b.z}; };
+        right = less(rays(row + x + 1), here);
+        below = less(rays(row + x + (y + 1 < lens_.height ? lens_.stride : 0)), here);
+        iv columns{};
+        for (int k = 0; k < lanes; ++k) columns[k] = x + k;
+        const iv inner = columns < lens_.width - 1;
+        right = {inner ? right.x : fv{}, inner ? right.y : fv{}, inner ? right.z : fv{}};
+    }
+    const fv one = step(right), other = step(below), most = one < other ? other : one;
+    const fv within = most < 1e30f ? most : fv{} + 1e30f;
+    iv level = (as_whole(128.0f * log_2(within)) - sharper + 128) >> 8;
+    level = (most > 1.0f) & (level > 0) ? level : iv{};
+    level = level < of.sizes - 1 ? level : iv{} + (of.sizes - 1);
+    const fv across = Texture::within(u - floored(u)), down = Texture::within(v - floored(v));
+    for (int k = 0; k < lanes; ++k) {
+        if (!asked[k]) continue;
+        opacity[k] *= of.texture->opacity(scene_.texels.data(), across[k], down[k], level[k]);
+        least[k] = of.thresholds[level[k]];
+    }
+    return asked & (opacity >= least);
+}
+
+Band::Opacity Band::opacity(const Triangle& triangle) const {
+    const Placed& placed = scene_.placed_[triangle.geom];
+    const std::int32_t* corners = placed.mesh->corners.data() + triangle.corner;
+    return opacity(triangle, Corners({placed.seen[corners[0]], placed.seen[corners[1]],
+                                      placed.seen[corners[2]]}));
+}
+
+void Band::shadow_cut(const Triangle& triangle) {
+    const Opacity opacity = this->opacity(triangle);
+    over(triangle, 0, [&](int y, int x, iv inside, fv q) {
+        float* here = images_.depth + std::size_t(y) * lens_.width + x;
+        const fv before = load<fv>(here), depth = 1.0f / q;
+        const iv nearer = inside & (depth < before);
+        if (any(nearer)) store(here, is_opaque(opacity, x, y, nearer, q) ? depth : before);
+    });
+}
+
+void Band::cover_cut(const Triangle& triangle, std::int32_t number) {
+    const bool rolling = view_.poses > 1;
+    Opacity opacity{};
+    if (!rolling) opacity = this->opacity(triangle);
+    int row = -1;  // that it is known for, while all moves
+    over(triangle, number, [&](int y, int x, iv inside, fv q) {
+        float* nearest = nearest_ + at(y) + x;
+        std::int32_t* visible = visible_ + at(y) + x;
+        iv wins = inside & (q > load<fv>(nearest));
+        if (!any(wins)) return;
+        if (rolling && y != row)
+            row = y, opacity = this->opacity(triangle, between_poses(number, y));
+        wins = is_opaque(opacity, x, y, wins, q);
+        store(nearest, wins ? q : load<fv>(nearest));
+        store(visible, wins ? iv{} + number : load<iv>(visible));
+    });
 }
 
 // Whether a pixel on an edge is the triangle's, and not that of the one beyond.
@@ -276,7 +391,7 @@ static bool owns(const Triangle& triangle, Vec3f ray) {
 bool Band::owned(const Triangle& triangle, std::int32_t number, int x, int y) const {
     if (view_.poses == 1) return owns(triangle, lens_.ray(x, y));
     Triangle row = triangle;
-    return seen(row.planes, number, y) && owns(row, lens_.ray(x, y));
+    return seen(row, number, y) && owns(row, lens_.ray(x, y));
 }
 
 // Draw what is see-through over what is behind it, from the back to the front. It has a number, but

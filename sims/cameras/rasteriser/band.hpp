@@ -24,6 +24,15 @@ class Band {
         int share;
     };
 
+    struct Opacity {  // of a triangle: its planes, each times the ray
+        float depth[3], u[3], v[3];
+        float vertices[3];
+        bool by_vertices;  // whether these have one
+        const Texture* texture;   // null if it has none
+        const float* thresholds;  // by its sizes
+        int sizes;
+    };
+
     static constexpr int most_triangles = 64;  // of a pixel that are walked over
     struct Span {  // pixels side by side with one level of a mipmap, in 256ths
         std::int32_t surface;  // number of theirs; -1 for the sky
@@ -41,7 +50,7 @@ class Band {
     std::int32_t surface(std::int32_t number, int y);
     const Moving& moving(std::int32_t number) const;
     Corners between_poses(std::int32_t number, int y) const;
-    bool seen(Planes& planes, std::int32_t number, int y) const;
+    bool seen(Triangle& row, std::int32_t number, int y) const;
     const Triangle* seen_by(std::int32_t number, int y, Triangle& row) const;
     bool owned(const Triangle& triangle, std::int32_t number, int x, int y) const;
     template <typename Found>
@@ -60,6 +69,11 @@ class Band {
     template <typename Found>
     void runs(int y, Found found) const;
     void cover(const Triangle& triangle, std::int32_t number);
+    void cover_cut(const Triangle& triangle, std::int32_t number);
+    void shadow_cut(const Triangle& triangle);
+    Opacity opacity(const Triangle& triangle) const;
+    Opacity opacity(const Triangle& triangle, const Corners& seen) const;
+    iv is_opaque(const Opacity& of, int x, int y, iv asked, fv nearest) const;
     void shade();
     template <bool pinhole>
     void find_levels(int y);

@@ -64,6 +64,12 @@ int raster_mesh(Scene* scene, int vertices, const float* points, const float* no
     return static_cast<int>(scene->meshes.size()) - 1;
 }
 
+// Factors on the colour of each vertex of a mesh: red, green, blue, opacity.
+void raster_colours(Scene* scene, int mesh, const float* colours) {
+    std::vector<float>& to = scene->meshes[mesh]->colours;
+    to.assign(colours, colours + 4 * scene->meshes[mesh]->points.size());
+}
+
 // Rays of a pinhole (x of each column, y of each row, z null) or of each pixel (NaN: none).
 int raster_lens(Scene* scene, int width, int height, const float* x, const float* y,
                 const float* z) {

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <functional>
+#include <map>
 #include <memory>
 #include <vector>
 
@@ -13,6 +14,7 @@ namespace raster {
 struct Mesh {
     std::vector<Vec3f> points, normals;
     std::vector<float> places;          // in a texture, u and v of each vertex
+    std::vector<float> colours;         // factors of each vertex: red, green, blue, opacity; or none
     std::vector<std::int32_t> corners;  // three of each triangle, counterclockwise from outside
     std::vector<std::int32_t> parts;    // of each triangle: number of the surface without a crease
     int part_count = 0;
@@ -134,6 +136,7 @@ struct Triangle {
     int left, right, top, bottom;  // pixels that it may cover: to right - 1 and bottom - 1
     Vec3f ahead;                   // towards the ball about it, and the least cosine of rays to it
     float least;
+    bool behind;                   // whether it is seen from there
 };
 
 struct Moving {  // a triangle that is seen from one pose in its first row, and another in its last
@@ -188,6 +191,8 @@ struct Placed {  // a geom of the frame
     bool is_seen;                  // whether the following are known
     std::vector<Vec3> seen;        // its vertices in the optical frame
     std::vector<Lens::Pixel> pixels;  // and in the image
+    const float* thresholds;       // of opacity, for sizes of its texture; null without a cutoff
+    int sizes;
     int square, column, row, side;  // the smallest of the lens's squares about it, if it has any
 };
 
@@ -220,7 +225,8 @@ class Scene {
   private:
     friend class Band;
 
-    struct Slot {  // light on a geom's vertices, and then that of each light that throws shadows
+    struct Slot {  // light on a geom's vertices, and then that of each light that throws shadows;
+                   // and after it, if it is double-sided, all of this on their other sides
         Geom geom;
         Pose pose;
         int frame;
@@ -231,7 +237,9 @@ class Scene {
 
     void draw_rows(int first, int last, const Geom* geoms, const Pose* poses, int count,
                    const Images& images, bool fresh);
-    void place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) const;
+    void place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed);
+    void cut(Placed& placed);
+    static bool is_solid(const Geom& geom) { return geom.rgba[3] >= 1.0f || geom.cutoff > 0; }
     void see(Placed& placed) const;
     int beyond(const Placed& placed) const;
     static double ball(Vec3 middle, double reach, Vec3f& ahead, float& least);
@@ -240,7 +248,7 @@ class Scene {
     bool bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels, int count,
                  bool turns) const;
     void light(const Geom& geom, const Pose& pose, Slot& slot) const;
-    void light(const Slot& slot, int vertex, Vec3f* to, std::size_t apart) const;
+    void light(const Slot& slot, int vertex, bool behind, Vec3f* to, std::size_t apart) const;
     void spread(int parts, const std::function<void(int)>& work) const;
 
     const Lens* lens_ = nullptr;
@@ -253,6 +261,7 @@ class Scene {
     const Pose* middle_poses_ = nullptr;  // of geoms; their light is that of all rows
     std::vector<Light> lights_;
     std::vector<Light> casters_;  // those that throw shadows
+    std::map<std::pair<std::int32_t, float>, std::vector<float>> thresholds_;  // by texture
     std::vector<Placed> placed_, later_;  // for the first pose, and the next one
     std::vector<Slot> slots_;
     Triangles solid_, clear_;  // of these rows, in parts

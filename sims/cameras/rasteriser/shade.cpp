@@ -20,21 +20,30 @@ void Scene::light(const Geom& geom, const Pose& pose, Slot& slot) const {
                        !std::memcmp(&slot.pose, &pose, sizeof pose);
     slot.geom = geom, slot.pose = pose;
     if (!rests) slot.light.clear();
-    const std::size_t count = meshes[geom.mesh]->points.size();
     if ((!rests && view_.poses == 1) || (!shines && !slot.light.empty())) return;
-    slot.light.resize(count * (1 + casters_.size()));
-    for (std::size_t k = 0; k < count; ++k) light(slot, static_cast<int>(k), &slot.light[k], count);
+    const std::size_t count = meshes[geom.mesh]->points.size();
+    const std::size_t side = count * (1 + casters_.size());
+    slot.light.resize(geom.double_sided ? 2 * side : side);
+    for (std::size_t k = 0; k < count; ++k) {
+        light(slot, static_cast<int>(k), false, &slot.light[k], count);
+        if (geom.double_sided) light(slot, static_cast<int>(k), true, &slot.light[side + k], count);
+    }
 }
 
-// Light on one vertex; after it, so far apart, that of each light that throws shadows.
-void Scene::light(const Slot& slot, int vertex, Vec3f* to, std::size_t apart) const {
+// Light on one vertex, on its front or back; after it, so far apart, that of each light that throws
+// shadows.
+void Scene::light(const Slot& slot, int vertex, bool behind, Vec3f* to, std::size_t apart) const {
     const Mesh& mesh = *meshes[slot.geom.mesh];
     const Pose& pose = slot.pose;
     const Vec3 eye{middle_eye_.position[0], middle_eye_.position[1], middle_eye_.position[2]};
     const Vec3 origin{pose.position[0], pose.position[1], pose.position[2]};
     const Vec3f p = mesh.points[vertex], n = mesh.normals[vertex];
     const Vec3 normal = unit(pose.turn * Vec3{n.x, n.y, n.z});
-    lit(slot.geom, lights_, pose.turn * Vec3{p.x, p.y, p.z} + origin, normal, eye, to, apart);
+    const Vec3 point = pose.turn * Vec3{p.x, p.y, p.z} + origin;
+    Geom coloured = slot.geom;
+    if (!mesh.colours.empty())
+        for (int part = 0; part < 3; ++part) coloured.rgba[part] *= mesh.colours[4 * vertex + part];
+    lit(coloured, lights_, point, behind ? normal * -1.0 : normal, eye, to, apart);
 }
 
 // Number of a triangle's surface: the planes of all that is interpolated on it, computed when its
@@ -86,13 +95,17 @@ std::int32_t Band::surface(std::int32_t number, int y) {
     }
     const Scene::Slot& slot = scene_.slots_[triangle.geom];
     const Vec3f* light = slot.light.data();
+    const bool behind = geom.double_sided && seen.away() > 0;
     std::size_t apart = mesh.points.size();
     std::int32_t of[3] = {corners[0], corners[1], corners[2]};
     if (slot.light.empty()) {
         apart = 3;
         light_.resize(apart * (1 + scene_.casters_.size()));
-        for (int k = 0; k < 3; ++k) scene_.light(slot, corners[k], &light_[k], apart), of[k] = k;
+        for (int k = 0; k < 3; ++k)
+            scene_.light(slot, corners[k], behind, &light_[k], apart), of[k] = k;
         light = light_.data();
+    } else if (behind) {
+        light += slot.light.size() / 2;
     }
     const Vec3f l[3] = {light[of[0]], light[of[1]], light[of[2]]};
     made.flat = !std::memcmp(&l[0], &l[1], sizeof l[0]) &&

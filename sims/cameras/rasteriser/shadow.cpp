@@ -76,9 +76,9 @@ void Scene::shadow(const Lens& lens, float near, const Pose& eye, const Geom* ge
                                          placed.pixels[of[2]]};
             const Vec3 points[3] = {placed.seen[of[0]], placed.seen[of[1]], placed.seen[of[2]]};
             const Corners from(points);
-            if (!(from.away() < 0)) continue;
+            if (!(from.away() < 0 || (from.away() > 0 && geoms[*index].double_sided))) continue;
             Triangle triangle;
-            triangle.geom = *index;
+            triangle.geom = *index, triangle.corner = static_cast<int>(corner);
             if (!bounded(triangle, points, rays, 3, false)) continue;
             triangle.planes = Planes(from);
             band.shadow(triangle);

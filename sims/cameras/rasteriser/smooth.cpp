@@ -74,10 +74,11 @@ void Mesh::find_parts() {
 const Triangle* Band::seen_by(std::int32_t number, int y, Triangle& row) const {
     if (number < 0) return nullptr;
     if (view_.poses == 1) return &triangle(number);
-    if (y >= scene_.first_) return seen((row = triangle(number)).planes, number, y) ? &row : nullptr;
+    if (y >= scene_.first_) return seen(row = triangle(number), number, y) ? &row : nullptr;
     const Moving& moving = scene_.before_moving_[number];
     row = scene_.before_[number];  // it is above these rows
-    row.planes = Planes({moving.from, moving.to, share(y) + scene_.passed_});
+    const Corners corners(moving.from, moving.to, share(y) + scene_.passed_);
+    row.planes = Planes(corners), row.behind = corners.away() > 0;
     return &row;
 }
 
@@ -111,13 +112,16 @@ Band::End Band::end(const Triangle& triangle, Vec3f from, Vec3f to, int y) const
             const std::int32_t number = placed.listed[corner / 3];
             if (number == Placed::faces_away) return found;
             if (number >= 0) {
-                at = (*placed.list)[number].planes;
+                const Triangle& next = (*placed.list)[number];
+                if (next.behind != triangle.behind) return found;
+                at = next.planes;
                 continue;
             }
         }
         const std::int32_t* corners = mesh.corners.data() + corner;
         const Vec3 next[3] = {point(corners[0]), point(corners[1]), point(corners[2])};
-        if (!(dot(cross(next[1] - next[0], next[2] - next[0]), next[0]) < 0)) return found;
+        const double away = dot(cross(next[1] - next[0], next[2] - next[0]), next[0]);
+        if (!(triangle.behind ? away > 0 : away < 0)) return found;
         at = Planes(Corners(next));
     }
     return found;
@@ -140,7 +144,7 @@ void Band::smooth(int x, int y, bool below) {
     // Of the way between the middles that is the nearer one's, and what ends it.
     auto [share, plane] = end(*first, near_ray, far_ray, y);
     if (share > 1) {
-        if (!second) return;
+        if (!second || scene_.placed_[first->geom].thresholds) return;  // it ends by its opacity
         const Planes& farther = second->planes;
         const f4 theirs = farther(far_ray), behind = farther(near_ray);
         const End start = end(*second, far_ray, near_ray, y);

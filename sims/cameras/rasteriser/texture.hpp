@@ -34,7 +34,7 @@ inline iv twice(iv value) { return (value & 65535) | value << 16; }
 // An image, which repeats, or a cube of six square ones.
 class Texture {
   public:
-    const bool is_cube;
+    const bool is_cube, has_opacity;
 
     // How many texels one takes, with all of its sizes.
     static std::int64_t count(std::int64_t width, std::int64_t height, bool cube) {
@@ -47,16 +47,17 @@ class Texture {
         }
     }
 
-    // Adds its texels, red in their lowest bytes, to those of all.
+    // Adds its texels, red in their lowest bytes and opacity in their highest, to those of all.
     Texture(std::vector<std::uint32_t>& all, int width, int height, int channels,
             const std::uint8_t* data, bool cube)
-        : is_cube(cube) {
+        : is_cube(cube), has_opacity(channels == 4) {
         std::vector<std::uint32_t> texels(std::size_t(width) * height);
         for (std::size_t k = 0; k < texels.size(); ++k) {
             const std::uint8_t* from = data + k * channels;
             const std::uint8_t red = from[0], green = channels > 2 ? from[1] : red;
             const std::uint8_t blue = channels > 2 ? from[2] : red;
-            texels[k] = red | green << 8 | blue << 16;
+            const std::uint32_t opacity = has_opacity ? from[3] : 0;
+            texels[k] = red | green << 8 | blue << 16 | opacity << 24;
         }
         const int sides = cube ? 6 : 1;
         for (height /= sides;;) {
@@ -92,7 +93,59 @@ class Texture {
         place(taps, at, within(s * share + 0.5f), within(t * share + 0.5f), face, detail);
     }
 
+    static fv within(fv at) { return (at >= 0) & (at <= 1) ? at : fv{}; }  // also if it is none
+
+    // What opacity, from 0 to 1, is compared with in each size, so that the share of texels that pass
+    // is that of the finest size, where `least` is its first (I. Castano, "Computing Alpha Mipmaps",
+    // 2010): means of leaves and gaps alone would vanish in the distance, or close. Sizes end where
+    // no number gives that share; what is farther is read from the last of them.
+    void keep_coverage(const std::vector<std::uint32_t>& all, std::vector<float>& least) const {
+        double share = 0;  // that passes
+        for (const Level& level : levels_) {
+            if (std::min(level.width, level.height) < fewest && share > 0) return;
+            std::int64_t passing[257]{}, count = std::int64_t(level.width) * level.height;
+            for (int y = 1; y <= level.height; ++y)
+                for (int x = 1; x <= level.width; ++x)
+                    ++passing[all[level.start + std::size_t(y) * level.stride() + x] >> 24];
+            for (int from = 255; from-- > 0;) passing[from] += passing[from + 1];
+            int best = 0;
+            if (&level == &levels_[0]) {
+                while (best < 256 && !(static_cast<float>(best) / 255.0f >= least[0])) ++best;
+                share = double(passing[best]) / double(count);
+                continue;
+            }
+            const auto off = [&](int from) {
+                return std::abs(double(passing[from]) / double(count) - share);
+            };
+            for (int from = 1; from <= 256; ++from)
+                if (off(from) < off(best)) best = from;
+            if (off(best) > 0.1 * std::min(share, 1 - share)) return;
+            int last = best;  // with the same share: what is halfway between keeps outlines in place
+            while (last < 256 && passing[last + 1] == passing[best]) ++last;
+            least.push_back(0.5f * static_cast<float>(best - 1 + last) / 255.0f);
+        }
+    }
+
+    // From 0 to 1, at a place from 0 to 1 in one of its sizes.
+    float opacity(const std::uint32_t* all, float u, float v, int size) const {
+        const Level& level = levels_[size];
+        const float across = u * static_cast<float>(level.width) + 0.5f;
+        const float down = v * static_cast<float>(level.height) + 0.5f;
+        const int column = std::min(static_cast<int>(across), level.width);
+        const int row = std::min(static_cast<int>(down), level.height);
+        const std::uint32_t* at = all + level.start + std::size_t(row) * level.stride() + column;
+        const auto between = [share = across - static_cast<float>(column)](const std::uint32_t* two) {
+            const auto left = static_cast<float>(two[0] >> 24);
+            return left + (static_cast<float>(two[1] >> 24) - left) * share;
+        };
+        const float above = between(at), below = between(at + level.stride());
+        return (above + (below - above) * (down - static_cast<float>(row))) / 255.0f;
+    }
+
   private:
+    // Sizes for opacity end where a texel is a large share of it.
+    static constexpr int fewest = 8;  // texels along a side
+
     // One of its sizes: six sides, if it is a cube, one below the other, and about each a border of
     // one texel, so that the four texels about a place are two pairs of neighbours.
     struct Level {
@@ -100,8 +153,6 @@ class Texture {
         std::int32_t start;  // among all texels
         int stride() const { return width + 2; }
     };
-
-    static fv within(fv at) { return (at >= 0) & (at <= 1) ? at : fv{}; }  // also if it is none
 
     void place(Taps& taps, int x, fv u, fv v, iv face, int detail) const {
         const int part = detail & 255, first = detail >> 8;
@@ -164,17 +215,17 @@ class Texture {
                     const std::uint32_t* above = &from[std::size_t(2 * y) * width + 2 * x];
                     const std::uint32_t texels[4] = {above[0], above[1], above[width],
                                                      above[width + 1]};
-                    std::uint32_t red_blue = 0x20002, green = 0x200;
+                    std::uint32_t red_blue = 0x20002, green_opacity = 0x20002;
                     for (const std::uint32_t texel : texels)
-                        red_blue += texel & 0xff00ff, green += texel & 0xff00;
-                    to.push_back((red_blue >> 2 & 0xff00ff) | (green >> 2 & 0xff00));
+                        red_blue += texel & 0xff00ff, green_opacity += texel >> 8 & 0xff00ff;
+                    to.push_back((red_blue >> 2 & 0xff00ff) | (green_opacity << 6 & 0xff00ff00));
                 }
             return to;
         }
         // Of an odd size, texels that two cover count for each by their share: all stays in place.
         for (int y = 0; y < down; ++y)
             for (int x = 0; x < across; ++x) {
-                std::uint64_t sums[3] = {0, 0, 0};
+                std::uint64_t sums[4] = {0, 0, 0, 0};
                 using Wide = std::int64_t;
                 const auto shares = [](Wide at, Wide size, Wide smaller, auto found) {
                     const Wide begin = at * size, end = begin + size;
@@ -184,13 +235,14 @@ class Texture {
                 shares(y, height, down, [&](Wide row, Wide rows) {
                     shares(x, width, across, [&](Wide column, Wide columns) {
                         const std::uint32_t texel = from[row * width + column];
-                        for (int k = 0; k < 3; ++k)
+                        for (int k = 0; k < 4; ++k)
                             sums[k] += std::uint64_t(rows * columns) * (texel >> 8 * k & 255);
                     });
                 });
                 const std::uint64_t count = std::uint64_t(width) * height;
                 for (std::uint64_t& sum : sums) sum = (sum + count / 2) / count;
-                to.push_back(static_cast<std::uint32_t>(sums[0] | sums[1] << 8 | sums[2] << 16));
+                to.push_back(static_cast<std::uint32_t>(sums[0] | sums[1] << 8 | sums[2] << 16 |
+                                                        sums[3] << 24));
             }
         return to;
     }

@@ -168,6 +168,8 @@ struct Geom {
     float emission, specular, shininess;
     float repeat[2], offset;  // of the places in the texture
     float cube[3];            // times a point of the mesh: its direction in a cube of textures
+    std::int32_t double_sided;  // whether its triangles are seen from behind too
+    float cutoff;               // where its opacity is below it, nothing is drawn; 0 if all is
 };
 
 struct Pose {

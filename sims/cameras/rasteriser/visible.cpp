@@ -27,6 +27,7 @@ void Scene::draw(const Lens& lens, const View& view, const Pose* eyes, const Geo
     view_ = view;
     for (float& part : view_.fog) part = part > 0 ? std::min(part, 1.0f) : 0.0f;
     ++frame_;
+    if (thresholds_.size() > 1000) thresholds_.clear();  // as colours change
     if (lights_.size() != std::size_t(light_count) ||
         (light_count && std::memcmp(lights_.data(), lights, sizeof(Light) * light_count))) {
         slots_.clear();
@@ -69,6 +70,7 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
         if (!(geoms[index].rgba[3] > 0.0f)) continue;
         if (fresh) place(geoms[index], poses[index], eye_, placed);
         placed.parts = parts, parts += placed.mesh->part_count;
+        if (geoms[index].double_sided) parts += placed.mesh->part_count;
         if (rolling) place(geoms[index], poses[count + index], next_eye_, later_[index]);
         if (lens_->pinhole) {
             if (beyond(placed) & (rolling ? beyond(later_[index]) : ~0)) continue;
@@ -97,10 +99,10 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
             see(placed_[index]);
             if (rolling) see(later_[index]);
             if (images.rgb) light(geoms[index], middle_poses_[index], slots_[index]);
-            if (geoms[index].rgba[3] >= 1.0f) add(index, solid_[part], solid_moving_[part]);
+            if (is_solid(geoms[index])) add(index, solid_[part], solid_moving_[part]);
         }
         for (std::size_t k = end; k-- > begin;)  // from back to front
-            if (geoms[order[k].second].rgba[3] < 1.0f)
+            if (!is_solid(geoms[order[k].second]))
                 add(order[k].second, clear_[part], clear_moving_[part]);
     });
     const int rows = last - first, bands = std::min(pieces, rows);
@@ -123,10 +125,11 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
     each([](Band& band) { band.finish(); });
 }
 
-void Scene::place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) const {
+void Scene::place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& placed) {
     placed.geom = &geom;
     placed.is_seen = false;
     placed.mesh = meshes[geom.mesh].get();
+    cut(placed);
     placed.shift = eye.turn.back({pose.position[0] - eye.position[0],
                                   pose.position[1] - eye.position[1],
                                   pose.position[2] - eye.position[2]});
@@ -137,6 +140,23 @@ void Scene::place(const Geom& geom, const Pose& pose, const Pose& eye, Placed& p
         placed.turn.m[3 + column] = axis.y;
         placed.turn.m[6 + column] = axis.z;
     }
+}
+
+// Find what opacity is compared with in each size of a geom's texture, if the geom has a cutoff.
+void Scene::cut(Placed& placed) {
+    placed.thresholds = nullptr;
+    const Geom& geom = *placed.geom;
+    if (!(geom.cutoff > 0)) return;
+    const float least = geom.cutoff / geom.rgba[3];
+    const auto [entry, is_new] = thresholds_.try_emplace({geom.texture, least});
+    std::vector<float>& known = entry->second;
+    if (is_new) {
+        const Texture* texture = geom.texture < 0 ? nullptr : textures[geom.texture].get();
+        known.assign(1, least);
+        if (texture && texture->has_opacity && !texture->is_cube)
+            texture->keep_coverage(texels, known);
+    }
+    placed.thresholds = known.data(), placed.sizes = static_cast<int>(known.size());
 }
 
 void Scene::see(Placed& placed) const {
@@ -210,7 +230,7 @@ bool Scene::in_squares(Placed& placed, const Placed& later) const {
 // Add a geom's triangles to the frame, unless they are out of view or seen from behind.
 void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) {
     Placed& placed = placed_[index];
-    const bool rolling = view_.poses > 1;
+    const bool rolling = view_.poses > 1, double_sided = placed.geom->double_sided;
     const std::vector<std::int32_t>& corners = placed.mesh->corners;
     double same = 0;  // 1 and twice the cosine of the turn until the next pose
     if (rolling)
@@ -247,7 +267,9 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         triangle.part = placed.parts + placed.mesh->parts[corner / 3];
         if (!rolling) {
             const double away = dot(cross(now[1] - now[0], now[2] - now[0]), now[0]);
-            if (!(away < 0)) continue;
+            triangle.behind = double_sided && away > 0;
+            if (!(away < 0) && !triangle.behind) continue;
+            if (triangle.behind) triangle.part += placed.mesh->part_count;
             std::int32_t& listed = placed.listed[corner / 3];
             listed = Placed::out_of_view;
             if (!bounded(triangle, points, pixels, 3, false)) continue;
@@ -259,8 +281,8 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
         put(later_[index], 3);
         if (!bounded(triangle, points, pixels, 6, turns)) continue;
         const Corners from(now), next(*reinterpret_cast<Vec3(*)[3]>(points + 3));
-        if (from.away() >= 0 && next.away() >= 0) continue;
-        triangle.planes = Planes(from);
+        if (from.away() >= 0 && next.away() >= 0 && !double_sided) continue;
+        triangle.planes = Planes(from), triangle.behind = from.away() > 0;
         to.push_back(triangle);
         moving.push_back({from, next});
     }
