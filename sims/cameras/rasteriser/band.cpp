@@ -10,11 +10,22 @@ namespace raster {
 constexpr int parts_from = 24;  // bit of a triangle's number; those before count within its part
 constexpr std::int32_t clear_part = 1 << 30;
 
-Band::Band(Scene& scene, int first, int last, const Images& images, std::vector<Tile>* tiles)
+Band::Band(Scene& scene, int first, int last, const Images& images, Memory& memory)
     : scene_(scene), lens_(*scene.lens_), view_(scene.view_), first_(first), last_(last),
       images_(images), end_(images.rgb ? row(last) : nullptr), nearest_(scene.nearest_.data()),
-      visible_(scene.visible_.data()), tiles_(tiles), taps_(lens_.stride, scene.texels.data()),
-      farthest_(lens_.pinhole ? 0 : leaf(0, last + Lens::smallest)) {}
+      visible_(scene.visible_.data()), tiles_(memory.tiles), taps_(lens_.stride, scene.texels.data()),
+      farthest_(lens_.pinhole ? 0 : leaf(0, last + Lens::smallest)), surfaces_(memory.surfaces),
+      shades_(memory.shades), surface_of_(memory.surface_of) {
+    surfaces_.clear(), shades_.clear();
+    surface_of_.resize(scene.solid_.size() + scene.clear_.size());
+    for (auto& known : surface_of_) known.clear();
+}
+
+void Band::clear() {
+    std::fill(nearest_ + at(first_), nearest_ + at(last_), 0.0f);
+    std::fill(visible_ + at(first_), visible_ + at(last_), -1);
+    covered_.assign(scene_.solid_.size(), 0);
+}
 
 const Triangle& Band::triangle(std::int32_t number) const {
     const auto& parts = number & clear_part ? scene_.clear_ : scene_.solid_;
@@ -39,8 +50,7 @@ bool Band::seen(Triangle& row, std::int32_t number, int y) const {
 }
 
 std::int32_t& Band::surface_of(std::int32_t number) {
-    const std::size_t solid = scene_.solid_.size(), clear = scene_.clear_.size();
-    if (surface_of_.empty()) surface_of_.resize(solid + clear);
+    const std::size_t solid = scene_.solid_.size();
     const bool is_clear = number & clear_part;
     const std::size_t part = (number & ~clear_part) >> parts_from;
     std::vector<std::int32_t>& known = surface_of_[part + (is_clear ? solid : 0)];
@@ -48,15 +58,43 @@ std::int32_t& Band::surface_of(std::int32_t number) {
     return known[number & ((1 << parts_from) - 1)];
 }
 
-void Band::draw() {
-    std::fill(nearest_ + at(first_), nearest_ + at(last_), 0.0f);
-    std::fill(visible_ + at(first_), visible_ + at(last_), -1);
-    std::int32_t part = 0;
-    for (const std::vector<Triangle>& triangles : scene_.solid_) {
-        std::int32_t number = part++ << parts_from;
-        for (const Triangle& triangle : triangles) cover(triangle, number++);
+void Band::cover() {
+    for (std::size_t part = 0; part < covered_.size(); ++part)
+        for (std::size_t& next = covered_[part]; next < scene_.solid_[part].size(); ++next) {
+            if (next + 8 < scene_.solid_[part].size()) prefetch(scene_.solid_[part][next + 8]);
+            cover(scene_.solid_[part][next], static_cast<std::int32_t>(part << parts_from | next));
+        }
+}
+
+// Have the first pixels of a triangle on their way from memory.
+void Band::prefetch(const Triangle& triangle) const {
+    const int first = std::max(triangle.top, first_);
+    const int last = std::min({triangle.bottom, last_, first + 4});
+    for (int y = first; y < last; ++y) {
+        __builtin_prefetch(nearest_ + at(y) + triangle.left, 1);
+        __builtin_prefetch(visible_ + at(y) + triangle.left, 1);
     }
-    if (images_.rgb) shade();
+}
+
+void Band::hide() {
+    iv lane{};
+    for (int k = 0; k < lanes; ++k) lane[k] = k;
+    for (int top = first_, end; top < last_; top = end) {
+        end = std::min((top / Lens::smallest + 1) * Lens::smallest, last_);
+        for (int left = 0; left < lens_.width; left += Lens::smallest) {
+            fv least = fv{} + 1e30f;
+            for (int x = left; x < left + Lens::smallest; x += lanes) {
+                const iv in_image = lane < lens_.width - x;
+                for (int y = top; y < end; ++y) {
+                    const fv here = load<fv>(nearest_ + at(y) + x);
+                    least = in_image & (here < least) ? here : least;
+                }
+            }
+            float all = least[0];
+            for (int k = 1; k < lanes; ++k) all = std::min(all, least[k]);
+            scene_.hiding_[scene_.tile(left, top)] = all;
+        }
+    }
 }
 
 void Band::finish() {

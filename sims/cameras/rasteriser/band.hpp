@@ -7,10 +7,13 @@ namespace raster {
 
 class Band {
   public:
-    Band(Scene& scene, int first, int last, const Images& images, std::vector<Tile>* tiles);
-    void draw();           // all but what needs the rows of other bands
+    Band(Scene& scene, int first, int last, const Images& images, Memory& memory);
+    void clear();          // begin a frame
+    void cover();          // what is new of the scene's solid triangles
+    void hide();           // find the farthest in squares of pixels
     void shadow(const Triangle& triangle);  // the depth of one triangle alone, into a square image
-    void find_outlines();  // when all bands are drawn
+    void shade();          // all but what needs the rows of other bands
+    void find_outlines();  // when all bands are shaded
     void finish();         // when all have found theirs
 
   private:
@@ -38,6 +41,10 @@ class Band {
         std::int32_t surface;  // number of theirs; -1 for the sky
         int x, count, level;
         float nearest;  // inverse depth in the middle
+    };
+    struct Run {  // pixels of a row that see one triangle, or none (-1): left to right - 1
+        int left, right;
+        std::int32_t number;
     };
     static constexpr int most_side_by_side = 16;
 
@@ -74,7 +81,8 @@ class Band {
     Opacity opacity(const Triangle& triangle) const;
     Opacity opacity(const Triangle& triangle, const Corners& seen) const;
     iv is_opaque(const Opacity& of, int x, int y, iv asked, fv nearest) const;
-    void shade();
+    void prefetch(int run) const;
+    void prefetch(const Triangle& triangle) const;
     template <bool pinhole>
     void find_levels(int y);
     template <bool pinhole>
@@ -106,7 +114,7 @@ class Band {
         return images_.rgb + std::size_t(y - view_.first) * lens_.width * 3;
     }
 
-    const Scene& scene_;
+    Scene& scene_;
     const Lens& lens_;
     const View& view_;
     const int first_, last_;  // rows: first to last - 1
@@ -114,17 +122,19 @@ class Band {
     std::uint8_t* const end_;  // of its rows of colours
     float* const nearest_;     // of the frame
     std::int32_t* const visible_;
-    std::vector<Tile>* const tiles_;  // that are known
+    std::vector<Tile>& tiles_;  // that are known
     Taps taps_;
     std::vector<Outline> outlines_;
     std::size_t first_row_ = 0;  // how many are within its first row
-    std::vector<Span> spans_;  // of a row
+    std::vector<std::size_t> covered_;  // how many triangles of each of the scene's parts
+    std::vector<Run> runs_;  // of a row
+    std::vector<Span> spans_;
     std::vector<float> farthest_;  // least inverse depth in each of the lens's smallest squares
-    std::vector<Surface> surfaces_;
-    std::vector<Shade> shades_;
+    std::vector<Surface>& surfaces_;
+    std::vector<Shade>& shades_;
     std::vector<Vec3f> light_;  // of a triangle's corners, by light and corner
     std::vector<Area> areas_;  // of the lights, for a span
-    std::vector<std::vector<std::int32_t>> surface_of_;  // by part and triangle; -1: none yet
+    std::vector<std::vector<std::int32_t>>& surface_of_;  // by part and triangle; -1: none yet
 };
 
 // Call found(left, right, number) for pixels side by side that see one triangle, or none (-1).

@@ -15,6 +15,11 @@ Lens::Lens(int width, int height, const float* x, const float* y, const float* z
         this->y.assign(y, y + height);
         step[0] = width > 1 ? (double(x[width - 1]) - x[0]) / (width - 1) : 1.0;
         step[1] = height > 1 ? (double(y[height - 1]) - y[0]) / (height - 1) : 1.0;
+        double most = 1;
+        for (const float ray : {x[0], x[width - 1], y[0], y[height - 1]})
+            most = std::max(most, std::abs(double(ray)));
+        is_precise = std::min(step[0], step[1]) > 5e-4 * most;  // of which float32 is off by 1e-6
+        for (int k = 0; k < 2; ++k) per_step[k] = inverse(step[k]);
         return;
     }
     for (auto [to, from] : {std::pair{&this->x, x}, std::pair{&this->y, y}, std::pair{&this->z, z}}) {

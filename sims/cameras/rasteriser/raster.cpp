@@ -52,14 +52,9 @@ int raster_mesh(Scene* scene, int vertices, const float* points, const float* no
     std::memcpy(mesh->normals.data(), normals, sizeof(Vec3f) * vertices);
     mesh->places.assign(places, places + 2 * vertices);
     mesh->corners.assign(corners, corners + 3 * triangles);
-    Vec3f low{1e30f, 1e30f, 1e30f}, high{-1e30f, -1e30f, -1e30f};
-    for (const Vec3f& p : mesh->points) {
-        low = {std::min(low.x, p.x), std::min(low.y, p.y), std::min(low.z, p.z)};
-        high = {std::max(high.x, p.x), std::max(high.y, p.y), std::max(high.z, p.z)};
-    }
-    mesh->middle = (low + high) * 0.5f;
-    mesh->reach = (high - low) * 0.5f;
+    mesh->bounds = Bounds::about(vertices, [&](int k) { return mesh->points[k]; });
     mesh->find_parts();
+    mesh->find_clusters();
     scene->meshes.push_back(std::move(mesh));
     return static_cast<int>(scene->meshes.size()) - 1;
 }

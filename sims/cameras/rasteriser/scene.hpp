@@ -1,6 +1,7 @@
 // What is drawn, and how far the drawing of a frame has come.
 #pragma once
 
+#include <algorithm>
 #include <functional>
 #include <map>
 #include <memory>
@@ -10,6 +11,29 @@
 #include "types.hpp"
 
 namespace raster {
+
+struct Bounds {
+    Vec3f middle, reach;
+
+    template <typename Point>
+    static Bounds about(int count, Point point) {
+        Vec3f low{1e30f, 1e30f, 1e30f}, high{-1e30f, -1e30f, -1e30f};
+        for (int k = 0; k < count; ++k) {
+            const Vec3f p = point(k);
+            low = {std::min(low.x, p.x), std::min(low.y, p.y), std::min(low.z, p.z)};
+            high = {std::max(high.x, p.x), std::max(high.y, p.y), std::max(high.z, p.z)};
+        }
+        return {(low + high) * 0.5f, (high - low) * 0.5f};
+    }
+};
+
+// Neighbouring triangles of a mesh, which are left out together where none is seen.
+struct Cluster {
+    static constexpr int most = 64;
+    Bounds bounds;
+    Vec3f axis;  // of a cone about their normals,
+    float sine;  // of its half angle; more than 1 if they face all ways
+};
 
 struct Mesh {
     std::vector<Vec3f> points, normals;
@@ -21,8 +45,11 @@ struct Mesh {
     std::vector<std::int32_t> beyond;   // of each edge: first corner of the triangle on the other
                                         // side that belongs to the same part, or -1
 
+    Bounds bounds;
+    std::vector<Cluster> clusters;      // of so many triangles each; none of a small mesh
+
     void find_parts();
-    Vec3f middle, reach;                // of the box about it
+    void find_clusters();
 };
 
 // Rays of all pixels: of a pinhole x by column and y by row, else all by pixel.
@@ -30,6 +57,8 @@ struct Lens {
     const bool pinhole;
     const int width, height, stride;
     double step[2]{};  // of a pinhole: a pixel's width and height at z = 1
+    double per_step[2]{};
+    bool is_precise = false;  // whether it is certain to 1/400 pixel on which side of an edge a ray is
     std::vector<float> x, y, z;
 
     // Squares of pixels, and of each the four smaller ones in it, with boxes about their rays.
@@ -203,6 +232,14 @@ struct Images {
     std::int32_t* numbers;
 };
 
+// What a band finds out, for the next frame; and what it fills anew in each, which stays allocated.
+struct Memory {
+    std::vector<Surface> surfaces;
+    std::vector<Shade> shades;
+    std::vector<std::vector<std::int32_t>> surface_of;
+    std::vector<Tile> tiles;  // known of lights' maps
+};
+
 class Scene {
   public:
     std::vector<std::unique_ptr<Mesh>> meshes;
@@ -241,12 +278,19 @@ class Scene {
     void cut(Placed& placed);
     static bool is_solid(const Geom& geom) { return geom.rgba[3] >= 1.0f || geom.cutoff > 0; }
     void see(Placed& placed) const;
-    int beyond(const Placed& placed) const;
+    int beyond(const Placed& placed, const Bounds& bounds) const;
+    bool hidden(const Placed& placed, const Bounds& bounds) const;
+    std::int32_t unseen(const Placed& placed, const Cluster& cluster) const;
+    std::size_t tile(int x, int y) const {  // number of the square about a pixel of these rows
+        return std::size_t(y / Lens::smallest - first_ / Lens::smallest) *
+                   (lens_->stride / Lens::smallest) + x / Lens::smallest;
+    }
     static double ball(Vec3 middle, double reach, Vec3f& ahead, float& least);
     bool in_squares(Placed& placed, const Placed& later) const;
     void add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving);
     bool bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* pixels, int count,
                  bool turns) const;
+    bool tightly_bounded(Triangle& triangle, const Lens::Pixel* pixels) const;
     void light(const Geom& geom, const Pose& pose, Slot& slot) const;
     void light(const Slot& slot, int vertex, bool behind, Vec3f* to, std::size_t apart) const;
     void spread(int parts, const std::function<void(int)>& work) const;
@@ -266,9 +310,11 @@ class Scene {
     std::vector<Slot> slots_;
     Triangles solid_, clear_;  // of these rows, in parts
     Movings solid_moving_, clear_moving_;
-    std::vector<std::vector<Tile>> tiles_;  // those known of lights' maps, by band
     std::vector<Triangle> before_;  // solid ones of the rows before these, while all moves
     std::vector<Moving> before_moving_;
+    std::vector<Memory> memory_;  // of each band
+    bool hides_ = false;         // whether what is drawn so far may hide something
+    std::vector<float> hiding_;  // least inverse depth in each square of pixels, of a pinhole
     std::vector<float> nearest_;         // inverse depth of the nearest surface; 0 for nothing
     std::vector<std::int32_t> visible_;  // its triangle
 };

@@ -238,8 +238,8 @@ int Band::tile(std::int32_t caster, const Shade& shade, int column, int row, boo
     const Light& light = scene_.casters_[caster];
     const std::int32_t place = row * tiles_across(light.size) + column;
     const std::uint32_t change = light.changes[place];
-    if (tiles_->empty()) tiles_->resize(known);
-    Tile& tile = (*tiles_)[(shade.spread + 64 * row + column) & (known - 1)];
+    if (tiles_.empty()) tiles_.resize(known);
+    Tile& tile = tiles_[(shade.spread + 64 * row + column) & (known - 1)];
     if (tile.place == place && tile.caster == caster && tile.change == change &&
         !std::memcmp(tile.depth, shade.depth, sizeof shade.depth))
         return tile.state;
@@ -423,6 +423,28 @@ void Band::write(std::uint8_t* to, Colours colours, int count) const {
     }
 }
 
+// Have what the surfaces of the next runs of a row are made of on its way from memory, in three
+// steps: where small triangles are many, to wait for it takes longest.
+void Band::prefetch(int run) const {
+    const auto of = [&](int ahead) {
+        const std::size_t at = run + ahead;
+        return at < runs_.size() && runs_[at].number >= 0 ? &triangle(runs_[at].number) : nullptr;
+    };
+    if (const Triangle* triangle = of(24)) __builtin_prefetch(&triangle->geom);
+    if (const Triangle* triangle = of(16))
+        __builtin_prefetch(&scene_.placed_[triangle->geom].mesh->corners[triangle->corner]);
+    if (const Triangle* triangle = of(8)) {
+        const Placed& placed = scene_.placed_[triangle->geom];
+        const std::vector<Vec3f>& light = scene_.slots_[triangle->geom].light;
+        for (int k = 0; k < 3; ++k) {
+            const std::int32_t corner = placed.mesh->corners[triangle->corner + k];
+            __builtin_prefetch(&placed.seen[corner]);
+            __builtin_prefetch(&placed.mesh->places[2 * corner]);
+            if (!light.empty()) __builtin_prefetch(&light[corner]);
+        }
+    }
+}
+
 void Band::shade() {
     std::vector<std::int32_t> rows[2];  // parts that pixels of a row, and of that above, see
     for (auto& row : rows) row.resize(lens_.stride + widest);
@@ -432,7 +454,11 @@ void Band::shade() {
         std::int32_t* parts = rows[y & 1].data();
         spans_.clear(), ends.clear();
         if (view_.poses > 1) surfaces_.clear(), shades_.clear();
-        runs(y, [&](int left, int right, std::int32_t number) {
+        runs_.clear();
+        runs(y, [&](int left, int right, std::int32_t number) { runs_.push_back({left, right, number}); });
+        for (int k = 0; k < static_cast<int>(runs_.size()); ++k) {
+            prefetch(k);
+            auto [left, right, number] = runs_[k];
             const std::int32_t seen = number < 0 ? -1 : surface(number, y);
             const std::int32_t part = seen < 0 ? -1 : surfaces_[seen].part;
             if (left && part != parts[left - 1]) ends.push_back(left - 1);
@@ -445,7 +471,7 @@ void Band::shade() {
                 count = seen < 0 ? right - left : std::min(right - left, most_side_by_side);
                 spans_.push_back({seen, left, count, 0, nearest_[at(y) + left + count / 2]});
             }
-        });
+        }
         if (lens_.pinhole) place<true>(y);
         else place<false>(y);
         for (int x = 0; x < lens_.width; x += lanes)

@@ -53,13 +53,14 @@ void Scene::shadow(const Lens& lens, float near, const Pose& eye, const Geom* ge
     view_.near = near;
     first_ = 0, last_ = size;
     if (placed_.size() < std::size_t(count)) placed_.resize(count);
-    Band band(*this, 0, size, {nullptr, map, nullptr}, nullptr);
+    Memory none;
+    Band band(*this, 0, size, {nullptr, map, nullptr}, none);
     const double per_step[2] = {1.0 / lens.step[0], 1.0 / lens.step[1]};
     std::vector<Lens::Pixel> at;
     for (const std::int32_t* index = moving; index < moving + moving_count; ++index) {
         Placed& placed = placed_[*index];
         place(geoms[*index], poses[*index], eye, placed);
-        if (beyond(placed)) continue;
+        if (beyond(placed, placed.mesh->bounds)) continue;
         see(placed);
         at.clear();
         for (std::size_t k = 0; k < placed.seen.size(); ++k) {

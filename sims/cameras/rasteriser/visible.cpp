@@ -8,6 +8,38 @@
 
 namespace raster {
 
+constexpr std::size_t smallest_batch = 8000;  // triangles
+
+void Mesh::find_clusters() {
+    const int count = static_cast<int>(corners.size()) / 3;
+    for (int first = 0; count > 2 * Cluster::most && first < count; first += Cluster::most) {
+        const int last = std::min(first + Cluster::most, count);
+        const auto point = [&](int k) { return points[corners[k]]; };
+        const auto widened = [&](int k) { const Vec3f p = point(k); return Vec3{p.x, p.y, p.z}; };
+        Cluster cluster{Bounds::about(3 * (last - first), [&](int k) { return point(3 * first + k); }),
+                        {}, 2};
+        std::vector<Vec3> normals;
+        Vec3 sum{};
+        bool known = true;
+        for (int k = 3 * first; k < 3 * last; k += 3) {
+            const Vec3 normal = cross(widened(k + 1) - widened(k), widened(k + 2) - widened(k));
+            const double length = root(dot(normal, normal));
+            known &= length > 0;
+            normals.push_back(normal * inverse(length));
+            sum = sum + normals.back();
+        }
+        const double length = root(dot(sum, sum));
+        double least = known ? 1 : -1;  // cosine
+        const Vec3 axis = sum * inverse(length);
+        for (const Vec3& normal : normals) least = std::min(least, dot(normal, axis));
+        if (least > 0) {
+            cluster.axis = narrow(axis);
+            cluster.sine = static_cast<float>(root(std::max(1 - least * least, 0.0)));
+        }
+        clusters.push_back(cluster);
+    }
+}
+
 // Do parts of some work, in as many threads as there may be.
 void Scene::spread(int parts, const std::function<void(int)>& work) const {
     std::atomic<int> next{0};
@@ -63,7 +95,7 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
                       const Images& images, bool fresh) {
     first_ = first, last_ = last;
     const bool rolling = view_.poses > 1;
-    std::vector<std::pair<double, int>> order;
+    std::vector<std::pair<double, int>> order, clear;
     std::int32_t parts = 0;
     for (int index = 0; index < count; ++index) {
         Placed& placed = placed_[index];
@@ -73,41 +105,37 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
         if (geoms[index].double_sided) parts += placed.mesh->part_count;
         if (rolling) place(geoms[index], poses[count + index], next_eye_, later_[index]);
         if (lens_->pinhole) {
-            if (beyond(placed) & (rolling ? beyond(later_[index]) : ~0)) continue;
+            const Bounds& bounds = placed.mesh->bounds;
+            if (beyond(placed, bounds) & (rolling ? beyond(later_[index], bounds) : ~0)) continue;
         } else if (!in_squares(placed, rolling ? later_[index] : placed)) {
             continue;
         }
         const double distance = dot(placed.shift, placed.shift);
-        if (distance == distance) order.emplace_back(distance, index);  // else it is nowhere
+        if (distance == distance)  // else it is nowhere
+            (is_solid(geoms[index]) ? order : clear).emplace_back(distance, index);
     }
     std::sort(order.begin(), order.end());  // front to back: of equal depths the first counts
+    std::sort(clear.begin(), clear.end());
     // So many that no thread waits long for another, and that triangles' numbers have room for.
     const int pieces = view_.threads == 1 || rolling ? 1 : std::min(view_.threads * 4, 60);
     if (rolling && !solid_.empty()) {
         std::swap(before_, solid_[0]), std::swap(before_moving_, solid_moving_[0]);
         if (first == view_.first) before_.clear();
     }
-    solid_.resize(pieces), clear_.resize(pieces);
-    solid_moving_.resize(pieces), clear_moving_.resize(pieces);
-    spread(pieces, [&](int part) {
-        solid_[part].clear(), clear_[part].clear();
-        solid_moving_[part].clear(), clear_moving_[part].clear();
-        const std::size_t begin = order.size() * part / pieces;
-        const std::size_t end = order.size() * (part + 1) / pieces;
-        for (std::size_t k = begin; k < end; ++k) {
-            const int index = order[k].second;
-            see(placed_[index]);
-            if (rolling) see(later_[index]);
-            if (images.rgb) light(geoms[index], middle_poses_[index], slots_[index]);
-            if (is_solid(geoms[index])) add(index, solid_[part], solid_moving_[part]);
-        }
-        for (std::size_t k = end; k-- > begin;)  // from back to front
-            if (!is_solid(geoms[order[k].second]))
-                add(order[k].second, clear_[part], clear_moving_[part]);
-    });
+    for (Triangles* of : {&solid_, &clear_}) {
+        of->resize(pieces);
+        for (auto& part : *of) part.clear();
+    }
+    for (Movings* of : {&solid_moving_, &clear_moving_}) {
+        of->resize(pieces);
+        for (auto& part : *of) part.clear();
+    }
     const int rows = last - first, bands = std::min(pieces, rows);
     std::vector<std::unique_ptr<Band>> drawn(bands);
-    if (tiles_.size() < std::size_t(bands)) tiles_.resize(bands);
+    memory_.resize(std::max<std::size_t>(memory_.size(), bands));
+    const auto each = [&](auto step) {
+        spread(bands, [&](int band) { if (drawn[band]) step(*drawn[band]); });
+    };
     spread(bands, [&](int band) {
         const auto edge = [&](int number) {  // between the smallest squares of a lens
             if (number == 0 || number == bands) return number ? last : first;
@@ -115,12 +143,53 @@ void Scene::draw_rows(int first, int last, const Geom* geoms, const Pose* poses,
         };
         if (edge(band) >= edge(band + 1)) return;
         drawn[band] = std::make_unique<Band>(*this, edge(band), edge(band + 1), images,
-                                             &tiles_[band]);
-        drawn[band]->draw();
+                                             memory_[band]);
+        drawn[band]->clear();
     });
-    const auto each = [&](auto step) {
-        spread(bands, [&](int band) { if (drawn[band]) step(*drawn[band]); });
+    const auto add_all = [&](const std::vector<int>& batch, Triangles& to, Movings& moving) {
+        spread(pieces, [&](int part) {
+            const std::size_t end = batch.size() * (part + 1) / pieces;
+            for (std::size_t k = batch.size() * part / pieces; k < end; ++k) {
+                const int index = batch[k];
+                see(placed_[index]);
+                if (rolling) see(later_[index]);
+                if (images.rgb) light(geoms[index], middle_poses_[index], slots_[index]);
+                add(index, to[part], moving[part]);
+            }
+        });
     };
+    // In batches, each as large as half of those before it: what these hide is left out.
+    const bool hiding = lens_->pinhole && !rolling;
+    std::vector<int> batch;
+    std::size_t triangles = 0;
+    hides_ = false;
+    const auto take = [&](int index) {
+        if (hides_ && hidden(placed_[index], placed_[index].mesh->bounds)) return;
+        batch.push_back(index);
+    };
+    for (auto next = order.begin(); next != order.end();) {
+        batch.clear();
+        const std::size_t most = std::max(smallest_batch, triangles / 2);
+        std::size_t more = 0;
+        for (; next != order.end() && !(hiding && more >= most); ++next) {
+            const std::size_t before = batch.size();
+            take(next->second);
+            if (batch.size() > before) more += placed_[next->second].mesh->corners.size() / 3;
+        }
+        triangles += more;
+        add_all(batch, solid_, solid_moving_);
+        const bool is_last = next == order.end() && clear.empty();
+        if (hiding && !is_last) hiding_.resize(tile(0, last + Lens::smallest));
+        each([&](Band& band) {
+            band.cover();
+            if (hiding && !is_last) band.hide();
+        });
+        hides_ = hiding && !is_last;
+    }
+    batch.clear();
+    for (auto next = clear.rbegin(); next != clear.rend(); ++next) take(next->second);
+    add_all(batch, clear_, clear_moving_);  // from back to front
+    if (images.rgb) each([](Band& band) { band.shade(); });
     if (images.rgb) each([](Band& band) { band.find_outlines(); });
     each([](Band& band) { band.finish(); });
 }
@@ -171,22 +240,73 @@ void Scene::see(Placed& placed) const {
     for (const Vec3& point : placed.seen) placed.pixels.push_back(lens_->pixel(point));
 }
 
-// Edges of a pinhole's image that the box about a geom is beyond, a bit each.
-int Scene::beyond(const Placed& placed) const {
-    const Mesh& mesh = *placed.mesh;
+// Edges of a pinhole's image that a box is beyond, a bit each.
+int Scene::beyond(const Placed& placed, const Bounds& bounds) const {
     const float left = lens_->x[0], right = lens_->x[lens_->width - 1];
     const float top = lens_->y[first_], bottom = lens_->y[last_ - 1];
     const Vec3 middle =
-        placed.turn * Vec3{mesh.middle.x, mesh.middle.y, mesh.middle.z} + placed.shift;
+        placed.turn * Vec3{bounds.middle.x, bounds.middle.y, bounds.middle.z} + placed.shift;
     const Vec3 inward[5] = {{1, 0, -left}, {-1, 0, right}, {0, 1, -top}, {0, -1, bottom}, {0, 0, 1}};
     int found = 0;
     for (int k = 0; k < 5; ++k) {
         const Vec3 along = placed.turn.back(inward[k]);
-        const double reach = std::abs(along.x) * mesh.reach.x + std::abs(along.y) * mesh.reach.y +
-                             std::abs(along.z) * mesh.reach.z;
+        const double reach = std::abs(along.x) * bounds.reach.x + std::abs(along.y) * bounds.reach.y +
+                             std::abs(along.z) * bounds.reach.z;
         if (dot(inward[k], middle) + reach * 1.001 < 0) found |= 1 << k;
     }
     return found;
+}
+
+// Whether a box is behind what is drawn so far, in a pinhole's image: it is farther
+// than the farthest in all squares of pixels in which it may be.
+bool Scene::hidden(const Placed& placed, const Bounds& bounds) const {
+    double low[2] = {1e30, 1e30}, high[2] = {-1e30, -1e30}, nearest = 1e30;
+    for (int corner = 0; corner < 8; ++corner) {
+        const auto along = [corner](int bit, float middle, float reach) {
+            return double(middle) + (corner & bit ? reach : -reach);
+        };
+        const Vec3 at = placed.turn * Vec3{along(1, bounds.middle.x, bounds.reach.x),
+                                           along(2, bounds.middle.y, bounds.reach.y),
+                                           along(4, bounds.middle.z, bounds.reach.z)} + placed.shift;
+        if (!(at.z >= view_.near)) return false;
+        nearest = std::min(nearest, at.z);
+        const Lens::Pixel pixel = lens_->pixel(at);
+        low[0] = std::min(low[0], pixel.column), high[0] = std::max(high[0], pixel.column);
+        low[1] = std::min(low[1], pixel.row), high[1] = std::max(high[1], pixel.row);
+    }
+    const auto bound = [](double at, double start, double step, int first, int last) {
+        return static_cast<int>(std::min(std::max((at - start) / step, double(first)), double(last)));
+    };
+    const float x = lens_->x[0], y = lens_->y[0];
+    const double* step = lens_->step;  // two pixels more on each side for rounding
+    const int left = bound(low[0] - 2 * step[0], x, step[0], 0, lens_->width - 1);
+    const int right = bound(high[0] + 2 * step[0], x, step[0], 0, lens_->width - 1);
+    const int top = bound(low[1] - 2 * step[1], y, step[1], first_, last_ - 1);
+    const int bottom = bound(high[1] + 2 * step[1], y, step[1], first_, last_ - 1);
+    // Much more than inverse depths on a triangle are off that an eye almost in its plane sees.
+    const auto most = static_cast<float>(1.01 / nearest);
+    constexpr int side = Lens::smallest;
+    for (int row = top / side; row <= bottom / side; ++row)
+        for (int column = left / side; column <= right / side; ++column)
+            if (!(hiding_[tile(column * side, row * side)] > most)) return false;
+    return true;
+}
+
+// Why no triangle of a cluster is seen, as `Placed::listed` has it; 0 if one may be.
+std::int32_t Scene::unseen(const Placed& placed, const Cluster& cluster) const {
+    const Bounds& bounds = cluster.bounds;
+    const Vec3 middle{bounds.middle.x, bounds.middle.y, bounds.middle.z};
+    if (cluster.sine < 1 && !placed.geom->double_sided) {
+        const Vec3 way = middle + placed.turn.back(placed.shift);  // from the eye, in the mesh's axes
+        const Vec3 half{bounds.reach.x, bounds.reach.y, bounds.reach.z};
+        const double reach = root(dot(half, half)), away = root(dot(way, way));
+        const Vec3 axis{cluster.axis.x, cluster.axis.y, cluster.axis.z};
+        // From anywhere in the ball about it, each normal is less than 90 degrees from the way.
+        if (dot(way, axis) > (cluster.sine + 1e-4) * (away + reach) + reach) return Placed::faces_away;
+    }
+    if (!lens_->pinhole) return 0;
+    if (beyond(placed, bounds) || (hides_ && hidden(placed, bounds))) return Placed::out_of_view;
+    return 0;
 }
 
 // Direction of a ball from the eye and least cosine of rays that meet it. Returns the sine's square
@@ -205,8 +325,8 @@ double Scene::ball(Vec3 middle, double reach, Vec3f& ahead, float& least) {
 // Whether the ball about a geom, on its way, may be in view, and the smallest square of rays about it.
 bool Scene::in_squares(Placed& placed, const Placed& later) const {
     const Mesh& mesh = *placed.mesh;
-    const Vec3 half{mesh.reach.x, mesh.reach.y, mesh.reach.z};
-    const Vec3 centre{mesh.middle.x, mesh.middle.y, mesh.middle.z};
+    const Vec3 half{mesh.bounds.reach.x, mesh.bounds.reach.y, mesh.bounds.reach.z};
+    const Vec3 centre{mesh.bounds.middle.x, mesh.bounds.middle.y, mesh.bounds.middle.z};
     const Vec3 from = placed.turn * centre + placed.shift, to = later.turn * centre + later.shift;
     const double way = 0.5 * root(dot(to - from, to - from)), reach = root(dot(half, half)) + way;
     placed.square = 0, placed.column = placed.row = 0, placed.side = lens_->largest;
@@ -241,7 +361,16 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
     const double start = lens_->pinhole ? lens_->y[0] : 0;  // of rows, and some more for rounding
     const double above = start + (first_ - 4) * lens_->step[1];
     const double below = start + (last_ + 3) * lens_->step[1];
+    const std::vector<Cluster>& clusters = placed.mesh->clusters;
     for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
+        if (!rolling && corner % (3 * Cluster::most) == 0 && !clusters.empty()) {
+            if (const std::int32_t why = unseen(placed, clusters[corner / (3 * Cluster::most)])) {
+                const auto next = std::min(corner + 3 * Cluster::most, corners.size());
+                std::fill(&placed.listed[corner / 3], placed.listed.data() + next / 3, why);
+                corner = next - 3;
+                continue;
+            }
+        }
         Vec3 points[6];  // now, and for the next pose
         Lens::Pixel pixels[6];
         const auto put = [&](const Placed& of, int first) {
@@ -323,6 +452,9 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
     }
     if (turns) return true;
     const double near = view_.near;
+    if (count == 3 && lens_->is_precise && points[0].z >= near && points[1].z >= near &&
+        points[2].z >= near && tightly_bounded(triangle, pixels))
+        return triangle.left < triangle.right && triangle.top < triangle.bottom;
     const auto cross_near = [&](Vec3 from, Vec3 to) {
         if ((from.z >= near) == (to.z >= near)) return;
         Vec3 at = from + (to - from) * ((near - from.z) / (to.z - from.z));
@@ -348,6 +480,31 @@ bool Scene::bounded(Triangle& triangle, const Vec3* points, const Lens::Pixel* p
     };
     return span(low[1], high[1], lens_->y[0], lens_->step[1], triangle.top, triangle.bottom) &&
            span(low[0], high[0], lens_->x[0], lens_->step[0], triangle.left, triangle.right);
+}
+
+// Find the pixels that may see a triangle, and hardly more, in a pinhole's image; false for one so
+// narrow, or so far from the image, that rounding may move its corners by more than this allows for.
+bool Scene::tightly_bounded(Triangle& triangle, const Lens::Pixel* pixels) const {
+    const double across = lens_->per_step[0], down = lens_->per_step[1];
+    const double x = lens_->x[0], y = lens_->y[0];
+    double u[3], v[3];
+    for (int k = 0; k < 3; ++k)
+        u[k] = (pixels[k].column - x) * across, v[k] = (pixels[k].row - y) * down;
+    const double left = std::min(std::min(u[0], u[1]), u[2]);
+    const double right = std::max(std::max(u[0], u[1]), u[2]);
+    const double top = std::min(std::min(v[0], v[1]), v[2]);
+    const double bottom = std::max(std::max(v[0], v[1]), v[2]);
+    const double width = right - left, height = bottom - top;
+    const double area = std::abs((u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0]));
+    if (!(area >= 0.05 * (width * width + height * height))) return false;
+    if (!(left > -lens_->width && right < 2 * lens_->width)) return false;
+    if (!(top > -lens_->height && bottom < 2 * lens_->height)) return false;
+    constexpr double more = 0.125;
+    triangle.left = std::max(triangle.left, static_cast<int>(std::ceil(left - more)));
+    triangle.right = std::min(triangle.right, static_cast<int>(std::floor(right + more)) + 1);
+    triangle.top = std::max(triangle.top, static_cast<int>(std::ceil(top - more)));
+    triangle.bottom = std::min(triangle.bottom, static_cast<int>(std::floor(bottom + more)) + 1);
+    return true;
 }
 
 }  // namespace raster

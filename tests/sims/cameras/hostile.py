@@ -87,6 +87,13 @@ def model_of(pick: random.Random) -> Any:
         material.textures = textures
     points = np.array([pick.uniform(-1.0, 1.0) for _ in range(24)])
     world.add_mesh(name="mesh", uservert=points.tolist())
+    if pick.random() < 0.5:
+        channels = pick.choice((3, 4))
+        colours = world.add_texture(
+            name="mesh.colours", type=kinds.mjTEXTURE_2D, width=3, height=3, nchannel=channels
+        )
+        colours.data = pick.randbytes(9 * channels)
+    world.add_text(name="geom_user", data="double_sided alpha_cutoff")
     heights = [pick.random() for _ in range(6)]
     world.add_hfield(name="hill", size=[1, 0.7, 0.3, 0.1], nrow=2, ncol=3, userdata=heights)
     for _ in range(pick.randint(1, 6)):
@@ -97,6 +104,7 @@ def model_of(pick: random.Random) -> Any:
             pos=[pick.uniform(-2.0, 2.0) for _ in range(3)],
             euler=[pick.choice((0.0, 90.0, pick.uniform(0.0, 360.0))) for _ in range(3)],
             rgba=[pick.random(), pick.random(), pick.random(), pick.choice((1.0, 1.0, 0.4))],
+            userdata=[pick.choice((0.0, 1.0)), pick.choice((0.0, 0.0, 0.5, pick.random()))],
         )
         if kind == "mesh":
             geom.meshname = "mesh"
@@ -120,7 +128,7 @@ def model_of(pick: random.Random) -> Any:
     model = world.compile()
     spoiled = {
         "mat": ("emission", "specular", "shininess", "rgba", "texrepeat"),
-        "geom": ("rgba", "size", "pos", "quat"),
+        "geom": ("rgba", "size", "pos", "quat", "user"),
     }
     what = pick.choice((*spoiled, "mat", "places", "visual", "mesh", "none"))
     share = pick.choice((0.1, 0.5))

@@ -451,3 +451,52 @@ def test_what_mujocos_renderer_leaves_out_is_logged(
         'renderer = "mujoco" does not draw the back of double-sided geoms: 4, the gaps of cut-out '
         'geoms: 2, vertex colours of meshes: 4; "raster" does'
     )
+
+
+def cells_of(across: int, down: int) -> Any:
+    """Return the triangles of a grid of cells, of vertices row by row, shape (m, 3)."""
+    corner = (np.arange(down)[:, None] * (across + 1) + np.arange(across)).ravel()
+    above = corner + across + 1
+    return np.stack([corner, corner + 1, above + 1, corner, above + 1, above], -1).reshape(-1, 3)
+
+
+def wall_and_balls() -> list[tuple[Any, Any]]:
+    """Return the points and triangles of a bumpy wall, and of balls behind it and through it."""
+    line = np.linspace(-4.0, 4.0, 68)
+    y, z = (part.ravel() for part in np.meshgrid(line, line))
+    things = [(np.stack([3.0 + 0.1 * np.sin(3 * y) * np.cos(4 * z), -y, z], -1), cells_of(67, 67))]
+    around, up = np.meshgrid(np.linspace(0, 2 * np.pi, 31), np.linspace(-1.5, 1.5, 31))
+    ball = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
+    for k, radius in enumerate((0.4, 0.7, 0.9, 1.7, 2.2)):
+        place = (4.5 + 0.1 * k, 1.3 * k - 3.0, (-1.0) ** k)
+        things.append((radius * ball.reshape(-1, 3) + np.array(place), cells_of(30, 30)))
+    return things
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_what_is_left_out_unseen_changes_no_pixel(threads: int) -> None:
+    """Of large meshes parts are left out; the same in small pieces, few at a time, has none."""
+    whole, pieces = world_of(), world_of()
+    for k, (points, faces) in enumerate(wall_and_balls()):
+        add_mesh(whole, f"thing{k}", points, faces)
+        for n, part in enumerate(np.array_split(faces, len(faces) // 100)):
+            used, corners = np.unique(part, return_inverse=True)
+            add_mesh(pieces, f"thing{k}.chunk{n}", points[used], corners)
+    images = seen(whole, threads=threads)
+    model = compiled(pieces)
+    owner = np.array([int(model.geom(geom).name[5]) for geom in object_numbers(model)])
+    alone, nearest, number = Raster(model), np.full((180, 240), np.inf), np.full((180, 240), -1)
+    for some in np.array_split(np.arange(model.ngeom), 5):  # each fewer than one batch
+        model.geom_rgba[:, 3] = np.isin(np.arange(model.ngeom), some)
+        _, depth, numbers = drawn(alone, PINHOLE, *AHEAD)
+        assert depth is not None
+        assert numbers is not None
+        nearer = depth < nearest
+        number[nearer] = owner[numbers[nearer]]
+        nearest[nearer] = depth[nearer]
+    alone.close()
+    assert np.unique(number).tolist() == [0, 5]  # the others are behind the wall
+    assert images.numbers is not None
+    assert images.depth is not None
+    np.testing.assert_allclose(images.depth, nearest, rtol=1e-4)  # meshes are turned otherwise
+    assert np.mean(images.numbers != number) < 1e-3
