@@ -20,7 +20,7 @@ from sims.cameras.stage import NEAR, SHADOW_SIZE
 SUN_AWAY = 200.0  # distance at which a directional light's map is drawn, in half widths of it
 PAUSE = 100  # changes of the scene after which a geom that moved counts as standing still again
 _TILE = 16
-_ROOM = 8  # elements after a map that vectors at its end may write back as they are
+_ROOM = _TILE + 8  # elements after a map, which its last tile and vectors at its end may touch
 
 
 class _Map:
