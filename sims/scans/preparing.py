@@ -16,6 +16,7 @@ from sims.scans.solids import find_floor, voxel_boxes
 from sims.scans.textures import extended, fitted
 
 MOST_TRIANGLES = 4000  # of a part: what is out of view or hidden is left out part by part
+CLUSTER = 64  # triangles that the rasteriser leaves out together
 MOST_OBJECTS = 1000  # that are told apart: each costs physics some time
 FARTHEST = 20_000.0  # metres from the origin, where float32 still tells 2 mm apart
 MANY_BOXES = 10_000  # 0.15 ms a step of the physics
@@ -245,24 +246,37 @@ def _normals(piece: Piece, corners: npt.NDArray[np.int32]) -> npt.NDArray[np.flo
 
 
 def _cut(middles: Floats, most: float) -> Iterator[npt.NDArray[np.intp]]:
-    """Yield the numbers of neighbouring triangles, halved along the longest side until few."""
+    """Yield the numbers of neighbouring triangles, halved along the longest side until few.
+
+    The rasteriser leaves out `CLUSTER` triangles in a row at a time, so these are neighbours, too.
+    """
     waiting = [np.arange(len(middles))]
+    part: list[npt.NDArray[np.intp]] = []
+    room = 0  # triangles that the present part still gets
     while waiting:
         chosen = waiting.pop()
-        if len(chosen) <= most:
-            yield np.sort(chosen)
+        if not room and len(chosen) <= most:
+            room = len(chosen)
+        if room and len(chosen) <= CLUSTER:
+            part.append(np.sort(chosen))
+            room -= len(chosen)
+            if not room:
+                yield np.concatenate(part)
+                part = []
             continue
         places = middles[chosen]
         axis = int(np.argmax(places.max(axis=0) - places.min(axis=0)))
         order = np.argsort(places[:, axis], kind="stable")
-        half = len(order) // 2
+        half = -(-len(order) // (2 * CLUSTER)) * CLUSTER
         waiting += [chosen[order[half:]], chosen[order[:half]]]
 
 
 def _part(
     name: str, piece: Piece, corners: npt.NDArray[np.int32], normals: npt.NDArray[np.float32]
 ) -> Part:
-    used, numbers = np.unique(corners, return_inverse=True)
+    used, first, numbers = np.unique(corners, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # vertices in the order in which they are used
+    used, numbers = used[order], np.argsort(order)[numbers]
     points = piece.points[used].astype(np.float32)
     return Part(
         name,
