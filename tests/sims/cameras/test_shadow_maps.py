@@ -9,14 +9,20 @@ import mujoco
 import numpy as np
 import pytest
 
-from sims.cameras import CameraSpec, add_free_camera
+from events.frames import from_rpy
+from sims.cameras import CameraSpec, add_free_camera, pose_to_qpos
+from sims.cameras.optics import Lens
 from sims.cameras.raster import Raster
 from sims.cameras.spec import camera_info
 from sims.cameras.stage import View
 from sims.compiled import libraries
 
-CAMERA = CameraSpec(name="eye", width=40, height=30, fov=90.0, position=(0.0, 0.0, 0.0))
-VIEW = View(camera_info(CAMERA))
+FISHEYE = Lens(model="equidistant", coefficients=(0.01, 0.0, 0.0, 0.0))
+CAMERAS = tuple(
+    CameraSpec(name=name, width=120, height=90, fov=fov, position=(0.0, 0.0, 0.0), lens=lens)
+    for name, fov, lens in (("pinhole", 90.0, None), ("fisheye", 150.0, FISHEYE))
+)
+VIEWS = {camera.name: View(camera_info(camera)) for camera in CAMERAS}
 SHAPES = ("box", "sphere", "cylinder", "capsule", "ellipsoid")
 FAR = (300.0, 1.0, 1.0)  # a place that no light's map shows
 
@@ -51,7 +57,7 @@ def scene(pick: Any, size: int, reach: float = 0.6) -> Any:
             light = body.add_light(cutoff=40.0, dir=(0.3, 0.0, -1.0), pos=(0.0, 0.0, 1.0))
             light.mode = mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY
             light.targetbody = "body1"
-    add_free_camera(spec, "free", (CAMERA,))
+    add_free_camera(spec, "free", CAMERAS)
     return spec.compile()
 
 
@@ -62,16 +68,19 @@ def maps(raster: Any) -> list[Any]:
     return [shadow.depth[: size * size].reshape(size, size) for shadow in shadows._maps]
 
 
-def draw(raster: Any, qpos: Any) -> Any:
-    raster.look(raster.model.camera("free/eye").id, qpos)
-    return raster.draw(VIEW, True, False, False).colours
+def draw(raster: Any, qpos: Any, name: str = "pinhole") -> Any:
+    """Return an image from above."""
+    seen = qpos.copy()
+    seen[-7:] = pose_to_qpos((-2.5, 0.0, -3.0), from_rpy(0.0, -0.8, 0.0))
+    raster.look(raster.model.camera(f"free/{name}").id, seen)
+    return raster.draw(VIEWS[name], True, False, False).colours
 
 
-def together(raster: Any, qpos: Any) -> Any:
+def together(raster: Any, qpos: Any, name: str) -> Any:
     """Draw all maps anew, of all geoms together, and an image by them."""
     for shadow in raster._shadows._maps:
         shadow.view = b""
-    return draw(raster, qpos)
+    return draw(raster, qpos, name)
 
 
 SETS = list(itertools.product(libraries(), ((1, 50), (3, 128))))
@@ -91,7 +100,7 @@ def test_maps_of_parts_are_those_of_all(
     model = scene(pick, size, 0.03 if seed == 1 else 0.6)
     parts, whole = (Raster(model, None, threads, instructions) for _ in range(2))
     qpos, redrawn = model.qpos0.copy(), 0
-    for _ in range(12):
+    for _ in range(16):
         before = parts._shadows.still_version
         for body in np.flatnonzero(pick.random(5) < pick.choice((0.1, 0.5))):
             place = pick.uniform((-3, -3, 0), (3, 3, 3)) if pick.random() < 0.8 else FAR
@@ -102,14 +111,15 @@ def test_maps_of_parts_are_those_of_all(
             model.body_pos[-2] = pick.uniform((-2, -2, 0), (2, 2, 2))  # of body 6
         if pick.random() < 0.2:
             model.light("low").pos[:] = pick.uniform((-1, -1, 0.1), (1, 1, 2))
-        images = [step(stage, qpos) for step, stage in ((draw, parts), (together, whole))]
+        name = str(pick.choice(list(VIEWS)))
+        images = draw(parts, qpos, name), together(whole, qpos, name)
         for one, other in zip(maps(parts), maps(whole), strict=True):
             np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(*images)
         # Now that nothing moves, light on all vertices is kept, and not computed where it is seen.
-        np.testing.assert_array_equal(images[0], draw(parts, qpos))
+        np.testing.assert_array_equal(images[0], draw(parts, qpos, name))
         redrawn += parts._shadows.still_version > before
-    assert 0 < redrawn < 12
+    assert 0 < redrawn < 16
     parts.close()
     whole.close()
 
