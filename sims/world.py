@@ -193,10 +193,10 @@ async def join_world(node: Any) -> SharedWorld:
             f'world: expected "{world.name}", in which {world.named_by} is, since all vehicles of '
             f'a run share one world, found "{node.config.world}"'
         )
-    if node.config.mesh not in (MeshSpec(), world.mesh):
+    if node.config.mesh != (world.mesh if node.config.world else MeshSpec()):
         raise WorldError(
-            f"mesh: expected the settings of {world.named_by or 'none'}, which names the world, or "
-            f"none, found others"
+            f"mesh: expected the settings of {world.named_by or 'a node'}, which names the world, "
+            f"where a node names it too, and else none, found others"
         )
     origins = {i.config.origin for i in inhabitants if hasattr(i.config, "origin")}
     if len(origins) > 1:

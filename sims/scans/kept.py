@@ -29,6 +29,7 @@ from sims.scans.settings import MeshSpec
 _LOG = logging.getLogger("visnav.world")
 _ARRAYS = ("points", "corners", "normals", "places", "colours")
 MOST_ENTRIES = 20  # the oldest go
+SEARCHED = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH")  # environment that finds models
 
 
 def kept(
@@ -49,6 +50,8 @@ def kept(
         return prepared
     _LOG.info("preparing %s, to be kept for the next runs", path.name)
     prepared, files = make()
+    if any("not found" in note for note in prepared.notes):  # it may be there the next time
+        return prepared
     try:
         _write(entry, prepared, files)
     except OSError as error:
@@ -66,6 +69,7 @@ def _key(path: Path, spec: MeshSpec) -> str:
     digest = hashlib.blake2b(_version().encode(), digest_size=16)
     digest.update(str(path.resolve()).encode())  # its images are found from there
     digest.update(msgspec.json.encode(spec))
+    digest.update("\0".join(os.environ.get(name, "") for name in SEARCHED).encode())
     digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -88,7 +88,13 @@ def prepare(file: MeshFile, spec: MeshSpec, solids: MeshFile | None = None) -> P
         points, corners = _joined(collision) if collision else (points, corners)
         if floor is not None:  # a plane stands for the ground, which may be kilometres wide
             corners = corners[points[corners, 2].max(axis=1) > floor + 0.5 * spec.voxel]
-        boxes = voxel_boxes(points, corners, spec.voxel, floor)
+        try:
+            boxes = voxel_boxes(points, corners, spec.voxel, floor)
+        except MeshError as error:
+            longest = float((extent[1] - extent[0]).max())
+            raise MeshError(
+                f"{error}. Or is the unit wrong? The mesh is {longest:.4g} m long"
+            ) from None
         if len(boxes) > MANY_BOXES:
             notes.append(
                 f"solid: {len(boxes):,} boxes, which slow the physics; a voxel of "
@@ -153,7 +159,10 @@ def _is_baked(file: MeshFile) -> bool:
     used = {piece.material for piece in file.pieces}
     if any(file.materials[number].unlit for number in used):
         return True
-    return not file.lit and all(piece.normals is None for piece in file.pieces)
+    coloured = any(piece.colours is not None for piece in file.pieces) or any(
+        file.materials[number].image is not None for number in used
+    )
+    return coloured and not file.lit and all(piece.normals is None for piece in file.pieces)
 
 
 def _joined(pieces: Sequence[Piece]) -> tuple[Floats, npt.NDArray[np.int32]]:
@@ -301,6 +310,7 @@ def _materials(file: MeshFile, spec: MeshSpec, notes: list[str]) -> Iterator[Mat
     drawn: dict[tuple[int, bool], npt.NDArray[np.uint8]] = {}
     smaller = seen_through = 0
     for number, material in enumerate(file.materials):
+        material = material._replace(double_sided=material.double_sided or spec.double_sided)
         if material.image is None or number not in placed:
             yield material._replace(image=None)
             continue

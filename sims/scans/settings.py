@@ -44,11 +44,12 @@ class MeshSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         floor: ``auto``: a solid plane at the height of the ground, if the mesh has level ground;
             ``none``; or the plane's height, metres up.
         light: ``baked``: the images are what is seen; ``lit``: they are lit, from above and all
-            round. ``auto``: baked if the file says so, or has neither lights nor normals.
+            round. ``auto``: baked if the file says so, or has colours and no lights or normals.
         image: Image of what has texture coordinates and no image, as some baked scans come with.
+        double_sided: Draw all triangles from behind, too: of a room whose faces point outwards.
         solid: What vehicles touch. ``voxels``: boxes about the surfaces, or about the file's own
-            collision shapes; ``hulls``: convex hulls of the parts; ``none``; or another mesh
-            file in the same axes and unit, of whose objects the convex hulls are solid.
+            collision shapes; ``hulls``: convex hulls of the parts; ``none``: the floor alone; or
+            another mesh file in the same axes and unit, whose objects' convex hulls are solid.
         voxel: Edge of a voxel, metres; surfaces are solid up to as much too far out.
         texture_size: Most columns and rows of an image; larger ones are made smaller.
     """
@@ -60,6 +61,7 @@ class MeshSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     floor: Literal["auto", "none"] | float = "auto"
     light: Literal["auto", "baked", "lit"] = "auto"
     image: InputPath = ""
+    double_sided: bool = False
     solid: NameOrPath = "voxels"
     voxel: Annotated[float, msgspec.Meta(ge=0.01, le=10.0)] = 0.1
     texture_size: Annotated[int, msgspec.Meta(ge=16, le=16384)] = 4096

@@ -30,6 +30,7 @@ GAP = 0.3  # metres, between solids, into which no vehicle flies
 
 _COLOUR = (0.5, 0.5, 0.5, 1.0)
 _LAYER, _COLUMN = 0.1, 0.5  # height and least width of the cells in which the floor is looked for
+_LEAST = 0.05  # of the area of the box about a mesh, of its floor: else it is a table
 _FLAT, _LOWER = 3, 20  # a floor: a third of the ground at least, a twentieth at most below it
 _DENSE = 20_000_000  # cells of a grid that are looked at at once
 _BATCH = 500_000  # rows or columns of cells that are tested at once
@@ -201,6 +202,9 @@ def find_floor(points: Floats, corners: Corners) -> Floor:
         return Floor(None, f"{lower / len(layers):.0%} of the ground is below its lowest level")
     heights = (triangles[:, 0, 2] + triangles[:, 1, 2] + triangles[:, 2, 2]) / 3.0
     within = abs(heights - (base + level + 0.5) * _LAYER) <= 1.001 * _LAYER
+    sides = np.ptp(points[corners].reshape(-1, 3)[:, :2], axis=0)
+    if 0.5 * float(areas[within].sum()) < _LEAST * float(sides[0] * sides[1]):
+        return Floor(None, f"what is level is less than {_LEAST:.0%} of the mesh's area")
     order = np.argsort(heights[within], kind="stable")
     shares = np.cumsum(areas[within][order])
     if not len(shares):

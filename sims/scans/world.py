@@ -100,8 +100,6 @@ def build(prepared: Prepared, name: str, solid: str = "voxels", *, bare: bool = 
     by_hulls = solid == "hulls" and not prepared.hulls
     if not bare or by_hulls:
         _add_looks(spec, prepared, bare, by_hulls)
-    if solid == "none":
-        return spec
     add_solids(spec, prepared.boxes, prepared.floor)
     for part in prepared.hulls:
         _add_mesh(spec, part, f"solid.{part.name}", solid=True)

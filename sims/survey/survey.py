@@ -50,7 +50,7 @@ name = "drone"
 type = "Multirotor"
 world = {world}
 position = {position}
-{mesh}
+{height}{mesh}
 [[nodes.cameras]]
 name = "camera"
 noise = 2.0
@@ -158,6 +158,7 @@ class Survey:
             name=json.dumps(re.sub(r"[^\w-]+", "_", self.path.stem).strip("_") or "scan"),
             world=json.dumps(path if "/" in path else f"./{path}"),
             mesh=mesh,
+            height=f"height = {start[2]:.3f}\n" if abs(start[2]) > 5e-4 else "",
             position=[round(start[0], 2), round(0.0 - start[1], 2)],
             waypoints=_rows([*self._tour(), self._tour()[0]]),
         )
@@ -186,7 +187,8 @@ class Survey:
             yield "free: a vehicle fits nowhere: is the unit right, and the axis that points up?"
             return
         yield f"free: {space.volume:.0f} m³"
-        yield f"start: position = [{space.start[0]:.2f}, {0.0 - space.start[1]:.2f}]"
+        north, west, height = space.start
+        yield f"start: position = [{north:.2f}, {0.0 - west:.2f}], height = {height + 0.0:.3f}"
         tour = space.tour
         yield f"tour: {tour.length:.1f} m, {tour.clearance:.2f} m clear of everything"
         yield f"waypoints = [{_rows([*self._tour(), self._tour()[0]])}]"

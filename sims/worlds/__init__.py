@@ -74,6 +74,8 @@ def load_scene(
     suffix = Path(text).suffix.lower()
     if suffix in SUFFIXES:
         return Scene(_from_mesh(Path(name_or_path), mesh, bare))
+    if mesh != USUAL:
+        raise WorldError(f'mesh: expected a mesh file as the world, found "{text}"')
     if isinstance(name_or_path, Path) or "/" in text or suffix == ".xml":
         return Scene(_from_file(Path(name_or_path)))
     built = WORLDS[text](seed, bare) if text in WORLDS else _from_package(text, seed, bare)

@@ -91,6 +91,15 @@ def test_it_is_made_anew_for_other_content_settings_and_files(tmp_path: Path, ca
     assert makes_anew()
 
 
+def test_a_mesh_of_which_a_file_is_missing_is_not_kept(tmp_path: Path, cache: Path) -> None:
+    file = tmp_path / "a.obj"
+    file.write_bytes(b"1")
+    part = whole()._replace(notes=("image 'a.png' (1): not found",))
+    for _ in range(2):
+        assert kept(file, MeshSpec(), lambda: (part, ())) is part
+    assert not list(cache.glob("*.npz"))
+
+
 def test_the_oldest_entries_go(tmp_path: Path, cache: Path) -> None:
     for number in range(MOST_ENTRIES + 2):
         file = tmp_path / f"{number}.glb"

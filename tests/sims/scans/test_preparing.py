@@ -106,7 +106,8 @@ NORMALS = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
 @pytest.mark.parametrize(
     ("piece", "fields", "light", "baked"),
     [
-        (quad(), {}, "auto", True),
+        (quad(), {}, "auto", False),
+        (quad(colours=np.full((4, 4), 9, np.uint8)), {}, "auto", True),
         (quad(normals=NORMALS), {}, "auto", False),
         (quad(), {"lit": True}, "auto", False),
         (quad(normals=NORMALS), {"materials": (Material(unlit=True),)}, "auto", True),
@@ -131,6 +132,18 @@ def test_a_plane_stands_for_level_ground_and_no_box_above_it() -> None:
     assert without.floor is None
     assert len(without.boxes) == 1
     assert prepare(file_of(quad()), MeshSpec(floor=-1.0)).floor == -1.0
+
+
+def test_a_table_in_a_room_is_no_ground() -> None:
+    wall = quad("wall")._replace(points=np.array([[0, 0, 0], [9, 9, 0], [9, 9, 3], [0, 0, 3.0]]))
+    prepared = prepare(file_of(wall, quad("table", z=0.8, size=1.0)), MeshSpec())
+    assert prepared.floor is None
+
+
+def test_a_wrong_unit_is_told_with_the_voxels_that_it_would_take() -> None:
+    wall = quad("wall")._replace(points=np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1.0]]))
+    with pytest.raises(MeshError, match=r"is the unit wrong\? The mesh is 5000 m long"):
+        prepare(file_of(wall), MeshSpec(unit=5000.0))
 
 
 def test_no_level_ground_is_said() -> None:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
+from runtime.config.model import Config, RunConfig
+from runtime.errors import NodeError
+from runtime.testing import run_nodes, spec
+from runtime.tools.preflight import of_nodes
 from sims.cameras.stage import object_numbers
+from sims.multirotor import Multirotor
 from sims.scans.mesh_file import Material, MeshError, MeshFile
 from sims.scans.preparing import prepare
 from sims.scans.settings import MeshSpec
@@ -95,7 +101,7 @@ def test_what_is_solid_is_a_setting() -> None:
     }
     models = {s: build(p, "x", s).compile() for s, p in prepared.items()}
     met = {s: int((m.geom_contype != 0).sum()) for s, m in models.items()}
-    assert met == {"voxels": 1, "hulls": 2, "none": 0}  # with the ground's plane
+    assert met == {"voxels": 1, "hulls": 2, "none": 1}  # with the ground's plane
     other = prepare(file_of(sheet(4)), MeshSpec(solid="a.obj"), file_of(quad("own")))
     model = build(other, "x", "a.obj").compile()
     assert model.geom("solid.own.chunk0").contype[0] == 1
@@ -139,6 +145,24 @@ def test_what_is_no_mesh_is_refused(tmp_path: Path, name: str, solid: str, error
     write_room(tmp_path / "room.obj")
     with pytest.raises(MeshError, match=error):
         prepared_mesh(tmp_path / name, MeshSpec(solid=solid))
+
+
+def test_settings_of_a_mesh_beside_another_world_are_refused() -> None:
+    with pytest.raises(WorldError, match='mesh: expected a mesh file as the world, found "hall"'):
+        load_scene("hall", mesh=MeshSpec(voxel=0.2))
+
+
+@pytest.mark.parametrize("second", [{"mesh": {"up": "y", "heading": 90}}, {}, {"world": ""}])
+def test_nodes_of_one_world_agree_on_its_mesh(tmp_path: Path, second: dict[str, Any]) -> None:
+    room = str(write_room(tmp_path / "room.obj"))
+    first = {"world": room, "mesh": {"up": "y"}}
+    other = {"world": room, "position": [1.0, 0.0], **second}
+    nodes = (spec(Multirotor, "a", first), spec(Multirotor, "b", other))
+    if second == {"world": ""}:
+        assert not of_nodes(Config(run=RunConfig(), nodes=nodes)).errors
+    else:
+        with pytest.raises(NodeError, match="mesh: expected the settings of a, which names"):
+            run_nodes(nodes, duration=0.01)
 
 
 def test_a_world_by_suffix_is_a_mesh_and_its_error_a_world_error(tmp_path: Path) -> None:

@@ -62,3 +62,11 @@ def test_a_mesh_without_room_for_a_vehicle_is_drawn_from_its_middle(room: Path) 
     assert Path("my room-world.png").exists()
     with pytest.raises(Exception, match="expected room for a vehicle"):
         CliRunner().invoke(app, [*arguments, "--config", "a.toml"], catch_exceptions=False)
+
+
+def test_a_floor_at_another_height_is_where_the_flight_starts(room: Path) -> None:
+    arguments = ["world", room.name, "--set", "up=y", "--set", "position=[0, 0, -2]"]
+    CliRunner().invoke(app, [*arguments, "--config", "fly.toml"], catch_exceptions=False)
+    settings = load(Path("fly.toml"))
+    assert settings.nodes[0].config.height == 2.0  # type: ignore[attr-defined]
+    assert of_nodes(settings).errors == []
