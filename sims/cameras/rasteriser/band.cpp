@@ -436,7 +436,7 @@ bool Band::owned(const Triangle& triangle, std::int32_t number, int x, int y) co
 // no depth.
 void Band::blend() {
     std::vector<float> front;  // inverse depth of the nearest of all
-    for (std::size_t part = scene_.clear_.size(); part-- > 0;) {
+    for (std::size_t part = 0; part < scene_.clear_.size(); ++part) {
         std::int32_t number = clear_part | static_cast<std::int32_t>(part) << parts_from;
         for (const Triangle& triangle : scene_.clear_[part]) {
             const std::int32_t geom = scene_.placed_[triangle.geom].geom->number;

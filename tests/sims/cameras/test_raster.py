@@ -474,6 +474,26 @@ def hash_of(name: str, instructions: str, threads: int = 1) -> str:
     return total.hexdigest()
 
 
+def test_panes_behind_each_other_are_mixed_from_the_back_by_any_number_of_threads() -> None:
+    """Each thread takes some of them."""
+    panes = "".join(
+        f'<geom type="box" size=".01 1 1" pos="{2 + 0.2 * k} 0 0" '
+        f'rgba="{k % 2} {k % 3 / 2} {k % 5 / 4} .5"/>'
+        for k in range(9)
+    )
+    xml = f"<mujoco><worldbody>{panes}</worldbody></mujoco>"
+    model = compiled(mujoco.MjSpec.from_string(xml))
+    images = []
+    for threads in (1, 2, 5):
+        raster = Raster(model, threads=threads)
+        images.append(drawn(raster, PINHOLE, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+        raster.close()
+    for other in images[1:]:
+        for image, same in zip(images[0], other, strict=True):
+            assert image is not None
+            np.testing.assert_array_equal(image, same)
+
+
 @drawn_by_5
 @pytest.mark.parametrize("name", WORLD)
 @pytest.mark.timeout(300)
