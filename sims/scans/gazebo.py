@@ -195,12 +195,8 @@ class _Reader:
                     self._include(child, place, scope)
                 case "link":
                     self._link(child, place, scope)
-                case "light":
-                    self._lit = True
-                case tag if tag in _NOT_READ:
-                    self._left_out.note(_NOT_READ[tag], "not read")
-                case _:
-                    pass
+                case tag:
+                    self._note(tag)
 
     def _model(self, model: ET.Element, place: _Place, name: str | None) -> None:
         self._models += 1
@@ -301,12 +297,14 @@ class _Reader:
                 case "visual" | "collision":
                     matrix = compose(place.matrix, scope.pose(child, link.get("name", "")))
                     self._geometry(child, place._replace(matrix=matrix), child.tag == "collision")
-                case "light":
-                    self._lit = True
-                case tag if tag in _NOT_READ:
-                    self._left_out.note(_NOT_READ[tag], "not read")
-                case _:
-                    pass
+                case tag:
+                    self._note(tag)
+
+    def _note(self, tag: str) -> None:
+        """Take note of an element that is no geometry."""
+        self._lit |= tag == "light"
+        if tag in _NOT_READ:
+            self._left_out.note(_NOT_READ[tag], "not read")
 
     def _geometry(self, element: ET.Element, place: _Place, solid: bool) -> None:
         shapes = element.find("geometry")

@@ -53,7 +53,7 @@ def kept(
     if any("not found" in note for note in prepared.notes):  # it may be there the next time
         return prepared
     try:
-        _write(entry, prepared, files)
+        _write(entry, prepared, [file for file in files if file != path])
     except OSError as error:
         _LOG.debug("expected a folder for prepared meshes, found: %s", error)
     return prepared
@@ -98,9 +98,8 @@ def _write(entry: Path, prepared: Prepared, files: Sequence[Path]) -> None:
                     arrays[f"{group}.{number}.{field}"] = values
     images = {id(m.image): m.image for m in prepared.materials if m.image is not None}
     arrays |= {f"image.{number}": image for number, image in enumerate(images.values())}
-    numbers = [
-        [*images].index(id(m.image)) if id(m.image) in images else -1 for m in prepared.materials
-    ]
+    places = {image: number for number, image in enumerate(images)}
+    numbers = [places.get(id(material.image), -1) for material in prepared.materials]
     about = {
         "files": {str(path): _digest(path) for path in files},
         "floor": prepared.floor,

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sims.scans.mesh_file import Floats, Material, MeshError, MeshFile, Piece
+from sims.scans.parsing import unique_name
 from sims.scans.settings import UNITS, MeshSpec
 from sims.scans.solids import find_floor, voxel_boxes
 from sims.scans.textures import extended, fitted
@@ -63,13 +64,13 @@ def prepare(file: MeshFile, spec: MeshSpec, solids: MeshFile | None = None) -> P
         MeshError: The mesh is too far away or too large for `spec.voxel`.
     """
     notes = list(file.left_out)
-    pieces = [_placed(piece, file, spec) for piece in file.pieces]
+    pieces = [_placed(piece, file, spec) for piece in file.pieces if len(piece.corners)]
     extent = _extent(pieces)
     _check_extent(extent, spec)
     notes += _odd_size(extent)
     baked = spec.light == "baked" or (spec.light == "auto" and _is_baked(file))
     parts = tuple(_parts(_few_objects(pieces, notes)))
-    points, corners = _joined(pieces)
+    points, corners = joined(pieces)
     floor: float | None = None
     if spec.floor == "auto":
         floor, reason = find_floor(points, corners)
@@ -85,7 +86,7 @@ def prepare(file: MeshFile, spec: MeshSpec, solids: MeshFile | None = None) -> P
     elif spec.solid == "hulls":
         hulls = tuple(_parts(collision, math.inf))
     elif spec.solid == "voxels":
-        points, corners = _joined(collision) if collision else (points, corners)
+        points, corners = joined(collision) if collision else (points, corners)
         if floor is not None:  # a plane stands for the ground, which may be kilometres wide
             corners = corners[points[corners, 2].max(axis=1) > floor + 0.5 * spec.voxel]
         try:
@@ -165,10 +166,12 @@ def _is_baked(file: MeshFile) -> bool:
     return coloured and not file.lit and all(piece.normals is None for piece in file.pieces)
 
 
-def _joined(pieces: Sequence[Piece]) -> tuple[Floats, npt.NDArray[np.int32]]:
+def joined(pieces: Sequence[Piece | Part]) -> tuple[Floats, npt.NDArray[np.int32]]:
+    """Return points and corners of several pieces as those of one."""
     starts = np.cumsum([0] + [len(piece.points) for piece in pieces])
     corners = [piece.corners + start for piece, start in zip(pieces, starts, strict=False)]
-    return np.concatenate([piece.points for piece in pieces]), np.concatenate(corners)
+    points = np.concatenate([piece.points for piece in pieces])
+    return points.astype(np.float64), np.concatenate(corners).astype(np.int32)
 
 
 def _few_objects(pieces: Sequence[Piece], notes: list[str]) -> list[Piece]:
@@ -193,9 +196,9 @@ def _by_material(pieces: Iterable[Piece]) -> list[Piece]:
     for piece in pieces:
         fields = (piece.normals is None, piece.places is None, piece.colours is None)
         groups.setdefault((piece.object, piece.material, *fields), []).append(piece)
-    joined = []
+    result = []
     for group in groups.values():
-        points, corners = _joined(group)
+        points, corners = joined(group)
         first = group[0]
         normals, places, colours = (
             None
@@ -203,19 +206,21 @@ def _by_material(pieces: Iterable[Piece]) -> list[Piece]:
             else np.concatenate([getattr(p, field) for p in group])
             for field in ("normals", "places", "colours")
         )
-        joined.append(
+        result.append(
             Piece(first.object, first.material, points, corners, normals, places, colours)
         )
-    return joined
+    return result
 
 
 def _parts(pieces: Iterable[Piece], most: float = MOST_TRIANGLES) -> Iterator[Part]:
     """Yield the parts of all pieces, of at most so many triangles each."""
     numbers: dict[str, int] = {}
     names: dict[str, str] = {}
+    taken: set[str] = set()
     for piece in pieces:
         if piece.object not in names:
-            names[piece.object] = _free_name(piece.object, set(names.values()))
+            base = re.sub(r"[^\w.+-]+", "_", piece.object).strip("_")[:60] or "object"
+            names[piece.object] = unique_name(base, taken)
         name = names[piece.object]
         corners = _with_area(piece)
         normals = _normals(piece, corners) if piece.normals is None else piece.normals
@@ -223,15 +228,6 @@ def _parts(pieces: Iterable[Piece], most: float = MOST_TRIANGLES) -> Iterator[Pa
             number = numbers.get(name, 0)
             numbers[name] = number + 1
             yield _part(f"{name}.chunk{number}", piece, corners[chosen], normals)
-
-
-def _free_name(text: str, taken: set[str]) -> str:
-    base = re.sub(r"[^\w.+-]+", "_", text).strip("_")[:60] or "object"
-    name, number = base, 1
-    while name in taken:
-        number += 1
-        name = f"{base}_{number}"
-    return name
 
 
 def _with_area(piece: Piece) -> npt.NDArray[np.int32]:

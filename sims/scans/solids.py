@@ -160,11 +160,6 @@ class Floor(NamedTuple):
     reason: str = ""
 
 
-def floor_height(points: Floats, corners: Corners) -> float | None:
-    """Return the height of a mesh's floor; `None` if it has none, for a reason of `find_floor`."""
-    return find_floor(points, corners).height
-
-
 def find_floor(points: Floats, corners: Corners) -> Floor:
     """Return the lowest level that is ground: what a plane may stand for, and hide nothing below.
 

@@ -18,9 +18,9 @@ from sims.scans.mesh_file import Material, MeshError, MeshFile
 from sims.scans.preparing import Part, Prepared, prepare
 from sims.scans.reading import read
 from sims.scans.settings import SUFFIXES, USUAL, MeshSpec
-from sims.scans.solids import add_solids
+from sims.scans.solids import GROUP, add_solids
 
-DRAWN_GROUP, SOLID_GROUP = 2, 3
+DRAWN_GROUP = 2
 FLAT, THICKNESS = 1e-3, 0.02  # metres: a part is flat; a flat hull is as thick
 USER = "double_sided alpha_cutoff"  # names of the geoms' user numbers
 _LOG = logging.getLogger("visnav.world")
@@ -102,10 +102,10 @@ def build(prepared: Prepared, name: str, solid: str = "voxels", *, bare: bool = 
         _add_looks(spec, prepared, bare, by_hulls)
     add_solids(spec, prepared.boxes, prepared.floor)
     for part in prepared.hulls:
-        _add_mesh(spec, part, f"solid.{part.name}", solid=True)
+        _add_mesh(spec, _padded(part, solid=True), f"solid.{part.name}")
         spec.worldbody.add_geom(
             name=f"solid.{part.name}", type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"solid.{part.name}", group=SOLID_GROUP,
+            meshname=f"solid.{part.name}", group=GROUP,
         )  # fmt: skip
     return spec
 
@@ -131,12 +131,12 @@ def _add_looks(spec: Any, prepared: Prepared, bare: bool, solid: bool) -> None:
     """Add the drawn parts with their materials."""
     materials: set[int] = set()
     images: dict[int, str] = {}  # names of textures by image
-    for part in prepared.parts:
+    for part in (_padded(part, solid) for part in prepared.parts):
         material = prepared.materials[part.material]
         if part.material not in materials and not bare:
             materials.add(part.material)
             _add_material(spec, part.material, material, prepared.baked, images)
-        _add_mesh(spec, part, part.name, solid)
+        _add_mesh(spec, part, part.name)
         if part.colours is not None and not bare:
             _add_colours(spec, part)
         meets = int(solid)
@@ -185,25 +185,29 @@ def _add_colours(spec: Any, part: Part) -> None:
     _add_image(spec, f"{part.name}.colours", texels.reshape(rows, width, channels))
 
 
-def _add_mesh(spec: Any, part: Part, name: str, solid: bool) -> None:
-    points, normals, places = part.points, part.normals, part.places
-    # MuJoCo takes no fewer than four vertices, and makes no hull of points in a plane. Further
-    # vertices are not drawn.
-    if solid and (behind := _behind(part)) is not None:
-        more = behind
-    else:
-        more = points[:1].repeat(max(4 - len(points), 0), axis=0)
-    points = np.concatenate([points, more])
-    normals = np.concatenate([normals, normals[:1].repeat(len(more), axis=0)])
-    textured = {}
-    if places is not None:
-        places = np.concatenate([places, places[:1].repeat(len(more), axis=0)])
-        textured["usertexcoord"] = places.ravel()
+def _add_mesh(spec: Any, part: Part, name: str) -> None:
+    textured = {} if part.places is None else {"usertexcoord": part.places.ravel()}
     spec.add_mesh(
-        name=name, uservert=points.ravel(), usernormal=normals.ravel(),
+        name=name, uservert=part.points.ravel(), usernormal=part.normals.ravel(),
         userface=part.corners.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         **textured,
     )  # fmt: skip
+
+
+def _padded(part: Part, solid: bool) -> Part:
+    """Return a part with further vertices, which are not drawn, where MuJoCo needs them.
+
+    It takes no fewer than four, and makes no hull of points in a plane.
+    """
+    more = _behind(part) if solid else None
+    if more is None:
+        more = part.points[:1].repeat(max(4 - len(part.points), 0), axis=0)
+    longer: dict[str, Any] = {
+        field: np.concatenate([values, values[:1].repeat(len(more), axis=0)])
+        for field in ("normals", "places", "colours")
+        if (values := getattr(part, field)) is not None
+    }
+    return part._replace(points=np.concatenate([part.points, more]), **longer)
 
 
 def _behind(part: Part) -> npt.NDArray[np.float32] | None:

@@ -23,6 +23,7 @@ from runtime.errors import CommandError
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.cameras.renderer import Shot
 from sims.scans.mesh_file import Floats
+from sims.scans.preparing import joined
 from sims.scans.settings import MeshSpec
 from sims.scans.solids import voxelise
 from sims.scans.world import build, prepared_mesh
@@ -164,14 +165,10 @@ class Survey:
         )
 
     def _triangles(self) -> tuple[Floats, npt.NDArray[np.int32]]:
-        parts = self.prepared.parts
-        starts = np.cumsum([0, *(len(part.points) for part in parts)])
-        corners = [part.corners + start for part, start in zip(parts, starts, strict=False)]
-        points = np.concatenate([part.points for part in parts]).astype(np.float64)
-        joined = np.concatenate(corners).astype(np.int32)
+        points, corners = joined(self.prepared.parts)
         # A plane that stands for the ground may be kilometres wide, and is none of the room.
-        wide = np.ptp(points[joined][:, :, :2], axis=1).max(axis=1) > WIDEST
-        return points, joined[~wide] if self.prepared.floor is not None else joined
+        wide = np.ptp(points[corners][:, :, :2], axis=1).max(axis=1) > WIDEST
+        return points, corners[~wide] if self.prepared.floor is not None else corners
 
     def _tour(self) -> list[Vector3]:
         """Return the tour's waypoints, NED."""

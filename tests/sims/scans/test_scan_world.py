@@ -9,11 +9,15 @@ import mujoco
 import numpy as np
 import pytest
 
+from events.frames import from_rpy
 from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError
 from runtime.testing import run_nodes, spec
 from runtime.tools.preflight import of_nodes
-from sims.cameras.stage import object_numbers
+from sims.cameras import CameraSpec, add_free_camera, pose_to_qpos
+from sims.cameras.raster import Raster
+from sims.cameras.spec import camera_info
+from sims.cameras.stage import View, object_numbers
 from sims.multirotor import Multirotor
 from sims.scans.mesh_file import Material, MeshError, MeshFile
 from sims.scans.preparing import prepare
@@ -24,6 +28,7 @@ from sims.vehicle.autopilot import Clearance, trouble_at_start
 from sims.worlds import WorldError, load_scene
 from tests.sims.scans.test_preparing import NORMALS, PLACES, file_of, quad, sheet
 
+CAMERA = CameraSpec(name="camera", width=64, height=48, position=(0.0, 0.0, 0.0))
 OUTWARDS = ("1243", "5786", "1562", "3487", "1375", "2684")
 FACES = {"table": OUTWARDS, "room": tuple(face[::-1] for face in OUTWARDS)}
 
@@ -68,6 +73,21 @@ def test_a_part_of_one_triangle_is_drawn() -> None:
     piece = quad()._replace(corners=np.array([[0, 1, 2]], np.int32))
     model = build(prepare(file_of(piece), MeshSpec()), "x").compile()
     assert model.mesh_facenum.tolist() == [1]
+
+
+def test_a_coloured_part_of_one_triangle_is_drawn_in_its_colours() -> None:
+    """MuJoCo is given a vertex more, which needs a colour, too."""
+    colours = np.tile(np.array([200, 40, 90, 255], np.uint8), (4, 1))
+    piece = quad(colours=colours)._replace(corners=np.array([[0, 1, 2]], np.int32))
+    for solid in ("voxels", "hulls"):
+        spec = build(prepare(file_of(piece), MeshSpec(solid=solid)), "x", solid)
+        add_free_camera(spec, "eye", (CAMERA,))
+        raster = Raster(spec.compile())
+        raster.look(0, pose_to_qpos((2.0, -1.0, -3.0), from_rpy(0.0, -np.pi / 2, 0.0)))
+        image = raster.draw(View(camera_info(CAMERA)), True, False, False).colours
+        raster.close()
+        assert image is not None
+        assert (image == (200, 40, 90)).all(axis=2).any()
 
 
 def test_materials_have_colour_image_and_the_marks_of_the_rasteriser() -> None:

@@ -18,7 +18,6 @@ from sims.scans.solids import (
     Voxels,
     add_solids,
     find_floor,
-    floor_height,
     merged,
     voxel_boxes,
     voxelise,
@@ -222,7 +221,7 @@ HOLE = block((5.0, 4.0, -3.0), (5.5, 4.5, -2.0))
 )  # fmt: skip
 def test_the_floor_is_the_lowest_level_ground(mesh: Mesh, height: float) -> None:
     points, corners = mesh
-    assert floor_height(np.add(points, (0.0, 0.0, 1.37)), corners) == pytest.approx(
+    assert find_floor(np.add(points, (0.0, 0.0, 1.37)), corners).height == pytest.approx(
         1.37 + height, abs=0.01
     )
 
