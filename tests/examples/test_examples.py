@@ -105,6 +105,24 @@ def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_scan_is_flown_in_as_the_world_that_it_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`scan` lands without a collision, as well followed as in the hall it was exported from."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    less = "camera.width=256", "camera.height=256", "camera.rate=15"
+    figures = []
+    for name, *world in (("scan",), ("hall", "drone.world=hall", "drone.mesh={}")):
+        summary = run("scan", tmp_path / name, *less, *world, "report.figures=[]")
+        assert summary["reason"] == "pilot: flight completed"
+        figures.append(summary["verdict"]["estimators"]["odometry"])
+    scan, hall = figures
+    assert scan["collisions"] == 0
+    assert scan["ate_percent"] < 2.0 * hall["ate_percent"]
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(500)
 def test_the_figure_eight_is_flown_and_followed(tmp_path: Path) -> None:
     """`figure_eight` excites the vehicle, flies at 3 m/s, and lands without a collision."""
