@@ -1,4 +1,4 @@
-"""Command ``plot``: several runs in one figure, or the plots of a sweep, as SVG or PDF for a paper.
+"""Command ``plot``: runs in one figure, a sweep or a comparison, as SVG or PDF for a paper.
 
 Runs are drawn as their reports draw one: trajectories from above, position errors over time and
 over the distance flown. A style file (TOML) has the size, font, colours and labels.
@@ -40,6 +40,7 @@ from runtime.errors import CommandError, ConfigError, ResultsError, expect_known
 from runtime.run.results import replacing
 from runtime.time.clock import SECOND
 from runtime.tools.cli.commands import warn
+from runtime.tools.comparison import COMPARISONS, draw_slopes, read_slopes
 from runtime.tools.sweep.plots import figures_of
 from runtime.tools.sweep.tables import decode_rows, plan_from
 
@@ -306,21 +307,42 @@ def draw_sweep(folder: Path, out: Path, style: PlotStyle) -> list[Path]:
         )
     paths = []
     for name, figure in figures.items():
-        if style.size_mm is not None:
-            figure.set_size_inches(style.size_mm[0] / _INCH, style.size_mm[1] / _INCH)
-        for text in figure.findobj(Text):
-            if isinstance(text, Text):
-                text.set_fontsize(style.font_size)
         path = out if len(figures) == 1 else out.with_stem(f"{out.stem}_{name}")
-        save(figure, path, style)
+        _save_page(figure, path, style)
         paths.append(path)
     return paths
+
+
+def draw_comparison(folder: Path, out: Path, style: PlotStyle) -> list[Path]:
+    """Draw the flights of a comparison as lines from A to B; return the path."""
+    _save_page(draw_slopes(read_slopes(folder)), out, style)
+    return [out]
+
+
+def _save_page(figure: Figure, path: Path, style: PlotStyle) -> None:
+    """Write a figure that was drawn for a page in the size and font of a style."""
+    if style.size_mm is not None:
+        figure.set_size_inches(style.size_mm[0] / _INCH, style.size_mm[1] / _INCH)
+    for text in figure.findobj(Text):
+        if isinstance(text, Text):
+            text.set_fontsize(style.font_size)
+    save(figure, path, style)
+
+
+_WHOLE: dict[str, Callable[[Path, Path, PlotStyle], list[Path]]] = {
+    COMPARISONS: draw_comparison,  # whose runs are those of a sweep, too
+    "rows.jsonl": draw_sweep,
+}
+"""What draws a folder that stands alone, by the file that shows what it is."""
 
 
 def plot(
     folders: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN…", help="Folders of runs or judgements; or of one sweep."),
+        typer.Argument(
+            metavar="RUN…",
+            help="Folders of runs or judgements; or of one sweep, or one comparison.",
+        ),
     ],
     out: Annotated[
         Path, typer.Option(help="File to write; its suffix is the format: .svg or .pdf.")
@@ -339,13 +361,14 @@ def plot(
         Path | None, typer.Option(help="TOML file with size, font, labels and colours.")
     ] = None,
 ) -> None:
-    """Plot several runs in one figure, or a sweep, as SVG with text as text or as PDF.
+    """Plot several runs in one figure, a sweep or a comparison, as SVG with text as text or as PDF.
 
     Of runs the panels are the trajectories from above, and the position errors over time and over
     the distance flown; of a sweep there is a plot for each setting that was varied, in a file of
-    its own if there are several. The style file has any of size_mm (width, height),
-    font, font_size, line_width, colours, truth (a colour), grid, legend, and a table labels, which
-    has another text for a text of the plot: "a: vo" = "ours". A file that is there is replaced.
+    its own if there are several; of a comparison each flight is a line from A to B. The style file
+    has any of size_mm (width, height), font, font_size, line_width, colours, truth (a colour),
+    grid, legend, and a table labels, which has another text for a text of the plot:
+    "a: vo" = "ours". A file that is there is replaced.
     """
     if out.suffix not in _DATES:
         raise CommandError(f"--out {out}: expected a file .svg or .pdf, found {out.suffix!r}")
@@ -355,14 +378,22 @@ def plot(
         message = f"--panel: expected one of {', '.join(_PANELS)}, found {name}"
         expect_known(name, _PANELS, message, CommandError)
     look = read_style(style)
-    sweeps = [folder for folder in folders if (folder / "rows.jsonl").is_file()]
-    if sweeps and len(folders) > 1:
-        raise CommandError(f"{sweeps[0]}: expected runs, or one sweep, found a sweep among others")
+    whole = [
+        (folder, draw)
+        for folder in folders
+        for file, draw in _WHOLE.items()
+        if (folder / file).is_file()
+    ][:1]
+    if whole and len(folders) > 1:
+        raise CommandError(
+            f"{whole[0][0]}: expected runs, or one sweep or comparison, found it among others"
+        )
     try:
-        with drawing(look.settings() | {"text.parse_math": bool(sweeps)}):
-            if sweeps:
+        with drawing(look.settings() | {"text.parse_math": bool(whole)}):
+            if whole:
                 _only_of_runs(panel, estimator)
-                paths = draw_sweep(folders[0], out, look)
+                ((folder, draw),) = whole
+                paths = draw(folder, out, look)
             else:
                 panels: Iterable[Any] = dict.fromkeys(panel or _PANELS)
                 save(draw_overlay(curves_of(folders, estimator or ()), [*panels], look), out, look)
@@ -376,4 +407,4 @@ def plot(
 def _only_of_runs(panel: Sequence[str] | None, estimator: Sequence[str] | None) -> None:
     for name, given in (("--panel", panel), ("--estimator", estimator)):
         if given:
-            raise CommandError(f"{name}: expected runs, found a sweep, of which all is plotted")
+            raise CommandError(f"{name}: expected runs, found a folder of which all is plotted")

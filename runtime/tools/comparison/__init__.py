@@ -4,7 +4,14 @@ Read in this order: `statistics` (pairs, the test, the interval and the verdict)
 flights, when they are enough, and the page). The command is `runtime.tools.cli.sweep`.
 """
 
-from runtime.tools.comparison.flying import Compared, compare, read_folder
+from runtime.tools.comparison.flying import (
+    COMPARISONS,
+    Compared,
+    compare,
+    draw_slopes,
+    read_folder,
+    read_slopes,
+)
 from runtime.tools.comparison.statistics import (
     ERROR,
     USUAL,
@@ -15,6 +22,6 @@ from runtime.tools.comparison.statistics import (
 )
 
 __all__ = [
-    "ERROR", "USUAL", "Compared", "Comparison", "Key", "compare", "compare_rows", "compare_values",
-    "read_folder",
+    "COMPARISONS", "ERROR", "USUAL", "Compared", "Comparison", "Key", "compare", "compare_rows",
+    "compare_values", "draw_slopes", "read_folder", "read_slopes",
 ]  # fmt: skip

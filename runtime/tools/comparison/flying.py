@@ -12,19 +12,20 @@ import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from runtime.config.explain import show
 from runtime.config.reading import load_configuration
-from runtime.errors import ConfigError
+from runtime.errors import ConfigError, ResultsError
 from runtime.figures import FIGURES, figure
 from runtime.run.results import newest, write
 from runtime.tools.comparison.statistics import (
     USUAL,
     Comparison,
     Key,
+    Word,
     compare_rows,
     compare_until_sure,
 )
@@ -33,6 +34,12 @@ from runtime.tools.sweep.console import listed
 from runtime.tools.sweep.plots import decades, template
 from runtime.tools.sweep.process import Ended, note_inputs
 from runtime.tools.sweep.tables import decode_rows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COMPARISONS = "compare.json"
+"""Name of the file of a comparison's rows, beside its page."""
 
 Fly = Callable[[Plan], Sequence[Row]]  # carries out a plan: returns a row for each of its jobs
 
@@ -272,21 +279,48 @@ def write_page(
     b: Sequence[str],
     notes: Sequence[str] = (),
 ) -> Path:
-    """Write ``compare.html`` into a folder, made if missing; return its path."""
+    """Write ``compare.html`` and its rows as ``compare.json`` into a folder, made if missing.
+
+    Returns:
+        Path of the page.
+    """
     out.mkdir(parents=True, exist_ok=True)
+    text = msgspec.json.encode(comparisons)
+    write(out / COMPARISONS, msgspec.json.format(text, indent=2) + b"\n")
+    image = io.BytesIO()
+    draw_slopes(comparisons).savefig(image, format="png", dpi=120, metadata={"Software": None})
     page = template(Path(__file__).with_name("page.html.jinja")).render(
         sides=[(side, " ".join(changes)) for side, changes in (("A", a), ("B", b)) if changes],
         comparisons=comparisons,
         notes=notes,
         figure=figure,
-        image=base64.b64encode(_slopes(comparisons)).decode(),
+        image=base64.b64encode(image.getvalue()).decode(),
     )
     path = out / "compare.html"
     write(path, page.encode())
     return path
 
 
-def _slopes(comparisons: Sequence[Comparison]) -> bytes:
+class Slopes(msgspec.Struct, frozen=True):
+    """What is drawn of a `Comparison`: JSON has no infinity, which a change may be."""
+
+    estimator: str
+    figure: str
+    verdict: Word
+    flights: dict[str, tuple[float | None, float | None]]
+
+
+def read_slopes(folder: Path) -> list[Slopes]:
+    """Read a comparison from its folder, to draw it. Raises `ResultsError`."""
+    path = folder / COMPARISONS
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=list[Slopes])
+    except (OSError, msgspec.MsgspecError) as error:
+        raise ResultsError(f"{path}: expected what compare writes, found: {error}") from None
+
+
+def draw_slopes(comparisons: Sequence[Comparison | Slopes]) -> Figure:
+    """Draw each flight as a line from A to B, a panel for each figure."""
     from matplotlib.figure import Figure
 
     columns = min(max(len(comparisons), 1), 4)
@@ -318,6 +352,4 @@ def _slopes(comparisons: Sequence[Comparison]) -> bytes:
         axes.grid(alpha=0.3, axis="y")
     if len(handles) > 1:
         sheet.legend(handles.values(), handles, loc="outside lower center", fontsize=8, ncols=4)
-    file = io.BytesIO()
-    sheet.savefig(file, format="png", dpi=120, metadata={"Software": None})
-    return file.getvalue()
+    return sheet

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from pathlib import Path
@@ -16,6 +17,8 @@ from nodes.judging.evaluation.thresholds import Thresholds
 from nodes.judging.report.overlay import curves_of, draw_overlay, read_style, save
 from nodes.judging.report.tables import drawing
 from runtime.errors import CommandError, ConfigError, ResultsError
+from runtime.tools.comparison import compare_values, read_slopes
+from runtime.tools.comparison.flying import write_page
 from tests.nodes.judging.report.folders import evaluated, recorded, summary, walk
 from tests.runtime.tools.samples_cli import command_here
 from tests.runtime.tools.sweep.samples import plan_in, pretend
@@ -138,7 +141,23 @@ def test_a_sweep_has_a_plot_for_each_setting(tmp_path: Path) -> None:
     done = command_here("plot", "out", "out", folder=tmp_path)
     assert "expected runs, or one sweep" in done.stderr
     done = command_here("plot", "out", "--panel", "time", folder=tmp_path)
-    assert "--panel: expected runs, found a sweep" in done.stderr
+    assert "--panel: expected runs, found a folder of which all is plotted" in done.stderr
+
+
+def test_a_comparison_is_plotted_as_its_page_draws_it(tmp_path: Path) -> None:
+    flights = {("hall", seed): (0.2 + 0.01 * seed, None if seed > 1 else 0.1) for seed in range(8)}
+    rows = [compare_values("vo", "ate_rmse_m", flights)]
+    write_page(rows, tmp_path / "compared", ["old"], ["new"])
+    assert math.isinf(rows[0].change)
+    (slopes,) = read_slopes(tmp_path / "compared")
+    assert (slopes.verdict, slopes.flights) == (rows[0].verdict, rows[0].flights)
+    (tmp_path / "compared/rows.jsonl").touch()  # of its flights
+    done = command_here("plot", "compared", "--out", "c.svg", folder=tmp_path)
+    assert done.stdout.split() == ["c.svg"], done.stderr
+    assert {"A", "B", "ate_rmse_m"} <= {*texts(tmp_path / "c.svg")}
+    (tmp_path / "compared/compare.json").write_text("{")
+    done = command_here("plot", "compared", "--out", "c.svg", folder=tmp_path)
+    assert "compare.json: expected what compare writes, found" in done.stderr
 
 
 @pytest.mark.parametrize(
