@@ -111,6 +111,7 @@ class PilotConfig(VehicleControllerConfig):
     Attributes:
         waypoints: Places to pass, metres in ``map`` (x north, y east, z down: heights are
             negative). The path begins above the vehicle. May be left out beside a `figure_eight`.
+        laps: How often the waypoints are passed, for long flights.
         speed: Highest speed along the path, metres per second.
         acceleration: Highest acceleration along the path and across it, metres per second squared.
         corner_radius: Distance from a waypoint at which the rounding of its corner begins, metres.
@@ -126,6 +127,7 @@ class PilotConfig(VehicleControllerConfig):
     """
 
     waypoints: tuple[Vector3, ...] = ()
+    laps: Annotated[int, msgspec.Meta(ge=1)] = 1
     speed: Positive = 1.3
     acceleration: Positive = 1.0
     corner_radius: Positive = 0.8
@@ -140,14 +142,24 @@ class PilotConfig(VehicleControllerConfig):
     def __post_init__(self) -> None:
         if not self.waypoints and self.figure_eight is None:
             raise ValueError("waypoints: expected at least one, or a figure_eight, found neither")
+        if self.laps > 1 and not self.waypoints:
+            raise ValueError(f"laps: expected waypoints to pass {self.laps} times, found none")
 
-    def places(self, laps: int = 1) -> list[Vector3]:
-        """Return the places to pass: the waypoints, then the figure eight some times."""
-        places = list(self.waypoints)
-        if self.figure_eight is not None:
-            for x, y, z in self.figure_eight.places().tolist() * laps:
-                places.append((x, y, z))
+    def places(self) -> list[Vector3]:
+        """Return the places to pass in their order, with all laps."""
+        places = [*self.waypoints] * self.laps
+        if (figure := self.figure_eight) is not None:
+            places += [(x, y, z) for x, y, z in figure.places().tolist() * figure.laps]
         return places
+
+    def legs(self) -> list[Vector3]:
+        """Return the ends of all different legs: the places, and the way back to the first."""
+        once = [*self.waypoints]
+        if self.laps > 1:
+            once.append(self.waypoints[0])
+        if self.figure_eight is not None:
+            once += [(x, y, z) for x, y, z in self.figure_eight.places().tolist()]
+        return once
 
 
 C = TypeVar("C", bound=PilotConfig, default=PilotConfig)
@@ -176,7 +188,7 @@ class Pilot(VehicleController[C], ABC):
             stamp=0,
             source=self.name,
             vehicle=self.config.vehicle,
-            waypoints=tuple(self.config.places()),
+            waypoints=tuple(self.config.legs()),
             margin=0.0 if excitation is None else excitation.reach,
         )
 
@@ -250,7 +262,7 @@ class Pilot(VehicleController[C], ABC):
         if config.excitation is not None:
             parts.append(excited(config.excitation, start.position, yaw, step))
         points = [start.position]
-        for place in config.places(config.figure_eight.laps if config.figure_eight else 1):
+        for place in config.places():
             if math.dist(points[-1], place) > 0.05:
                 points.append(place)
         if len(points) > 1:

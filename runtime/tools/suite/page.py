@@ -225,7 +225,9 @@ def flights(suite: Suite, plan: Plan) -> dict[str, dict[int, str]]:
     Raises:
         ConfigError: Two estimators were given flights that differ.
     """
-    flying = {node["name"] for node in tomllib.loads(Path(suite.rig).read_text())["nodes"]}
+    rigs = {Path(suite.rig_of(scenario)) for scenario in suite.scenarios}
+    nodes = (node for rig in rigs for node in tomllib.loads(rig.read_text())["nodes"])
+    flying = {node["name"] for node in nodes}
     digests: dict[str, dict[int, str]] = {}
     for job, summary in summaries(plan):
         if summary.get("error"):  # it ended early: its digest is that of a part

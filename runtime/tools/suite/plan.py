@@ -28,7 +28,9 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         name: In one word.
         level: How hard it is.
         shows: What is in it, for the page.
-        set: What differs from ``rig.toml``, as for ``--set``.
+        rig: Another file of the vehicle with its sensors than the suite's, in the file relative to
+            it.
+        set: What differs from the rig's file, as for ``--set``.
         calibration: ``errs``: the suite's `calibration_errors` hold. ``exact``: they do not.
             ``both``: they hold, and it is flown once more without them, with the same seeds, so
             that the page says what exactness was worth.
@@ -37,6 +39,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     name: str
     level: Literal["easy", "medium", "hard", "brutal"]
     shows: str
+    rig: str = ""
     set: tuple[str, ...] = ()
     calibration: Literal["errs", "exact", "both"] = "errs"
 
@@ -90,6 +93,10 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     scenarios: tuple[Scenario, ...]
     estimators: tuple[Entrant, ...]
 
+    def rig_of(self, scenario: Scenario) -> str:
+        """Return the path of the file of a scenario's vehicle."""
+        return str(Path(self.rig).parent / scenario.rig) if scenario.rig else self.rig
+
     def flown(self) -> list[Scenario]:
         """Return the scenarios, each followed by its exact one if both are flown."""
         pairs = ((s, s.exact) if s.calibration == "both" else (s,) for s in self.scenarios)
@@ -138,7 +145,7 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
     entrants = [estimator for estimator in suite.estimators if estimator.installed(folder)]
     jobs = (
         make_job(
-            parse(_table(suite, scenario, entrant), suite.rig, folder),
+            parse(_table(suite, scenario, entrant), suite.rig_of(scenario), folder),
             (("scenario", scenario.name), ("estimator", entrant.name)),
             *(seed, folder, out, repeat),
         )
@@ -152,10 +159,11 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
 
 def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]:
     """Return the settings of a run, as they would stand in a file."""
+    rig = suite.rig_of(scenario)
     try:
-        table = tomllib.loads(Path(suite.rig).read_text(encoding="utf-8"))
+        table = tomllib.loads(Path(rig).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{suite.rig}: expected a TOML file of a rig, found: {error}") from None
+        raise ConfigError(f"{rig}: expected a TOML file of a rig, found: {error}") from None
     errors = () if scenario.calibration == "exact" else suite.calibration_errors
     for change in (f"run.name={scenario.name}", *errors, *scenario.set):
         override(table, change)

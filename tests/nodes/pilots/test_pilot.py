@@ -161,9 +161,21 @@ def test_it_moves_about_before_it_sets_off_and_flies_an_eight_at_last() -> None:
     assert sum(a < 2.9 <= b for a, b in itertools.pairwise(north)) == 2
 
 
+def test_waypoints_are_passed_lap_by_lap_and_the_way_back_is_announced() -> None:
+    there = [[1, 0, -1.5], [3, 0, -1.5]]
+    result = fly(there, laps=3)
+    north = [s.position[0] for s in result.of(PositionSetpoint)]
+    assert sum(a < 2 <= b for a, b in itertools.pairwise(north)) == 3
+    assert north[-1] == pytest.approx(3, abs=0.05)
+    (path,) = result.of(PathAnnouncement)
+    assert path.waypoints == ((1, 0, -1.5), (3, 0, -1.5), (1, 0, -1.5))
+
+
 def test_no_waypoints_are_a_mistake_in_the_file() -> None:
     with pytest.raises(ConfigError, match="waypoints: expected at least one, or a figure_eight"):
         fly([])
+    with pytest.raises(ConfigError, match="laps: expected waypoints to pass 2 times, found none"):
+        fly([], figure_eight={"centre": [1, 0, -1.5]}, laps=2)
 
 
 def test_of_several_vehicles_a_tour_says_which_it_flies() -> None:

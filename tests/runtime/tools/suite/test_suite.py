@@ -127,6 +127,19 @@ def test_a_part_of_it_is_chosen_by_name(small: Path) -> None:
         read_suite(small).only(["quik"], [])
 
 
+def test_a_scenario_may_have_another_vehicle(small: Path) -> None:
+    rig = RIG.replace('name = "drone"', 'name = "other"')
+    (small.parent / "other.toml").write_text(rig, encoding="utf-8")
+    own = 'level = "easy"\nrig = "other.toml"'
+    small.write_text(SMALL.replace('level = "easy"', own, 1), encoding="utf-8")
+    jobs = make_plan(read_suite(small), out=Path("out")).jobs
+    vehicles = {dict(j.settings)["scenario"]: '"other"' in j.text for j in jobs}
+    assert sorted(vehicles.values()) == [False, True]
+    small.write_text(small.read_text().replace("other.toml", "none.toml"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"none\.toml: expected a TOML file of a rig"):
+        make_plan(read_suite(small), out=Path("out"))
+
+
 def page_of(suite: Suite, tmp_path: Path, change: Any) -> str:
     """Return the page of rows of which one estimator's are changed."""
     plan = make_plan(suite, out=tmp_path / "out", seeds=2, repeats=2)
@@ -340,7 +353,7 @@ def test_the_command_runs_a_suite_and_runs_it_on(small: Path, tmp_path: Path) ->
     assert "2 runs are finished already, 0 to do" in again.stderr
 
 
-@pytest.mark.parametrize("file", ["suite.toml", "calibration.toml", "carried.toml"])
+@pytest.mark.parametrize("file", ["suite.toml", "calibration.toml", "carried.toml", "long.toml"])
 def test_programs_are_those_of_the_checkout(file: str) -> None:
     folders = [e.node["folder"] for e in read_suite(FOLDER / file).estimators if "folder" in e.node]
     root = Path(__file__).parents[4]
