@@ -575,7 +575,9 @@ async def test_each_kind_of_message_is_treated_as_the_table_has_it() -> None:
             assert answers == [], name
         elif name not in TREATED_WITH_WORDS and others != {"MISSION_ACK"}:
             assert refusal == [], name
-        assert (len(outside.seen) > poses) == (row is not None and row.treatment == "judged"), name
+        is_pose = row is not None and row.treatment == "judged" and "SPEED" not in name
+        outside.passes(0.03)  # in which a pose may wait for a speed
+        assert (len(outside.seen) > poses) == is_pose, name
         assert acts == [], name
     assert counts["errors"] == 0
     outside.close()

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from events.frames import Geodetic, from_rpy
+from events.frames import Geodetic
 from runtime.logs import NodeLogger
 from visnav_mavlink.answers import ANSWERS
 from visnav_mavlink.clocks import Clocks
 from visnav_mavlink.flight import Flight
-from visnav_mavlink.links import Links, Peer, Sender, mav
-from visnav_mavlink.messages import TREATMENTS
+from visnav_mavlink.links import Links, Peer, Sender, ardupilot_dialect, mav
+from visnav_mavlink.messages import OF_ARDUPILOT, TREATMENTS
 from visnav_mavlink.missions import Guided, Missions
 from visnav_mavlink.settings import MavlinkConfig
 from visnav_mavlink.vehicle import Parameters, Telemetry, Vehicle
+from visnav_mavlink.vision import Vision
 
 MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it
-_COVARIANCE = np.triu_indices(6)
 
 Handler = Callable[[Peer, Sender, Any, int], None]
 """Takes the link's peer, the sender, the message and the time (ns)."""
@@ -43,7 +40,7 @@ class MavlinkEndpoint:
         now: Callable[[], int],
         log: NodeLogger,
     ) -> None:
-        self._config, self._see_pose, self._now, self._log = config, see, now, log
+        self._config, self._now, self._log = config, now, log
         self._sentences: set[str] = set()
         self._text_number = 0
         self._is_lost = True  # until the first is heard
@@ -52,6 +49,7 @@ class MavlinkEndpoint:
         self._send = send = self._links.send
         self.vehicle = vehicle = Vehicle(origin, config.gps, config.autopilot == "ardupilot")
         self._clocks = Clocks(send, self._tell_once)
+        self._vision = Vision(config.delay, self._clocks, see, self._refuse)
         self._telemetry = Telemetry(vehicle, self._links, self._tell)
         self._parameters = Parameters(send, self._tell)
         self._missions = Missions(
@@ -63,6 +61,7 @@ class MavlinkEndpoint:
             if vehicle.is_copter
             else None,
         )
+        vehicle.progress = lambda: self._missions.progress
         parts = self._missions, self._parameters
         self.flight = Flight(vehicle, *parts, act, self._tell, self._once)
         by_handler: dict[Handler, str] = {
@@ -78,7 +77,7 @@ class MavlinkEndpoint:
             self._set_rates: "REQUEST_DATA_STREAM",
             self._timesync: "TIMESYNC",
             self._see: "ODOMETRY VISION_POSITION_ESTIMATE VICON_POSITION_ESTIMATE ATT_POS_MOCAP "
-            "GLOBAL_VISION_POSITION_ESTIMATE",
+            "GLOBAL_VISION_POSITION_ESTIMATE VISION_SPEED_ESTIMATE VISION_POSITION_DELTA",
         }
         self._handlers = {
             kind: handle for handle, kinds in by_handler.items() for kind in kinds.split()
@@ -86,6 +85,8 @@ class MavlinkEndpoint:
 
     def open(self) -> None:
         """Open the links; a `ValueError` if one cannot be."""
+        if self._config.vision:
+            ardupilot_dialect()  # 0.2 s, which the first message that needs it must not take
         for link in self._config.endpoints:
             try:
                 self._links.open(link)
@@ -103,11 +104,25 @@ class MavlinkEndpoint:
         self._missions.update(now)
         if config.vision:
             self._clocks.update(now)
+            self._vision.update(now)
         self.flight.update(now)
         is_lost = self._links.quiet_for(wall) > config.link_timeout
         if is_lost and not self._is_lost and config.link_loss != "nothing":
             self.flight.lost(config.link_loss, now)
         self._is_lost = is_lost
+
+    def finish(self) -> str:
+        """Publish the last pose from outside; tell all programs, and return, how many there were.
+
+        Returns:
+            Sentence; empty without `vision`.
+        """
+        if not self._config.vision:
+            return ""
+        text = self._vision.summary()
+        self._say(text, mav.MAV_SEVERITY_INFO)
+        (self._log.warning if self._vision.refused else self._log.info)("%s", text)
+        return text
 
     def close(self) -> None:
         """Close the links."""
@@ -120,6 +135,7 @@ class MavlinkEndpoint:
         if target not in {0, self._config.system_id} or part not in {0, 1}:
             return
         now, kind = self._now(), message.get_type()
+        kind = OF_ARDUPILOT.get(kind, kind)
         is_vehicle = not target and sender[1] == mav.MAV_COMP_ID_AUTOPILOT1
         row = TREATMENTS.get(kind)
         if row is None:
@@ -127,6 +143,7 @@ class MavlinkEndpoint:
         elif row.treatment == "refused" and not is_vehicle:
             self._refuse(kind, sender, row.words)
         elif is_vehicle and row.treatment == "judged":
+            self._vision.refused["another vehicle"] += self._config.vision
             self._once("{} of system {}, component {} is another vehicle's".format(kind, *sender))
         elif kind in self._handlers:
             self._handlers[kind](peer, sender, message, now)
@@ -171,52 +188,16 @@ class MavlinkEndpoint:
             words = f"stream {message.req_stream_id} has no messages here"
             self._refuse("REQUEST_DATA_STREAM", sender, words)
 
-    def _see(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
-        """Publish a pose from outside as an estimate."""
-        kind, counts = message.get_type(), self._links.counts
+    def _see(self, peer: Peer, sender: Sender, message: Any, now: int) -> None:
+        """Take a pose from outside as an estimate."""
+        kind = message.get_type()
         if not self._config.vision:
-            self._refuse(kind, sender, "vision is false")
+            self._refuse(OF_ARDUPILOT.get(kind, kind), sender, "vision is false")
             return
-        if kind == "ODOMETRY":
-            frame = message.frame_id
-            if frame not in {mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD}:
-                words = f"expected frame_id LOCAL_NED or LOCAL_FRD, found {frame}"
-                self._refuse(kind, sender, words)
-                return
-            if getattr(message, "quality", 0) < 0:
-                counts["poses of failed quality, not judged"] += 1
-                self._refuse(kind, sender, "its quality says failed; others are judged")
-                return
-        if kind in {"ODOMETRY", "ATT_POS_MOCAP"}:
-            size = math.hypot(*message.q)
-            orientation = tuple(part / size for part in message.q) if 0.5 < size < 2.0 else ()
-        else:
-            angles = message.roll, message.pitch, message.yaw
-            orientation = from_rpy(*angles) if all(map(math.isfinite, angles)) else ()
-        position = message.x, message.y, message.z
-        if not orientation or not all(map(math.isfinite, position)):
-            counts["poses with numbers that are none, not judged"] += 1
-            self._refuse(kind, sender, "its numbers are none; others are judged")
+        if kind in OF_ARDUPILOT and (message := peer.read_ardupilot(message)) is None:
+            self._links.counts["pieces of garbage"] += 1
             return
-        stamp = 1000 * (message.time_usec if hasattr(message, "time_usec") else message.usec)
-        corrected = self._clocks.stamp(sender, stamp, now)
-        if corrected != stamp:
-            counts["poses with stamps of another clock, corrected"] += 1
-        counter = getattr(message, "reset_counter", 0)
-        covariance = message.pose_covariance if kind == "ODOMETRY" else message.covariance
-        full: tuple[float, ...] = ()
-        if np.isfinite(covariance).all() and np.any(covariance):
-            matrix = np.zeros((6, 6))
-            matrix[_COVARIANCE] = covariance
-            full = tuple((matrix + np.triu(matrix, 1).T).ravel().tolist())
-        counts["poses judged"] += 1
-        self._see_pose(
-            stamp=corrected,
-            frame_id=f"odom_{counter}" if counter else "odom",
-            position=position,
-            orientation=orientation,
-            covariance=full,
-        )
+        self._vision.hear(sender, message, now)
 
     def _refuse(self, kind: str, sender: Sender, words: str) -> None:
         """Tell why messages have no effect, once for each kind, sender and reason."""
@@ -238,10 +219,12 @@ class MavlinkEndpoint:
 
     def _tell(self, text: str) -> None:
         self._log.warning("%s", text)
+        self._say(text, mav.MAV_SEVERITY_WARNING)
+
+    def _say(self, text: str, level: int) -> None:
         data = text.encode("ascii", "replace")
         parts = [data[begin : begin + 50] for begin in range(0, len(data), 50)]
         self._text_number = self._text_number % 65535 + 1
         number = self._text_number if len(parts) > 1 else 0
         for index, part in enumerate(parts):
-            level = mav.MAV_SEVERITY_WARNING
             self._send(mav.MAVLink_statustext_message(level, part, number, index))

@@ -12,7 +12,7 @@ import math
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -33,6 +33,7 @@ _EPOCH_2015 = 1_420_070_400  # signatures' time begins there (mavlink.io, messag
 SLICE = 0.2  # real seconds between two looks at whether the run has ended
 STARTING = 0.004  # real seconds that PX4's answer may take before the first one has come
 _IMU, _MAGNETOMETER, _BAROMETER = 0b111111, 0b111000000, 0b1101000000000
+_TEMPERATURE = 0b1000000000000
 MOTORS = 4
 
 Sender = tuple[int, int]
@@ -61,6 +62,20 @@ class Peer:
     def pack(self, message: Any) -> bytes:
         """Return a message's bytes, with the link's next sequence number and signature."""
         return _packed(message, self.parser)
+
+    def read_ardupilot(self, message: Any) -> Any:
+        """Return a message of ArduPilot's dialect, whose bytes `parser` has left as they are.
+
+        Returns:
+            `None` if it is broken, or not signed as all others must be.
+        """
+        dialect = ardupilot_dialect()
+        reader = dialect.MAVLink(None)
+        reader.signing = self.parser.signing
+        try:
+            return reader.decode(bytearray(message.get_msgbuf()))
+        except dialect.MAVError:
+            return None
 
     def messages(self, data: bytes) -> list[Any]:
         """Return the messages in some bytes; a datagram goes on from nothing before it."""
@@ -336,6 +351,27 @@ def sensors(imu: Imu, field: MagneticField | None, pressure: FluidPressure | Non
         air, updated = (pascal / 100.0, 0.0, altitude, 25.0), updated | _BAROMETER
     measured = *imu.linear_acceleration, *imu.angular_velocity
     return mav.MAVLink_hil_sensor_message(imu.stamp // 1000, *measured, *gauss, *air, updated, 0)
+
+
+def highres_imu(
+    imu: Imu, field: MagneticField | None, pressure: FluidPressure | None, updated: Sequence[bool]
+) -> Any:
+    """Return a ``HIGHRES_IMU`` of an IMU's sample and of what else was measured last.
+
+    Args:
+        updated: Which of the three are new. No sensor here measures a temperature.
+    """
+    hil = sensors(imu, field, pressure)
+    groups = _IMU, _MAGNETOMETER, _BAROMETER & ~_TEMPERATURE
+    flags = sum(group for group, is_new in zip(groups, updated, strict=True) if is_new)
+    values = (getattr(hil, name) for name in _MEASURED)
+    return mav.MAVLink_highres_imu_message(*values, 0.0, flags, 0)
+
+
+_MEASURED = (
+    "time_usec", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag", "ymag", "zmag",
+    "abs_pressure", "diff_pressure", "pressure_alt",
+)  # fmt: skip
 
 
 def satellites(fix: NavSatFix) -> Any:

@@ -52,6 +52,16 @@ ROWS = (
         "as poses of an estimator, if `vision` is true; those of another vehicle are not",
     ),
     Row(
+        "judged",
+        "VISION_SPEED_ESTIMATE",
+        "as the velocity of its sender's pose of the same stamp; alone it has no effect",
+    ),
+    Row(
+        "judged",
+        "VISION_POSITION_DELTA",
+        "of ArduPilot's dialect; added up to poses, unless its sender sends poses, too",
+    ),
+    Row(
         "answered",
         "MISSION_REQUEST_LIST MISSION_REQUEST MISSION_REQUEST_INT PARAM_REQUEST_LIST "
         "PARAM_REQUEST_READ TIMESYNC PING",
@@ -61,11 +71,6 @@ ROWS = (
         "refused",
         "MANUAL_SETPOINT RC_CHANNELS_OVERRIDE",
         "sticks fly by MANUAL_CONTROL",
-    ),
-    Row(
-        "refused",
-        "VISION_SPEED_ESTIMATE VISION_POSITION_DELTA",
-        "speeds and differences alone are not judged, ODOMETRY is",
     ),
     Row(
         "refused",
@@ -172,6 +177,8 @@ ROWS = (
 
 TREATMENTS = {kind: row for row in ROWS for kind in row.kinds.split()}
 """Row of each kind of message."""
+OF_ARDUPILOT = {"UNKNOWN_11011": "VISION_POSITION_DELTA"}
+"""Names of kinds that only ArduPilot's dialect has, by what the common one calls them."""
 
 
 def table() -> str:

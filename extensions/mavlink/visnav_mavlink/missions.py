@@ -101,6 +101,11 @@ class Missions:
         self._upload: Upload | None = None
         self._done: tuple[Sender, int] | None = None  # of the last upload, and its last item
 
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Number of the item under way, or of the last one after it, and how many there are."""
+        return min(self._next, max(len(self.items) - 1, 0)), len(self.items)
+
     def current(self) -> Item | None:
         """Return the item to fly; `None` after the last."""
         return self.items[self._next] if self._next < self._end else None
@@ -316,8 +321,7 @@ class Missions:
         self._send(mav.MAVLink_mission_ack_message(*sender, result, which))
 
     def _progress(self) -> None:
-        last = max(len(self.items) - 1, 0)
-        self._send(mav.MAVLink_mission_current_message(min(self._next, last), len(self.items)))
+        self._send(mav.MAVLink_mission_current_message(*self.progress))
 
 
 def _item(message: Any) -> Item | None:

@@ -22,6 +22,7 @@ from events import (
     NavSatFix,
     Odometry,
     PoseEstimate,
+    Quaternion,
     Setpoint,
     VehicleEvent,
 )
@@ -59,6 +60,7 @@ class Mavlink(VehicleController[MavlinkConfig]):
     def __init__(self) -> None:
         super().__init__()
         self._estimators: list[str] = []
+        self._imus: dict[str, Quaternion] = {}  # orientation in the body, by source
         self._endpoint: MavlinkEndpoint | None = None
 
     async def on_startup(self) -> None:
@@ -89,6 +91,8 @@ class Mavlink(VehicleController[MavlinkConfig]):
         self.refuse_several()
         if isinstance(announcement, EstimatorAnnouncement):
             self._estimators.append(announcement.source)
+        if isinstance(announcement, ImuAnnouncement):
+            self._imus[announcement.source] = announcement.orientation
 
     def check(self) -> Iterable[str]:
         """Say if there is nothing to fly, or time runs away from programs."""
@@ -110,6 +114,12 @@ class Mavlink(VehicleController[MavlinkConfig]):
         if self._endpoint and not self.config.telemetry and event.source == self._vehicles[0]:
             self._endpoint.vehicle.note(event)
 
+    @on(Imu, MagneticField, FluidPressure)
+    def samples(self, event: Imu | MagneticField | FluidPressure) -> None:
+        """Take note of what the vehicle's sensors measure."""
+        if self._endpoint and self._is_aboard(event.source):
+            self._endpoint.vehicle.measure(event)
+
     @on(PoseEstimate)
     def poses(self, event: PoseEstimate) -> None:
         """Take note of the estimated pose."""
@@ -122,16 +132,30 @@ class Mavlink(VehicleController[MavlinkConfig]):
         if self._endpoint and event.source == self._vehicles[0]:
             self._endpoint.flight.noted(event)
 
+    async def on_ready(self) -> None:
+        """Take note of the vehicle's IMU."""
+        for source, orientation in self._imus.items():
+            if self._endpoint and self._is_aboard(source):
+                self._endpoint.vehicle.imu_orientation = orientation
+
     @every(hz=RATE)
     def go_on(self, tick: Tick) -> None:
         """Send telemetry, and steer."""
         if self._endpoint:
             self._endpoint.update(tick.stamp, self.wall())
 
+    async def on_end(self) -> None:
+        """Tell how many poses came from outside."""
+        if self._endpoint and (text := self._endpoint.finish()):
+            self.note_environment(f"{self.name}: poses from outside", text)
+
     async def on_shutdown(self) -> None:
         """Close the links."""
         if self._endpoint:
             self._endpoint.close()
+
+    def _is_aboard(self, source: str) -> bool:
+        return f"{source}/".startswith(f"{self._vehicles[0]}/")
 
     def _act(self, kind: Callable[..., Command | Setpoint], **fields: Any) -> None:
         event = self.made(kind, **fields)

@@ -9,6 +9,7 @@ import msgspec
 
 from nodes.pilots.pilot import VehicleControllerConfig
 from runtime import Duration
+from runtime.units import Latency
 
 RATE = 100.0
 """Highest rate of telemetry, and of set-points on the way to a place, Hz."""
@@ -28,6 +29,9 @@ class MavlinkConfig(VehicleControllerConfig):
         gps: Whether the telemetry has a global position.
         vision: Whether poses come from outside (``ODOMETRY``, ``VISION_POSITION_ESTIMATE``); they
             are judged as this node's estimates.
+        delay: How long before their stamps poses from outside were measured, as PX4's
+            ``EKF2_EV_DELAY``: whole latency where stamps are those of another clock that only the
+            earliest arrival tells, none where they are synchronized.
         link_loss: What a flying vehicle does when nobody is heard any more.
         link_timeout: Real time after which that is so.
         signing_key: Secret of 64 hexadecimal digits, without which nobody is heard; empty for
@@ -40,6 +44,7 @@ class MavlinkConfig(VehicleControllerConfig):
     telemetry: str = ""
     gps: bool = True
     vision: bool = False
+    delay: Latency = Latency(0.0)  # immutable
     link_loss: Literal["nothing", "hold", "land"] = "hold"
     link_timeout: Duration = Duration(3.0)  # immutable
     signing_key: str = ""

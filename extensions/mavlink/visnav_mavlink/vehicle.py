@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from events import Odometry, PoseEstimate, Quaternion, Vector3
+from events import FluidPressure, Imu, MagneticField, Odometry, PoseEstimate, Quaternion, Vector3
 from events.frames import Geodetic, from_geodetic, rotate, rotate_inverse, to_geodetic, yaw_of
-from visnav_mavlink.links import Links, Peer, ardupilot_dialect, mav
+from visnav_mavlink.links import Links, Peer, ardupilot_dialect, highres_imu, mav
 from visnav_mavlink.settings import RATE
 
 SECOND = 1_000_000_000
@@ -71,6 +71,8 @@ _ESTIMATED = (
 )
 _PREDICTED = mav.ESTIMATOR_PRED_POS_HORIZ_ABS
 
+Sample = Imu | MagneticField | FluidPressure
+
 
 @dataclass
 class Vehicle:
@@ -81,6 +83,9 @@ class Vehicle:
         home: Where it stood at first, metres in ``map``.
         gps: Whether it has a global position.
         is_copter: Whether it is seen as ArduPilot's Copter, not as PX4.
+        imu_orientation: Rotation from its IMU's frame to the body's; `None` without an IMU.
+        measured: Newest sample of each kind of sensor, with its number among all samples.
+        progress: Returns the number of its mission's item under way, and how many there are.
     """
 
     origin: Geodetic
@@ -94,6 +99,10 @@ class Vehicle:
     orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
     armed: bool = False
     mode: str = "hold"
+    imu_orientation: Quaternion | None = None
+    measured: dict[type[Sample], tuple[int, Any]] = field(default_factory=dict)
+    samples: int = 0
+    progress: Callable[[], tuple[int, int]] = lambda: (0, 0)
 
     def note(self, pose: Odometry | PoseEstimate) -> None:
         """Take note of the newest pose."""
@@ -105,6 +114,11 @@ class Vehicle:
             self.velocity = pose.velocity
         if self.home is None:
             self.home = self.position
+
+    def measure(self, sample: Sample) -> None:
+        """Take note of a sensor's newest sample."""
+        self.samples += 1
+        self.measured[type(sample)] = self.samples, sample
 
     @property
     def ready(self) -> bool:
@@ -280,6 +294,29 @@ def _ekf_status(v: Vehicle, _: int) -> Any:
     )
 
 
+def _highres_imu(v: Vehicle, since: int) -> Any:
+    """Return the newest samples, those after the number `since` as new; `None` if the IMU's is not.
+
+    It is in the body's frame, as PX4's.
+    """
+    kinds = Imu, MagneticField, FluidPressure
+    (number, imu), field, pressure = (v.measured.get(kind, (0, None)) for kind in kinds)
+    if imu is None or number <= since:
+        return None
+    if v.imu_orientation is not None:
+        imu = Imu(
+            stamp=imu.stamp, source=imu.source,
+            angular_velocity=rotate(v.imu_orientation, imu.angular_velocity),
+            linear_acceleration=rotate(v.imu_orientation, imu.linear_acceleration),
+        )  # fmt: skip
+    updated = [True, field[0] > since, pressure[0] > since]
+    return highres_imu(imu, field[1], pressure[1], updated)
+
+
+def _mission_current(v: Vehicle, _: int) -> Any:
+    return mav.MAVLink_mission_current_message(*v.progress())
+
+
 def _autopilot_version(v: Vehicle, _: int) -> Any:  # noqa: ARG001
     can = (
         mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
@@ -301,6 +338,7 @@ def _heading(v: Vehicle) -> int:
 
 
 _EKF_STATUS_REPORT = 193  # of ArduPilot's dialect
+_HIGHRES_IMU = mav.MAVLINK_MSG_ID_HIGHRES_IMU
 Make = Callable[[Vehicle, int], Any]
 TELEMETRY: dict[int, tuple[float, Make]] = {
     mav.MAVLINK_MSG_ID_HEARTBEAT: (1.0, _heartbeat),
@@ -316,6 +354,8 @@ TELEMETRY: dict[int, tuple[float, Make]] = {
     mav.MAVLINK_MSG_ID_HOME_POSITION: (1.0, _home_position),
     mav.MAVLINK_MSG_ID_VFR_HUD: (5.0, _vfr_hud),
     mav.MAVLINK_MSG_ID_BATTERY_STATUS: (1.0, _battery),
+    _HIGHRES_IMU: (20.0, _highres_imu),  # of samples since the last one to a peer
+    mav.MAVLINK_MSG_ID_MISSION_CURRENT: (1.0, _mission_current),
     mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: (1.0, _estimator_status),
     _EKF_STATUS_REPORT: (1.0, _ekf_status),
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: (0.0, _autopilot_version),
@@ -329,9 +369,11 @@ STREAMS: dict[int, tuple[int, ...]] = {
         for number, (rate, _) in TELEMETRY.items()
         if rate and number != mav.MAVLINK_MSG_ID_HEARTBEAT
     ),
+    mav.MAV_DATA_STREAM_RAW_SENSORS: (_HIGHRES_IMU,),
     mav.MAV_DATA_STREAM_EXTENDED_STATUS: (
         mav.MAVLINK_MSG_ID_SYS_STATUS,
         mav.MAVLINK_MSG_ID_GPS_RAW_INT,
+        mav.MAVLINK_MSG_ID_MISSION_CURRENT,
     ),
     mav.MAV_DATA_STREAM_POSITION: (
         mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -339,17 +381,25 @@ STREAMS: dict[int, tuple[int, ...]] = {
     ),
     mav.MAV_DATA_STREAM_EXTRA1: (mav.MAVLINK_MSG_ID_ATTITUDE,),
     mav.MAV_DATA_STREAM_EXTRA2: (mav.MAVLINK_MSG_ID_VFR_HUD,),
-    mav.MAV_DATA_STREAM_EXTRA3: (mav.MAVLINK_MSG_ID_BATTERY_STATUS,),
+    mav.MAV_DATA_STREAM_EXTRA3: (
+        mav.MAVLINK_MSG_ID_BATTERY_STATUS,
+        mav.MAVLINK_MSG_ID_SYSTEM_TIME,
+    ),
 }
 """Messages of ``REQUEST_DATA_STREAM``'s streams, as ArduPilot groups them."""
 
 
 @dataclass
 class Timer:
-    """Period of a message, and when it is due (ns)."""
+    """Period of a message, and when it is due (ns).
+
+    Attributes:
+        since: Number of the newest sample that was sent, of a message of samples.
+    """
 
     period: int
     due: int = 0
+    since: int = 0
 
     def take(self, now: int) -> bool:
         """Return whether it is due; then it is due again a period later, not sooner after a gap."""
@@ -368,8 +418,8 @@ class Telemetry:
         request, version = self._request, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
         home = mav.MAVLINK_MSG_ID_HOME_POSITION
         self._commands: dict[int, Callable[[Peer, Any, int], bool]] = {
-            mav.MAV_CMD_SET_MESSAGE_INTERVAL: lambda peer, m, _: self.set_period(
-                peer, m.param1, m.param2
+            mav.MAV_CMD_SET_MESSAGE_INTERVAL: lambda peer, m, _: (
+                self._is_there(m.param1) and self.set_period(peer, m.param1, m.param2)
             ),
             mav.MAV_CMD_GET_MESSAGE_INTERVAL: lambda peer, m, _: self._tell_period(peer, m.param1),
             mav.MAV_CMD_REQUEST_MESSAGE: lambda peer, m, now: (
@@ -408,22 +458,25 @@ class Telemetry:
 
     def set_stream(self, peer: Peer, stream: int, hertz: int) -> bool:
         """Set the rates of a stream's messages; `False` if it has none."""
-        numbers = STREAMS.get(stream, ())
+        numbers = [n for n in STREAMS.get(stream, ()) if not self._lacks(n)]
         for number in numbers:
             self.set_period(peer, number, 1e6 / hertz if hertz else -1)
         return bool(numbers)
 
     def update(self, now: int) -> None:
         """Send all that is due at a stamp (ns)."""
-        made: dict[int, Any] = {}
+        made: dict[tuple[int, int], Any] = {}
         for peer in [*self._links.peers]:
             for number, timer in self._of(peer).items():
                 if not timer.take(now):
                     continue
-                if number not in made:
-                    made[number] = self._make(number, now)
-                if made[number] is not None:
-                    self._links.send_to(peer, made[number])
+                key = number, timer.since
+                if key not in made:
+                    made[key] = self._make(*key, now)
+                if made[key] is not None:
+                    self._links.send_to(peer, made[key])
+                if number == _HIGHRES_IMU:
+                    timer.since = self._vehicle.samples
 
     def _of(self, peer: Peer) -> dict[int, Timer]:
         if (timers := self._timers.get(peer)) is None:
@@ -432,11 +485,27 @@ class Telemetry:
             self._timers[peer] = timers
         return timers
 
-    def _make(self, number: int, now: int) -> Any:
+    def _make(self, number: int, since: int, now: int) -> Any:
+        if number == _HIGHRES_IMU:
+            return _highres_imu(self._vehicle, since)
         return TELEMETRY[number][1](self._vehicle, now // 1_000_000 % 2**32)
 
+    def _lacks(self, number: float) -> str:
+        """Return why a message never comes, if so."""
+        if number == _HIGHRES_IMU and self._vehicle.imu_orientation is None:
+            return "HIGHRES_IMU: expected a vehicle with an IMU, found none"
+        if number == _EKF_STATUS_REPORT and not self._vehicle.is_copter:
+            return "EKF_STATUS_REPORT: it is ArduPilot's"
+        return ""
+
+    def _is_there(self, number: float) -> bool:
+        """Tell why a message never comes, if so; return whether it may."""
+        if words := self._lacks(number):
+            self._tell(words)
+        return not words
+
     def _request(self, peer: Peer, number: float, now: int) -> bool:
-        message = self._make(int(number), now) if number in TELEMETRY else None
+        message = self._make(int(number), 0, now) if number in TELEMETRY else None
         if message is not None:
             self._links.send_to(peer, message)
         return message is not None
