@@ -41,6 +41,10 @@ def drone(**settings: Any) -> dict[str, Any]:
     return {"Vehicles": {"Drone1": {"VehicleType": "SimpleFlight", **settings}}}
 
 
+def lidar(**settings: Any) -> dict[str, Any]:
+    return drone(Sensors={"L": {"SensorType": 6, "Enabled": True, **settings}})
+
+
 @pytest.mark.parametrize("settings", [{}, {"SimMode": ""}, {"Vehicles": {}}, {"Vehicles": None}])
 def test_without_settings_there_is_a_drone_with_airsims_sensors(settings: Any) -> None:
     config = parse(table_of(settings)[0], "settings.json")
@@ -87,6 +91,41 @@ def test_the_computer_vision_mode_has_a_camera_that_flies_freely() -> None:
     eye = node(settings, "Eye")
     assert (eye.position, eye.orientation) == ((0.0, 0.0, -2.0), (0.0, -30.0, 0.0))
     assert node({"SimMode": "ComputerVision"}, "ComputerVision").position == (0.0, 0.0, -1.5)
+
+
+def test_a_camera_without_a_vehicle_names_the_sensors_that_it_lacks() -> None:
+    sensors = {
+        "Top": {"SensorType": 6, "Enabled": True, "Range": 20},
+        "Imu1": {"SensorType": 2, "Enabled": True},
+        "Off": {"SensorType": 1, "Enabled": False},
+    }
+    eye = {"SimMode": "ComputerVision", "Vehicles": {"Eye": {"Sensors": sensors}}}
+    (note,) = table_of(eye, 1)[1]
+    assert note.startswith("settings.json: Vehicles.Eye.Sensors: ignored: Imu1, Top: ")
+    assert "cameras and no other sensor" in note
+    usual = {"SimMode": "ComputerVision", "DefaultSensors": sensors}
+    (note,) = table_of(usual, 1)[1]
+    assert note.startswith("settings.json: DefaultSensors: ignored: Imu1, Top: ")
+    del sensors["Top"], sensors["Imu1"]
+    table_of(eye, 0)
+
+
+def test_a_lidars_cycle_is_measured_as_cosys_airsim_does() -> None:
+    top = {"SensorType": 6, "Enabled": True, "NumberOfChannels": 32, "MeasurementsPerCycle": 512}
+    noise = {"GenerateNoise": True, "MinNoiseStandardDeviation": 0.02}
+    (lidar,) = node(drone(Sensors={"Top": top}), "Drone1").lidars
+    assert (lidar.columns, lidar.rate, lidar.azimuths, lidar.noise) == (
+        512,
+        10.0,
+        (0.0, 360.0),
+        0.0,
+    )
+    narrow = top | noise | {"HorizontalFOVStart": -30, "HorizontalFOVEnd": 30}
+    (lidar,) = node(drone(Sensors={"Top": narrow}), "Drone1").lidars
+    assert (lidar.columns, lidar.azimuths, lidar.noise) == (512, (330.0, 390.0), 0.02)
+    quiet = top | noise | {"GenerateNoise": False, "NoiseDistanceScale": 2}
+    (lidar,) = node(drone(Sensors={"Top": quiet}), "Drone1", notes=None).lidars
+    assert lidar.noise == 0.0
 
 
 def test_the_whole_file() -> None:
@@ -252,6 +291,22 @@ def test_cosys_imus_are_without_noise_unless_asked() -> None:
             drone(Sensors={n: {"SensorType": 3, "Enabled": True} for n in "GH"}),
             "Vehicles.Drone1.Sensors.H: ignored: a vehicle has one gnss",
         ),
+        (
+            lidar(MeasurementsPerCycle=512, PointsPerSecond=1e5),
+            "Sensors.L.PointsPerSecond: ignored: MeasurementsPerCycle is given, too",
+        ),
+        (
+            lidar(GenerateNoise=True, MinNoiseStandardDeviation=0.1, NoiseDistanceScale=3),
+            "Sensors.L.NoiseDistanceScale: ignored: the noise is the same at all distances",
+        ),
+        (
+            lidar(External=True, ExternalLocal=True),
+            "Sensors.L.External: ignored: vehicles carry all cameras and sensors",
+        ),
+        (
+            drone(Sensors={"G": {"SensorType": 8, "Enabled": True}}),
+            "G.SensorType: ignored: no sensor of type 8 (lidar on a GPU; 6 is a lidar) is",
+        ),
         ({"SettingsVersion": 1.0}, "SettingsVersion: 1 is read as if it were 1.2"),
         (drone(DefaultVehicleState="Disarmed"), "Drone1.DefaultVehicleState: ignored: it starts"),
         ({"a\nb": 1}, r"settings.json: a\nb: ignored"),
@@ -307,6 +362,10 @@ def test_vehicles_at_one_place_are_named() -> None:
         (
             drone(Cameras={"c": {"CaptureSettings": [{"ProjectionMode": "orthographic"}]}}),
             "CaptureSettings[0].ProjectionMode: expected \"perspective\", found 'orthographic'",
+        ),
+        (
+            lidar(MeasurementsPerCycle=0),
+            "Sensors.L.MeasurementsPerCycle: expected 1 to 65536, found 0",
         ),
         (drone(Cameras={"c": {"CaptureSettings": [{"FOV_Degrees": 175}]}}), "fov: expected"),
         ({"OriginGeopoint": {"Latitude": 100}}, "origin"),

@@ -24,17 +24,22 @@ IGNORED = {
         "it changes only what Unreal shows": "ViewMode, TimeOfDay, SubWindows, CameraDirector, "
         "PawnPaths, PawnPath, RecordUIVisible, EngineSound, SpeedUnitFactor, SpeedUnitLabel, "
         "LogMessagesVisible, Default Environment, DrawDebugPoints, EnableTrace, UnrealEngine, "
-        "SeeDocsAt",
+        "SeeDocsAt, DrawSensor, ShowLosDebugLines, MoveWorldOrigin",
         "images are of one instant, in perspective, without errors": "MotionBlurAmount, "
         "TargetGamma, AutoExposureSpeed, AutoExposureBias, AutoExposureMaxBrightness, "
         "AutoExposureMinBrightness, OrthoWidth, DepthOfFieldFstop, DepthOfFieldFocalDistance, "
-        "DepthOfFieldFocalRegion, PublishToRos",
+        "DepthOfFieldFocalRegion, PublishToRos, MotionBlurMax, ChromaticAberrationScale, "
+        "LumenGIEnable, LumenReflectionEnable, LumenFinalQuality, LumenSceneDetail, "
+        "LumenSceneLightningDetail",
         "time is simulated in steps of 1 ms": "ClockType",
         "vehicles fly by MuJoCo's physics, and bodies are solid": "PhysicsEngineName, "
         "EnableCollisions, EnableCollisionPassthrogh, EnableCollisionPassthrough",
         "clients may always command": "EnableRpc, RpcEnabled, AllowAPIAlways, RC",
-        "cameras are carried by vehicles": "ExternalCameras",
-        "IDs begin as AirSim computes them from names": "SegmentationSettings",
+        "vehicles carry all cameras and sensors": "ExternalCameras, External, ExternalLocal",
+        "IDs begin as AirSim computes them from names": "SegmentationSettings, "
+        "InitialInstanceSegmentation",
+        "nothing is marked, and all is seen": "IgnoreMarked",
+        "a lidar's turn is always whole": "LimitPoints",
         "it starts armed": "DefaultVehicleState",
         "only eph is simulated": "EpvInitial, EpvFinal, EpvTimeConstant, EPV_TimeConstant",
     }.items()
@@ -44,6 +49,7 @@ IGNORED = {
 _HOLDS = {
     "DefaultVehicleState": "Armed",
     **dict.fromkeys(("EnableRpc", "RpcEnabled", "AllowAPIAlways", "EnableCollisions"), True),
+    "ExternalLocal": True,
 }  # values of these that hold here; so do 0, false and an empty text of all
 
 

@@ -26,6 +26,7 @@ _REFUSED = {
     "ardurover": "cars are not simulated",
 }
 _EYE_HEIGHT = 1.5  # metres above the ground of a computer-vision camera, if not said
+_MOST_COLUMNS = 2**16  # of a lidar's turn
 _IMAGE_TYPES = range(8)  # that the server takes
 
 DEFAULT_CAMERAS: tuple[tuple[tuple[str, ...], Vector3, Vector3], ...] = (
@@ -54,6 +55,9 @@ _NUMBERS = {
     5: {"MinDistance": "min_range", "MaxDistance": "max_range"},
     6: {"Range": "max_range"},
 }  # keys and our names of numbers; UpdateFrequency and times are all sensors'
+_COSYS = dict(
+    enumerate(["echo", "lidar on a GPU; 6 is a lidar", "template", "UWB", "Wi-Fi"], start=7)
+)  # by SensorType, sensors that Cosys-AirSim adds
 _UNITS = {"NoiseSigma": 1e-4, "NoiseBias": 1e-4}  # Gauss in tesla
 
 
@@ -133,7 +137,9 @@ def _vehicles(keys: Keys, mode: str, world: str, server: Table) -> list[Table]:
     for name, vehicle in given:
         camera = _is_camera(vehicle, mode)
         node = {"name": name, **_place(vehicle, camera), "world": world, "origin": origin}
-        if not camera:
+        if camera:
+            _note_sensors(vehicle, keys)
+        else:
             node |= _sensors(vehicle, keys, server)
         served = _cameras(name, vehicle, keys, camera)
         if vehicle.flag("AutoCreate", True):
@@ -281,12 +287,25 @@ def _sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str,
     return {"imu": _imu(Keys({}, "", []))} | sensors  # it always has one
 
 
+def _note_sensors(vehicle: Keys, settings: Keys) -> None:
+    """Note the sensors that a camera without a vehicle would have, and has not."""
+    for keys, key in ((vehicle, "Sensors"), (settings, "DefaultSensors")):
+        names = [name for name, sensor in keys.tables(key) if sensor.flag("Enabled")]
+        if names:
+            keys.note(
+                key,
+                f"ignored: {', '.join(names)}: a vehicle of the type {_CAMERA} has cameras and no "
+                f"other sensor, as in AirSim 1.8.1; one of the type {_DRONE} has them",
+            )
+
+
 def _known(listed: Iterable[tuple[str, Keys]]) -> Iterable[tuple[str, Keys, int]]:
     for name, keys in listed:
         if (type_ := keys.whole("SensorType", 0)) in _SETTINGS:
             yield name, keys, type_
         else:
-            keys.note("SensorType", f"ignored: no sensor of type {type_} is simulated")
+            called = f" ({_COSYS[type_]})" if type_ in _COSYS else ""
+            keys.note("SensorType", f"ignored: no sensor of type {type_}{called} is simulated")
 
 
 def _sensor(keys: Keys, type_: int) -> dict[str, Any]:
@@ -329,10 +348,22 @@ def _lidar(keys: Keys) -> dict[str, Any]:
     last = keys.number("HorizontalFOVEnd", 359.0) % 360
     low, high = keys.number("VerticalFOVLower", -45.0), keys.number("VerticalFOVUpper", -15.0)
     columns = keys.positive("PointsPerSecond", 1e5) / channels / turns
+    if "MeasurementsPerCycle" in keys:  # Cosys-AirSim's
+        if not 1 <= (columns := keys.whole("MeasurementsPerCycle", 512)) <= _MOST_COLUMNS:
+            raise keys.error(
+                "MeasurementsPerCycle", f"expected 1 to {_MOST_COLUMNS}, found {columns}"
+            )
+        if "PointsPerSecond" in keys:
+            keys.note("PointsPerSecond", "ignored: MeasurementsPerCycle is given, too")
+        last = keys.number("HorizontalFOVEnd", 360.0) % 360
+    noise = keys.number("MinNoiseStandardDeviation", 0.0) if keys.flag("GenerateNoise") else 0.0
+    if noise and keys.number("NoiseDistanceScale", 1.0) != 1.0:
+        keys.note("NoiseDistanceScale", "ignored: the noise is the same at all distances")
     return {
         "channels": keys.whole("NumberOfChannels", 16),
         "rate": turns,
-        "columns": max(round(min(columns, 2**16)), 1),
+        "columns": max(round(min(columns, _MOST_COLUMNS)), 1),
         "azimuths": [first, last + 360 * (last <= first)],
         "elevations": [min(low, high), max(low, high)],
+        **({"noise": abs(noise)} if noise else {}),
     }

@@ -145,6 +145,20 @@ def test_what_cannot_be_followed_says_why(message: Any, words: str) -> None:
         Offboard(vehicle()).take(message, 0)
 
 
+def test_a_place_in_another_country_says_how_far_it_is() -> None:
+    """MAVSDK's examples fly in Zürich, where PX4's simulator is; AirSim's vehicles in Redmond."""
+    drone = Vehicle((47.641468, -122.140165, 122.0), gps=True)
+    move(drone, HERE)
+    with pytest.raises(
+        ValueError, match=r"origin, 47\.641468, -122\.140165, .* found it 8,4\d\d km"
+    ):
+        drone.place_of(5, 473977420.0, 85455940.0, 490.0)
+    with pytest.raises(ValueError, match="found it 12 km away"):
+        drone.place_of(1, 12e3, 0.0, -2.0)
+    with pytest.raises(ValueError, match="found it inf km away"):
+        drone.place_of(1, math.inf, 0.0, -2.0)
+
+
 @pytest.mark.parametrize(
     ("frame", "frame_id"), [(1, "map"), (7, "map"), (8, "heading"), (12, "heading")]
 )

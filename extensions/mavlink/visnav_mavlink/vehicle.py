@@ -52,6 +52,7 @@ GLOBAL_FRAMES = {
 
 LOCAL_SCALE = 1e-4  # metres per unit of a local coordinate sent as an integer
 FARTHEST = 1e4  # metres from the origin that a place may be
+EARTH = 6371e3  # mean radius, metres
 ON_GROUND = 0.15  # metres above the start below which an armed vehicle stands
 _HEALTHY = (
     mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -168,7 +169,9 @@ class Vehicle:
         if not all(abs(coordinate) <= FARTHEST for coordinate in (north, east, down)):
             raise ValueError(
                 "expected a place within {:g} km of the vehicle's origin, {:.6f}, {:.6f}, {:.0f} m;"
-                " found it farther".format(FARTHEST / 1000, *self.origin)
+                " found it {:,.0f} km away: set the origin near it".format(
+                    FARTHEST / 1000, *self.origin, _along_earth(north, east, down) / 1000
+                )
             )
         return north, east, down
 
@@ -176,6 +179,14 @@ class Vehicle:
         """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a place in ``map``."""
         latitude, longitude, altitude = to_geodetic(position, self.origin)
         return round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)
+
+
+def _along_earth(north: float, east: float, down: float) -> float:
+    """Return the distance of a place from the origin, metres; along the earth if it is far."""
+    straight = math.hypot(north, east, down)
+    if straight > 2.0 * EARTH:
+        return straight
+    return 2.0 * EARTH * math.asin(straight / (2.0 * EARTH))
 
 
 def _heartbeat(v: Vehicle, _: int) -> Any:

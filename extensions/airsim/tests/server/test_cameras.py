@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import Any
 
 import cv2
@@ -22,6 +23,7 @@ from visnav_airsim.server.objects import initial_id
 from visnav_airsim.server.rendering import ImageType, palette
 from visnav_airsim.settings import default_mount
 
+FIELD_OF_VIEW = "simGetCurrentFieldOfView"
 NAMES = "front_center", "0", "", "fpv", "front_right", "1", "2", "bottom_center", "3", "4"
 
 
@@ -171,6 +173,14 @@ def test_clients_move_cameras_and_change_their_view(tiny_world: str) -> None:
         call("simSetCameraPose", "fpv", pose, "", False)
         call("simSetCameraFov", "0", 60, "", False)
         infos.update({name: info(call, name) for name in ("0", "1")})
+        for arguments in (("0", "", False), ("front_center", "")):  # AirSim's, Cosys-AirSim's
+            words = re.findall(
+                r"\t ?(\w+) Field Of View: ([\d.]+)", call(FIELD_OF_VIEW, *arguments)
+            )
+            assert {word: float(number) for word, number in words} == pytest.approx(
+                {"Horizontal": 60.0, "Vertical": 35.98}, abs=0.01
+            )
+        call.refuses("expected a camera of drone", FIELD_OF_VIEW, "none", "", False)
         bad: dict[str, Any]
         for bad in (
             {"position": {"x_val": math.nan}},

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from runtime.logs import NodeLogger
 from visnav_airsim import wire
-from visnav_airsim.server.connections import LONGEST_QUEUE, OPEN_REQUESTS, Listener
+from visnav_airsim.server.connections import LONGEST_QUEUE, OPEN_REQUESTS, Listener, check_host
 from visnav_airsim.server.methods import RpcError, Table, rpc
 
 
@@ -388,6 +388,27 @@ def test_refusals_do_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None
     assert len(caplog.records) == 3
     assert "not supported by visnav-runtime: make boxes" in caplog.text
     assert "no\nthing" not in caplog.text
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "2001:db8::1", "a" * 80])
+def test_an_address_of_another_machine_is_named_and_not_the_port(host: str) -> None:
+    """Those numbers are for documentation (RFC 5737 and 3849): no machine has them."""
+    for listen in (check_host, lambda host: Listener(host, 41451, 1, NodeLogger("airsim"))):
+        with pytest.raises(ValueError, match=f"host: expected an address of this .* {host}") as no:
+            listen(host)
+        assert "LocalHostIp" in str(no.value)
+        assert "port" not in str(no.value)
+
+
+def test_a_port_in_use_is_named_and_not_the_address() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(
+            ValueError, match=f"port: expected .* on 127.0.0.1, found {port} "
+        ) as no:
+            Listener("127.0.0.1", port, 1, NodeLogger("airsim"))
+        assert "ApiServerPort" in str(no.value)
+        check_host("127.0.0.1")
 
 
 @settings(max_examples=60, deadline=None)

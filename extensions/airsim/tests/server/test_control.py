@@ -212,7 +212,10 @@ def test_a_free_camera_is_where_it_is_put_at_once(tiny_world: str) -> None:
         replies["pose"] = call("simGetVehiclePose", "camera")
         replies["truth"] = call("getComputerVisionState", "")
         call.refuses("cannot be put there", "simSetVehiclePose", pose(1e30, 0.0, 0.0), True, "")
-        call.refuses("Vehicle API for '' is not available", "getMultirotorState", "")
+        for name in ("", "camera"):
+            text = f"Vehicle API for '{name}' is not available"
+            call.refuses(text, "getMultirotorState", name)
+            call.refuses("'camera' is a free camera", "getLidarData", "Lidar1", name)
         call("simContinueForTime", 0.1)
         replies["later"] = call("simGetVehiclePose", "")
         call("reset")

@@ -331,6 +331,18 @@ def test_a_takeoff_of_what_moves_is_refused(tiny_world: str) -> None:
     fly(tiny_world, script)
 
 
+def test_a_place_in_another_country_is_refused_with_the_distance(tiny_world: str) -> None:
+    zurich = (47.397742, 8.545594, 488.0)
+
+    def script(caller: Caller) -> None:
+        caller.refuses(
+            "expected a place within 1,000 km, found it 8,4",
+            *("moveToGPS", *zurich, 2, FOREVER, 0, NO_TURN, -1, 1, ""),
+        )
+
+    fly(tiny_world, script)
+
+
 NUMBERS = [
     ("takeoff", (20.0, "")),
     ("land", (60.0, "")),

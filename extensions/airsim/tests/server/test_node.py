@@ -17,9 +17,11 @@ import pytest
 
 from extensions.airsim.tests.scripts import Caller, drone, with_script
 from runtime.channels.wire import Digest
+from runtime.config.model import Config, RunConfig
 from runtime.node import Node
 from runtime.testing import run_nodes, spec
 from runtime.time.clock import SECOND, Once
+from runtime.tools.preflight import of_nodes
 from tests.runtime.samples_runs import supervise
 from visnav_airsim import wire
 from visnav_airsim.client.connection import RpcCallError, RpcClient
@@ -150,6 +152,16 @@ def test_a_run_in_real_time_has_no_time_that_stands(tiny_world: str) -> None:
     nodes = [drone(world=tiny_world), spec(AirsimServer, "airsim", {"port": 0, "time": "paused"})]
     error = supervise(nodes, clock="real").error
     assert 'time: expected "running", found "paused": the run is in real time' in str(error)
+
+
+def test_a_check_sees_an_address_of_another_machine_and_opens_no_port(tiny_world: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        here = {"host": "127.0.0.1", "port": taken.getsockname()[1]}
+        for settings, errors in (({"host": "192.0.2.1"}, 1), (here, 0)):
+            nodes = [drone(world=tiny_world), spec(AirsimServer, "airsim", settings)]
+            found = of_nodes(Config(run=RunConfig(), nodes=tuple(nodes))).errors
+            assert len(found) == errors
+            assert all("airsim: host: expected an address of this machine" in e for e in found)
 
 
 @pytest.mark.slow

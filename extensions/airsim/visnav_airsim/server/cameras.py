@@ -228,6 +228,19 @@ class Cameras:
             for kind, spec in target.specs.items()
         }
 
+    @rpc("simGetCurrentFieldOfView", cosys=2)
+    def field_of_view(self, camera: str, vehicle: ServedVehicle, external: bool = False) -> str:
+        """Return the fields of view of a camera's scene images in words, degrees, as announced."""
+        info = camera_info(self.find(vehicle, camera, external).told(0).spec)
+        across, down = (
+            math.degrees(2.0 * math.atan(pixels / (2.0 * focal_length)))
+            for pixels, focal_length in ((info.width, info.fx), (info.height, info.fy))
+        )
+        return (  # AirSim's words, from which scripts take the numbers
+            f"Current Field Of View:\n\tHorizontal Field Of View: {across:g};"
+            f"\n\t Vertical Field Of View: {down:g}"
+        )
+
     @rpc("simGetDistortionParams", cosys=2)
     def distortion(
         self, camera: str, vehicle: ServedVehicle, external: bool = False

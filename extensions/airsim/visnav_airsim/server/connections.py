@@ -7,6 +7,7 @@ All is bounded. A socket is read directly, a little in each turn of the loop: a 
 from __future__ import annotations
 
 import asyncio
+import errno
 import functools
 import re
 import socket
@@ -29,6 +30,7 @@ MOST_WARNINGS = 500  # different refusals that are logged as warnings; others ar
 SILENT, IDLE = 5.0, 300.0
 # Bytes that are read in one turn of the loop: some requests, or a part of a long one.
 SMALL, LARGE = 256, 2048
+_FOREIGN = {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT, errno.EINVAL}  # of others' addresses
 CHUNK = 1 << 17  # bytes of an answer that are sent in one turn of the loop: some 30 µs
 
 
@@ -252,6 +254,33 @@ class Connection:
         self._unsent[0] = self._unsent[0][sent:]
 
 
+def check_host(host: str) -> None:
+    """Raise a `ValueError` if no port of an address can be listened on, as of another machine."""
+    _listening(host, 0).close()
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except PermissionError as error:
+        raise ValueError(
+            f"port: expected one that this user may open, found {port}: {error}"
+        ) from None
+    except (OSError, UnicodeError) as error:
+        # Names that stand for no address have numbers below 0 (EAI_NONAME, …), or none.
+        number = (error.errno or 0) if isinstance(error, OSError) else -1
+        if number < 0 or number in _FOREIGN:
+            raise ValueError(
+                "host: expected an address of this machine (127.0.0.1 for clients on it, 0.0.0.0 "
+                f"for all), found {host} (LocalHostIp in settings.json): {error}"
+            ) from None
+        raise ValueError(
+            f"port: expected one that is free on {host}, found {port} (ApiServerPort in "
+            f"settings.json): {error}"
+        ) from None
+
+
 def _thrown(request: wire.Request, text: str) -> str:
     return thrown(request.method, len(request.arguments), text)
 
@@ -262,7 +291,7 @@ class Listener:
     `on_change` gets whether any client is there, whenever one has come or left.
 
     Raises:
-        ValueError: The port is not free.
+        ValueError: The address is not this machine's, or the port is not free.
     """
 
     def __init__(
@@ -273,13 +302,7 @@ class Listener:
         log: NodeLogger,
         on_change: Callable[[bool], None] = lambda _: None,
     ) -> None:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        try:
-            self._socket = socket.create_server((host, port), family=family)
-        except OSError as error:
-            raise ValueError(
-                f"port: expected one that is free on {host}, found {port}: {error}"
-            ) from None
+        self._socket = _listening(host, port)
         self._socket.setblocking(False)
         self.port: int = self._socket.getsockname()[1]
         self._most = most

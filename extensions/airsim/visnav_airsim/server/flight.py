@@ -33,6 +33,8 @@ from visnav_airsim.wire import KinematicsState, Number, Pose, YawMode
 
 Speed = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
 
+_FARTHEST = 1e6  # metres to a place on the earth that a vehicle may be sent to
+_EARTH = 6371e3  # mean radius, metres
 _SLOW = 0.5  # m/s of take-off, hovering and going home
 _AHEAD = lookahead_of(-1.0, 1.0, _SLOW)
 
@@ -366,8 +368,13 @@ class Flight:
     ) -> Reply:
         """Fly straight to a place on the earth, degrees, and metres above the ellipsoid."""
         place = from_geodetic((latitude, longitude, altitude), vehicle.config.origin)
-        if math.dist(place, vehicle.origin) > 1e6:
-            raise RpcError("expected a place within 1000 km")
+        if (far := math.dist(place, vehicle.origin)) > _FARTHEST:
+            arc = 2.0 * _EARTH * math.asin(min(far / (2.0 * _EARTH), 1.0))  # far is straight
+            raise RpcError(
+                f"expected a place within {_FARTHEST / 1e3:,.0f} km, found it {arc / 1e3:,.0f} km "
+                "away: the origin (OriginGeopoint) is "
+                "{:.6f}, {:.6f}, {:g} m".format(*vehicle.config.origin)
+            )
         corner = Corner(*astuple(vehicle.local(place)))
         how = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle
         return self.on_path([corner], *how)

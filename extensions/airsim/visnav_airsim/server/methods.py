@@ -68,7 +68,7 @@ Scripts only need these methods not to fail.
 
 _UNSUPPORTED = {
     r"sim\w*Detection\w*|simGetDetections": "make boxes of the segmentation image instead",
-    r"sim\w*(Lens|Filmback|Foc|CurrentFieldOfView)\w*": "cameras are ideal or have the lens of the "
+    r"sim\w*(Lens|Filmback|Foc)\w*": "cameras are ideal or have the lens of the "
     "run's file; simSetCameraFov sets the field of view",
     r"simSwapTextures|simSetObjectMaterial\w*": "a world's textures are those of its file",
     r"simCreateVoxelGrid": "a server writes no files for its clients",

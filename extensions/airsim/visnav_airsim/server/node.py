@@ -27,7 +27,7 @@ from sims.scans.settings import MeshSpec
 from sims.world import Count, Inhabitant, Simulator, join_world
 from sims.worlds import Dynamics, Scene
 from visnav_airsim.server.cameras import Cameras, Images, ServedCamera
-from visnav_airsim.server.connections import Listener
+from visnav_airsim.server.connections import Listener, check_host
 from visnav_airsim.server.flight import Control, Flight
 from visnav_airsim.server.measurements import (
     SAMPLES,
@@ -195,10 +195,15 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         return self.script_estimates.announce()
 
     def check(self) -> Iterable[str]:
-        """Return errors in the settings' names of vehicles."""
+        """Return errors in the settings' names of vehicles, and in its address."""
         default = self.config.default_vehicle
         if default and default not in self.vehicles:
             yield f'default_vehicle: expected one of {", ".join(self.vehicles)}, found "{default}"'
+        if self.checking:  # else it listens there already
+            try:
+                check_host(self.config.host)
+            except ValueError as error:
+                yield str(error)
 
     async def run(self) -> None:
         """Pause time, if so set; then serve clients, present and to come."""

@@ -202,6 +202,14 @@ class Vehicles(dict[str, ServedVehicle]):
         """Return a multirotor, unnamed the first by name; an `RpcError` if there is none."""
         flying = (key for key in self if isinstance(self[key], ServedMultirotor))
         vehicle = self.get(name or self._default or min(flying, default=""))
+        if vehicle is None and not name and self:
+            vehicle = self.find("")
+        if isinstance(vehicle, ServedFreeCamera):
+            raise RpcError(
+                f"{_unknown('Vehicle API', name)}: '{vehicle.name}' is a free camera "
+                "(ComputerVision), which has cameras and no other sensor, neither motors nor "
+                "physics; simSetVehiclePose moves it"
+            )
         if not isinstance(vehicle, ServedMultirotor):
             raise _unknown("Vehicle API", name)
         return vehicle
