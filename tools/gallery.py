@@ -29,12 +29,13 @@ VIEWS = {  # north, east, down, metres; roll, pitch, yaw, degrees
     "office": (-6.6, -3.4, -1.7, 0, -4, 25),
     "night": (4.0, 2.0, -1.7, 0, 2, 40),
     "forest": (-6.0, 6.4, -1.6, 0, 0, -60),
+    "field": (-14.0, -1.5, -3.5, 0, -8, 15),
 }
 
 
 def main() -> None:
     """Make all images."""
-    _write("worlds.jpg", {name: _seen(name) for name in WORLDS}, 3)
+    _write("worlds.jpg", {name: _seen(name) for name in WORLDS}, 4)
     _write("sensors.jpg", _sensed(), 5)
     _write("renderers.jpg", _compared(("yard", "office", "forest")), 3)
 

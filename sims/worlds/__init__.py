@@ -23,6 +23,7 @@ from sims.scans.mesh_file import MeshError
 from sims.scans.settings import SUFFIXES, USUAL, MeshSpec
 from sims.worlds.builder import CLEARANCE, TOURS
 from sims.worlds.dynamics import Dynamics, Motion, Scene
+from sims.worlds.field import field
 from sims.worlds.forest import forest
 from sims.worlds.hall import hall
 from sims.worlds.indoors import corridor, office
@@ -40,6 +41,7 @@ WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {
     "office": office,
     "night": night,
     "forest": forest,
+    "field": field,
 }  # built-in worlds by name: functions of a seed and `bare`; a `Scene` if parts move by themselves
 
 
