@@ -60,6 +60,20 @@ def fly(outside: Outside, seconds: float, follows: bool = True) -> tuple[list[in
     return reached, sentences
 
 
+def land_here(seq: int) -> Any:
+    return mav.MAVLink_mission_item_int_message(
+        1, 1, seq, 6, mav.MAV_CMD_NAV_LAND, 0, 1, 0, 0, 0, math.nan, 0, 0, 0.0, 0
+    )
+
+
+def touch_down(outside: Outside) -> tuple[list[int], list[str]]:
+    """Let the vehicle land; return what is reached then, and what is told."""
+    outside.hear()
+    outside.endpoint.flight.noted(ev.Landed(stamp=outside.now, source="drone"))
+    messages = outside.hear()
+    return [message.seq for message in of("MISSION_ITEM_REACHED", messages)], texts(messages)
+
+
 async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> None:
     asked = outside.say(mav.MAVLink_mission_count_message(1, 1, 3, 0))
     assert [message.get_type() for message in asked] == ["MISSION_REQUEST"]
@@ -78,8 +92,9 @@ async def test_a_mission_goes_up_comes_down_and_is_flown(outside: Outside) -> No
         reached += [message.seq for message in of("MISSION_ITEM_REACHED", outside.passes(0.1))]
         if isinstance(outside.acts[-1], ev.PositionSetpoint):
             outside.at(outside.acts[-1].position)
-    assert reached == [0, 1, 2]
+    assert reached == [0, 1]
     assert isinstance(outside.acts[-1], ev.Land)
+    assert touch_down(outside) == ([2], ["mission finished"])
 
 
 async def test_what_cannot_be_flown_is_refused_at_its_upload(outside: Outside) -> None:
@@ -287,7 +302,46 @@ async def test_a_mission_lands_at_its_place(outside: Outside) -> None:
     outside.say(start())
     reached, _ = fly(outside, 2.0)
     assert reached == [0]
-    reached, _ = fly(outside, 3.0)
-    assert reached == [1]
+    assert fly(outside, 3.0) == ([], [])
     assert isinstance(outside.acts[-1], ev.Land)
     assert outside.acts[-2].position == pytest.approx((6.0, 2.0, -2.0))
+    assert touch_down(outside) == ([1], ["mission finished"])
+
+
+@pytest.mark.parametrize("ends", ["hold", "jump", "kill"])
+async def test_a_landing_that_ends_in_the_air_is_not_reached(outside: Outside, ends: str) -> None:
+    upload(outside, place(0, 1.5), land_here(1))
+    outside.flies()
+    outside.say(start(1))
+    fly(outside, 0.2)
+    assert isinstance(outside.acts[-1], ev.Land)
+    if ends == "hold":
+        outside.say(mode(4, 3))
+    elif ends == "jump":
+        outside.say(mav.MAVLink_mission_set_current_message(1, 1, 0))
+    else:
+        outside.endpoint.flight.noted(ev.Disarmed(stamp=outside.now, source="drone"))
+    assert touch_down(outside) == ([], [])
+
+
+async def test_the_item_under_way_and_the_state_are_told_each_second(outside: Outside) -> None:
+    """As the specification has it, whoever comes later; so that programs know when it is over."""
+
+    def told() -> set[tuple[int, int, int, int]]:
+        messages = of("MISSION_CURRENT", outside.passes(3.0))
+        assert len(messages) == 3
+        return {(m.seq, m.total, m.mission_state, m.mission_mode) for m in messages}
+
+    assert told() == {(0, 65535, mav.MISSION_STATE_NO_MISSION, 2)}
+    upload(outside, place(0, 1.0), place(1, 30.0), land_here(2))
+    assert told() == {(0, 3, mav.MISSION_STATE_NOT_STARTED, 2)}
+    outside.flies()
+    outside.say(start())
+    assert fly(outside, 2.0)[0] == [0]
+    assert told() == {(1, 3, mav.MISSION_STATE_ACTIVE, 1)}
+    outside.say(mode(4, 3))
+    assert told() == {(1, 3, mav.MISSION_STATE_PAUSED, 2)}
+    outside.say(start(2))
+    assert told() == {(2, 3, mav.MISSION_STATE_ACTIVE, 1)}
+    touch_down(outside)
+    assert told() == {(2, 3, mav.MISSION_STATE_COMPLETE, 2)}

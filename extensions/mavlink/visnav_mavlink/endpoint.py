@@ -53,6 +53,7 @@ class MavlinkEndpoint:
         self._telemetry = Telemetry(vehicle, self._links, self._tell)
         self._parameters = Parameters(send, self._tell)
         self._missions = Missions(
+            vehicle,
             send,
             lambda item: self.flight.why_not(item),
             self._tell,

@@ -167,6 +167,10 @@ class Flight:
             vehicle.armed = vehicle.armed and not isinstance(event, ev.Disarmed)
             if vehicle.mode in {"land", "takeoff", "return"}:
                 vehicle.mode = "hold"
+            if self._missions.landing and isinstance(event, ev.Landed):
+                self._missions.reached()
+                self._tell_end()
+            self._missions.landing = False
         elif isinstance(event, ev.TakenOff) and vehicle.mode == "takeoff":
             vehicle.mode = "hold"
 
@@ -240,6 +244,7 @@ class Flight:
 
     def _drop_goal(self) -> None:
         self._goal, self._lands_there, self._wait_until = None, False, None
+        self._missions.landing = False
 
     def lost(self, action: str, now: int) -> None:
         """Do what is to be done without any program in the air: ``hold`` or ``land``.
@@ -370,9 +375,9 @@ class Flight:
             stay = item.params[0] if item.command == mav.MAV_CMD_NAV_WAYPOINT else 0
             self._wait_until = now + (round(stay * SECOND) if 0 < stay <= LONGEST_STAY else 0)
         elif self._lands_there:
-            if self._vehicle.mode == "mission":
-                self._missions.reached()
+            by_item = self._vehicle.mode == "mission"
             self.set_mode("land", now)
+            self._missions.landing = by_item
 
     def _go_on_with_mission(self, now: int) -> None:
         """Begin with a mission's item, or see whether it has been stayed at for long enough."""
@@ -387,7 +392,7 @@ class Flight:
     def _begin_item(self, now: int) -> None:
         vehicle, item = self._vehicle, self._missions.current()
         if item is None:
-            self._tell("mission finished" if self._missions.items else "mission cleared: holding")
+            self._tell_end()
             self.set_mode("hold", now)
             return
         kind = item.command
@@ -412,9 +417,19 @@ class Flight:
             self._missions.reached()
         elif kind == mav.MAV_CMD_NAV_DELAY:
             self._wait_until = now + round(item.params[0] * SECOND)
+        elif kind == mav.MAV_CMD_NAV_LAND:
+            self.set_mode("land", now)
+            self._missions.landing = vehicle.armed
+            if not vehicle.armed:
+                self._missions.reached()
         else:
             self._missions.reached()
-            self.set_mode("land" if kind == mav.MAV_CMD_NAV_LAND else "return", now)
+            self.set_mode("return", now)
+
+    def _tell_end(self) -> None:
+        """Tell that there is no further item."""
+        if self._missions.current() is None:
+            self._tell("mission finished" if self._missions.items else "mission cleared: holding")
 
     def _location(self, message: Any) -> tuple[int, float, float, float]:
         """Return a command's frame and place, as `Vehicle.place_of` takes it."""

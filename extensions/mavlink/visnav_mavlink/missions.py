@@ -16,6 +16,8 @@ GUIDED = 2  # of a MISSION_ITEM's `current`: ArduPilot's way to say where to go 
 _MISSION, _ALL = mav.MAV_MISSION_TYPE_MISSION, mav.MAV_MISSION_TYPE_ALL
 _OTHERS = {mav.MAV_MISSION_TYPE_FENCE, mav.MAV_MISSION_TYPE_RALLY}
 _LARGEST = 2**31 - 1
+_NO_MISSION = 65535  # as the number of items, where there is no mission
+_FLOWN, _SUSPENDED = 1, 2  # of MISSION_CURRENT's mission_mode, which has no names
 
 
 class Item(NamedTuple):
@@ -79,6 +81,7 @@ class Missions:
     """The vehicle's mission.
 
     Args:
+        vehicle: Whose mode says whether it is flown.
         send: Sends a message to all programs, who know by its target whether it is for them.
         why_not: Returns why an item cannot be flown; empty if it can.
         changed: Called when another item than the next one is to be flown.
@@ -87,24 +90,28 @@ class Missions:
 
     def __init__(
         self,
+        vehicle: Vehicle,
         send: Callable[[Any], None],
         why_not: Callable[[Item], str],
         tell: Callable[[str], None],
         changed: Callable[[], None],
         guided: Guided | None = None,
     ) -> None:
-        self._send, self._why_not = send, why_not
+        self._vehicle, self._send, self._why_not = vehicle, send, why_not
         self._tell, self._changed = tell, changed
         self.items: list[Item] = []
         self._guided, self._first = guided, int(guided is not None)
         self._next = self._end = 0  # the item under way, and the one before which it ends
+        self.landing = False  # by the item under way, which is reached at the touch-down
         self._upload: Upload | None = None
         self._done: tuple[Sender, int] | None = None  # of the last upload, and its last item
 
     @property
-    def progress(self) -> tuple[int, int]:
-        """Number of the item under way, or of the last one after it, and how many there are."""
-        return min(self._next, max(len(self.items) - 1, 0)), len(self.items)
+    def progress(self) -> tuple[int, int, int, int]:
+        """Fields of ``MISSION_CURRENT``: the item under way, the number of items, state, mode."""
+        last = max(len(self.items) - 1, 0)
+        flown = _FLOWN if self._is_flown else _SUSPENDED
+        return min(self._next, last), len(self.items) or _NO_MISSION, self._state, flown
 
     def current(self) -> Item | None:
         """Return the item to fly; `None` after the last."""
@@ -114,6 +121,7 @@ class Missions:
         """Go on to the next item, and say so."""
         self._send(mav.MAVLink_mission_item_reached_message(self._next))
         self._next += 1
+        self.landing = False
         self._progress()
 
     def resume(self) -> None:
@@ -310,6 +318,7 @@ class Missions:
 
     def _go_to(self, number: int) -> None:
         self._next, self._end = max(number, self._first), len(self.items)
+        self.landing = False
         self._progress()
         self._changed()
 
@@ -322,6 +331,22 @@ class Missions:
 
     def _progress(self) -> None:
         self._send(mav.MAVLink_mission_current_message(*self.progress))
+
+    @property
+    def _is_flown(self) -> bool:
+        return self.landing or self._vehicle.mode == "mission"
+
+    @property
+    def _state(self) -> int:
+        """As MAVLink's ``MISSION_STATE``."""
+        if not self.items:
+            return int(mav.MISSION_STATE_NO_MISSION)
+        if self._next >= self._end:
+            return int(mav.MISSION_STATE_COMPLETE)
+        if self._is_flown:
+            return int(mav.MISSION_STATE_ACTIVE)
+        begun = self._next > self._first
+        return int(mav.MISSION_STATE_PAUSED if begun else mav.MISSION_STATE_NOT_STARTED)
 
 
 def _item(message: Any) -> Item | None:

@@ -86,7 +86,7 @@ class Vehicle:
         is_copter: Whether it is seen as ArduPilot's Copter, not as PX4.
         imu_orientation: Rotation from its IMU's frame to the body's; `None` without an IMU.
         measured: Newest sample of each kind of sensor, with its number among all samples.
-        progress: Returns the number of its mission's item under way, and how many there are.
+        progress: Returns the fields of its mission's ``MISSION_CURRENT``.
     """
 
     origin: Geodetic
@@ -103,7 +103,7 @@ class Vehicle:
     imu_orientation: Quaternion | None = None
     measured: dict[type[Sample], tuple[int, Any]] = field(default_factory=dict)
     samples: int = 0
-    progress: Callable[[], tuple[int, int]] = lambda: (0, 0)
+    progress: Callable[[], tuple[int, int, int, int]] = lambda: (0, 65535, 0, 0)
 
     def note(self, pose: Odometry | PoseEstimate) -> None:
         """Take note of the newest pose."""
