@@ -20,9 +20,9 @@ FOLDER = Path("examples/motions")
 HEAD = "# base_link (FRD) in map (NED): timestamp[s] tx ty tz[m] qx qy qz qw\n"
 STRIDES = 0.9  # of a walk, two steps each, per second
 BUMPS = (0.7, 1.3, 1.9)  # of a car on its springs, per second
-ROUND = [  # a drive round the middle of the field, metres north and east
-    [20.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0], [-60.0, 60.0], [-60.0, 0.0],
-    [-60.0, -60.0], [0.0, -60.0], [20.0, -60.0], [20.0, 0.0],
+ROUND = [  # a drive round the middle of the field, metres north and east, 11 m from all things
+    [32.0, 20.0], [88.0, 20.0], [88.0, 104.0], [4.0, 104.0], [-80.0, 104.0],
+    [-80.0, 20.0], [-80.0, -64.0], [4.0, -64.0], [32.0, -64.0], [32.0, 20.0],
 ]  # fmt: skip
 
 
@@ -46,18 +46,18 @@ def walk(rate: float = 25.0) -> str:
 
 
 def drive(rate: float = 10.0) -> str:
-    """Return a drive round the middle of the field, a camera on the roof, 7 m/s.
+    """Return a drive round the middle of the field, a camera on the roof, 8 m/s.
 
     The car sways by centimetres and tenths of a degree as the ground does.
     """
     corners = np.array([[x, y, -1.8] for x, y in ROUND])
     path = plan(
-        corners, speed=7.0, acceleration=1.5, radius=12.0, yaw=0.0, turn_time=1.0, step=1 / rate
+        corners, speed=8.0, acceleration=1.5, radius=12.0, yaw=0.0, turn_time=1.0, step=1 / rate
     )
     speed = np.linalg.norm(path.velocity, axis=1)
-    share = np.clip(speed / 7.0, 0.0, 1.0)
+    share = np.clip(speed / 8.0, 0.0, 1.0)
     time = 2.0 * np.pi * np.arange(len(speed)) / rate
-    first, second, third = (np.sin(rate_ * time + phase) for phase, rate_ in enumerate(BUMPS))
+    first, second, third = (np.sin(bump * time + phase) for phase, bump in enumerate(BUMPS))
     rise = 0.02 * share * (first + 0.6 * second + 0.3 * third)
     degrees = [0.4 * first + 0.3 * third, 0.4 * second + 0.2 * first, 0.0 * first]
     return _rows(path, rate, 0.0 * rise, rise, [np.radians(share * angle) for angle in degrees])
