@@ -355,7 +355,9 @@ async def test_stamps_of_another_clock_are_corrected_from_the_first_pose_on(behi
     word = "behind" if behind > 0 else "ahead"
     (text,) = sentences
     assert text.startswith("poses of 245/190: stamps are ")
-    assert text.endswith(f"s {word}, of another clock: corrected by the earliest arrival")
+    assert text.endswith(
+        f"s {word}, of another clock: corrected by the earliest arrival; delay 0 ms"
+    )
     outside.close()
 
 
@@ -370,7 +372,9 @@ async def test_a_clock_that_answers_is_measured() -> None:
     taken = outside.now
     outside.now += SECOND // 5
     (text,) = texts(outside.say(vision(taken - 8 * SECOND)))
-    assert text.endswith("stamps are 8.0 s behind, of another clock: corrected by TIMESYNC")
+    assert text.endswith(
+        "stamps are 8.0 s behind, of another clock: corrected by TIMESYNC; delay 0 ms"
+    )
     assert outside.seen[-1]["stamp"] == pytest.approx(taken, abs=1e3)
     other = Outside(vision=True)
     assert other.say(vision(other.now - SECOND // 2)) == []
@@ -637,6 +641,81 @@ async def test_streams_of_rates_are_set(outside: Outside) -> None:
     assert texts(outside.say(mav.MAVLink_request_data_stream_message(1, 1, 3, 4, 1))) == [
         "REQUEST_DATA_STREAM of 245/190 has no effect: stream 3 has no messages here"
     ]
+
+
+def sampled(vehicle: Any, stamp: int) -> None:
+    """Let an IMU measure that is turned upside down about the body's x."""
+    vehicle.imu_orientation = (0.0, 1.0, 0.0, 0.0)
+    vehicle.measure(
+        ev.Imu(
+            stamp=stamp, source="drone/imu", angular_velocity=(0.1, 0.2, 0.3),
+            linear_acceleration=(1.0, 2.0, 9.8),
+        )
+    )  # fmt: skip
+
+
+async def test_samples_of_the_imu_come_in_the_axes_of_the_body(outside: Outside) -> None:
+    """A flag says of each group whether it is new since the last message to this program."""
+    vehicle, number = outside.endpoint.vehicle, mav.MAVLINK_MSG_ID_HIGHRES_IMU
+    field = ev.MagneticField(stamp=1, source="drone/magnetometer", magnetic_field=(2e-5, 0.0, 4e-5))
+    pressure = ev.FluidPressure(stamp=1, source="drone/barometer", fluid_pressure=101325.0)
+    sampled(vehicle, 5_000_000)
+    vehicle.measure(field)
+    (imu,) = of("HIGHRES_IMU", outside.passes(0.04))
+    assert (imu.time_usec, imu.temperature) == (5000, 0.0)
+    assert (imu.xacc, imu.yacc, imu.zacc) == pytest.approx((1.0, -2.0, -9.8))
+    assert (imu.xgyro, imu.ygyro, imu.zgyro) == pytest.approx((0.1, -0.2, -0.3))
+    assert (imu.xmag, imu.ymag, imu.zmag) == pytest.approx((0.2, 0.0, 0.4))
+    assert imu.fields_updated == 0b111111111
+    assert of("HIGHRES_IMU", outside.passes(0.2)) == []  # nothing new
+    vehicle.measure(pressure)
+    sampled(vehicle, 9_000_000)
+    (imu,) = of("HIGHRES_IMU", outside.passes(0.1))
+    assert imu.fields_updated == 0b101000111111
+    assert (imu.abs_pressure, imu.pressure_alt) == pytest.approx((1013.25, 0.0), abs=1e-3)
+    assert imu.xmag == pytest.approx(0.2)
+    whole = of("HIGHRES_IMU", outside.say(command(mav.MAV_CMD_REQUEST_MESSAGE, number)))
+    assert [message.fields_updated for message in whole] == [0b101111111111]
+
+
+async def test_what_is_new_is_so_for_each_program() -> None:
+    outside = Outside(other := Program())
+    vehicle, number = outside.endpoint.vehicle, mav.MAVLINK_MSG_ID_HIGHRES_IMU
+    sampled(vehicle, 1)
+    raw = mav.MAV_DATA_STREAM_RAW_SENSORS
+    outside.say(mav.MAVLink_request_data_stream_message(1, 1, raw, 100, 1))
+    other.say(command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, number, 2e5))
+    outside.passes(0.2)
+    other.hear()
+    flags: list[int] = []
+    for step in range(60):
+        if step == 25:
+            source = "drone/magnetometer"
+            vehicle.measure(ev.MagneticField(stamp=1, source=source, magnetic_field=(1.0, 0, 0)))
+        sampled(vehicle, step)
+        flags += [message.fields_updated for message in of("HIGHRES_IMU", outside.passes(0.01))]
+    assert [flag > 0b111111 for flag in flags] == [step == 25 for step in range(60)]
+    slower = [message.fields_updated > 0b111111 for message in of("HIGHRES_IMU", other.hear())]
+    assert len(slower) == 3
+    assert sum(slower) == 1
+    other.close()
+    outside.close()
+
+
+async def test_what_never_comes_is_not_accepted(outside: Outside) -> None:
+    outside.passes(0.1)
+    unsupported = [mav.MAV_RESULT_UNSUPPORTED]
+    interval = mav.MAV_CMD_SET_MESSAGE_INTERVAL
+    answers = outside.say(command(interval, mav.MAVLINK_MSG_ID_HIGHRES_IMU, 1e5))
+    assert results(answers) == unsupported
+    assert texts(answers) == ["HIGHRES_IMU: expected a vehicle with an IMU, found none"]
+    answers = outside.say(command(interval, 193, 1e5))
+    assert results(answers) == unsupported
+    assert texts(answers) == ["EKF_STATUS_REPORT: it is ArduPilot's"]
+    raw = mav.MAV_DATA_STREAM_RAW_SENSORS
+    (text,) = texts(outside.say(mav.MAVLink_request_data_stream_message(1, 1, raw, 10, 1)))
+    assert text.endswith(f"stream {raw} has no messages here")
+    assert of("HIGHRES_IMU", outside.passes(1.0)) == []
 
 
 async def test_a_failed_pose_is_not_judged() -> None:

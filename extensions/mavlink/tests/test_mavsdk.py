@@ -71,6 +71,11 @@ def test_an_estimator_outside_is_judged(tmp_path: Path) -> None:
     assert printed == f"{figures['estimates']} poses\n"
     assert figures["passed"]
     assert figures["scale"] == pytest.approx(1 / 1.01, rel=1e-3)
+    assert figures["velocities_percent"] == 100.0
+    assert figures["velocity_error_percent"] < 10.0
+    words = ended["environment"]["vision: poses from outside"]
+    count = figures["estimates"]
+    assert words == f"{count} poses taken ({count} with a velocity)"
 
 
 async def first(stream: Any, ok: Callable[[Any], Any] = lambda _: True) -> Any:

@@ -345,3 +345,18 @@ async def test_the_item_under_way_and_the_state_are_told_each_second(outside: Ou
     assert told() == {(2, 3, mav.MISSION_STATE_ACTIVE, 1)}
     touch_down(outside)
     assert told() == {(2, 3, mav.MISSION_STATE_COMPLETE, 2)}
+
+
+async def test_progress_comes_once_a_second_and_on_request(outside: Outside) -> None:
+    """For a station that joins later, too; at another rate if it asks for that."""
+    number, interval = mav.MAVLINK_MSG_ID_MISSION_CURRENT, mav.MAV_CMD_SET_MESSAGE_INTERVAL
+    outside.passes(0.1)
+    upload(outside, place(0, 1.0), place(1, 2.0), place(2, 3.0))
+    outside.say(mav.MAVLink_mission_set_current_message(1, 1, 1))
+    (current,) = of("MISSION_CURRENT", outside.passes(1.0))
+    assert (current.seq, current.total) == (1, 3)
+    (current,) = of("MISSION_CURRENT", outside.say(command(mav.MAV_CMD_REQUEST_MESSAGE, number)))
+    assert current.seq == 1
+    assert results(outside.say(command(interval, number, 1e5))) == [0]
+    outside.passes(1.0)
+    assert len(of("MISSION_CURRENT", outside.passes(1.0))) == 10

@@ -75,6 +75,28 @@ async def test_a_delay_is_taken_off_each_stamp(behind: float) -> None:
     outside.close()
 
 
+async def test_no_pose_is_stamped_before_an_earlier_one(seeing: Outside) -> None:
+    """When a quicker message shows that those before were late; a sender's own repeats stay."""
+    start, offset = seeing.now, 8 * SECOND
+    for number, latency in enumerate((0.2, 0.2, 0.02, 0.02, 0.02, 0.02, 0.02)):
+        taken = start + number * FRAME
+        seeing.now = taken + round(latency * SECOND)
+        seeing.say(pose(taken - offset))
+    stamps = [seen["stamp"] - start for seen in seeing.seen]
+    late = [0.2, FRAME / SECOND + 0.2, *(number * FRAME / SECOND + 0.02 for number in (7, 8))]
+    assert stamps[:2] == pytest.approx([round(s * SECOND) for s in late[:2]], abs=1e3)
+    assert stamps == sorted(stamps)
+    assert len(stamps) == 2
+    for number in (7, 8, 8):
+        seeing.now = start + number * FRAME + SECOND // 50
+        seeing.say(pose(start + number * FRAME - offset))
+    stamps = [seen["stamp"] - start for seen in seeing.seen]
+    assert stamps[2:] == pytest.approx([round(s * SECOND) for s in [*late[2:], late[3]]], abs=1e3)
+    assert seeing.endpoint.finish() == (
+        "5 poses taken (5 restamped), 5 refused: 5 restamped to before the last"
+    )
+
+
 @pytest.mark.parametrize(
     ("frames", "expected"),
     [
@@ -87,9 +109,10 @@ async def test_a_delay_is_taken_off_each_stamp(behind: float) -> None:
 async def test_velocities_are_in_the_frame_of_the_pose(
     seeing: Outside, frames: tuple[int, int], expected: tuple[float, ...]
 ) -> None:
-    assert seeing.say(odometry(seeing.now, velocity=(1.0, 2.0, 3.0), frames=frames)) == []
+    before = seeing.now - FRAME
+    assert seeing.say(odometry(before, velocity=(1.0, 2.0, 3.0), frames=frames)) == []
     assert seeing.seen[-1]["velocity"] == pytest.approx(expected)
-    seeing.say(odometry(seeing.now + 1000, velocity=(1.0, NAN, 3.0), frames=frames))
+    seeing.say(odometry(seeing.now, velocity=(1.0, NAN, 3.0), frames=frames))
     assert seeing.seen[-1]["velocity"] is None
 
 
@@ -233,11 +256,8 @@ async def test_differences_have_to_be_signed_as_all_else() -> None:
     outside.close()
 
 
-def counted(outside: Outside) -> Iterator[Any]:
-    """Yield messages of which some are refused."""
-    now = outside.now
-    yield odometry(now - 8 * SECOND, velocity=(1.0, 0.0, 0.0))
-    yield odometry(now - 8 * SECOND + 1000)
+def refused(now: int) -> Iterator[Any]:
+    """Yield messages that are not taken."""
     yield from [odometry(now, quality=-1)] * 3
     yield from [odometry(now, (NAN, 0.0, 0.0))] * 2
     yield odometry(now, frames=(mav.MAV_FRAME_GLOBAL, mav.MAV_FRAME_BODY_FRD))
@@ -246,7 +266,9 @@ def counted(outside: Outside) -> Iterator[Any]:
 async def test_the_end_is_told_how_many_poses_were_taken(caplog: pytest.LogCaptureFixture) -> None:
     outside = Outside(vision=True, delay=0.06)
     outside.now = 100 * SECOND
-    outside.say(*counted(outside))
+    outside.say(odometry(outside.now - 8 * SECOND, velocity=(1.0, 0.0, 0.0)))
+    outside.now += FRAME
+    outside.say(odometry(outside.now - 8 * SECOND), *refused(outside.now))
     outside.parser = mav.MAVLink(None, 2, 1)
     outside.say(pose(outside.now))
     with caplog.at_level("INFO"):

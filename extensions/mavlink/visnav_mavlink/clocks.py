@@ -42,12 +42,15 @@ class Clocks:
     """All programs' clocks.
 
     Args:
+        delay: Of poses behind their corrected stamps, ns, which is told with the correction.
         send: Sends a message to all programs.
         tell: Says a sentence, the first time, to all programs and to the log.
     """
 
-    def __init__(self, send: Callable[[Any], None], tell: Callable[[str], None]) -> None:
-        self._send, self._tell = send, tell
+    def __init__(
+        self, delay: int, send: Callable[[Any], None], tell: Callable[[str], None]
+    ) -> None:
+        self.delay, self._send, self._tell = delay, send, tell
         self._clocks: dict[Sender, Clock] = {}
         self._due = 0
 
@@ -66,7 +69,7 @@ class Clocks:
             clock.round_trip = round_trip
 
     def stamp(self, sender: Sender, stamp: int, now: int) -> int:
-        """Return a stamp of a sender's (ns) in our clock, at its arrival."""
+        """Return a stamp of a sender's (ns) in our clock, at its arrival, without the delay."""
         age, clock = now - stamp, self._of(sender)
         if clock.way == "the earliest arrival":
             clock.correction = min(clock.correction, age)
@@ -94,7 +97,7 @@ class Clocks:
             where = "behind" if clock.correction > 0 else "ahead"
             self._tell(
                 f"poses of {system}/{component}: stamps are {off:.1f} s {where}, of another clock: "
-                f"corrected by {clock.way}"
+                f"corrected by {clock.way}; delay {self.delay / 1e6:g} ms"
             )
 
     def _of(self, sender: Sender) -> Clock:

@@ -14,7 +14,7 @@ from visnav_mavlink.links import Links, Peer, Sender, ardupilot_dialect, mav
 from visnav_mavlink.messages import OF_ARDUPILOT, TREATMENTS
 from visnav_mavlink.missions import Guided, Missions
 from visnav_mavlink.settings import MavlinkConfig
-from visnav_mavlink.vehicle import Parameters, Telemetry, Vehicle
+from visnav_mavlink.vehicle import SECOND, Parameters, Telemetry, Vehicle
 from visnav_mavlink.vision import Vision
 
 MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it
@@ -48,8 +48,8 @@ class MavlinkEndpoint:
         self._links = Links(ids, bytes.fromhex(config.signing_key), self._hear, log)
         self._send = send = self._links.send
         self.vehicle = vehicle = Vehicle(origin, config.gps, config.autopilot == "ardupilot")
-        self._clocks = Clocks(send, self._tell_once)
-        self._vision = Vision(config.delay, self._clocks, see, self._refuse)
+        self._clocks = Clocks(round(config.delay * SECOND), send, self._tell_once)
+        self._vision = Vision(self._clocks, see, self._refuse)
         self._telemetry = Telemetry(vehicle, self._links, self._tell)
         self._parameters = Parameters(send, self._tell)
         self._missions = Missions(

@@ -33,7 +33,7 @@ _HERE: Vector3 = (0.0, 0.0, 0.0)
 
 
 class RefusedPoseError(ValueError):
-    """A pose that is not taken.
+    """A pose that is not taken; its sender is told why unless the words are empty.
 
     Attributes:
         reason: In a word or two, by which such poses are counted.
@@ -71,6 +71,7 @@ class Source:
     Attributes:
         has_poses: Whether it sends poses, so that differences are not integrated besides.
         last: The sender's stamp (µs) of the last pose or difference; `None` before.
+        stamped: The same of the last pose that got a stamp of our clock (ns): `newest`.
         restarts: How often its differences began anew.
         position: Sum of its differences; `orientation` as well.
         speed: Newest speed that no pose has.
@@ -81,6 +82,8 @@ class Source:
 
     has_poses: bool = False
     last: int | None = None
+    stamped: int = -1
+    newest: int | None = None
     restarts: int = 0
     position: Vector3 = _HERE
     orientation: Quaternion = _LEVEL
@@ -95,19 +98,17 @@ class Vision:
     """All poses from outside.
 
     Args:
-        delay: Of poses behind their stamps, seconds.
         see: Publishes a pose: its stamp and fields.
         refuse: Says why messages of a kind and a sender have no effect.
     """
 
     def __init__(
         self,
-        delay: float,
         clocks: Clocks,
         see: Callable[..., None],
         refuse: Callable[[str, Sender, str], None],
     ) -> None:
-        self._delay, self._clocks = round(delay * SECOND), clocks
+        self._clocks = clocks
         self._see, self._refuse = see, refuse
         self._sources: dict[Sender, Source] = {}
         self.refused: Counter[str] = Counter()
@@ -125,7 +126,8 @@ class Vision:
                 self._hear_pose(sender, source, message, now)
         except RefusedPoseError as refusal:
             self.refused[refusal.reason] += 1
-            self._refuse(kind, sender, str(refusal))
+            if words := str(refusal):
+                self._refuse(kind, sender, words)
 
     def update(self, now: int) -> None:
         """Publish poses whose speeds do not come."""
@@ -138,8 +140,8 @@ class Vision:
         for source in self._sources.values():
             self._release(source)
         notes = [f"{self._restamped} restamped"] if self._restamped else []
-        if self._taken and self._delay:
-            notes.append(f"each {self._delay / 1e6:g} ms earlier by delay")
+        if self._taken and (delay := self._clocks.delay):
+            notes.append(f"each {delay / 1e6:g} ms earlier by delay")
         notes += [f"{self._moving} with a velocity"] if self._moving else []
         text = f"{self._taken} {'pose' if self._taken == 1 else 'poses'} taken"
         text += f" ({', '.join(notes)})" if notes else ""
@@ -169,7 +171,7 @@ class Vision:
         counter = getattr(message, "reset_counter", 0)
         source.has_poses = True
         fields = {
-            "stamp": self._stamp(sender, stamp, now),
+            "stamp": self._stamp(sender, source, stamp, now),
             "frame_id": f"odom_{counter}" if counter else "odom",
             "position": position,
             "orientation": orientation,
@@ -248,7 +250,7 @@ class Vision:
         x, y, z = rotate(source.orientation, (way[0], way[1], way[2]))
         source.position = source.position[0] + x, source.position[1] + y, source.position[2] + z
         fields = {
-            "stamp": self._stamp(sender, stamp, now),
+            "stamp": self._stamp(sender, source, stamp, now),
             "frame_id": f"odom_{source.restarts}" if source.restarts else "odom",
             "position": source.position,
             "orientation": source.orientation,
@@ -256,11 +258,19 @@ class Vision:
         }
         self._join(source, stamp, fields, None, now)
 
-    def _stamp(self, sender: Sender, stamp: int, now: int) -> int:
-        """Return when a pose of a sender's stamp (µs) was measured, in our clock (ns)."""
+    def _stamp(self, sender: Sender, source: Source, stamp: int, now: int) -> int:
+        """Return when a pose of a sender's stamp (µs) was measured, in our clock (ns).
+
+        Poses that a better measure of the clock puts before the last one are not taken, since that
+        one's stamp was wrong.
+        """
         corrected = self._clocks.stamp(sender, 1000 * stamp, now)
+        is_later, source.stamped = stamp > source.stamped, stamp
+        if is_later and source.newest is not None and corrected <= source.newest:
+            raise RefusedPoseError("restamped to before the last", "")
+        source.newest = corrected
         self._restamped += corrected != 1000 * stamp
-        return corrected - self._delay
+        return corrected - self._clocks.delay
 
     def _join(
         self,
