@@ -20,6 +20,7 @@ def libraries() -> dict[str, Any]:
             library = ctypes.CDLL(str(path))
             library.raster_new.restype = ctypes.c_void_p
             library.rays_new.restype = ctypes.c_void_p
+            library.raster_texel_count.restype = ctypes.c_int64
             if library.raster_runs():
                 builds[name] = library
     return builds

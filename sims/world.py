@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
@@ -24,6 +25,8 @@ from runtime.host import Sibling
 from runtime.paths import NameOrPath
 from runtime.typed import TypeVar
 from sims.cameras import CameraSpec, model_to_bytes
+from sims.cameras.packed import Packed, pack, without_looks
+from sims.cameras.raster import library_for
 from sims.cameras.rig import CameraOutputs, CameraRig
 from sims.cameras.stage import RendererName
 from sims.scans.settings import MeshSpec
@@ -88,6 +91,16 @@ class SharedWorld:
         # Gives the state of each free camera at a time (ns); no physics knows it.
         self.free_cameras: dict[str, Callable[[int], State]] = {}
         self._bare = bare or not any(i.node.sees(i.config) for i in inhabitants)
+        seeing = [i.config for i in inhabitants if i.node.sees(i.config)]
+        draws = {getattr(config, "renderer", "") for config in seeing}
+        self._rasterised = "raster" in draws and not self._bare
+        # Lidars ask textures how bright they are.
+        lidars = any(getattr(config, "lidars", ()) for config in seeing)
+        self._shares_texels = draws == {"raster"} and not lidars
+        self._images: dict[str, Any] = {}  # of textures of which the model has the name alone
+        self._places: Any = None  # the model for processes of the rasteriser
+        self._packed: dict[RendererName, Packed] = {}
+        self._packing = threading.Lock()
         self._seed = seed
         self._built = False
         self._building = asyncio.Lock()
@@ -110,6 +123,25 @@ class SharedWorld:
     def model_bytes(self) -> bytes:
         """Compiled world for other processes, made at the first request."""
         return model_to_bytes(self.model)
+
+    def packed(self, renderer: RendererName) -> Packed:
+        """Return the world for processes in which this renderer draws, made at the first request.
+
+        It is there for as long as this object is. May be called in any thread.
+
+        Raises:
+            GraphicsError: The rasteriser is wanted, and was not compiled with the package.
+            ValueError: The world has what the renderer does not draw.
+        """
+        with self._packing:
+            if renderer not in self._packed:
+                if renderer == "raster":
+                    library = library_for(self.model)
+                    packed = pack(self._places or self.model, library, self.model, self._images)
+                else:
+                    packed = pack(self.model)
+                self._packed[renderer] = packed
+            return self._packed[renderer]
 
     def state_at(self, stamp_ns: int) -> tuple[int, Floats, Floats]:
         """Step the physics up to a time if necessary, and return the world's state.
@@ -151,7 +183,9 @@ class SharedWorld:
         return tuple(np.flatnonzero(self.model.geom_bodyid == self.model.body(body).id).tolist())
 
     def _build(self) -> None:
-        spec, dynamics = load_scene(self.name, bare=self._bare, mesh=self.mesh)
+        self._images, self._packed = {}, {}
+        aside = self._images if self._shares_texels else None
+        spec, dynamics = load_scene(self.name, bare=self._bare, mesh=self.mesh, aside=aside)
         wind = None
         for inhabitant in self._inhabitants:
             node: type[Inhabitant] = inhabitant.node
@@ -160,6 +194,7 @@ class SharedWorld:
             wind = node.wind_of(inhabitant.config) or wind
         self.model = spec.compile()
         self.__dict__.pop("model_bytes", None)
+        self._places = without_looks(spec, self.model) if self._rasterised else None
         self.dynamics = dynamics
         self.simulation = self.air = None
         if self.vehicles:

@@ -24,6 +24,7 @@ LIGHT = np.dtype(
         ("step", "f8"), ("eye", POSE),
     ]
 )  # fmt: skip
+CLUSTER = np.dtype([("middle", "f4", 3), ("reach", "f4", 3), ("axis", "f4", 3), ("sine", "f4")])
 VIEW = np.dtype(
     [
         ("width", "i4"), ("height", "i4"), ("first", "i4"), ("last", "i4"), ("sky", "i4"),

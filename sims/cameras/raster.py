@@ -18,8 +18,9 @@ from events import CameraInfo
 from runtime.typed import override
 from sims.cameras.layouts import GEOM, LIGHT, POSE, VIEW
 from sims.cameras.layouts import address as _at
-from sims.cameras.meshes import Mesh, mesh_of, narrow, shape_of
+from sims.cameras.meshes import narrow, shape_of
 from sims.cameras.optics import pixel_rays
+from sims.cameras.packed import DRAWN_GROUPS, Drawable, PreparedMesh, prepare
 from sims.cameras.shadows import ShadowMaps
 from sims.cameras.stage import (
     NEAR,
@@ -32,12 +33,11 @@ from sims.cameras.stage import (
     View,
     object_numbers,
 )
-from sims.cameras.surfaces import colours_texture, geom_numbers, texture_bytes
+from sims.cameras.surfaces import geom_numbers
 from sims.compiled import libraries
 
 _Kind = mujoco.mjtGeom
 _OPTICAL = np.tile([1.0, -1.0, -1.0], 3)  # MuJoCo's camera looks along -z, with y up
-MOST_TRIANGLES = 1 << 24  # of all geoms: the rasteriser numbers them with 24 bits
 FROM_BEHIND = 0.3  # factor on the opacity of a plane that is seen from behind, as MuJoCo's
 _GREY = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a geom's colour if nothing is said
 
@@ -48,6 +48,7 @@ class Raster(Stage):
     Args:
         threads: Threads that draw; any number draws the same.
         instructions: One of `libraries`; the quickest by default. All draw the same.
+        drawable: From `prepare` of this model, if that is done.
 
     Raises:
         GraphicsError: The rasteriser was not compiled with the package.
@@ -63,57 +64,38 @@ class Raster(Stage):
         dynamics: Changing | None = None,
         threads: int = 1,
         instructions: str = "",
+        drawable: Drawable | None = None,
     ) -> None:
         super().__init__(model, dynamics)
         self._threads = threads
         self._colours = b""  # those that the geoms have
         self._kept: list[tuple[npt.NDArray[Any], npt.NDArray[Any]]] = []  # poses of eye and geoms
-        for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
-            if count:
-                raise ValueError(
-                    f'renderer = "raster": expected a world without {kind}, found {count}; '
-                    '"mujoco" draws them'
-                )
-        if not libraries():
-            raise GraphicsError(
-                'renderer = "raster": expected sims/cameras/_raster_*.so, found none: there was no '
-                "C++ compiler (GCC 11 or later) when the package was installed. Install one "
-                "(Debian, Ubuntu: apt-get install g++) and the package again, or say "
-                'renderer = "mujoco"'
-            )
-        self._library = libraries()[instructions or next(iter(libraries()))]
+        self._library = library_for(model, instructions)
+        if drawable is None:
+            drawable = prepare(model, self._library)
+        self._drawable = drawable  # which the scene refers to
         self._world = ctypes.c_void_p(self._library.raster_new())
         self._shadows = ShadowMaps(self._library, self._world, model, threads)
-        colours = {colours_texture(model, mesh) for mesh in range(model.nmesh)}
-        colours -= set(model.mat_texid.ravel().tolist())
+        self._library.raster_texels(self._world, _at(drawable.texels))
         self._textures = [
-            -1 if number in colours else self._add_texture(number) for number in range(model.ntex)
+            -1 if place is None else int(self._library.raster_texture(self._world, *place))
+            for place in drawable.textures
         ]
         skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = self._textures[skies[0]] if skies.size else -1
-        self._drawn = np.flatnonzero(model.geom_group < 3)
+        self._drawn = np.flatnonzero(model.geom_group < DRAWN_GROUPS)
         self._geoms = np.zeros(len(self._drawn), GEOM)
         self._geoms["double_sided"] = geom_numbers(model, "double_sided")[self._drawn] != 0.0
         self._geoms["cutoff"] = narrow(geom_numbers(model, "alpha_cutoff")[self._drawn])
         planes = model.geom_type[self._drawn] == _Kind.mjGEOM_PLANE
         self._planes = np.flatnonzero(planes & (self._geoms["double_sided"] == 0))
         self._behind: dict[int, int] = {}  # by a plane's mesh, that of its other side
-        meshes: dict[Any, tuple[int, int]] = {}  # numbers, and how many triangles
-        triangles = 0
-        for place, geom in enumerate(self._drawn.tolist()):
-            shape = shape_of(model, geom)
-            if shape not in meshes:
-                mesh = mesh_of(model, *shape)
-                meshes[shape] = self._add_mesh(mesh), len(mesh.corners)
-                if shape[0] == _Kind.mjGEOM_PLANE:
-                    self._behind[meshes[shape][0]] = self._add_mesh(mesh.turned())
-            self._geoms["mesh"][place], count = meshes[shape]
-            triangles += count
-        if triangles >= MOST_TRIANGLES:
-            raise ValueError(
-                f'renderer = "raster": expected geoms of fewer than {MOST_TRIANGLES} triangles in '
-                f'all, found {triangles}; "mujoco" draws them'
-            )
+        meshes: dict[Any, int] = {}
+        for shape, (mesh, behind) in drawable.meshes.items():
+            meshes[shape] = self._add_mesh(mesh)
+            if behind is not None:
+                self._behind[meshes[shape]] = self._add_mesh(behind)
+        self._geoms["mesh"] = [meshes[shape_of(model, geom)] for geom in self._drawn.tolist()]
         self._describe()
         self._lenses: dict[CameraInfo, int] = {}
 
@@ -308,35 +290,14 @@ class Raster(Stage):
         in_metres = np.isin(kind, (_Kind.mjGEOM_MESH, _Kind.mjGEOM_HFIELD, _Kind.mjGEOM_PLANE))
         return np.where(uniform, size, 1.0) / np.where(in_metres[:, None], 1.0, size)
 
-    def _add_texture(self, number: int) -> int:
-        model = self.model
-        width, height = int(model.tex_width[number]), int(model.tex_height[number])
-        data = texture_bytes(model, number)
-        channels = data.shape[1]
-        cube = model.tex_type[number] != mujoco.mjtTexture.mjTEXTURE_2D
-        if cube and height == width:  # all of its faces
-            data, height = np.tile(data, (6, 1)), 6 * height
-        texture = int(
-            self._library.raster_texture(self._world, width, height, channels, _at(data), int(cube))
-        )
-        if texture < 0:
-            raise ValueError(
-                f"texture {model.texture(number).name or number}: expected fewer than 2³¹ texels "
-                f"of all textures and their smaller copies, found more with its {width} x {height}"
-            )
-        return texture
-
-    def _add_mesh(self, mesh: Mesh) -> int:
-        points, corners = mesh.points, mesh.corners
-        number = int(
+    def _add_mesh(self, mesh: PreparedMesh) -> int:
+        return int(
             self._library.raster_mesh(
-                self._world, len(points), _at(points), _at(mesh.normals), _at(mesh.places),
-                len(corners), _at(corners),
+                self._world, len(mesh.points), _at(mesh.points), _at(mesh.normals),
+                _at(mesh.places), _at(mesh.colours), len(mesh.corners), _at(mesh.corners),
+                _at(mesh.parts), mesh.part_count, _at(mesh.beyond), _at(mesh.clusters),
             )
         )  # fmt: skip
-        if mesh.colours is not None:
-            self._library.raster_colours(self._world, number, _at(mesh.colours))
-        return number
 
     def _lens(self, info: CameraInfo) -> int:
         if info not in self._lenses:
@@ -350,6 +311,29 @@ class Raster(Stage):
                 self._world, info.width, info.height, *map(_at, planes)
             )
         return self._lenses[info]
+
+
+def library_for(model: Any, instructions: str = "") -> Any:
+    """Return the rasteriser's library for a model.
+
+    Raises:
+        GraphicsError: The rasteriser was not compiled with the package.
+        ValueError: The model has skins or flexes, which are not drawn.
+    """
+    for kind, count in (("skin", model.nskin), ("flex", model.nflex)):
+        if count:
+            raise ValueError(
+                f'renderer = "raster": expected a world without {kind}, found {count}; '
+                '"mujoco" draws them'
+            )
+    if not libraries():
+        raise GraphicsError(
+            'renderer = "raster": expected sims/cameras/_raster_*.so, found none: there was no '
+            "C++ compiler (GCC 11 or later) when the package was installed. Install one "
+            "(Debian, Ubuntu: apt-get install g++) and the package again, or say "
+            'renderer = "mujoco"'
+        )
+    return libraries()[instructions or next(iter(libraries()))]
 
 
 def _even(rays: npt.NDArray[np.float32]) -> bool:

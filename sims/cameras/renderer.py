@@ -21,6 +21,7 @@ from events.geometry import pose_matrix
 from sims.cameras.development import Development
 from sims.cameras.opengl import OpenGL
 from sims.cameras.optics import generator, grey_of, moments, undistorted
+from sims.cameras.packed import Drawable, Packed
 from sims.cameras.raster import Raster
 from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain
 from sims.cameras.stage import (
@@ -139,25 +140,34 @@ def model_from_bytes(data: bytes) -> Any:
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": data})
 
 
+def opened(world: Packed | bytes) -> tuple[Any, Drawable | None]:
+    """Return the model of a world, and what the rasteriser draws if that is prepared."""
+    if isinstance(world, Packed):
+        return world.model(), world.drawable
+    return model_from_bytes(world), None
+
+
 def open_stage(
     renderer: RendererName,
     model: Any,
     infos: tuple[CameraInfo, ...],
     threads: int,
     dynamics: Changing | None = None,
+    drawable: Drawable | None = None,
 ) -> Stage:
     """Return a stage of a renderer.
 
     Args:
         infos: The largest cameras.
         threads: Threads that draw; of OpenGL's software renderer only in the first context.
+        drawable: What the rasteriser draws, if that is prepared.
 
     Raises:
         GraphicsError: What the renderer needs is missing; the message names what to install.
         ValueError: The model holds what the renderer does not draw.
     """
     if renderer == "raster":
-        return Raster(model, dynamics, threads)
+        return Raster(model, dynamics, threads, drawable=drawable)
     return OpenGL(model, infos, threads, dynamics)
 
 
@@ -185,7 +195,8 @@ class CameraRenderer:
     Not thread-safe: stay in the thread that made it.
 
     Args:
-        model_bytes: From `model_to_bytes`; has a camera `<prefix><name>` for each spec.
+        world: Of the simulator's process, or from `model_to_bytes`; has a camera
+            `<prefix><name>` for each spec.
         cameras: Settings of the cameras; a stereo rig is two.
         threads: Threads that draw.
         dynamics: What moves in the world by itself, as `sims.worlds.Dynamics`.
@@ -199,7 +210,7 @@ class CameraRenderer:
 
     def __init__(
         self,
-        model_bytes: bytes,
+        world: Packed | bytes,
         cameras: tuple[CameraSpec, ...],
         prefix: str,
         seed: int,
@@ -209,7 +220,7 @@ class CameraRenderer:
     ) -> None:
         cameras = tuple(eye for spec in cameras for eye in eyes(spec))
         keep_memory()
-        model = model_from_bytes(model_bytes)
+        model, drawable = opened(world)
         self._model = model
         self._seed = seed
         self._cameras = {spec.name: (spec, _number(model, prefix + spec.name)) for spec in cameras}
@@ -224,7 +235,7 @@ class CameraRenderer:
         }
         self._views = {spec.name: View(camera_info(spec), is_plain(spec)) for spec in cameras}
         infos = tuple(view.info for view in self._views.values())
-        self._stage = open_stage(renderer, model, infos, threads, dynamics)
+        self._stage = open_stage(renderer, model, infos, threads, dynamics, drawable)
 
     def expose(self, shots: tuple[Shot, ...]) -> tuple[Frame, ...]:
         """Return the frames of some exposures. The same arguments give the same bits."""

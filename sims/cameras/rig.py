@@ -17,6 +17,7 @@ from runtime import Node, Worker
 from runtime.channels.sender import Sender
 from sims.cameras.calibration import Calibration, announced, difference
 from sims.cameras.optics import ExposureControl, undistorted
+from sims.cameras.packed import Packed
 from sims.cameras.renderer import CameraRenderer, Frame, Motion, Shot, delay_of, stamp_error
 from sims.cameras.spec import CameraSpec, announcement, calibration, eyes, optical_frame
 from sims.cameras.stage import RendererName
@@ -42,6 +43,9 @@ class DrawnWorld(Protocol):
     @property
     def model_bytes(self) -> bytes:
         """The compiled world, from `model_to_bytes`."""
+
+    def packed(self, renderer: RendererName) -> Packed:
+        """Return the world for processes in which this renderer draws."""
 
 
 States = Callable[[int], npt.NDArray[np.float64]]
@@ -110,7 +114,7 @@ class CameraRig:
             self._node.doing = "starting the renderer of its cameras"
             self._seed = int(self._node.rng.integers(1 << 31))
             return (
-                await self._node.offload(lambda: world.model_bytes),
+                await self._node.offload(lambda: world.packed(self._draws)),
                 tuple(self._specs.values()),
                 f"{self._node.name}/",
                 self._seed,

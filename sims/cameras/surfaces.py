@@ -36,11 +36,17 @@ def geom_numbers(model: Any, name: NumberName) -> npt.NDArray[np.float64]:
     return np.array(model.geom_user[:, column], np.float64)
 
 
-def texture_bytes(model: Any, texture: int) -> npt.NDArray[np.uint8]:
-    """Return a texture's texels, row by row, shape (height · width, channels)."""
+def texture_bytes(
+    model: Any, texture: int, image: npt.NDArray[np.uint8] | None = None
+) -> npt.NDArray[np.uint8]:
+    """Return a texture's texels, row by row, shape (height · width, channels).
+
+    Args:
+        image: What the texture shows, if the model has it without texels.
+    """
     channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
     count = int(model.tex_width[texture]) * int(model.tex_height[texture])
-    data = model.tex_data[start : start + count * channels]
+    data = model.tex_data[start : start + count * channels] if image is None else image
     texels = np.ascontiguousarray(data).reshape(-1, channels)
     if model.tex_colorspace[texture] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
         opacity = texels[:, 3:].copy()

@@ -12,6 +12,7 @@ import hashlib
 import json
 import logging
 import os
+import struct
 import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from sims.scans.mesh_file import Material
 from sims.scans.preparing import Part, Prepared
@@ -120,6 +122,19 @@ def _write(entry: Path, prepared: Prepared, files: Sequence[Path]) -> None:
         old.unlink(missing_ok=True)
 
 
+def _mapped(entry: Path, name: str) -> npt.NDArray[np.uint8]:
+    """Return an array of an entry in the file, read only; it takes memory only when it is used."""
+    with entry.open("rb") as file, zipfile.ZipFile(file) as archive:
+        with archive.open(f"{name}.npy") as member:
+            while member.read(1 << 20):  # which checks it
+                pass
+        file.seek(archive.getinfo(f"{name}.npy").header_offset + 26)
+        file.seek(sum(struct.unpack("<HH", file.read(4))), os.SEEK_CUR)
+        np.lib.format.read_magic(file)
+        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(file)
+        return np.memmap(file, dtype, "r", file.tell(), shape, "F" if by_columns else "C")
+
+
 def _read(entry: Path) -> Prepared:
     with entry.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         about = json.loads(arrays["about"].tobytes())
@@ -136,7 +151,7 @@ def _read(entry: Path) -> Prepared:
                 for number, (name, material) in enumerate(about[group])
             )  # fmt: skip
         materials = []
-        images = [arrays[f"image.{k}"] for k in range(max(about["images"], default=-1) + 1)]
+        images = [_mapped(entry, f"image.{k}") for k in range(max(about["images"], default=-1) + 1)]
         for number, row in zip(about["images"], about["materials"], strict=True):
             material = Material(*row)
             r, g, b, a = material.colour  # a list

@@ -73,11 +73,18 @@ def _with_image(file: MeshFile, image: Image) -> MeshFile:
     return file._replace(materials=materials)
 
 
-def mesh_world(path: Path, mesh: MeshSpec = USUAL, *, bare: bool = False) -> Any:
+def mesh_world(
+    path: Path,
+    mesh: MeshSpec = USUAL,
+    *,
+    bare: bool = False,
+    aside: dict[str, Image] | None = None,
+) -> Any:
     """Return a mesh file's world, as a `mujoco.MjSpec`; what is not drawn is logged.
 
     Args:
         bare: Leave out all that is only seen.
+        aside: Takes the images, by the names of their textures, which have one texel then.
 
     Raises:
         MeshError: As `prepared_mesh`.
@@ -85,11 +92,18 @@ def mesh_world(path: Path, mesh: MeshSpec = USUAL, *, bare: bool = False) -> Any
     prepared = prepared_mesh(path, mesh)
     for note in prepared.notes:
         _LOG.warning("%s: %s", path.name, note)
-    return build(prepared, path.stem, mesh.solid, bare=bare)
+    return build(prepared, path.stem, mesh.solid, bare=bare, aside=aside)
 
 
-def build(prepared: Prepared, name: str, solid: str = "voxels", *, bare: bool = False) -> Any:
-    """Return the world of a prepared mesh, of a setting `solid`."""
+def build(
+    prepared: Prepared,
+    name: str,
+    solid: str = "voxels",
+    *,
+    bare: bool = False,
+    aside: dict[str, Image] | None = None,
+) -> Any:
+    """Return the world of a prepared mesh, of a setting `solid`; else as `mesh_world`."""
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.visual.quality.shadowsize = 0
@@ -99,7 +113,7 @@ def build(prepared: Prepared, name: str, solid: str = "voxels", *, bare: bool = 
     _add_light(spec, prepared)
     by_hulls = solid == "hulls" and not prepared.hulls
     if not bare or by_hulls:
-        _add_looks(spec, prepared, bare, by_hulls)
+        _add_looks(spec, prepared, bare, by_hulls, aside)
     add_solids(spec, prepared.boxes, prepared.floor)
     for part in prepared.hulls:
         _add_mesh(spec, _padded(part, solid=True), f"solid.{part.name}")
@@ -127,7 +141,9 @@ def _add_light(spec: Any, prepared: Prepared) -> None:
         )  # fmt: skip
 
 
-def _add_looks(spec: Any, prepared: Prepared, bare: bool, solid: bool) -> None:
+def _add_looks(
+    spec: Any, prepared: Prepared, bare: bool, solid: bool, aside: dict[str, Image] | None
+) -> None:
     """Add the drawn parts with their materials."""
     materials: set[int] = set()
     images: dict[int, str] = {}  # names of textures by image
@@ -135,7 +151,7 @@ def _add_looks(spec: Any, prepared: Prepared, bare: bool, solid: bool) -> None:
         material = prepared.materials[part.material]
         if part.material not in materials and not bare:
             materials.add(part.material)
-            _add_material(spec, part.material, material, prepared.baked, images)
+            _add_material(spec, part.material, material, prepared.baked, images, aside)
         _add_mesh(spec, part, part.name)
         if part.colours is not None and not bare:
             _add_colours(spec, part)
@@ -148,7 +164,12 @@ def _add_looks(spec: Any, prepared: Prepared, bare: bool, solid: bool) -> None:
 
 
 def _add_material(
-    spec: Any, number: int, material: Material, baked: bool, images: dict[int, str]
+    spec: Any,
+    number: int,
+    material: Material,
+    baked: bool,
+    images: dict[int, str],
+    aside: dict[str, Image] | None,
 ) -> None:
     *rgb, alpha = material.colour
     added = spec.add_material(
@@ -158,7 +179,11 @@ def _add_material(
     if material.image is not None:
         if id(material.image) not in images:
             images[id(material.image)] = f"m{number}"
-            _add_image(spec, f"m{number}", material.image)
+            image = material.image
+            if aside is not None:
+                aside[f"m{number}"] = image
+                image = np.zeros((1, 1, image.shape[2]), np.uint8)
+            _add_image(spec, f"m{number}", image)
         textures = list(added.textures)
         textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = images[id(material.image)]
         added.textures = textures

@@ -55,7 +55,12 @@ def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
 
 
 def load_scene(
-    name_or_path: str | Path, seed: int = 0, *, bare: bool = False, mesh: MeshSpec = USUAL
+    name_or_path: str | Path,
+    seed: int = 0,
+    *,
+    bare: bool = False,
+    mesh: MeshSpec = USUAL,
+    aside: dict[str, Any] | None = None,
 ) -> Scene:
     """Return a world, ready for vehicles and cameras; MuJoCo's warnings go to the log from then on.
 
@@ -65,6 +70,8 @@ def load_scene(
         seed: Seed of a built-in world's textures, and of what lies on shelves. A file has none.
         bare: Leave out a built-in world's images, and all of a mesh that is only seen.
         mesh: How a mesh file becomes a world.
+        aside: Takes the images of a mesh file, by the names of its textures; these have one texel
+            then.
 
     Raises:
         WorldError: No such name or file, the file is no MJCF that compiles and no mesh of use, or a
@@ -75,7 +82,7 @@ def load_scene(
     text = str(name_or_path)
     suffix = Path(text).suffix.lower()
     if suffix in SUFFIXES:
-        return Scene(_from_mesh(Path(name_or_path), mesh, bare))
+        return Scene(_from_mesh(Path(name_or_path), mesh, bare, aside))
     if mesh != USUAL:
         raise WorldError(f'mesh: expected a mesh file as the world, found "{text}"')
     if isinstance(name_or_path, Path) or "/" in text or suffix == ".xml":
@@ -106,11 +113,11 @@ def _from_package(name: str, seed: int, bare: bool) -> mujoco.MjSpec | Scene:
     return built
 
 
-def _from_mesh(path: Path, mesh: MeshSpec, bare: bool) -> Any:
+def _from_mesh(path: Path, mesh: MeshSpec, bare: bool, aside: dict[str, Any] | None) -> Any:
     from sims.scans.world import mesh_world  # reading meshes takes libraries that few runs need
 
     try:
-        return mesh_world(path, mesh, bare=bare)
+        return mesh_world(path, mesh, bare=bare, aside=aside)
     except MeshError as error:
         raise WorldError(f"world: {error}") from error
 

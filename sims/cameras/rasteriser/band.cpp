@@ -13,7 +13,7 @@ constexpr std::int32_t clear_part = 1 << 30;
 Band::Band(Scene& scene, int first, int last, const Images& images, Memory& memory)
     : scene_(scene), lens_(*scene.lens_), view_(scene.view_), first_(first), last_(last),
       images_(images), end_(images.rgb ? row(last) : nullptr), nearest_(scene.nearest_.data()),
-      visible_(scene.visible_.data()), tiles_(memory.tiles), taps_(lens_.stride, scene.texels.data()),
+      visible_(scene.visible_.data()), tiles_(memory.tiles), taps_(lens_.stride, scene.texels),
       farthest_(lens_.pinhole ? 0 : leaf(0, last + Lens::smallest)), surfaces_(memory.surfaces),
       shades_(memory.shades), surface_of_(memory.surface_of) {
     surfaces_.clear(), shades_.clear();
@@ -375,7 +375,7 @@ iv Band::is_opaque(const Opacity& of, int x, int y, iv asked, fv nearest) const 
     const fv across = Texture::within(u - floored(u)), down = Texture::within(v - floored(v));
     for (int k = 0; k < lanes; ++k) {
         if (!asked[k]) continue;
-        opacity[k] *= of.texture->opacity(scene_.texels.data(), across[k], down[k], level[k]);
+        opacity[k] *= of.texture->opacity(scene_.texels, across[k], down[k], level[k]);
         least[k] = of.thresholds[level[k]];
     }
     return asked & (opacity >= least);

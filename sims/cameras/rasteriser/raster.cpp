@@ -12,6 +12,16 @@
 
 using namespace raster;
 
+static Mesh shape_of(int vertices, const float* points, const float* normals, int triangles,
+                     const std::int32_t* corners) {
+    Mesh mesh;
+    const auto count = std::size_t(vertices);
+    mesh.points = {reinterpret_cast<const Vec3f*>(points), count};
+    mesh.normals = {reinterpret_cast<const Vec3f*>(normals), count};
+    mesh.corners = {corners, 3 * std::size_t(triangles)};
+    return mesh;
+}
+
 extern "C" {
 #pragma GCC visibility push(default)
 
@@ -32,37 +42,53 @@ Scene* raster_new() { return new Scene; }
 
 void raster_free(Scene* scene) { delete scene; }
 
-// -1 if there is no room for it: all texels have a number.
-int raster_texture(Scene* scene, int width, int height, int channels, const std::uint8_t* data,
-                   int cube) {
-    const auto before = static_cast<std::int64_t>(scene->texels.size());
-    if (before + Texture::count(width, height, cube) > std::numeric_limits<std::int32_t>::max())
-        return -1;
-    scene->textures.push_back(std::make_unique<Texture>(
-        scene->texels, width, height, channels, data, cube));
+// How many texels a texture takes, with all of its sizes.
+std::int64_t raster_texel_count(int width, int height, int cube) {
+    return Texture::count(width, height, cube);
+}
+
+// Write as many: an image in all of its sizes.
+void raster_fill(std::uint32_t* to, int width, int height, int channels, const std::uint8_t* data,
+                 int cube) {
+    Texture::fill(to, width, height, channels, data, cube);
+}
+
+// Texels of all textures, after two white ones. Like all arrays from here on, the caller keeps them
+// as long as the scene is there, unchanged: several scenes, also of several processes, may share them.
+void raster_texels(Scene* scene, const std::uint32_t* texels) { scene->texels = texels; }
+
+// A texture of so many columns and rows, whose texels begin at `start` among all.
+int raster_texture(Scene* scene, int start, int width, int height, int channels, int cube) {
+    scene->textures.push_back(std::make_unique<Texture>(start, width, height, channels, cube));
     return static_cast<int>(scene->textures.size()) - 1;
 }
 
-int raster_mesh(Scene* scene, int vertices, const float* points, const float* normals,
-                const float* places, int triangles, const std::int32_t* corners) {
-    auto mesh = std::make_unique<Mesh>();
-    mesh->points.resize(vertices);
-    mesh->normals.resize(vertices);
-    std::memcpy(mesh->points.data(), points, sizeof(Vec3f) * vertices);
-    std::memcpy(mesh->normals.data(), normals, sizeof(Vec3f) * vertices);
-    mesh->places.assign(places, places + 2 * vertices);
-    mesh->corners.assign(corners, corners + 3 * triangles);
-    mesh->bounds = Bounds::about(vertices, [&](int k) { return mesh->points[k]; });
-    mesh->find_parts();
-    mesh->find_clusters();
-    scene->meshes.push_back(std::move(mesh));
-    return static_cast<int>(scene->meshes.size()) - 1;
+int raster_cluster_count(int triangles) { return Mesh::cluster_count(triangles); }
+
+// Find what `raster_mesh` takes of a mesh: the part of each triangle, the triangle beyond each of
+// its edges, and clusters. Returned is the number of parts.
+int raster_find(int vertices, const float* points, const float* normals, int triangles,
+                const std::int32_t* corners, std::int32_t* parts, std::int32_t* beyond,
+                Cluster* clusters) {
+    const Mesh mesh = shape_of(vertices, points, normals, triangles, corners);
+    mesh.find_clusters(clusters);
+    return mesh.find_parts(parts, beyond);
 }
 
-// Factors on the colour of each vertex of a mesh: red, green, blue, opacity.
-void raster_colours(Scene* scene, int mesh, const float* colours) {
-    std::vector<float>& to = scene->meshes[mesh]->colours;
-    to.assign(colours, colours + 4 * scene->meshes[mesh]->points.size());
+// A mesh; colours are factors on the colour of each vertex (red, green, blue, opacity), or null.
+int raster_mesh(Scene* scene, int vertices, const float* points, const float* normals,
+                const float* places, const float* colours, int triangles,
+                const std::int32_t* corners, const std::int32_t* parts, int part_count,
+                const std::int32_t* beyond, const Cluster* clusters) {
+    Mesh mesh = shape_of(vertices, points, normals, triangles, corners);
+    mesh.places = {places, 2 * std::size_t(vertices)};
+    if (colours) mesh.colours = {colours, 4 * std::size_t(vertices)};
+    mesh.parts = {parts, std::size_t(triangles)}, mesh.part_count = part_count;
+    mesh.beyond = {beyond, 3 * std::size_t(triangles)};
+    mesh.clusters = {clusters, std::size_t(Mesh::cluster_count(triangles))};
+    mesh.bounds = Bounds::about(vertices, [&](int k) { return mesh.points[k]; });
+    scene->meshes.push_back(std::make_unique<Mesh>(mesh));
+    return static_cast<int>(scene->meshes.size()) - 1;
 }
 
 // Rays of a pinhole (x of each column, y of each row, z null) or of each pixel (NaN: none).

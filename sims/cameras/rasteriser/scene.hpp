@@ -35,21 +35,37 @@ struct Cluster {
     float sine;  // of its half angle; more than 1 if they face all ways
 };
 
+// Elements that the caller keeps, as long as the scene refers to them.
+template <typename T>
+struct Span {
+    const T* first = nullptr;
+    std::size_t count = 0;
+
+    const T& operator[](std::size_t k) const { return first[k]; }
+    const T* data() const { return first; }
+    std::size_t size() const { return count; }
+    bool empty() const { return count == 0; }
+};
+
 struct Mesh {
-    std::vector<Vec3f> points, normals;
-    std::vector<float> places;          // in a texture, u and v of each vertex
-    std::vector<float> colours;         // factors of each vertex: red, green, blue, opacity; or none
-    std::vector<std::int32_t> corners;  // three of each triangle, counterclockwise from outside
-    std::vector<std::int32_t> parts;    // of each triangle: number of the surface without a crease
+    Span<Vec3f> points, normals;
+    Span<float> places;          // in a texture, u and v of each vertex
+    Span<float> colours;         // factors of each vertex: red, green, blue, opacity; or none
+    Span<std::int32_t> corners;  // three of each triangle, counterclockwise from outside
+    Span<std::int32_t> parts;    // of each triangle: number of the surface without a crease
     int part_count = 0;
-    std::vector<std::int32_t> beyond;   // of each edge: first corner of the triangle on the other
-                                        // side that belongs to the same part, or -1
+    Span<std::int32_t> beyond;   // of each edge: first corner of the triangle on the other side
+                                 // that belongs to the same part, or -1
 
     Bounds bounds;
-    std::vector<Cluster> clusters;      // of so many triangles each; none of a small mesh
+    Span<Cluster> clusters;      // of so many triangles each; none of a small mesh
 
-    void find_parts();
-    void find_clusters();
+    // Of its points, normals and corners: `parts`, whose count is returned, and `beyond`.
+    int find_parts(std::int32_t* to_parts, std::int32_t* to_beyond) const;
+    static int cluster_count(int triangles) {
+        return triangles > 2 * Cluster::most ? (triangles + Cluster::most - 1) / Cluster::most : 0;
+    }
+    void find_clusters(Cluster* to) const;
 };
 
 // Rays of all pixels: of a pinhole x by column and y by row, else all by pixel.
@@ -245,7 +261,7 @@ class Scene {
     std::vector<std::unique_ptr<Mesh>> meshes;
     std::vector<std::unique_ptr<Texture>> textures;
     std::vector<std::unique_ptr<Lens>> lenses;
-    std::vector<std::uint32_t> texels{0xffffff, 0xffffff};  // two white ones, and all textures'
+    const std::uint32_t* texels = nullptr;  // two white ones, and all textures'; the caller keeps them
 
     // Eyes and poses are `view.poses` times those of one pose: the first are of the uppermost row of
     // the image, the last of the lowest one, and the others between at equal steps.

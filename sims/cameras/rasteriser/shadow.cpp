@@ -69,7 +69,7 @@ void Scene::shadow(const Lens& lens, float near, const Pose& eye, const Geom* ge
                           (placed.pixels[k].row - lens.y[0]) * per_step[1] * share});
         }
         Box box{size, 0, size, 0};
-        const std::vector<std::int32_t>& corners = placed.mesh->corners;
+        const Span<std::int32_t>& corners = placed.mesh->corners;
         for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
             const std::int32_t* of = &corners[corner];
             if (!holds_pixel(at[of[0]], at[of[1]], at[of[2]])) continue;

@@ -16,7 +16,7 @@ namespace raster {
 
 // Join triangles that share a vertex: there the normal is the same, which a crease parts. And find
 // those on the other side of each edge.
-void Mesh::find_parts() {
+int Mesh::find_parts(std::int32_t* to_parts, std::int32_t* to_beyond) const {
     std::vector<std::int32_t> root(points.size()), same(points.size());
     std::iota(root.begin(), root.end(), 0), std::iota(same.begin(), same.end(), 0);
     std::vector<std::array<std::int64_t, 6>> places;  // rounded: a turn ends where it began
@@ -56,18 +56,20 @@ void Mesh::find_parts() {
     std::sort(sides.begin(), sides.end(), [](const Side& a, const Side& b) {
         return std::tie(a.low, a.high, a.side) < std::tie(b.low, b.high, b.side);
     });
-    beyond.assign(corners.size(), -1);
+    std::fill(to_beyond, to_beyond + corners.size(), -1);
     for (std::size_t k = 1; k < sides.size(); ++k) {
         const Side &one = sides[k - 1], &other = sides[k];
         if (one.low != other.low || one.high != other.high) continue;
-        beyond[one.side] = other.side / 3 * 3, beyond[other.side] = one.side / 3 * 3;
+        to_beyond[one.side] = other.side / 3 * 3, to_beyond[other.side] = one.side / 3 * 3;
     }
     std::vector<std::int32_t> number(points.size(), -1);
+    int count = 0;
     for (std::size_t k = 0; k < corners.size(); k += 3) {
         std::int32_t& part = number[find(corners[k])];
-        if (part < 0) part = part_count++;
-        parts.push_back(part);
+        if (part < 0) part = count++;
+        *to_parts++ = part;
     }
+    return count;
 }
 
 // The triangle that a row's pixel sees, while all moves as the row sees it; null for none.

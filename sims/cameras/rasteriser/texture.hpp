@@ -47,22 +47,32 @@ class Texture {
         }
     }
 
-    // Adds its texels, red in their lowest bytes and opacity in their highest, to those of all.
-    Texture(std::vector<std::uint32_t>& all, int width, int height, int channels,
-            const std::uint8_t* data, bool cube)
+    // One whose texels, as `fill` writes them, begin at a place among those of the scene.
+    Texture(std::int32_t start, int width, int height, int channels, bool cube)
         : is_cube(cube), has_opacity(channels == 4) {
+        const int sides = cube ? 6 : 1;
+        for (height /= sides;; width = std::max(width / 2, 1), height = std::max(height / 2, 1)) {
+            levels_.push_back({width, height, start});
+            start += sides * (width + 2) * (height + 2);
+            if (width == 1 && height == 1) break;
+        }
+    }
+
+    // Write all sizes of an image, `count` texels: red in their lowest bytes and opacity in their
+    // highest.
+    static void fill(std::uint32_t* to, int width, int height, int channels,
+                     const std::uint8_t* data, bool cube) {
         std::vector<std::uint32_t> texels(std::size_t(width) * height);
         for (std::size_t k = 0; k < texels.size(); ++k) {
             const std::uint8_t* from = data + k * channels;
             const std::uint8_t red = from[0], green = channels > 2 ? from[1] : red;
             const std::uint8_t blue = channels > 2 ? from[2] : red;
-            const std::uint32_t opacity = has_opacity ? from[3] : 0;
+            const std::uint32_t opacity = channels == 4 ? from[3] : 0;
             texels[k] = red | green << 8 | blue << 16 | opacity << 24;
         }
         const int sides = cube ? 6 : 1;
         for (height /= sides;;) {
-            levels_.push_back({width, height, static_cast<std::int32_t>(all.size())});
-            border(all, texels, width, height);
+            to = border(to, texels, width, height, cube);
             if (width == 1 && height == 1) break;
             const int across = std::max(width / 2, 1), down = std::max(height / 2, 1);
             texels = halved(texels, width, height * sides, across, down * sides);
@@ -99,7 +109,7 @@ class Texture {
     // is that of the finest size, where `least` is its first (I. Castano, "Computing Alpha Mipmaps",
     // 2010): means of leaves and gaps alone would vanish in the distance, or close. Sizes end where
     // no number gives that share; what is farther is read from the last of them.
-    void keep_coverage(const std::vector<std::uint32_t>& all, std::vector<float>& least) const {
+    void keep_coverage(const std::uint32_t* all, std::vector<float>& least) const {
         double share = 0;  // that passes
         for (const Level& level : levels_) {
             if (std::min(level.width, level.height) < fewest && share > 0) return;
@@ -191,17 +201,19 @@ class Texture {
         taps.set(Taps::low + size, x, row.share);
     }
 
-    void border(std::vector<std::uint32_t>& all, const std::vector<std::uint32_t>& texels,
-                int width, int height) const {
+    // Write the sides of an image with their borders, and return where they end.
+    static std::uint32_t* border(std::uint32_t* to, const std::vector<std::uint32_t>& texels,
+                                 int width, int height, bool cube) {
         for (auto side = texels.begin(); side != texels.end(); side += std::size_t(width) * height)
             for (int y = -1; y <= height; ++y) {
-                const int beyond = is_cube ? std::min(std::max(y, 0), height - 1)
-                                           : (y + height) % height;
+                const int beyond = cube ? std::min(std::max(y, 0), height - 1)
+                                        : (y + height) % height;
                 const auto row = side + std::size_t(beyond) * width;
-                all.push_back(row[is_cube ? 0 : width - 1]);
-                all.insert(all.end(), row, row + width);
-                all.push_back(row[is_cube ? width - 1 : 0]);
+                *to++ = row[cube ? 0 : width - 1];
+                to = std::copy(row, row + width, to);
+                *to++ = row[cube ? width - 1 : 0];
             }
+        return to;
     }
 
     // Smaller, rounded down: each texel the mean of what it covers.

@@ -10,9 +10,9 @@ namespace raster {
 
 constexpr std::size_t smallest_batch = 8000;  // triangles
 
-void Mesh::find_clusters() {
+void Mesh::find_clusters(Cluster* to) const {
     const int count = static_cast<int>(corners.size()) / 3;
-    for (int first = 0; count > 2 * Cluster::most && first < count; first += Cluster::most) {
+    for (int first = 0; cluster_count(count) && first < count; first += Cluster::most) {
         const int last = std::min(first + Cluster::most, count);
         const auto point = [&](int k) { return points[corners[k]]; };
         const auto widened = [&](int k) { const Vec3f p = point(k); return Vec3{p.x, p.y, p.z}; };
@@ -36,7 +36,7 @@ void Mesh::find_clusters() {
             cluster.axis = narrow(axis);
             cluster.sine = static_cast<float>(root(std::max(1 - least * least, 0.0)));
         }
-        clusters.push_back(cluster);
+        *to++ = cluster;
     }
 }
 
@@ -351,7 +351,7 @@ bool Scene::in_squares(Placed& placed, const Placed& later) const {
 void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& moving) {
     Placed& placed = placed_[index];
     const bool rolling = view_.poses > 1, double_sided = placed.geom->double_sided;
-    const std::vector<std::int32_t>& corners = placed.mesh->corners;
+    const Span<std::int32_t>& corners = placed.mesh->corners;
     double same = 0;  // 1 and twice the cosine of the turn until the next pose
     if (rolling)
         for (int k = 0; k < 9; ++k) same += placed.turn.m[k] * later_[index].turn.m[k];
@@ -361,7 +361,7 @@ void Scene::add(int index, std::vector<Triangle>& to, std::vector<Moving>& movin
     const double start = lens_->pinhole ? lens_->y[0] : 0;  // of rows, and some more for rounding
     const double above = start + (first_ - 4) * lens_->step[1];
     const double below = start + (last_ + 3) * lens_->step[1];
-    const std::vector<Cluster>& clusters = placed.mesh->clusters;
+    const Span<Cluster>& clusters = placed.mesh->clusters;
     for (std::size_t corner = 0; corner < corners.size(); corner += 3) {
         if (!rolling && corner % (3 * Cluster::most) == 0 && !clusters.empty()) {
             if (const std::int32_t why = unseen(placed, clusters[corner / (3 * Cluster::most)])) {

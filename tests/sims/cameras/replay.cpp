@@ -2,12 +2,19 @@
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
+#include <list>
 #include <vector>
 
 extern "C" {
 void* raster_new();
-int raster_texture(void*, int, int, int, const void*, int);
-int raster_mesh(void*, int, const void*, const void*, const void*, int, const void*);
+std::int64_t raster_texel_count(int, int, int);
+void raster_fill(std::uint32_t*, int, int, int, const void*, int);
+void raster_texels(void*, const void*);
+int raster_texture(void*, int, int, int, int, int);
+int raster_cluster_count(int);
+int raster_find(int, const void*, const void*, int, const void*, void*, void*, void*);
+int raster_mesh(void*, int, const void*, const void*, const void*, const void*, int, const void*,
+                const void*, int, const void*, const void*);
 int raster_lens(void*, int, int, const void*, const void*, const void*);
 void raster_draw(void*, int, const void*, const void*, int, const void*, const void*, int,
                  const void*, void*, void*, void*);
@@ -18,13 +25,15 @@ void rays_cast(void*, const void*, const void*, const void*, const void*, int, c
                void*, void*, void*);
 }
 
+constexpr int cluster_size = 40;  // bytes, as in `layouts.py`
+
 static std::int32_t number() {
     std::int32_t found;
     if (std::fread(&found, sizeof found, 1, stdin) != 1) std::exit(0);  // the recording's end
     return found;
 }
 
-static std::vector<char> bytes() {  // their count, and they; kept, as the scene may point to them
+static std::vector<char> bytes() {  // their count, and they
     std::vector<char> found(number());
     if (std::fread(found.data(), 1, found.size(), stdin) != found.size()) std::exit(1);
     return found;
@@ -33,18 +42,40 @@ static std::vector<char> bytes() {  // their count, and they; kept, as the scene
 int main() {
     void* scene = raster_new();
     void* trees = nullptr;
+    std::vector<std::uint32_t> texels{0xffffff, 0xffffff};  // the scene points to them
+    std::list<std::vector<char>> meshes;                    // and to these
+    const auto lasting = [&](std::vector<char> part) { return meshes.emplace_back(part).data(); };
     for (;;) {
         switch (number()) {
             case 0: {
                 const int width = number(), height = number(), channels = number(), cube = number();
-                raster_texture(scene, width, height, channels, bytes().data(), cube);
+                const auto start = texels.size();
+                texels.resize(start + raster_texel_count(width, height, cube));
+                raster_fill(&texels[start], width, height, channels, bytes().data(), cube);
+                raster_texels(scene, texels.data());
                 break;
             }
             case 1: {
                 const int vertices = number(), triangles = number();
-                const auto points = bytes(), normals = bytes(), places = bytes(), corners = bytes();
-                raster_mesh(scene, vertices, points.data(), normals.data(), places.data(), triangles,
-                            corners.data());
+                const char *points = lasting(bytes()), *normals = lasting(bytes());
+                const char* places = lasting(bytes());
+                const auto factors = bytes();
+                const char* colours = factors.empty() ? nullptr : lasting(factors);
+                const char* corners = lasting(bytes());
+                char* parts = lasting(std::vector<char>(4 * triangles));
+                char* beyond = lasting(std::vector<char>(12 * triangles));
+                char* clusters =
+                    lasting(std::vector<char>(cluster_size * raster_cluster_count(triangles)));
+                const int count = raster_find(vertices, points, normals, triangles, corners, parts,
+                                              beyond, clusters);
+                raster_mesh(scene, vertices, points, normals, places, colours, triangles,
+                            corners, parts, count, beyond, clusters);
+                break;
+            }
+            case 7: {
+                const int start = number(), width = number(), height = number();
+                const int channels = number(), cube = number();
+                raster_texture(scene, start, width, height, channels, cube);
                 break;
             }
             case 2: {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from typing import Any
 
@@ -99,25 +98,22 @@ def test_texels_and_triangles_that_have_no_room_are_refused(
 ) -> None:
     """Each has a number: of 31 bits, and of 24 bits."""
     model = shaped(SHAPES["box"], kind=FLAT)
-    raster = Raster(model)
-    library = raster._library
-    none = ctypes.c_void_p(None)
-    assert library.raster_texture(raster._world, 1 << 16, 1 << 15, 3, none, 0) == -1
-    assert library.raster_texture(raster._world, 1 << 15, 6 << 14, 3, none, 1) == -1
-    raster.close()
-    monkeypatch.setattr("sims.cameras.raster.MOST_TRIANGLES", 192)  # of a box
+    monkeypatch.setattr("sims.cameras.packed.MOST_TRIANGLES", 192)  # of a box
     with pytest.raises(ValueError, match="fewer than 192 triangles in all, found 192"):
         Raster(model)
 
-    class Full:
-        def raster_new(self) -> int:
-            return 1
-
-        def raster_texture(self, *_: Any) -> int:
-            return -1
-
-    monkeypatch.setattr("sims.cameras.raster.libraries", lambda: {"full": Full()})
-    with pytest.raises(ValueError, match=r"texture sky: expected fewer than 2³¹ texels"):
+    monkeypatch.undo()
+    library = next(iter(libraries().values()))
+    texels = 2 + sum(
+        library.raster_texel_count(int(width), int(height), int(cube))
+        for width, height, cube in zip(
+            model.tex_width, model.tex_height, model.tex_type != FLAT, strict=True
+        )
+    )
+    monkeypatch.setattr("sims.cameras.texels.MOST_TEXELS", texels)
+    Raster(model).close()
+    monkeypatch.setattr("sims.cameras.texels.MOST_TEXELS", texels - 1)
+    with pytest.raises(ValueError, match=r"texture ramps: expected fewer than 2³¹ texels"):
         Raster(model)
 
 

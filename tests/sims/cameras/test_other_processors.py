@@ -50,11 +50,27 @@ class Recorder:
     def raster_free(self, world: Any) -> None:
         self._library.raster_free(world)
 
-    def raster_texture(
-        self, world: Any, width: int, height: int, channels: int, data: Any, cube: int
-    ) -> int:
+    def raster_texel_count(self, width: int, height: int, cube: int) -> int:
+        return int(self._library.raster_texel_count(width, height, cube))
+
+    def raster_fill(
+        self, to: Any, width: int, height: int, channels: int, data: Any, cube: int
+    ) -> None:
         self._note(0, width, height, channels, cube, (data, width * height * channels))
-        return int(self._library.raster_texture(world, width, height, channels, data, cube))
+        self._library.raster_fill(to, width, height, channels, data, cube)
+
+    def raster_texels(self, world: Any, texels: Any) -> None:
+        self._library.raster_texels(world, texels)
+
+    def raster_texture(self, world: Any, *numbers: int) -> int:
+        self._note(7, *numbers)
+        return int(self._library.raster_texture(world, *numbers))
+
+    def raster_cluster_count(self, triangles: int) -> int:
+        return int(self._library.raster_cluster_count(triangles))
+
+    def raster_find(self, *args: Any) -> int:
+        return int(self._library.raster_find(*args))
 
     def raster_mesh(
         self,
@@ -63,12 +79,15 @@ class Recorder:
         points: Any,
         normals: Any,
         at: Any,
+        colours: Any,
         count: int,
         corners: Any,
+        *rest: Any,
     ) -> int:
         arrays = (points, 12 * vertices), (normals, 12 * vertices), (at, 8 * vertices)
-        self._note(1, vertices, count, *arrays, (corners, 12 * count))
-        return int(self._library.raster_mesh(world, vertices, points, normals, at, count, corners))
+        self._note(1, vertices, count, *arrays, (colours, 16 * vertices), (corners, 12 * count))
+        mesh = vertices, points, normals, at, colours, count, corners, *rest
+        return int(self._library.raster_mesh(world, *mesh))
 
     def raster_lens(self, world: Any, width: int, height: int, x: Any, y: Any, z: Any) -> int:
         pixels = width * height if z.value else 0

@@ -358,7 +358,7 @@ class Images:
             if self._renderer is None:
                 self._renderer = await self._node.worker(
                     Renderer,
-                    await self._node.offload(lambda: self._world.model_bytes),
+                    await self._node.offload(lambda: self._world.packed(self._draws)),
                     f"{self._node.name}/camera",
                     self._cameras.largest,
                     self._threads,

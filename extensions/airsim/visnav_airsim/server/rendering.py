@@ -20,7 +20,8 @@ from events import CameraInfo
 from events.base import Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation, multiply
 from events.geometry import pose_matrix
-from sims.cameras.renderer import model_from_bytes, open_stage
+from sims.cameras.packed import Packed
+from sims.cameras.renderer import open_stage, opened
 from sims.cameras.spec import CameraSpec, camera_info, is_plain, vertical_fov
 from sims.cameras.stage import (
     Changing,
@@ -199,6 +200,7 @@ class Renderer:
     Not thread-safe: stay in the thread that made it.
 
     Args:
+        world: Of the simulator's process, or from `model_to_bytes`.
         camera: Name of a camera of the model, which is moved to where it is needed.
         infos: The largest cameras.
         threads: Threads of the software renderer, if this is the process's first GL context.
@@ -207,7 +209,7 @@ class Renderer:
 
     def __init__(
         self,
-        model_bytes: bytes,
+        world: Packed | bytes,
         camera: str,
         infos: tuple[CameraInfo, ...],
         threads: int = 1,
@@ -215,9 +217,10 @@ class Renderer:
         renderer: RendererName = "raster",
     ) -> None:
         keep_memory()
-        self._model: Any = model_from_bytes(model_bytes)
+        model, drawable = opened(world)
+        self._model: Any = model
         self._camera = int(self._model.camera(camera).id)
-        self._make = partial(open_stage, renderer, self._model, infos, threads, dynamics)
+        self._make = partial(open_stage, renderer, self._model, infos, threads, dynamics, drawable)
 
     def take(
         self, stamp: int, qpos: Floats, ids: npt.NDArray[np.uint8], wanted: Sequence[Wanted]
