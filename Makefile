@@ -15,7 +15,7 @@ OPENCV_TESTS := $(addprefix tests/,events sims/cameras sims/scans sims/worlds no
 	runtime/tools/monitor)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-core test-slow test-pythons test-opencv4 test-all check fix size mutants docs wheel peers bench bench-quick orbslam3 svo suite images clean
+.PHONY: help setup demo test test-core test-slow test-pythons test-opencv4 test-all check fix size mutants docs wheel mavproxy peers bench bench-quick orbslam3 svo suite images clean
 
 # Setuptools warns at length of every editable install that folders here may hide packages.
 INSTALL = PYTHONWARNINGS='ignore:Editable installation' $(BIN)/python -m pip install --quiet
@@ -50,7 +50,16 @@ test-core: $(READY)  ## Run the quick tests of the core, without those of the ex
 	@sh tools/system_packages.sh display
 	$(BIN)/python -m pytest -n 3 --dist loadfile -m 'not slow' tests
 
-test-slow: $(READY)  ## Run the slow tests; what fails is repeated once, alone.
+# What it needs of its own accord only: with its maps and graphs it is a gigabyte more.
+.venv-mavproxy/.ready:
+	$(PYTHON) -m venv .venv-mavproxy
+	.venv-mavproxy/bin/python -m pip install --quiet 'pymavlink>=2.4.41' pyserial numpy
+	.venv-mavproxy/bin/python -m pip install --quiet --no-deps 'MAVProxy>=1.8.70'
+	@touch $@
+
+mavproxy: .venv-mavproxy/.ready  ## Install MAVProxy (GPL) in an environment of its own, for its test.
+
+test-slow: $(READY) .venv-mavproxy/.ready  ## Run the slow tests; what fails is repeated once, alone.
 	@sh tools/system_packages.sh display
 	@sh tools/system_packages.sh arm
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow || { \
@@ -125,4 +134,4 @@ images: demo $(READY)  ## Make the documentation's images (needs ORB-SLAM3, eval
 	$(BIN)/python tools/monitor_images.py
 
 clean:  ## Remove the environment, results and caches.
-	rm -rf $(VENV) runs sweeps .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) .venv-mavproxy runs sweeps .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,42 +13,10 @@ import pytest
 
 import visnav
 from events import PoseEstimate
+from extensions.mavlink.tests.flights import calling, first, flown, free_udp_port
 from runtime import Node, NodeConfig, on
-from tests.runtime.tools.samples_cli import ROOT, start, summary
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
-
-
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
-
-
-def flown(
-    out: Path, port: int, *script: str, example: str = "mavsdk", node: str = "mavlink"
-) -> tuple[str, dict[str, Any]]:
-    """Run a script beside an example; return what it prints, and the run's summary."""
-    endpoints = f'{node}.endpoints=["udp://127.0.0.1:{port}"]'
-    words = [
-        "run",
-        f"extensions/mavlink/examples/{example}.toml",
-        "--quiet",
-        "--out",
-        str(out),
-        "--set",
-        endpoints,
-    ]
-    with start(words, ROOT) as process:
-        done = subprocess.run(
-            [sys.executable, *script], cwd=ROOT, capture_output=True, text=True, timeout=100
-        )
-        if example == "mavsdk":  # the other one ends with its pilot
-            process.terminate()
-        process.wait(60)
-    assert done.returncode == 0, done.stderr
-    return done.stdout, summary(out)
 
 
 def test_the_script_of_the_example_flies(tmp_path: Path) -> None:
@@ -66,7 +32,7 @@ def test_an_estimator_outside_is_judged(tmp_path: Path) -> None:
     """By pymavlink's own connection: its poses are one percent too long, and hardly late."""
     port = free_udp_port()
     script = "extensions/mavlink/examples/external_vision.py", f"udpin:127.0.0.1:{port}", "10"
-    printed, ended = flown(tmp_path, port, *script, example="external_vision", node="vision")
+    printed, ended = flown(tmp_path, port, *script, example="external_vision")
     figures = ended["verdict"]["estimators"]["vision"]
     assert printed == f"{figures['estimates']} poses\n"
     assert figures["passed"]
@@ -76,13 +42,6 @@ def test_an_estimator_outside_is_judged(tmp_path: Path) -> None:
     words = ended["environment"]["vision: poses from outside"]
     count = figures["estimates"]
     assert words == f"{count} poses taken ({count} with a velocity)"
-
-
-async def first(stream: Any, ok: Callable[[Any], Any] = lambda _: True) -> Any:
-    async for sample in stream:
-        if ok(sample):
-            return sample
-    raise AssertionError("expected more telemetry, found its end")
 
 
 async def everything(address: str) -> None:
@@ -137,9 +96,9 @@ async def everything(address: str) -> None:
 
 def test_all_plugins_fly(tmp_path: Path) -> None:
     port = free_udp_port()
-    code = "import asyncio, sys; from extensions.mavlink.tests.test_mavsdk import everything; "
-    code += "asyncio.run(everything(sys.argv[1]))"
-    _, ended = flown(tmp_path, port, "-c", code, f"udpin://127.0.0.1:{port}")
+    _, ended = flown(
+        tmp_path, port, *calling("test_mavsdk", "everything", f"udpin://127.0.0.1:{port}")
+    )
     assert ended["outputs"]["drone.vehicle_events"] == 4
 
 
