@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -37,7 +37,7 @@ from runtime.tools.cli.commands import (
 
 if TYPE_CHECKING:
     from runtime.tools.comparison import Compared, Comparison
-    from runtime.tools.sweep import Children, Plan, Row
+    from runtime.tools.sweep import Children, Job, Plan, Row
 
 
 def sweep(
@@ -162,8 +162,17 @@ def end(rows: Sequence[Row], *, judged: bool = True) -> None:
         raise typer.Exit(1)
 
 
-def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> list[Row]:
+def carry_out(
+    plan: Plan,
+    *,
+    jobs: int | None = None,
+    fresh: bool = False,
+    finished: Callable[[Job, Row], None] | None = None,
+) -> list[Row]:
     """Run the missing jobs of a plan on this machine, and show the progress.
+
+    Args:
+        finished: Called with each job that ends, and its row; not after an interruption.
 
     Raises:
         typer.Exit: With 130, after Ctrl-C or another signal that ends it.
@@ -172,7 +181,7 @@ def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> li
 
     from runtime.tools.sweep.console import Display, run_here
 
-    display = Display(Console(stderr=True))
+    display = Display(Console(stderr=True), finished)
     try:
         with _signals_interrupt(display.children), display:
             return run_here(plan, jobs=jobs, fresh=fresh, display=display)

@@ -160,11 +160,17 @@ def _row(future: concurrent.futures.Future[Row], job: Job) -> Row:
 class Display(Watch):
     """A bar in a terminal, else a line per finished run; a context manager.
 
+    Args:
+        finished: Called with each job that has ended, and its row.
+
     Attributes:
         children: The processes of the runs; whoever interrupts the sweep ends them.
     """
 
-    def __init__(self, console: Console) -> None:
+    def __init__(
+        self, console: Console, finished: Callable[[Job, Row], None] | None = None
+    ) -> None:
+        self._tell = finished
         self.children = Children()
         self.crashed = 0
         self.finished = 0
@@ -210,6 +216,8 @@ class Display(Watch):
 
     def done(self, job: Job, row: Row) -> None:
         """Count a run; print failures, and without a bar every run."""
+        if self._tell is not None:
+            self._tell(job, row)
         self.finished += 1
         self.crashed += bool(row["error"])
         self._last = time.monotonic()

@@ -1,0 +1,303 @@
+"""Command ``reality`` and its page ``REALITY.md``: what agrees with published figures."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from runtime.run.results import write
+from runtime.tools.reality import agreement
+from runtime.tools.reality.agreement import Cell
+from runtime.tools.reality.plot import draw
+from runtime.tools.reality.results import Ledger, Result, result_of
+from runtime.tools.reality.study import (
+    FOLDER,
+    REAL,
+    Planned,
+    Published,
+    Run,
+    Study,
+    keys_of,
+    make_plan,
+    read_published,
+    read_study,
+    truths,
+)
+from runtime.tools.sweep.plan import Job, plan_of
+from runtime.tools.sweep.plots import template
+from runtime.tools.sweep.tables import Row, decode_rows
+
+Names = Annotated[str, typer.Option(metavar="A,B,…", help="Only these; all if not given.")]
+
+
+def reality(
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Folder with EuRoC's ground truth; without, only the page is written."),
+    ] = None,
+    sequences: Names = "",
+    worlds: Names = "",
+    conditions: Names = "",
+    systems: Names = "",
+    outside: Annotated[
+        Path | None, typer.Option(metavar="SCAN", help="A scan to fly in, the world `outside`.")
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Flights of each sequence; 3, of two of them 5.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the runs.")] = Path("sweeps/reality"),
+    results: Annotated[
+        Path, typer.Option(help="The ledger: a line for each run, to be committed.")
+    ] = Path("bench/reality.csv"),
+    page: Annotated[Path, typer.Option(help="The page, Markdown.")] = Path("bench/REALITY.md"),
+    file: Annotated[
+        Path | None, typer.Option(help="Another study.toml than the project's own.")
+    ] = None,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Say what would be flown, and what not; fly nothing.")
+    ] = False,
+    stale: Annotated[
+        bool, typer.Option("--stale", help="Count results of other settings where no other is.")
+    ] = False,
+    retry: Annotated[
+        bool, typer.Option("--retry", help="Fly again what has crashed, which counts as failed.")
+    ] = False,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Runs at the same time, as for `sweep`.")
+    ] = None,
+) -> None:
+    """Compare systems' errors in the simulator with those published for EuRoC.
+
+    EuRoC's rig is carried along EuRoC's motions through worlds of the simulator, and systems with
+    published figures are judged as in their papers. Each result is a line of the ledger; what
+    stands there is not flown again, so the study can be flown in parts, on several machines.
+    Exit codes: 130 after Ctrl-C, else 0, also if systems failed or nothing agreed, as the page
+    says.
+    """
+    from runtime.run.summarise import command_line
+    from runtime.tools.cli.sweep import carry_out
+
+    whole, published = read_study(file) if file else read_study(), read_published()
+    study = whole.only(
+        sequences=_names(sequences),
+        worlds=_names(worlds),
+        conditions=_names(conditions),
+        systems=_names(systems),
+    )
+    out, ledger, keys = out.absolute(), Ledger(results), keys_of(study, seeds)
+    planned = make_plan(
+        study,
+        keys if truth else {},
+        out=out,
+        truth=truths(truth, study.sequences),
+        outside=outside,
+        wanted=lambda run, data: not ledger.has(run, keys[run], data, crashed=not retry),
+    )
+    for line in told(study, planned) if truth else ():
+        typer.echo(line)
+    if plan:
+        return
+    by_id = {job.id: run for run, job in planned.jobs.items()}
+
+    def enter(*ended: tuple[Job, Row]) -> None:
+        ledger.add(
+            result_of(run, job, row, key=keys[run], data=planned.data[run[:2]], study=study)
+            for job, row in ended
+            if not row["error"].startswith(NOT_ITS_OWN)
+            for run in [by_id[job.id]]
+        )
+
+    def enter_all() -> None:
+        rows = rows_in(out)
+        enter(*((job, rows[job.id]) for job in planned.jobs.values() if job.id in rows))
+
+    enter_all()  # what ended while an earlier call was interrupted
+    left = [
+        job
+        for run, job in planned.jobs.items()
+        if not ledger.has(run, keys[run], planned.data[run[:2]], crashed=not retry)
+    ]
+    try:
+        if left:
+            carry_out(plan_of(left, out), jobs=jobs, finished=lambda *ended: enter(ended))
+    finally:
+        enter_all()
+        everything = keys_of(whole)
+        more = keys_of(whole, seeds) if seeds else {}
+        count, old = ledger.valid(more | everything, planned.data, stale=stale)
+        write_page(whole, published, everything, count, old, page, command_line())
+    typer.echo(f"{len(count)} results in {results}   the page is {page}")
+
+
+NOT_ITS_OWN = "interrupted by", "not started"
+"""Begins of the errors of runs that were ended from outside: they are flown again."""
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def rows_in(out: Path) -> dict[str, Row]:
+    """Return the rows of the runs in a folder, by job."""
+    path = out / "rows.jsonl"
+    return decode_rows(path.read_bytes()) if path.is_file() else {}
+
+
+def told(study: Study, planned: Planned) -> Iterator[str]:
+    """Yield what is planned, in lines: how much, for how long, and what is left out."""
+    yield (
+        f"{len(planned.jobs)} runs on {planned.flights(study)} flights to do, some "
+        f"{planned.hours(study):.1f} processor hours; {planned.finished} are in the ledger"
+    )
+    for why, number in planned.absent.items():
+        yield f"left out: {number} runs: {why}"
+
+
+class Group(msgspec.Struct, frozen=True, kw_only=True):
+    """Results of a system in a cell.
+
+    Attributes:
+        error: Median over the seeds (m); infinite if most of them failed.
+    """
+
+    results: tuple[Result, ...]
+    failed: int
+    error: float
+
+    @property
+    def words(self) -> str:
+        """The error, and how many failed."""
+        number = len(self.results)
+        text = "failed" if math.isinf(self.error) else f"{self.error:.3f}"
+        return text + f" ({self.failed} of {number} failed)" * bool(self.failed and number > 1)
+
+
+def groups(
+    study: Study, count: Mapping[Run, Result], condition: str = REAL
+) -> dict[str, dict[Cell, Group]]:
+    """Return the results under a condition by system and cell, in the order of the study."""
+    table: dict[str, dict[Cell, Group]] = {}
+    for system in study.systems:
+        cells: dict[Cell, list[Result]] = {}
+        for run, result in sorted(count.items()):
+            if (run.system, run.condition) == (system.name, condition):
+                cells.setdefault(Cell(run.sequence, run.world), []).append(result)
+        for cell, results in cells.items():
+            table.setdefault(system.name, {})[cell] = Group(
+                results=tuple(results),
+                failed=sum(result.failed(system, study) for result in results),
+                error=statistics.median(_error(result, study) for result in results),
+            )
+    return table
+
+
+def _error(result: Result, study: Study) -> float:
+    system = next(system for system in study.systems if system.name == result.system)
+    return math.inf if result.failed(system, study) else result.error_m(system)
+
+
+def ablations(study: Study, count: Mapping[Run, Result]) -> dict[str, dict[str, str]]:
+    """Return by condition and system the error divided by that under ``real``, in words."""
+    errors: dict[str, dict[str, dict[object, float]]] = {}
+    for run, result in count.items():
+        place = run.sequence, run.world, run.seed
+        own = errors.setdefault(run.condition, {}).setdefault(run.system, {})
+        own[place] = _error(result, study)
+    return {
+        condition.name: {
+            name: f"× {ratio:.2g} ({runs})"
+            for name, (ratio, runs) in agreement.ablation(
+                errors[condition.name], errors.get(REAL, {})
+            ).items()
+        }
+        for condition in study.conditions
+        if condition.name != REAL and condition.name in errors
+    }
+
+
+def differing(study: Study, count: Mapping[Run, Result]) -> list[str]:
+    """Return the flights of which results of different bytes count, as words."""
+    systems = {system.name: system for system in study.systems}
+    digests: dict[tuple[object, ...], set[str]] = {}
+    for run, result in count.items():
+        if result.flight:
+            digests.setdefault((*run[:4], systems[run.system].set), set()).add(result.flight)
+    return [" ".join(map(str, flight[:4])) for flight, own in digests.items() if len(own) > 1]
+
+
+def write_page(
+    study: Study,
+    published: Published,
+    keys: Mapping[Run, str],
+    count: Mapping[Run, Result],
+    old: Sequence[Result],
+    path: Path,
+    command: str,
+) -> None:
+    """Write the page, and the plot into a folder of its name beside it.
+
+    Args:
+        keys: All runs of the study.
+        count: The results that count.
+        old: The stale ones.
+    """
+    systems = {system.name: system for system in study.systems}
+    real = published.errors()
+    errors = {name: real[s.published] for name, s in systems.items() if s.published}
+    table = groups(study, count)
+    simulated = {name: {c: g.error for c, g in row.items()} for name, row in table.items()}
+    counted = {name: row for name, row in simulated.items() if not systems[name].why_not}
+    folder = path.parent / path.stem.lower()
+    folder.mkdir(parents=True, exist_ok=True)
+    labels = {name: systems[name].published for name in counted}
+    worlds = [world.name for world in study.worlds]
+    drawn = draw(counted, errors, labels, worlds, folder / "scatter.svg")
+    by_world = {
+        world.name: agreement.criteria(
+            {
+                n: {c: e for c, e in row.items() if c.world == world.name}
+                for n, row in counted.items()
+            },
+            errors,
+        )
+        for world in study.worlds
+        if any(cell.world == world.name for row in counted.values() for cell in row)
+    }
+    text = template(FOLDER / "REALITY.md.jinja").render(
+        command=command,
+        study=study,
+        finished=sum(run in count for run in keys),
+        whole=len(keys),
+        criteria=agreement.criteria(counted, errors),
+        by_world=by_world,
+        inverted=agreement.inversions(counted, errors)[0],
+        rankings=agreement.rankings(counted, errors),
+        levels=agreement.levels(counted, errors),
+        systems=systems,
+        counted=counted,
+        table=table,
+        published=errors,
+        sources=[t for t in published.tables if {*t.rows} & {s.published for s in study.systems}],
+        ablations=ablations(study, count),
+        drawn=drawn,
+        folder=folder.name,
+        problems=[r for r in count.values() if r.failed(systems[r.system], study)],
+        missing=Counter(
+            f"{run.world}, {run.condition}: {run.system}" for run in keys if run not in count
+        ),
+        old=Counter(f"{r.world}, {r.condition}: {r.system}" for r in old if r.run not in count),
+        replaced=sum(result.run in count for result in old),
+        stale=sum(result in old for result in count.values()),
+        differing=differing(study, count),
+        commits=Counter(result.commit or "unknown" for result in count.values()),
+        Cell=Cell,
+        word=lambda value: "failed" if math.isinf(value) else f"{value:.3f}",
+    )
+    write(path, (text.rstrip() + "\n").encode())
