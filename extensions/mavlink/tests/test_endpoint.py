@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega
 from pymavlink.dialects.v20 import common as mav
 
 import events as ev
@@ -493,6 +494,7 @@ KINDS = [
     mav.MAVLink_mission_ack_message, mav.MAVLink_mission_set_current_message,
     mav.MAVLink_mission_request_message, mav.MAVLink_timesync_message,
     mav.MAVLink_file_transfer_protocol_message, mav.MAVLink_param_ext_set_message,
+    mav.MAVLink_vision_speed_estimate_message, ardupilotmega.MAVLink_vision_position_delta_message,
 ]  # fmt: skip
 NUMBERS = {
     "uint8_t": 0xFF, "uint16_t": 0xFFFF, "uint32_t": 0xFFFFFFFF, "uint64_t": 2**64 - 1,
@@ -597,8 +599,6 @@ async def test_the_table_is_what_is_done_and_what_the_page_shows(outside: Outsid
 
 
 async def test_a_message_of_another_dialect_is_told_once(outside: Outside) -> None:
-    from pymavlink.dialects.v20 import ardupilotmega
-
     message = ardupilotmega.MAVLink_fence_point_message(1, 1, 0, 0, 47.0, 8.0)
     data = message.pack(ardupilotmega.MAVLink(None, 245, 190))
     text = "UNKNOWN_160 of 245/190 has no effect: it is not known here"

@@ -133,7 +133,10 @@ async def test_velocities_that_stay_zero_are_told_from_those_of_a_hover(seeing: 
     assert texts(seeing.say(odometry(seeing.now, velocity=still))) == []
     assert texts(seeing.say(odometry(seeing.now, (0.9, 0.0, 0.0), still))) == []
     (text,) = texts(seeing.say(*[odometry(seeing.now, (1.1, 0.0, 0.0), still)] * 2))
-    assert "zero while it moves: send NaN if it is unknown" in text
+    assert text == (
+        "velocity in ODOMETRY of 245/190 is zero while it moves, and so judged: "
+        "send NaN if it is unknown"
+    )
     other = Outside(vision=True)
     other.say(odometry(other.now, velocity=(0.1, 0.0, 0.0)))
     assert texts(other.say(odometry(other.now, (5.0, 0.0, 0.0), still))) == []

@@ -49,7 +49,7 @@ class MavlinkEndpoint:
         self._send = send = self._links.send
         self.vehicle = vehicle = Vehicle(origin, config.gps, config.autopilot == "ardupilot")
         self._clocks = Clocks(round(config.delay * SECOND), send, self._tell_once)
-        self._vision = Vision(self._clocks, see, self._refuse)
+        self._vision = Vision(self._clocks, see, self._refuse, self._tell_once)
         self._telemetry = Telemetry(vehicle, self._links, self._tell)
         self._parameters = Parameters(send, self._tell)
         self._missions = Missions(

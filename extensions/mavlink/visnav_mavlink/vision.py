@@ -100,6 +100,7 @@ class Vision:
     Args:
         see: Publishes a pose: its stamp and fields.
         refuse: Says why messages of a kind and a sender have no effect.
+        tell: Says a sentence, the first time, to all programs and to the log.
     """
 
     def __init__(
@@ -107,9 +108,10 @@ class Vision:
         clocks: Clocks,
         see: Callable[..., None],
         refuse: Callable[[str, Sender, str], None],
+        tell: Callable[[str], None],
     ) -> None:
         self._clocks = clocks
-        self._see, self._refuse = see, refuse
+        self._see, self._refuse, self._tell = see, refuse, tell
         self._sources: dict[Sender, Source] = {}
         self.refused: Counter[str] = Counter()
         self._taken = self._restamped = self._moving = self._alone = 0
@@ -206,8 +208,8 @@ class Vision:
         elif not source.moves:
             source.still_at = source.still_at or position
             if math.dist(source.still_at, position) > MOVED:
-                words = "it is judged, but zero while it moves: send NaN if it is unknown"
-                self._refuse("velocity in ODOMETRY", sender, words)
+                words = "is zero while it moves, and so judged: send NaN if it is unknown"
+                self._tell("velocity in ODOMETRY of {}/{} {}".format(*sender, words))
                 source.moves = True
         return rotate(orientation, velocity) if frame in _BODY else velocity
 
