@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from runtime.logs import NodeLogger
 from visnav_airsim import wire
-from visnav_airsim.server.connections import LONGEST_QUEUE, OPEN_REQUESTS, Listener, check_host
+from visnav_airsim.server.connections import LONGEST_QUEUE, OPEN_REQUESTS, Listener, check_address
 from visnav_airsim.server.methods import RpcError, Table, rpc
 
 
@@ -393,7 +393,7 @@ def test_refusals_do_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None
 @pytest.mark.parametrize("host", ["192.0.2.1", "2001:db8::1", "a" * 80])
 def test_an_address_of_another_machine_is_named_and_not_the_port(host: str) -> None:
     """Those numbers are for documentation (RFC 5737 and 3849): no machine has them."""
-    for listen in (check_host, lambda host: Listener(host, 41451, 1, NodeLogger("airsim"))):
+    for listen in (check_address, lambda host: Listener(host, 41451, 1, NodeLogger("airsim"))):
         with pytest.raises(ValueError, match=f"host: expected an address of this .* {host}") as no:
             listen(host)
         assert "LocalHostIp" in str(no.value)
@@ -408,7 +408,7 @@ def test_a_port_in_use_is_named_and_not_the_address() -> None:
         ) as no:
             Listener("127.0.0.1", port, 1, NodeLogger("airsim"))
         assert "ApiServerPort" in str(no.value)
-        check_host("127.0.0.1")
+        check_address("127.0.0.1")
 
 
 @settings(max_examples=60, deadline=None)

@@ -254,9 +254,9 @@ class Connection:
         self._unsent[0] = self._unsent[0][sent:]
 
 
-def check_host(host: str) -> None:
-    """Raise a `ValueError` if no port of an address can be listened on, as of another machine."""
-    _listening(host, 0).close()
+def check_address(host: str, port: int = 0) -> None:
+    """Raise a `ValueError` if an address is another machine's, or its port (0: any) not free."""
+    _listening(host, port).close()
 
 
 def _listening(host: str, port: int) -> socket.socket:

@@ -27,7 +27,7 @@ from sims.scans.settings import MeshSpec
 from sims.world import Count, Inhabitant, Simulator, join_world
 from sims.worlds import Dynamics, Scene
 from visnav_airsim.server.cameras import Cameras, Images, ServedCamera
-from visnav_airsim.server.connections import Listener, check_host
+from visnav_airsim.server.connections import Listener, check_address
 from visnav_airsim.server.flight import Control, Flight
 from visnav_airsim.server.measurements import (
     SAMPLES,
@@ -123,6 +123,8 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
     async def on_startup(self) -> None:
         """Join the world, and listen."""
         config, log, now = self.config, self.log, self.clock.now
+        if not self.checking:
+            check_address(config.host, config.port)  # before the world takes its time
         self.deterministic = config.time != "running"  # type: ignore[misc]
         world = await join_world(self)
         vehicles = Vehicles(world, config.default_vehicle, config.settings, self)
@@ -201,7 +203,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
             yield f'default_vehicle: expected one of {", ".join(self.vehicles)}, found "{default}"'
         if self.checking:  # else it listens there already
             try:
-                check_host(self.config.host)
+                check_address(self.config.host)
             except ValueError as error:
                 yield str(error)
 
