@@ -300,6 +300,18 @@ BENCHMARKS = (
         texts=0,
     ),
     Benchmark(
+        "memory",
+        "memory:measure",
+        "A flight in a scan of a million triangles with four images of 4096² texels: memory of all "
+        "processes together (Pss: shared pages count once), two of which draw",
+        "start: start | triangles: triangles ,d | MB in flight: flight MB | "
+        "of the run's process: main MB | most MB: peak MB | "
+        "seconds to the first image: seconds .1f",
+        _IMAGES,
+        "Measure the memory of all processes of a run in a large scan.",
+        (Option("seconds", 3.0, "Simulated, of each flight.", 1.0, quick=1.0),),
+    ),
+    Benchmark(
         "bridge",
         "bridge:measure",
         "A run in two processes on one machine, beside bare Zenoh sessions in the same two",

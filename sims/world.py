@@ -28,7 +28,7 @@ from sims.cameras import CameraSpec, model_to_bytes
 from sims.cameras.packed import Packed, pack, without_looks
 from sims.cameras.raster import library_for
 from sims.cameras.rig import CameraOutputs, CameraRig
-from sims.cameras.stage import RendererName
+from sims.cameras.stage import RendererName, return_memory
 from sims.scans.settings import MeshSpec
 from sims.vehicle import Simulation, State
 from sims.vehicle.physics import Air
@@ -117,6 +117,7 @@ class SharedWorld:
             if not self._built or (self.simulation and self.simulation.diverged):
                 node.doing = f"building the world {self.name}"
                 await node.offload(self._build)
+                await node.offload(return_memory)
                 self._built, node.doing = True, ""
 
     @functools.cached_property
@@ -138,8 +139,10 @@ class SharedWorld:
                 if renderer == "raster":
                     library = library_for(self.model)
                     packed = pack(self._places or self.model, library, self.model, self._images)
+                    self._images = {}  # which the file has now
                 else:
                     packed = pack(self.model)
+                return_memory()
                 self._packed[renderer] = packed
             return self._packed[renderer]
 

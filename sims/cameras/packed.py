@@ -151,7 +151,8 @@ def _opened(path: str, body: bytes, spans: list[tuple[int, int]]) -> Packed:
     finally:
         os.close(fd)
     buffers = [memory[offset : offset + size] for offset, size in spans]
-    return Packed(*pickle.loads(body, buffers=buffers), None)  # noqa: S301  # of the run's process
+    model, drawable = pickle.loads(body, buffers=buffers)  # noqa: S301  # of the run's process
+    return Packed(model, drawable, None)
 
 
 def pack(model: Any, library: Any = None, drawn: Any = None, images: Any = NONE) -> Packed:

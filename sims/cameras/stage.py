@@ -40,6 +40,15 @@ def keep_memory() -> None:
         mallopt(-3, 1 << 25)  # M_MMAP_THRESHOLD: the most that it takes
 
 
+def return_memory() -> None:
+    """Have glibc's allocator, if here, return what is free of it to the system.
+
+    What a thread has freed stays with the thread's arena: half a gigabyte after a large scan.
+    """
+    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(ctypes.c_size_t(0))
+
+
 Floats = npt.NDArray[np.float64]
 
 NEAR = 0.02

@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import msgspec
+import mujoco
 import numpy as np
 import numpy.typing as npt
 
@@ -22,12 +23,13 @@ from events.frames import from_rpy
 from runtime.errors import CommandError
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.cameras.renderer import Shot
+from sims.cameras.surfaces import geom_numbers
 from sims.scans.mesh_file import Floats
 from sims.scans.preparing import joined
 from sims.scans.settings import MeshSpec
 from sims.scans.solids import voxelise
 from sims.scans.world import build, prepared_mesh
-from sims.sensors.rays import Rays
+from sims.sensors.rays import Hits, Rays
 from sims.survey.free_space import find_free_space
 from sims.worlds.dynamics import Dynamics
 
@@ -96,6 +98,7 @@ class Survey:
         self.space = find_free_space(self._voxels, self.prepared.floor)
         self._rays = Rays(model, Dynamics(), "survey")
         self._images: list[Image] = []
+        self._behind = 0.0  # share of single-sided triangles met by rays that is met from behind
 
     def lines(self) -> Iterator[str]:
         """Yield what there is to say, a line each."""
@@ -127,6 +130,11 @@ class Survey:
         size = f"{CAMERA.width} x {CAMERA.height}"
         yield f"image of {size}, colour and depth: {self._image_ms():.1f} ms"
         yield f"lidar turn of {CHANNELS} x {COLUMNS}: {self._turn_ms():.1f} ms"
+        if self._behind > 0.5:
+            yield (
+                f"note: {self._behind:.0%} of what is met from within is met from behind, where it "
+                "is not drawn: its faces point outwards; double_sided = true draws them"
+            )
         yield from self._free()
 
     def sheet(self) -> Image:
@@ -272,12 +280,28 @@ class Survey:
             [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1
         )
         self._rays.look(self._rays.model.qpos0, 0.0)
-        times = []
+        times, behind = [], []
         for (north, east, down), _ in self._views():
             start = time.process_time()
-            self._rays.cast(np.array([north, -east, -down]), directions, 100.0)
+            hits = self._rays.cast(np.array([north, -east, -down]), directions, 100.0)
             times.append(time.process_time() - start)
+            behind.append(self._met_from_behind(hits, directions))
+        middle = self.prepared.extent.mean(axis=0)
+        if self.prepared.floor is not None and self.prepared.floor > middle[2]:
+            # The ground is what faces up: of a room that faces outwards its roof.
+            hits = self._rays.cast(middle, directions, 100.0)
+            behind = [self._met_from_behind(hits, directions)]
+        met = np.concatenate(behind)
+        self._behind = float(met.mean()) if met.size else 0.0
         return 1e3 * median(times)
+
+    def _met_from_behind(self, hits: Hits, directions: Floats) -> npt.NDArray[np.bool_]:
+        """Return of each hit of a single-sided triangle whether it is on its back."""
+        model = self._rays.model
+        single = geom_numbers(model, "double_sided") == 0.0
+        single &= model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+        away = np.einsum("ri,ri->r", hits.normals, directions) > 0.0
+        return np.asarray(away[single[hits.geoms] & np.isfinite(hits.distances)])
 
 
 def _rows(places: list[Vector3]) -> str:

@@ -70,3 +70,24 @@ def test_a_floor_at_another_height_is_where_the_flight_starts(room: Path) -> Non
     settings = load(Path("fly.toml"))
     assert settings.nodes[0].config.height == 2.0  # type: ignore[attr-defined]
     assert of_nodes(settings).errors == []
+
+
+def test_a_room_whose_faces_point_outwards_is_named_with_the_setting(room: Path) -> None:
+    """Once: not of the room as it is, nor if its triangles are seen from both sides."""
+
+    def notes(*more: str) -> list[str]:
+        arguments = ["world", room.name, "--set", "up=y", *more]
+        result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+        return [line for line in result.output.splitlines() if "faces point outwards" in line]
+
+    assert notes() == []
+    lines = room.read_text(encoding="utf-8").splitlines()
+    turned = [
+        " ".join(["f", *reversed(line.split()[1:])]) if line.startswith("f ") else line
+        for line in lines
+    ]
+    room.write_text("\n".join(turned) + "\n", encoding="utf-8")
+    for floor in ("auto", "0.0"):  # by itself it takes the roof for the ground
+        (note,) = notes("--set", f"floor={floor}")
+        assert note.endswith("double_sided = true draws them")
+        assert notes("--set", f"floor={floor}", "--set", "double_sided=true") == []
