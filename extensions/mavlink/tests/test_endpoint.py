@@ -284,7 +284,12 @@ async def test_parameters_are_listed_read_and_set(outside: Outside) -> None:
     assert [message.param_value for message in of("PARAM_VALUE", kept)] == [4.0]
     unknown = mav.MAVLink_param_request_read_message(1, 1, b"CAL_GYRO0_ID", -1)
     text = "PARAM_REQUEST_READ of 245/190 has no effect: parameter CAL_GYRO0_ID is unknown here"
-    assert texts(outside.say(unknown, unknown)) == [text]
+    answers = outside.say(unknown, unknown)
+    assert texts(answers) == [text]
+    errors = [(error.param_id, error.error) for error in of("PARAM_ERROR", answers)]
+    assert errors == [("CAL_GYRO0_ID", mav.MAV_PARAM_ERROR_DOES_NOT_EXIST)] * 2
+    (beyond,) = of("PARAM_ERROR", outside.say(mav.MAVLink_param_request_read_message(1, 1, b"", 9)))
+    assert (beyond.param_index, beyond.target_component) == (9, 190)
     whole = mav.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", 3.0, mav.MAV_PARAM_TYPE_INT32)
     assert of("PARAM_VALUE", outside.say(whole))[0].param_value == 4.0
 
@@ -551,6 +556,7 @@ ANSWERED = {
     "PARAM_REQUEST_READ": {"PARAM_VALUE"}, "LOG_REQUEST_LIST": {"LOG_ENTRY"},
     "LOG_REQUEST_DATA": {"LOG_DATA"}, "FILE_TRANSFER_PROTOCOL": {"FILE_TRANSFER_PROTOCOL"},
     "PARAM_EXT_SET": {"PARAM_EXT_ACK"}, "MISSION_REQUEST_PARTIAL_LIST": {"MISSION_ACK"},
+    "PARAM_SET": {"PARAM_ERROR"},
     "MISSION_WRITE_PARTIAL_LIST": {"MISSION_ACK"}, "SET_GPS_GLOBAL_ORIGIN": {"GPS_GLOBAL_ORIGIN"},
 }  # fmt: skip
 """Answers to one message of each kind, besides words; nothing to all others."""

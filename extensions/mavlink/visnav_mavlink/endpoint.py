@@ -172,7 +172,7 @@ class MavlinkEndpoint:
             self._refuse(message.get_type(), sender, words)
 
     def _parameter(self, _: Peer, sender: Sender, message: Any, now: int) -> None:  # noqa: ARG002
-        if (words := self._parameters.hear(message)) is not None:
+        if (words := self._parameters.hear(message, sender)) is not None:
             self._refuse(message.get_type(), sender, words)
 
     def _set_mode(self, _: Peer, sender: Sender, message: Any, now: int) -> None:

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 from events import FluidPressure, Imu, MagneticField, Odometry, PoseEstimate, Quaternion, Vector3
 from events.frames import Geodetic, from_geodetic, rotate, rotate_inverse, to_geodetic, yaw_of
-from visnav_mavlink.links import Links, Peer, ardupilot_dialect, highres_imu, mav
+from visnav_mavlink.links import Links, Peer, Sender, ardupilot_dialect, highres_imu, mav
 from visnav_mavlink.settings import RATE
 
 SECOND = 1_000_000_000
@@ -551,7 +551,7 @@ class Parameters(dict[str, float]):
         self._send, self._tell = send, tell
         self._inert: dict[str, tuple[float, int]] = {}  # value as sent, and its type
 
-    def hear(self, message: Any) -> str | None:
+    def hear(self, message: Any, sender: Sender) -> str | None:
         """Answer a request of the parameter protocol; return what is wrong with it, if so."""
         kind, names = message.get_type(), [*self, *self._inert]
         if kind == "PARAM_REQUEST_LIST":
@@ -560,6 +560,7 @@ class Parameters(dict[str, float]):
             return None
         if kind == "PARAM_REQUEST_READ" and message.param_index >= 0:
             if message.param_index >= len(names):
+                self._deny(sender, "", message.param_index)
                 return f"parameter {message.param_index} is unknown here"
             self._give(names[message.param_index])
             return None
@@ -578,9 +579,16 @@ class Parameters(dict[str, float]):
             else:
                 self._tell(f"{name}: expected {least:g} to {most:g}")
         if name not in self and name not in self._inert:
+            self._deny(sender, name, -1)
             return f"parameter {name} is unknown here"
         self._give(name)
         return words
+
+    def _deny(self, sender: Sender, name: str, index: int) -> None:
+        """Say that there is no such parameter, so that nobody asks again and again."""
+        if hasattr(mav, "MAVLink_param_error_message"):  # older dialects have no such message
+            unknown = mav.MAV_PARAM_ERROR_DOES_NOT_EXIST
+            self._send(mav.MAVLink_param_error_message(*sender, name.encode(), index, unknown))
 
     def _give(self, name: str) -> None:
         real, names = mav.MAV_PARAM_TYPE_REAL32, [*self, *self._inert]
