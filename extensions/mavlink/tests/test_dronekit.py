@@ -63,4 +63,5 @@ def test_dronekit_flies_to_places_and_a_mission(tmp_path: Path) -> None:
     script = calling("test_dronekit", "guided", f"udpin:127.0.0.1:{port}", plain=True)
     settings = ('mavlink.autopilot="ardupilot"',)
     _, ended = flown(tmp_path, port, *script, settings=settings)
-    assert ended["outputs"]["drone.vehicle_events"] == 4
+    # Armed, landed and disarmed; taken off only if the take-off was over before it was left.
+    assert ended["outputs"]["drone.vehicle_events"] in {3, 4}
