@@ -232,6 +232,33 @@ def differing(study: Study, count: Mapping[Run, Result]) -> list[str]:
     return [" ".join(map(str, flight[:4])) for flight, own in digests.items() if len(own) > 1]
 
 
+def _of(errors: Mapping[str, Mapping[Cell, float]], world: str) -> dict[str, dict[Cell, float]]:
+    return {
+        name: {cell: error for cell, error in row.items() if cell.world == world}
+        for name, row in errors.items()
+    }
+
+
+def progress(
+    study: Study, keys: Mapping[Run, str], count: Mapping[Run, Result]
+) -> dict[str, list[str]]:
+    """Return by system how many of its runs have been flown, ``3 of 22``, in each of `places`."""
+    planned = Counter((run.system, run.world, run.condition) for run in keys)
+    flown = Counter((run.system, run.world, run.condition) for run in count if run in keys)
+    return {
+        system.name: [
+            f"{flown[system.name, *place]} of {planned[system.name, *place]}"
+            for place in places(keys)
+        ]
+        for system in study.systems
+    }
+
+
+def places(keys: Mapping[Run, str]) -> list[tuple[str, str]]:
+    """Return the worlds and conditions of a study's runs."""
+    return [*dict.fromkeys((run.world, run.condition) for run in keys)]
+
+
 def write_page(
     study: Study,
     published: Published,
@@ -259,24 +286,17 @@ def write_page(
     labels = {name: systems[name].published for name in counted}
     worlds = [world.name for world in study.worlds]
     drawn = draw(counted, errors, labels, worlds, folder / "scatter.svg")
-    by_world = {
-        world.name: agreement.criteria(
-            {
-                n: {c: e for c, e in row.items() if c.world == world.name}
-                for n, row in counted.items()
-            },
-            errors,
-        )
-        for world in study.worlds
-        if any(cell.world == world.name for row in counted.values() for cell in row)
-    }
+    flown = [w for w in worlds if any(c.world == w for row in table.values() for c in row)]
+    of_all = agreement.criteria(counted, errors)
+    of_world = [agreement.criteria(_of(counted, world), errors) for world in flown]
     text = template(FOLDER / "REALITY.md.jinja").render(
         command=command,
         study=study,
         finished=sum(run in count for run in keys),
         whole=len(keys),
-        criteria=agreement.criteria(counted, errors),
-        by_world=by_world,
+        criteria=of_all,
+        flown=flown,
+        by_world=[(c[0].name, c[1:]) for c in zip(of_all, *of_world, strict=True)],
         inverted=agreement.inversions(counted, errors)[0],
         rankings=agreement.rankings(counted, errors),
         levels=agreement.levels(counted, errors),
@@ -289,10 +309,9 @@ def write_page(
         drawn=drawn,
         folder=folder.name,
         problems=[r for r in count.values() if r.failed(systems[r.system], study)],
-        missing=Counter(
-            f"{run.world}, {run.condition}: {run.system}" for run in keys if run not in count
-        ),
-        old=Counter(f"{r.world}, {r.condition}: {r.system}" for r in old if r.run not in count),
+        places=places(keys),
+        progress=progress(study, keys, count),
+        old=[result for result in old if result.run not in count],
         replaced=sum(result.run in count for result in old),
         stale=sum(result in old for result in count.values()),
         differing=differing(study, count),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import hashlib
 import itertools
 import json
@@ -321,7 +322,7 @@ def _hash(path: Path, option: str) -> str:
 def table_of(study: Study, run: Run) -> dict[str, Any]:
     """Return the settings of a run, as they would stand in a file, without its files."""
     try:
-        table = tomllib.loads(Path(study.rig).read_text(encoding="utf-8"))
+        table = copy.deepcopy(_loads(Path(study.rig).read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{study.rig}: expected a TOML file of a rig, found: {error}") from None
     system = next(system for system in study.systems if system.name == run.system)
@@ -340,6 +341,11 @@ def table_of(study: Study, run: Run) -> dict[str, Any]:
         {"name": "evaluation", "type": "Evaluation", **evaluation},
     ]
     return table
+
+
+@functools.cache
+def _loads(text: str) -> dict[str, Any]:
+    return tomllib.loads(text)
 
 
 def key_of(table: Mapping[str, Any], folder: Path) -> str:

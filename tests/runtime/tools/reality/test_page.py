@@ -1,0 +1,180 @@
+"""The page of a ledger that was made up, and the command with two estimators of the project."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from runtime.tools.reality.page import write_page
+from runtime.tools.reality.results import Ledger, Result
+from runtime.tools.reality.study import Run, Study, keys_of, read_published, read_study
+from tests.runtime.tools.reality.test_study import motion
+from tests.runtime.tools.samples_cli import command
+
+PUBLISHED = read_published().errors()
+
+
+@pytest.fixture(scope="module")
+def study() -> Study:
+    """A part of the project's own, with all systems."""
+    sequences, conditions = ["V1_01", "V1_02", "V1_03"], ["real", "exact"]
+    return read_study().only(sequences=sequences, worlds=["poor", "rich"], conditions=conditions)
+
+
+@pytest.fixture(autouse=True)
+def _without_a_plot(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes a second of processor time."""
+    if "slow" not in request.keywords:
+        monkeypatch.setattr("runtime.tools.reality.page.draw", lambda *_: False)
+
+
+def made_up(study: Study, **more: Any) -> dict[Run, Result]:
+    """Return a result for each run, whose error is the published one."""
+    rows = {system.name: PUBLISHED.get(system.published, {}) for system in study.systems}
+    return {
+        run: Result(
+            **run._asdict(),
+            verdict="passed",
+            ate_m=rows[run.system].get(run.sequence, 0.02),
+            final_ate_m=rows[run.system].get(run.sequence, 0.02),
+            coverage_percent=99.0,
+            final_percent=99.0,
+            key=key,
+            data="d",
+            **more,
+        )
+        for run, key in keys_of(study).items()
+    }
+
+
+def page(study: Study, count: dict[Run, Result], path: Path, old: Any = ()) -> str:
+    keys = keys_of(study)
+    file = path / "REALITY.md"
+    write_page(study, read_published(), keys, count, [*old], file, "the command")
+    text = file.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    for number, line in enumerate(lines):  # each table is one
+        if line.startswith("|---"):
+            assert lines[number - 1].count("|") == line.count("|") == lines[number + 1].count("|")
+    assert "\n\n\n" not in text
+    return text
+
+
+def test_a_page_without_results_says_so(study: Study, tmp_path: Path) -> None:
+    text = page(study, {}, tmp_path)
+    assert "**Nothing of the study has been flown yet**" in text.split("\n\n")[2]
+    assert "not enough systems" in text
+    assert "| passed |" not in text
+    assert not (tmp_path / "reality" / "scatter.svg").exists()
+
+
+def test_a_page_of_all_results_has_each_criterion(study: Study, tmp_path: Path) -> None:
+    count = made_up(study, flight="f", commit="c0ffee")
+    text = page(study, count, tmp_path)
+    assert text.split("\n\n")[2] == f"All {len(count)} runs of the study have been flown."
+    assert re.search(
+        r"\| ranking of systems \| Spearman 1\.00, median of \d+ rankings .* passed \|", text
+    )
+    assert re.search(r"\| level \| 1 in the median of \d+ \|.*\| passed \|", text)
+    assert "| 0.035 / 0.035 |" in text
+    assert "no: it was developed with this simulator" in text
+    assert "| dso | × 1 (10) |" in text
+    assert f"`c0ffee` ({len(count)})" in text
+    assert "different bytes" not in text
+
+
+@pytest.mark.slow
+def test_the_plot_is_of_text_and_the_same_each_time(study: Study, tmp_path: Path) -> None:
+    plots = []
+    for name in ("a", "b"):
+        text = page(study, made_up(study), tmp_path / name)
+        assert "](reality/scatter.svg)" in text
+        plots.append((tmp_path / name / "reality" / "scatter.svg").read_bytes())
+    assert plots[0] == plots[1]
+    assert b"<text" in plots[0]
+    assert plots[0].count(b"V1_03") == 2 * 7
+
+
+def test_a_page_of_a_part_says_how_large_it_is(study: Study, tmp_path: Path) -> None:
+    """In its first paragraph; and its verdicts are not the study's."""
+    whole = made_up(study)
+    part = {run: r for run, r in whole.items() if run.seed == 1 and run.world == "rich"}
+    text = page(study, part, tmp_path)
+    expected = f"**This is a part of the study: {len(part)} of {len(whole)} runs have been flown.**"
+    assert text.split("\n\n")[2].startswith(expected)
+    assert "what has been flown, not on the study" in text
+    assert "0 of 11" in text
+
+
+def test_what_went_wrong_is_on_the_page(study: Study, tmp_path: Path) -> None:
+    """Crashes, silence, stale results, and flights of different bytes."""
+    count = made_up(study, flight="f")
+    runs = [run for run in count if (run.system, run.condition) == ("basalt", "real")][:3]
+    count[runs[0]] = changed(count[runs[0]], verdict="crashed", error="its program died")
+    count[runs[1]] = changed(count[runs[1]], coverage_percent=12.0)
+    count[runs[2]] = changed(count[runs[2]], flight="g")
+    gone = count.pop(runs[2])
+    text = page(study, count | {runs[2]: gone}, tmp_path, old=[gone])
+    assert "seed 1, basalt: crashed: its program died" in text
+    assert "seed 1, basalt: poses for 12 % of the images" in text
+    assert (
+        f"different bytes count**, as by different versions or machines: {runs[2].sequence} "
+        in text
+    )
+    assert "**1 results that count here are stale**" in text
+    text = page(study, count, tmp_path, old=[gone])
+    assert f"- not counted: {gone.sequence}, {gone.world}, real, seed 1, basalt" in text
+
+
+def changed(result: Result, **more: Any) -> Result:
+    return msgspec.structs.replace(result, **more)
+
+
+def test_inverted_pairs_are_named(study: Study, tmp_path: Path) -> None:
+    count = made_up(study)
+    for run, result in count.items():
+        if run.system == "orb_slam3_stereo_inertial":
+            count[run] = changed(result, final_ate_m=3.0)
+    text = page(study, count, tmp_path)
+    assert re.search(
+        r"Inverted:.*openvins errs [\d.]+ × as much as orb_slam3_stereo_inertial", text
+    )
+    assert re.search(r"pairs in the right order \|.* \*\*failed\*\* \|", text)
+
+
+def test_the_page_alone_needs_no_truth(tmp_path: Path) -> None:
+    done = command("reality", "--results", "r.csv", "--page", "R.md", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Nothing of the study" in (tmp_path / "R.md").read_text(encoding="utf-8")
+    assert not (tmp_path / "sweeps").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_command_flies_once_and_remembers_it(tmp_path: Path) -> None:
+    """Three seconds of a made-up motion, two estimators, one flight; nothing is flown again."""
+    motion(tmp_path / "truth" / "V1_02_made_up.csv", radius=0.5)
+    words = ["reality", "--truth", "truth", "--worlds", "rich", "--conditions", "real"]
+    words += ["--seeds", "1", "--systems", "stereo,stereo_inertial", "--results", "r.csv"]
+    words += ["--page", "R.md", "--out", "out"]
+    planned = command(*words, "--plan", folder=tmp_path, limit=300)
+    assert "2 runs on 1 flights to do" in planned.stdout
+    assert not (tmp_path / "r.csv").exists()
+    done = command(*words, folder=tmp_path, limit=800)
+    assert done.returncode == 0, done.stderr
+    results = Ledger(tmp_path / "r.csv").results.values()
+    assert {result.system for result in results} == {"stereo", "stereo_inertial"}
+    assert all(r.verdict == "passed" and r.ate_m and r.ate_m < 0.05 for r in results)
+    assert len({result.flight for result in results}) == 1
+    text = (tmp_path / "R.md").read_text(encoding="utf-8")
+    assert "**This is a part of the study: 2 of " in text
+    ledger = (tmp_path / "r.csv").read_bytes()
+    again = command(*words, "--out", "elsewhere", folder=tmp_path, limit=300)
+    assert (
+        "0 runs on 0 flights to do, some 0.0 processor hours; 2 are in the ledger" in again.stdout
+    )
+    assert (tmp_path / "r.csv").read_bytes() == ledger
