@@ -89,7 +89,7 @@ def measure(*, seconds: float = 3.0, progress: Progress = silent) -> list[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         progress("making a scan of a million triangles")
-        triangles = write_scan(folder / "scan.glb", CELLS[1_000_000])
+        triangles = write_scan(folder / "scan.glb", CELLS[1_000_000], SIDE)
         file = _FILE.format(seconds=seconds, renderer="raster")
         (folder / "run.toml").write_text(file, encoding="utf-8")
         rows: list[Row] = []
@@ -162,7 +162,7 @@ def memory_of(pid: int) -> int:
     return 0
 
 
-def write_scan(path: Path, cells: int, side: int = SIDE) -> int:
+def write_scan(path: Path, cells: int, side: int) -> int:
     """Write a bumpy room with bodies in it as GLB, and return how many triangles it has."""
     random = np.random.default_rng(0)
     patches = room(cells)

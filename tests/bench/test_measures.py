@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import frame, lockstep, outside, rays, stall, throughput
+from bench import frame, lockstep, memory, outside, rays, stall, throughput
 
 
 @pytest.mark.slow
@@ -126,3 +126,16 @@ def test_rays_of_all_sides_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert row["ours_us"] < row["mujoco_us"]
     if "embree_us" in row:
         assert row["ratio"] == pytest.approx(row["ours_us"] / row["embree_us"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_memory_of_all_processes_is_measured_cold_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "CELLS", {1_000_000: 14})
+    monkeypatch.setattr(memory, "SIDE", 64)
+    rows = memory.measure(seconds=1.0)
+    assert [row["start"] for row in rows] == ["cold", "kept"]
+    for row in rows:
+        assert row["triangles"] == 250 * 2 * 14 * 14
+        assert 30e6 < row["main"] < row["flight"] <= row["peak"] < 2e9
+        assert row["seconds"] > 0.0
