@@ -137,7 +137,8 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
             kind = "other"
     if kind == "same" and degrees > max(_TURNED, 3.0 * spread):
         kind = "turned"
-    w, x, y, z = mean.as_quat(scalar_first=True).tolist()
+    # The mean's quaternion has either sign; with a scalar above 0 its vector is the turn's axis.
+    w, x, y, z = mean.as_quat(canonical=True, scalar_first=True).tolist()
     return Orientations(kind=kind, turn=(w, x, y, z), degrees=degrees, spread=spread)
 
 

@@ -39,15 +39,71 @@ def test_a_constant_turn_between_bodies_is_found(seed: int, degrees: float, scal
     assert (rotation * turn).magnitude() < 1e-9  # from its body to the truth's
 
 
-def test_a_turn_is_named_by_its_axis() -> None:
-    estimate = oriented(TRUTH.rotations() * Rotation.from_euler("x", 180, degrees=True))
-    orientations = examine(TRUTH, estimate)
+@pytest.mark.parametrize(
+    ("vector", "text"),
+    [
+        ([180, 0, 0], "180.0° about x"), ([0, -90, 0], "90.0° about -y"),
+        ([0, 0, 90], "90.0° about z"), ([120 / 3**0.5] * 3, "120.0° about (0.58, 0.58, 0.58)"),
+        ([-10, 0.13, 0], "10.0° about -x"), ([-10, 0.3, 0.5], "10.0° about (-1.00, 0.03, 0.05)"),
+    ],
+)  # fmt: skip
+def test_a_turn_is_named_by_its_axis(vector: list[float], text: str) -> None:
+    """Within a degree of one; of a half turn the sign tells nothing."""
+    turn = Rotation.from_rotvec(np.radians(vector))
+    orientations = examine(TRUTH, oriented(TRUTH.rotations() * turn))
     assert orientations is not None
-    assert "turned by 180.0° about x against the truth's" in orientations.text()
-    optical = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
-    orientations = examine(TRUTH, oriented(TRUTH.rotations() * optical))
+    assert f"its body is turned by {text} against the truth's" in orientations.text()
+
+
+def swings(degrees: float, period: int = 2) -> Rotation:
+    """Return rotations about z, to and fro by so many degrees in so many poses."""
+    signs = np.where(np.arange(len(TRUTH)) % period < period // 2, 1.0, -1.0)
+    return about("z", degrees * signs[:, None])
+
+
+def about(axis: str, degrees: float | np.ndarray) -> Rotation:
+    """Return the rotation about an axis, or rotations by degrees of shape (n, 1)."""
+    return Rotation.from_euler(axis, degrees, degrees=True)
+
+
+@pytest.mark.parametrize(
+    ("true", "given", "kind"),
+    [
+        # A constant turn is told from 5° on, and from three times of what is beside it.
+        (1, swings(1) * about("x", 4.5), "same"),
+        (1, swings(1) * about("x", 5.5), "turned"),
+        (1, swings(1) * swings(3, 4) * about("z", 10), "turned"),
+        (1, swings(1) * swings(3.6, 4) * about("z", 10), "same"),
+        # What swings by 30° beside the body is none of it, unless the body swings by twice that.
+        (1, swings(1) * swings(29.5, 4), "same"),
+        (1, swings(1) * swings(30.5, 4), "other"),
+        (64, swings(64) * swings(31, 4), "same"),
+        (64, swings(64) * swings(33, 4), "other"),
+        # What swings by 10° beside a truth that never does shows that the truth has none.
+        (0, swings(9.5), "same"),
+        (0, swings(10.5), "truth without"),
+        (1, swings(0), "estimate without"),
+        # Inverted is what fits four times better if inverted back; below 2° nothing is told.
+        (1.2, swings(-1.2), "inverse"),
+        (0.9, swings(-0.9), "same"),
+        (10, swings(-10) * swings(4, 4), "inverse"),
+        (10, swings(-10) * swings(8, 4), "same"),
+    ],
+)
+def test_limits_of_what_orientations_tell(true: float, given: Rotation, kind: str) -> None:
+    orientations = examine(oriented(swings(true)), oriented(given))
     assert orientations is not None
-    assert "turned by 120.0° about (0.58, 0.58, 0.58)" in orientations.text().replace("-", "")
+    assert orientations.kind == kind
+
+
+@pytest.mark.parametrize(("share", "tells"), [(0.08, True), (0.12, False)])
+def test_positions_off_by_a_tenth_of_their_extent_tell_nothing(share: float, tells: bool) -> None:
+    """Of the second of their three extents."""
+    centred = TRUTH.positions - TRUTH.positions.mean(axis=0)
+    extent = np.linalg.svd(centred, compute_uv=False)[1] / np.sqrt(len(centred))
+    off = np.where(np.arange(len(TRUTH)) % 2, share, -share)[:, None] * extent * [0.0, 0.0, 1.0]
+    estimate = Trajectory(TRUTH.stamps, TRUTH.positions + off, TRUTH.orientations)
+    assert (examine(TRUTH, estimate) is not None) == tells
 
 
 def test_an_estimate_with_noise_and_drift_is_of_the_same_body() -> None:
