@@ -191,10 +191,10 @@ def path_pairs(
         return first, second
     n = len(distances)
     first = np.arange(n - 1)
-    above = np.clip(np.searchsorted(distances, distances[:-1] + delta), first + 1, n - 1)
-    # The nearest from below, and of those that stand on one spot the one that came first.
+    above = np.minimum(np.searchsorted(distances, distances[:-1] + delta), n - 1)
+    # The nearest from below, and of those that stand on one spot the one that came first: where
+    # that is the pair's first pose or an earlier one, it misses by the whole length.
     below = np.searchsorted(distances, distances[above - 1])
-    below = np.where(below > first, below, np.minimum(first + 1, above))
     miss_above = np.abs(distances[above] - distances[first] - delta)
     miss_below = np.abs(distances[below] - distances[first] - delta)
     second = np.where(miss_below <= miss_above, below, above)

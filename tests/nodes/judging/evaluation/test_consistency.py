@@ -56,20 +56,32 @@ def test_a_true_covariance_is_consistent(seed: int) -> None:
     assert figures["nees_pose_inside_percent"] == pytest.approx(95.0, abs=2.5)
 
 
-@pytest.mark.slow
-def test_one_pose_is_the_quadratic_form_and_the_bounds_are_those_of_chi_squared() -> None:
-    from scipy.stats import chi2
-
-    truth = walk(2)
-    p = repeated(np.diag([0.01, 0.04, 0.09, 1.0, 1.0, 1.0]), 2)
-    for share in (0.024, 0.026, 0.974, 0.976):
-        size = np.sqrt(chi2.ppf(share, 3)) * 0.2
-        moved = Trajectory(
-            truth.stamps, truth.positions + np.array([0.0, size, 0.0]), truth.orientations
-        )
-        figures = consistency(truth, moved, p)
-        assert figures["nees_position"] == pytest.approx(size**2 / 0.04)
-        assert figures["nees_position_inside_percent"] == (100.0 if 0.025 < share < 0.975 else 0.0)
+@pytest.mark.parametrize(
+    ("nees", "position", "pose", "three_sigma"),
+    [
+        (0.215, 0, 0, 100), (0.217, 100, 0, 100), (0.23, 100, 0, 100), (0.24, 100, 100, 100),
+        (9.34, 100, 100, 100), (9.36, 0, 100, 100), (13.4, 0, 100, 100), (13.5, 0, 0, 100),
+        (14.1, 0, 0, 100), (14.2, 0, 0, 0),
+    ],
+)  # fmt: skip
+def test_one_pose_is_the_quadratic_form_and_the_bounds_are_those_of_chi_squared(
+    nees: float, position: int, pose: int, three_sigma: int
+) -> None:
+    """Beside the position, the orientation is off by one standard deviation."""
+    truth = walk(4)
+    moved = truth.positions + np.array([0.0, 0.2 * np.sqrt(nees), 0.0])
+    turned = Rotation.from_rotvec([0.5, 0.0, 0.0]) * truth.rotations()
+    estimate = Trajectory(truth.stamps, moved, turned.as_quat(scalar_first=True))
+    p = repeated(np.diag([0.01, 0.04, 0.09, 0.25, 1.0, 1.0]), 4)
+    figures = consistency(truth, estimate, p)
+    assert figures == {
+        "covariance_invalid": 0,
+        "nees_position": pytest.approx(nees),
+        "nees_position_inside_percent": position,
+        "within_3_sigma_percent": three_sigma,
+        "nees_pose": pytest.approx(nees + 1.0),
+        "nees_pose_inside_percent": pose,
+    }
 
 
 @pytest.mark.parametrize(("factor", "mean"), [(0.01, 300.0), (100.0, 0.03)])
@@ -86,9 +98,12 @@ NONE: dict[str, Callable[[Floats], Floats]] = {
     "zeros": lambda p: 0.0 * p,
     "negative": lambda p: -p,
     "not symmetric": lambda p: p + np.triu(p.diagonal()[:, None] * np.ones((6, 6)), 1),
+    "not symmetric by a little": lambda p: p * (1 + 1e-3 * np.triu(np.ones((6, 6)), 1)),
     "not a number": lambda p: p * np.nan,
+    "not a number in one place": lambda p: np.where(np.arange(36).reshape(6, 6) == 1, np.nan, p),
     "infinite": lambda p: p * np.inf,
     "certain in one direction": lambda p: p * (np.arange(6) > 0) * (np.arange(6) > 0)[:, None],
+    "two of six the same": lambda p: np.diag([0.01] * 6) + 0.01 * np.eye(6)[[1, 0, 2, 3, 4, 5]],
     "singular": lambda p: np.outer(np.ones(6), np.ones(6)) * 1e-4,
     "greater correlation than 1": lambda p: np.eye(6) * 0.01 + 0.02 * (1 - np.eye(6)),
 }
@@ -116,6 +131,12 @@ def test_what_is_no_covariance_is_counted_and_outside(kind: str) -> None:
 def test_a_covariance_is_one_in_any_units(seed: int, scales: list[float]) -> None:
     p = covariance(seed) * np.outer(scales, scales)
     assert positive_definite(p[None]).tolist() == [True]
+
+
+@pytest.mark.parametrize("count", [4096, 4097, 9000])
+def test_of_many_covariances_each_is_checked(count: int) -> None:
+    valid = positive_definite(np.eye(6) * np.append(np.ones(count - 1), -1.0)[:, None, None])
+    assert (len(valid), valid.sum(), valid[-1]) == (count, count - 1, False)
 
 
 def moving(

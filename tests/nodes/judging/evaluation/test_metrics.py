@@ -20,13 +20,16 @@ from nodes.judging.evaluation.alignment import align
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.metrics import (
     absolute_errors,
+    consistency,
     end_error_percent,
     frame_errors,
+    interpolated,
     path_errors,
     path_pairs,
     rotation_errors,
     segment_errors,
 )
+from nodes.judging.evaluation.orientations import examine
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory, associate
 from nodes.trajectory_files import read_tum
@@ -140,6 +143,61 @@ def test_pairs_are_evos_also_for_a_vehicle_that_stands_still_or_jumps(
         assert j == k or tie
 
 
+STRAIGHT = Trajectory(
+    10**9 * (10**9 + np.arange(101)),
+    np.arange(101.0)[:, None] * [1.0, 0.0, 0.0],
+    np.tile([1.0, 0.0, 0.0, 0.0], (101, 1)),
+)
+"""100 m along x."""
+
+
+ROLLS = Rotation.from_euler("x", 0.3 * np.arange(101)[:, None], degrees=True).as_quat(
+    scalar_first=True
+)
+"""Orientations that roll by 0.3° a metre: seen from the body, the motion stays along x."""
+
+
+def test_relative_errors_are_a_share_of_the_length_whatever_it_is() -> None:
+    estimate = Trajectory(STRAIGHT.stamps, 1.1 * STRAIGHT.positions, ROLLS)
+    shares = {f"rpe_{share}pct" for share in SHARES} | {"rpe_mean"}
+    expected = {f"{name}_trans_percent": 10.0 for name in shares}
+    expected |= {f"{name}_rot_deg_per_m": 0.3 for name in shares}
+    # None of KITTI's, which are of longer paths; at its end, stretches may be a tenth too short.
+    assert segment_errors(STRAIGHT, estimate, 100.0) == pytest.approx(expected, rel=3e-3)
+    errors = path_errors(STRAIGHT, estimate, 4.0)
+    assert errors == pytest.approx({"rpe_4m_trans_percent": 10.0, "rpe_4m_rot_deg_per_m": 0.3})
+    assert end_error_percent(STRAIGHT, estimate) == pytest.approx(10.0)
+    short = slice(0, 2)
+    assert end_error_percent(STRAIGHT.take(short), estimate.take(short)) == pytest.approx(10.0)
+
+
+def test_motions_from_pose_to_pose_stay_within_a_piece() -> None:
+    pieces = np.repeat([0, 1, 2], [1, 50, 50])
+    jumps = STRAIGHT.positions + pieces[:, None] * [0.0, 7.0, 0.0]
+    estimate = Trajectory(STRAIGHT.stamps, jumps, ROLLS)
+    errors = frame_errors(STRAIGHT, estimate, pieces)
+    assert errors == pytest.approx({"rpe_frame_trans_m": 0.0, "rpe_frame_rot_deg": 0.3})
+    with pytest.raises(ValueError, match="expected two poses in a piece, found 101"):
+        frame_errors(STRAIGHT, estimate, np.arange(101))
+
+
+@pytest.mark.parametrize("metres", [8.9, 9.0, 11.0, 11.1])
+def test_a_pair_may_miss_its_length_by_a_tenth_and_leaves_no_piece(metres: float) -> None:
+    distances = np.array([0.0, metres])
+    kept = [0] * (9.0 <= metres <= 11.0)
+    assert path_pairs(distances, 10.0)[0].tolist() == kept
+    for row, pieces in ((1, [0, 1, 1]), (0, [0, 0, 1])):  # one of the two is alone
+        first, second = path_pairs(np.append(distances, 2 * metres), 10.0, pieces=np.array(pieces))
+        assert (first.tolist(), second.tolist()) == ([row] * len(kept), [row + 1] * len(kept))
+
+
+def test_between_stamps_of_today_every_nanosecond_counts() -> None:
+    known = 10**18 + np.array([0, 10, 20])
+    values = np.array([[0.0, 5.0], [1.0, 5.0], [3.0, 5.0]])
+    at = interpolated(known, values, 10**18 + np.array([5, 15, 15]))
+    assert at == pytest.approx(np.array([[0.5, 5.0], [2.0, 5.0], [2.0, 5.0]]))
+
+
 def test_no_pair_so_far_apart_is_an_error_that_says_how_long_the_path_is() -> None:
     truth = walk(10)
     with pytest.raises(ValueError, match=r"expected poses 1 m apart .* in 10 poses and 0\.450 m"):
@@ -202,7 +260,19 @@ def test_errors_by_axis_are_those_of_the_axis_that_is_off() -> None:
     assert sum(value**2 for value in axes) == pytest.approx(errors["ate_rmse_m"] ** 2)
 
 
-@pytest.mark.parametrize("function", [absolute_errors, path_errors, end_error_percent])
+@pytest.mark.parametrize(
+    "function",
+    [
+        absolute_errors,
+        path_errors,
+        end_error_percent,
+        frame_errors,
+        lambda *both: segment_errors(*both, 1.0),
+        lambda *both: consistency(*both, np.eye(6)[None]),
+        lambda truth, estimate: align(estimate, truth, "none"),
+        examine,
+    ],
+)
 def test_other_stamps_are_an_error_that_names_the_row(function: Any) -> None:
     truth = walk(5)
     late = Trajectory(truth.stamps + np.array([0, 0, 1, 1, 1]), truth.positions, truth.orientations)
