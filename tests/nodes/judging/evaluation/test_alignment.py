@@ -74,6 +74,9 @@ def test_a_straight_flight_cannot_be_aligned_by_its_positions(direction: list[fl
     truth = walk()
     straight = np.outer(np.linspace(0.0, 5.0, len(truth)), direction)
     line = Trajectory(truth.stamps, straight, truth.orientations)
+    spread = 5.0 / np.sqrt(12.0) * np.linalg.norm(direction)  # of points evenly on a line
+    with pytest.raises(ValueError, match=f"found 300 with spreads .* and {spread:.2g}"):
+        align(truth, line, "sim3")
     for pair in ((truth, line), (line, truth), (line, line)):
         with pytest.raises(ValueError, match=r"expected positions that do not all lie on one line"):
             align(*pair, "se3")
@@ -141,7 +144,7 @@ def test_one_pose_is_enough_for_heading_and_translation() -> None:
 @pytest.mark.parametrize("first", [100, 4.95])
 def test_an_alignment_of_the_first_poses_is_evos(method: AlignmentMethod, first: float) -> None:
     """100 poses, or 4.95 s of them at 20 Hz."""
-    truth = walk()
+    truth = walk(start=10**18)
     estimate = noisy(moved(truth), seed=3)
     aligned = align(estimate, truth, method, first)
     beginning = align(estimate.take(slice(100)), truth.take(slice(100)), method)
@@ -151,6 +154,36 @@ def test_an_alignment_of_the_first_poses_is_evos(method: AlignmentMethod, first:
         theirs = as_evo(estimate)
         theirs.align(as_evo(truth), correct_scale=method == "sim3", n=100)
         assert aligned.trajectory.positions == pytest.approx(theirs.positions_xyz, abs=1e-9)
+
+
+@pytest.mark.parametrize("method", ["origin", "posyaw", "se3", "sim3"])
+def test_a_flight_of_millimetres_is_aligned_as_any_other(method: AlignmentMethod) -> None:
+    walked = walk(30)
+    small = Trajectory(walked.stamps, 1e-3 * walked.positions, walked.orientations)
+    turn = Rotation.from_euler("z", 70, degrees=True)
+    estimate = Trajectory(
+        small.stamps,
+        turn.apply(small.positions.copy()),
+        (turn * small.rotations()).as_quat(scalar_first=True),
+    )
+    aligned = align(estimate, small, method)
+    assert absolute_errors(small, aligned.trajectory)["ate_max_m"] < 1e-9
+
+
+def test_a_half_turn_about_the_horizon_has_any_heading() -> None:
+    truth = Trajectory(np.array([0]), np.ones((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    for over in ([0.0, 1.0, 0.0, 0.0], [0.0, 0.6, 0.8, 0.0]):
+        estimate = Trajectory(truth.stamps, np.zeros((1, 3)), np.array([over]))
+        aligned = align(estimate, truth, "posyaw")
+        assert aligned.rotation.tolist() == np.eye(3).tolist()
+        assert aligned.translation.tolist() == [1.0, 1.0, 1.0]
+    for degrees in (90.0, 180.0):  # and one about the vertical has its own
+        turn = Rotation.from_euler("z", degrees, degrees=True)
+        estimate = Trajectory(
+            truth.stamps, truth.positions, turn.inv().as_quat(scalar_first=True)[None]
+        )
+        aligned = align(estimate, truth, "posyaw")
+        assert aligned.rotation == pytest.approx(turn.as_matrix(), abs=1e-12)
 
 
 def test_heading_needs_positions_beside_the_vertical() -> None:

@@ -501,14 +501,18 @@ BAD: dict[str, Animal] = {
     "overconfident": inexact(
         says(noisy(0.01, covariance=covariance(1e-7))),
         "nees_position",
-        "within_3_sigma",
+        "within_3_sigma_percent",
         default="nees_position",
     ),
     "velocity of 99 m/s": inexact(
-        says(given(0, velocity=(99.0, 0.0, 0.0))), "velocity_rmse", default="velocity_error_percent"
+        says(given(0, velocity=(99.0, 0.0, 0.0))),
+        "velocity_rmse_m_per_s",
+        default="velocity_error_percent",
     ),
     "velocity of the body": inexact(
-        says(given(0, velocity=(1.26, 0.0, 0.0))), "velocity_rmse", default="velocity_error_percent"
+        says(given(0, velocity=(1.26, 0.0, 0.0))),
+        "velocity_rmse_m_per_s",
+        default="velocity_error_percent",
     ),
     "velocities of the first 19": bad(
         says(lambda t, p: first(19, velocity=velocity(t))(t, p)), "velocities_percent"
