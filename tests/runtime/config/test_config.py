@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from runtime.config.model import Config
-from runtime.config.reading import load, parse
+from runtime.config.reading import convert, find_node, load, parse
 from runtime.errors import ConfigError
+from runtime.extras import Offer
+from runtime.node import NodeConfig
 
 DRONE = """
 [[nodes]]
@@ -135,6 +138,13 @@ OF_FILES = [
     (SPEAKER + SPEAKER, "nodes[1].name: expected a name that no other node has, found"),
     (SPEAKER + "rate = 0", "(s): rate: expected a rate above 0, up to 100000 Hz, for speak"),
     (SPEAKER + "rate = 1e9", "(s): rate: expected a rate above 0, up to 100000 Hz, for speak"),
+    (SPEAKER + '[network]\nmeet = "here"', "network.meet: expected a Zenoh endpoint such as tcp/"),
+    (f"a = {2**63 - 1}", "[[nodes]], found 'a'"),
+    (f"a = [{-(2**63)}]", "[[nodes]], found 'a'"),
+    (f"a = [{2**63}]", "expected whole numbers of 64 bits, found a larger one"),
+    (f"a.b = {-(2**63) - 1}", "expected whole numbers of 64 bits, found a larger one"),
+    (f"a = {'[' * 32}{']' * 32}", "[[nodes]], found 'a'"),
+    (f"a = {'[' * 33}{']' * 33}", "expected tables and lists at most 32 deep, found deeper ones"),
 ]
 
 
@@ -154,6 +164,29 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match=r"c.toml: expected UTF-8 text, found invalid start"):
         load(path)
+
+
+def test_a_file_in_a_folder_whose_name_is_no_text(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"\xff")
+    folder.mkdir()
+    assert r"c.toml: expected a path in UTF-8, found" in message(folder, SPEAKER)
+
+
+def test_a_node_that_two_packages_offer_is_named_by_its_class(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    both = [Offer("one", "Twice", "a:Twice"), Offer("two", "Twice", "b:Twice")]
+    monkeypatch.setattr("runtime.config.reading.offers", lambda _: both)
+    with pytest.raises(ConfigError, match="one node named Twice, found a:Twice of one, b:Twice of"):
+        find_node("Twice", "here")
+
+
+def test_a_setting_of_a_type_that_no_file_has_is_a_fault_of_the_node() -> None:
+    class Odd(NodeConfig):
+        number: complex
+
+    with pytest.raises(NotImplementedError, match="settings of type <class 'complex'>"):
+        convert({"number": 1}, Odd, "here")
 
 
 def test_a_node_beside_the_file_is_found(tmp_path: Path) -> None:

@@ -20,6 +20,8 @@ from tests.runtime.config.test_config import CAMERAS, DRONE, SPEAKER, message, r
 from tests.runtime.samples import Speaker, SpeakerConfig
 
 BAD_OVERRIDES = [
+    pytest.param("s.a=" + "9" * 5000, "...: expected a number of a usual size", id="digits"),
+    pytest.param("s.a=" + "[" * 100_000, "...: expected a value, found brackets", id="brackets"),
     ("s.rate=1\nx=2", "expected one setting, found more lines"),
     ("x", "--set x: expected node.key=value or run.key=value"),
     ("drone=1", "--set drone=1: expected node.key=value or run.key=value"),

@@ -239,7 +239,13 @@ def test_orientations_of_no_body_fail_and_in_files_may_be_missing() -> None:
     [
         (IMAGES, 0, 100.0),
         (IMAGES + 900_000, 0, 100.0),
+        (IMAGES + 4_900_000, 0, 100.0),  # a tenth of the period
+        (IMAGES + 5_100_000, 0, 0.0),
+        (IMAGES - 4_900_000, 0, 100.0),
         (IMAGES + 15 * MS, 0, 0.0),  # of the arrival
+        (IMAGES + 15 * MS, -10 * MS, 100.0),
+        (IMAGES + 15 * MS, 9 * MS, 0.0),
+        (np.arange(5 * MS, 12 * SECOND, 33 * MS), 0, 100.0),  # as dense as two of three images
         (IMAGES + 15 * MS, 15 * MS, 100.0),  # as the camera's clock has them
         (IMAGES[::7], 0, 100.0),
         (np.arange(0, 12 * SECOND, 7 * MS), 0, 100.0),  # of the samples of an IMU

@@ -40,8 +40,13 @@ def test_a_file_may_have_infinite_thresholds(tmp_path: Path) -> None:
     own = config.own_thresholds()["odometry"]
     assert own.frame_coverage_percent == math.inf  # type: ignore[attr-defined]
     assert not config.thresholds.given()
-    for wrong in ("thresholds = { ate_percent = nan }", "gap = inf"):
-        with pytest.raises(ConfigError, match="expected"):
+    for wrong, expected in (
+        ("thresholds = { ate_percent = nan }", "expected a finite number"),
+        ("gap = inf", "expected a finite number"),
+        ("align_first = 0", "expected a whole number >= 1"),
+        ("align_first = '5 parsec'", "align_first: expected a number of poses or a duration: "),
+    ):
+        with pytest.raises(ConfigError, match=expected):
             evaluation(tmp_path, f"[[nodes]]\nname = 'e'\ntype = 'Evaluation'\n{wrong}\n")
 
 
