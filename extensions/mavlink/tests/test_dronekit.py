@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,7 +26,7 @@ def guided(address: str) -> None:
     """Arm, take off, go somewhere, fly a mission up to its last item, return."""
     from dronekit import Command, LocationGlobalRelative, VehicleMode, connect
 
-    vehicle = connect(address, wait_ready=True, heartbeat_timeout=60)
+    vehicle: Any = connect(address, wait_ready=True, heartbeat_timeout=60)
     assert vehicle.parameters["MPC_XY_CRUISE"] == 2.0
     wait_until(lambda: vehicle.is_armable)
     vehicle.mode = VehicleMode("GUIDED")
