@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import msgspec
@@ -256,7 +256,7 @@ def difficulty(simulated: Simulated, published: Published) -> dict[str, float]:
 
 
 def ablation(
-    condition: Mapping[str, Mapping[object, float]], real: Mapping[str, Mapping[object, float]]
+    condition: Mapping[str, Mapping[Hashable, float]], real: Mapping[str, Mapping[Hashable, float]]
 ) -> dict[str, tuple[float, int]]:
     """Return by system the median error under a condition divided by that under ``real``.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -205,7 +205,7 @@ def _error(result: Result, study: Study) -> float:
 
 def ablations(study: Study, count: Mapping[Run, Result]) -> dict[str, dict[str, str]]:
     """Return by condition and system the error divided by that under ``real``, in words."""
-    errors: dict[str, dict[str, dict[object, float]]] = {}
+    errors: dict[str, dict[str, dict[Hashable, float]]] = {}
     for run, result in count.items():
         place = run.sequence, run.world, run.seed
         own = errors.setdefault(run.condition, {}).setdefault(run.system, {})

@@ -40,12 +40,16 @@ def draw(
             axes.plot([0.005, 5.0], [0.005 * factor, 5.0 * factor], style, color="0.6", lw=1)
         for name, cell, sim, real in _points(simulated, published, world):
             index = [*labels].index(name)
-            style = {"marker": MARKS[index % len(MARKS)], "color": f"C{index}", "ls": ""}
+            look: dict[str, Any] = {
+                "marker": MARKS[index % len(MARKS)],
+                "color": f"C{index}",
+                "ls": "",
+            }
             at = [min(value, FAILED) for value in (real, sim)]
             failed = math.isinf(sim) or math.isinf(real)
-            axes.plot(*at, **style, fillstyle="none" if failed else "full", clip_on=False)
+            axes.plot(*at, **look, fillstyle="none" if failed else "full", clip_on=False)
             axes.annotate(cell.sequence, at, fontsize=5, xytext=(3, 2), textcoords="offset points")
-            handles[labels[name]] = axes.plot([], [], **style)[0]
+            handles[labels[name]] = axes.plot([], [], **look)[0]
         axes.set(xscale="log", yscale="log", xlim=(0.008, 4.0), ylim=(0.002, 4.0), title=world)
         axes.set_xlabel("published ATE (m)")
         axes.set_ylabel("simulated ATE (m)")

@@ -332,7 +332,7 @@ def table_of(study: Study, run: Run) -> dict[str, Any]:
         for part in parts
         if part.name == name
     ]
-    for change in (c for part in [*parts, system] for c in part.set):
+    for change in [*(c for part in parts for c in part.set), *system.set]:
         override(table, change)
     override(table, f'drone.trajectory="{run.sequence}"')
     evaluation = {"alignment": system.alignment, "image_count": 0}

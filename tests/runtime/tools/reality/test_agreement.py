@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Hashable
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from runtime.tools.reality.agreement import (
     ranks,
     spearman,
 )
+
+Errors = dict[str, dict[Hashable, float]]
 
 NAMES = "abcdef"
 SEQUENCES = "1234"
@@ -191,9 +194,10 @@ def test_difficulty_is_ranked_over_the_sequences_of_each_world() -> None:
 
 
 def test_an_ablation_is_over_the_runs_that_both_have() -> None:
-    real = {"a": {1: 0.2, 2: 0.4, 3: 0.6, 4: 99.0}, "b": {1: 0.1}}
-    condition = {"a": {1: 0.1, 2: 0.2, 3: 0.3, 5: 99.0}, "b": {1: math.inf}, "c": {1: 1.0}}
-    assert ablation(condition, real) == {"a": (pytest.approx(0.5), 3)}
+    real: Errors = {"a": {1: 0.2, 2: 0.4, 3: 0.6, 4: 99.0}, "b": {1: 0.1}}
+    condition: Errors = {"a": {1: 0.1, 2: 0.2, 3: 0.3, 5: 99.0}, "b": {1: math.inf}, "c": {1: 1.0}}
+    ((name, (ratio, runs)),) = ablation(condition, real).items()
+    assert (name, ratio, runs) == ("a", pytest.approx(0.5), 3)
 
 
 @given(st.floats(0.01, 100.0), st.integers(0, 1000))

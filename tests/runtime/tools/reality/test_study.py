@@ -271,8 +271,9 @@ def test_a_key_is_that_of_templates_content(tmp_path: Path) -> None:
 
 
 def result(seed: int = 1, system: str = "good", **more: Any) -> Result:
-    run = {"sequence": "S1", "world": "wall", "condition": "real", "seed": seed, "system": system}
-    return Result(**{"verdict": "passed", "ate_m": 0.1, "key": "k", "data": "d"} | run | more)
+    run: dict[str, Any] = {"sequence": "S1", "world": "wall", "condition": "real", "seed": seed}
+    usual: dict[str, Any] = {"verdict": "passed", "ate_m": 0.1, "key": "k", "data": "d"}
+    return Result(**(usual | run | {"system": system} | more))
 
 
 def test_a_ledger_keeps_what_it_is_given(tmp_path: Path) -> None:
@@ -351,7 +352,7 @@ def row_of(small: Path, figures: dict[str, Any], error: str = "") -> Result:
         + "a" * 40 + '-dirty"}, "code": {"good": "bbbbbbbbbbbb"}}'
     )  # fmt: skip
     row = crashed(job, error) | {"estimators": own, "workers": {"good.X": {"cpu_p50_ms": 7.0}}}
-    return result_of(run, job, row, key="k", data="d", study=study)  # type: ignore[arg-type]
+    return result_of(run, job, row, key="k", data="d", study=study)
 
 
 def test_a_result_is_what_the_verdict_says(small: Path) -> None:
