@@ -100,7 +100,7 @@ def reality(
         outside=outside,
         wanted=lambda run, data: not ledger.has(run, keys[run], data, crashed=not retry),
     )
-    for line in told(study, planned) if truth else ():
+    for line in plan_lines(study, planned) if truth else ():
         typer.echo(line)
     if plan:
         return
@@ -110,7 +110,7 @@ def reality(
         ledger.add(
             result_of(run, job, row, key=keys[run], data=planned.data[run[:2]], study=study)
             for job, row in ended
-            if not row["error"].startswith(NOT_ITS_OWN)
+            if not row["error"].startswith(NOT_ITS_OWN) and not row.get("edited")
             for run in [by_id[job.id]]
         )
 
@@ -150,7 +150,7 @@ def rows_in(out: Path) -> dict[str, Row]:
     return decode_rows(path.read_bytes()) if path.is_file() else {}
 
 
-def told(study: Study, planned: Planned) -> Iterator[str]:
+def plan_lines(study: Study, planned: Planned) -> Iterator[str]:
     """Yield what is planned, in lines: how much, for how long, and what is left out."""
     yield (
         f"{len(planned.jobs)} runs on {planned.flights(study)} flights to do, some "

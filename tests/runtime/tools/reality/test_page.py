@@ -8,13 +8,17 @@ from typing import Any
 
 import msgspec
 import pytest
+import typer
 
-from runtime.tools.reality.page import write_page
+from runtime.tools.reality.page import reality, write_page
 from runtime.tools.reality.results import Ledger, Result
 from runtime.tools.reality.study import Run, Study, keys_of, read_published, read_study
-from tests.runtime.tools.reality.test_study import motion
+from runtime.tools.sweep.plan import Plan
+from runtime.tools.sweep.tables import crashed
+from tests.runtime.tools.reality.test_study import motion, small
 from tests.runtime.tools.samples_cli import command
 
+__all__ = ["small"]  # a fixture
 PUBLISHED = read_published().errors()
 
 
@@ -151,6 +155,57 @@ def test_the_page_alone_needs_no_truth(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "Nothing of the study" in (tmp_path / "R.md").read_text(encoding="utf-8")
     assert not (tmp_path / "sweeps").exists()
+
+
+def test_an_interruption_loses_nothing(
+    small: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What has ended is in the ledger; what was ended, crashed or edited is flown as is due."""
+    flown: list[list[str]] = []
+
+    def carry_out(plan: Plan, *, jobs: int | None, finished: Any) -> None:
+        flown.append(
+            [dict(job.settings)["seed"] + dict(job.settings)["system"] for job in plan.jobs]
+        )
+        plan.out.mkdir(exist_ok=True)
+        ends = {
+            "1good": "",
+            "1other": "",
+            "2good": "its worker died",
+            "2other": "interrupted by us",
+        }
+        with (plan.out / "rows.jsonl").open("ab") as file:
+            for job in plan.jobs:
+                name = dict(job.settings)["system"]
+                run = job.settings[3][1] + name
+                row = crashed(job, ends[run])
+                row["estimators"] = {name: {"ate_rmse_m": 0.1, "coverage_percent": 90.0}}
+                if run == "1other":
+                    row["edited"] = ["x.py changed"]
+                file.write(msgspec.json.encode(row) + b"\n")
+                if run == "1good":  # the others end during the interruption
+                    finished(job, row)
+        raise typer.Exit(130)
+
+    monkeypatch.setattr("runtime.tools.cli.sweep.carry_out", carry_out)
+    monkeypatch.chdir(tmp_path)
+    words = {"truth": tmp_path / "truth", "file": small, "results": Path("r.csv"), "out": Path("o")}
+    words |= {"worlds": "wall", "conditions": "real", "sequences": "S1", "page": Path("R.md")}
+    for more in ({}, {}, {"retry": True}):
+        with pytest.raises(typer.Exit):
+            reality(**{"systems": "good,other", **words, **more})  # type: ignore[arg-type]
+    assert flown == [
+        ["1good", "1other", "2good", "2other"],
+        ["1other", "2other"],
+        ["1other", "2good", "2other"],
+    ]
+    results = Ledger(tmp_path / "r.csv").results.values()
+    assert {(r.seed, r.system): r.verdict for r in results} == {
+        (1, "good"): "passed", (2, "good"): "crashed"
+    }  # fmt: skip
+    assert "2 of " in (tmp_path / "R.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

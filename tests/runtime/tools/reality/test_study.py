@@ -198,24 +198,24 @@ def test_what_cannot_be_flown_is_told(small: Path, tmp_path: Path) -> None:
     motion(tmp_path / "truth" / "S2" / "data.csv", radius=3000.0)
     study = read_study(small)
     keys = keys_of(study, 1)
-    own = truths(tmp_path / "truth", study.sequences)
-    assert {name: path.name for name, path in own.items()} == {
+    files = truths(tmp_path / "truth", study.sequences)
+    assert {name: path.name for name, path in files.items()} == {
         "S1": "S1_easy.csv",
         "S2": "data.csv",
     }
-    planned = make_plan(study, keys, out=tmp_path / "out", truth=own)
+    planned = make_plan(study, keys, out=tmp_path / "out", truth=files)
     assert {run.sequence for run in planned.jobs} == {"S1"}
     assert planned.flights(study) == 4, "the other system has a flight of its own"
-    told = [*planned.absent]
-    assert "elsewhere: not installed (make elsewhere)" in told
-    assert "given: no scan is given by --outside" in told
-    assert any(why.startswith("S2 in wall: ") and "500 m/s²" in why for why in told)
+    reasons = [*planned.absent]
+    assert "elsewhere: not installed (make elsewhere)" in reasons
+    assert "given: no scan is given by --outside" in reasons
+    assert any(why.startswith("S2 in wall: ") and "500 m/s²" in why for why in reasons)
     assert sum(planned.absent.values()) + len(planned.jobs) == len(keys)
     assert planned.hours(study) == pytest.approx(4 * 20 * 5.48 * 150 / 3.6e6, rel=0.01)
-    del own["S2"]
+    del files["S2"]
     done = next(iter(planned.jobs))
     rest = make_plan(
-        study, keys, out=tmp_path / "out", truth=own, wanted=lambda run, _: run != done
+        study, keys, out=tmp_path / "out", truth=files, wanted=lambda run, _: run != done
     )
     assert {*planned.jobs} - {*rest.jobs} == {done}
     assert rest.finished == 1
@@ -230,9 +230,9 @@ def test_the_files_of_the_truth(tmp_path: Path) -> None:
     for sensor in ("cam0", "state_groundtruth_estimate0"):
         (tmp_path / "V1_03" / "mav0" / sensor).mkdir(parents=True)
         (tmp_path / "V1_03" / "mav0" / sensor / "data.csv").write_text("")
-    found = {n: str(p.relative_to(tmp_path)) for n, p in truths(tmp_path, parts).items()}
+    files = {n: str(p.relative_to(tmp_path)) for n, p in truths(tmp_path, parts).items()}
     truth = "V1_03/mav0/state_groundtruth_estimate0/data.csv"
-    assert found == {"V1_01": "V1_01_easy.csv", "V1_02": "V1_02.tum", "V1_03": truth}
+    assert files == {"V1_01": "V1_01_easy.csv", "V1_02": "V1_02.tum", "V1_03": truth}
     assert truths(None, parts) == {}
     with pytest.raises(CommandError, match=r"--truth: expected a folder, found .*nowhere"):
         truths(tmp_path / "nowhere", parts)
