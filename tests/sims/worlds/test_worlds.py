@@ -395,7 +395,8 @@ def test_a_file_is_a_world(tmp_path: Path) -> None:
 
 def test_an_unknown_name_gets_near_ones_suggested() -> None:
     """The message has what was found, what there is and what may have been meant."""
-    with pytest.raises(WorldError, match=r'of corridor, field, forest.*found "hal"; did you mean hall\?'):
+    words = r'of corridor, field, forest.*found "hal"; did you mean hall\?'
+    with pytest.raises(WorldError, match=words):
         load_world("hal")
     with pytest.raises(WorldError, match=r'found "moon"$'):
         load_world("moon")

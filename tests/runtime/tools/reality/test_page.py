@@ -191,11 +191,16 @@ def test_an_interruption_loses_nothing(
 
     monkeypatch.setattr("runtime.tools.cli.sweep.carry_out", carry_out)
     monkeypatch.chdir(tmp_path)
-    words = {"truth": tmp_path / "truth", "file": small, "results": Path("r.csv"), "out": Path("o")}
+    words: dict[str, Any] = {
+        "truth": tmp_path / "truth",
+        "file": small,
+        "results": Path("r.csv"),
+        "out": Path("o"),
+    }
     words |= {"worlds": "wall", "conditions": "real", "sequences": "S1", "page": Path("R.md")}
     for more in ({}, {}, {"retry": True}):
         with pytest.raises(typer.Exit):
-            reality(**{"systems": "good,other", **words, **more})  # type: ignore[arg-type]
+            reality(**{"systems": "good,other", **words, **more})
     assert flown == [
         ["1good", "1other", "2good", "2other"],
         ["1other", "2other"],
