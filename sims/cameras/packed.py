@@ -59,8 +59,8 @@ class Drawable(NamedTuple):
 
     texels: npt.NDArray[np.uint32]
     textures: list[TexturePlace | None]
-    # By `meshes.shape_of`; with a plane its other side.
-    meshes: dict[Any, tuple[PreparedMesh, PreparedMesh | None]]
+    meshes: list[tuple[PreparedMesh, PreparedMesh | None]]  # with a plane its other side
+    mesh_of_geom: list[int]  # number of the mesh of each geom that is drawn
 
 
 def prepare(
@@ -80,23 +80,27 @@ def prepare(
     textures, count = places_of(model, library, images)
     texels = empty((count,), np.uint32)
     fill(texels, model, library, images, textures)
-    meshes: dict[Any, tuple[PreparedMesh, PreparedMesh | None]] = {}
+    meshes: list[tuple[PreparedMesh, PreparedMesh | None]] = []
+    numbers: dict[Any, int] = {}
+    mesh_of_geom = []
     triangles = 0
     for geom in np.flatnonzero(model.geom_group < DRAWN_GROUPS).tolist():
         shape = shape_of(model, geom)
-        if shape not in meshes:
+        if shape not in numbers:
+            numbers[shape] = len(meshes)
             mesh = mesh_of(model, *shape)
             behind = None
             if shape[0] == _Kind.mjGEOM_PLANE:
                 behind = _prepared(mesh.turned(), library, empty)
-            meshes[shape] = _prepared(mesh, library, empty), behind
-        triangles += len(meshes[shape][0].corners)
+            meshes.append((_prepared(mesh, library, empty), behind))
+        mesh_of_geom.append(numbers[shape])
+        triangles += len(meshes[numbers[shape]][0].corners)
     if triangles >= MOST_TRIANGLES:
         raise ValueError(
             f'renderer = "raster": expected geoms of fewer than {MOST_TRIANGLES} triangles in '
             f'all, found {triangles}; "mujoco" draws them'
         )
-    return Drawable(texels, textures, meshes)
+    return Drawable(texels, textures, meshes, mesh_of_geom)
 
 
 def _prepared(mesh: Mesh, library: Any, empty: Empty) -> PreparedMesh:

@@ -18,7 +18,7 @@ from events import CameraInfo
 from runtime.typed import override
 from sims.cameras.layouts import GEOM, LIGHT, POSE, VIEW
 from sims.cameras.layouts import address as _at
-from sims.cameras.meshes import narrow, shape_of
+from sims.cameras.meshes import narrow
 from sims.cameras.optics import pixel_rays
 from sims.cameras.packed import DRAWN_GROUPS, Drawable, PreparedMesh, prepare
 from sims.cameras.shadows import ShadowMaps
@@ -90,12 +90,12 @@ class Raster(Stage):
         planes = model.geom_type[self._drawn] == _Kind.mjGEOM_PLANE
         self._planes = np.flatnonzero(planes & (self._geoms["double_sided"] == 0))
         self._behind: dict[int, int] = {}  # by a plane's mesh, that of its other side
-        meshes: dict[Any, int] = {}
-        for shape, (mesh, behind) in drawable.meshes.items():
-            meshes[shape] = self._add_mesh(mesh)
+        meshes = []
+        for mesh, behind in drawable.meshes:
+            meshes.append(self._add_mesh(mesh))
             if behind is not None:
-                self._behind[meshes[shape]] = self._add_mesh(behind)
-        self._geoms["mesh"] = [meshes[shape_of(model, geom)] for geom in self._drawn.tolist()]
+                self._behind[meshes[-1]] = self._add_mesh(behind)
+        self._geoms["mesh"] = [meshes[number] for number in drawable.mesh_of_geom]
         self._describe()
         self._lenses: dict[CameraInfo, int] = {}
 

@@ -41,9 +41,9 @@ def beside(example: str, out: Path, text: str = "") -> tuple[str, Any]:
         return done.stdout, rig.end(interrupt=name == "airsim")
 
 
-def test_the_lines_of_the_readme_fly(tmp_path: Path) -> None:
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (lines,) = re.findall(r"^```python\n(import cosysairsim.*?)^```", readme, re.M | re.S)
+def test_the_lines_of_the_page_fly(tmp_path: Path) -> None:
+    page = (ROOT / "extensions/airsim/docs/airsim.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"^```python\n(import cosysairsim.*?)^```", page, re.M | re.S)
     lines = lines.replace("MultirotorClient()", "MultirotorClient(port=PORT)")
     lines += "print(png[:4], len(depth.image_data_float))"
     printed, _ = beside("airsim_hello", tmp_path, lines)

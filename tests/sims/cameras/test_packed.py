@@ -15,7 +15,7 @@ import pytest
 
 from events.frames import from_rpy
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
-from sims.cameras.packed import Packed, SharedFile, pack, without_looks
+from sims.cameras.packed import Packed, SharedFile, pack, prepare, without_looks
 from sims.cameras.raster import Raster, library_for
 from sims.cameras.renderer import Shot
 from tests.sims.cameras.scenes import fresh
@@ -206,3 +206,13 @@ def test_another_process_reads_it() -> None:
     assert done.stdout.split() == [
         str(model.ngeom).encode(), str(int(packed.drawable.texels.sum())).encode()
     ]  # fmt: skip
+
+
+def test_a_size_that_is_no_number_has_a_mesh_like_any_other() -> None:
+    """It is not equal to itself, and so no key."""
+    xml = '<mujoco><worldbody><geom type="ellipsoid" size="1 1 1"/></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.geom_size[0, 0] = np.nan
+    drawable = prepare(model, library_for(model))
+    assert (len(drawable.meshes), drawable.mesh_of_geom) == (1, [0])
+    Raster(model, drawable=drawable)
