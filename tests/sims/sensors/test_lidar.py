@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -24,7 +23,6 @@ from events import LidarScan
 from runtime import Tick
 from sims.cameras import model_to_bytes
 from sims.sensors.lidar import LATE, LidarRig, LidarSpec, Scanner, pattern_of, solids
-from sims.sensors.rays import DRAWN, Rays
 from sims.vehicle import Physics, attach_vehicle
 from sims.worlds import Dynamics, Motion, load_scene
 from tests.sims.vehicle.flight import compiled
@@ -291,40 +289,6 @@ def test_another_vehicle_is_hit_and_its_own_is_not() -> None:
         near = points[np.linalg.norm(points, axis=1) < 1.9]
         assert len(near) > 50
         assert (near[:, 1] * side > 1.0).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("world", ["hall", "yard"])
-def test_a_turn_costs_less_than_its_rays_cast_one_millisecond_after_the_other(world: str) -> None:
-    """Processor time of whole turns of 16 x 1024, against MuJoCo's alone for the same number of
-    rays at what is drawn, each by turns: half of it in the hall, a third in the yard."""
-    scene = load_scene(world, bare=True)
-    attach_vehicle(scene.spec, "drone", (0.0, 0.0, -1.5), 0.0)
-    compiled = scene.spec.compile()
-    spec = LidarSpec(name="lidar")
-    scanner = Scanner(model_to_bytes(compiled), scene.dynamics, (spec,), "drone", 0)
-    plain = Rays(compiled, scene.dynamics, "drone/base_link")
-    states = np.tile(compiled.qpos0, (101, 1))
-    directions = pattern_of(spec, 0.0).directions.reshape(-1, 3)
-    own = compiled.body("drone/base_link").id
-    plain.look(states[0], 0.0)
-
-    def cast() -> None:
-        for begin in range(0, len(directions), 164):
-            part = directions[begin : begin + 164]
-            geoms, distances = np.empty(len(part), np.int32), np.empty(len(part))
-            mujoco.mj_multiRay(
-                compiled, plain.data, states[0, :3], part.ravel(), DRAWN, 1, own, geoms,
-                distances, np.empty(part.size), len(part), mujoco.mjMAXVAL,
-            )  # fmt: skip
-
-    times: list[list[float]] = [[], []]
-    for _ in range(12):
-        for index, call in enumerate((lambda: scanner.scan("lidar", 0, states), cast)):
-            begin = time.process_time()
-            call()
-            times[index].append(time.process_time() - begin)
-    assert min(times[0]) < 0.8 * min(times[1])
 
 
 def test_the_floor_of_the_hall_is_met_far_from_its_middle() -> None:
