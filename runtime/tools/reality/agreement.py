@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import rankdata
 
 Floats = npt.NDArray[np.float64]
 
@@ -72,9 +73,7 @@ class Ranking(msgspec.Struct, frozen=True, kw_only=True):
 
 def ranks(values: Iterable[float]) -> Floats:
     """Return ranks from 1; equal values, also infinite ones, share the mean of theirs."""
-    array = np.array([*values], np.float64)
-    below = (array[:, None] > array[None, :]).sum(1)
-    return np.asarray(below + ((array[:, None] == array[None, :]).sum(1) + 1) / 2, np.float64)
+    return np.asarray(rankdata([*values]), np.float64)
 
 
 def spearman(a: Iterable[float], b: Iterable[float]) -> float:
@@ -324,18 +323,14 @@ def criteria(simulated: Simulated, published: Published) -> list[Criterion]:
         ),
         Criterion(
             name="published failures fail",
-            figure=f"{failed.both} of {failed.both + failed.real_only}"
-            if failed.both + failed.real_only
-            else "",
+            figure=_counted(failed.both, failed.both + failed.real_only),
             passes="≥ 80 %",
             ceiling="",
             verdict=_verdict(failed.recall >= 0.8, there=not math.isnan(failed.recall)),
         ),
         Criterion(
             name="false failures",
-            figure=f"{failed.sim_only} of {failed.sim_only + failed.neither}"
-            if failed.sim_only + failed.neither
-            else "",
+            figure=_counted(failed.sim_only, failed.sim_only + failed.neither),
             passes="≤ 10 %",
             ceiling="",
             verdict=_verdict(failed.false <= 0.1, there=not math.isnan(failed.false)),
@@ -348,6 +343,10 @@ def criteria(simulated: Simulated, published: Published) -> list[Criterion]:
             verdict="nothing to compare",
         ),
     ]
+
+
+def _counted(part: int, whole: int) -> str:
+    return f"{part} of {whole}" if whole else ""
 
 
 def _verdict(right: bool, *, enough: bool = True, there: bool = True) -> Verdict:
