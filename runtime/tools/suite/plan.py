@@ -14,6 +14,7 @@ import msgspec
 from runtime.config.overrides import override
 from runtime.config.reading import parse
 from runtime.errors import CommandError, ConfigError, expect_known
+from runtime.paths import unmarked
 from runtime.tools.sweep import Plan, make_job, plan_of
 
 FOLDER = Path(__file__).parent
@@ -158,7 +159,7 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
 
 
 def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]:
-    """Return the settings of a run, as they would stand in a file."""
+    """Return the settings of a run, as they would stand in a file in the suite's folder."""
     rig = suite.rig_of(scenario)
     try:
         table = tomllib.loads(Path(rig).read_text(encoding="utf-8"))
@@ -176,7 +177,7 @@ def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]
             "image_count": 2,
         },
     ]
-    return table
+    return dict(unmarked(table))  # paths start at the suite's folder, not where it is called
 
 
 def _named(what: str, known: tuple[Any, ...], names: Sequence[str]) -> tuple[Any, ...]:

@@ -140,6 +140,12 @@ def test_a_scenario_may_have_another_vehicle(small: Path) -> None:
         make_plan(read_suite(small), out=Path("out"))
 
 
+def test_paths_in_a_scenario_start_at_the_suites_folder(small: Path) -> None:
+    small.write_text(SMALL.replace("pilot.speed=2", "drone.world=rooms/room.xml"), encoding="utf-8")
+    texts = [job.text for job in make_plan(read_suite(small), out=Path("out")).jobs]
+    assert any(f'world = "{small.parent}/rooms/room.xml"' in text for text in texts)
+
+
 def page_of(suite: Suite, tmp_path: Path, change: Any) -> str:
     """Return the page of rows of which one estimator's are changed."""
     plan = make_plan(suite, out=tmp_path / "out", seeds=2, repeats=2)
