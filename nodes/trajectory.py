@@ -173,6 +173,11 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         ends = self.stamps[:-1][np.diff(self.stamps) > hole]
         return np.searchsorted(ends, stamps)
 
+    def moved(self, lever: npt.ArrayLike) -> Trajectory:
+        """Return the poses of a point fixed to the body, metres in its frame, shape (3,)."""
+        positions = self.positions + self.rotations().apply(lever)
+        return Trajectory(self.stamps, positions, self.orientations)
+
     def step(self) -> int:
         """Return the median time from a pose to the next, nanoseconds; 0 for one pose."""
         return int(np.median(np.diff(self.stamps))) if len(self) > 1 else 0

@@ -155,6 +155,8 @@ def judge(
 
     Args:
         record: Without arrivals, latencies and errors at control ticks are not among the figures.
+            With a `lever`, errors are those at its end, the camera: in a unit of its own an
+            estimator knows the camera's place, but not the body's beside it.
         cameras: Stamps of the images (ns), strictly rising, by camera: the flight is that of the
             estimator's camera; without cameras that of the truth.
     """
@@ -181,6 +183,11 @@ def judge(
     due = due[truth.covers(due, longest)]
     lengths = truth.distances(longest)
     path = float(np.ptp(lengths[inside] if inside.any() else lengths))
+    lever = np.zeros(3) if record.lever is None else np.array(record.lever)
+    sent = estimate
+    if record.lever is not None:
+        truth = truth.moved(lever)
+        estimate, weighed = (t and t.moved(lever) for t in (estimate, weighed))
     figures: dict[str, Any] = {
         "method": record.method,
         "estimates": len(record),
@@ -211,11 +218,11 @@ def judge(
 
     how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
     final, final_note = _judge_final(
-        record, truth, hole, due, path, alignment, align_first, figures, planned
+        record, truth, lever, hole, due, path, alignment, align_first, figures, planned
     )
     if estimate is None or weighed is None:
         figures |= without()
-        return Judgement(figures, estimate, final_note, lost=coverage.lost, final=final)
+        return Judgement(figures, sent, final_note, lost=coverage.lost, final=final)
     # An interval that lasts to the end of the flight counts as long as it is: it took no less.
     if took := [seconds([interval]) for interval in coverage.lost if interval.start >= poses[0]]:
         figures["relocalization_p50_seconds"] = float(np.median(took))
@@ -235,7 +242,7 @@ def judge(
     except ValueError as error:  # too little to align, or no time in common
         figures |= {**without(), "why": f"{error}{_elsewhere_in_time(truth, estimate)}"}
         note = "; ".join(filter(None, notes))
-        return Judgement(figures, estimate, note, lost=coverage.lost, final=final)
+        return Judgement(figures, sent, note, lost=coverage.lost, final=final)
     if sparse:
         figures["compared"] = len(there)
     figures["compared_percent"] = 100.0 * float(_near(there.stamps, poses).mean())
@@ -273,8 +280,10 @@ def judge(
         figures = {k: v for k, v in figures.items() if not figure(k).of_orientation}
         figures["why_no_rotations"] = orientations.text()
     note = "; ".join(filter(None, notes))
+    if record.lever is not None:
+        moved = moved.moved(-lever)
     return Judgement(
-        figures, estimate, note, orientations, moved, at_images, at_ticks, coverage.lost, final
+        figures, sent, note, orientations, moved, at_images, at_ticks, coverage.lost, final
     )
 
 
@@ -446,7 +455,8 @@ def _held(
 
 def _judge_final(
     record: EstimatorRecord,
-    truth: Trajectory,
+    truth: Trajectory,  # of the lever's end
+    lever: Floats,  # on the body, shape (3,)
     hole: int,
     frames: Stamps,
     path: float,
@@ -464,6 +474,7 @@ def _judge_final(
         how = choose_alignment(record.scale_free, record.final_frame_id)
     try:
         final = record.final.take(one_a_step(record.final.stamps))
+        final = final.moved(lever) if lever.any() else final
         there, kept = pair(truth, final, hole)
         orientations = examine(there, kept)
         how = _possible(how, alignment, align_first, orientations)
@@ -485,6 +496,7 @@ def _judge_final(
     if offset is not None:
         notes.append(offset.text())
     note = "; ".join(filter(None, notes))
+    moved = moved.moved(-lever) if lever.any() else moved
     return moved, f"after loop closures: {note}" if note else ""
 
 

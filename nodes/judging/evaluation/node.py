@@ -28,6 +28,7 @@ from events import (
     TrackedFeatures,
     TrackingEvent,
     TrajectoryEstimate,
+    Vector3,
     VehicleEvent,
 )
 from events.announcements import Vehicles
@@ -194,6 +195,7 @@ class Evaluation(Node[EvaluationConfig]):
         self._scans: dict[str, array[int]] = {}  # by lidar
         self._late: dict[str, int] = {}  # offsets of the cameras' clocks
         self._latencies: dict[str, int] = {}  # of their images (ns)
+        self._places: dict[str, Vector3] = {}  # of the cameras on their bodies (m)
         self._read: dict[str, tuple[str, ...]] = {}  # cameras by estimator, as it announced
         self._commands = CommandLog()
         self._album = Album(self.config.image_count)
@@ -205,6 +207,7 @@ class Evaluation(Node[EvaluationConfig]):
         if isinstance(announcement, CameraAnnouncement):
             self._late[announcement.source] = round(announcement.time_offset * 1e9)
             self._latencies[announcement.source] = round(announcement.latency * 1e9)
+            self._places[announcement.source] = announcement.position
         if isinstance(announcement, EstimatorAnnouncement):
             record = EstimatorRecord(
                 announcement.scale_free, announcement.method, announcement.reads
@@ -362,6 +365,9 @@ class Evaluation(Node[EvaluationConfig]):
             read = self._read_by(name, how)
             camera = choose_camera(seen, poses, read)
             body = self._flights.get(vehicle, Flight()).body
+            if record.scale_free and "grey" in record.reads:  # of a node that knows its camera
+                eyes = {eye.removesuffix("/grey") for eye in read} & self._places.keys()
+                record.lever = self._places[eyes.pop()] if len(eyes) == 1 else None
             judgement = self._judge(
                 name,
                 record,

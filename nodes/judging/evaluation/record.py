@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import PoseEstimate, TrackingEvent, TrackingLost, TrajectoryEstimate
+from events import PoseEstimate, TrackingEvent, TrackingLost, TrajectoryEstimate, Vector3
 from nodes.trajectory import PoseRows, Trajectory
 from runtime.time.clock import SECOND
 
@@ -199,6 +199,9 @@ class EstimatorRecord:
         reads: tuple[str, ...] = (),  # see `events.EstimatorAnnouncement`
     ) -> None:
         self.scale_free, self.method, self.reads = scale_free, method, reads
+        # The camera on the body (m), if poses are the camera's, moved to the body in a unit that is
+        # not the metre; `None` if they are judged as the body's.
+        self.lever: Vector3 | None = None
         self.frame_id = ""
         self.rows = PoseRows()  # poses of the trajectory
         self.repeated = 0  # poses with a stamp not later than the last
