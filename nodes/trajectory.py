@@ -234,7 +234,7 @@ class PoseRows:
         return made + self._written + sum(map(len, self._blocks)) + len(self._rows)
 
     def add(self, stamp: int, position: Vector3, orientation: Quaternion) -> None:
-        """Note a pose: nanoseconds, metres, quaternion w, x, y, z."""
+        """Add a pose: nanoseconds, metres, quaternion w, x, y, z."""
         self._rows.append((stamp, position, orientation))
         if len(self._rows) == _BLOCK:
             self._spill()

@@ -252,9 +252,9 @@ def vslamlab(
         runs.mkdir(parents=True, exist_ok=True)
         for number in range(repeat):
             run = runs / f"{number:05d}"
-            given = arguments(sequence, run, mode, settings, dashes=dashes)
+            run_arguments = arguments(sequence, run, mode, settings, dashes=dashes)
             try:
-                path = run_once([*command, *given], run, limit)
+                path = run_once([*command, *run_arguments], run, limit)
                 source = readers.read(f"{run.name}={path}", camera=camera)
                 judgement.judge_all(truth, [source], images, config)  # raises, of another flight
                 estimates.append(source)

@@ -58,22 +58,22 @@ class JudgeConfig(EvaluationConfig):
         offset_of(self.time_offset)
 
 
-def offset_of(given: float | str) -> int:
+def offset_of(offset: float | str) -> int:
     """Return nanoseconds of seconds, or of a text as ``-30ms``; a `ValueError` if it is neither."""
-    sign, size = 1, given
-    if isinstance(given, str):
-        text = given.strip()
+    sign, size = 1, offset
+    if isinstance(offset, str):
+        text = offset.strip()
         sign, size = (-1 if text.startswith("-") else 1), text.lstrip("+-")
         try:
             size = float(size)
         except ValueError:
             size = str(size)
-    elif given < 0:
-        sign, size = -1, -given
+    elif offset < 0:
+        sign, size = -1, -offset
     try:
         return sign * round(Duration.parse(size) * SECOND)
     except ValueError as error:
-        raise ValueError(f"time_offset: {error}, after a sign or none; found {given!r}") from None
+        raise ValueError(f"time_offset: {error}, after a sign or none; found {offset!r}") from None
 
 
 def judge_all(
@@ -173,7 +173,7 @@ def _judge_one(
 
 
 def _option_for(judgement: Judgement) -> str:
-    """Return the options that mend what a judgement says of bodies and clocks, if it does."""
+    """Return the options that fix the mismatch of body or clock in a judgement's note."""
     options = {
         "turned": "declare the axes of both by --axes and --truth-axes, or say where the camera "
         "is by --body-from-camera",
@@ -200,7 +200,7 @@ def _why_not(truth: Source, source: Source, why: str) -> str:
 
 
 def _usual(truth: Source, source: Source, config: JudgeConfig) -> AlignmentMethod:
-    """Return how an estimate is laid on the truth: as in a run where both name their frames."""
+    """Return how an estimate is aligned: as in a run where both name their frames."""
     if config.scale_free:
         return "sim3"
     oriented = not (truth.positions_only or source.positions_only)
@@ -228,16 +228,16 @@ def _rows(source: Source, values: Floats | None) -> Iterator[tuple[int, tuple[fl
 def _conclude(judgements: dict[str, Judgement], config: JudgeConfig, *, known: bool) -> Verdict:
     """Return the verdict; a missed coverage names the option that may be meant."""
     figures = {name: judgement.figures for name, judgement in judgements.items()}
-    own: dict[str, Thresholds] = {}
+    by_estimator: dict[str, Thresholds] = {}
     asked = msgspec.structs.asdict(config.thresholds)["frame_coverage_percent"]
     if known and asked is None and config.gap <= _USUAL_GAP:
         few = msgspec.structs.replace(config.thresholds, frame_coverage_percent=IMAGES_PERCENT)
-        own = {
+        by_estimator = {
             name: few
             for name, row in figures.items()
             if row["frame_coverage_percent"] < IMAGES_PERCENT
         }
-    verdict = conclude(figures, config.thresholds, own=own)
+    verdict = conclude(figures, config.thresholds, by_estimator=by_estimator)
     hints = {
         "frame_coverage_percent": "of key frames only, set --gap; else say what is enough by "
         "--threshold frame_coverage_percent=…",

@@ -22,7 +22,7 @@ class Album:
         self._size = size
         self._images: dict[tuple[str, int], Image] = {}  # by optical frame and stamp
         self._tracked: set[str] = set()  # optical frames
-        self._kept: dict[str, list[tuple[Image, TrackedFeatures | None]]] = {}
+        self._samples: dict[str, list[tuple[Image, TrackedFeatures | None]]] = {}
         self._interval: dict[str, int] = {}
         self._next: dict[str, int] = {}
 
@@ -46,18 +46,18 @@ class Album:
     def _keep(self, name: str, image: Image, features: TrackedFeatures | None) -> None:
         if image.stamp < self._next.get(name, 0):
             return
-        kept = self._kept.setdefault(name, [])
+        samples = self._samples.setdefault(name, [])
         interval = self._interval.setdefault(name, SECOND)
-        kept.append((image, features))
-        if len(kept) > self._size:
-            self._kept[name] = kept[::2]
+        samples.append((image, features))
+        if len(samples) > self._size:
+            self._samples[name] = samples[::2]
             self._interval[name] = interval = 2 * interval
         self._next[name] = image.stamp + interval
 
     def write(self, folder: Path) -> None:
         """Draw the kept images into JPEG files: ``<estimator or camera>_<stamp>.jpg``."""
-        for name, kept in self._kept.items():
-            for image, features in kept:
+        for name, samples in self._samples.items():
+            for image, features in samples:
                 if features is None and image.frame_id in self._tracked:
                     continue  # kept before its estimator began
                 folder.mkdir(exist_ok=True)

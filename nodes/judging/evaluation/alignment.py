@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float64]
 AlignmentMethod = Literal["none", "origin", "posyaw", "se3", "sim3"]
 """Transform from the estimate's frame to the truth's.
 
-``none``: none. ``origin``: the first pose is laid on the first true pose. Least squares over
+``none``: none. ``origin``: the first pose is moved onto the first true pose. Least squares over
 positions: ``posyaw``: translation and heading (4 degrees of freedom), for estimates that know the
 vertical, as those of an IMU do; ``se3``: rigid; ``sim3``: with scale, for an unknown unit.
 """

@@ -18,8 +18,8 @@ def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
     rows = np.flatnonzero(truth.covers(plan.stamps))
     if not len(rows):
         return {}
-    there = truth.at(plan.stamps[rows])
-    distances = position_errors(there.positions, plan.positions[rows])
+    true_poses = truth.at(plan.stamps[rows])
+    distances = position_errors(true_poses.positions, plan.positions[rows])
     return {"plan_rmse_m": rms(distances), "plan_max_m": float(distances.max())}
 
 

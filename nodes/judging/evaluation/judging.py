@@ -73,10 +73,10 @@ def held_errors(
     after = np.clip(np.searchsorted(poses, frames), 1, max(len(poses) - 1, 1))
     nearer = abs(poses[after - 1] - frames) <= abs(poses[after % len(poses)] - frames)
     at_frames = errors[np.where(nearer, after - 1, after % len(poses))]
-    own = np.searchsorted((frames[:-1] + frames[1:]) // 2, poses)  # the image of each pose
+    rows = np.searchsorted((frames[:-1] + frames[1:]) // 2, poses)  # the image of each pose
     worst = np.full(len(frames), -np.inf)
-    np.maximum.at(worst, own, errors)
-    at_frames = np.where(np.bincount(own, minlength=len(frames)) > 0, worst, at_frames)
+    np.maximum.at(worst, rows, errors)
+    at_frames = np.where(np.bincount(rows, minlength=len(frames)) > 0, worst, at_frames)
     before = np.searchsorted(poses, frames, side="right") - 1
     none = before < 0
     since = np.where(none, path[:1], _path_at(truth, poses)[before])
@@ -127,7 +127,7 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
     figures: dict[str, Any]  # by name, which ends with the unit
     estimate: Trajectory | None  # as sent
     note: str = ""  # what a reader of the figures has to know; empty if nothing
-    orientations: Orientations | None = None  # whether they are the body's, if that can be told
+    orientations: Orientations | None = None  # whether they are the body's, if that is known
     # The same in the truth's frame, where there is a truth; `None` if there are none.
     aligned: Trajectory | None = None
     image_errors: Errors | None = None  # errors of each pose at the time of its image
@@ -205,7 +205,7 @@ def judge(
             if name.rpartition("/")[2] != body.rpartition("/")[2]
         ),
         "path_m": path,
-        # Who never has a pose is at it until the end.
+        # Without any pose, initialization lasts to the end.
         "initialization_seconds": (
             (coverage.flight.end if estimate is None else int(poses[0])) - coverage.flight.start
         )
@@ -235,23 +235,25 @@ def judge(
     if frames is None and len(weighed) < len(estimate):
         notes.append(f"of {len(estimate)} poses in bursts {len(weighed)} weigh, one a usual step")
     try:
-        there, kept = pair(truth, weighed, hole)
-        orientations = examine(there, kept)
+        true_poses, estimated = pair(truth, weighed, hole)
+        orientations = examine(true_poses, estimated)
         how = figures["alignment"] = _possible(how, alignment, align_first, orientations)
-        aligned = align(kept, there, how, align_first)
+        aligned = align(estimated, true_poses, how, align_first)
     except ValueError as error:  # too little to align, or no time in common
         figures |= {**without(), "why": f"{error}{_elsewhere_in_time(truth, estimate)}"}
         note = "; ".join(filter(None, notes))
         return Judgement(figures, sent, note, lost=coverage.lost, final=final)
     if sparse:
-        figures["compared"] = len(there)
-    figures["compared_percent"] = 100.0 * float(_near(there.stamps, poses).mean())
-    figures |= _errors(there, kept, aligned.trajectory, path, truth.pieces(there.stamps, longest))
+        figures["compared"] = len(true_poses)
+    figures["compared_percent"] = 100.0 * float(_near(true_poses.stamps, poses).mean())
+    figures |= _errors(
+        true_poses, estimated, aligned.trajectory, path, truth.pieces(true_poses.stamps, longest)
+    )
     offset = best_time_offset(truth, weighed, with_scale=how == "sim3")
     if offset is not None:
         figures["time_offset_ms"] = 1e3 * offset.seconds
         notes.append(offset.text())
-    notes.append(_tilted(there, aligned.trajectory, how))
+    notes.append(_tilted(true_poses, aligned.trajectory, how))
     if orientations is not None:
         figures["orientations"] = orientations.kind
         figures["body_rotation_deg"] = orientations.degrees
@@ -261,17 +263,17 @@ def judge(
     whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
     if not sparse:
         rows = truth.covers(poses, hole)
-        there, moved = truth.at(poses[rows]), whole.take(rows)
+        true_poses, moved = truth.at(poses[rows]), whole.take(rows)
         arrived = arrivals[rows] if len(arrivals) else arrivals
     at_images = Errors(
-        stamps=there.stamps,
+        stamps=true_poses.stamps,
         since=arrived,
-        position=position_errors(there.positions, moved.positions),
-        rotation=rotation_errors(there.orientations, moved.orientations),
+        position=position_errors(true_poses.positions, moved.positions),
+        rotation=rotation_errors(true_poses.orientations, moved.orientations),
     )
-    held = held_errors(truth, due, there.stamps, at_images.position, coverage.lost)
+    held = held_errors(truth, due, true_poses.stamps, at_images.position, coverage.lost)
     figures |= _held(held, path, due, planned)
-    figures |= _velocities_and_covariances(record, truth, there, moved, aligned)
+    figures |= _velocities_and_covariances(record, truth, true_poses, moved, aligned)
     at_ticks = None
     if len(arrivals):
         at_ticks, available = errors_at_ticks(truth, whole, arrivals, rate, hole)
@@ -475,14 +477,14 @@ def _judge_final(
     try:
         final = record.final.take(one_a_step(record.final.stamps))
         final = final.moved(lever) if lever.any() else final
-        there, kept = pair(truth, final, hole)
-        orientations = examine(there, kept)
+        true_poses, estimated = pair(truth, final, hole)
+        orientations = examine(true_poses, estimated)
         how = _possible(how, alignment, align_first, orientations)
-        moved = align(kept, there, how, align_first).trajectory
+        moved = align(estimated, true_poses, how, align_first).trajectory
     except ValueError as error:
         figures["why_not_final"] = str(error)
         return None, ""
-    errors = absolute_errors(there, moved)
+    errors = absolute_errors(true_poses, moved)
     figures["final_ate_rmse_m"] = errors["ate_rmse_m"]
     notes = []
     if orientations is not None:
@@ -521,7 +523,7 @@ def _possible(
     return "se3" if orientations.kind == "truth without" else method
 
 
-_TILT = 10.0  # degrees of a vertical that is told
+_TILT = 10.0  # degrees of a vertical that is reported
 _FITS = 0.2  # share of the error that is left without the tilt
 
 
@@ -549,7 +551,7 @@ def _tilted(truth: Trajectory, aligned: Trajectory, method: AlignmentMethod) -> 
 def _velocities_and_covariances(
     record: EstimatorRecord,
     truth: Trajectory,
-    there: Trajectory,
+    true_poses: Trajectory,
     moved: Trajectory,
     aligned: Alignment,
 ) -> dict[str, Any]:
@@ -559,20 +561,20 @@ def _velocities_and_covariances(
     for name, series in (("velocities", record.velocities), ("covariances", record.covariances)):
         if len(series):
             figures[f"{name}_percent"] = 100.0 * len(series) / len(record)
-    rows, values = record.velocities.at(there.stamps)
+    rows, values = record.velocities.at(true_poses.stamps)
     if rows.any():
         # The true velocity is the difference of the true positions, as densely as there are.
-        near = truth.near(there.stamps[rows])
-        true = interpolated(near.stamps, near.velocities(), there.stamps[rows])
+        near = truth.near(true_poses.stamps[rows])
+        true = interpolated(near.stamps, near.velocities(), true_poses.stamps[rows])
         wrong = position_errors(true, scale * values @ rotation.T)
         figures["velocity_rmse_m_per_s"] = rms(wrong)
         figures["velocity_error_percent"] = velocity_error_percent(wrong, true)
-    rows, values = record.covariances.at(there.stamps)
+    rows, values = record.covariances.at(true_poses.stamps)
     if rows.any():
         turn = np.kron(np.diag([scale, 1.0]), rotation)
         turned = turn @ values.reshape(-1, 6, 6) @ turn.T
-        figures["covariance_too_large_percent"] = too_large_percent(turned, there.length())
-        figures |= consistency(there.take(rows), moved.take(rows), turned)
+        figures["covariance_too_large_percent"] = too_large_percent(turned, true_poses.length())
+        figures |= consistency(true_poses.take(rows), moved.take(rows), turned)
     return figures
 
 
@@ -603,19 +605,19 @@ def errors_at_ticks(
     # Should poses overtake each other, the newest by stamp is the one to go by.
     newest, came = np.maximum.accumulate(order), arrivals[order]
     step = 2 ** max(math.ceil(math.log2(len(ticks) / _MOST_TICKS)), 0)
-    kept = []
+    blocks = []
     sums = np.zeros(3)
     for start in range(0, len(ticks), _BLOCK):  # which is a multiple of each step
         now = ticks[start : start + _BLOCK]
         rows = newest[np.searchsorted(came, now, side="right") - 1]
-        there = truth.at(now)
+        true_poses = truth.at(now)
         since = estimate.stamps[rows]
-        position = position_errors(there.positions, estimate.positions[rows])
-        rotation = rotation_errors(there.orientations, estimate.orientations[rows])
+        position = position_errors(true_poses.positions, estimate.positions[rows])
+        rotation = rotation_errors(true_poses.orientations, estimate.orientations[rows])
         sums += (position**2).sum(), (rotation**2).sum(), (now - since).sum()
-        kept.append([values[::step] for values in (now, since, position, rotation)])
+        blocks.append([values[::step] for values in (now, since, position, rotation)])
     square, turned, age = (sums / len(ticks)).tolist()
-    return Errors(*map(np.concatenate, zip(*kept, strict=True))), {
+    return Errors(*map(np.concatenate, zip(*blocks, strict=True))), {
         "newest_pose_rmse_m": math.sqrt(square),
         "newest_pose_rot_rmse_deg": math.degrees(math.sqrt(turned)),
         "newest_pose_age_ms": age / MILLISECOND,

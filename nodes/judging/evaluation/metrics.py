@@ -198,8 +198,8 @@ def path_pairs(
     miss_above = np.abs(distances[above] - distances[first] - delta)
     miss_below = np.abs(distances[below] - distances[first] - delta)
     second = np.where(miss_below <= miss_above, below, above)
-    kept = np.minimum(miss_below, miss_above) <= delta * tolerance
-    return first[kept], second[kept]
+    within = np.minimum(miss_below, miss_above) <= delta * tolerance
+    return first[within], second[within]
 
 
 def position_errors(truth: Floats, estimate: Floats) -> Floats:
@@ -256,9 +256,9 @@ def relative_errors(
         (t.rotations(), t.positions[last] - t.positions[first]) for t in (truth, estimate)
     )
     true_motion = r1[first].inv().apply(p1)
-    said_motion = r2[first].inv().apply(p2)
+    estimated_motion = r2[first].inv().apply(p2)
     turns = (_turns(t.orientations[first], t.orientations[last]) for t in (truth, estimate))
-    shifts = np.linalg.norm(said_motion - true_motion, axis=1)
+    shifts = np.linalg.norm(estimated_motion - true_motion, axis=1)
     return np.asarray(shifts), rotation_errors(*turns)
 
 

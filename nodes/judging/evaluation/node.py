@@ -53,7 +53,7 @@ from runtime.time.clock import SECOND
 
 
 class LiveErrors:
-    """Errors of an estimator so far; estimates in ``odom`` are laid on the truth at the first."""
+    """Errors of an estimator so far; estimates in ``odom`` are aligned at the first."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -82,7 +82,7 @@ class LiveErrors:
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
-Laid = Literal["auto", "none", "origin", "posyaw", "se3", "sim3"]
+AlignmentSetting = Literal["auto", "none", "origin", "posyaw", "se3", "sim3"]
 
 
 class OwnConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -93,7 +93,7 @@ class OwnConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         thresholds: Thresholds by figure; ``inf`` for none.
     """
 
-    alignment: Laid | None = None
+    alignment: AlignmentSetting | None = None
     thresholds: dict[str, float] = {}
 
 
@@ -101,7 +101,7 @@ class EvaluationConfig(NodeConfig):
     """Settings of an evaluation.
 
     Attributes:
-        alignment: How an estimate is laid on the truth: ``none``, ``origin`` (first pose on first
+        alignment: How an estimate is aligned: ``none``, ``origin`` (first pose on first
             pose), ``posyaw`` (translation and heading), ``se3``, ``sim3``; ``auto`` is ``sim3`` for
             scale-free estimators, ``none`` for estimates in ``map``, and ``origin`` for all others.
             The verdict always has trajectory errors after ``se3`` and ``sim3``, too.
@@ -123,7 +123,7 @@ class EvaluationConfig(NodeConfig):
         image_count: Sample images with features of each estimator; 0 for none.
     """
 
-    alignment: Laid = "auto"
+    alignment: AlignmentSetting = "auto"
     align_first: Annotated[int, msgspec.Meta(ge=1)] | str | None = None
     vehicle: str = ""
     control_rate: Positive = 400
@@ -140,8 +140,8 @@ class EvaluationConfig(NodeConfig):
             raise ValueError(
                 f"align_first: expected a number of poses or a duration: {error}"
             ) from None
-        for name, own in self.estimators.items():
-            for figure in own.thresholds:
+        for name, settings in self.estimators.items():
+            for figure in settings.thresholds:
                 known = [k for k in self.thresholds.__struct_fields__ if not FIGURES[k].of_flight]
                 if figure not in known:
                     raise ValueError(
@@ -160,17 +160,17 @@ class EvaluationConfig(NodeConfig):
             return float(Duration.parse(self.align_first))
         return self.align_first
 
-    def alignment_of(self, estimator: str) -> Laid:
-        """Return how an estimator's poses are laid on the truth."""
-        own = self.estimators.get(estimator)
-        return (own and own.alignment) or self.alignment
+    def alignment_of(self, estimator: str) -> AlignmentSetting:
+        """Return how an estimator's poses are aligned with the truth."""
+        settings = self.estimators.get(estimator)
+        return (settings and settings.alignment) or self.alignment
 
     def own_thresholds(self) -> dict[str, Thresholds]:
         """Return the thresholds of estimators with other ones, those of all included."""
         return {
-            name: msgspec.structs.replace(self.thresholds, **own.thresholds)
-            for name, own in self.estimators.items()
-            if own.thresholds
+            name: msgspec.structs.replace(self.thresholds, **settings.thresholds)
+            for name, settings in self.estimators.items()
+            if settings.thresholds
         }
 
 
@@ -202,7 +202,7 @@ class Evaluation(Node[EvaluationConfig]):
         self._files: dict[str, GrowingFile] = {}
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Note vehicles and their cameras; expect estimators."""
+        """Record vehicles, their cameras, and estimators."""
         self._vehicles.announced(announcement)
         if isinstance(announcement, CameraAnnouncement):
             self._late[announcement.source] = round(announcement.time_offset * 1e9)
@@ -216,14 +216,14 @@ class Evaluation(Node[EvaluationConfig]):
             self._read[announcement.source] = announcement.cameras
 
     def check(self) -> Iterable[str]:
-        """Say if there is no such vehicle as the file names, or nobody to judge."""
+        """Report an unknown vehicle or estimator, and thresholds without an estimator."""
         config = self.config
-        asked = any(t.given() for t in (config.thresholds, *config.own_thresholds().values()))
+        asked = any(t.any_set() for t in (config.thresholds, *config.own_thresholds().values()))
         if asked and not (self._records or self.senders_of(PoseEstimate, TrajectoryEstimate)):
             yield "thresholds: expected an estimator to judge, found none"
         senders = self.senders_of(PoseEstimate, TrajectoryEstimate)
         sources = [*self._records, *senders]
-        # Who announces no estimator, such as a replay, may speak for any.
+        # A sender without announcement, such as a replay, may send for any.
         complete = {node_of(source, senders) for source in self._records} >= set(senders)
         for name in config.estimators if complete else ():
             if name not in sources:
@@ -239,7 +239,7 @@ class Evaluation(Node[EvaluationConfig]):
 
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
-        """Note the truth."""
+        """Record the true pose."""
         known = self._vehicles.names
         if known and event.source not in known and "odometry" not in self.sources:
             return
@@ -252,13 +252,13 @@ class Evaluation(Node[EvaluationConfig]):
 
     @on(PlannedPose, PositionSetpoint)
     def plans(self, event: PlannedPose | PositionSetpoint) -> None:
-        """Note where a pilot means its vehicle to be."""
+        """Record a planned pose or a set-point."""
         vehicle = self._vehicles.of(event.vehicle or event.source)
         self._flights.setdefault(vehicle, Flight()).add_plan(event)
 
     @on(PoseEstimate)
     def estimates(self, event: PoseEstimate) -> None:
-        """Note an estimate, and send its errors as scores."""
+        """Record an estimate, and send its errors as scores."""
         name, now = event.source, self.clock.now()
         record = self._records.setdefault(name, EstimatorRecord())
         if not record.add(event, now):
@@ -281,7 +281,7 @@ class Evaluation(Node[EvaluationConfig]):
     def tracking_events(self, event: TrackingEvent) -> None:
         """Record loss or recovery of an estimator's tracking."""
         record = self._records.setdefault(event.source, EstimatorRecord())
-        record.note(event, self.clock.now())
+        record.add_tracking(event, self.clock.now())
 
     @on(TrajectoryEstimate)
     def trajectories(self, event: TrajectoryEstimate) -> None:
@@ -314,12 +314,12 @@ class Evaluation(Node[EvaluationConfig]):
 
     @on(Command, VehicleEvent)
     def commands(self, event: Command | VehicleEvent) -> None:
-        """Note who commands a vehicle, and what comes of it."""
+        """Record commands to vehicles, and the vehicles' events."""
         self._commands.add(event)
 
     @on(Collision)
     def collisions(self, event: Collision) -> None:
-        """Note a vehicle's collision."""
+        """Record a vehicle's collision."""
         self._flights.setdefault(event.source, Flight()).collisions.append(event)
 
     @on(TrackedFeatures)
@@ -411,7 +411,7 @@ class Evaluation(Node[EvaluationConfig]):
             how,
             declared,
             flights={vehicle: flight for vehicle, flight in flown.items() if vehicle},
-            own=config.own_thresholds(),
+            by_estimator=config.own_thresholds(),
             ended_flights=ended,
         )
         if self.out is not None:

@@ -1,7 +1,7 @@
 """Check of whether an estimate's orientations are those of the truth's body.
 
 Positions alone fix the transform between the frames. What then remains between true and estimated
-orientations, ``D_i = R_i⁻¹ · (R · R̂_i)``, tells what the orientations are:
+orientations, ``D_i = R_i⁻¹ · (R · R̂_i)``, shows what the orientations are:
 
 - the identity, but for errors: those of the truth's body;
 - another constant: those of a body that is turned against the truth's, as FLU against FRD, or a
@@ -30,8 +30,8 @@ Kind = Literal["same", "turned", "truth without", "estimate without", "inverse",
 _EXTENT = (
     0.1  # positions fit if they are off by less than this share of their least relevant extent
 )
-_TURNED = 5.0  # degrees from which a constant turn is told
-_STILL = 2.0  # degrees: rotations below tell nothing
+_TURNED = 5.0  # degrees from which a constant turn is reported
+_STILL = 2.0  # degrees: smaller rotations are ignored
 _ROTATES = 10.0  # degrees that an estimate rotates by, beside a truth that never does
 _LOOSE = 30.0  # degrees of spread from which orientations are none of this body
 _BETTER = 0.25  # share of the spread that a guess has to leave to be right
@@ -96,16 +96,16 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
         estimate: In a frame and a unit of its own.
 
     Returns:
-        `None` if nothing can be told: positions on a line, or positions that do not fit. Of two
+        `None` if undecidable: positions on a line, or positions that do not fit. Of two
         without orientations the truth is named.
 
     Raises:
         ValueError: The stamps of the two differ.
     """
     same_stamps(truth, estimate)
-    true, given = truth.rotations(), estimate.rotations()
+    true, estimated = truth.rotations(), estimate.rotations()
     constant = [float(np.ptp(t.orientations, axis=0).max()) < 1e-9 for t in (truth, estimate)]
-    rotates = [_mean_and_spread(rotations)[1] for rotations in (true, given)]
+    rotates = [_mean_and_spread(rotations)[1] for rotations in (true, estimated)]
     if constant[0] and (constant[1] or rotates[1] > _ROTATES):
         return Orientations(kind="truth without")
     if constant[1]:
@@ -121,13 +121,15 @@ def examine(truth: Trajectory, estimate: Trajectory) -> Orientations | None:
     if residual > _EXTENT * extents[1]:
         return None
     frame = Rotation.from_matrix(matrix)
-    mean, spread = _mean_and_spread(true.inv() * frame * given)
+    mean, spread = _mean_and_spread(true.inv() * frame * estimated)
     degrees = float(np.degrees(mean.magnitude()))
     kind: Kind = "same"
     if spread > _STILL:
         guesses: dict[Kind, list[Rotation]] = {
-            "inverse": [given.inv()],
-            "order": [Rotation.from_quat(np.roll(given.as_quat(), by, axis=1)) for by in (1, -1)],
+            "inverse": [estimated.inv()],
+            "order": [
+                Rotation.from_quat(np.roll(estimated.as_quat(), by, axis=1)) for by in (1, -1)
+            ],
         }
         for name, rotations in guesses.items():
             left = min(_mean_and_spread(true.inv() * frame * guess)[1] for guess in rotations)

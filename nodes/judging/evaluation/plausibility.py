@@ -1,6 +1,6 @@
 """Figures of what an estimator can mean at all: stamps, velocities, covariances, commands.
 
-Errors of positions say nothing of these: poses stamped at their arrival, velocities of zero or
+Errors of positions do not show these: poses stamped at their arrival, velocities of zero or
 covariances filled in by hand come with positions that are right.
 """
 
@@ -105,14 +105,14 @@ def too_large_percent(covariances: Floats, path: float) -> float:
 
 
 class CommandLog:
-    """Commands to vehicles by who sent them, and the vehicles' take-offs and landings."""
+    """Commands to vehicles by sender, and the vehicles' take-offs and landings."""
 
     def __init__(self) -> None:
         self._commands: list[Command] = []
         self._events: list[VehicleEvent] = []
 
     def add(self, event: Command | VehicleEvent) -> None:
-        """Note a command or an event of a vehicle."""
+        """Record a command or an event of a vehicle."""
         if isinstance(event, Command):
             self._commands.append(event)
         elif isinstance(event, TakenOff | Landed | Disarmed):

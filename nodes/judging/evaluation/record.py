@@ -64,7 +64,7 @@ def cover(
     """Return the coverage of a flight by poses.
 
     Lost is no pose for longer than `gap` (ns) although there were images, or by the estimator's own
-    word; a camera slower than `gap` makes nobody lost.
+    word; a camera slower than `gap` causes no loss.
 
     Args:
         planned: Planned end of the flight (ns), if it was ended before: images at their usual rate
@@ -97,9 +97,9 @@ def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
     A pose answers at most one image, the nearest (the earlier of two equally near).
     """
     has_pose = np.zeros(len(frames), np.bool_)
-    own, distance = nearest(frames, poses)
+    rows, distance = nearest(frames, poses)
     period = int(np.median(np.diff(frames))) if len(frames) > 1 else 0
-    has_pose[own[2 * distance <= period]] = True
+    has_pose[rows[2 * distance <= period]] = True
     return has_pose
 
 
@@ -256,7 +256,7 @@ class EstimatorRecord:
         self.final = Trajectory(*poses) if len(event.stamps) else None
         self.final_frame_id = event.frame_id
 
-    def note(self, event: TrackingEvent, now: int) -> None:
+    def add_tracking(self, event: TrackingEvent, now: int) -> None:
         """Record a tracking event; a stamp in the future is counted, and clipped to `now` (ns)."""
         self.future += event.stamp > now + _AHEAD
         self._tracking.append((min(event.stamp, now + _AHEAD), isinstance(event, TrackingLost)))

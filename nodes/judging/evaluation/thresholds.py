@@ -11,7 +11,7 @@ from runtime.figures import FIGURES, Figure, is_off
 
 
 class _Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    def given(self, *, of_flight: bool = False) -> bool:
+    def any_set(self, *, of_flight: bool = False) -> bool:
         """Return whether any threshold of an estimator, or else of a flight, is not its default.
 
         One that switches a default off asks for nothing.

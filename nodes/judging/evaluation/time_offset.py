@@ -28,7 +28,7 @@ _MOST = 4_000_000  # samples of a speed to correlate, at most: eleven hours at 1
 _LEAST_ROWS = 10
 _HOLE = 10  # steps of the denser one beyond which it is not interpolated
 _STEPS = 12  # most steps of the least squares
-_ALIKE = 0.7  # correlation of the speeds from which it tells anything
+_ALIKE = 0.7  # correlation of the speeds from which it is used
 _CHANGES = 0.1  # standard deviation of a speed, in shares of its mean, likewise
 _BETTER = 0.5  # share of the error that is left where an offset makes a difference
 
@@ -84,13 +84,13 @@ def best_time_offset(
     if best is None:
         return None
     without = _fit(truth, estimate, 0.0, with_scale, beside=best[0])
-    if without is None and not anywhere:  # what both offsets have in common tells nothing
+    if without is None and not anywhere:  # the overlap of both offsets is too short
         return None
     return TimeOffset(best[0], math.inf if without is None else without[1], best[1])
 
 
 def _correlated(truth: Trajectory, estimate: Trajectory, start: float) -> float | None:
-    """Return the offset (s) near `start` at which the speeds are most alike, if they tell any."""
+    """Return the offset (s) near `start` at which the speeds are most alike, or `None`."""
     step = max(min(truth.step(), estimate.step()), 10_000_000)
     if max(int(np.ptp(trajectory.stamps)) for trajectory in (truth, estimate)) > _MOST * step:
         return None  # as of stamps in another unit
@@ -165,9 +165,9 @@ def _fit(
         return None
     rows = rows[inside]
     at = interpolated(sparse.stamps, sparse.positions, rows)
-    there = interpolated(dense.stamps, dense.positions, rows + sign * shift)
+    moved = interpolated(dense.stamps, dense.positions, rows + sign * shift)
     speed = interpolated(dense.stamps, dense.velocities(), rows + sign * shift)
-    source, target = (at, there) if sparse is estimate else (there, at)
+    source, target = (at, moved) if sparse is estimate else (moved, at)
     try:
         rotation, translation, scale = umeyama(source, target, with_scale=with_scale)
     except ValueError:

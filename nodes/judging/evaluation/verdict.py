@@ -25,12 +25,13 @@ def conclude(
     end: RunEnd | None = None,
     declared: Collection[str] = (),  # estimators that announced that they read the truth
     flights: Mapping[str, dict[str, Any]] = MappingProxyType({}),
-    own: Mapping[str, Thresholds] = MappingProxyType({}),  # thresholds of single estimators
+    by_estimator: Mapping[str, Thresholds] = MappingProxyType({}),
     ended_flights: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the verdict on figures by estimator, for ``evaluation/verdict.json``.
 
     Args:
+        by_estimator: Thresholds of single estimators.
         ended_flights: Commands by which estimators ended the flight of their vehicle.
         flights: Figures of the flights themselves, by vehicle.
 
@@ -41,8 +42,12 @@ def conclude(
     stopped = ""  # by the user, before the plan was flown
     if end is not None and end.by == "user" and not end.planned:
         stopped = f"the user ended the run before its plan was flown: {end.reason}"
-    absent = {name: {"why": "expected estimates, found none"} for name in own if name not in judged}
-    judged = {**judged, **absent}  # who is asked for something and is not there has failed
+    absent = {
+        name: {"why": "expected estimates, found none"}
+        for name in by_estimator
+        if name not in judged
+    }
+    judged = {**judged, **absent}  # a listed estimator without estimates fails
     estimators = {}
     for name, figures in judged.items():
         of_run = {} if end is None else _of_run(name, figures, end, name in declared)
@@ -50,7 +55,7 @@ def conclude(
         if figures.get("ate_rmse_m") is None:
             failed.append(figures.get("why", "expected estimates, found none"))
         known = {**figures, **of_run}
-        asked = own.get(name, thresholds)
+        asked = by_estimator.get(name, thresholds)
         missed = asked.missed(known) if "coverage_percent" in figures else []
         missed += _no_rotations(figures, asked, missed, in_run=end is not None)
         if end is not None:
@@ -70,7 +75,7 @@ def conclude(
         if of_run.get("reads_truth") == "undeclared":
             failed.append(UNDECLARED)
         failed += faults
-        passed = not failed if failed or asked.given() else None
+        passed = not failed if failed or asked.any_set() else None
         if stopped:
             passed, failed = None, []
             of_run["why"] = stopped
@@ -79,7 +84,7 @@ def conclude(
     for vehicle, figures in flights.items():
         failed = [] if stopped else thresholds.missed(figures, of_flight=True)
         passed = (
-            not failed if failed or (thresholds.given(of_flight=True) and not stopped) else None
+            not failed if failed or (thresholds.any_set(of_flight=True) and not stopped) else None
         )
         flown[vehicle] = {"passed": passed, **figures, "failed": failed}
     verdict = {
@@ -88,9 +93,9 @@ def conclude(
         "flights": flown,
         "thresholds": msgspec.to_builtins(thresholds),
     }
-    if own:
-        verdict["own_thresholds"] = msgspec.to_builtins(own)
-    if not judged and thresholds.given():
+    if by_estimator:
+        verdict["own_thresholds"] = msgspec.to_builtins(by_estimator)
+    if not judged and thresholds.any_set():
         why = "expected an estimator to judge, found none that announced itself or sent a pose"
         verdict |= {"passed": None if stopped else False, "failed": [stopped or why, *faults]}
     return verdict
@@ -122,13 +127,13 @@ def planned_end(end: RunEnd | None) -> int | None:
 def _of_run(name: str, figures: Mapping[str, Any], end: RunEnd, declared: bool) -> dict[str, Any]:
     """Return an estimator's figures from the run's end: early end, restarts, use of the truth."""
     missing: float | None = 0.0
-    if not end.planned:  # of a run that has no planned duration nobody knows how much is missing
+    if not end.planned:  # without a planned duration the missing time is not known
         planned = end.duration
         missing = None if planned is None else max(planned - end.stamp / SECOND, 0.0)
     facts: dict[str, Any] = {"early_end_seconds": missing, "ended_by": end.by or "duration"}
     owner = owner_of(name, end)
     again = end.restarts.get(node_of(owner, end.restarts), 0)
-    if again or "restarts" in figures:  # who restarts in a new frame has it in both
+    if again or "restarts" in figures:  # a restart in a new frame is in both counts
         facts["restarts"] = max(figures.get("restarts", 0), again)
     if declared or node_of(owner, end.truth_readers):
         facts["reads_truth"] = "declared" if declared else "undeclared"
@@ -145,5 +150,5 @@ def owner_of(source: str, end: RunEnd) -> str:
 
 def node_of(source: str, nodes: Iterable[str]) -> str:
     """Return the node of a source: the longest name equal to or above the source; or ""."""
-    own = (n for n in nodes if n and (source == n or source.startswith(f"{n}/")))
-    return max(own, key=len, default="")
+    candidates = (n for n in nodes if n and (source == n or source.startswith(f"{n}/")))
+    return max(candidates, key=len, default="")

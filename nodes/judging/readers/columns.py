@@ -84,7 +84,7 @@ class Column(NamedTuple):
     """What a column holds: "stamp", "rest" (nanoseconds of it), x, qw, vx, pr11, …; or ""."""
 
     kind: str
-    unit: str = ""  # of a stamp or a length, if its name says so: also one that nobody knows
+    unit: str = ""  # of a stamp or a length, if its name has one: also an unknown one
     sure: bool = False  # whether the unit is the user's word
 
 
@@ -96,13 +96,13 @@ POINTS = "with a decimal point, not with a decimal comma"
 
 def column_of(name: str) -> Column:
     """Return what a column holds by its name, with a unit in brackets or without."""
-    given = [_folded(unit).replace(" ", "") for unit in _UNIT.findall(name)]
+    units = [_folded(unit).replace(" ", "") for unit in _UNIT.findall(name)]
     plain = _plain(name)
     if plain in {*ROTATION_COVARIANCE, *POSITION_COVARIANCE}:
         return Column(plain)
     if match := _STAMP.fullmatch(plain):
-        if any(given):
-            return Column("stamp", _unit(given, _STAMP_UNITS))
+        if any(units):
+            return Column("stamp", _unit(units, _STAMP_UNITS))
         named = match["unit"] or match["name"] or ""
         if named in _UNIT_NAMES or match["unit"] is None:
             return Column("stamp", _UNIT_NAMES.get(named, ""))
@@ -110,8 +110,8 @@ def column_of(name: str) -> Column:
         for pattern in patterns:
             if match := pattern.fullmatch(plain):
                 if prefix == "v":
-                    given = [_PER_SECOND.sub("", unit) for unit in given]
-                unit = _unit(given, _LENGTH_UNITS) if prefix != "q" else ""
+                    units = [_PER_SECOND.sub("", unit) for unit in units]
+                unit = _unit(units, _LENGTH_UNITS) if prefix != "q" else ""
                 return Column(prefix + match[1], unit)
     return SKIPPED
 
@@ -126,9 +126,9 @@ def _folded(text: str) -> str:
     return text.casefold().replace("\N{GREEK SMALL LETTER MU}", "u")
 
 
-def _unit(given: Sequence[str], known: dict[str, str]) -> str:
+def _unit(units: Sequence[str], known: dict[str, str]) -> str:
     """Return the unit among texts in brackets: one that is known, else the first text, or ""."""
-    texts = [text for text in given if text]
+    texts = [text for text in units if text]
     return next((known[text] for text in texts if text in known), texts[0] if texts else "")
 
 
@@ -173,8 +173,8 @@ def columns_of(names: Sequence[str]) -> list[Column] | None:
 def _choose_stamp(names: Sequence[str], columns: list[Column]) -> None:
     """Leave one stamp among the columns, a message's own if there is one, or its two parts."""
     stamps = [k for k, column in enumerate(columns) if column.kind == "stamp"]
-    own = [k for k in stamps if "stamp" in _plain(names[k])] or stamps
-    whole, rest = own[0], own[0] + 1
+    candidates = [k for k in stamps if "stamp" in _plain(names[k])] or stamps
+    whole, rest = candidates[0], candidates[0] + 1
     parts = rest in stamps and (columns[whole].unit, columns[rest].unit) == ("s", "ns")
     for k in stamps:
         if k != whole:
@@ -204,7 +204,7 @@ class Layout(NamedTuple):
 
     separator: str | None  # `None` for blanks
     columns: list[Column]
-    unit: str = "s"  # of stamps, if neither their name nor their size says otherwise
+    unit: str = "s"  # of stamps, if neither their name nor their size gives it
     trailing: bool = False  # whether lines end with a separator
 
 

@@ -90,7 +90,7 @@ def _plain(
         separator = separator_of(start)
         count = len(fields_of(start.row, separator))
         if separator and any(len(fields_of(line, separator)) == count for line in start.head):
-            return None  # a header names the columns, with names that nobody knows
+            return None  # a header names the columns, with unknown names
         ends = separator is not None and start.row.rstrip().endswith(separator)
         fitting = (
             layout

@@ -12,21 +12,21 @@ from nodes.judging.readers import AXES, AxesName, Collected, Source, of_body
 from nodes.trajectory import Trajectory
 
 
-def of_memory(name: str, given: Any, axes: AxesName | None, camera: Floats | None = None) -> Source:
+def of_memory(name: str, poses: Any, axes: AxesName | None, camera: Floats | None = None) -> Source:
     """Return the source of a trajectory in memory; `axes` and `camera` as of `read`.
 
     Args:
-        given: A `Trajectory`, or rows as TUM's, whose bad ones are left out and counted as a
+        poses: A `Trajectory`, or rows as TUM's, whose bad ones are left out and counted as a
             file's: seconds, x, y, z in metres, and a quaternion x, y, z, w, shape (n, 8), or
             without the quaternion, (n, 4).
 
     Raises:
         ValueError: It is neither.
     """
-    if isinstance(given, Trajectory):
-        source = Source(name=name, file=name, poses=given)
+    if isinstance(poses, Trajectory):
+        source = Source(name=name, file=name, poses=poses)
     else:
-        rows = np.asarray(given, dtype=np.float64)
+        rows = np.asarray(poses, dtype=np.float64)
         if rows.ndim != 2 or rows.shape[1] not in {4, 8}:
             raise ValueError(
                 f"{name}: expected a file, a Trajectory, or TUM's rows of shape (n, 8), or (n, 4) "

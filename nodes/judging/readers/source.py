@@ -26,7 +26,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
-    """What a reader is told besides the path.
+    """Options of a reader besides the path.
 
     Attributes:
         part: Text after the path and a colon: a bag's topic, a table's vehicle; "" if none.

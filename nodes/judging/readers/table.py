@@ -132,18 +132,18 @@ def read_truth(
 ) -> Source:
     """Read true poses of a file, a topic, or a run's folder; a `ValueError` names the line."""
     path = newest(Path(text))
-    own = path / "trajectories" / "truth.tum"
-    if not own.is_file():
+    truth_file = path / "trajectories" / "truth.tum"
+    if not truth_file.is_file():
         if path.is_dir() and not _is_known(path):
             run_folder(path)  # raises, of a folder that is none
-            own.stat()
+            truth_file.stat()
         source = read(text, axes, times, columns=columns)
         if changes := source.counts.get("restarts"):
             raise ValueError(
                 f"{text}: expected a truth in one frame, found that it changes ({changes} times)"
             )
         return source
-    source = read(str(own), axes or "ned", times, columns=columns)
+    source = read(str(truth_file), axes or "ned", times, columns=columns)
     return msgspec.structs.replace(source, frame_id="map", file=text)
 
 

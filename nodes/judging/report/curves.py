@@ -232,8 +232,12 @@ def draw_relative(run: Run) -> Plot | None:
     axes: Any = figure.subplots(1, 2)
     for row, axis in enumerate(axes):
         for estimator in dict.fromkeys(estimator for estimator, *_ in boxes):
-            own = [box for box in boxes if box[0] is estimator]
-            _boxes(axis, estimator, [(where, width, v[row]) for _, where, width, _, v in own])
+            estimator_boxes = [box for box in boxes if box[0] is estimator]
+            _boxes(
+                axis,
+                estimator,
+                [(where, width, v[row]) for _, where, width, _, v in estimator_boxes],
+            )
         scale_axis(axis, [values[row] for *_, values in boxes], "y", 95)
         axis.set_xticks(range(len(LENGTHS)), [f"{length:g}" for length in LENGTHS])
         axis.set(xlabel="length of path (m)", xlim=(-0.6, len(LENGTHS) - 0.4))

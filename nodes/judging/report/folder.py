@@ -139,8 +139,8 @@ class _Reader:
     ) -> list[Estimator]:
         figures = {} if verdict is None else verdict.estimators
         files = {source_file(name): name for name in figures}
-        there = {p.stem for p in (self.folder / "trajectories").glob("*.tum")}
-        sent = {name for name in there if name.partition(".")[0] not in _NO_ESTIMATES}
+        stems = {p.stem for p in (self.folder / "trajectories").glob("*.tum")}
+        sent = {name for name in stems if name.partition(".")[0] not in _NO_ESTIMATES}
         files |= {file: source_of(file) for file in sorted(sent - set(files))}
         if not files:
             self.missing.append("no estimator has sent anything, and none was judged")
@@ -194,7 +194,7 @@ class _Reader:
         )
 
     def _try(self, name: str, read: Callable[[Path], T], without: str = "") -> T | None:
-        """Read a file or return `None`; note in `missing` if invalid, or expected but absent."""
+        """Read a file or return `None`; add to `missing` if invalid, or expected but absent."""
         path = self.folder / name
         if not path.is_file():
             if without:

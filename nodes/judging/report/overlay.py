@@ -132,10 +132,10 @@ class Curve(msgspec.Struct, frozen=True, eq=False):
 def curves_of(folders: Sequence[Path], estimators: Sequence[str] = ()) -> list[Curve]:
     """Read runs; return their judged estimators, or those of the given names.
 
-    A name is that of the run, of the estimator, or of both: as much as tells them apart.
+    A name is that of the run, of the estimator, or of both: the shortest unique one.
 
     Raises:
-        ResultsError: A folder is no run's, or nobody was judged in it.
+        ResultsError: A folder is no run's, or has no judged estimator.
         CommandError: No run has an estimator of a given name.
     """
     ends = Counter(folder.name for folder in folders)
@@ -405,6 +405,6 @@ def plot(
 
 
 def _only_of_runs(panel: Sequence[str] | None, estimator: Sequence[str] | None) -> None:
-    for name, given in (("--panel", panel), ("--estimator", estimator)):
-        if given:
+    for name, value in (("--panel", panel), ("--estimator", estimator)):
+        if value:
             raise CommandError(f"{name}: expected runs, found a folder of which all is plotted")

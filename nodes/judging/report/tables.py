@@ -150,7 +150,10 @@ def figures(run: Run, *, main: bool) -> list[Row]:
         values = [e.figures.get(row.name) for e in run.estimators]
         limit = asked.get(row.name)
         why = [e.figures.get("failed") or () for e in run.estimators]
-        missed = [any(str(sentence).startswith(f"{row.name}: ") for sentence in own) for own in why]
+        missed = [
+            any(str(sentence).startswith(f"{row.name}: ") for sentence in sentences)
+            for sentences in why
+        ]
         known = any(value is not None for value in values)
         if known or any(missed) or (limit is not None and not row.optional):
             cells = list(zip(map(show, values), missed, strict=True))
@@ -425,7 +428,7 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def wide_range(values: list[Floats], share: float = 95.0) -> bool:
-    """Tell whether series need a logarithmic axis: percentiles (`share`) differ over 20-fold."""
+    """Return whether series need a logarithmic axis: percentiles (`share`) differ over 20-fold."""
     tops = [top for v in values if len(v) and (top := float(np.nanpercentile(v, share))) > 0.0]
     return len(tops) > 1 and max(tops) > 20.0 * min(tops)
 
@@ -437,7 +440,7 @@ def legend_columns(names: Sequence[str]) -> int:
 
 
 def legend_above(figure: Figure, axes: Any, *extra: Artist) -> None:
-    """Put the legend of some axes, and of further artists, at the top of a figure."""
+    """Draw the legend of some axes, and of further artists, at the top of a figure."""
     handles, names = axes.get_legend_handles_labels()
     handles, names = [*handles, *extra], [*names, *(str(artist.get_label()) for artist in extra)]
     if handles:

@@ -111,7 +111,7 @@ def test_intervals_that_touch_or_overlap_are_one() -> None:
 def test_stamps_are_of_the_future_from_a_millisecond_on(ahead: int, future: int) -> None:
     record = EstimatorRecord()
     assert record.add(estimate(SECOND + ahead), SECOND) is (not future)
-    record.note(TrackingLost(stamp=2 * SECOND + ahead, source="est", reason=""), 2 * SECOND)
+    record.add_tracking(TrackingLost(stamp=2 * SECOND + ahead, source="est", reason=""), 2 * SECOND)
     assert record.future == 2 * future
     assert record.reported_lost(3 * SECOND) == [(2 * SECOND + MS, 3 * SECOND)]
 

@@ -203,9 +203,9 @@ def test_defaults_count_only_where_there_is_a_figure() -> None:
 
 def test_a_default_that_is_switched_off_asks_for_nothing() -> None:
     off = Thresholds(rot_rmse_deg=math.inf, coverage_percent=math.inf)
-    assert not off.given()
+    assert not off.any_set()
     assert not off.missed({"compared_percent": 100.0})
-    assert Thresholds(rot_rmse_deg=14.0).given()
+    assert Thresholds(rot_rmse_deg=14.0).any_set()
     assert is_off(-math.inf)
     assert not is_off(None)
 

@@ -39,7 +39,7 @@ def test_a_file_may_have_infinite_thresholds(tmp_path: Path) -> None:
     assert config.thresholds.repeated_stamps == math.inf  # type: ignore[attr-defined]
     own = config.own_thresholds()["odometry"]
     assert own.frame_coverage_percent == math.inf  # type: ignore[attr-defined]
-    assert not config.thresholds.given()
+    assert not config.thresholds.any_set()
     for wrong, expected in (
         ("thresholds = { ate_percent = nan }", "expected a finite number"),
         ("gap = inf", "expected a finite number"),
@@ -66,4 +66,4 @@ def test_infinite_thresholds_turn_defaults_off() -> None:
     assert names <= {text.partition(":")[0] for text in asked.missed(figures)}
     off = Thresholds(ate_percent=math.inf, **dict.fromkeys(names, math.inf))
     assert not names & {text.partition(":")[0] for text in off.missed(figures)}
-    assert not off.given()
+    assert not off.any_set()

@@ -87,7 +87,7 @@ def test_a_row_of_a_verdict(
 
 def test_who_is_asked_for_something_and_is_not_there_has_a_row_that_says_so() -> None:
     asked = {"mono": Thresholds(ate_percent=5.0)}
-    row = conclude({}, Thresholds(), own=asked)["estimators"]["mono"]
+    row = conclude({}, Thresholds(), by_estimator=asked)["estimators"]["mono"]
     why = "expected estimates, found none"
     assert row == {"passed": False, "why": why, "failed": [why]}
 

@@ -203,9 +203,9 @@ def test_a_reported_loss_is_charged_only_where_there_is_no_pose() -> None:
     def says_so(keeps_on: bool) -> Say:
         def say(record: EstimatorRecord, stamp: int, share: float) -> None:
             if stamp == 5 * SECOND:
-                record.note(lost(stamp), stamp)
+                record.add_tracking(lost(stamp), stamp)
             if stamp == 7 * SECOND:
-                record.note(regained(stamp), stamp)
+                record.add_tracking(regained(stamp), stamp)
             if keeps_on or not 5 * SECOND < stamp < 7 * SECOND:
                 drifts(0)(record, stamp, share)
 

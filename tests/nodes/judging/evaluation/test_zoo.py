@@ -75,7 +75,7 @@ def judged(animal: Animal) -> dict[str, Any]:
         if isinstance(event, PoseEstimate):
             record.add(event, now)
         elif isinstance(event, TrackingEvent):
-            record.note(event, now)
+            record.add_tracking(event, now)
         elif isinstance(event, TrajectoryEstimate):
             record.add_final(event)
     stop = animal.end.stamp
@@ -281,11 +281,11 @@ def test_an_estimator_may_have_thresholds_of_its_own() -> None:
     figures = judged(next(iter(GOOD.values()))) | {"ate_percent": 3.0}
     judged_figures = dict.fromkeys(("vo", "mono"), figures)
     limits = Thresholds(ate_percent=1.0)
-    verdict = conclude(judged_figures, limits, own={"mono": Thresholds(ate_percent=5.0)})
+    verdict = conclude(judged_figures, limits, by_estimator={"mono": Thresholds(ate_percent=5.0)})
     assert verdict["estimators"]["mono"]["passed"] is True
     assert verdict["estimators"]["vo"]["failed"] == ["ate_percent: expected at most 1, found 3"]
     assert verdict["own_thresholds"]["mono"]["ate_percent"] == 5.0
     for there in ({}, {"vo": figures | {"ate_percent": 0.5}}):  # and it has to be there
-        verdict = conclude(there, limits, own={"mono": Thresholds(ate_percent=5.0)})
+        verdict = conclude(there, limits, by_estimator={"mono": Thresholds(ate_percent=5.0)})
         assert verdict["passed"] is verdict["estimators"]["mono"]["passed"] is False
         assert verdict["estimators"]["mono"]["failed"] == ["expected estimates, found none"]

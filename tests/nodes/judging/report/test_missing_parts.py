@@ -140,8 +140,8 @@ def test_lost_time_that_the_gaps_do_not_tell_of_is_said(tmp_path: Path) -> None:
     """An estimator may say that it is lost and go on saying poses."""
     truth = walk(8)
     record = recorded(truth)
-    record.note(TrackingLost(stamp=2 * SECOND, source="vo", reason="dark"), 2 * SECOND)
-    record.note(TrackingRegained(stamp=5 * SECOND, source="vo"), 5 * SECOND)
+    record.add_tracking(TrackingLost(stamp=2 * SECOND, source="vo", reason="dark"), 2 * SECOND)
+    record.add_tracking(TrackingRegained(stamp=5 * SECOND, source="vo"), 5 * SECOND)
     evaluated(tmp_path, truth, {"vo": record}, Thresholds())
     (tmp_path / "evaluation" / "vo.lost.csv").unlink()
     missing = read_run(tmp_path).missing
