@@ -216,7 +216,7 @@ class Slot:
         self._matcher = matcher
         self._source: str | None = None
 
-    def take(self, event: Event) -> None:
+    def add(self, event: Event) -> None:
         """Keep an event, and deliver the sets completed by its arrival.
 
         Of two sources of which one is below the other (``drone/front/grey``), the upper one counts.
@@ -233,7 +233,7 @@ class Slot:
             self.pop()
 
     def is_full(self) -> bool:
-        """Tell whether there is no room for another event."""
+        """Return whether there is no room for another event."""
         count = len(self.events)
         return count >= self._most or (self._bytes >= WAITING_BYTES and count > 1)
 

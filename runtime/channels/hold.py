@@ -294,7 +294,7 @@ class Hold(Generic[T]):
             self._began = self._last_answer = None
 
     def fail(self, error: Exception) -> None:
-        """Raise an error in whoever waits for an answer, and with the next frame."""
+        """Raise an error in all tasks that await an answer, and with the next frame."""
         with self._lock:
             self._fail(error)
 

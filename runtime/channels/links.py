@@ -74,7 +74,7 @@ class Link:
         return self.offer
 
     def close(self) -> None:
-        """Deliver nothing any more: the far end is gone."""
+        """Stop delivering events: the receiver is gone."""
         self._deliver = None
 
     def offer(self, event: Any) -> bool:

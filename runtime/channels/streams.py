@@ -64,7 +64,7 @@ class Stream(Generic[T]):
     """
 
     __slots__ = (
-        "_buffer", "_closed", "_room", "_seen", "_taken", "before", "bound", "dropped", "merge",
+        "_buffer", "_closed", "_read", "_room", "_seen", "before", "bound", "dropped", "merge",
         "name", "offer", "overflow", "peak", "prepare", "soon", "waiter",
     )  # fmt: skip
 
@@ -84,7 +84,7 @@ class Stream(Generic[T]):
         self.before: Callable[[], Awaitable[object]] | None = None
         self.prepare: Callable[[T], Awaitable[T]] | None = None
         self.waiter: Waiter | None = None  # set by the task that a reader yielded this stream to
-        self._taken = 0
+        self._read = 0
         self._seen: T | None = None
         self._room: asyncio.Event | None = None
         self._closed = False
@@ -99,9 +99,9 @@ class Stream(Generic[T]):
         """Return the next event, waiting if necessary; stop when closed and empty."""
         buffer = self._buffer
         if buffer:
-            self._taken += 1
-            if self._taken == TURN:  # a reader that never runs dry must not keep the loop
-                self._taken = 0
+            self._read += 1
+            if self._read == TURN:  # a reader that never runs dry must not keep the loop
+                self._read = 0
                 yield
         while not buffer:
             if self._closed:
@@ -120,9 +120,9 @@ class Stream(Generic[T]):
     def _next_by_future(self) -> Generator[Any, Any, T]:
         """Wait as `__anext__` does, but on a future: for tasks accepting nothing else."""
         if self._buffer:
-            self._taken += 1
-            if self._taken == TURN:
-                self._taken = 0
+            self._read += 1
+            if self._read == TURN:
+                self._read = 0
                 yield
         while not self._buffer:
             if self._closed:

@@ -27,7 +27,7 @@ DEPTH_LIMIT = 32
 stack, nor keep the loop to itself."""
 
 Fault = Callable[[Callable[[Any], Any], BaseException], None]
-"""Called with a failed listener and its exception; the delivery then goes on."""
+"""Called with a failed listener and its exception; the delivery then continues."""
 
 _NOTHING: Any = object()
 
@@ -121,7 +121,7 @@ class ResumableCoroutine(Coroutine[Any, Any, Any]):
         FanOut((_WakeUp(self),)).send(None)  # not the stream: another reader may wait there now
 
     def leave_stream(self) -> None:
-        """Be resumed by no stream any more: the task is being cancelled."""
+        """Detach from the stream: the task is being cancelled."""
         if self._later is not None:
             self._later.cancel()
             self._later = None

@@ -209,7 +209,7 @@ class Digest:
                 f"found {error}; or run without one, digest = false under [run]"
             ) from None
         if len(pending) > _CHUNK:  # one call of the hash for many small events
-            output.take_in()
+            output.hash_pending()
 
     @staticmethod
     def name_of(sender: Sender[Any] | None, event: Event) -> str:
@@ -247,12 +247,12 @@ class _Output:
         self.hash = xxhash.xxh3_128()
         self.pending = bytearray()
 
-    def take_in(self) -> None:
+    def hash_pending(self) -> None:
         self.hash.update(self.pending)
         self.pending.clear()
 
     def hexdigest(self) -> str:
-        self.take_in()
+        self.hash_pending()
         digest: str = self.hash.hexdigest()
         return digest
 

@@ -74,7 +74,7 @@ def listeners(
             for field, slot in matcher.slots.items():
                 port = f"{name}.{field}"
                 of_all = None if slot.kind == "all" else sources.get(name, declared.source)
-                add(port, slot.take, (declared.fields[field].event,), sources.get(port, of_all))
+                add(port, slot.add, (declared.fields[field].event,), sources.get(port, of_all))
         else:
             input_, stream = node.declared.inputs[name], getattr(node, name)
             source = sources.get(name, input_.source)

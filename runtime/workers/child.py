@@ -147,8 +147,8 @@ def _answer(pipe: SharedPipe, succeeded: bool, result: Any, wall: int, cpu: int)
 
 def _portable(error: BaseException) -> PortableError:
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
-    own = [f for f in frames if not f.filename.startswith(_LIBRARIES)] or frames
-    place = f"{own[-1].filename}:{own[-1].lineno} in {own[-1].name}" if own else ""
+    frames = [f for f in frames if not f.filename.startswith(_LIBRARIES)] or frames
+    place = f"{frames[-1].filename}:{frames[-1].lineno} in {frames[-1].name}" if frames else ""
     return PortableError.of(error, place)
 
 

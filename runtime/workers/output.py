@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 _LONGEST = 4096  # bytes of a line at most; a longer line is cut into several
-_KEPT = 20  # last lines reported of an ended process
+_REPORTED = 20  # last lines reported of an ended process
 LINES = 100  # lines handed on per real second of a process; lines beyond are only counted
 
 # A lone carriage return, as of a progress bar, ends a line, too; the next byte may be its "\n".
@@ -39,7 +39,7 @@ def plain_lines(data: bytes | bytearray) -> Iterable[str]:
 
 
 class Throttle:
-    """Hands on lines from any thread, `LINES` a second at most, and then their number."""
+    """Prints lines from any thread, `LINES` a second at most, and the number of the rest."""
 
     def __init__(
         self, printed: Callable[[str], None], now: Callable[[], float] = time.monotonic
@@ -49,17 +49,17 @@ class Throttle:
         self._second, self._shown = 0, 0
 
     def __call__(self, line: str) -> None:
-        """Hand a line on, unless there were too many within a second."""
+        """Print a line, unless there were too many within a second."""
         with self._lock:
             if (second := int(self._now())) != self._second:
-                self._say_how_many_more()
+                self._print_omitted()
                 self._second, self._shown = second, 0
             self._shown += 1
             if self._shown <= LINES:
                 self._printed(line)
 
-    def take(self, text: bytes | bytearray) -> None:
-        """Hand the lines of a text on; beyond the limit only count, at little cost."""
+    def add(self, text: bytes | bytearray) -> None:
+        """Print the lines of a text; beyond the limit only count them, at little cost."""
         with self._lock:
             if self._shown > LINES and int(self._now()) == self._second:
                 self._shown += text.count(b"\n") + 1
@@ -68,12 +68,12 @@ class Throttle:
             self(line)
 
     def end(self) -> None:
-        """Say how many lines were left out at last."""
+        """Print how many lines were left out at last."""
         with self._lock:
-            self._say_how_many_more()
+            self._print_omitted()
             self._shown = 0
 
-    def _say_how_many_more(self) -> None:
+    def _print_omitted(self) -> None:
         if self._shown > LINES:
             self._printed(f"({self._shown - LINES} more lines)")
 
@@ -84,22 +84,22 @@ class Output:
     def __init__(self, printed: Callable[[str], None]) -> None:
         self._printed = printed
         self._begun = b""
-        self._last: collections.deque[str] = collections.deque(maxlen=_KEPT)
+        self._last: collections.deque[str] = collections.deque(maxlen=_REPORTED)
 
-    def take(self, data: bytes) -> None:
-        """Take bytes read from the process."""
+    def add(self, data: bytes) -> None:
+        """Add bytes read from the process."""
         *lines, begun = _LINE_END.split(self._begun + data)
         while len(begun.removesuffix(b"\r")) > _LONGEST:
             lines.append(begun[:_LONGEST])
             begun = begun[_LONGEST:]
         self._begun = begun
         for line in lines:
-            self._take_line(line)
+            self._add_line(line)
 
     def end(self) -> None:
-        """Take the unfinished last line."""
+        """Add the unfinished last line."""
         if self._begun:
-            self._take_line(self._begun)
+            self._add_line(self._begun)
             self._begun = b""
 
     def story(self, what: str) -> str:
@@ -108,7 +108,7 @@ class Output:
             return f"{what}; it said nothing"
         return f"{what}; its last output:\n" + "\n".join(self._last)
 
-    def _take_line(self, line: bytes) -> None:
+    def _add_line(self, line: bytes) -> None:
         for text in plain_lines(line):
             self._last.append(text)
             self._printed(text)

@@ -59,11 +59,11 @@ class Arena:
         self._fd = fd
         self._limit = limit
         self._map: mmap.mmap | None = None
-        self._taken: dict[int, int] = {}  # offset: size
+        self._reserved: dict[int, int] = {}  # offset: size
         self._holes: list[tuple[int, int]] = []  # offset and size, by offset; no two touch
         self._top = 0  # where the last block ends
 
-    def put(self, data: memoryview) -> int | None:
+    def store(self, data: memoryview) -> int | None:
         """Copy `data` (contiguous bytes) into a block and return its offset; `None` if full."""
         offset = self.reserve(data.nbytes)
         if offset is not None:
@@ -71,7 +71,7 @@ class Arena:
         return offset
 
     def reserve(self, size: int) -> int | None:
-        """Take a block of at least `size` bytes and return its offset; `None` if full."""
+        """Reserve a block of at least `size` bytes and return its offset; `None` if full."""
         size = max(-(-size // mmap.PAGESIZE), 1) * mmap.PAGESIZE
         for index, (offset, room) in enumerate(self._holes):
             if room >= size:
@@ -83,7 +83,7 @@ class Arena:
                 return None
             self._reach(offset + size)
             self._top = offset + size
-        self._taken[offset] = size
+        self._reserved[offset] = size
         return offset
 
     def view(self, offset: int, size: int) -> memoryview:
@@ -92,8 +92,8 @@ class Arena:
         return memoryview(self._map)[offset : offset + size]
 
     def free(self, offset: int) -> None:
-        """Let a block be used again; where none begins, nothing happens."""
-        size = self._taken.pop(offset, 0)
+        """Free a block; where none begins, nothing happens."""
+        size = self._reserved.pop(offset, 0)
         if not size:
             return
         index = bisect.bisect(self._holes, (offset, 0))
@@ -129,8 +129,8 @@ class MappedFile:
         self.freed: collections.deque[int] = collections.deque()
         """Offsets of blocks no longer read; appended to from any thread."""
 
-    def take_freed(self) -> tuple[int, ...]:
-        """Return the blocks no longer read, each once."""
+    def pop_freed(self) -> tuple[int, ...]:
+        """Remove and return the offsets of the blocks no longer read."""
         return tuple(self.freed.popleft() for _ in range(len(self.freed)))
 
     def view(self, offset: int, size: int) -> Any:
@@ -175,7 +175,7 @@ class SharedPipe:
         self._connection.sendall(packed)
 
     def pack(self, message: Any) -> bytes:
-        """Put an object's arrays into shared memory, and return the message to send."""
+        """Copy an object's arrays into shared memory, and return the message to send."""
         while self._returned:
             self._arena.free(self._returned.popleft())
         spans: list[tuple[int, int]] = []
@@ -183,7 +183,7 @@ class SharedPipe:
         def place(buffer: pickle.PickleBuffer) -> bool:
             """Tell pickle (by True) to keep a buffer inside the message."""
             raw = buffer.raw()
-            if raw.nbytes < INLINE or (offset := self._arena.put(raw)) is None:
+            if raw.nbytes < INLINE or (offset := self._arena.store(raw)) is None:
                 return True
             spans.append((offset, raw.nbytes))
             return False
@@ -194,7 +194,7 @@ class SharedPipe:
             for offset, _ in spans:
                 self._arena.free(offset)
             raise
-        frame = pickle.dumps((self._window.take_freed(), spans, body))
+        frame = pickle.dumps((self._window.pop_freed(), spans, body))
         return _LENGTH.pack(len(frame)) + frame
 
     def post(self, packed: bytes) -> None:

@@ -403,7 +403,7 @@ class _Process:
                 read = os.read(output.fileno(), 1 << 16)
                 if not read:
                     break
-                self._lines.take(read)
+                self._lines.add(read)
         self._lines.end()
 
     def close(self) -> None:

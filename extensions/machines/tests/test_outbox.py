@@ -66,7 +66,7 @@ def test_a_frame_stays_until_its_last_array_is_gone_and_then_its_place_is_used_a
     assert (part == 1).all()
     del part
     assert len(incoming.freed) == 1
-    outgoing.freed.extend(incoming.take_freed())
+    outgoing.freed.extend(incoming.pop_freed())
     assert not incoming.freed
     assert put(outgoing, sample_image(9)) == place
 

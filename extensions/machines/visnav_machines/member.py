@@ -140,7 +140,7 @@ class Member:
         self._arrived += count
         unread = 0 if self.incoming is None else len(self.incoming.freed)
         if self._arrived >= ACK_EVERY or unread >= FREE_EVERY:
-            freed = () if self.incoming is None else self.incoming.take_freed()
+            freed = () if self.incoming is None else self.incoming.pop_freed()
             self.outbox.send(messages.Ack(self._arrived, freed))
             self._arrived = 0
 
@@ -410,7 +410,7 @@ class Outgoing:
         self._arena = Arena(self._fd, LIMIT)
         weakref.finalize(self, self._arena.close)
         self._key = secrets.token_bytes(KEY)
-        self._arena.put(memoryview(self._key))
+        self._arena.store(memoryview(self._key))
         self.freed: deque[int] = deque()
 
     def offer(self) -> messages.MemoryOffer:

@@ -278,7 +278,7 @@ class Process(Estimator[ProcessConfig]):
             slots=slots,
             slot_bytes=pixels * sum(KINDS[kind][1] for kind in config.images),
             gone=self._disconnected,
-            logged=self._show.take,
+            logged=self._show.add,
             orders=config.pilot,
         )
 
@@ -309,7 +309,7 @@ class Process(Estimator[ProcessConfig]):
         """Put the images of an exposure together; once all are there, they are sent."""
         slot = self._slots.get((event.source, type(event)))
         if slot is not None:
-            slot.take(event)
+            slot.add(event)
 
     def _send(self, images: tuple[Image | DepthImage, ...]) -> None:
         """Send an exposure."""

@@ -161,7 +161,7 @@ class Program:
         data = b""
         with contextlib.suppress(OSError):  # a terminal that nobody writes to any more
             data = os.read(output, _AT_ONCE)
-        self._output.take(data)
+        self._output.add(data)
         return bool(data)
 
     def _report_end(self, output: int, exit_code: str) -> None:

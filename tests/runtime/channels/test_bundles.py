@@ -163,7 +163,7 @@ def test_of_a_source_and_one_below_it_the_upper_counts() -> None:
     both = sorted(below + at(A, 1, 2, 3) + at(B, 1, 2, 3), key=lambda e: e.stamp)
     matcher: Matcher[Two] = Reader.sets.make("n")
     for event in both:
-        matcher.slots["a" if isinstance(event, A) else "b"].take(event)
+        matcher.slots["a" if isinstance(event, A) else "b"].add(event)
     got = []
     while matcher.statistics().buffered:
         got.append(matcher.receive_nowait())
@@ -181,7 +181,7 @@ def test_the_file_narrows_a_bundle_and_its_fields() -> None:
 def test_events_without_partners_do_not_pile_up() -> None:
     matcher = Reader.sets.make("n")
     for index in range(3 * HISTORY):
-        matcher.slots["a"].take(A(stamp=index, source="x"))
+        matcher.slots["a"].add(A(stamp=index, source="x"))
     assert len(matcher.slots["a"].events) < HISTORY
     assert matcher.missed["b"] > HISTORY
 
@@ -197,7 +197,7 @@ def test_each_common_stamp_gives_one_set_however_the_two_are_interleaved(
     order = random.Random(seed)
     while left["a"] or left["b"]:
         field = order.choice([name for name, rest in left.items() if rest])
-        matcher.slots[field].take(kinds[field](stamp=left[field].pop(0), source="x"))
+        matcher.slots[field].add(kinds[field](stamp=left[field].pop(0), source="x"))
     got = []
     while matcher.statistics().buffered:
         got.append(matcher.receive_nowait())
@@ -299,7 +299,7 @@ def test_each_event_of_a_tuple_is_read_once_whatever_is_lost_or_skipped(
     kinds: dict[str, type[Event]] = {"a": A, "b": B, "c": C}
     got: list[Four] = []
     for stamp, kind in events:
-        matcher.slots[kind].take(kinds[kind](stamp=stamp, source="x"))
+        matcher.slots[kind].add(kinds[kind](stamp=stamp, source="x"))
         if matcher.statistics().buffered and data.draw(st.booleans()):
             got.append(matcher.receive_nowait())
     while matcher.statistics().buffered:
@@ -327,18 +327,18 @@ def test_what_waits_is_bounded_in_bytes() -> None:
     array = np.broadcast_to(np.uint8(0), (1 << 20, 10))  # of no memory: 10 MiB
     for index in range(30):
         for field in ("heavy", "also"):
-            matcher.slots[field].take(Heavy(stamp=index, source="x", data=array))
+            matcher.slots[field].add(Heavy(stamp=index, source="x", data=array))
     most = WAITING_BYTES // array.nbytes + 1
     assert 1 <= len(matcher.slots["heavy"].events) <= most
     assert 1 <= len(matcher.slots["also"].events) <= most
     assert matcher.missed["b"] == 30 - len(matcher.slots["heavy"].events)
-    matcher.slots["b"].take(B(stamp=29, source="x"))
+    matcher.slots["b"].add(B(stamp=29, source="x"))
     assert matcher.receive_nowait().heavy.stamp == 29
 
 
 def test_an_event_larger_than_all_that_may_wait_finds_its_partners() -> None:
     matcher: Matcher[Pair] = Bundle(Pair).make("n")
     array = np.broadcast_to(np.uint8(0), (WAITING_BYTES, 2))
-    matcher.slots["heavy"].take(Heavy(stamp=1, source="x", data=array))
-    matcher.slots["b"].take(B(stamp=1, source="x"))
+    matcher.slots["heavy"].add(Heavy(stamp=1, source="x", data=array))
+    matcher.slots["b"].add(B(stamp=1, source="x"))
     assert matcher.receive_nowait().heavy.stamp == 1

@@ -240,7 +240,7 @@ def test_what_controls_a_terminal_is_left_out(printed: bytes, lines: list[str]) 
     logged: list[str] = []
     output = Output(logged.append)
     for byte in printed:
-        output.take(bytes([byte]))
+        output.add(bytes([byte]))
     output.end()
     assert logged == lines
     assert [*plain_lines(printed.removesuffix(b"\n"))] == lines
@@ -252,7 +252,7 @@ def test_lines_are_the_same_however_they_arrive(pieces: list[bytes]) -> None:
         logged: list[str] = []
         output = Output(logged.append)
         for piece in pieces:
-            output.take(piece)
+            output.add(piece)
         output.end()
         return logged
 
@@ -263,7 +263,7 @@ def test_lines_are_the_same_however_they_arrive(pieces: list[bytes]) -> None:
 def test_what_controls_no_terminal_is_told_as_it_is(lines: list[str]) -> None:
     logged: list[str] = []
     output = Output(logged.append)
-    output.take("".join(f"{line}\n" for line in lines).encode())
+    output.add("".join(f"{line}\n" for line in lines).encode())
     assert logged == [line.rstrip() for line in lines]
 
 
@@ -272,7 +272,7 @@ def test_a_line_without_end_takes_no_more_memory_than_a_long_one() -> None:
     logged: list[str] = []
     output = Output(logged.append)
     for _ in range(1000):
-        output.take(b"x" * 65536)
+        output.add(b"x" * 65536)
     assert len(output._begun) <= 4096
     assert {len(line) for line in logged} == {4096}
 
