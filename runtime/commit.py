@@ -9,7 +9,7 @@ import os
 import subprocess
 from pathlib import Path
 
-NOTE = Path(__file__).with_name("commit.txt")
+RECORD = Path(__file__).with_name("commit.txt")
 """Written by the build (`tools/wheel.py`) beside this file; a checkout has none."""
 
 
@@ -19,16 +19,16 @@ def commit() -> str:
     The folder in which a command is called plays no part. Empty if nothing is known.
     """
     revision = of_repository(Path(__file__))
-    if not revision and NOTE.is_file():
-        revision = NOTE.read_text(encoding="ascii", errors="replace").strip()
+    if not revision and RECORD.is_file():
+        revision = RECORD.read_text(encoding="ascii", errors="replace").strip()
     return revision
 
 
-def write_note(folder: Path) -> None:
-    """Write the commit beside a copy of this file; of an unpacked archive, the archive's note."""
+def write_commit(folder: Path) -> None:
+    """Write the commit beside a copy of this file; of an unpacked archive, that archive's."""
     if revision := commit():
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / NOTE.name).write_text(f"{revision}\n", encoding="ascii")
+        (folder / RECORD.name).write_text(f"{revision}\n", encoding="ascii")
 
 
 def of_repository(file: Path) -> str:

@@ -51,7 +51,7 @@ def not_utf8(path: str | Path) -> str:
     return ""
 
 
-class GivenHere(str):
+class CommandLineText(str):
     """Text from the command line; as a path, relative to the working directory."""
 
     __slots__ = ()
@@ -69,7 +69,7 @@ def resolve(table: Any, type_: Any, folder: Path) -> Any:
         path = Path(text)
         if kind == "name" and "/" not in text and not path.suffix:
             return text
-        base = Path.cwd() if isinstance(text, GivenHere) else folder
+        base = Path.cwd() if isinstance(text, CommandLineText) else folder
         return str(base / path.expanduser())
 
     return unmarked(_walk(table, type_, absolute))
@@ -81,7 +81,7 @@ def unmarked(value: Any) -> Any:
         return {key: unmarked(inner) for key, inner in value.items()}
     if isinstance(value, list):
         return [unmarked(inner) for inner in value]
-    return str(value) if isinstance(value, GivenHere) else value
+    return str(value) if isinstance(value, CommandLineText) else value
 
 
 def file_names(table: Any, type_: Any) -> Any:
@@ -104,12 +104,12 @@ def inputs(config: msgspec.Struct) -> Iterator[str]:
 def _of_kinds(config: msgspec.Struct, kinds: Container[Kind]) -> Iterator[str]:
     texts: list[str] = []
 
-    def note(kind: Kind, text: str) -> str:
+    def collect(kind: Kind, text: str) -> str:
         if kind in kinds and text:
             texts.append(text)
         return text
 
-    _walk(msgspec.to_builtins(config, enc_hook=plain), type(config), note)
+    _walk(msgspec.to_builtins(config, enc_hook=plain), type(config), collect)
     yield from texts
 
 

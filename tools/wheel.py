@@ -17,14 +17,14 @@ INSIDE = "runtime/tools/example_files"
 
 
 def write_commit(tree: Path) -> None:
-    """Note the commit in a tree of packages; ours need not be importable."""
+    """Write the commit into a tree of packages; ours need not be importable."""
     path = ROOT / "runtime" / "commit.py"
     spec = importlib.util.spec_from_file_location("commit", path)
     assert spec is not None
     assert spec.loader is not None
     module: Any = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    module.write_note(tree / "runtime")
+    module.write_commit(tree / "runtime")
 
 
 class ArchiveWithCommit(sdist):

@@ -104,7 +104,7 @@ def judge(
 
     from nodes.judging import judged, judgement, mounting, readers
     from nodes.judging.readers.stamps import read_stamps
-    from runtime.config.overrides import given
+    from runtime.config.overrides import parse_value
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
     from runtime.tools.cli.brief import print_typeset, print_verdict, verdict_table
@@ -125,7 +125,7 @@ def judge(
                 "max_difference": max_difference,
                 "gap": gap,
                 "thresholds": {
-                    k: given(v) for k, _, v in (t.partition("=") for t in threshold or ())
+                    k: parse_value(v) for k, _, v in (t.partition("=") for t in threshold or ())
                 },
             }
             config = convert(settings, judgement.JudgeConfig, "judge")

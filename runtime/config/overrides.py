@@ -8,11 +8,11 @@ from typing import Any
 
 from runtime.config.explain import show
 from runtime.errors import ConfigError, expect_known, suggest
-from runtime.paths import GivenHere
+from runtime.paths import CommandLineText
 
 
 def override(table: dict[str, Any], change: str) -> None:
-    """Change a single setting of a table given by `tomllib`.
+    """Change a single setting of a table read by `tomllib`.
 
     Args:
         change: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word.
@@ -27,7 +27,7 @@ def override(table: dict[str, Any], change: str) -> None:
     if not equals or len(keys) < 2 or not all(keys):
         raise ConfigError(f"{where}: expected node.key=value or run.key=value")
     try:
-        value = given(text)
+        value = parse_value(text)
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
     nodes = _by_name(table.get("nodes"))
@@ -52,12 +52,12 @@ def override(table: dict[str, Any], change: str) -> None:
     target[keys[-1]] = value
 
 
-def given(text: str) -> Any:
+def parse_value(text: str) -> Any:
     """Return a command-line text's value in TOML, or the text; else raise `ValueError`."""
     try:
         table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
-        return GivenHere(text.strip())
+        return CommandLineText(text.strip())
     except ValueError:  # of Python's int()
         raise ValueError("expected a number of a usual size") from None
     except RecursionError:
@@ -65,7 +65,7 @@ def given(text: str) -> Any:
     if len(table) > 1:
         raise ValueError("expected one setting, found more lines")
     value = table["value"]
-    return GivenHere(value) if isinstance(value, str) else value
+    return CommandLineText(value) if isinstance(value, str) else value
 
 
 def _part(nodes: dict[str, dict[str, Any]], name: str, where: str) -> dict[str, Any]:

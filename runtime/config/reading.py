@@ -262,13 +262,13 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
     except DeclarationError as error:
         frames = traceback.extract_tb(error.__traceback__)
         here = str(Path(__file__).parents[1])
-        own = [
+        outside = [
             frame
             for frame in frames
             if not frame.filename.startswith((here, "<frozen"))
             and frame.name != "__init_subclass__"
         ]
-        place = f"{own[-1].filename}, line {own[-1].lineno}"
+        place = f"{outside[-1].filename}, line {outside[-1].lineno}"
         raise ConfigError(f"{where}: {module_name}: {error} ({place})") from error
     except VisnavError:
         raise
@@ -299,12 +299,12 @@ def abstract(cls: type[Node[Any]]) -> str:
 
 
 def is_base(cls: type[Node[Any]]) -> bool:
-    """Tell whether a class is there to be subclassed, and no node for a file."""
+    """Return whether a class is there to be subclassed, and no node for a file."""
     return cls is Node or inspect.isabstract(cls)
 
 
 def convert(value: Any, type_: type[S], where: str) -> S:
-    """Turn a table into a struct, with its presets put in.
+    """Convert a table to a struct, with its presets applied.
 
     Raises:
         ConfigError: A key or a preset is unknown, a key is missing, or a value is of the wrong type
@@ -337,7 +337,7 @@ def by_name_alone(table: type[msgspec.Struct]) -> list[str]:
 
 
 def expanded(value: Any, type_: Any, where: str, at: str = "") -> Any:
-    """Return settings of the file with their presets put in, at any depth.
+    """Return settings of the file with their presets applied, at any depth.
 
     Raises:
         ConfigError: There is no such preset, or a setting is overridden without one it belongs to.
@@ -353,12 +353,12 @@ def expanded(value: Any, type_: Any, where: str, at: str = "") -> Any:
     if not isinstance(value, Mapping):
         return value
     if isinstance(value.get("preset"), str) and extra:
-        value = _put_in(value, extra, f"{where}: {f'{at}.preset'[1:]}")
+        value = _apply_preset(value, extra, f"{where}: {f'{at}.preset'[1:]}")
     types = types_of(table)
     return {k: expanded(v, types.get(k), where, f"{at}.{k}") for k, v in value.items()}
 
 
-def _put_in(value: Mapping[str, Any], extra: Mapping[str, Any], where: str) -> dict[str, Any]:
+def _apply_preset(value: Mapping[str, Any], extra: Mapping[str, Any], where: str) -> dict[str, Any]:
     presets, name = presets_in(extra), value["preset"]
     listed = ", ".join(presets)
     expect_known(name, presets, f"{where}: expected one of {listed}, found {show(name)}")

@@ -29,7 +29,7 @@ from typing import Any, TypeGuard, TypeVar
 import msgspec
 import xxhash
 
-from runtime.commit import NOTE
+from runtime.commit import RECORD
 
 T = TypeVar("T")
 
@@ -192,8 +192,8 @@ def _read_whole(content: bytes) -> Code:
             joined.append([part.value for part in _joined(node)])
         elif isinstance(node, ast.Call):
             name = _called(node)
-            if name in _LOADERS and (given := [*node.args, *(k.value for k in node.keywords)]):
-                text, complete = _beginning(given[0])
+            if name in _LOADERS and (arguments := [*node.args, *(k.value for k in node.keywords)]):
+                text, complete = _beginning(arguments[0])
                 if complete:
                     loaded.append(text)
                 elif "." in text:
@@ -213,7 +213,7 @@ def _read_whole(content: bytes) -> Code:
         for text in texts
         if text not in written and (_FILE.fullmatch(text) or _REFERENCE.fullmatch(text))
     )
-    kept_places = dict.fromkeys(
+    unwritten_places = dict.fromkeys(
         (place, ups)
         for inner, place, ups in places
         if _PATTERN.fullmatch(place) and not written.issuperset(part.value for part in inner)
@@ -225,7 +225,7 @@ def _read_whole(content: bytes) -> Code:
         tuple(dict.fromkeys(loaded)),
         dynamic,
         tuple(literals),
-        tuple(kept_places),
+        tuple(unwritten_places),
         of_stem,
     )
 
@@ -300,14 +300,14 @@ def _place(node: ast.AST) -> tuple[list[_Text], str, ast.expr | None]:
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
         inner, base = _joined(node), node.left
     elif isinstance(node, ast.Call) and _called(node) in {"join", "joinpath"}:
-        given = list(node.args)
+        arguments = list(node.args)
         if _called(node) == "joinpath" and isinstance(node.func, ast.Attribute):
             base = node.func.value
-        elif len(given) > 1 and not _is_text(given[0]):
-            base = given.pop(0)
+        elif len(arguments) > 1 and not _is_text(arguments[0]):
+            base = arguments.pop(0)
         if len(node.args) > 1 or base is not None:
-            others = (n for n, arg in enumerate(given) if not _is_text(arg))
-            inner = [arg for arg in given[: next(others, len(given))] if _is_text(arg)]
+            others = (n for n, arg in enumerate(arguments) if not _is_text(arg))
+            inner = [arg for arg in arguments[: next(others, len(arguments))] if _is_text(arg)]
     elif isinstance(node, ast.JoinedStr):
         inner = [part for part in node.values if _is_text(part)]
         first = node.values[0] if node.values else None
@@ -323,9 +323,9 @@ def _is_text(node: ast.AST) -> TypeGuard[_Text]:
 
 
 def _writes(call: ast.Call) -> bool:
-    """Tell whether a call of ``open`` has a mode to write."""
-    given = [*call.args, *(keyword.value for keyword in call.keywords)]
-    return any(_is_text(arg) and re.fullmatch("[wax][bt+]*", arg.value) for arg in given)
+    """Return whether a call of ``open`` has a mode to write."""
+    arguments = [*call.args, *(keyword.value for keyword in call.keywords)]
+    return any(_is_text(arg) and re.fullmatch("[wax][bt+]*", arg.value) for arg in arguments)
 
 
 def _parsed(content: bytes) -> ast.AST:
@@ -393,7 +393,7 @@ class Finder:
         return file, folders
 
     def is_beside(self, name: str) -> bool:
-        """Tell whether a module is in one of the first folders."""
+        """Return whether a module is in one of the first folders."""
         return bool(self._inside(self.first, name.partition(".")[0])[0])
 
     def modules(self, folders: Iterable[str]) -> list[str]:
@@ -461,7 +461,7 @@ def _linked(sites: Iterable[Path]) -> Iterator[str]:
 
 
 def is_installed(path: str) -> bool:
-    """Tell whether a file belongs to an installed package."""
+    """Return whether a file belongs to an installed package."""
     return not _INSTALLED.isdisjoint(path.split("/"))
 
 
@@ -511,15 +511,15 @@ def find_sources(
     read: set[str] = set()
 
     def read_file(path: str, name: str, package: str) -> None:
-        own = name.partition(".")[0] in OURS and path.startswith(f"{TOOL}/")
-        code = read_code(Path(path), whole=not own)
+        ours = name.partition(".")[0] in OURS and path.startswith(f"{TOOL}/")
+        code = read_code(Path(path), whole=not ours)
         for level, module, names in code.imports:
             base = _absolute(level, module, package)
             todo.extend([base, *(f"{base}.{name}" for name in names)] if base else ())
         for reference in code.loaded:
             level = len(reference) - len(reference.lstrip("."))
             todo.append(_absolute(level, reference.lstrip("."), package) or reference)
-        if own:
+        if ours:
             return
         folder = Path(path).parent
         if code.dynamic:
@@ -601,10 +601,10 @@ def find_sources(
         base = "/".join(parts if is_package else parts[:-1])
         sources.add(f"{base}/{Path(file).name}".lstrip("/"), file)
         if is_package:
-            for beside in os.scandir(folders[0]):
-                skipped = beside.name.endswith((".py", ".pyc", ".pyi")) or beside.path == str(NOTE)
-                if not skipped and beside.is_file():
-                    sources.add(f"{base}/{beside.name}", beside.path)
+            for entry in os.scandir(folders[0]):
+                skipped = entry.name.endswith((".py", ".pyc", ".pyi")) or entry.path == str(RECORD)
+                if not skipped and entry.is_file():
+                    sources.add(f"{base}/{entry.name}", entry.path)
         read_file(file, name, name if is_package else ".".join(parts[:-1]))
     return sources
 

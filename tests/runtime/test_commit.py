@@ -60,10 +60,10 @@ def test_an_installed_tool_knows_the_commit_of_its_build(
     """So does a wheel that is built from an unpacked archive, where there is no repository."""
     expected = commit()
     for name in ("archive", "built"):
-        module.write_note(tmp_path / name)
+        module.write_commit(tmp_path / name)
         assert (tmp_path / name / "commit.txt").read_text() == f"{expected}\n"
         monkeypatch.setattr(module, "__file__", str(tmp_path / name / "commit.py"))
-        monkeypatch.setattr(module, "NOTE", tmp_path / name / "commit.txt")
+        monkeypatch.setattr(module, "RECORD", tmp_path / name / "commit.txt")
         assert commit() == expected
     (tmp_path / "built" / "commit.txt").unlink()
     assert commit() == ""

@@ -17,7 +17,7 @@ import msgspec
 import tomli_w
 
 from runtime.config.model import Config, to_builtins
-from runtime.config.overrides import given
+from runtime.config.overrides import parse_value
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
 from runtime.run.made_from import RUN, Roots, roots_of
@@ -54,7 +54,7 @@ class Axis(msgspec.Struct, frozen=True):
 
 
 def parameter(change: str) -> Parameter:
-    """Read ``PATH=V1,V2,…``; raise `ConfigError` for all else, or a value given twice."""
+    """Read ``PATH=V1,V2,…``; raise `ConfigError` for all else, or a value parse_value twice."""
     path, equals, text = change.partition("=")
     where = f"--vary {change}"
     if not equals or not path.strip():
@@ -106,7 +106,7 @@ def split(text: str, where: str) -> tuple[str, ...]:
 def value(text: str) -> Any:
     """Return the TOML value of a text, or else the text itself, as for ``--set``."""
     try:
-        return given(text)
+        return parse_value(text)
     except ValueError:  # which reading the settings refuses
         return text.strip()
 
