@@ -136,13 +136,13 @@ class Host:
     def conclude(
         self, subject: str, figures: Mapping[str, Any], passed: bool | None, flight: bool
     ) -> None:
-        """Put a verdict into the summary."""
+        """Record a verdict in the summary."""
 
     def note_environment(self, name: str, value: str) -> None:
         """Record a dependency of the run in the summary."""
 
     def note_truth(self, subject: str, facts: Mapping[str, Any]) -> None:
-        """Put what nobody may know during the run into its summary."""
+        """Record in the summary what is secret during the run."""
 
     def after_run(self, call: Callable[[Path], Any]) -> None:
         """Call a function once the summary is written."""

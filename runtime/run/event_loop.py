@@ -43,7 +43,7 @@ Factory = Callable[..., asyncio.Task[Any]]
 def install(loop: asyncio.AbstractEventLoop) -> None:
     """Make every task created on `loop` from now on resumable by streams.
 
-    If the interpreter does not allow it, its tasks stay as they are, and the log says so once.
+    If the interpreter does not allow it, tasks stay asyncio's own, with one warning in the log.
     """
     if resumable():
         loop.set_task_factory(functools.partial(_task_factory, Nesting()))
@@ -74,11 +74,11 @@ async def _exercise(factory: Factory | None, loop: asyncio.AbstractEventLoop) ->
     read: list[tuple[int, bool]] = []
 
     async def reader() -> None:
-        own = asyncio.current_task()
+        task = asyncio.current_task()
         async for number in numbers:
             if number == 2:
                 await asyncio.sleep(0)
-            read.append((number, asyncio.current_task() is own))
+            read.append((number, asyncio.current_task() is task))
             if number == 4:
                 raise LookupError
 
@@ -293,7 +293,7 @@ def leaf(error: BaseException) -> BaseException:
 
 
 def waits_for(task: asyncio.Task[Any], future: asyncio.Future[Any]) -> bool:
-    """Tell whether a task waits for this future."""
+    """Return whether a task waits for this future."""
     return getattr(task, "_fut_waiter", None) is future
 
 

@@ -209,7 +209,7 @@ class _Run:
             self.supervisor.state.error = error
 
     def conclude(self, out: Path, summary: Summary) -> None:
-        """Write the summary, then call all `after_run` functions, whatever goes wrong."""
+        """Write the summary, then call all `after_run` functions, also after errors."""
         if summary.error is None and self.supervisor.state.error is not None:
             error = with_place(self.supervisor.state.error)
             summary = msgspec.structs.replace(summary, error=error)

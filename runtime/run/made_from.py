@@ -97,21 +97,21 @@ def roots_of(config: Config, folder: Path | None = None, modules: Iterable[str] 
         besides = [*spec.node.made_from(spec.config)]
         lines = [source for source in besides if isinstance(source, CommandLine)]
         of_programs = {text for line in lines for text in line.texts()}
-        own_files = [file for file in inputs(spec.config) if file not in of_programs]
-        files |= dict.fromkeys(own_files)
+        input_files = [file for file in inputs(spec.config) if file not in of_programs]
+        files |= dict.fromkeys(input_files)
         files |= dict.fromkeys(str(source) for source in besides if isinstance(source, Path))
-        apart = {*written(spec.config), *of_programs, *own_files}
-        own = msgspec.to_builtins(spec.config, enc_hook=plain)
-        texts |= dict.fromkeys(text for text in _texts(own) if text not in apart)
+        apart = {*written(spec.config), *of_programs, *input_files}
+        settings = msgspec.to_builtins(spec.config, enc_hook=plain)
+        texts |= dict.fromkeys(text for text in _texts(settings) if text not in apart)
         programs += lines
     named = (spec.type_name.partition(":") for spec in config.nodes)
-    own_modules = {spec.node.__module__ for spec in config.nodes}
-    own_modules |= {module for module, colon, _ in named if colon}
+    used_modules = {spec.node.__module__ for spec in config.nodes}
+    used_modules |= {module for module, colon, _ in named if colon}
     # Sensors, readers and worlds of other packages, as nothing here tells which of them are used.
     plugged = (offer for group in (SENSORS, READERS, WORLDS) for offer in others(group))
-    own_modules |= {offer.value.partition(":")[0] for offer in plugged}
+    used_modules |= {offer.value.partition(":")[0] for offer in plugged}
     return Roots(
-        modules=tuple(sorted({*modules, *own_modules})),
+        modules=tuple(sorted({*modules, *used_modules})),
         folder=str(folder or ""),
         inputs=tuple(files),
         texts=tuple(texts),
@@ -322,7 +322,7 @@ class _Collector:
                 self._add_named_folder(Path(path), name, [working or Path.cwd()])
         for name, paths in sources.files.items():
             for path in paths:
-                self._note(name, path, certain=name not in sources.named)
+                self._add_path(name, path, certain=name not in sources.named)
                 if path.endswith(".so") and name.partition("/")[0] not in OURS and libraries:
                     self._add_libraries(Path(path), None)
         if libraries:
@@ -358,7 +358,7 @@ class _Collector:
             first = [script.parent if script else working, *first]
             sites = _sites(program)
             if Path(os.path.realpath(program)) != Path(os.path.realpath(sys.executable)):
-                self._note(program.name, str(program))
+                self._add_path(program.name, str(program))
         elif program is not None:
             scripts += self._add(program, [working], line, libraries=libraries)
             if program in scripts:
@@ -370,7 +370,7 @@ class _Collector:
                 Finder(first, sites), modules, scripts, libraries=libraries, working=working
             )
 
-    def _note(self, name: str, path: str, *, certain: bool = True) -> None:
+    def _add_path(self, name: str, path: str, *, certain: bool = True) -> None:
         if not certain and name not in self._files:
             self._named[name] = _NAMED if _kind(Path(path)) else _WRITABLE
         elif certain:
@@ -406,7 +406,7 @@ class _Collector:
             kind = _kind(path)
             if kind == "program" and line is not None and line.build and _within(path, bases):
                 continue  # it is made from sources, which count
-            self._note(self._name(path, bases), str(path), certain=certain)
+            self._add_path(self._name(path, bases), str(path), certain=certain)
             if kind == "python":
                 scripts.append(path)
             elif kind == "program" and libraries:
@@ -458,7 +458,7 @@ class _Collector:
         for name, _ in _files_in(folder, without=_RESULTS | _BUILT):
             path = folder / name
             if path.suffix in _SOURCES or path.name in _BUILD_FILES:
-                self._note(name, str(path))
+                self._add_path(name, str(path))
 
     def _add_libraries(self, program: Path, line: CommandLine | None) -> None:
         environment = dict(line.environment) if line is not None else {}
@@ -467,7 +467,7 @@ class _Collector:
             if path.startswith(_SYSTEM):
                 system.append(f"{Path(path).name} {content_hash(Path(path))}")
             else:
-                self._note(Path(path).name, path)
+                self._add_path(Path(path).name, path)
         if system:
             name = f"system libraries of {program.name}"
             self._others[name] = hashed(sorted(system))
@@ -547,7 +547,7 @@ def _is_file(path: Path) -> bool:
 
 
 def _is_data(path: Path) -> bool:
-    """Tell whether a path is a folder of data, and none that everything lies in."""
+    """Return whether a path is a folder of data, and none that everything lies in."""
     path, home = Path(os.path.normpath(path)), Path(os.environ.get("HOME") or "/")
     around = {Path("/"), home, *home.parents}
     return path.is_dir() and path not in around and not f"{path}/".startswith(_SYSTEM)
@@ -560,7 +560,7 @@ def _is_folder(path: Path) -> bool:
 
 
 def _is_named_data(folder: Path, around: Iterable[Path]) -> bool:
-    """Tell whether a folder that a text names is one of data, of at most `MOST_FILES` files.
+    """Return whether a folder that a text names is one of data, of at most `MOST_FILES` files.
 
     It is none if it is around what is worked on, directly below ``/``, a package, or has results of
     runs.
@@ -579,7 +579,7 @@ def _is_named_data(folder: Path, around: Iterable[Path]) -> bool:
 
 
 def _is_small(folder: Path) -> bool:
-    """Tell whether a folder has at most `MOST_FILES` files and folders."""
+    """Return whether a folder has at most `MOST_FILES` files and folders."""
     count, todo, seen = 0, [str(folder)], set()
     while todo:
         inside = os.path.realpath(todo.pop())

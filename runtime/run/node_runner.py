@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("visnav.runtime")
 
-MOST_GIVEN = 10_000  # announcements of a node, or unmet needs
+MOST_VALUES = 10_000  # announcements of a node, or unmet needs
 
 GRACE = 0.5  # real seconds for a step to end after its cancellation, such as over its limit
 
@@ -113,9 +113,9 @@ class NodeRunner:
         assert self.node is not None
         name = self.spec.name
         try:
-            given: Any = self.node.announce()
-            given = given if isinstance(given, Iterable) else [given]
-            announced = self._items("announce", given, limit)
+            values: Any = self.node.announce()
+            values = values if isinstance(values, Iterable) else [values]
+            announced = self._items("announce", values, limit)
             for announcement in announced:
                 if not isinstance(announcement, Announcement):
                     raise NodeError(
@@ -128,15 +128,15 @@ class NodeRunner:
         except BaseException as error:
             raise wrap(name, error) from error
 
-    def _items(self, phase: str, given: Iterable[Any], limit: float) -> list[Any]:
-        """Return what a phase gives, which may be endless; or raise `NodeError`."""
+    def _items(self, phase: str, items: Iterable[Any], limit: float) -> list[Any]:
+        """Return the values of a phase, which may be endless; or raise `NodeError`."""
         values: list[Any] = []
         until = time.monotonic() + limit
-        for value in given:
-            if len(values) == MOST_GIVEN:
+        for value in items:
+            if len(values) == MOST_VALUES:
                 raise NodeError(
                     self.spec.name,
-                    f"{phase}(): expected an end after at most {MOST_GIVEN:,} values, found more",
+                    f"{phase}(): expected an end after at most {MOST_VALUES:,} values, found more",
                 )
             if time.monotonic() > until:
                 raise self._too_late(phase, limit, "")
@@ -180,8 +180,8 @@ class NodeRunner:
         async with self.shutdown_lock:
             return await self._last_step(limit, "on_end", node.on_end())
 
-    def hang_up(self) -> None:
-        """Take nothing more in: what the node knows stays as it is while it shuts down."""
+    def stop_receiving(self) -> None:
+        """Stop delivering events to the node."""
         self.shutting_down = True
         for link in self.links.values():
             link.close()
@@ -189,7 +189,7 @@ class NodeRunner:
     async def shut_down(self, limit: float) -> list[NodeError]:
         """End ticks, tasks, node and workers, within a limit (real s) each; return the errors.
 
-        For a node that has hung up.
+        For a node that receives nothing any more (`stop_receiving`).
         """
         node, wrong = self.node, []
         for ticker in self.tickers:
@@ -305,8 +305,8 @@ def wrap(name: str, error: BaseException) -> NodeError:
         wrapped = NodeError(name, str(leaf).removeprefix(f"{name}: "))
     else:
         wrapped = NodeError(name, _described(leaf))
-        there = getattr(leaf, "place_in_worker", "")
-        wrapped.place = there or (event_loop.of_error(leaf)[1] if leaf.__traceback__ else "")
+        place = getattr(leaf, "place_in_worker", "")
+        wrapped.place = place or (event_loop.of_error(leaf)[1] if leaf.__traceback__ else "")
     wrapped.__cause__ = error
     return wrapped
 
@@ -357,7 +357,7 @@ async def start_up(
     limit: float,
     give_up: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Take nodes through their phases up to the first update.
+    """Run the phases of all nodes up to the first update.
 
     Args:
         start: Constructs a node and runs its `on_startup`.

@@ -30,9 +30,9 @@ class Others:
         """
         return 0
 
-    async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
+    async def announce(self, local: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Exchange announcements; return those of all nodes, in file order."""
-        return list(chain(*own.values()))
+        return list(chain(*local.values()))
 
     async def begin(self) -> None:
         """Agree with the others on the first update, and wait until then."""

@@ -122,12 +122,12 @@ def newest(path: Path) -> Path:
 
 
 def has_run(folder: Path) -> bool:
-    """Tell whether a run has begun in a folder."""
+    """Return whether a run has begun in a folder."""
     return _STARTED in _marked(folder) or all((folder / sign).is_file() for sign in SIGNS[:3])
 
 
 def has_flown(folder: Path) -> bool:
-    """Tell whether the run in a folder has come to its first update."""
+    """Return whether the run in a folder has come to its first update."""
     marked = _marked(folder)
     return _FLOWN in marked or _STARTED not in marked
 
@@ -347,8 +347,8 @@ def _is_left(folder: Path) -> bool:
 def _private_results_move(source: Path, target: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
     for entry in source.iterdir():
-        there = target / entry.name
-        if entry.is_dir() and there.is_dir():
-            _private_results_move(entry, there)
+        destination = target / entry.name
+        if entry.is_dir() and destination.is_dir():
+            _private_results_move(entry, destination)
         else:
-            entry.replace(there)
+            entry.replace(destination)

@@ -146,7 +146,7 @@ class RunState(Host):
         declared = {s.name for s in self.config.nodes if s.node.flies or s.node.reads_truth}
         return self.truth_receivers - (declared - self.estimators())
 
-    def note_error(self, error: Exception) -> None:
+    def record_error(self, error: Exception) -> None:
         """Record an error; the first becomes the error of the run."""
         self.error = self.error or error
 
@@ -210,7 +210,7 @@ class RunState(Host):
                 self._early.append(changed)
         return values
 
-    def tell_early_changes(self) -> None:
+    def send_early_changes(self) -> None:
         """Send the events of changes made while the nodes were starting."""
         early, self._early = self._early, []
         for changed in early:
@@ -381,5 +381,5 @@ def siblings(config: Config, here: Container[str]) -> tuple[Sibling, ...]:
 
 def _ticker_name(runner: NodeRunner, name: str) -> str:
     full = f"{runner.spec.name}.{name}"
-    taken = {ticker.name for ticker in runner.tickers if not ticker.stopped}
-    return next(n for n in chain([full], (f"{full}_{i}" for i in count(2))) if n not in taken)
+    used = {ticker.name for ticker in runner.tickers if not ticker.stopped}
+    return next(n for n in chain([full], (f"{full}_{i}" for i in count(2))) if n not in used)

@@ -135,12 +135,12 @@ def inputs(state: RunState, outputs: Mapping[str, str]) -> dict[str, str]:
         outputs: Fingerprint of each output's events, by its name.
     """
     others = [a for a in state.announcements if isinstance(a, _OF_OTHERS)]
-    given = [a for a in state.announcements if not _named(a.source, others)]
-    digests = {f"{a.source} {type(a).__name__}": f"{fingerprint(a):016x}" for a in given}
+    inputs = [a for a in state.announcements if not _named(a.source, others)]
+    digests = {f"{a.source} {type(a).__name__}": f"{fingerprint(a):016x}" for a in inputs}
     for node in state.all_nodes:
         for sender in senders(node).values():
             if any(event.category in _INPUTS for event in sender.sent()) and any(
-                _named(source, given) and not _named(source, others) for source in sender.sources
+                _named(source, inputs) and not _named(source, others) for source in sender.sources
             ):
                 digests[sender.name] = outputs[sender.name]
     return dict(sorted(digests.items()))

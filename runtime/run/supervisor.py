@@ -65,14 +65,14 @@ class Supervisor:
         scripted: Collection[str] = (),
     ) -> None:
         here = [spec for spec in config.nodes if not only or spec.name in only]
-        runners = {spec.name: NodeRunner(spec, self._own) for spec in here}
+        runners = {spec.name: NodeRunner(spec, self._create_task) for spec in here}
         self.instruments = Instruments(runners, self._reconnect)
         self.state = RunState(
             config,
             clock,
             runners,
             self.instruments,
-            self._own,
+            self._create_task,
             lambda node, reason: self.stop(reason, by=node),
             self.fault,
         )
@@ -93,7 +93,7 @@ class Supervisor:
 
     async def main(self) -> None:
         """Run to the end of the run; its cause is in the state's `reason` and `error`."""
-        self._startup = self._own(self._start_all(), "start")
+        self._startup = self._create_task(self._start_all(), "start")
         try:
             await self._ended.wait()
             await asyncio.wait([self._startup])
@@ -103,7 +103,7 @@ class Supervisor:
                 task.cancel()
             self.state.close()
 
-    def _own(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
+    def _create_task(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(coro, name=name)
         if isinstance(task, RunTask):
             task.protected = True
@@ -159,7 +159,7 @@ class Supervisor:
             self._startup.cancel()
 
     def _is_planned(self, by: str) -> bool:
-        """Tell whether an end by `by`, without an error, completes the run's plan."""
+        """Return whether an end by `by`, without an error, completes the run's plan."""
         if by != "user":
             return not by or self._ends_run(by) == "plan"
         config = self.state.config  # no simulator alone has a plan
@@ -190,7 +190,7 @@ class Supervisor:
             return
         wrapped = wrap("runtime", error)
         log_error(wrapped, last=not self._ended.is_set())
-        self.state.note_error(wrapped)
+        self.state.record_error(wrapped)
         self.stop(f"failed at {place}", wrapped, by="runtime")
 
     def fault(self, name: str, error: BaseException) -> None:
@@ -206,7 +206,7 @@ class Supervisor:
         )
         log_error(wrapped, last=fatal and not self._ended.is_set())
         if self._ended.is_set():
-            self.state.note_error(wrapped)
+            self.state.record_error(wrapped)
         elif fatal:
             self.stop(f"{name} failed", wrapped, by=name)
         else:
@@ -218,7 +218,7 @@ class Supervisor:
         runner.restarting = True
         if self.state.clock.now() - runner.running_since > HEALTHY * SECOND:
             runner.failures = 0
-        task = self._own(self._restart(runner, anyway), f"restart {name}")
+        task = self._create_task(self._restart(runner, anyway), f"restart {name}")
         self._restarts[task] = None
         task.add_done_callback(lambda task: self._restarts.pop(task, None))
 
@@ -238,12 +238,12 @@ class Supervisor:
             owners=self._owners,
             deaf={runner.spec.name for runner in runners if runner.shutting_down},
         )
-        self._note_inputs(listeners)
+        self._record_inputs(listeners)
         self.others.connect(listeners, self._listener_failed)
         self.state.changes.connect(listeners, taps, self._listener_failed)
 
-    def _note_inputs(self, listeners: list[Listener]) -> None:
-        """Note who receives true poses, and whose images and scans; of restarted nodes, too."""
+    def _record_inputs(self, listeners: list[Listener]) -> None:
+        """Record the receivers of true poses, images and scans, also of restarted nodes."""
         state = self.state
         for announcement in state.announcements:
             if owner := self._owners.owner(announcement.source):
@@ -306,7 +306,7 @@ class Supervisor:
             if spec.name in state.runners:
                 state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
                 self.state.run_node(state.runners[spec.name])
-        state.tell_early_changes()
+        state.send_early_changes()
         self.others.nodes_run()
 
     async def _start_nodes(self) -> list[Announcement]:
@@ -359,7 +359,7 @@ class Supervisor:
     async def _restart(self, runner: NodeRunner, anyway: bool) -> None:
         name = runner.spec.name
         # Shielded: the end of the run ends this task, but must not cut an on_shutdown short.
-        await asyncio.shield(self._own(self._shut_down(runner), name))
+        await asyncio.shield(self._create_task(self._shut_down(runner), name))
         if runner.spec.on_error == "drop" and not anyway:
             log.warning("%s: left out from here on", name)
             return
@@ -379,7 +379,7 @@ class Supervisor:
                     self.stop(f"{name} failed", error, by=name)
                     return
                 log_error(error, last=False)
-                await asyncio.shield(self._own(self._shut_down(runner), name))
+                await asyncio.shield(self._create_task(self._shut_down(runner), name))
                 continue
             runner.restarting = False
             self.connect()
@@ -400,7 +400,7 @@ class Supervisor:
         for runner in self.state.runners.values():
             runner.first_error = self.state.error is None
             for error in await runner.end(self.state.shutdown_limit()):
-                self.state.note_error(error)
+                self.state.record_error(error)
         for name, runner in reversed(self.state.runners.items()):
             await self._wait_to_end(name)
             await self._shut_down(runner)
@@ -412,16 +412,16 @@ class Supervisor:
             await self.others.wait_to_end(name)
         except VisnavError as error:
             log.error("%s", error)
-            self.state.note_error(error)
+            self.state.record_error(error)
 
     async def _shut_down(self, runner: NodeRunner) -> None:
         """Shut a node down, once; from the first step on the node receives nothing."""
         async with runner.shutdown_lock:
-            runner.hang_up()
+            runner.stop_receiving()
             self.connect()
             runner.first_error = self.state.error is None
             for error in await runner.shut_down(self.state.shutdown_limit()):
-                self.state.note_error(error)
+                self.state.record_error(error)
 
 
 def _give_up(_phase: Phase, _runner: NodeRunner, error: NodeError) -> None:

@@ -196,7 +196,7 @@ class ProgressWatchdog:
                 self._interrupt()
 
     def _is_deaf(self) -> bool:
-        """Tell whether Ctrl-C is not heard before the first update, as somebody blocks the loop."""
+        """Return whether a node blocks the loop during start-up after Ctrl-C."""
         run = self._state
         return bool(run.stop_requested) and run.stopped is None and run.first_update is None
 
@@ -285,7 +285,7 @@ class ProgressWatchdog:
 
 
 def _doing(runner: NodeRunner) -> str:
-    """Return what a node that the run waits for does: in its own words, or its phase and line."""
+    """Return a node's status text, or its phase and line."""
     if runner.doing != runner.phase:
         return runner.doing
     return f"{runner.phase}{_at(runner.awaited())}"

@@ -148,7 +148,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
     finally:
         before = len(warnings)
         for runner in reversed(runners):
-            runner.hang_up()
+            runner.stop_receiving()
             await runner.shut_down(config.run.shutdown_limit)
         del warnings[before:]  # that nothing came is no news
         host.executor.shutdown(wait=False, cancel_futures=True)

@@ -77,9 +77,9 @@ class Peers(Others):
         self._receive_early()
         return before
 
-    async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
+    async def announce(self, local: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Send the announcements of the nodes here; return those of all, in file order."""
-        return await self._start.announce(own)
+        return await self._start.announce(local)
 
     async def begin(self) -> None:
         """Agree with the others on the first update, and wait until then."""

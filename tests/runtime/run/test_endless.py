@@ -14,7 +14,7 @@ from runtime import Node
 from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeTimeoutError
 from runtime.run import node_runner
-from runtime.run.node_runner import MOST_GIVEN
+from runtime.run.node_runner import MOST_VALUES
 from runtime.testing import spec
 from runtime.tools.preflight import of_nodes
 from tests.runtime.samples import Offer
@@ -49,7 +49,7 @@ class LacksSlowly(Node):
 
 @pytest.fixture(autouse=True)
 def _few(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(node_runner, "MOST_GIVEN", 300)
+    monkeypatch.setattr(node_runner, "MOST_VALUES", 300)
 
 
 @pytest.mark.parametrize(("node", "phase"), [(Announces, "announce"), (Lacks, "check")])
@@ -79,4 +79,4 @@ def test_what_ends_is_taken_whole(monkeypatch: pytest.MonkeyPatch) -> None:
             heard.append(announcement)
 
     assert supervise([spec(Few, "few")]).error is None
-    assert len(heard) == 300 < MOST_GIVEN
+    assert len(heard) == 300 < MOST_VALUES
