@@ -232,14 +232,14 @@ def check_covariance(event: Any, field: str, size: int) -> None:
 def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
     """Make `array` read-only; raise `TypeError` for a wrong dtype or number of dimensions."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype or array.ndim not in ndim:
-        given = (
+        actual = (
             f"{array.dtype} of shape {array.shape}"
             if isinstance(array, np.ndarray)
             else type(array).__name__
         )
         dims = " or ".join(str(n) for n in sorted(ndim))
         raise TypeError(
-            f"{owner}.{name}: expected a {dims}-dimensional {np.dtype(dtype)} array, found {given}"
+            f"{owner}.{name}: expected a {dims}-dimensional {np.dtype(dtype)} array, found {actual}"
         )
     array.setflags(write=False)
 

@@ -17,6 +17,6 @@ tables, this applies to the setting (``drone.cameras.front.loss``); around them,
 
 
 def is_marked(type_: Any) -> bool:
-    """Tell whether a setting of this type can change in a run."""
+    """Return whether a setting of this type can change in a run."""
     marks = type_.__metadata__ if get_origin(type_) is Annotated else ()
     return any(isinstance(m, msgspec.Meta) and (m.extra or {}).get(_MARK) for m in marks)

@@ -135,15 +135,15 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
 class _Queued(logging.handlers.QueueHandler):
     def __init__(self, records: queue.SimpleQueue[logging.LogRecord]) -> None:
         super().__init__(records)
-        self.given = self.taken = self.dropped = 0
+        self.queued = self.handled = self.dropped = 0
 
     def enqueue(self, record: logging.LogRecord) -> None:
         """Queue a record, or count a drop if there is no room; errors have extra room."""
         room = MOST_WAITING * (2 if record.levelno >= logging.ERROR else 1)
-        if self.given - self.taken > room:
+        if self.queued - self.handled > room:
             self.dropped += 1
             return
-        self.given += _size(record)
+        self.queued += _size(record)
         super().enqueue(record)
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
@@ -172,7 +172,7 @@ class _Listener(logging.handlers.QueueListener):
 
     def handle(self, record: logging.LogRecord) -> None:
         """Pass a record to the handlers of its level; after `ends`, not to a terminal."""
-        self._queued.taken += _size(record)
+        self._queued.handled += _size(record)
         late = time.monotonic() > self.ends
         for handler in self.handlers:
             if late and isinstance(handler.formatter, _OneLine):

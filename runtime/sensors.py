@@ -36,12 +36,12 @@ def other_sensors() -> tuple[Any, ...]:
                 f"SensorKind as its kind, found {sensor!r}"
             )
         for what in _UNIQUE:
-            if (taken := (what, getattr(kind, what))) in names:
+            if (pair := (what, getattr(kind, what))) in names:
                 raise CommandError(
-                    f"{whose}: kind.{what}: expected one of its own, found {taken[1]!r}, which "
+                    f"{whose}: kind.{what}: expected one of its own, found {pair[1]!r}, which "
                     "another sensor has"
                 )
-            names.add(taken)
+            names.add(pair)
         sensors.append(sensor)
     return tuple(sensors)
 

@@ -471,5 +471,5 @@ def _beside(schema: Schema, key: str, value: Any) -> Schema:
 
 
 def _may_stand(default: Any) -> bool:
-    """Tell whether a default may stand in a file; a table's are those of its settings."""
+    """Return whether a default may stand in a file; a table's are those of its settings."""
     return default not in (None, msgspec.NODEFAULT) and not isinstance(default, msgspec.Struct)

@@ -277,7 +277,7 @@ def compare(
     markdown: Markdown = False,
     csv: Csv = False,
 ) -> None:
-    """Tell whether B is better than A, over equal flights, with confidence.
+    """Return whether B is better than A, over equal flights, with confidence.
 
     A and B are settings of the same files: `--a odometry.corners=300 --b odometry.corners=500`, or
     two builds of a program: `--a 'slam.command=["./old"]' --b 'slam.command=["./new"]'`. Each

@@ -48,7 +48,7 @@ class Path:
         self._spacing, self._next = SECOND // 20, 0
 
     def due(self, stamp: int) -> bool:
-        """Tell whether a place of this stamp (ns) is to be kept."""
+        """Return whether a place of this stamp (ns) is to be kept."""
         return stamp >= self._next
 
     def add(self, stamp: int, *place: float) -> None:

@@ -315,7 +315,7 @@ def find(run: str | None) -> Path:
 
 
 def _answers(path: Path) -> bool:
-    """Tell whether a run listens at a socket; remove the socket of a killed run."""
+    """Return whether a run listens at a socket; remove the socket of a killed run."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(1.0)
         try:

@@ -68,7 +68,7 @@ class Entrant(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     install: str = ""
 
     def installed(self, folder: Path) -> bool:
-        """Tell whether its module or program is there; paths are relative to `folder`."""
+        """Return whether its module or program is there; paths are relative to `folder`."""
         if self.module and importlib.util.find_spec(self.module) is None:
             return False
         program, *_ = self.node.get("command") or [""]

@@ -409,5 +409,5 @@ class Causes:
 
 
 def _passes(sent: SentEvent, node: str) -> bool:
-    """Tell whether a path can go on to a node: each node is on a path only once."""
+    """Return whether a path can go on to a node: each node is on a path only once."""
     return all(step.node != node for step in sent.path())
