@@ -68,10 +68,10 @@ class Clock(ABC):
             entry.cancel()
 
     def start(self) -> None:  # noqa: B027  # simulated time has nothing to start
-        """Let time run, from 0: the first update is now."""
+        """Start time at 0: the first update is now."""
 
     def hurry(self) -> None:  # noqa: B027  # real time has no order to keep
-        """End soon, by an error or a signal: nothing due waits for slower work any more."""
+        """Process finished work from now on without waiting for earlier work (the run ends)."""
 
     def close(self) -> None:  # noqa: B027  # most clocks hold nothing
         """Release the clock's resources."""
@@ -86,7 +86,7 @@ async def result_of(work: concurrent.futures.Future[R]) -> R:
     future: asyncio.Future[R] = loop.create_future()
 
     def done(finished: concurrent.futures.Future[R]) -> None:  # no circle: results may be large
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nothing awaits the result
             loop.call_soon_threadsafe(settle, future, finished)
 
     work.add_done_callback(done)
@@ -98,7 +98,7 @@ async def result_of(work: concurrent.futures.Future[R]) -> R:
 
 
 def settle(future: asyncio.Future[Any], work: concurrent.futures.Future[Any]) -> None:
-    """Give a future the outcome of finished work, unless nobody waits for it any more."""
+    """Copy the outcome of finished work to a future, unless that is cancelled."""
     if future.cancelled():
         return
     if work.cancelled():
@@ -113,10 +113,10 @@ class Alarm(Protocol):
     """Calls a function at a time of `time.monotonic_ns`."""
 
     def set(self, when: int) -> None:
-        """Ring at `when` (ns) instead of whatever was set before."""
+        """Set the alarm time (ns); replaces the earlier one."""
 
     def close(self) -> None:
-        """Ring no more."""
+        """Cancel the alarm and close its file."""
 
 
 class RealClock(Clock):
@@ -128,7 +128,7 @@ class RealClock(Clock):
         self.speed = speed
         self._pace: _Pace | None = None
         make = TimerFd if sys.platform == "linux" else LoopAlarm
-        self._alarm: Alarm = make(loop, self._ring)
+        self._alarm: Alarm = make(loop, self._run_due)
         self.schedule = Schedule()
         self.schedule.on_sooner = self._set_alarm
 
@@ -137,16 +137,16 @@ class RealClock(Clock):
         return 0 if self._pace is None else self._pace.at(time.monotonic_ns())
 
     def start(self) -> None:
-        """Let time run, from 0."""
+        """Start time at 0."""
         self.start_at(time.monotonic_ns())
 
     def start_at(self, origin: int) -> None:
-        """Let time run, from 0 at a time of `time.monotonic_ns`."""
+        """Start time, 0 at a time of `time.monotonic_ns`."""
         self._pace = _Pace(origin, 0, self.speed)
-        self._ring()
+        self._run_due()
 
     def steer(self, factor: float) -> None:
-        """Let time run a little quicker or slower than its speed from here on, without a jump."""
+        """Change the rate of time from now on to `factor` times the speed, without a jump."""
         now = time.monotonic_ns()
         then = 0 if self._pace is None else self._pace.at(now)
         self._pace = _Pace(now, then, self.speed * factor)
@@ -170,10 +170,10 @@ class RealClock(Clock):
             await super().sleep_until(stamp)
 
     def close(self) -> None:
-        """Ring no more."""
+        """Close the alarm."""
         self._alarm.close()
 
-    def _ring(self) -> None:
+    def _run_due(self) -> None:
         self.schedule.on_sooner = _ignore  # while running what is due, one setting at the end
         try:
             self.schedule.run_due(self.now)
@@ -209,16 +209,16 @@ class _Pace:
 class TimerFd:
     """An alarm on timerfd_create(2), read by the loop like any file."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
         self._loop = loop
-        self._ring = ring
+        self._call = call
         self._fd = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create failed")
         loop.add_reader(self._fd, self._read)
 
     def set(self, when: int) -> None:
-        """Ring at `when` (ns of the monotonic clock)."""
+        """Set the alarm time (ns of the monotonic clock)."""
         setting = (ctypes.c_long * 4)(0, 0, *divmod(max(when, 1), SECOND))
         if _libc.timerfd_settime(self._fd, _ABSOLUTE, setting, None) < 0:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
@@ -231,27 +231,27 @@ class TimerFd:
     def _read(self) -> None:
         try:
             os.read(self._fd, 8)
-        except BlockingIOError:  # set anew between ringing and reading
+        except BlockingIOError:  # set anew between expiry and reading
             return
-        self._ring()
+        self._call()
 
 
 class LoopAlarm:
     """An alarm on the loop's own timers, where there is no timerfd."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
         self._loop = loop
-        self._ring = ring
+        self._call = call
         self._handle: asyncio.TimerHandle | None = None
 
     def set(self, when: int) -> None:
-        """Ring at `when` (ns of the monotonic clock)."""
+        """Set the alarm time (ns of the monotonic clock)."""
         self.close()
         delay = (when - time.monotonic_ns()) / SECOND
-        self._handle = self._loop.call_later(max(delay, 0.0), self._ring)
+        self._handle = self._loop.call_later(max(delay, 0.0), self._call)
 
     def close(self) -> None:
-        """Ring no more."""
+        """Cancel the alarm."""
         if self._handle is not None:
             self._handle.cancel()
 
@@ -400,7 +400,7 @@ class Once:
             self.call()
 
     def cancel(self) -> None:
-        """Do nothing when the time comes."""
+        """Cancel the call."""
         self.call = None
 
 

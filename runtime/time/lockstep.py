@@ -55,10 +55,10 @@ class _JumpingSelector(selectors.DefaultSelector):
 
 
 class Gate(Protocol):
-    """Decides when time may go on: other processes may have to, first."""
+    """Decides when time may advance: other processes may have to, first."""
 
     def may_go(self, key: tuple[int, int, int]) -> bool:
-        """Tell whether to go on to the next due entry: its time (ns), kind and order."""
+        """Return whether to run the next due entry: its time (ns), kind and order."""
 
 
 class _Timer(asyncio.TimerHandle):
@@ -132,7 +132,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         return self.hold(executor.submit(func, *args), self.now)
 
     async def shutdown_default_executor(self, timeout: float | None = None) -> None:  # noqa: ARG002, ASYNC109
-        """Let go of the threads; a time-out on them would be simulated, and over at once."""
+        """Stop without joining the threads: a time-out would be simulated, and over at once."""
         self._default_executor.shutdown(wait=False, cancel_futures=True)  # type: ignore[attr-defined]
 
     def orders(self) -> tuple[int, int]:
@@ -145,7 +145,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         return self.schedule.order, order
 
     def move(self, now: int, orders: tuple[int, int]) -> None:
-        """Go on from a time, and with these numbers, as another process left off."""
+        """Set time and sequence numbers from another process."""
         self.now = max(self.now, now)
         self.schedule.order = orders[0]
         self._orders = itertools.count(orders[1])
@@ -169,7 +169,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         return "pace" if self._pace and due > self.now else None
 
     def _wake_up(self) -> None:
-        with contextlib.suppress(RuntimeError):  # closed: nobody waits any more
+        with contextlib.suppress(RuntimeError):  # closed: nothing awaits the result
             self.call_soon_threadsafe(_nothing)
 
     def _advance(self, timeout: float | None) -> _Ready:
@@ -208,7 +208,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
                     self.now = due
                 return []
             if held <= due:
-                if not _is_over(held_work[0]) and not (self.hurried and self._take_over(due)):
+                if not _is_over(held_work[0]) and not (self.hurried and self._promote(due)):
                     return wait(None)
                 self.now = due
                 _, _, work, future = heapq.heappop(held_work)
@@ -221,8 +221,8 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         self._jumps += 1
         return wait(0) if self._jumps % _POLL_EVERY == 0 or timeout == 0 else []
 
-    def _take_over(self, due: int) -> bool:
-        """Move finished work ahead of other due work; tell if there is any."""
+    def _promote(self, due: int) -> bool:
+        """Move finished work ahead of other due work; return whether there is any."""
         over = [work for work in self._held if work[0] <= due and _is_over(work)]
         if over:
             self._held.remove(first := min(over))
@@ -264,15 +264,15 @@ async def _exercise(loop: asyncio.AbstractEventLoop) -> bool:
     assert isinstance(loop, LockstepLoop)
     order: list[tuple[str, float]] = []
 
-    def note(name: str) -> None:
+    def record(name: str) -> None:
         order.append((name, loop.time()))
 
     for name in "abcdef":  # at one time; a bare heap would mix them
-        loop.call_at(2.0, note, name)
-    loop.call_at(3.0, note, "cancelled").cancel()
-    loop.schedule.add(2 * SECOND, Once(lambda: note("schedule")))
-    loop.schedule.add(SECOND, Once(lambda: note("early")))
-    work = loop.run_in_executor(None, note, "beside")
+        loop.call_at(2.0, record, name)
+    loop.call_at(3.0, record, "cancelled").cancel()
+    loop.schedule.add(2 * SECOND, Once(lambda: record("schedule")))
+    loop.schedule.add(SECOND, Once(lambda: record("early")))
+    work = loop.run_in_executor(None, record, "beside")
     await work
     await asyncio.sleep(2.5)
     expected = [("beside", 0.0), ("early", 1.0), *((name, 2.0) for name in [*"abcdef", "schedule"])]
@@ -293,7 +293,7 @@ class LockstepClock(Clock):
         return self._loop.now
 
     def hurry(self) -> None:
-        """Take due work once done, out of its order, from here on."""
+        """Process finished work immediately, ignoring its order."""
         self._loop.hurried = True
 
     async def beside(self, work: concurrent.futures.Future[R], latency: int = 0) -> R:

@@ -19,11 +19,11 @@ def call_after(
 ) -> threading.Timer:
     """Call a function on a loop, unless closed, after real seconds; return the running timer."""
 
-    def ring() -> None:
+    def submit() -> None:
         with contextlib.suppress(RuntimeError):  # closed
             loop.call_soon_threadsafe(call)
 
-    timer = threading.Timer(seconds, ring)
+    timer = threading.Timer(seconds, submit)
     timer.daemon = True
     timer.start()
     return timer

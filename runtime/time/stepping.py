@@ -47,7 +47,7 @@ class Stepping:
 
     @property
     def state(self) -> Literal["running", "stepping", "paused"]:
-        """Whether time runs, runs for a step, or stands."""
+        """Whether time runs, runs for a step, or is paused."""
         if self._loop is None or self._loop.gate is not self or self._over():
             return "running"
         return "stepping" if self._steps else "paused"
@@ -60,7 +60,7 @@ class Stepping:
         return round(1.0 / (self._loop._pace * SECOND), 9)
 
     def may_go(self, key: tuple[int, int, int]) -> bool:
-        """Tell whether the loop may go on to the next due entry."""
+        """Return whether the loop may run the next due entry."""
         if self._over():
             self._end_steps()
             return True
@@ -80,7 +80,7 @@ class Stepping:
         loop.gate = self
 
     def resume(self) -> None:
-        """Let time run, and end a step; raise `CommandError` if time is not ours."""
+        """Resume time, and end a step; raise `CommandError` if time is not ours."""
         loop = self._checked()
         self._go_on()
         loop.gate = None
@@ -88,10 +88,10 @@ class Stepping:
         self._end_steps()
 
     def step(self, ns: int | None = None) -> asyncio.Future[int]:
-        """Let time run for `ns` nanoseconds, or to what is due next, and then stand.
+        """Run for `ns` nanoseconds, or to the next due entry, then pause.
 
-        A step that is asked for while another goes on is added to it. The result is the nanoseconds
-        by which time has gone on: fewer if time was paused or resumed, or the run ended, before.
+        A step requested during another is added to it. The result is the nanoseconds by which time
+        has advanced: fewer if time was paused or resumed, or the run ended, before.
 
         Raises:
             CommandError: Time cannot be controlled.
@@ -112,7 +112,7 @@ class Stepping:
     def stands(self) -> asyncio.Future[int]:
         """Return a future done once time is paused; at once if no pause is requested.
 
-        After `pause`, all else due now is still done before time stands. Raises as `resume` does.
+        After `pause`, all else due now is still done before. Raises as `resume` does.
         """
         loop = self._checked()
         done: asyncio.Future[int] = loop.create_future()
@@ -141,7 +141,7 @@ class Stepping:
         assert self._loop is not None
         steps, self._steps = self._steps, []
         for begin, done in steps:
-            if not done.done():  # whoever waited may have been cancelled
+            if not done.done():  # the awaiting task may have been cancelled
                 done.set_result(self._loop.now - begin)
 
     def _checked(self) -> LockstepLoop:
