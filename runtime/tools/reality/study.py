@@ -71,7 +71,8 @@ class System(Entrant, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         published: Row of its published figures; empty if there are none.
-        alignment: Laid on the truth before it is judged.
+        alignment: With the truth, before errors are computed; ``origin`` is by the position and
+            heading of the first pose.
         final: Whether the published error is that of the final map, else of the poses as said.
         set: What its flight needs to have different, as for ``--set``.
         cost_ms: Processor time of a frame, for the estimate.
@@ -79,7 +80,7 @@ class System(Entrant, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     published: str = ""
-    alignment: Literal["se3", "sim3"] = "se3"
+    alignment: Literal["origin", "se3", "sim3"] = "se3"
     final: bool = False
     set: tuple[str, ...] = ()
     cost_ms: float = 50.0
