@@ -175,6 +175,8 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
 
     def moved(self, lever: npt.ArrayLike) -> Trajectory:
         """Return the poses of a point fixed to the body, metres in its frame, shape (3,)."""
+        if not np.any(lever):
+            return self
         positions = self.positions + self.rotations().apply(lever)
         return Trajectory(self.stamps, positions, self.orientations)
 

@@ -183,11 +183,10 @@ def judge(
     due = due[truth.covers(due, longest)]
     lengths = truth.distances(longest)
     path = float(np.ptp(lengths[inside] if inside.any() else lengths))
-    lever = np.zeros(3) if record.lever is None else np.array(record.lever)
-    sent = estimate
-    if record.lever is not None:
-        truth = truth.moved(lever)
-        estimate, weighed = (t and t.moved(lever) for t in (estimate, weighed))
+    sent, lever = estimate, np.array(record.lever)
+    truth = truth.moved(lever)
+    if estimate is not None and weighed is not None:
+        estimate, weighed = estimate.moved(lever), weighed.moved(lever)
     figures: dict[str, Any] = {
         "method": record.method,
         "estimates": len(record),
@@ -218,7 +217,7 @@ def judge(
 
     how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
     final, final_note = _judge_final(
-        record, truth, lever, hole, due, path, alignment, align_first, figures, planned
+        record, truth, hole, due, path, alignment, align_first, figures, planned
     )
     if estimate is None or weighed is None:
         figures |= without()
@@ -282,10 +281,9 @@ def judge(
         figures = {k: v for k, v in figures.items() if not figure(k).of_orientation}
         figures["why_no_rotations"] = orientations.text()
     note = "; ".join(filter(None, notes))
-    if record.lever is not None:
-        moved = moved.moved(-lever)
+    at_body = moved.moved(-lever)
     return Judgement(
-        figures, sent, note, orientations, moved, at_images, at_ticks, coverage.lost, final
+        figures, sent, note, orientations, at_body, at_images, at_ticks, coverage.lost, final
     )
 
 
@@ -458,7 +456,6 @@ def _held(
 def _judge_final(
     record: EstimatorRecord,
     truth: Trajectory,  # of the lever's end
-    lever: Floats,  # on the body, shape (3,)
     hole: int,
     frames: Stamps,
     path: float,
@@ -471,12 +468,12 @@ def _judge_final(
     if record.final is None:
         return None, ""
     figures["final_poses"] = len(record.final)
+    lever = np.array(record.lever)
     how = alignment
     if how == "auto":
         how = choose_alignment(record.scale_free, record.final_frame_id)
     try:
-        final = record.final.take(one_a_step(record.final.stamps))
-        final = final.moved(lever) if lever.any() else final
+        final = record.final.take(one_a_step(record.final.stamps)).moved(lever)
         true_poses, estimated = pair(truth, final, hole)
         orientations = examine(true_poses, estimated)
         how = _possible(how, alignment, align_first, orientations)
@@ -498,8 +495,7 @@ def _judge_final(
     if offset is not None:
         notes.append(offset.text())
     note = "; ".join(filter(None, notes))
-    moved = moved.moved(-lever) if lever.any() else moved
-    return moved, f"after loop closures: {note}" if note else ""
+    return moved.moved(-lever), f"after loop closures: {note}" if note else ""
 
 
 def _possible(

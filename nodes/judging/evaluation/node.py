@@ -367,7 +367,7 @@ class Evaluation(Node[EvaluationConfig]):
             body = self._flights.get(vehicle, Flight()).body
             if record.scale_free and "grey" in record.reads:  # of a node that knows its camera
                 eyes = {eye.removesuffix("/grey") for eye in read} & self._places.keys()
-                record.lever = self._places[eyes.pop()] if len(eyes) == 1 else None
+                record.lever = self._places[eyes.pop()] if len(eyes) == 1 else (0.0, 0.0, 0.0)
             judgement = self._judge(
                 name,
                 record,

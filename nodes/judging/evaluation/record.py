@@ -199,9 +199,9 @@ class EstimatorRecord:
         reads: tuple[str, ...] = (),  # see `events.EstimatorAnnouncement`
     ) -> None:
         self.scale_free, self.method, self.reads = scale_free, method, reads
-        # The camera on the body (m), if poses are the camera's, moved to the body in a unit that is
-        # not the metre; `None` if they are judged as the body's.
-        self.lever: Vector3 | None = None
+        # The point of the body (m) whose poses are judged: the camera, if its poses have been moved
+        # to the body in a unit that is not the metre.
+        self.lever: Vector3 = (0.0, 0.0, 0.0)
         self.frame_id = ""
         self.rows = PoseRows()  # poses of the trajectory
         self.repeated = 0  # poses with a stamp not later than the last
