@@ -150,9 +150,9 @@ def _judge_one(
     record = EstimatorRecord.of(source.poses)
     record.final = None if final is None else final.poses
     for stamp, row in _rows(source, source.covariances):
-        record.covariances.add(stamp, row)
+        record.longest.covariances.add(stamp, row)
     for stamp, row in _rows(source, source.velocities):
-        record.velocities.add(stamp, row)
+        record.longest.velocities.add(stamp, row)
     judgement = judge(
         record,
         truth.poses,

@@ -35,6 +35,7 @@ from nodes.judging.evaluation.plausibility import too_large_percent, velocity_er
 from nodes.judging.evaluation.record import (
     EstimatorRecord,
     Interval,
+    MapRecord,
     Stamps,
     answered,
     choose_frames,
@@ -161,7 +162,8 @@ def judge(
             estimator's camera; without cameras that of the truth.
     """
     end = int(truth.stamps[-1]) if end is None else end
-    estimate = record.rows.trajectory() if len(record) else None
+    longest_map = record.longest
+    estimate = longest_map.rows.trajectory() if len(longest_map) else None
     poses = np.empty(0, np.int64) if estimate is None else estimate.stamps
     arrivals = record.arrivals()
     frames = choose_frames(cameras or {}, poses)
@@ -189,7 +191,7 @@ def judge(
         estimate, weighed = estimate.moved(lever), weighed.moved(lever)
     figures: dict[str, Any] = {
         "method": record.method,
-        "estimates": len(record),
+        "estimates": len(longest_map),
         "compared": 0 if sparse else int(truth.covers(poses, hole).sum()),
         "coverage_percent": coverage.percent,
         "frame_coverage_percent": None if frames is None else coverage.frames_percent,
@@ -200,7 +202,7 @@ def judge(
         "future_stamps": record.future,
         "other_bodies": sum(
             count
-            for name, count in record.bodies.items()
+            for name, count in longest_map.bodies.items()
             if name.rpartition("/")[2] != body.rpartition("/")[2]
         ),
         "path_m": path,
@@ -215,7 +217,8 @@ def judge(
         errors = held_errors(truth, due, poses[:0], np.empty(0), coverage.lost)
         return _held(errors, path, due, planned)
 
-    how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
+    frame = longest_map.frame_id
+    how = choose_alignment(record.scale_free, frame) if alignment == "auto" else alignment
     final, final_note = _judge_final(
         record, truth, hole, due, path, alignment, align_first, figures, planned
     )
@@ -230,7 +233,7 @@ def judge(
     figures["rate_hz"] = (len(estimate) - 1) / estimate.seconds if estimate.seconds else 0.0
     if len(arrivals):
         figures |= _latencies(poses, arrivals, due)
-    notes = [_not_compared(truth, poses, longest), final_note]
+    notes = [record.elsewhere(), _not_compared(truth, poses, longest), final_note]
     if frames is None and len(weighed) < len(estimate):
         notes.append(f"of {len(estimate)} poses in bursts {len(weighed)} weigh, one a usual step")
     try:
@@ -272,7 +275,7 @@ def judge(
     )
     held = held_errors(truth, due, true_poses.stamps, at_images.position, coverage.lost)
     figures |= _held(held, path, due, planned)
-    figures |= _velocities_and_covariances(record, truth, true_poses, moved, aligned)
+    figures |= _velocities_and_covariances(longest_map, truth, true_poses, moved, aligned)
     at_ticks = None
     if len(arrivals):
         at_ticks, available = errors_at_ticks(truth, whole, arrivals, rate, hole)
@@ -545,7 +548,7 @@ def _tilted(truth: Trajectory, aligned: Trajectory, method: AlignmentMethod) -> 
 
 
 def _velocities_and_covariances(
-    record: EstimatorRecord,
+    poses: MapRecord,
     truth: Trajectory,
     true_poses: Trajectory,
     moved: Trajectory,
@@ -554,10 +557,10 @@ def _velocities_and_covariances(
     """Return the figures of velocities and covariances, as far as they were given."""
     figures: dict[str, Any] = {}
     rotation, scale = aligned.rotation, aligned.scale
-    for name, series in (("velocities", record.velocities), ("covariances", record.covariances)):
+    for name, series in (("velocities", poses.velocities), ("covariances", poses.covariances)):
         if len(series):
-            figures[f"{name}_percent"] = 100.0 * len(series) / len(record)
-    rows, values = record.velocities.at(true_poses.stamps)
+            figures[f"{name}_percent"] = 100.0 * len(series) / len(poses)
+    rows, values = poses.velocities.at(true_poses.stamps)
     if rows.any():
         # The true velocity is the difference of the true positions, as densely as there are.
         near = truth.near(true_poses.stamps[rows])
@@ -565,7 +568,7 @@ def _velocities_and_covariances(
         wrong = position_errors(true, scale * values @ rotation.T)
         figures["velocity_rmse_m_per_s"] = rms(wrong)
         figures["velocity_error_percent"] = velocity_error_percent(wrong, true)
-    rows, values = record.covariances.at(true_poses.stamps)
+    rows, values = poses.covariances.at(true_poses.stamps)
     if rows.any():
         turn = np.kron(np.diag([scale, 1.0]), rotation)
         turned = turn @ values.reshape(-1, 6, 6) @ turn.T

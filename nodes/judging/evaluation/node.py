@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Collection, Iterable
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -43,7 +44,7 @@ from nodes.judging.evaluation.record import EstimatorRecord, Stamps, choose_came
 from nodes.judging.evaluation.thresholds import Thresholds
 from nodes.judging.evaluation.verdict import conclude, node_of, owner_of, planned_end
 from nodes.trajectory import Trajectory
-from nodes.trajectory_files import GrowingFile, tum_row
+from nodes.trajectory_files import GrowingFile, tum_row, write_tum
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
 from runtime.figures import FIGURES
@@ -53,9 +54,10 @@ from runtime.time.clock import SECOND
 
 
 class LiveErrors:
-    """Errors of an estimator so far; estimates in ``odom`` are aligned at the first."""
+    """Errors of an estimator so far in one frame; in others than ``map`` aligned at the first."""
 
-    def __init__(self) -> None:
+    def __init__(self, frame_id: str) -> None:
+        self.frame_id = frame_id
         self.count = 0
         self.sum_of_squares = 0.0
         self._origin: npt.NDArray[np.float64] | None = None
@@ -63,7 +65,7 @@ class LiveErrors:
     def of(self, event: PoseEstimate, truth: Pose) -> tuple[float, float]:
         """Return the errors of an estimate: metres, radians."""
         position, orientation = event.position, event.orientation
-        if event.frame_id != "map":
+        if self.frame_id != "map":
             matrix = pose_matrix(position, orientation)
             if self._origin is None:
                 self._origin = pose_matrix(*truth) @ np.linalg.inv(matrix)
@@ -263,13 +265,16 @@ class Evaluation(Node[EvaluationConfig]):
         record = self._records.setdefault(name, EstimatorRecord())
         if not record.add(event, now):
             return
-        self._append(source_file(name), event)
+        if event.frame_id == next(iter(record.maps)):
+            self._append(source_file(name), event)
         self._score(event, "latency", (now - event.stamp) / 1e9, "s")
         flight = self._flight_of(name)
         truth = flight.recent.at(event.stamp, self.config.hole)
         if truth is None or record.scale_free:
             return
-        live = self._live.setdefault(name, LiveErrors())
+        live = self._live.get(name)
+        if live is None or live.frame_id != event.frame_id:
+            live = self._live[name] = LiveErrors(event.frame_id)
         distance, angle = live.of(event, truth)
         self._score(event, "position_error", distance, "m")
         self._score(event, "rotation_error", angle, "rad")
@@ -417,6 +422,11 @@ class Evaluation(Node[EvaluationConfig]):
         if self.out is not None:
             plans = {self._named("plan", v): f.plan() for v, f in self._flights.items()}
             write_results(self.out, plans, judgements, verdict)
+            for name, record in self._records.items():
+                if record.longest is not next(iter(record.maps.values()), record.longest):
+                    # Its file has the first map, as it came.
+                    path, head = self._trajectory_file(source_file(name), record.longest.frame_id)
+                    write_tum(path, record.longest.rows.trajectory(), head)
             collisions = [c for flight in self._flights.values() for c in flight.collisions]
             file = self.out / "trajectories" / "collisions.csv"
             file.write_text(collision_rows(collisions), encoding="utf-8")
@@ -498,15 +508,20 @@ class Evaluation(Node[EvaluationConfig]):
             return
         file = self._files.get(name)
         if file is None:
-            folder = self.out / "trajectories"
-            folder.mkdir(exist_ok=True)
-            path = folder / f"{name}.tum"
             true = isinstance(event, Odometry)
-            frame = event.frame_id.encode("unicode_escape").decode("ascii")  # in one line
-            frame = "map (NED)" if true else f"{frame}, as it was sent"
-            head = f"# {FRAMES.format(frame)}\n"
-            file = self._files[name] = GrowingFile(self, path, head)
+            path, head = self._trajectory_file(name, None if true else event.frame_id)
+            path.parent.mkdir(exist_ok=True)
+            file = self._files[name] = GrowingFile(self, path, f"# {head}\n")
         file.add(tum_row(event.stamp, event.position, event.orientation))
+
+    def _trajectory_file(self, name: str, frame_id: str | None) -> tuple[Path, str]:
+        """Return the path and the first line of a trajectory's file; without a frame, a truth's."""
+        assert self.out is not None
+        frame = "map (NED)"
+        if frame_id is not None:
+            in_one_line = frame_id.encode("unicode_escape").decode("ascii")
+            frame = f"{in_one_line}, as it was sent"
+        return self.out / "trajectories" / f"{name}.tum", FRAMES.format(frame)
 
     def _score(self, event: PoseEstimate, metric: str, value: float, unit: str) -> None:
         self.scores.send(

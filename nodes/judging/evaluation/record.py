@@ -185,11 +185,38 @@ class SampledRows:
         return np.isin(stamps, mine), rows[np.isin(mine, stamps)]
 
 
-class EstimatorRecord:
-    """Events of an estimator, sorted into a trajectory and counts.
+class MapRecord:
+    """An estimator's poses in one frame, with strictly rising stamps: those of one map."""
 
-    The trajectory has the poses in the first one's frame, with strictly rising stamps; others are
-    only counted.
+    def __init__(self, frame_id: str = "") -> None:
+        self.frame_id = frame_id
+        self.rows = PoseRows()
+        self.arrivals = array("q")  # of its poses (ns), if known
+        self.bodies: Counter[str] = Counter()  # number of poses by body (`child_frame_id`)
+        self.velocities = SampledRows(3)  # velocities of the poses that carry one: 3 numbers
+        self.covariances = SampledRows(36)  # likewise: 36 numbers, row by row
+
+    def add(self, event: PoseEstimate, now: int | None) -> None:
+        """Add an estimate and its arrival (ns, if known)."""
+        self.rows.add(event.stamp, event.position, event.orientation)
+        self.bodies[event.child_frame_id] += 1
+        if now is not None:
+            self.arrivals.append(now)
+        if event.velocity is not None:
+            self.velocities.add(event.stamp, event.velocity)
+        if event.covariance:
+            self.covariances.add(event.stamp, event.covariance)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+class EstimatorRecord:
+    """Record of an estimator: its poses by frame, and losses of tracking.
+
+    Poses in another frame are those of another map, whose place, and often unit of length, are not
+    known in the first. Judged is the map with most poses, the earliest of equal ones; the poses of
+    all others are only counted.
     """
 
     def __init__(
@@ -202,32 +229,29 @@ class EstimatorRecord:
         # The point of the body (m) whose poses are judged: the camera, if its poses have been moved
         # to the body in a unit that is not the metre.
         self.lever: Vector3 = (0.0, 0.0, 0.0)
-        self.frame_id = ""
-        self.rows = PoseRows()  # poses of the trajectory
+        self.longest = MapRecord()
+        self.maps: dict[str, MapRecord] = {}  # by frame, in the order of their first poses
         self.repeated = 0  # poses with a stamp not later than the last
         self.future = 0  # poses and tracking events stamped later than their arrival
         self.restarts = 0  # number of changes to another frame, one after each loss of tracking
-        self.bodies: Counter[str] = Counter()  # number of poses by body (`child_frame_id`)
-        self.velocities = SampledRows(3)  # velocities of the poses that carry one: 3 numbers
-        self.covariances = SampledRows(36)  # likewise: 36 numbers, row by row
         # The last trajectory after loop closures; `None` for none, or an empty one.
         self.final: Trajectory | None = None
         self.final_frame_id = ""  # frame of `final`
         self._last_stamp: int | None = None
         self._last_frame = ""
-        self._arrivals = array("q")
         self._tracking: list[tuple[int, bool]] = []
 
     @classmethod
-    def of(cls, trajectory: Trajectory) -> EstimatorRecord:
+    def of(cls, trajectory: Trajectory, frame_id: str = "") -> EstimatorRecord:
         """Return the record of a trajectory without arrival times."""
         record = cls()
+        record.longest = record.maps[frame_id] = MapRecord(frame_id)
         for pose in trajectory.poses():
-            record.rows.add(*pose)
+            record.longest.rows.add(*pose)
         return record
 
     def add(self, event: PoseEstimate, now: int | None) -> bool:
-        """Add an estimate and its arrival (ns, if known); return whether the trajectory grew."""
+        """Add an estimate and its arrival (ns, if known); return whether the longest map grew."""
         if now is not None and event.stamp > now + _AHEAD:
             self.future += 1
             return False
@@ -235,20 +259,16 @@ class EstimatorRecord:
             self.repeated += 1
             return False
         self._last_stamp = event.stamp
-        self.frame_id = self.frame_id or event.frame_id
-        self.restarts += event.frame_id not in {self.frame_id, self._last_frame}
-        self._last_frame = event.frame_id
-        if event.frame_id != self.frame_id:
-            return False
-        self.rows.add(event.stamp, event.position, event.orientation)
-        self.bodies[event.child_frame_id] += 1
-        if now is not None:
-            self._arrivals.append(now)
-        if event.velocity is not None:
-            self.velocities.add(event.stamp, event.velocity)
-        if event.covariance:
-            self.covariances.add(event.stamp, event.covariance)
-        return True
+        frame = event.frame_id
+        if frame not in self.maps:
+            self.maps[frame] = MapRecord(frame)
+        self.restarts += frame not in {next(iter(self.maps)), self._last_frame}
+        self._last_frame = frame
+        grown = self.maps[frame]
+        grown.add(event, now)
+        if len(grown) > len(self.longest):
+            self.longest = grown
+        return grown is self.longest
 
     def add_final(self, event: TrajectoryEstimate) -> None:
         """Store the estimator's latest trajectory after loop closures."""
@@ -261,16 +281,24 @@ class EstimatorRecord:
         self.future += event.stamp > now + _AHEAD
         self._tracking.append((min(event.stamp, now + _AHEAD), isinstance(event, TrackingLost)))
 
-    def __len__(self) -> int:
-        return len(self.rows)
-
     def stamps(self) -> Stamps:
-        """Return the stamps of the trajectory's poses (ns), strictly rising, shape (n,)."""
-        return self.rows.trajectory().stamps if len(self) else np.empty(0, np.int64)
+        """Return the stamps of the longest map's poses (ns), strictly rising, shape (n,)."""
+        rows = self.longest.rows
+        return rows.trajectory().stamps if len(rows) else np.empty(0, np.int64)
 
     def arrivals(self) -> npt.NDArray[np.int64]:
-        """Return when each pose of the trajectory came (ns), shape (n,); (0,) if not known."""
-        return np.array(self._arrivals, np.int64)
+        """Return when each pose of the longest map came (ns), shape (n,); (0,) if not known."""
+        return np.array(self.longest.arrivals, np.int64)
+
+    def elsewhere(self) -> str:
+        """Return, in words, what is not judged since it is in other frames; empty if nothing is."""
+        others = sum(map(len, self.maps.values())) - len(self.longest)
+        if not others:
+            return ""
+        return (
+            f"judged are the {len(self.longest)} poses in {self.longest.frame_id!r}, most of those "
+            f"in {len(self.maps)} frames; {others} in others are left out"
+        )
 
     def reported_lost(self, end: int) -> list[Interval]:
         """Return the lost intervals reported by the estimator, up to the run's end (ns)."""

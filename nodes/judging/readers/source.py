@@ -1,13 +1,14 @@
 """A trajectory from outside (`Source`), a row of the table (`Reader`), and how rows become poses.
 
 Rows that cannot be compared are left out and counted: numbers that are none, stamps that repeat or
-go back, poses in another frame than the first one's.
+go back, poses in other frames than that of most.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -168,10 +169,9 @@ class Collected:
         self._rows: list[str] = []
         self._covariances: list[Floats | None] = []
         self._velocities: list[Sequence[float] | None] = []
+        self._frames: list[str] = []  # by row
         self._last: int | None = None
-        self._frame = ""
-        self._first_frame: str | None = None
-        self.not_numbers = self.repeated = self.back = self.restarts = self.elsewhere = 0
+        self.not_numbers = self.repeated = self.back = self.restarts = 0
         self.outside = 0  # rows without a pose, such as a receiver's without a fix
 
     def add(
@@ -196,12 +196,8 @@ class Collected:
             self.back += stamp < self._last
             return
         self._last = stamp
-        self._first_frame = frame_id if self._first_frame is None else self._first_frame
-        self.restarts += frame_id not in {self._first_frame, self._frame}
-        self._frame = frame_id
-        if frame_id != self._first_frame:
-            self.elsewhere += 1
-            return
+        self.restarts += bool(self._frames) and frame_id not in {self._frames[0], self._frames[-1]}
+        self._frames.append(frame_id)
         self._stamps.append(stamp)
         self._poses.append([*position, *(orientation or (0.0,) * 4)])
         self._rows.append(row)
@@ -217,8 +213,8 @@ class Collected:
 
     @property
     def frame_id(self) -> str:
-        """Frame of the poses."""
-        return self._first_frame or ""
+        """Frame of most poses, the earliest of equal ones; empty without poses."""
+        return max(Counter(self._frames).items(), key=lambda row: row[1], default=("", 0))[0]
 
     def source(
         self,
@@ -231,14 +227,17 @@ class Collected:
         if not self._stamps:
             left = "; ".join(self._left_out())
             raise ValueError(f"{self._place}: expected poses, found none{left and f': {left}'}")
-        poses = np.array(self._poses)
+        judged = self.frame_id
+        inside = [row for row, frame in enumerate(self._frames) if frame == judged]
+        poses = np.array(self._poses)[inside]
         lengths = np.linalg.norm(poses[:, 3:], axis=1)
         positions_only = not lengths.any()
         if positions_only:
             poses[:, 3:] = IDENTITY
         elif wrong := np.flatnonzero(~(abs(lengths - 1.0) <= UNIT_LENGTH)).tolist():
+            row = self._rows[inside[wrong[0]]]
             raise ValueError(
-                f"{self._place}{self._rows[wrong[0]]}: expected a quaternion of length 1, found "
+                f"{self._place}{row}: expected a quaternion of length 1, found "
                 f"w x y z = {poses[wrong[0], 3:].tolist()}"
             )
         counts = {"restarts": self.restarts} if counted else {}
@@ -247,25 +246,26 @@ class Collected:
         return Source(
             name="",
             file="",
-            poses=Trajectory(np.array(self._stamps, np.int64), poses[:, :3], poses[:, 3:]),
-            frame_id=self.frame_id,
+            poses=Trajectory(np.array(self._stamps, np.int64)[inside], poses[:, :3], poses[:, 3:]),
+            frame_id=judged,
             axes=axes,
             usual=usual,
             positions_only=positions_only,
             counts=counts,
             notes=tuple(self._left_out()),
-            covariances=_filled(self._covariances, (6, 6)),
-            velocities=_filled(self._velocities, (3,)),
+            covariances=_filled([self._covariances[row] for row in inside], (6, 6)),
+            velocities=_filled([self._velocities[row] for row in inside], (3,)),
         )
 
     def _left_out(self) -> list[str]:
+        elsewhere = len(self._frames) - self._frames.count(self.frame_id)
         parts = [
             f"{count} {what[0] if count == 1 else what[1]}"
             for count, what in (
                 (self.not_numbers, ("pose with NaN", "poses with NaN")),
                 (self.repeated, ("repeated stamp", "repeated stamps")),
                 (self.back, ("stamp that goes back", "stamps that go back")),
-                (self.elsewhere, ("pose in another frame", "poses in another frame")),
+                (elsewhere, ("pose in another frame", "poses in another frame")),
                 (self.outside, ("row without a pose", "rows without a pose")),
             )
             if count

@@ -89,15 +89,21 @@ def test_without_a_pose_nothing_is_covered_also_of_a_single_image() -> None:
     assert cover(FRAMES[:1], FRAMES, GAP, planned=SECOND).flight == (0, 0)  # at no known rate
 
 
-def test_the_trajectory_is_in_the_first_frame_and_only_that_grows_it() -> None:
+def test_judged_is_the_frame_of_most_poses_and_of_equal_ones_the_first() -> None:
     record = EstimatorRecord()
     grown = [
         record.add(estimate(k * MS, frame_id=frame), k * MS)
         for k, frame in enumerate(["odom", "odom", "map", "map", "odom", "map"])
     ]
     assert grown == [True, True, False, False, True, False]
-    assert (len(record), record.frame_id, record.restarts) == (3, "odom", 2)
-    assert record.bodies == {"base_link": 3}
+    assert (record.longest.frame_id, record.restarts) == ("odom", 2)
+    assert record.stamps().tolist() == record.arrivals().tolist() == [0, MS, 4 * MS]
+    assert record.longest.bodies == {"base_link": 3}
+    assert record.elsewhere() == (
+        "judged are the 3 poses in 'odom', most of those in 2 frames; 3 in others are left out"
+    )
+    assert record.add(estimate(6 * MS, frame_id="map"), 6 * MS) is True
+    assert record.stamps().tolist() == [2 * MS, 3 * MS, 5 * MS, 6 * MS]
     assert record.add(estimate(5 * MS), 9 * MS) is False
     assert record.repeated == 1
 

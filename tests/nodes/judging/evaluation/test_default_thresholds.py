@@ -182,7 +182,7 @@ def test_twenty_minutes_in_a_small_place_make_a_frozen_estimator_no_better() -> 
     truth = Trajectory(stamps, np.array(places), np.array(headings))
     record = EstimatorRecord()
     for stamp, _, orientation in truth.poses():
-        record.rows.add(stamp, place(0), orientation)
+        record.longest.rows.add(stamp, place(0), orientation)
     figures = judge(record, truth, alignment="none", cameras={"c": stamps}).figures
     assert figures["ate_percent"] < 0.4
     (failed,) = conclude({"est": figures}, Thresholds(**ASKED))["estimators"]["est"]["failed"]

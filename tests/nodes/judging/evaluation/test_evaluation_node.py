@@ -222,6 +222,24 @@ def test_each_estimator_has_files_of_its_own_whatever_it_and_its_frame_are_calle
     assert len([*(tmp_path / "evaluation").glob("*.aligned.tum")]) == len(sources)
 
 
+def test_a_second_map_with_more_poses_is_what_is_judged_scored_and_written(tmp_path: Path) -> None:
+    sent: list[Event] = [
+        estimate(stamp, error=(5.0, 0.0, 0.0), frame_id="odom" if n < 3 else "odom_1")
+        for n, stamp in enumerate(FRAMES[:11])
+    ]
+    scores = run(tmp_path, announced(), truth(1), sent)
+    scored = [s.stamp for s in scores if s.metric == "position_error"]
+    assert scored == [*FRAMES[:3], *FRAMES[6:11]]  # those of the map that had most poses then
+    written = tmp_path / "trajectories" / "est.tum"
+    assert read_tum(written).stamps.tolist() == [*FRAMES[3:11]]
+    assert "in odom_1, as it was sent" in written.read_text()
+    figures = json.loads((tmp_path / "evaluation" / "verdict.json").read_text())["estimators"][
+        "est"
+    ]
+    assert (figures["estimates"], figures["restarts"]) == (8, 1)
+    assert figures["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_of_many_images_a_few_are_kept_with_their_features(tmp_path: Path) -> None:
     events: list[Event] = []
     for stamp in FRAMES:

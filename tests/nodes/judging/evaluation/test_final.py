@@ -43,8 +43,7 @@ def judged(
     record = EstimatorRecord(scale_free)
     drift = np.arange(len(TRUTH))[:, None] * [0.0, 0.001, 0.0]
     poses = said or Trajectory(TRUTH.stamps, TRUTH.positions + drift, TRUTH.orientations)
-    record.rows = EstimatorRecord.of(poses).rows
-    record.frame_id = "map"
+    record.longest = EstimatorRecord.of(poses, "map").longest
     for trajectory in finals:
         record.add_final(trajectory)
     return judge(record, TRUTH, cameras={"c": TRUTH.stamps})

@@ -357,7 +357,7 @@ def test_a_scale_that_is_wrong_is_as_wrong_over_every_share() -> None:
         assert errors[f"rpe_{share}pct_rot_deg_per_m"] == pytest.approx(0.0, abs=1e-9)
     for how, scale_free in (("se3", False), ("sim3", True)):
         record = EstimatorRecord(scale_free)
-        record.rows = EstimatorRecord.of(large).rows
+        record.longest = EstimatorRecord.of(large).longest
         figures = judge(record, truth, alignment="auto" if scale_free else "se3").figures
         assert figures["alignment"] == how
         assert figures["scale"] == pytest.approx(1 / 1.1, rel=1e-6)

@@ -181,8 +181,7 @@ def test_a_first_pose_without_orientation_aligns_nothing(
             EstimatorRecord.of(estimate), truth, alignment=alignment, align_first=first
         )
         assert f"expected orientations for {alignment}, found none" in judgement.figures["why"]
-    record = EstimatorRecord.of(SENT)
-    record.frame_id = "odom"
+    record = EstimatorRecord.of(SENT, "odom")
     judgement = judge(record, oriented(Rotation.identity(len(TRUTH))))
     assert judgement.figures["alignment"] == "se3"
 

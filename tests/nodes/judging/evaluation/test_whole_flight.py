@@ -315,8 +315,8 @@ def test_within_a_loss_images_with_a_pose_of_their_own_have_its_error() -> None:
 
 def test_a_vehicle_that_stands_has_no_errors_in_percent() -> None:
     stands = Trajectory(TRUTH.stamps, np.ones((len(TRUTH), 3)), TRUTH.orientations)
-    record = EstimatorRecord.of(stands)
-    record.frame_id = record.final_frame_id = "map"
+    record = EstimatorRecord.of(stands, "map")
+    record.final_frame_id = "map"
     record.final = stands
     figures = judge(record, stands, cameras={"c": FRAMES}).figures
     for prefix in ("", "final_", "flight_", "final_flight_"):

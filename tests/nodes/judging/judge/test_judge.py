@@ -193,6 +193,25 @@ def test_topics_of_bags_are_read_in_our_frames(type_: str, tmp_path: Path) -> No
         assert (figures["restarts"], figures["estimates"]) == (0, 200)
 
 
+@pytest.mark.parametrize(("changes_at", "left_out"), [(20, 20), (150, 50)])
+def test_of_a_topics_frames_the_one_with_most_poses_is_judged(
+    tmp_path: Path, changes_at: int, left_out: int
+) -> None:
+    def change(number: int, message: Any) -> Any:
+        message.header.frame_id = "odom" if number <= changes_at else "odom_1"
+        message.pose.position.x += 50.0 if number <= changes_at else 0.0  # no frame fits the other
+        return message
+
+    truth = walk(200, start=10**18)
+    write_tum(tmp_path / "truth.tum", truth, FRAMES.format("map (NED)"))
+    bags.bag(tmp_path / "bag", bags.POSE, truth, frame_id="odom", change=change)
+    words = ["--truth", "truth.tum", "--estimate", "slam=bag:/slam/poses"]
+    figures = judge(tmp_path, *words, code=1)["slam"]
+    assert (figures["restarts"], figures["estimates"]) == (1, 200 - left_out)
+    assert figures["ate_rmse_m"] == pytest.approx(0.0, abs=1e-6)
+    assert f"left out: {left_out} poses in another frame" in said(tmp_path, *words).stderr
+
+
 def test_restarts_and_repeated_stamps_of_a_topic_are_counted_and_fail(tmp_path: Path) -> None:
     def change(number: int, message: Any) -> Any:
         message.header.frame_id = "odom" if number < 190 else "odom_1"

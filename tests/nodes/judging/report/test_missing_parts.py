@@ -43,7 +43,7 @@ def test_a_killed_run_gives_a_page_of_what_it_left(tmp_path: Path) -> None:
     truth = walk(4)
     folder = tmp_path / "trajectories"
     folder.mkdir()
-    for name, trajectory in (("truth", truth), ("vo", recorded(truth).rows.trajectory())):
+    for name, trajectory in (("truth", truth), ("vo", recorded(truth).longest.rows.trajectory())):
         rows = zip(
             trajectory.stamps.tolist(),
             trajectory.positions.tolist(),

@@ -50,7 +50,7 @@ def test_what_holds_no_poses_is_an_error(tmp_path: Path, text: str) -> None:
 
 def test_gaps_are_where_no_pose_is_and_lines_break_there() -> None:
     truth = walk(10)
-    said = recorded(truth, silent=(4.0, 6.0)).rows.trajectory()
+    said = recorded(truth, silent=(4.0, 6.0)).longest.rows.trajectory()
     (lost,) = gaps(said, truth)
     assert (lost.start / SECOND, lost.end / SECOND) == pytest.approx((4.0, 6.0), abs=0.04)
     line = broken(said.positions, said.stamps, [lost])
@@ -78,7 +78,7 @@ def test_lines_break_where_no_truth_is_known(tmp_path: Path) -> None:
 
 def test_an_end_in_silence_is_a_gap() -> None:
     truth = walk(10)
-    said = recorded(truth).rows.trajectory()
+    said = recorded(truth).longest.rows.trajectory()
     (lost,) = gaps(said.take(said.stamps <= 7 * SECOND), truth)
     assert lost.end == truth.stamps[-1]
 
