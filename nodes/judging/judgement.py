@@ -149,6 +149,8 @@ def _judge_one(
 ) -> Judgement:
     record = EstimatorRecord.of(source.poses)
     record.final = None if final is None else final.poses
+    if config.scale_free:  # the body's place beside the camera is in metres, its poses are not
+        record.lever = source.lever
     for stamp, row in _rows(source, source.covariances):
         record.longest.covariances.add(stamp, row)
     for stamp, row in _rows(source, source.velocities):

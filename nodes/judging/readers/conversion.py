@@ -77,4 +77,5 @@ def converted(source: Source, world: World, body: Body) -> Source:
         poses=Trajectory.from_matrices(source.poses.stamps, matrices),
         covariances=None if source.covariances is None else both @ source.covariances @ both.T,
         velocities=None if source.velocities is None else source.velocities @ to_ned.T,
+        lever=tuple((to_frd @ source.lever).tolist()),
     )

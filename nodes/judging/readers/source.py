@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from events import Vector3
 from nodes.judging.readers.axes import UNDECLARED, Axes
 from nodes.trajectory import UNIT_LENGTH, Trajectory
 
@@ -56,6 +57,7 @@ class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         covariances: Of the poses, in ROS's order (x, y, z, and angles about the frame's fixed
             axes), shape (n, 6, 6); NaN for poses without one.
         velocities: In the poses' frame (m/s), shape (n, 3); NaN for poses without one.
+        lever: Place on the body (m) of the camera whose poses were given; see `of_body`.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     notes: tuple[str, ...] = ()
     covariances: Floats | None = None
     velocities: Floats | None = None
+    lever: Vector3 = (0.0, 0.0, 0.0)
 
 
 class Start(msgspec.Struct, frozen=True):

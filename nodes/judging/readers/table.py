@@ -239,4 +239,5 @@ def of_body(source: Source, camera: Floats) -> Source:
         covariances=None,
         velocities=None,
         notes=notes,
+        lever=tuple(camera[:3, 3].tolist()),
     )

@@ -22,7 +22,7 @@ from nodes.trajectory import Trajectory
 from nodes.trajectory_files import write_euroc, write_kitti, write_tum
 from tests.nodes.judging.judge import bags
 from tests.nodes.judging.judge.test_judge import said
-from tests.nodes.trajectory.samples import angle, walk
+from tests.nodes.trajectory.samples import angle, moved, walk
 from tests.nodes.trajectory.test_formats import assert_names, trajectories
 
 LAB = "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n"
@@ -231,6 +231,25 @@ def judged(tmp_path: Path, truth: Trajectory, estimate: Trajectory, **settings: 
     config = judgement.JudgeConfig(**settings)
     _, judgements, _, _ = judgement.judge_all(true, [source], None, config)
     return judgements["vo"]
+
+
+@pytest.mark.parametrize("axes", ["ned", "enu"])
+@pytest.mark.parametrize("final", [False, True])
+def test_a_camera_in_a_unit_of_its_own_is_judged_at_the_camera(
+    tmp_path: Path, axes: Any, final: bool
+) -> None:
+    truth = walk(200)
+    camera = moved(Trajectory.from_matrices(truth.stamps, truth.matrices() @ MOUNTING), 0.25)
+    write_tum(tmp_path / "truth", truth)
+    write_tum(tmp_path / "vo", camera)
+    true = read_truth(str(tmp_path / "truth"), axes=axes)
+    source = read(str(tmp_path / "vo"), camera=MOUNTING)
+    config = judgement.JudgeConfig(scale_free=True)
+    finals = {"vo": source} if final else {}
+    _, judgements, _, _ = judgement.judge_all(true, [source], None, config, finals)
+    figures = judgements["vo"].figures
+    assert figures["scale"] == pytest.approx(4.0)
+    assert figures["final_ate_rmse_m" if final else "ate_rmse_m"] < 1e-5
 
 
 def test_no_time_in_common_fails_and_says_why(tmp_path: Path) -> None:
