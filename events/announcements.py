@@ -421,6 +421,10 @@ class Vehicles:
         """Note whose images an estimator looks at."""
         self._followed[event.source] = event.frame_id
 
+    def camera_of(self, source: str) -> str:
+        """Return the camera in whose images an estimator tracks features; empty if unknown."""
+        return self._cameras.get(self._followed.get(source, ""), "")
+
     def carrier(self, source: str) -> str:
         """Return the vehicle named in a source; empty if there is none."""
         vehicles = (v for v in self.names if source == v or source.startswith(f"{v}/"))
@@ -428,6 +432,6 @@ class Vehicles:
 
     def of(self, source: str) -> str:
         """Return the vehicle of a source; empty if there are no vehicles."""
-        camera = self._cameras.get(self._followed.get(source, ""), "")
+        camera = self.camera_of(source)
         vehicle = self._estimated.get(source, "") or self.carrier(source)
         return vehicle or self.carrier(camera) or next(iter(self.names), "")

@@ -570,8 +570,12 @@ def _velocities_and_covariances(
         figures["velocity_error_percent"] = velocity_error_percent(wrong, true)
     rows, values = poses.covariances.at(true_poses.stamps)
     if rows.any():
+        # That of the body, as sent, becomes that of the lever's end, as the errors are.
         turn = np.kron(np.diag([scale, 1.0]), rotation)
-        turned = turn @ values.reshape(-1, 6, 6) @ turn.T
+        levers = scale * moved.rotations()[rows].apply(record.lever)
+        turns = np.tile(turn, (len(levers), 1, 1))
+        turns[:, :3, 3:] = np.cross(levers[:, None], np.eye(3)) @ rotation  # minus its product
+        turned = turns @ values.reshape(-1, 6, 6) @ turns.transpose(0, 2, 1)
         figures["covariance_too_large_percent"] = too_large_percent(turned, true_poses.length())
         figures |= consistency(true_poses.take(rows), moved.take(rows), turned)
     return figures

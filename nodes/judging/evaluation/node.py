@@ -370,9 +370,8 @@ class Evaluation(Node[EvaluationConfig]):
             read = self._read_by(name, how)
             camera = choose_camera(seen, poses, read)
             body = self._flights.get(vehicle, Flight()).body
-            if record.scale_free and "grey" in record.reads:  # of a node that knows its camera
-                eyes = {eye.removesuffix("/grey") for eye in read} & self._places.keys()
-                record.lever = self._places[eyes.pop()] if len(eyes) == 1 else (0.0, 0.0, 0.0)
+            if record.scale_free and {"grey", "rgb"} & {*record.reads}:  # and knows its camera
+                record.lever = self._place_of_camera(name, read, how)
             judgement = self._judge(
                 name,
                 record,
@@ -437,6 +436,19 @@ class Evaluation(Node[EvaluationConfig]):
         """Return the cameras and lidars that an estimator reads, as far as that is known."""
         read = None if end is None else end.read.get(owner_of(estimator, end))
         return read or self._read.get(estimator, ())
+
+    def _place_of_camera(
+        self, estimator: str, read: Collection[str], end: RunEnd | None
+    ) -> Vector3:
+        """Return the place on the body of the camera whose poses an estimator gives.
+
+        Of several that are read, it is the one in whose images features are tracked.
+        """
+        eyes = {eye.removesuffix("/grey") for eye in read} & self._places.keys()
+        if len(eyes) > 1:
+            owner = estimator if end is None else owner_of(estimator, end)
+            eyes &= {self._vehicles.camera_of(estimator) or self._vehicles.camera_of(owner)}
+        return self._places[eyes.pop()] if eyes else (0.0, 0.0, 0.0)
 
     def _add_commands(
         self,

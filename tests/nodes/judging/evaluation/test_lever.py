@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from events import CameraAnnouncement, CameraInfo, EstimatorAnnouncement, Event, TrajectoryEstimate
+from events import (
+    CameraAnnouncement,
+    CameraInfo,
+    EstimatorAnnouncement,
+    Event,
+    TrackedFeatures,
+    TrajectoryEstimate,
+)
 from events.geometry import pose_matrix
 from nodes.estimators import Mount, TrackingResult
 from nodes.judging.evaluation import Evaluation
@@ -55,16 +62,30 @@ def camera() -> CameraAnnouncement:
     )
 
 
-def as_sent(reads: tuple[str, ...]) -> tuple[list[Event], list[Event]]:
-    """Return announcements, and what an estimator sends that knows the camera's poses exactly."""
+def as_sent(
+    reads: tuple[str, ...], shift: float = 0.0, turn: float = 0.0
+) -> tuple[list[Event], list[Event]]:
+    """Return announcements, and what an estimator sends that knows the camera's poses.
+
+    Args:
+        shift: Standard deviation of the camera's position, metres; with a covariance, if above 0.
+        turn: The same of its orientation, radians.
+    """
     eye = camera()
     on_body = pose_matrix(eye.position, eye.orientation)
     seen = np.array([pose_matrix(place(s), attitude(s)) @ on_body for s in FRAMES])
-    poses = np.linalg.inv(seen[0]) @ seen
+    start, covariance = np.linalg.inv(seen[0]), None
+    if shift:
+        random = np.random.default_rng(1)
+        seen[:, :3, 3] += random.normal(0.0, shift, (len(seen), 3))
+        turns = Rotation.from_rotvec(random.normal(0.0, turn, (len(seen), 3)))
+        seen[:, :3, :3] = turns.as_matrix() @ seen[:, :3, :3]
+        covariance = np.diag([(shift / UNIT) ** 2] * 3 + [turn**2] * 3)
+    poses = start @ seen
     poses[:, :3, 3] /= UNIT
     mount = Mount.of(eye, None)
     sent: list[Event] = [
-        mount.estimate(s, "est", TrackingResult(pose=pose))
+        mount.estimate(s, "est", TrackingResult(pose=pose, covariance=covariance))
         for s, pose in zip(FRAMES, poses, strict=True)
     ]
     last = mount.trajectory(10 * SECOND, "est", np.array(FRAMES), poses)
@@ -89,13 +110,39 @@ def judged(out: Path, *groups: list[Event]) -> dict[str, Any]:
     return figures
 
 
-def test_a_unit_of_its_own_is_judged_at_the_camera(tmp_path: Path) -> None:
-    said, sent = as_sent(("grey",))
+@pytest.mark.parametrize("kind", ["grey", "rgb"])
+def test_a_unit_of_its_own_is_judged_at_the_camera(tmp_path: Path, kind: str) -> None:
+    said, sent = as_sent((kind,))
     figures = judged(tmp_path, said, truth(10), sent)
     assert figures["alignment"] == "sim3"
     assert figures["scale"] == pytest.approx(UNIT, rel=1e-6)
     assert figures["ate_rmse_m"] < 1e-5
     assert figures["final_ate_rmse_m"] < 1e-5
+
+
+def test_of_several_cameras_it_is_that_of_the_features(tmp_path: Path) -> None:
+    said, sent = as_sent(("grey",))
+    other = msgspec.structs.replace(
+        camera(), source="drone/other", frame_id="drone/other_optical", position=(-1.0, 0.0, 0.0)
+    )
+    said[-1] = msgspec.structs.replace(said[-1], cameras=("drone/other", "drone/eye"))
+    features = TrackedFeatures(
+        stamp=0,
+        source="est",
+        frame_id="drone/eye_optical",
+        points=np.empty((0, 2), np.float32),
+        inliers=np.empty(0, np.bool_),
+    )
+    figures = judged(tmp_path, [*said, other], truth(10), [features, *sent])
+    assert figures["ate_rmse_m"] < 1e-5
+
+
+def test_a_covariance_is_held_against_the_error_of_the_camera(tmp_path: Path) -> None:
+    """The turn of a radian would move a body by as many metres as the lever has."""
+    said, sent = as_sent(("grey",), shift=0.05, turn=0.1)
+    figures = judged(tmp_path, said, truth(10), sent)
+    assert figures["nees_position"] == pytest.approx(3.0, abs=0.8)
+    assert figures["nees_pose"] == pytest.approx(6.0, abs=1.2)
 
 
 def test_what_is_written_is_the_body(tmp_path: Path) -> None:
