@@ -275,7 +275,7 @@ def judge(
     )
     held = held_errors(truth, due, true_poses.stamps, at_images.position, coverage.lost)
     figures |= _held(held, path, due, planned)
-    figures |= _velocities_and_covariances(longest_map, truth, true_poses, moved, aligned)
+    figures |= _velocities_and_covariances(longest_map, lever, truth, true_poses, moved, aligned)
     at_ticks = None
     if len(arrivals):
         at_ticks, available = errors_at_ticks(truth, whole, arrivals, rate, hole)
@@ -549,6 +549,7 @@ def _tilted(truth: Trajectory, aligned: Trajectory, method: AlignmentMethod) -> 
 
 def _velocities_and_covariances(
     poses: MapRecord,
+    lever: Floats,
     truth: Trajectory,
     true_poses: Trajectory,
     moved: Trajectory,
@@ -572,7 +573,7 @@ def _velocities_and_covariances(
     if rows.any():
         # That of the body, as sent, becomes that of the lever's end, as the errors are.
         turn = np.kron(np.diag([scale, 1.0]), rotation)
-        levers = scale * moved.rotations()[rows].apply(record.lever)
+        levers = scale * moved.rotations()[rows].apply(lever)
         turns = np.tile(turn, (len(levers), 1, 1))
         turns[:, :3, 3:] = np.cross(levers[:, None], np.eye(3)) @ rotation  # minus its product
         turned = turns @ values.reshape(-1, 6, 6) @ turns.transpose(0, 2, 1)
