@@ -122,7 +122,7 @@ def make_clock(run: RunConfig, loop: asyncio.AbstractEventLoop) -> Clock:
     """Return the run's clock, at 0."""
     if isinstance(loop, LockstepLoop):
         return LockstepClock(loop)
-    return RealClock(loop, speed=1.0 if run.speed in {None, "max"} else run.speed)  # type: ignore[arg-type]
+    return RealClock(loop, speed=1.0 if run.speed is None else run.speed)  # type: ignore[arg-type]
 
 
 @dataclass
@@ -219,7 +219,7 @@ class _Run:
             self.failed(error)
         for call in self.supervisor.state.afterwards:
             owner = getattr(call, "__self__", None)
-            name = owner.name if isinstance(owner, Node) else getattr(call, "__module__", "runtime")
+            name = owner.name if isinstance(owner, Node) else call.__module__ or "runtime"
             try:
                 call(out)
             except BaseException as error:
