@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-import tomllib
 
 import pytest
 
-from tools.mutants import LIST, ROOT, equivalents, path_of
+from tools.mutants import ROOT, equivalents, listed, path_of, places_of
 from tools.mutations import mutants
 
-LISTED = tomllib.loads(LIST.read_text(encoding="utf-8"))
+LISTED = listed()
+TESTS = LISTED.pop("tests")
 
 
 @pytest.mark.parametrize(
@@ -70,6 +70,13 @@ def test_listed_mutants_exist_and_have_a_reason(module: str) -> None:
     there = {mutant[:3] for mutant in mutants((ROOT / path_of(module)).read_bytes())}
     assert not equivalents(module) - there
     assert all(row["why"] for row in LISTED[module])
+
+
+@pytest.mark.parametrize("module", TESTS)
+def test_listed_modules_and_their_further_tests_exist(module: str) -> None:
+    assert (ROOT / path_of(module)).is_file()
+    assert [place for place in places_of(module) if not (ROOT / place).exists()] == []
+    assert set(TESTS[module]) < set(places_of(module))
 
 
 @pytest.mark.slow

@@ -4,7 +4,10 @@
 
 The tests are the quick ones of the mirrored folder, of these the ones that run the changed line.
 They run in a copy of the checkout, in processes forked from one that has imported the libraries.
-`tools/mutants.toml` lists equivalent mutants, which no test can kill, each with a reason.
+For each mutant of a module that runs only in processes started by tests, all of them are run, since
+nothing there says which run its lines.
+`tools/mutants.toml` lists equivalent mutants, which no test can kill, each with a reason, and under
+``[tests]`` the modules with tests in other folders, too.
 
 Neither mutmut nor cosmic-ray fit. The wrappers of mutmut add a frame to each call, which senders
 look at (`HandlerCircleError`), and leave out decorated functions and class bodies. Cosmic-ray
@@ -16,6 +19,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import importlib.util
 import os
 import random
 import resource
@@ -131,14 +135,16 @@ def run_tests(copy: Path, module: str, places: Sequence[str], plugin: Plugin, se
             if "site-packages" in str(getattr(loaded, "__file__", "")) and "pytest" not in name
         ]  # fmt: skip
         Path("baseline").write_bytes(msgspec.json.encode(plugin.baseline))
-    used_file = getattr(sys.modules.get(module), "__file__", "")
-    return 99 if code == 0 and used_file != plugin.file else code
+    spec = importlib.util.find_spec(module)  # of what is imported, or would be by a process
+    return 99 if code == 0 and (spec is None or spec.origin != plugin.file) else code
 
 
 def run_baseline(copy: Path, module: str, places: Sequence[str]) -> Baseline:
     """Run all quick tests, and import the libraries that they need."""
     _, status = os.waitpid(start(copy, module, places, Plugin(copy / path_of(module)), 3600), 0)
-    if status:
+    if (code := os.waitstatus_to_exitcode(status)) == 99:
+        raise SystemExit(f"expected tests that run {copy / path_of(module)}, found another file")
+    if code:
         raise SystemExit(f"expected tests that pass, found:\n{(copy / 'output').read_text()}")
     baseline = msgspec.json.decode((copy / "baseline").read_bytes(), type=Baseline)
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -165,10 +171,19 @@ def run_mutant(module: str, folder: Path, seconds: int, task: tuple[Mutant, set[
         time.sleep(0.02)
         if time.monotonic() > deadline:
             os.killpg(child, signal.SIGKILL)
+    end_session(child)
     code = os.waitstatus_to_exitcode(ended[1])
     if code in {0, 5, 99}:
         return {0: "survived"}.get(code, f"error: {(copy / 'output').read_text()}")
     return "timed out" if code in {-signal.SIGALRM, -signal.SIGXCPU, -signal.SIGKILL} else "killed"
+
+
+def end_session(leader: int) -> None:
+    """End what is left of a session: the processes that its tests have started."""
+    for pid in [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]:
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            if os.getsid(pid) == leader:
+                os.kill(pid, signal.SIGKILL)
 
 
 def run_mutants(
@@ -183,9 +198,12 @@ def run_mutants(
         print(
             f"{len(baseline.tests)} tests, {baseline.seconds:.0f} s of processor time", flush=True
         )
+        elsewhere = not any(baseline.tests.values())
+        if elsewhere:
+            print("no test runs the module in its own process: all are run for each mutant")
         tests = [
             {test for test, lines in baseline.tests.items()
-             if not mutant.lines or lines.intersection(mutant.lines)}
+             if elsewhere or not mutant.lines or lines.intersection(mutant.lines)}
             for mutant in sample
         ]  # fmt: skip
         tasks = [task for task in zip(sample, tests, strict=True) if task[1]]
@@ -201,10 +219,20 @@ def path_of(module: str) -> Path:
     return Path(*module.split(".")).with_suffix(".py")
 
 
+def listed() -> dict[str, Any]:
+    """Return what is listed: rows of equivalent mutants by module, and ``tests``."""
+    return tomllib.loads(LIST.read_text(encoding="utf-8"))
+
+
 def equivalents(module: str) -> set[tuple[str, str, str]]:
     """Return function, line before and line after of the listed mutants of a module."""
-    rows = tomllib.loads(LIST.read_text(encoding="utf-8")).get(module, [])
+    rows = listed().get(module, [])
     return {(row["function"], row["was"], row["becomes"]) for row in rows}
+
+
+def places_of(module: str) -> list[str]:
+    """Return where the tests of a module are: the mirrored folder, and what is listed."""
+    return [str(Path("tests", *module.split(".")[:-1])), *listed()["tests"].get(module, [])]
 
 
 def main() -> None:
@@ -212,7 +240,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("module", help="such as runtime.channels.hold")
     parser.add_argument(
-        "--tests", nargs="*", default=[], help="beside those of the mirrored folder"
+        "--tests", nargs="*", default=[], help="beside those of its folder and those listed"
     )
     parser.add_argument("--sample", type=int, default=0, help="so many, at random; 0 for all")
     parser.add_argument("--seed", type=int, default=0)
@@ -220,16 +248,16 @@ def main() -> None:
     parser.add_argument("--removes", help="only removed statements of a kind, such as Raise")
     parser.add_argument("--function", default="", help="only of functions whose name begins so")
     asked = parser.parse_args()
-    listed = equivalents(asked.module)
+    left_out = equivalents(asked.module)
     chosen = [
         mutant for mutant in mutants((ROOT / path_of(asked.module)).read_bytes())
         if asked.removes in {None, mutant.removes} and mutant.function.startswith(asked.function)
-        and mutant[:3] not in listed
+        and mutant[:3] not in left_out
     ]  # fmt: skip
     count = len(chosen)
     if 0 < asked.sample < count:
         chosen = random.Random(asked.seed).sample(chosen, asked.sample)  # noqa: S311
-    places = [str(Path("tests", *asked.module.split(".")[:-1])), *asked.tests]
+    places = [*places_of(asked.module), *asked.tests]
     results = Counter[str]()
     for mutant, result in run_mutants(asked.module, chosen, places, asked.jobs):
         results[result] += 1
@@ -240,7 +268,7 @@ def main() -> None:
     percent = 100 * killed / max(len(chosen), 1)
     print(
         f"{asked.module}: {killed} of {len(chosen)} killed ({percent:.0f} %; "
-        f"{count} mutants and {len(listed)} listed): {dict(results)}"
+        f"{count} mutants and {len(left_out)} listed): {dict(results)}"
     )
 
 

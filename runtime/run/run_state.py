@@ -246,7 +246,7 @@ class RunState(Host):
         tickers[full_name] = ticker
         runner.tickers.append(ticker)
         self.instruments.on_ticker(ticker)
-        if self.running and runner.started:
+        if self.running and not runner.restarting:  # before, `run_node` does it
             self._add(ticker)
         return ticker
 
