@@ -45,10 +45,10 @@ TITLES = {
     6: "Stamps of image, depth, pose and IMU agree",
 }
 
-_KEPT = {
+_CAMERA_SETTINGS = {
     *("name", "images", "width", "height", "fov", "intrinsics", "lens", "undistorted", "stereo"),
     *("position", "orientation", "rate", "latency", "readout", "time_offset"),
-}  # camera settings kept in the self-test (optics, pose, timing); defects default to off
+}  # used in the self-test (optics, pose, timing); other settings, as defects, have their defaults
 
 _SECONDS, _RATE = 9.0, 5.0  # length of the flight; images a second, about
 _COLLECTOR = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
@@ -64,7 +64,7 @@ class Result(msgspec.Struct, eq=False):
     points: dict[str, Points]  # by source of the camera
 
     def passed(self) -> bool:
-        """Whether every figure is within its limit."""
+        """Return whether every figure is within its limit."""
         return all(figure.passed for figures in self.figures.values() for figure in figures)
 
 
@@ -93,7 +93,7 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
         ConfigError: The file cannot be flown.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    table = _alone(config, spec, folder)
+    table = _vehicle_table(config, spec, folder)
     world = folder / "room.xml"
     table["world"] = str(world.resolve())
     world.write_text(mjcf(0.05), encoding="utf-8")
@@ -113,38 +113,38 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
     sensors = (getattr(spec.config, "imu", None), *itertools.chain(*lists))
     if any(getattr(sensor, "calibration_error", False) for sensor in sensors):
         notes.append("The errors of the announced calibrations, which are meant, are switched off.")
-    kept = _run(_flight(table, folder), config)
-    motion = Motion(kept.odometry)
+    collected = _run(_flight(table, folder), config)
+    motion = Motion(collected.odometry)
     result = Result(spec.name, {number: [] for number in TITLES}, notes, [], {})
     figures = result.figures
     imu = next((a for a in announced if isinstance(a, ImuAnnouncement)), None)
-    if imu is None or kept.imu_announced is None:
+    if imu is None or collected.imu_announced is None:
         notes.append(f"{spec.name} has no IMU: proofs 1 and 2 do not apply.")
     else:
-        begin = max(kept.imu[0].stamp, kept.taken_off) + 50_000_000  # in mid-flight
-        figures[1].append(proofs.integration(kept.imu_announced, kept.imu, motion, begin))
+        start = max(collected.imu[0].stamp, collected.taken_off) + 50_000_000  # in mid-flight
+        figures[1].append(proofs.integration(collected.imu_announced, collected.imu, motion, start))
         seconds = needed(imu, standing)
-        still = _run(_rest(table, seconds), config, seconds)
+        resting = _run(_nodes_at_rest(table, seconds), config, seconds)
         samples = {
-            "gyroscope": np.array([sample.angular_velocity for sample in still.imu]),
-            "accelerometer": np.array([sample.linear_acceleration for sample in still.imu]),
+            "gyroscope": np.array([sample.angular_velocity for sample in resting.imu]),
+            "accelerometer": np.array([sample.linear_acceleration for sample in resting.imu]),
         }
         for curve, curve_figures in noise(imu, samples):
             result.curves.append(curve)
             figures[2] += curve_figures
-    for camera in kept.cameras.values():
+    for camera in collected.cameras.values():
         points = None
-        if kept.images[camera.source]:
-            points = proofs.discs(camera, kept, motion, angle)
+        if collected.images[camera.source]:
+            points = proofs.discs(camera, collected, motion, angle)
             result.points[camera.source] = points
             figures[3].append(proofs.projection(camera, points))
         if "depth" in camera.images:
-            figures[4].append(proofs.depth(camera, kept, motion, angle))
-        figures[6] += proofs.stamps(camera, kept, motion, points)
-    if imu is not None and kept.imu_announced is not None:
-        figures[6].append(proofs.lateness(kept.imu_announced, kept, motion))
-    if kept.cameras:
-        rig = choose([*kept.cameras.values(), *([imu] if imu else [])], spec.name)
+            figures[4].append(proofs.depth(camera, collected, motion, angle))
+        figures[6] += proofs.stamps(camera, collected, motion, points)
+    if imu is not None and collected.imu_announced is not None:
+        figures[6].append(proofs.lateness(collected.imu_announced, collected, motion))
+    if collected.cameras:
+        rig = choose([*collected.cameras.values(), *([imu] if imu else [])], spec.name)
         figures[5] += proofs.exported(rig, folder / "calibration")
     return result
 
@@ -153,7 +153,7 @@ def _is_carried(table: dict[str, Any]) -> bool:
     return "trajectory" in table and "imu" in table
 
 
-def _alone(config: Config, spec: NodeSpec, folder: Path) -> dict[str, Any]:
+def _vehicle_table(config: Config, spec: NodeSpec, folder: Path) -> dict[str, Any]:
     """Return the vehicle's node table at the room's centre, without inputs and links."""
     (table,) = (node for node in to_builtins(config)["nodes"] if node["name"] == spec.name)
     sensors = (kind.name for kind in sensor_kinds() if kind.name != "imu")
@@ -161,7 +161,7 @@ def _alone(config: Config, spec: NodeSpec, folder: Path) -> dict[str, Any]:
         table.pop(key, None)
     table.get("imu", {}).pop("calibration_error", None)
     for camera in table.get("cameras", ()):
-        for key in set(camera) - _KEPT:
+        for key in set(camera) - _CAMERA_SETTINGS:
             del camera[key]
         camera["rate"] /= max(math.ceil(camera["rate"] / _RATE - 1e-9), 1)
         images = set(camera["images"]) | {"depth"}
@@ -169,7 +169,7 @@ def _alone(config: Config, spec: NodeSpec, folder: Path) -> dict[str, Any]:
     if _is_carried(table):
         table |= {"rest": 0.0, "speed": 1.0, "lever": [0.0, 0.0, 0.0], "margin": 0.0}
         table |= {"axes": "ned", "body": "frd", "columns": "", "topic": "", "knots": 0.05}
-        table |= {"trajectory": _written(folder, 10), "place": "recorded"}
+        table |= {"trajectory": _write_path(folder, 10), "place": "recorded"}
     elif "trajectory" in table:
         table["rate"] /= max(math.ceil(table["rate"] / _RATE - 1e-9), 1)
     else:
@@ -183,7 +183,7 @@ def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     if _is_carried(table):
         return [table, _COLLECTOR]
     if "trajectory" in table:
-        return [table | {"trajectory": _written(folder, 1)}, _COLLECTOR]
+        return [table | {"trajectory": _write_path(folder, 1)}, _COLLECTOR]
     pilot = {
         "name": "selftest_pilot",
         "type": "WaypointFollower",
@@ -195,14 +195,14 @@ def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     return [table, pilot, _COLLECTOR]
 
 
-def _rest(table: dict[str, Any], seconds: float) -> list[dict[str, Any]]:
+def _nodes_at_rest(table: dict[str, Any], seconds: float) -> list[dict[str, Any]]:
     """Return the nodes of a run in which the vehicle rests, without cameras."""
     slow = {"rest": seconds + 1.0} if _is_carried(table) else {"control_rate": 20}
     return [table | {"cameras": []} | slow, _COLLECTOR]
 
 
-def _written(folder: Path, step: int) -> str:
-    """Write the path of what is not flown, with a row each `step` ms; return the file."""
+def _write_path(folder: Path, step: int) -> str:
+    """Write the path of a vehicle without pilot, with a row each `step` ms; return the file."""
     path = folder.resolve() / "path.tum"
     path.write_text("".join(_path(step)), encoding="utf-8")
     return str(path)
@@ -224,15 +224,15 @@ def _config(nodes: list[dict[str, Any]], config: Config, seconds: float) -> Conf
 
 
 def _run(nodes: list[dict[str, Any]], config: Config, seconds: float = _SECONDS) -> _Collector:
-    kept: list[Supervisor] = []
+    supervisors: list[Supervisor] = []
 
     @contextlib.contextmanager
     def watch(supervisor: Supervisor) -> Iterator[None]:
-        kept.append(supervisor)
+        supervisors.append(supervisor)
         yield
 
     execute(_config(nodes, config, seconds), watch=watch)
-    (collector,) = (node for node in kept[0].state.all_nodes if isinstance(node, _Collector))
+    (collector,) = (node for node in supervisors[0].state.all_nodes if isinstance(node, _Collector))
     return collector
 
 

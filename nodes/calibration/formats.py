@@ -104,9 +104,9 @@ def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
     chosen = pair(rig) if form.pair_only else rig.cameras
     ros = form.topics and topics
     cameras = [_camera(rig, camera, name, ros=ros) for camera in chosen]
-    for what in ("fisheye",) if name == "orbslam3" else ("time_offset",) * (name != "kalibr"):
-        if len({camera[what] for camera in cameras}) > 1:
-            raise ValueError(f"{name} has one {what} for all cameras, found several")
+    for field in ("fisheye",) if name == "orbslam3" else ("time_offset",) * (name != "kalibr"):
+        if len({camera[field] for camera in cameras}) > 1:
+            raise ValueError(f"{name} has one {field} for all cameras, found several")
     common = variables(rig, cameras) | {
         "imu_errors": _imu_errors(rig, name, ros=ros) if form.imu_errors else None,
         "axes": "x forward, y left, z up, as on ROS's topics"
@@ -165,14 +165,14 @@ def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
     """
     entries: dict[str, Any] = {}
     turn = imu_axes(rig, ros=ros)[:3, :3]
-    feigned = rig.imu.g_sensitivity if rig.imu else 0.0
+    g_sensitivity = rig.imu.g_sensitivity if rig.imu else 0.0
     names = ("gyroscope", "Tw", "R_IMUtoGYRO"), ("accelerometer", "Ta", "R_IMUtoACC")
     for sensor, lower, rotation in names:
-        given = getattr(rig.imu, f"{sensor}_matrix") if rig.imu else IDENTITY
-        matrix = turn @ np.reshape(given, (3, 3)) @ turn
+        announced = getattr(rig.imu, f"{sensor}_matrix") if rig.imu else IDENTITY
+        matrix = turn @ np.reshape(announced, (3, 3)) @ turn
         if abs(np.linalg.det(matrix)) < 1e-9:
             raise ValueError(
-                f"{name}: expected an IMU of three axes, found {sensor}_matrix {given}"
+                f"{name}: expected an IMU of three axes, found {sensor}_matrix {announced}"
             )
         q, r = np.linalg.qr(matrix.T)
         signs = np.sign(np.diag(r))
@@ -180,15 +180,15 @@ def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
         error = np.linalg.inv(matrix) - np.eye(3)
         if sensor == "accelerometer":
             above = np.triu(np.ones((3, 3), np.bool_), 1)
-            if name == "basalt" and (feigned or np.abs(error[above]).max() > 1e-12):
+            if name == "basalt" and (g_sensitivity or np.abs(error[above]).max() > 1e-12):
                 raise ValueError(
                     "basalt has no word for all of the IMU's errors: expected no g_sensitivity and "
                     "an accelerometer_matrix without numbers above its diagonal, found "
-                    f"{feigned:g} and {given}"
+                    f"{g_sensitivity:g} and {announced}"
                 )
             error = error.T[~above.T]
         entries[f"{sensor}_error"] = np.ravel(error, "F")
-    entries["Tg"] = feigned * np.eye(3)
+    entries["Tg"] = g_sensitivity * np.eye(3)
     return {key: value + 0.0 for key, value in entries.items()}  # without -0.0
 
 
@@ -239,18 +239,18 @@ def _camera(rig: Rig, camera: CameraAnnouncement, name: str, *, ros: bool) -> di
 
 
 def _coefficients(camera: CameraAnnouncement, name: str) -> tuple[float, ...]:
-    info, most = camera.info, FORMATS[name].radtan if name else 8
+    info, count = camera.info, FORMATS[name].radtan if name else 8
     if info.distortion_model == "equidistant":
         return info.distortion
     k = (0.0,) * 8 if info.is_pinhole else (*info.distortion, 0.0, 0.0, 0.0)[:8]
-    if any(k[most:]):
-        knows = ", ".join(("k1", "k2", "p1", "p2", "k3")[:most])
+    if any(k[count:]):
+        names = ", ".join(("k1", "k2", "p1", "p2", "k3")[:count])
         lens = info.distortion_model + (" with k3" if len(info.distortion) == 5 else "")
         raise ValueError(
-            f"{camera.source}: {name} has no word for its lens: expected radtan ({knows}) or "
+            f"{camera.source}: {name} has no word for its lens: expected radtan ({names}) or "
             f"equidistant, found {lens}; the format basalt has one"
         )
-    return k[:most]
+    return k[:count]
 
 
 Floats = npt.NDArray[np.float64]
@@ -321,20 +321,20 @@ def export_calibration(
     written = [folder / name for name in files]
     if form != "vslamlab" or not recording.is_file():
         return written
-    from nodes.data.replay.bags import Recorded  # which wants what reads MCAP
+    from nodes.data.replay.bags import Recorded  # which imports the MCAP library
 
     for number in range(len(rig.cameras)):
         for kind in ("rgb", "depth"):
             shutil.rmtree(folder / f"{kind}_{number}", ignore_errors=True)
     reader, sequence = Recorded(recording), VslamLab(folder, rig, DEPTH_FACTOR, zero)
-    take: dict[type[Any], Callable[[Any], ImageFile | None]] = {
+    handlers: dict[type[Any], Callable[[Any], ImageFile | None]] = {
         Image: sequence.image,
         DepthImage: sequence.depth,
         Imu: sequence.imu,
         Odometry: sequence.odometry,
     }
-    for _, event in reader.events(0, None, lambda kind, _: kind in take):
-        if (file := take[type(event)](event)) is not None:
+    for _, event in reader.events(0, None, lambda kind, _: kind in handlers):
+        if (file := handlers[type(event)](event)) is not None:
             file()
     reader.close()
     sequence.close()
@@ -404,7 +404,7 @@ class VslamLab(Recording):
     depth = image
 
     def odometry(self, event: Odometry) -> None:
-        """Note where the body is, and with it the IMU."""
+        """Add a row with the true pose of the IMU, or of the body of a rig without one."""
         if event.source == self.rig.body:
             place, turn = event.position, event.orientation
             if (self._imu_in_body != np.eye(4)).any():
@@ -424,13 +424,13 @@ class VslamLab(Recording):
         """Write the rows of matching images, within half of the first camera's period."""
         head = ",".join(f"ts_{name} (ns),path_{name}" for name in self._stamps)
         rows = self.rows("rgb.csv", f"{head}\n")
-        most = 0.5e9 / self.rig.cameras[0].rate
+        tolerance = 0.5e9 / self.rig.cameras[0].rate
         for stamp in self._stamps["rgb_0"]:
             cells = []
             for name, stamps in self._stamps.items():
-                away = np.abs(np.asarray(stamps, np.int64) - stamp)
-                if len(stamps) and away.min() <= most:
-                    near = stamps[int(away.argmin())]
+                distances = np.abs(np.asarray(stamps, np.int64) - stamp)
+                if len(stamps) and distances.min() <= tolerance:
+                    near = stamps[int(distances.argmin())]
                     cells.append(f"{near},{name}/{near}.png")
             if len(cells) == len(self._stamps):
                 rows.add(stamp, ",".join(cells) + "\n")

@@ -22,7 +22,7 @@ from nodes.data.dataset.recording import Rig
 INTEGRATED = 5.0  # seconds of IMU integration
 _POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.005, 0.1, 0.3, 0.005, 1e-5
 """Metres; pixels, global and rolling shutter; metres; pixels."""
-_MOST = 0.99  # least share of points, and of depths, within the limit; the rest: within 3 times
+_MOST = 0.99  # least share of points, and of depths, within the limit; others: within 3 times
 _LATE, _PLACE, _TURN = 2e-4, 5e-4, 5e-4  # largest errors of stamps and poses: s, m, rad
 
 
@@ -55,13 +55,13 @@ class Points(msgspec.Struct, frozen=True, eq=False):
     flow: Floats  # pixels per second, shape (n, 2)
 
 
-def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, begin: int) -> Figure:
+def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, start: int) -> Figure:
     """Return how far the ideal IMU, integrated, gets from the truth: proof 1.
 
     Rotations are exponentials of the mean of two angular velocities; velocity and position follow
     by the trapezoidal rule on splines through the samples; of an IMU that averages, by its sample.
     """
-    used = [s for s in samples if begin <= s.stamp <= begin + round(INTEGRATED * 1e9)]
+    used = [s for s in samples if start <= s.stamp <= start + round(INTEGRATED * 1e9)]
     stamps = np.array([s.stamp for s in used], np.int64)
     rates = np.array([s.angular_velocity for s in used])
     forces = np.array([s.linear_acceleration for s in used])
@@ -72,9 +72,9 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
     gravity = np.array([0.0, 0.0, GRAVITY])
     seconds = (stamps - stamps[0]) / 1e9
     if not imu.averaged:
-        fine = np.interp(np.arange(4 * len(stamps) - 3) / 4.0, np.arange(len(stamps)), seconds)
-        rates, forces = (CubicSpline(seconds, values)(fine) for values in (rates, forces))
-        seconds = fine
+        refined = np.interp(np.arange(4 * len(stamps) - 3) / 4.0, np.arange(len(stamps)), seconds)
+        rates, forces = (CubicSpline(seconds, values)(refined) for values in (rates, forces))
+        seconds = refined
     for index, step in enumerate(np.diff(seconds), 1):
         rate = rates[index] if imu.averaged else (rates[index - 1] + rates[index]) / 2.0
         after = turn * Rotation.from_rotvec(rate * step)
@@ -95,29 +95,35 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
     return judged(imu.source, f"position after {length:.2f} s", off, _POSITION, "m", wrong)
 
 
-def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Points:
+def discs(
+    camera: CameraAnnouncement, collected: _Collector, motion: Motion, angle: float
+) -> Points:
     """Return measured and expected positions of all discs seen whole and separately."""
     info, points = camera.info, []
     grid = np.stack(np.meshgrid(np.arange(info.width), np.arange(info.height)), axis=-1)
     rays = info.unproject(grid.reshape(-1, 2)).reshape(*grid.shape[:2], 3)
     balls, radii = spheres(angle)
-    for stamp, image in kept.images[camera.source].items():
-        if stamp < kept.taken_off:
+    for stamp, image in collected.images[camera.source].items():
+        if stamp < collected.taken_off:
             continue
         places, turns = motion.rows_of(camera, stamp)
         later, turned = motion.rows_of(camera, stamp + 1_000_000)
-        into, then = (rotations.as_matrix().transpose(0, 2, 1) for rotations in (turns, turned))
-        own = kept.own[camera.source].get(stamp)
+        into, later_into = (
+            rotations.as_matrix().transpose(0, 2, 1) for rotations in (turns, turned)
+        )
+        vehicle_pixels = collected.vehicle_pixels[camera.source].get(stamp)
         boxes = list(_boxes(camera, balls, radii, places, into))
         for ball, (left, top, right, bottom) in boxes:
             left, top, right, bottom = left - 4, top - 4, right + 4, bottom + 4
-            alone = all(
+            separate = all(
                 other == ball or x0 > right or x1 < left or y0 > bottom or y1 < top
                 for other, (x0, y0, x1, y1) in boxes
             )
             inside = left >= 0 and top >= 0 and right < info.width and bottom < info.height
             window = np.s_[top : bottom + 1, left : right + 1]
-            if not (alone and inside) or (own is not None and own[window].any()):
+            if not (separate and inside) or (
+                vehicle_pixels is not None and vehicle_pixels[window].any()
+            ):
                 continue
             rows = np.arange(top, bottom + 1)
             towards = np.einsum("rij,rj->ri", into[rows], balls[ball] - places[rows])
@@ -130,23 +136,25 @@ def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: f
             pixels, measured = grid[window], image[window].astype(np.float64)
             half = ((measured > 20.0) & (measured < 235.0)).astype(np.uint8)
             if cv2.erode(half, np.ones((3, 3), np.uint8)).any():
-                continue  # behind the vehicle's turning rotors, of which depth knows nothing
+                continue  # behind the vehicle's turning rotors, which depth images do not show
             if np.isin(measured, (0.0, 255.0)).all():  # a pixel shows what its centre's ray meets
                 expected = (within > 0.0).astype(np.float64)
             else:
                 slope = np.maximum(np.hypot(*np.gradient(within)), 1e-12)
                 expected = np.clip(0.5 + within / slope, 0.0, 1.0)
             if measured.sum() < 0.3 * 255.0 * expected.sum():
-                centre = np.array([np.nan, np.nan])  # there is no disc
+                measured_centre = np.array([np.nan, np.nan])  # no disc in the image
             else:
-                centre = np.tensordot(measured, pixels, 2) / measured.sum()
-            should = np.tensordot(expected, pixels, 2) / expected.sum()
-            row = int(np.clip(np.rint(should[1]), 0, info.height - 1))
+                measured_centre = np.tensordot(measured, pixels, 2) / measured.sum()
+            expected_centre = np.tensordot(expected, pixels, 2) / expected.sum()
+            row = int(np.clip(np.rint(expected_centre[1]), 0, info.height - 1))
             ends = [
-                info.project(back[row] @ (balls[ball] - where[row]))[0]
-                for where, back in ((places, into), (later, then))
+                info.project(to_camera[row] @ (balls[ball] - origins[row]))[0]
+                for origins, to_camera in ((places, into), (later, later_into))
             ]
-            points.append((should, centre - should, (ends[1] - ends[0]) / 1e-3))
+            points.append(
+                (expected_centre, measured_centre - expected_centre, (ends[1] - ends[0]) / 1e-3)
+            )
     columns: Floats = np.array(points, np.float64).reshape(-1, 3, 2)
     return Points(columns[:, 0], columns[:, 1], columns[:, 2])
 
@@ -156,54 +164,56 @@ def projection(camera: CameraAnnouncement, points: Points) -> Figure:
     limit = _ROLLING if camera.readout else _GLOBAL
     distance = np.linalg.norm(points.off, axis=1)
     worst = float(np.quantile(distance, _MOST)) if len(distance) else float("nan")
-    wild = float(np.nanmax(distance, initial=0.0))
-    worst = wild if wild > 3.0 * limit else worst
-    gone = int(np.isnan(distance).sum())
+    largest = float(np.nanmax(distance, initial=0.0))
+    worst = largest if largest > 3.0 * limit else worst
+    unseen = int(np.isnan(distance).sum())
     wrong = "no sphere of the room was seen whole, so nothing is proven"
     if len(distance):
-        missing = f", and {gone} are missing" if gone else ""
-        wrong = f"points fall up to {wild:.2f} px beside their pixels{missing}"
-        wrong += _likely(camera, points)
+        missing = f", and {unseen} are missing" if unseen else ""
+        wrong = f"points fall up to {largest:.2f} px beside their pixels{missing}"
+        wrong += _likely_cause(camera, points)
     name = f"{_MOST:.0%} of {len(distance)} points beside their pixels"
     return judged(camera.source, name, worst, limit, "px", f"{camera.source}: {wrong}")
 
 
-def depth(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Figure:
+def depth(
+    camera: CameraAnnouncement, collected: _Collector, motion: Motion, angle: float
+) -> Figure:
     """Return how far a camera's depth is from the true surfaces: proof 4."""
     off: list[Floats] = []
     ratio: list[Floats] = []
-    for stamp, samples in kept.depths[camera.source].items():
-        if stamp < kept.taken_off:
+    for stamp, samples in collected.depths[camera.source].items():
+        if stamp < collected.taken_off:
             continue
         places, turns = motion.rows_of(camera, stamp)
         rows = samples[:, 1].astype(int)
-        met = []
+        surfaces = []
         for shift in ((0.0, 0.0), (4.0, 0.0), (-4.0, 0.0), (0.0, 4.0), (0.0, -4.0)):
             rays = camera.info.unproject(samples[:, :2] + shift)
-            seen = np.asarray(np.isfinite(rays).all(axis=1))
-            turned = turns[rows].apply(np.where(seen[:, None], rays, [0.0, 0.0, 1.0]))
-            along, what = hits(angle, places[rows], turned)
-            met.append((rays[:, 2] * along, np.where(seen, what, -99)))
+            valid = np.asarray(np.isfinite(rays).all(axis=1))
+            turned = turns[rows].apply(np.where(valid[:, None], rays, [0.0, 0.0, 1.0]))
+            along, numbers = hits(angle, places[rows], turned)
+            surfaces.append((rays[:, 2] * along, np.where(valid, numbers, -99)))
         # Not at edges, nor where the vehicle itself may be.
-        same = np.array([what == met[0][1] for _, what in met])
-        clear = same.all(axis=0) & (met[0][1] > -99)
+        same = np.array([numbers == surfaces[0][1] for _, numbers in surfaces])
+        clear = same.all(axis=0) & (surfaces[0][1] > -99)
         clear &= np.isfinite(samples[:, 2]) & (samples[:, 2] > NEAREST)
-        wrong = samples[:, 2] - met[0][0]
+        wrong = samples[:, 2] - surfaces[0][0]
         if camera.readout:  # rows may be as far off as proof 3 allows
-            slope = sum(np.abs(met[k][0] - met[k + 1][0]) / 8.0 for k in (1, 3))
+            slope = sum(np.abs(surfaces[k][0] - surfaces[k + 1][0]) / 8.0 for k in (1, 3))
             wrong = np.sign(wrong) * np.maximum(np.abs(wrong) - _ROLLING * slope, 0.0)
         off.append(wrong[clear])
-        ratio.append(samples[clear, 2] / met[0][0][clear])
+        ratio.append(samples[clear, 2] / surfaces[0][0][clear])
     errors = np.abs(np.concatenate(off)) if off else np.zeros(0)
-    worst, says = float("nan"), "no depth came, so nothing is proven"
+    worst, remark = float("nan"), "no depth came, so nothing is proven"
     if len(errors):
         worst = float(np.quantile(errors, _MOST))
-        says = (
+        remark = (
             f"depth is up to {1e3 * worst:.1f} mm beside the true surfaces: its median is "
             f"{float(np.median(np.concatenate(ratio))):.4f} times the truth"
         )
     name = f"{_MOST:.0%} of {len(errors)} depths beside the surfaces"
-    return judged(camera.source, name, worst, _DEPTH, "m", f"{camera.source}: {says}")
+    return judged(camera.source, name, worst, _DEPTH, "m", f"{camera.source}: {remark}")
 
 
 def exported(rig: Rig, folder: Path) -> Iterator[Figure]:
@@ -242,23 +252,23 @@ def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator)
 
 
 def stamps(
-    camera: CameraAnnouncement, kept: _Collector, motion: Motion, points: Points | None
+    camera: CameraAnnouncement, collected: _Collector, motion: Motion, points: Points | None
 ) -> Iterator[Figure]:
     """Yield the agreement of image, depth, pose and IMU at each exposure: proof 6."""
     source = camera.source
-    shot = set(kept.images[source]) | set(kept.depths[source])
-    for name, have in (("images", kept.images), ("depth images", kept.depths)):
-        if have[source]:
-            lonely = len(shot - set(have[source]))
-            wrong = f"{source}: {lonely} exposures have no {name[:-1]} of their stamp"
-            yield judged(source, f"exposures without {name}", lonely, 0, "", wrong)
+    exposures = set(collected.images[source]) | set(collected.depths[source])
+    for name, by_source in (("images", collected.images), ("depth images", collected.depths)):
+        if by_source[source]:
+            unmatched = len(exposures - set(by_source[source]))
+            wrong = f"{source}: {unmatched} exposures have no {name[:-1]} of their stamp"
+            yield judged(source, f"exposures without {name}", unmatched, 0, "", wrong)
     half = round(camera.readout * 5e8)
-    wanted = {s + d for s in shot for d in ({0, half, -half} if half else {0})}
-    poses = kept.poses[source]
-    missing = sum(not any(s + d in poses for d in (0, 1, -1)) for s in wanted)
+    expected = {s + d for s in exposures for d in ({0, half, -half} if half else {0})}
+    poses = collected.poses[source]
+    missing = sum(not any(s + d in poses for d in (0, 1, -1)) for s in expected)
     wrong = f"{source}: {missing} poses of rows are missing, or bear other stamps"
     yield judged(source, "poses of rows missing", missing, 0, "", wrong)
-    times = np.array(sorted(s for s in poses if s >= kept.taken_off), np.int64)
+    times = np.array(sorted(s for s in poses if s >= collected.taken_off), np.int64)
     true = times - round(camera.time_offset * 1e9)
     times, true = times[true <= motion.stamps[-1]], true[true <= motion.stamps[-1]]
     if len(times):
@@ -277,28 +287,28 @@ def stamps(
         yield _late(f"{source}", "images", points.flow, points.off)
 
 
-def lateness(imu: ImuAnnouncement, kept: _Collector, motion: Motion) -> Figure:
+def lateness(imu: ImuAnnouncement, collected: _Collector, motion: Motion) -> Figure:
     """Return by how much the IMU's samples are off their stamps, in proof 6 too."""
-    at = np.array([sample.stamp for sample in kept.imu], np.int64)
-    flying = (at > kept.taken_off) & (at < motion.stamps[-1] - 1_000_000)
+    at = np.array([sample.stamp for sample in collected.imu], np.int64)
+    flying = (at > collected.taken_off) & (at < motion.stamps[-1] - 1_000_000)
     turn = Rotation.from_quat(imu.orientation, scalar_first=True)
-    rates = turn.apply([sample.angular_velocity for sample in kept.imu])[flying]
+    rates = turn.apply([sample.angular_velocity for sample in collected.imu])[flying]
     # A mean belongs to the middle of its period.
     then = at[flying] - (0.5e9 / imu.rate if imu.averaged else 0.0)
     true = np.column_stack([np.interp(then, motion.stamps, axis) for axis in motion.rates.T])
     return _late(imu.source, "IMU samples", np.gradient(true, then / 1e9, axis=0), rates - true)
 
 
-def _late(source: str, what: str, flow: Floats, off: Floats) -> Figure:
+def _late(source: str, signal: str, flow: Floats, off: Floats) -> Figure:
     """Return the delay of a signal, by its rate of change and its error."""
-    fine = np.isfinite(off).all(axis=1)
-    moved = float((flow[fine] ** 2).sum())
-    late = -float((off[fine] * flow[fine]).sum()) / moved if moved else 0.0
+    finite = np.isfinite(off).all(axis=1)
+    moved = float((flow[finite] ** 2).sum())
+    late = -float((off[finite] * flow[finite]).sum()) / moved if moved else 0.0
     wrong = (
-        f"{source}: {what} show what was {abs(1e3 * late):.2f} ms "
+        f"{source}: {signal} show what was {abs(1e3 * late):.2f} ms "
         f"{'before' if late > 0 else 'after'} the time that their stamps say"
     )
-    return judged(source, f"{what} off their stamps", abs(late), _LATE, "s", wrong)
+    return judged(source, f"{signal} off their stamps", abs(late), _LATE, "s", wrong)
 
 
 def _boxes(
@@ -312,42 +322,42 @@ def _boxes(
     for number in np.flatnonzero(np.isfinite(rough).all(axis=1)):
         row = int(np.clip(rough[number, 1], 0, info.height - 1))
         centre = into[row] @ (balls[number] - places[row])
-        away = centre / np.linalg.norm(centre)
-        side = np.cross(away, [1.0, 0.0, 0.0] if abs(away[0]) < 0.9 else [0.0, 1.0, 0.0])
+        direction = centre / np.linalg.norm(centre)
+        side = np.cross(direction, [1.0, 0.0, 0.0] if abs(direction[0]) < 0.9 else [0.0, 1.0, 0.0])
         side /= np.linalg.norm(side)
-        ring = np.outer(np.cos(turn), side) + np.outer(np.sin(turn), np.cross(away, side))
-        outline = info.project(centre + radii[number] * 1.02 * ring)
+        circle = np.outer(np.cos(turn), side) + np.outer(np.sin(turn), np.cross(direction, side))
+        outline = info.project(centre + radii[number] * 1.02 * circle)
         if np.isfinite(outline).all():
             low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0))
             yield int(number), (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
 
-def _likely(camera: CameraAnnouncement, points: Points) -> str:
+def _likely_cause(camera: CameraAnnouncement, points: Points) -> str:
     """Return the announced number most likely wrong, as a remark; empty if none fits."""
     info = camera.info
-    fine = np.isfinite(points.off).all(axis=1)
-    off, pixels, flow = points.off[fine], points.pixels[fine], points.flow[fine]
+    finite = np.isfinite(points.off).all(axis=1)
+    off, pixels, flow = points.off[finite], points.pixels[finite], points.flow[finite]
     if len(off) < 10:
         return ""
     offset = pixels - (info.cx, info.cy)
     share = (pixels[:, 1] / max(info.height - 1, 1) - 0.5)[:, None]
-    one, none = np.ones(len(off)), np.zeros(len(off))
+    ones, zeros = np.ones(len(off)), np.zeros(len(off))
     causes: Mapping[str, tuple[npt.NDArray[np.float64], float, float, str]] = {
         "fx and fy": (offset, info.fx, info.fx, "px"),
-        "fx": (np.column_stack([offset[:, 0], none]), info.fx, info.fx, "px"),
-        "fy": (np.column_stack([none, offset[:, 1]]), info.fy, info.fy, "px"),
-        "cx": (np.column_stack([one, none]), info.cx, 1.0, "px"),
-        "cy": (np.column_stack([none, one]), info.cy, 1.0, "px"),
+        "fx": (np.column_stack([offset[:, 0], zeros]), info.fx, info.fx, "px"),
+        "fy": (np.column_stack([zeros, offset[:, 1]]), info.fy, info.fy, "px"),
+        "cx": (np.column_stack([ones, zeros]), info.cx, 1.0, "px"),
+        "cy": (np.column_stack([zeros, ones]), info.cy, 1.0, "px"),
         "time_offset": (-flow, 1e3 * camera.time_offset, 1e3, "ms"),
         "readout": (flow * share, 1e3 * camera.readout, 1e3, "ms"),
     }
-    left = {}
+    residuals = {}
     for name, (change, _, _, _) in causes.items():
         scale = float((off * change).sum() / max((change**2).sum(), 1e-12))
-        left[name] = (float(((off - scale * change) ** 2).sum()), scale)
-    name = min(left, key=lambda key: left[key][0])
-    rest, scale = left[name]
-    if rest > 0.25 * float((off**2).sum()):
+        residuals[name] = (float(((off - scale * change) ** 2).sum()), scale)
+    name = min(residuals, key=lambda key: residuals[key][0])
+    residual, scale = residuals[name]
+    if residual > 0.25 * float((off**2).sum()):
         return ""
     _, announced, factor, unit = causes[name]
     return (

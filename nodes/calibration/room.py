@@ -95,7 +95,7 @@ def hits(angle: float, origins: Floats, rays: Floats) -> tuple[Floats, npt.NDArr
     with np.errstate(divide="ignore"):
         faces = np.where(rays > 0, HIGH - origins, LOW - origins) / rays
     wall = faces.argmin(axis=1)
-    best, what = (
+    best, surfaces = (
         faces.min(axis=1),
         -1 - wall - 3 * (np.take_along_axis(rays, wall[:, None], 1)[:, 0] > 0),
     )
@@ -105,8 +105,8 @@ def hits(angle: float, origins: Floats, rays: Floats) -> tuple[Floats, npt.NDArr
         inside = radius**2 - ((to * to).sum(axis=1) - along**2)
         distance = along - np.sqrt(np.maximum(inside, 0.0))
         nearer = (inside > 0.0) & (distance > 0.0) & (distance < best)
-        best, what = np.where(nearer, distance, best), np.where(nearer, number, what)
-    return best, what
+        best, surfaces = np.where(nearer, distance, best), np.where(nearer, number, surfaces)
+    return best, surfaces
 
 
 def _text(vector: Floats, sign: int = 1) -> str:
@@ -114,7 +114,7 @@ def _text(vector: Floats, sign: int = 1) -> str:
     return f"{x:.9f} {sign * y:.9f} {sign * z:.9f}"
 
 
-_SAMPLES = 1500  # pixels kept of each depth image
+_SAMPLES = 1500  # pixels stored of each depth image
 
 
 class _Collector(Node):
@@ -132,18 +132,18 @@ class _Collector(Node):
         self.poses: dict[str, dict[int, PoseStamped]] = defaultdict(dict)
         self.depths: dict[str, dict[int, npt.NDArray[np.float64]]] = defaultdict(dict)
         """Rows of column, row and depth (metres), by source and stamp."""
-        self.own: dict[str, dict[int, npt.NDArray[np.bool_]]] = defaultdict(dict)
-        """Where the vehicle itself is seen, by source and stamp."""
+        self.vehicle_pixels: dict[str, dict[int, npt.NDArray[np.bool_]]] = defaultdict(dict)
+        """Mask of the pixels that show the vehicle itself, by source and stamp."""
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Note cameras and the IMU."""
+        """Store the announcements of cameras and of the IMU."""
         if isinstance(announcement, CameraAnnouncement):
             self.cameras[announcement.source] = announcement
         elif isinstance(announcement, ImuAnnouncement):
             self.imu_announced = announcement
 
     @on(Odometry, Imu, TakenOff, PoseStamped)
-    def note(self, event: Event) -> None:
+    def record(self, event: Event) -> None:
         """Store odometry, camera poses, IMU samples, and the time of take-off."""
         if isinstance(event, Odometry):
             self.odometry.append(event)
@@ -155,20 +155,20 @@ class _Collector(Node):
             self.taken_off = event.stamp
 
     @on(Image)
-    def note_image(self, event: Image) -> None:
-        """Keep an image in grey."""
+    def record_image(self, event: Image) -> None:
+        """Store an image in grey."""
         grey = event.data if event.data.ndim == 2 else cv2.cvtColor(event.data, cv2.COLOR_RGB2GRAY)
         self.images[event.source][event.stamp] = np.asarray(grey, np.uint8)
 
     @on(DepthImage)
-    def note_depth(self, event: DepthImage) -> None:
-        """Keep some pixels of a depth image, the same of each, and where the vehicle is seen."""
+    def record_depth(self, event: DepthImage) -> None:
+        """Store the same sample of pixels of each depth image, and the vehicle's own pixels."""
         depth = event.data
         pixels = np.random.default_rng(0).integers(0, depth.size, _SAMPLES)
         rows, columns = np.divmod(pixels, depth.shape[1])
-        kept = np.column_stack([columns, rows, depth[rows, columns]])
-        self.depths[event.source][event.stamp] = kept.astype(np.float64)
-        self.own[event.source][event.stamp] = depth < NEAREST
+        samples = np.column_stack([columns, rows, depth[rows, columns]])
+        self.depths[event.source][event.stamp] = samples.astype(np.float64)
+        self.vehicle_pixels[event.source][event.stamp] = depth < NEAREST
 
 
 Stamps = npt.NDArray[np.int64]
@@ -193,12 +193,12 @@ class Motion:
         length = ((self.stamps[after] - self.stamps[before]) / 1e9)[:, None]
         share = ((stamps - self.stamps[before]) / 1e9)[:, None] / length
         base = self.rotations[before]
-        whole = (base.inv() * self.rotations[after]).as_rotvec()
+        turn = (base.inv() * self.rotations[after]).as_rotvec()
         first, last = self.rates[before] * length, self.rates[after] * length
-        last = last + 0.5 * np.cross(whole, last)  # as the rotation vector changes there
+        last = last + 0.5 * np.cross(turn, last)  # as the rotation vector changes there
         vector = (
             (share**3 - 2 * share**2 + share) * first
-            + (3 * share**2 - 2 * share**3) * whole
+            + (3 * share**2 - 2 * share**3) * turn
             + (share**3 - share**2) * last
         )
         seconds = (stamps - self.stamps[0]) / 1e9
@@ -234,11 +234,11 @@ class ReadCamera(msgspec.Struct, frozen=True, eq=False):
 
     def project(self, points: Floats) -> Floats:
         """Return the pixels, shape (n, 2), of points in the IMU's frame, metres, shape (n, 3)."""
-        back = inverse(self.in_imu)
-        xyz = (points @ back[:3, :3].T + back[:3, 3]).reshape(-1, 1, 3)
-        still = np.zeros(3)
+        from_imu = inverse(self.in_imu)
+        xyz = (points @ from_imu[:3, :3].T + from_imu[:3, 3]).reshape(-1, 1, 3)
+        zeros = np.zeros(3)
         project: Any = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
-        return np.asarray(project(xyz, still, still, self.matrix, self.lens)[0]).reshape(-1, 2)
+        return np.asarray(project(xyz, zeros, zeros, self.matrix, self.lens)[0]).reshape(-1, 2)
 
 
 def read(form: str, folder: Path) -> list[ReadCamera]:
@@ -248,24 +248,24 @@ def read(form: str, folder: Path) -> list[ReadCamera]:
 
 def _kalibr(folder: Path, name: str = "camchain-imucam.yaml") -> list[ReadCamera]:
     text = (folder / name).read_text(encoding="utf-8")
-    if not text.startswith("%YAML"):  # Kalibr reads plain YAML; OpenCV wants to be told
+    if not text.startswith("%YAML"):  # Kalibr reads plain YAML; OpenCV needs the header
         text = f"%YAML:1.0\n---\n{text}"
     cameras: list[ReadCamera] = []
     storage = _storage(text)
     while not (node := storage.getNode(f"cam{len(cameras)}")).empty():
-        into = node.getNode("T_cam_imu")
-        matrix = np.array([_numbers(into.at(row)) for row in range(into.size())])
-        if into.empty():  # OpenVINS's own name
-            back = node.getNode("T_imu_cam")
-            matrix = inverse(np.array([_numbers(back.at(row)) for row in range(back.size())]))
+        transform = node.getNode("T_cam_imu")
+        matrix = np.array([_numbers(transform.at(row)) for row in range(transform.size())])
+        if transform.empty():  # OpenVINS's own name
+            pose = node.getNode("T_imu_cam")
+            matrix = inverse(np.array([_numbers(pose.at(row)) for row in range(pose.size())]))
         model, camera = (node.getNode(f"{x}_model").string() for x in ("distortion", "camera"))
         if camera != "pinhole" or model not in {"radtan", "equidistant"}:
             raise ValueError(f"{name}: expected pinhole with radtan or equidistant, found {model}")
         k = _numbers(node.getNode("distortion_coeffs"))
         shift = node.getNode("timeshift_cam_imu").real()
-        middle = _numbers(node.getNode("intrinsics"))
+        intrinsics = _numbers(node.getNode("intrinsics"))
         cameras.append(
-            ReadCamera(inverse(matrix), _k(*middle), np.array(k), model == "equidistant", shift)
+            ReadCamera(inverse(matrix), _k(*intrinsics), np.array(k), model == "equidistant", shift)
         )
     return cameras
 
@@ -282,11 +282,11 @@ def _vins(folder: Path) -> list[ReadCamera]:
         keys = (["mu", "mv", "u0", "v0"], ["k2", "k3", "k4", "k5"])
         if not fisheye:
             keys = (["fx", "fy", "cx", "cy"], ["k1", "k2", "p1", "p2"])
-        middle = [projection.getNode(key).real() for key in keys[0]]
+        intrinsics = [projection.getNode(key).real() for key in keys[0]]
         k = np.array([lens.getNode(key).real() for key in keys[1]])
         pose = storage.getNode(f"body_T_cam{number}").mat()
         shift = storage.getNode("td").real()
-        cameras.append(ReadCamera(np.asarray(pose, np.float64), _k(*middle), k, fisheye, shift))
+        cameras.append(ReadCamera(np.asarray(pose, np.float64), _k(*intrinsics), k, fisheye, shift))
     return cameras
 
 
@@ -324,9 +324,9 @@ def _orbslam3(folder: Path) -> list[ReadCamera]:
         if cameras:
             in_imu = in_imu @ np.asarray(storage.getNode("Stereo.T_c1_c2").mat(), np.float64)
         head = f"Camera{len(cameras) + 1}"
-        middle = [storage.getNode(f"{head}.{name}").real() for name in ("fx", "fy", "cx", "cy")]
+        intrinsics = [storage.getNode(f"{head}.{name}").real() for name in ("fx", "fy", "cx", "cy")]
         k = np.array([storage.getNode(f"{head}.{name}").real() for name in names])
-        cameras.append(ReadCamera(in_imu, _k(*middle), k, fisheye))
+        cameras.append(ReadCamera(in_imu, _k(*intrinsics), k, fisheye))
     return cameras
 
 

@@ -27,13 +27,15 @@ Announced = Sequence[Announcement]
 def baseline(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
     """Check the baseline: too short gives no depth, too long no overlap."""
     for left, right in stereo_pairs(announced):
-        apart = math.dist(left.position, right.position)
-        if not 0.02 <= apart <= 1.0:
-            yield Finding(right.source, f"its baseline is {apart:.3g} m", "0.05 to 0.5 m is usual")
-        elif abs(apart - right.baseline) > 1e-3:
+        distance = math.dist(left.position, right.position)
+        if not 0.02 <= distance <= 1.0:
+            yield Finding(
+                right.source, f"its baseline is {distance:.3g} m", "0.05 to 0.5 m is usual"
+            )
+        elif abs(distance - right.baseline) > 1e-3:
             yield Finding(
                 right.source,
-                f"it is {apart:.3f} m from {left.source}, and announces {right.baseline:.3f} m",
+                f"it is {distance:.3f} m from {left.source}, and announces {right.baseline:.3f} m",
                 "announce the distance between both positions",
             )
 
@@ -50,9 +52,9 @@ def square_pixels(config: Config, announced: Announced) -> Iterator[Finding]:  #
 def exposure(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
     """Before the next exposure the shutter is closed, and all rows are read out."""
     for camera in cameras(announced):
-        period, taken = 1.0 / camera.rate, camera.exposure + camera.readout
-        if taken > period * (1.0 + 1e-9):
-            fault = f"exposure and readout take {1e3 * taken:.3g} ms of {1e3 * period:.3g} ms"
+        period, duration = 1.0 / camera.rate, camera.exposure + camera.readout
+        if duration > period * (1.0 + 1e-9):
+            fault = f"exposure and readout take {1e3 * duration:.3g} ms of {1e3 * period:.3g} ms"
             yield Finding(camera.source, fault, "expose for a shorter time, or lower the rate")
 
 
@@ -120,14 +122,14 @@ def latency(config: Config, announced: Announced) -> Iterator[Finding]:
     """Estimators take time on a vehicle, and with more than an image period skip images."""
     rate = max((camera.rate for camera in cameras(announced)), default=0.0)
     for spec in estimators(config, announced):
-        taken = float(getattr(spec.config, "latency", -1.0))
-        if taken == 0.0 and config.run.clock == "lockstep":
+        delay = float(getattr(spec.config, "latency", -1.0))
+        if delay == 0.0 and config.run.clock == "lockstep":
             fault = "its estimates take no time on the run's clock"
             yield Finding(spec.name, fault, "give it the latency of the vehicle, as 15ms")
-        if rate and taken > 1.0 / rate * (1.0 + 1e-9):
+        if rate and delay > 1.0 / rate * (1.0 + 1e-9):
             yield Finding(
                 spec.name,
-                f"its latency is {1e3 * taken:.3g} ms, and images come every {1e3 / rate:.3g} ms",
+                f"its latency is {1e3 * delay:.3g} ms, and images come every {1e3 / rate:.3g} ms",
                 "lower the latency or the camera's rate, or mean it to skip images",
             )
 
@@ -135,7 +137,7 @@ def latency(config: Config, announced: Announced) -> Iterator[Finding]:
 def zero_noise(config: Config, announced: Announced) -> Iterator[Finding]:
     """Without noise in simulation an estimator is flattered; recordings are exempt."""
     if not any("thresholds" in spec.config.__struct_fields__ for spec in config.nodes):
-        return  # nobody is judged
+        return  # nothing is judged
     if any(isinstance(announcement, EstimatorAnnouncement) for announcement in announced):
         for camera in cameras(announced):
             seen = not camera.undistorted and {"rgb", "grey"} & {*camera.images}
@@ -152,9 +154,9 @@ def stamps(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: 
     """Both eyes of a stereo pair are matched by their stamps."""
     for left, right in stereo_pairs(announced):
         for name in ("rate", "time_offset"):
-            one, other = getattr(left, name), getattr(right, name)
-            if one != other:
-                fault = f"its {name} is {other:g}, that of {left.source} {one:g}"
+            left_value, right_value = getattr(left, name), getattr(right, name)
+            if left_value != right_value:
+                fault = f"its {name} is {right_value:g}, that of {left.source} {left_value:g}"
                 yield Finding(right.source, fault, "take the same, or stamps cannot match")
         if left.time_jitter or right.time_jitter:
             fault = f"its stamps and those of {left.source} have a jitter"
@@ -163,15 +165,15 @@ def stamps(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: 
 
 def needs(config: Config, announced: Announced) -> Iterator[Finding]:
     """Kinds of data needed by an estimator, and its IMU, must come from some sensor."""
-    given = {kind for camera in cameras(announced) for kind in camera.images}
-    given |= {"grey"} if "rgb" in given else set()
-    given |= {"lidar"} if any(isinstance(a, LidarAnnouncement) for a in announced) else set()
+    available = {kind for camera in cameras(announced) for kind in camera.images}
+    available |= {"grey"} if "rgb" in available else set()
+    available |= {"lidar"} if any(isinstance(a, LidarAnnouncement) for a in announced) else set()
     for spec in config.nodes:
-        wants: Any = getattr(spec.node, "needs", frozenset())
-        if lacking := sorted(wants - given if isinstance(wants, frozenset) else ()):
-            what = "sensor" if "lidar" in lacking else "camera"
-            fault = f"it needs {', '.join(lacking)}, which no {what} gives"
-            cure = "add one" if "lidar" in lacking else "add it to the camera's images"
+        required: Any = getattr(spec.node, "needs", frozenset())
+        if missing := sorted(required - available if isinstance(required, frozenset) else ()):
+            sensor = "sensor" if "lidar" in missing else "camera"
+            fault = f"it needs {', '.join(missing)}, which no {sensor} gives"
+            cure = "add one" if "lidar" in missing else "add it to the camera's images"
             yield Finding(spec.name, fault, cure)
         read = {port.event for port in spec.node.declared.inputs.values()}
         if {Image, DepthImage} & read and not cameras(announced):

@@ -125,7 +125,7 @@ def flown(*cameras: CameraAnnouncement, length: float = 6.0, images: int = 4) ->
             "angular_velocity": vector(rates[k]),
         }
         w, x, y, z = turns[k].as_quat(scalar_first=True).tolist()
-        kept.note(
+        kept.record(
             Odometry(
                 source="drone",
                 position=vector(places[k]),
@@ -134,7 +134,7 @@ def flown(*cameras: CameraAnnouncement, length: float = 6.0, images: int = 4) ->
                 **common,
             )
         )
-        kept.note(Imu(source="drone/imu", linear_acceleration=vector(forces[k]), **common))
+        kept.record(Imu(source="drone/imu", linear_acceleration=vector(forces[k]), **common))
     kept.imu_announced = IMU
     motion = Motion(kept.odometry)
     for camera in cameras:
@@ -154,7 +154,7 @@ def expose(kept: _Collector, camera: CameraAnnouncement, motion: Motion, stamp: 
     size = (info.height, info.width)
     kept.images[camera.source][stamp] = np.where(what >= 0, 255, 0).astype(np.uint8).reshape(size)
     depth = (distance * rays[:, 2]).reshape(size)
-    kept.own[camera.source][stamp] = np.zeros(size, np.bool_)
+    kept.vehicle_pixels[camera.source][stamp] = np.zeros(size, np.bool_)
     picked = np.random.default_rng(1).integers(0, depth.size, 300)
     v, u = np.divmod(picked, info.width)
     kept.depths[camera.source][stamp] = np.column_stack([u, v, depth[v, u]])
@@ -164,7 +164,7 @@ def expose(kept: _Collector, camera: CameraAnnouncement, motion: Motion, stamp: 
             at = np.array([stamp + shift - round(camera.time_offset * 1e9)])
             place, turn = motion.mounted(at, camera.position, camera.orientation)
             w, x, y, z = turn[0].as_quat(scalar_first=True).tolist()
-            kept.note(
+            kept.record(
                 PoseStamped(
                     stamp=stamp + shift,
                     source=camera.source,

@@ -74,9 +74,9 @@ def rolling() -> _Collector:
 @pytest.fixture
 def kept(plain: _Collector) -> _Collector:
     """Return a flight that may be changed."""
-    own = _Collector()
-    vars(own).update({k: v.copy() if isinstance(v, dict) else v for k, v in vars(plain).items()})
-    return own
+    copy = _Collector()
+    vars(copy).update({k: v.copy() if isinstance(v, dict) else v for k, v in vars(plain).items()})
+    return copy
 
 
 def judged(kept: _Collector, announced: CameraAnnouncement) -> dict[int, list[proofs.Figure]]:
@@ -132,7 +132,7 @@ def test_a_wrong_readout_is_named(rolling: _Collector) -> None:
 def test_a_shifted_stamp_is_named_with_its_time(kept: _Collector) -> None:
     announced = kept.cameras["drone/left"]
     late = 5_000_000  # as if stamps were those of the delivery
-    stores: tuple[dict[str, Any], ...] = (kept.images, kept.depths, kept.own, kept.poses)
+    stores: tuple[dict[str, Any], ...] = (kept.images, kept.depths, kept.vehicle_pixels, kept.poses)
     for store in stores:
         for source, rows in list(store.items()):
             store[source] = {s + late: image for s, image in rows.items()}
