@@ -73,7 +73,7 @@ def export_trajectories(
     # Before anything is written: a run that has no such pair leaves no half of an export.
     pairs = {
         name: associate(
-            truths.get(_truth_of(run, name), truths[TRUTH]),
+            truths.get(_truth_name(run, name), truths[TRUTH]),
             estimate,
             name=f"{run / 'trajectories' / name}.tum",
         )
@@ -152,8 +152,10 @@ def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
     ]
     chosen = [mounted for source, mounted in mounted_cameras if camera in {"", source}]
     if camera and not chosen:
-        there = ", ".join(source for source, _ in mounted_cameras) or "none"
-        raise ValueError(f"{path}: expected {camera!r} among the cameras on a body, found {there}")
+        sources = ", ".join(source for source, _ in mounted_cameras) or "none"
+        raise ValueError(
+            f"{path}: expected {camera!r} among the cameras on a body, found {sources}"
+        )
     return chosen[0] if chosen else pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
 
 
@@ -194,7 +196,7 @@ def load(run: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:
     return truths, estimates
 
 
-def _truth_of(run: Path, estimate: str) -> str:
+def _truth_name(run: Path, estimate: str) -> str:
     """Return the truth's name in an estimate's verdict; `TRUTH` if not named."""
     path = run / "evaluation" / "verdict.json"
     if not path.is_file():
@@ -249,11 +251,11 @@ def export_measurements(run: Path, out: Path | None = None, epoch: int | str = E
 
 
 def _measurements(recording: Path) -> Iterator[Event]:
-    from nodes.data.replay.bags import Recorded  # which needs mcap
+    from nodes.data.replay.bags import Recorded  # which imports the MCAP library
 
     reader = Recorded(recording)
-    wanted = reader.events(0, None, lambda kind, _: bool(fields_of(kind)))
-    yield from (recorded.event for recorded in wanted)
+    events = reader.events(0, None, lambda kind, _: bool(fields_of(kind)))
+    yield from (recorded.event for recorded in events)
 
 
 def _header(event: Event) -> str:

@@ -39,9 +39,9 @@ from nodes.data.dataset.recording import (
     Recording,
     Rig,
     RowFile,
+    extra_values,
     in_colour,
     in_grey,
-    noted,
     real,
 )
 from nodes.ros2.messages.images import depth_in_steps
@@ -86,8 +86,8 @@ class Euroc(Recording):
         self._depths: dict[str, tuple[str, RowFile]] = {}
         for number, camera in enumerate(rig.cameras):
             # With colour, a camera's grey images have a source of their own.
-            own_grey = {"rgb", "grey"} <= {*camera.images}
-            source = f"{camera.source}/grey" if own_grey else camera.source
+            separate_grey = {"rgb", "grey"} <= {*camera.images}
+            source = f"{camera.source}/grey" if separate_grey else camera.source
             self._images[source] = self._camera(f"cam{number}", camera, "camera")
             if "depth" in camera.images:
                 self._depths[camera.source] = self._camera(
@@ -103,15 +103,15 @@ class Euroc(Recording):
 
     def image(self, event: Image) -> ImageFile | None:
         """Add an image of the rig; return its file, still to be written."""
-        return self._note(self._images, event, functools.partial(ImageFile, convert=in_grey))
+        return self._add_image(self._images, event, functools.partial(ImageFile, convert=in_grey))
 
     def depth(self, event: DepthImage) -> ImageFile | None:
         """Add a depth image of the rig; return its file, still to be written."""
         convert = functools.partial(depth_in_steps, per_metre=self.depth_factor)
-        return self._note(self._depths, event, functools.partial(ImageFile, convert=convert))
+        return self._add_image(self._depths, event, functools.partial(ImageFile, convert=convert))
 
     def odometry(self, event: Odometry) -> None:
-        """Note where the body is, and its velocity in the world."""
+        """Add a row with the body's true pose and its velocity in the world."""
         if event.source == self.rig.body:
             self._velocity_known |= any(event.linear_velocity)
             if len(self._places) < 2:
@@ -162,11 +162,16 @@ class Euroc(Recording):
         """Write a sensor.yaml: kind, pose on the body, and further fields by kind."""
         pose, fields = np.eye(4), {}
         if mounted is not None:
-            pose, fields = pose_matrix(mounted.position, mounted.orientation), noted(mounted)
-        what = {"kind": kind, "comment": comment, "pose": pose.tolist(), "noted": fields} | more
-        self.describe(f"mav0/{name}/sensor.yaml", "euroc.sensor.yaml", **what)
+            pose, fields = pose_matrix(mounted.position, mounted.orientation), extra_values(mounted)
+        variables = {
+            "kind": kind,
+            "comment": comment,
+            "pose": pose.tolist(),
+            "noted": fields,
+        } | more
+        self.describe(f"mav0/{name}/sensor.yaml", "euroc.sensor.yaml", **variables)
 
-    def _note(
+    def _add_image(
         self,
         places: dict[str, tuple[str, RowFile]],
         event: Image | DepthImage,
@@ -223,8 +228,8 @@ class TumMono(Recording):
     def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
         super().__init__(folder, rig, depth_factor, epoch)
         self._camera = camera = rig.cameras[0]
-        own_grey = {"rgb", "grey"} <= {*camera.images}  # they have a source of their own
-        self._source = f"{camera.source}/grey" if own_grey else camera.source
+        separate_grey = {"rgb", "grey"} <= {*camera.images}  # they have a source of their own
+        self._source = f"{camera.source}/grey" if separate_grey else camera.source
         self.write("camera.txt", _calibration(camera.source, camera.info))
         light = 255.0 * response_light(camera.response)
         self.write("pcalib.txt", " ".join(f"{value:.9g}" for value in light) + "\n")
@@ -237,7 +242,7 @@ class TumMono(Recording):
         self._poses: dict[int, PoseStamped] = {}
 
     def image(self, event: Image) -> ImageFile | None:
-        """Note an image of the camera, and the pose of its stamp."""
+        """Add an image of the camera, and a row with the pose at its stamp."""
         if event.source != self._source:
             return None
         number, stamp = self._times.count, self.epoch + event.stamp
@@ -262,7 +267,7 @@ class TumMono(Recording):
         ]
 
     def pose(self, event: PoseStamped) -> None:
-        """Note where the camera is, until its image comes."""
+        """Store a pose of the camera until its image comes."""
         if event.source == self._camera.source:
             self._poses[event.stamp] = event
 
@@ -319,10 +324,14 @@ class TumRgbd(Recording):
                 "timestamp ax ay az",
             )  # fmt: skip
         self._unpaired: dict[int, str] = {}  # by stamp: rgb or depth, whichever came
-        fields = noted(camera)
+        fields = extra_values(camera)
         fields.pop("time_offset", None)  # the true poses are those of the images' own stamps
         self.describe(
-            "camera.yaml", "tum_rgbd.camera.yaml", camera=camera, factor=depth_factor, noted=fields
+            "camera.yaml",
+            "tum_rgbd.camera.yaml",
+            camera=camera,
+            factor=depth_factor,
+            noted=fields,
         )
 
     def image(self, event: Image) -> ImageFile | None:
@@ -332,20 +341,20 @@ class TumRgbd(Recording):
         return ImageFile(self._path("rgb", event.stamp), event.data, in_colour)
 
     def depth(self, event: DepthImage) -> ImageFile | None:
-        """Note a depth image of the camera."""
+        """Add a depth image of the camera; return its file, still to be written."""
         if event.source != self._camera.source or not self._add("depth", event.stamp):
             return None
         convert = functools.partial(depth_in_steps, per_metre=self.depth_factor)
         return ImageFile(self._path("depth", event.stamp), event.data, convert)
 
     def pose(self, event: PoseStamped) -> None:
-        """Note where the camera is."""
+        """Add a row with the camera's true pose."""
         if event.source == self._camera.source:
             pose = flip_yz(event.position), rotation_to_nwu(event.orientation)
             self._files["groundtruth"].add(event.stamp, tum_row(self.epoch + event.stamp, *pose))
 
     def imu(self, event: Imu) -> None:
-        """Note the accelerations."""
+        """Add a row with the accelerations."""
         if self.rig.imu is not None and event.source == self.rig.imu.source:
             x, y, z = rotate(self.rig.imu.orientation, event.linear_acceleration)
             row = f"{self._seconds(event.stamp)} {x:.9f} {y:.9f} {z:.9f}\n"

@@ -72,16 +72,16 @@ class DatasetWriter(Node[DatasetConfig]):
         self._announcements.append(announcement)
 
     async def run(self) -> None:
-        """Have images written as they come."""
+        """Write images in the background as they arrive."""
         self._open()
         for _ in range(_AT_ONCE):
             self.start(self._write())
-        self.start(self._take(self.depth_images))
-        await self._take(self.images)
+        self.start(self._enqueue_images(self.depth_images))
+        await self._enqueue_images(self.images)
 
-    async def _take(self, images: Stream[Any]) -> None:
+    async def _enqueue_images(self, images: Stream[Any]) -> None:
         async for image in images:
-            if (file := self._note(image)) is not None:
+            if (file := self._add(image)) is not None:
                 await self._queue.put(file)
 
     async def _write(self) -> None:
@@ -92,19 +92,19 @@ class DatasetWriter(Node[DatasetConfig]):
 
     @on(PoseStamped)
     def camera_poses(self, event: PoseStamped) -> None:
-        """Note where a camera is."""
+        """Record a camera's pose."""
         if (recording := self._open()) is not None:
             recording.pose(event)
 
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
-        """Note where the vehicle is."""
+        """Record the vehicle's pose."""
         if (recording := self._open()) is not None:
             recording.odometry(event)
 
     @on(Imu)
     def imu(self, event: Imu) -> None:
-        """Note a measurement."""
+        """Record an IMU sample."""
         if (recording := self._open()) is not None:
             recording.imu(event)
 
@@ -114,7 +114,7 @@ class DatasetWriter(Node[DatasetConfig]):
             return
         for images in (self.images, self.depth_images):
             for _ in range(images.statistics().buffered):
-                self._note(images.receive_nowait())
+                self._add(images.receive_nowait())
         await self.offload(_finish, self._recording, list(self._unwritten))
         for warning in self._recording.warnings():
             self.log.warning("%s", warning)
@@ -127,7 +127,7 @@ class DatasetWriter(Node[DatasetConfig]):
             self.log.warning("nothing came for %s", ", ".join(empty))
 
     def _open(self) -> Recording | None:
-        """Return the recording, begun at the first event: all announcements have come by then."""
+        """Return the recording, created at the first event, when all announcements are known."""
         if self._recording is None and self.out is not None:
             layout = _LAYOUTS[self.config.format]
             try:
@@ -138,8 +138,8 @@ class DatasetWriter(Node[DatasetConfig]):
                 self.log.fatal("%s", error)
         return self._recording
 
-    def _note(self, event: Image | DepthImage) -> ImageFile | None:
-        """Add an image, and keep its file until written, in case the run ends before."""
+    def _add(self, event: Image | DepthImage) -> ImageFile | None:
+        """Add an image; its file is stored until written, in case the run ends before."""
         if (recording := self._open()) is None:
             return None
         file = recording.image(event) if isinstance(event, Image) else recording.depth(event)

@@ -49,12 +49,14 @@ def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
         ValueError: No such camera gives images.
     """
     announced = [a for a in announcements if isinstance(a, CameraAnnouncement)]
-    able = [a for a in announced if {"rgb", "grey"} & {*a.images}]
-    cameras = [a for a in able if (_belongs(a, named) if named is not None else not a.undistorted)]
+    candidates = [a for a in announced if {"rgb", "grey"} & {*a.images}]
+    cameras = [
+        a for a in candidates if (_belongs(a, named) if named is not None else not a.undistorted)
+    ]
     if not cameras:
         names = ", ".join(f"{a.source} ({', '.join(a.images)})" for a in announced) or "none"
-        called = f" called {named}" if named is not None else ""
-        raise ValueError(f"expected a camera with rgb or grey images{called}, found {names}")
+        suffix = f" called {named}" if named is not None else ""
+        raise ValueError(f"expected a camera with rgb or grey images{suffix}, found {names}")
     vehicles = Vehicles()
     for announcement in announcements:
         vehicles.announced(announcement)
@@ -66,11 +68,13 @@ def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
     imus = (
         a for a in announcements if isinstance(a, ImuAnnouncement) and body_of(a.source) == body
     )
-    twins = cameras[0].undistorted  # either what cameras give, or that without distortion
+    undistorted = cameras[0].undistorted  # either all images as captured, or all without distortion
     return Rig(
         body=body,
         cameras=tuple(
-            a for a in cameras if body_of(a.source) == body and bool(a.undistorted) == bool(twins)
+            a
+            for a in cameras
+            if body_of(a.source) == body and bool(a.undistorted) == bool(undistorted)
         ),
         imu=next(imus, None),
     )
@@ -118,7 +122,7 @@ def in_grey(data: Pixels) -> Pixels:
     return cv2.cvtColor(data, cv2.COLOR_RGB2GRAY) if data.ndim == 3 else data
 
 
-_KEPT = 100_000_000  # nanoseconds between rows that the system is given
+_FLUSH_INTERVAL = 100_000_000  # nanoseconds between flushes to the operating system
 
 
 class RowFile:
@@ -133,7 +137,7 @@ class RowFile:
         self.count = 0  # rows so far
         self.left_out = 0  # rows left out because their stamp did not rise, as readers expect
         self._last: int | None = None
-        self._written = -_KEPT  # stamp of the last row that the system was given
+        self._written = -_FLUSH_INTERVAL  # stamp of the last row flushed to the operating system
         self._file = path.open("w", encoding="utf-8", newline="\n")
         self._file.write(header)
         self._file.flush()
@@ -146,7 +150,7 @@ class RowFile:
         self._last = stamp
         self.count += 1
         self._file.write(row)
-        if stamp - self._written >= _KEPT:
+        if stamp - self._written >= _FLUSH_INTERVAL:
             self._file.flush()
             self._written = stamp
         return True
@@ -173,17 +177,17 @@ class Recording(ABC):
     def image(self, event: Image) -> ImageFile | None:
         """Add an image; return its file, still to be written."""
 
-    # What a layout has no place for is passed over.
+    # By default, data that a layout has no file for is ignored.
 
     def depth(self, event: DepthImage) -> ImageFile | None:  # noqa: ARG002
         """Add a depth image; return its file, still to be written."""
         return None
 
     def pose(self, event: PoseStamped) -> None:  # noqa: B027
-        """Note where a camera is."""
+        """Record a camera's pose."""
 
     def odometry(self, event: Odometry) -> None:  # noqa: B027
-        """Note where the body is."""
+        """Record the body's pose."""
 
     def imu(self, event: Imu) -> None:  # noqa: B027
         """Add an IMU sample."""
@@ -225,22 +229,31 @@ class Recording(ABC):
         return sum(file.left_out for file in self.files)
 
 
-_SAID = {"position", "orientation", "parent_frame_id", "baseline", "stereo", "undistorted"}
+_STANDARD_FIELDS = {
+    "position",
+    "orientation",
+    "parent_frame_id",
+    "baseline",
+    "stereo",
+    "undistorted",
+}
 
 
-def notable(kind: Any) -> list[msgspec.structs.FieldInfo]:
-    """Return the fields of an announcement for which no layout has a word, all with defaults.
+def extra_fields(kind: Any) -> list[msgspec.structs.FieldInfo]:
+    """Return the fields of an announcement that no layout defines, all with defaults.
 
-    Our own data sets note them all the same.
+    Our own data sets contain them nevertheless.
     """
     fields = msgspec.structs.fields(kind)
-    return [f for f in fields if f.default is not msgspec.NODEFAULT and f.name not in _SAID]
+    return [
+        f for f in fields if f.default is not msgspec.NODEFAULT and f.name not in _STANDARD_FIELDS
+    ]
 
 
-def noted(announcement: CameraAnnouncement | ImuAnnouncement) -> dict[str, str]:
+def extra_values(announcement: CameraAnnouncement | ImuAnnouncement) -> dict[str, str]:
     """Return the `notable` fields that are not their defaults, as YAML."""
     fields = {}
-    for field in notable(announcement):
+    for field in extra_fields(announcement):
         value = getattr(announcement, field.name)
         if value != field.default:
             text = _row(value) if isinstance(value, tuple) else str(value).lower()

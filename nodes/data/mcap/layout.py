@@ -42,10 +42,10 @@ class TornError(ValueError):
     """Nothing can be read from some place in a file on; the message says why."""
 
 
-def pieces(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
+def pieces(file: IO[bytes], opcodes: Collection[int]) -> Iterator[tuple[int, bytes]]:
     """Yield records of some opcodes up to the footer; a `TornError` if there is none."""
     for opcode, length in _heads(file):
-        if opcode in wanted:
+        if opcode in opcodes:
             yield opcode, file.read(length)
 
 
@@ -56,7 +56,7 @@ def check_chunks(file: IO[bytes]) -> None:
             if opcode == _IS_CHUNK:
                 check_chunk(file.read(min(length, 128)))
     except TornError:
-        pass  # who reads it will say so
+        pass  # the reader reports it
 
 
 def check_chunk(content: bytes) -> None:
@@ -76,8 +76,8 @@ def frame_size(data: bytes) -> int:
         flags = data[4]
         single = flags >> 5 & 1
         width = (single, 2, 4, 8)[flags >> 6]
-        begin = 5 + (not single) + (0, 1, 2, 4)[flags & 3]
-        size = int.from_bytes(data[begin : begin + width], "little")
+        start = 5 + (not single) + (0, 1, 2, 4)[flags & 3]
+        size = int.from_bytes(data[start : start + width], "little")
         return size + 256 if width == 2 else size
     if data.startswith(_LZ4) and data[4] & 8:
         return int.from_bytes(data[6:14], "little")
@@ -96,7 +96,7 @@ def _heads(file: IO[bytes]) -> Iterator[tuple[int, int]]:
         opcode, length = HEAD.unpack(head)
         after = at + HEAD.size + length
         if not (0 < opcode <= _LAST or opcode >= _PRIVATE) or after > size:
-            raise TornError(_why(file, at, size))
+            raise TornError(_reason(file, at, size))
         yield opcode, length
         if opcode == _IS_FOOTER:
             return
@@ -128,17 +128,17 @@ def has_summary(file: IO[bytes]) -> bool:
         return False
     file.seek(at)
     footer = file.read(_FOOTER.size)
-    opcode, length, begin, _, checksum = _FOOTER.unpack(footer)
+    opcode, length, start, _, checksum = _FOOTER.unpack(footer)
     if file.read() != MAGIC or (opcode, length) != (_IS_FOOTER, _FOOTER.size - HEAD.size):
         return False
-    if not len(MAGIC) <= begin < at:
+    if not len(MAGIC) <= start < at:
         return False
-    file.seek(begin)
-    summary = file.read(at - begin) + footer[: -struct.calcsize("<I")]
+    file.seek(start)
+    summary = file.read(at - start) + footer[: -struct.calcsize("<I")]
     return checksum in {0, zlib.crc32(summary)}  # 0: its writer made none
 
 
-def _why(file: IO[bytes], at: int, size: int) -> str:
+def _reason(file: IO[bytes], at: int, size: int) -> str:
     """Return the error text for a file cut short, or damaged in the middle."""
     file.seek(-len(MAGIC), os.SEEK_END)
     if file.read() != MAGIC:
@@ -166,7 +166,7 @@ class WholeWrites(io.BufferedIOBase):
         return len(data)
 
     def tell(self) -> int:
-        """Return where the next bytes will stand."""
+        """Return the position of the next bytes."""
         return self._at
 
     def flush(self) -> None:
@@ -174,9 +174,9 @@ class WholeWrites(io.BufferedIOBase):
         piece, self._piece = self._piece, []
         try:
             for data in piece:
-                rest = memoryview(data)
-                while len(rest):
-                    rest = rest[self._raw.write(rest) or 0 :]
+                remaining = memoryview(data)
+                while len(remaining):
+                    remaining = remaining[self._raw.write(remaining) or 0 :]
         except OSError:
             self._at = self.size
             with contextlib.suppress(OSError):  # no ordinary file
@@ -194,7 +194,7 @@ class WholeWrites(io.BufferedIOBase):
         self._raw.close()
 
 
-def open_anew(path: Path) -> IO[bytes]:
+def open_for_writing(path: Path) -> IO[bytes]:
     """Open a file for writing, locked against other writers; an `OSError` if it cannot be."""
     file = open(  # noqa: SIM115
         path,
@@ -224,9 +224,9 @@ def unwritable(path: Path, error: OSError) -> RecordingError:
     return RecordingError(f"{path} cannot be written: {error.strerror or error} ({free})")
 
 
-def _locked(file: IO[bytes], how: int) -> bool:
+def _locked(file: IO[bytes], operation: int) -> bool:
     try:
-        fcntl.flock(file, how | fcntl.LOCK_NB)
+        fcntl.flock(file, operation | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:  # a file system without locks

@@ -18,7 +18,7 @@ import msgspec
 
 from nodes.data.mcap import layout
 from nodes.data.mcap import native as records
-from nodes.data.mcap.layout import WholeWrites, open_anew, unwritable
+from nodes.data.mcap.layout import WholeWrites, open_for_writing, unwritable
 
 Compression = Literal["zstd", "lz4", "none"]
 
@@ -71,7 +71,7 @@ class McapWriter:
         self._times: tuple[int, int] | None = None
         self._pending = 0
         try:
-            self._file = WholeWrites((open_file or open_anew)(path))  # type: ignore[arg-type]
+            self._file = WholeWrites((open_file or open_for_writing)(path))  # type: ignore[arg-type]
             self._writer = records.writer(
                 self._file,  # type: ignore[arg-type]
                 compression=compression,

@@ -58,11 +58,11 @@ def describe(frame: bytes | bytearray | memoryview) -> tuple[str, str]:
     return kind, head.source
 
 
-def lacking(data: bytes) -> list[Shape]:
-    """Return the arrays lacking in a message, none or all; a `WireError` if it is none of ours."""
-    shapes, begin, end = _shapes(data)
+def missing_arrays(data: bytes) -> list[Shape]:
+    """Return the arrays missing in a message, none or all; a `WireError` if it is none of ours."""
+    shapes, start, end = _shapes(data)
     content = any(0 not in shape for _, shape, _ in shapes)
-    if not shapes or len(data) - _HEAD.size > end or (not content and begin == end):
+    if not shapes or len(data) - _HEAD.size > end or (not content and start == end):
         return []
     return [Shape(dtype, tuple(shape)) for dtype, shape, _ in shapes]
 
@@ -77,15 +77,15 @@ def event(data: bytes, arrays: Sequence[npt.NDArray[Any]] = ()) -> Event:
     """Return a message's event; a `WireError` if arrays do not fit, or its type is unknown."""
     if not arrays:
         return unpack(memoryview(data)[_HEAD.size :])
-    shapes, begin, end = _shapes(data)
+    shapes, start, end = _shapes(data)
     if [(np.dtype(d), tuple(s)) for d, s, _ in shapes] != [(a.dtype, a.shape) for a in arrays]:
-        given = ", ".join(f"{a.dtype}{list(a.shape)}" for a in arrays)
-        raise WireError(f"expected arrays of {[(d, s) for d, s, _ in shapes]}, found {given}")
-    size = begin + max(at + a.nbytes for (_, _, at), a in zip(shapes, arrays, strict=True))
+        actual = ", ".join(f"{a.dtype}{list(a.shape)}" for a in arrays)
+        raise WireError(f"expected arrays of {[(d, s) for d, s, _ in shapes]}, found {actual}")
+    size = start + max(at + a.nbytes for (_, _, at), a in zip(shapes, arrays, strict=True))
     frame = np.empty(size, np.uint8)
     frame[:end] = np.frombuffer(data, np.uint8, end, _HEAD.size)
     for (_, _, at), array in zip(shapes, arrays, strict=True):
-        place = frame[begin + at : begin + at + array.nbytes]
+        place = frame[start + at : start + at + array.nbytes]
         place[:] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
     return unpack(frame.data)
 
@@ -263,23 +263,23 @@ def records(
     start: int,  # earlier messages (ns) may be left out
     end: int | None,  # so may those from this time on
     damaged: Callable[[str], None],  # called for parts that cannot be read, which are passed over
-    everything: bool = False,  # yield metadata and attachments, too
+    with_metadata: bool = False,  # yield metadata and attachments, too
 ) -> Iterator[Any]:
     """Yield schemas, channels and messages; of a file with an index, by its chunks in the range."""
     with open_file(path) as file:
         summary = summary_of(file)
         if summary is not None and summary.chunk_indexes and summary.channels:
-            stored = _by_index(file, summary, start, end, damaged, everything)
+            stored = _by_index(file, summary, start, end, damaged, with_metadata)
         else:
-            stored = _one_by_one(file, damaged, everything)
-        known: set[int] = set()
-        strange = False
+            stored = _one_by_one(file, damaged, with_metadata)
+        channels: set[int] = set()
+        reported = False
         for record in stored:
             if isinstance(record, Channel):
-                known.add(record.id)
-            elif isinstance(record, Message) and record.channel_id not in known:
-                if not strange:
-                    strange = True
+                channels.add(record.id)
+            elif isinstance(record, Message) and record.channel_id not in channels:
+                if not reported:
+                    reported = True
                     damaged("messages of topics that a damaged chunk named are left out")
                 continue
             yield record
@@ -291,7 +291,7 @@ def _by_index(
     start: int,
     end: int | None,
     damaged: Callable[[str], None],
-    everything: bool,
+    with_metadata: bool,
 ) -> Iterator[Any]:
     yield from summary.schemas.values()
     yield from summary.channels.values()
@@ -304,24 +304,26 @@ def _by_index(
                 damaged(_left_out(first, last, error))
             else:
                 yield from _broken_up(content, damaged)
-    if everything:
+    if with_metadata:
         for opcode, indexes in (
             (Opcode.METADATA, summary.metadata_indexes),
             (Opcode.ATTACHMENT, summary.attachment_indexes),
         ):
-            for place in indexes:
+            for entry in indexes:
                 try:
-                    yield _parsed(opcode, layout.piece_at(file, place.offset, place.length))
+                    yield _parsed(opcode, layout.piece_at(file, entry.offset, entry.length))
                 except (McapError, *_DAMAGED) as error:
-                    damaged(f"{place.name} is damaged and left out ({error})")
+                    damaged(f"{entry.name} is damaged and left out ({error})")
 
 
-def _one_by_one(file: IO[bytes], damaged: Callable[[str], None], everything: bool) -> Iterator[Any]:
-    wanted = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK}
-    if everything:
-        wanted |= {Opcode.METADATA, Opcode.ATTACHMENT}
+def _one_by_one(
+    file: IO[bytes], damaged: Callable[[str], None], with_metadata: bool
+) -> Iterator[Any]:
+    opcodes = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK}
+    if with_metadata:
+        opcodes |= {Opcode.METADATA, Opcode.ATTACHMENT}
     try:
-        for opcode, content in layout.pieces(file, wanted):
+        for opcode, content in layout.pieces(file, opcodes):
             if opcode == Opcode.CHUNK:
                 yield from _broken_up(content, damaged)
                 continue

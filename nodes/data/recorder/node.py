@@ -48,8 +48,8 @@ class McapRecorder(Node[McapRecorderConfig]):
         self._ended_run = False
         self._unfinished: int | None = None  # end of the run (ns), while yet to be written
         self._warned_at = 1
-        self._waits = 0
-        self._waited = 0.0
+        self._pauses = 0
+        self._pause_seconds = 0.0
 
     async def on_startup(self) -> None:
         """Open the file; a `FatalError` if it cannot be written."""
@@ -63,7 +63,7 @@ class McapRecorder(Node[McapRecorderConfig]):
         loop = asyncio.get_running_loop()
         self._failed = loop.create_future()
         try:
-            self._process = await self.offload(self._open, loop)
+            self._process = await self.offload(self._open_file, loop)
         except RecordingError as error:
             self.log.fatal("%s", error)
         assert self._process is not None
@@ -73,21 +73,21 @@ class McapRecorder(Node[McapRecorderConfig]):
     def on_announcement(self, announcement: Announcement) -> None:
         """Record an announcement; a bare `Announcement` only names sources: left out."""
         if self._process is not None and type(announcement) is not Announcement:
-            self._backlog.put(0, announcement)
+            self._backlog.add(0, announcement)
 
     async def run(self) -> None:
         """Pass all events to the thread feeding the writing process."""
         if self._process is None:
             return
-        self.start(self._watch())
-        clock, backlog, put = self.clock, self._backlog, self._backlog.put
+        self.start(self._end_run_on_failure())
+        clock, backlog, add_event = self.clock, self._backlog, self._backlog.add
         waits = backlog.when_full == "wait"
         async for event in self.events:
-            put(clock.now(), event)
+            add_event(clock.now(), event)
             if backlog.dropped >= self._warned_at:
                 self._warn()
             if waits and backlog.is_full:
-                await self._wait()
+                await self._wait_for_disk()
 
     async def on_shutdown(self) -> None:
         """Write queued events and the index, on a slow disk after the run, or end with an error."""
@@ -95,11 +95,11 @@ class McapRecorder(Node[McapRecorderConfig]):
         if process is None:
             return
         while self.events.statistics().buffered:
-            backlog.put(self.clock.now(), self.events.receive_nowait())
+            backlog.add(self.clock.now(), self.events.receive_nowait())
         self._unfinished = self.clock.now()
         if not await self.offload(process.close, self._unfinished, _END_TIMEOUT):
-            waits = backlog.bytes / 1e6
-            self.log.warning("%.1f MB are yet to be written: that goes on after the run", waits)
+            megabytes = backlog.bytes / 1e6
+            self.log.warning("%.1f MB are yet to be written: that goes on after the run", megabytes)
             return
         self._unfinished = None
         self._log_result(process)
@@ -118,36 +118,36 @@ class McapRecorder(Node[McapRecorderConfig]):
         backlog, result = self._backlog, process.result
         lost = backlog.dropped + process.unwritten
         self.events.dropped += lost
-        if result.what != "gone":  # it did not report how many there are
-            waits = f"{self._waits} times for the disk, {self._waited:.1f} s in all"
+        if result.kind != "gone":  # it did not report how many there are
+            pauses = f"{self._pauses} times for the disk, {self._pause_seconds:.1f} s in all"
             self.log.info(
                 "%s: %d events, %.1f MB; at most %.1f MB waited%s",
                 Path(process.path).name,
                 result.written,
                 result.size / 1e6,
                 backlog.peak / 1e6,
-                f", and simulated time {waits}" if self._waits else "",
+                f", and simulated time {pauses}" if self._pauses else "",
             )
         if lost:
             self.log.warning(
                 "%d events are not in the recording%s",
                 lost,
-                ", nor is what its process had yet to write" if result.what == "gone" else "",
+                ", nor is what its process had yet to write" if result.kind == "gone" else "",
             )
 
-    def _open(self, loop: asyncio.AbstractEventLoop) -> WriterProcess:
+    def _open_file(self, loop: asyncio.AbstractEventLoop) -> WriterProcess:
         assert self.out is not None
 
-        def complain(what: str) -> None:
+        def complain(text: str) -> None:
             with contextlib.suppress(RuntimeError):  # the run is over
-                loop.call_soon_threadsafe(self.log.warning, "%s", what)
+                loop.call_soon_threadsafe(self.log.warning, "%s", text)
 
         def failed(error: RecordingError) -> None:
             with contextlib.suppress(RuntimeError):  # the run is over, and `_finish` raises it
                 loop.call_soon_threadsafe(self._fail, error)
 
         path = self.out / part_name(self, self.config.file)
-        is_first = self.name == self.siblings(McapRecorder)[0].name  # of a bag there is one
+        is_first = self.name == self.siblings(McapRecorder)[0].name  # a folder is one bag at most
         request = WriteRequest(
             path=str(path),
             config=self.config,
@@ -162,27 +162,27 @@ class McapRecorder(Node[McapRecorderConfig]):
         if self._failed is not None and not self._failed.done():
             self._failed.set_result(error)
 
-    async def _watch(self) -> None:
+    async def _end_run_on_failure(self) -> None:
         assert self._failed is not None
         error = await self._failed
         self._ended_run = True
         self.log.fatal("%s", error)
 
-    async def _wait(self) -> None:
-        if not self._waits:
+    async def _wait_for_disk(self) -> None:
+        if not self._pauses:
             self.log.info(
                 "the disk is slower than the run: simulated time waits, now and again, with "
                 "%.0f MB to write",
                 self._backlog.bytes / 1e6,
             )
-        began = time.monotonic()
+        start = time.monotonic()
         assert self._process is not None
-        self._process.still_for()  # from now on
+        self._process.seconds_without_progress()  # counted from now on
         while not await self.offload(self._backlog.wait_for_room, _LOOK):
-            if self._process.still_for() >= STANDSTILL:
-                self.log.fatal("%s", self._process.standstill())
-        self._waits += 1
-        self._waited += time.monotonic() - began
+            if self._process.seconds_without_progress() >= STANDSTILL:
+                self.log.fatal("%s", self._process.standstill_error())
+        self._pauses += 1
+        self._pause_seconds += time.monotonic() - start
 
     def _warn(self) -> None:
         dropped = self._backlog.dropped

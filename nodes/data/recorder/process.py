@@ -69,9 +69,9 @@ class EventWriter:
             jpeg_quality=config.jpeg_quality,
         )
         self._ros = Publishing(self, self._store, published, Stamps().out)
-        self._puts: dict[str, Any] = {}
-        self._own: dict[tuple[str, str, str], int] = {}
-        self._begun = False
+        self._ros_writers: dict[str, Any] = {}
+        self._native_channels: dict[tuple[str, str, str], int] = {}
+        self._started = False
         self._time = 0
         self._holder = ""  # topic holding the arrays of the current event
 
@@ -80,48 +80,48 @@ class EventWriter:
         self._time = time
         self._holder = ""
         kind, source = native.describe(frame)
-        if not announcement and not self._begun:
-            self._begun = True
+        if not announcement and not self._started:
+            self._started = True
             self._ros.begin()
-        if kind not in self._puts:
-            self._puts[kind] = self._putter(kind)
-        if (put := self._puts[kind]) is not None:
+        if kind not in self._ros_writers:
+            self._ros_writers[kind] = self._ros_writer(kind)
+        if (write_ros := self._ros_writers[kind]) is not None:
             try:
-                put(unpack(frame))
+                write_ros(unpack(frame))
             except (ValueError, TypeError, OverflowError, struct.error, cv2.error) as error:
                 self._holder = ""
                 self._complain(f"{kind} of {source} has no message: {error}")
-        self._write_own(kind, source, frame, announcement)
+        self._write_native(kind, source, frame, announcement)
 
     def publisher(self, topic: Topic) -> RecordedTopic:
         """Add a topic of ROS's messages to the file."""
         qos = {"offered_qos_profiles": _LATCHED if topic.qos.transient_local else ""}
         channel = self._add_channel(topic.name, topic.type, qos)
 
-        def put(message: bytearray) -> None:
-            """Write a message of the event at hand."""
+        def write(message: bytearray) -> None:
+            """Write a message of the current event."""
             if topic.type in HOLDERS:
                 self._holder = topic.name
             self._writer.write(channel, self._time, message)
 
-        return RecordedTopic(topic, put)
+        return RecordedTopic(topic, write)
 
     def _add_channel(self, topic: str, type_: str, metadata: dict[str, str]) -> int:
         return self._writer.channel(topic, type_, self._store.definition, metadata)
 
-    def _putter(self, kind: str) -> Any:
+    def _ros_writer(self, kind: str) -> Any:
         """Return the writer of ROS messages for a kind of event; `None` if none exist."""
-        cls = _type_of(kind)
+        cls = _find_type(kind)
         if cls is None:
             return None
         if issubclass(cls, Announcement):
             return self._ros.announced
         return self._ros.put if issubclass(cls, LARGE + SMALL) else None
 
-    def _write_own(
+    def _write_native(
         self, kind: str, source: str, frame: bytes | bytearray, announcement: bool
     ) -> None:
-        channel = self._own.get((kind, source, self._holder))
+        channel = self._native_channels.get((kind, source, self._holder))
         if channel is None:
             metadata = {
                 "kind": kind,
@@ -132,7 +132,7 @@ class EventWriter:
             name = re.sub(r"\W", "_", kind.rpartition(":")[2])
             topic = f"{PREFIX}/{ros_name(source)}/{name}"
             channel = self._add_channel(topic, native.TYPE, metadata)
-            self._own[kind, source, self._holder] = channel
+            self._native_channels[kind, source, self._holder] = channel
         self._writer.write(channel, self._time, native.message(frame, arrays=not self._holder))
 
 
@@ -144,11 +144,11 @@ class RecordedTopic(msgspec.Struct, frozen=True):
     wanted: bool = True
 
 
-def _type_of(kind: str) -> type[Event] | None:
+def _find_type(kind: str) -> type[Event] | None:
     """Return an event type, imported if needed; `None` if unknown in this process."""
     with contextlib.suppress(WireError):
         return event_type(kind)
-    with contextlib.suppress(Exception):  # a module of the user's own, which may do anything
+    with contextlib.suppress(Exception):  # a user's module may raise any error
         importlib.import_module(kind.partition(":")[0])
         return event_type(kind)
     return None
@@ -176,7 +176,7 @@ class FileWriter:
         self._complaints: set[str] = set()
         self._written = 0
         self._in_chunk = 0
-        self._chunk_began: tuple[float, int] | None = None  # real seconds, run's nanoseconds
+        self._chunk_start: tuple[float, int] | None = None  # real seconds, run's nanoseconds
 
     def run(self, file: int) -> Reply:
         """Write the pieces from a file descriptor, and close the file."""
@@ -184,7 +184,7 @@ class FileWriter:
         try:
             for piece in writer_process.read_all(file, LONGEST / 2, self._while_idle):
                 last = piece.time
-                if piece.what == writer_process.END:
+                if piece.kind == writer_process.END:
                     break
                 self._write(piece)
             self._end_chunk()
@@ -203,14 +203,14 @@ class FileWriter:
 
     def _write(self, piece: writer_process.Piece) -> None:
         try:
-            self._events.write(piece.time, piece.frame, piece.what == writer_process.ANNOUNCEMENT)
+            self._events.write(piece.time, piece.frame, piece.kind == writer_process.ANNOUNCEMENT)
             self._written += 1
             self._in_chunk += 1
         except WireError as error:
             self._complain(str(error))
-        if self._chunk_began is None:
-            self._chunk_began = time.monotonic(), piece.time
-        real, run = self._chunk_began
+        if self._chunk_start is None:
+            self._chunk_start = time.monotonic(), piece.time
+        real, run = self._chunk_start
         if (
             self._writer.full
             or piece.time - run >= LONGEST * 1e9
@@ -219,21 +219,21 @@ class FileWriter:
             self._end_chunk()
 
     def _while_idle(self) -> None:
-        if self._chunk_began and time.monotonic() - self._chunk_began[0] >= LONGEST:
+        if self._chunk_start and time.monotonic() - self._chunk_start[0] >= LONGEST:
             self._end_chunk()
 
     def _end_chunk(self) -> None:
-        self._chunk_began = None
+        self._chunk_start = None
         self._writer.end_chunk()
         self._in_chunk = 0
 
-    def _complain(self, what: str) -> None:
-        if what not in self._complaints:
-            self._complaints.add(what)
-            send(Reply("complaint", what))
+    def _complain(self, text: str) -> None:
+        if text not in self._complaints:
+            self._complaints.add(text)
+            send(Reply("complaint", text))
 
-    def _reply(self, what: str, text: str = "") -> Reply:
-        return Reply(what, text, self._written, self._writer.size)
+    def _reply(self, kind: str, text: str = "") -> Reply:
+        return Reply(kind, text, self._written, self._writer.size)
 
 
 def send(reply: Reply) -> None:
@@ -248,14 +248,14 @@ def send(reply: Reply) -> None:
 
 def main(request: str) -> None:
     """Carry out a write request, and reply with the result."""
-    for number in (signal.SIGINT, signal.SIGHUP):  # the terminal is the run's business
+    for number in (signal.SIGINT, signal.SIGHUP):  # the run handles the terminal's signals
         signal.signal(number, signal.SIG_IGN)
-    wanted = msgspec.json.decode(request, type=WriteRequest)
-    os.nice(wanted.niceness)
-    if wanted.cores:
-        os.sched_setaffinity(0, wanted.cores)
+    write_request = msgspec.json.decode(request, type=WriteRequest)
+    os.nice(write_request.niceness)
+    if write_request.cores:
+        os.sched_setaffinity(0, write_request.cores)
     try:
-        writer = FileWriter(wanted)
+        writer = FileWriter(write_request)
     except RecordingError as error:
         send(Reply("error", str(error)))
         return

@@ -24,7 +24,7 @@ class Recovery(msgspec.Struct, frozen=True):
     path: Path
     messages: int
     trouble: list[str]  # parts unread, now or when mended before; empty if the file was whole
-    mended: bool  # whether there was anything to do
+    mended: bool  # whether the file was written again
     partial: bool  # whether messages are missing before the last one, too
 
 
@@ -45,30 +45,30 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
             raise RecordingError(f"{path}: expected a file that is done, found one being written")
     if recording.complete and out is None:
         trouble: list[str] = []
-        messages = sum(isinstance(r, records.Message) for r in _all_of(path, trouble))
+        messages = sum(isinstance(r, records.Message) for r in _records(path, trouble))
         trouble += recording.metadata.get(MENDED, {}).values()
         return Recovery(path, messages, trouble, mended=False, partial=bool(trouble))
     if out is not None and out.exists():
         raise RecordingError(f"{out}: expected the name of a new file, found one that is there")
-    place = out or path.with_name(f"{path.name}.mended")
+    target = out or path.with_name(f"{path.name}.mended")
     try:
-        messages, trouble = _write_anew(path, place)
+        messages, trouble = _write_readable(path, target)
         if not messages:
             raise RecordingError(f"{path}: expected messages, found none that can be read")
     except BaseException:
-        place.unlink(missing_ok=True)
+        target.unlink(missing_ok=True)
         raise
     if out is None:
-        place.replace(path)
+        target.replace(path)
     partial = any(problem != layout.NOT_CLOSED for problem in trouble)
     return Recovery(out or path, messages, trouble, mended=True, partial=partial)
 
 
-def _all_of(path: Path, trouble: list[str]) -> Iterator[Any]:
-    return records.records(path, 0, None, trouble.append, everything=True)
+def _records(path: Path, trouble: list[str]) -> Iterator[Any]:
+    return records.records(path, 0, None, trouble.append, with_metadata=True)
 
 
-def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
+def _write_readable(path: Path, out: Path) -> tuple[int, list[str]]:
     """Write a file's readable messages, with an index; return their number, and the troubles."""
     trouble: list[str] = []
     messages = 0
@@ -85,32 +85,32 @@ def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
             )
             schemas: dict[int, int] = {0: 0}
             channels: dict[int, int] = {}
-            for record in _all_of(path, trouble):
+            for record in _records(path, trouble):
                 match record:
                     case records.Schema():
                         if record.id not in schemas:
                             schema = record.name, record.encoding, record.data
                             schemas[record.id] = writer.register_schema(*schema)
-                    case records.Channel(topic=topic, message_encoding=how, metadata=metadata):
+                    case records.Channel(topic=topic, message_encoding=encoding, metadata=metadata):
                         if record.id not in channels:
                             schema_id = schemas.get(record.schema_id, 0)  # a damaged chunk's
-                            number = writer.register_channel(topic, how, schema_id, metadata)
+                            number = writer.register_channel(topic, encoding, schema_id, metadata)
                             channels[record.id] = number
                     case records.Metadata():
                         writer.add_metadata(record.name, record.metadata)
-                    case records.Attachment(create_time=made, log_time=time):
+                    case records.Attachment(create_time=created, log_time=time):
                         file_ = record.name, record.media_type, record.data
-                        writer.add_attachment(made, time, *file_)
+                        writer.add_attachment(created, time, *file_)
                     case records.Message(log_time=time, publish_time=published):
                         number = channels[record.channel_id]
                         writer.add_message(number, time, record.data, published, record.sequence)
                         messages += 1
             lost = [problem for problem in trouble if problem != layout.NOT_CLOSED]
-            if lost:  # so that nobody takes it for whole, now that it has an index
+            if lost:  # recorded, as a file with an index looks complete
                 writer.add_metadata(MENDED, {str(n): problem for n, problem in enumerate(lost, 1)})
             writer.finish()  # type: ignore[no-untyped-call]
             file.flush()
-            os.fsync(file.fileno())  # it may take the place of the only other one there is
+            os.fsync(file.fileno())  # it may replace the only copy
     except OSError as error:
         raise unwritable(out, error) from error
     return messages, trouble
@@ -131,15 +131,15 @@ def recover(
     from runtime.errors import ConfigError
 
     try:
-        done = recover_file(file, out)
+        result = recover_file(file, out)
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None
-    for trouble in done.trouble:
-        print(f"{file}: {trouble}")
-    partial = "; what is named above is missing" if done.partial else ""
-    if done.mended:
-        print(f"{done.path}: {done.messages} messages, now with an index{partial}")
-    elif done.partial:
-        print(f"{done.path}: {done.messages} messages, has its index, left as it is{partial}")
+    for problem in result.trouble:
+        print(f"{file}: {problem}")
+    partial = "; what is named above is missing" if result.partial else ""
+    if result.mended:
+        print(f"{result.path}: {result.messages} messages, now with an index{partial}")
+    elif result.partial:
+        print(f"{result.path}: {result.messages} messages, has its index, left as it is{partial}")
     else:
-        print(f"{done.path}: {done.messages} messages, complete, nothing to mend")
+        print(f"{result.path}: {result.messages} messages, complete, nothing to mend")

@@ -61,7 +61,7 @@ class Waiting(NamedTuple):
 
 
 class Backlog:
-    """A queue of references, bounded by bytes: the loop puts, a thread takes, and neither locks.
+    """Queue of event references, bounded by bytes: the loop adds, a thread pops, without locks.
 
     Args:
         limit: Bytes that may wait.
@@ -77,24 +77,24 @@ class Backlog:
         self.limit, self.when_full = limit, when_full
         self.dropped = self.peak = 0
         self._queue: deque[Waiting] = deque()
-        # One counter for each side, so that no addition is ever lost between the two.
-        self._put = self._dropped_bytes = self._written = 0
+        # Each counter is written by one thread only, so no addition is lost.
+        self._added = self._dropped_bytes = self._written = 0
         self._arrays: dict[type[Event], list[str]] = {}  # names of fields
         self._room = threading.Event()
 
     @property
     def bytes(self) -> int:
         """Return how many bytes wait, those being written included."""
-        return self._put - self._dropped_bytes - self._written
+        return self._added - self._dropped_bytes - self._written
 
     @property
     def is_full(self) -> bool:
-        """Tell whether more waits than should."""
+        """Return whether more bytes wait than the limit."""
         return self.bytes > self.limit
 
     # On the loop.
 
-    def put(self, time: int, event: Event) -> None:
+    def add(self, time: int, event: Event) -> None:
         """Add an event; if the backlog is full, drop some."""
         size = self._size(event)
         waiting = self.bytes + size
@@ -106,7 +106,7 @@ class Backlog:
             while waiting > self.limit + spare and self._drop_oldest():
                 waiting = self.bytes + size
         self.peak = max(self.peak, waiting)
-        self._put += size
+        self._added += size
         self._queue.append(Waiting(time, event, size))
 
     def _size(self, event: Event) -> int:
@@ -118,7 +118,7 @@ class Backlog:
         return SMALL + sum(getattr(event, name).nbytes for name in names) if names else SMALL
 
     def _drop_oldest(self) -> bool:
-        if (oldest := self.take()) is None:
+        if (oldest := self.pop()) is None:
             return False
         self._dropped_bytes += oldest.size
         self.dropped += 1
@@ -126,7 +126,7 @@ class Backlog:
 
     # In other threads.
 
-    def take(self) -> Waiting | None:
+    def pop(self) -> Waiting | None:
         """Return the oldest event, `None` if empty; call `done` after writing."""
         try:
             return self._queue.popleft()
@@ -145,7 +145,7 @@ class Backlog:
         return self.bytes <= self.limit // 2 or self._room.wait(timeout)
 
     def release(self) -> None:
-        """Let go of whoever waits: nothing will be written any more."""
+        """Remove the limit and wake waiting threads: nothing more is written."""
         self.limit = 1 << 62
         self._room.set()
 
@@ -175,9 +175,9 @@ class WriterProcess:
         self.backlog = backlog
         self.error: RecordingError | None = None  # what ended the writing
         self.result = Reply("")  # the last reply of the process
-        self.unwritten = self._handed = 0
-        self._seen: tuple[object, ...] = ()
-        self._seen_at = time.monotonic()
+        self.unwritten = self._sent = 0
+        self._progress: tuple[object, ...] = ()
+        self._progress_at = time.monotonic()
         self._cores = request.cores
         self._failed, self._complain = failed, complain
         self._closing = threading.Event()
@@ -192,24 +192,26 @@ class WriterProcess:
         )
         assert self._child.stdin is not None
         assert self._child.stdout is not None
-        self._replies, self._events = self._child.stdout, self._child.stdin
+        self._reply_pipe, self._event_pipe = self._child.stdout, self._child.stdin
         with contextlib.suppress(OSError, AttributeError):  # elsewhere it is smaller
-            fcntl.fcntl(self._events, fcntl.F_SETPIPE_SZ, _PIPE)
-        first = self._reply()
-        if first.what != "ready":
-            self._events.close()
-            self._replies.close()
+            fcntl.fcntl(self._event_pipe, fcntl.F_SETPIPE_SZ, _PIPE)
+        first = self._read_reply()
+        if first.kind != "ready":
+            self._event_pipe.close()
+            self._reply_pipe.close()
             self._child.wait()
-            if first.what == "missing":
+            if first.kind == "missing":
                 raise MissingDependencyError(first.text)
             raise RecordingError(first.text)
-        self._feeder = threading.Thread(target=self._feed, name="recorder", daemon=True)
-        self._listener = threading.Thread(target=self._listen, name="recorder", daemon=True)
+        self._event_thread = threading.Thread(target=self._send_all, name="recorder", daemon=True)
+        self._reply_thread = threading.Thread(
+            target=self._read_replies, name="recorder", daemon=True
+        )
 
     def start(self) -> None:
-        """Begin."""
-        self._listener.start()
-        self._feeder.start()
+        """Start both threads."""
+        self._reply_thread.start()
+        self._event_thread.start()
 
     def close(self, end: int, timeout: float | None = None) -> bool:
         """Write all queued events; return whether the file is closed. Not for a loop.
@@ -227,92 +229,95 @@ class WriterProcess:
         with contextlib.suppress(OSError):
             self._child.send_signal(signal.SIGCONT)
         until = math.inf if timeout is None else time.monotonic() + timeout
-        for thread in (self._feeder, self._listener):
+        for thread in (self._event_thread, self._reply_thread):
             while thread.is_alive():
-                if (rest := until - time.monotonic()) <= 0.0:
+                if (remaining := until - time.monotonic()) <= 0.0:
                     return False
-                thread.join(min(rest, _LOOK))
-                self._end_if_still()
+                thread.join(min(remaining, _LOOK))
+                self._kill_if_stuck()
         try:
             self._child.wait(STANDSTILL)
         except subprocess.TimeoutExpired:  # it has sent its last reply
             self._child.kill()
             self._child.wait()
-        if self.result.what in {"done", "error"}:  # one that was killed did not count
-            self.unwritten += self._handed - self.result.written
+        if self.result.kind in {"done", "error"}:  # a killed process reports no count
+            self.unwritten += self._sent - self.result.written
         return True
 
-    def still_for(self) -> float:
+    def seconds_without_progress(self) -> float:
         """Return the real seconds since the process's last sign of life."""
         try:
             size = Path(self.path).stat().st_size
             fields = Path(f"/proc/{self._child.pid}/stat").read_text().rpartition(")")[2].split()
-            seen = self._handed, size, fields[11], fields[12]  # with the time of its threads
+            progress = self._sent, size, fields[11], fields[12]  # with the time of its threads
         except (OSError, IndexError):  # gone, or another system
-            seen = self._handed, self._child.poll()  # type: ignore[assignment]
+            progress = self._sent, self._child.poll()  # type: ignore[assignment]
         now = time.monotonic()
-        if seen != self._seen:
-            self._seen, self._seen_at = seen, now
-        return now - self._seen_at
+        if progress != self._progress:
+            self._progress, self._progress_at = progress, now
+        return now - self._progress_at
 
-    def standstill(self) -> RecordingError:
+    def standstill_error(self) -> RecordingError:
         """Return the error for a process without a sign of life."""
         return RecordingError(
             f"{self.path}: the process that writes it ({self._child.pid}) has taken nothing for "
             f"{STANDSTILL:g} s; what it had taken is kept"
         )
 
-    def _end_if_still(self) -> None:
-        if self.still_for() >= STANDSTILL and self._child.poll() is None:
-            self.error = self.standstill()
+    def _kill_if_stuck(self) -> None:
+        if self.seconds_without_progress() >= STANDSTILL and self._child.poll() is None:
+            self.error = self.standstill_error()
             self._child.kill()
 
-    # The thread that feeds.
+    # In the thread that sends events.
 
-    def _feed(self) -> None:
-        # Off the busy cores: there this thread might wait for its turn with Python's lock, and
-        # then the loop would wait for that, too.
+    def _send_all(self) -> None:
+        # Off the busy cores: scheduled out there with Python's lock, this thread would block the
+        # loop.
         if self._cores and (spare := os.sched_getaffinity(0) - {*self._cores}):
             os.sched_setaffinity(0, spare)
         try:
-            self._hand_over()
-            write(self._events, self._end, END)
-            self._events.flush()
+            self._send_events()
+            write(self._event_pipe, self._end, END)
+            self._event_pipe.flush()
         except (OSError, ValueError):
-            pass  # the process is gone, or its pipe is closed, and the listener knows why
+            pass  # the process is gone, or its pipe is closed: the other thread reads why
         finally:
             with contextlib.suppress(OSError):
-                self._events.close()
+                self._event_pipe.close()
             self.backlog.release()
         closed = False
         while not closed:
             closed = self._closing.wait(_PAUSE)
-            while (waiting := self.backlog.take()) is not None:
+            while (waiting := self.backlog.pop()) is not None:
                 self.unwritten += 1
                 self.backlog.done(waiting)
 
-    def _hand_over(self) -> None:
-        taken: list[Waiting] = []
+    def _send_events(self) -> None:
+        unfinished: list[Waiting] = []
         try:
             while True:
-                closing = self._closing.is_set()  # before the look: what came before is written
-                if (waiting := self.backlog.take()) is not None:
-                    taken.append(waiting)
+                closing = self._closing.is_set()  # read before the queue, so no event is missed
+                if (waiting := self.backlog.pop()) is not None:
+                    unfinished.append(waiting)
                     self._write(waiting)
-                    if sum(entry.size for entry in taken) < _AT_ONCE and len(taken) < _IN_A_ROW:
+                    if (
+                        sum(entry.size for entry in unfinished) < _AT_ONCE
+                        and len(unfinished) < _IN_A_ROW
+                    ):
                         continue
-                if taken:
-                    self._events.flush()
-                    self._handed += len(taken)
-                    for entry in taken:
+                if unfinished:
+                    self._event_pipe.flush()
+                    self._sent += len(unfinished)
+                    for entry in unfinished:
                         self.backlog.done(entry)
-                    taken = []
+                    unfinished = []
                 elif closing:
                     return
                 else:
                     self._closing.wait(_PAUSE)
         except (OSError, ValueError):
-            self.unwritten += len(taken)
+            self.unwritten += len(unfinished)
             raise
 
     def _write(self, waiting: Waiting) -> None:
@@ -322,21 +327,21 @@ class WriterProcess:
         except WireError as error:
             self._complain(str(error))
             return
-        write(self._events, waiting.time, ANNOUNCEMENT if is_announced else EVENT, packed)
+        write(self._event_pipe, waiting.time, ANNOUNCEMENT if is_announced else EVENT, packed)
 
-    # The thread that listens.
+    # In the thread that reads replies.
 
-    def _listen(self) -> None:
-        while (reply := self._reply()).what == "complaint":
+    def _read_replies(self) -> None:
+        while (reply := self._read_reply()).kind == "complaint":
             self._complain(reply.text)
-        self._replies.close()
+        self._reply_pipe.close()
         self.result = reply
-        if reply.what != "done":
+        if reply.kind != "done":
             self.error = self.error or RecordingError(reply.text)
             self._failed(self.error)
 
-    def _reply(self) -> Reply:
-        line = self._replies.readline()
+    def _read_reply(self) -> Reply:
+        line = self._reply_pipe.readline()
         try:
             return msgspec.json.decode(line, type=Reply)
         except msgspec.DecodeError:
@@ -407,7 +412,7 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
 
     # ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``; ``gone`` stands for
     # a process that ended without a reply.
-    what: str
+    kind: str
     text: str = ""
     written: int = 0
     size: int = 0  # bytes of the file
@@ -415,20 +420,20 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
 
 EVENT, ANNOUNCEMENT, END = 0, 1, 2
 _HEAD = struct.Struct("<qIB")
-_PART = 1 << 16  # bytes written at once: the kernel does not let go of the core meanwhile
+_PART = 1 << 16  # bytes written at once: the kernel does not release the core meanwhile
 
 
 class Piece(NamedTuple):
     """Unit of the pipe: an event, an announcement, or the end."""
 
     time: int
-    what: int
+    kind: int
     frame: bytearray
 
 
-def write(file: IO[bytes], time: int, what: int, event: Packed | None = None) -> None:
+def write(file: IO[bytes], time: int, kind: int, event: Packed | None = None) -> None:
     """Write a piece to a buffered pipe, without the GIL; an `OSError` if the reader is gone."""
-    file.write(_HEAD.pack(time, 0 if event is None else event.size, what))
+    file.write(_HEAD.pack(time, 0 if event is None else event.size, kind))
     for part in () if event is None else event.parts():
         view = memoryview(part)
         for at in range(0, len(view), _PART):
@@ -443,17 +448,17 @@ def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator
         head = _read(file, _HEAD.size)
         if len(head) < _HEAD.size:
             return
-        time, length, what = _HEAD.unpack(head)
+        time, length, kind = _HEAD.unpack(head)
         frame = _read(file, length)
         if len(frame) < length:
             return
-        yield Piece(time, what, frame)
+        yield Piece(time, kind, frame)
 
 
 def _read(file: int, size: int) -> bytearray:
     """Return as many bytes, or fewer at the end."""
     buffer = bytearray(size)
-    view, got = memoryview(buffer), 0
-    while got < size and (count := os.readv(file, [view[got:]])):
-        got += count
-    return bytearray(view[:got]) if got < size else buffer
+    view, received = memoryview(buffer), 0
+    while received < size and (count := os.readv(file, [view[received:]])):
+        received += count
+    return bytearray(view[:received]) if received < size else buffer

@@ -118,15 +118,15 @@ class Recorded(Reader):
         return int(end) if end.isdigit() else None
 
     def _event(self, record: Record, holder: Record | None) -> Event:
-        lacking = native.lacking(record.data)
-        if not lacking:
+        missing = native.missing_arrays(record.data)
+        if not missing:
             return native.event(record.data)
         if holder is None or holder.time != record.time:
             raise ValueError(f"expected a message of {record.time} ns with its arrays, found none")
         # All events with arrays and a message have a frame.
         frame = native.fields(record.data).get("frame_id", "map")
         axes = self._frames.axes(frame)
-        pixels = arrays(self._store, holder.data, holder.type, lacking, axes)
+        pixels = arrays(self._store, holder.data, holder.type, missing, axes)
         return native.event(record.data, pixels)
 
     def _read_announcements(self) -> Iterator[Announcement]:
@@ -143,7 +143,7 @@ class Recorded(Reader):
                 return
 
 
-def is_ours(path: Path) -> bool:
+def is_recording(path: Path) -> bool:
     """Return whether a file is our recording, or one rewritten; a `ReplayError` if no MCAP file."""
     try:
         if contents(path).ours:
@@ -159,12 +159,12 @@ TYPES = {use: tuple(t for t, to in READERS if to == use) for use in get_args(Use
 
 def chosen(
     topics: Mapping[str, tuple[str, int]],  # type and number of messages, by topic
-    wanted: tuple[BagTopic, ...],
+    requested: tuple[BagTopic, ...],
     vehicle: str,
 ) -> dict[str, BagTopic]:
     """Return the topics to read, by name, with all sources; a `ReplayError` if one is missing."""
-    taken: dict[str, BagTopic] = {}
-    for topic in wanted:
+    by_name: dict[str, BagTopic] = {}
+    for topic in requested:
         name = topic_in(topics, topic.topic)
         if name not in topics:
             fit = [f"{k} ({v})" for k, (v, _) in sorted(topics.items()) if v in TYPES[topic.use]]
@@ -179,12 +179,12 @@ def chosen(
                 f"for {topic.use}, found {type_}"
             )
         source = topic.source or source_of(name, topic.use, vehicle)
-        taken[name] = msgspec.structs.replace(topic, topic=name, source=source)
-    return taken
+        by_name[name] = msgspec.structs.replace(topic, topic=name, source=source)
+    return by_name
 
 
 LONGEST = 16  # transforms between a camera and the body, at most: more would go in circles
-_HERE: Pose = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+_IDENTITY: Pose = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 class Mountings:
@@ -209,22 +209,22 @@ class Mountings:
                     continue
                 self._parents[stamped.child_frame_id] = stamped.header.frame_id, (position, turn)
 
-    def of(self, frame: str, axes: Axes = "optical", body: str = "base_link") -> Pose | None:
+    def pose(self, frame: str, axes: Axes = "optical", body: str = "base_link") -> Pose | None:
         """Return the pose of a frame, with such axes here, in the body, FRD; `None` if unknown."""
-        root, (position, rotation) = self._up(frame, body)
+        root, (position, rotation) = self._to_root(frame, body)
         if root != body:
             return None
         return convert_vector("body", position), convert_rotation("body", axes, rotation)
 
-    def same(self, one: str, other: str) -> bool:
+    def are_same(self, frame: str, other: str) -> bool:
         """Return whether two frames are known to be one, to 0.1 mm and 0.1 mrad."""
-        (root, a), (other_root, b) = self._up(one), self._up(other)
-        apart = max(abs(x - y) for x, y in zip(a[0], b[0], strict=True))
-        return root == other_root and apart < 1e-4 and angle_between(a[1], b[1]) < 1e-4
+        (root, a), (other_root, b) = self._to_root(frame), self._to_root(other)
+        distance = max(abs(x - y) for x, y in zip(a[0], b[0], strict=True))
+        return root == other_root and distance < 1e-4 and angle_between(a[1], b[1]) < 1e-4
 
-    def _up(self, frame: str, end: str = "") -> tuple[str, Pose]:
+    def _to_root(self, frame: str, end: str = "") -> tuple[str, Pose]:
         """Return the last known parent of a frame, or `end`, and the frame's pose in it."""
-        position, rotation = _HERE
+        position, rotation = _IDENTITY
         for _ in range(LONGEST):
             if frame == end or frame not in self._parents:
                 break
@@ -270,15 +270,15 @@ class RosBag(Reader):
             self._bag = open_bag(path)
         try:
             with readable(path):
-                self._found = self._bag.topics()
+                self._bag_topics = self._bag.topics()
                 self._mountings = self._read_mountings()
                 self._firsts = self._first_messages(topics)
                 self._topics = self._choose(topics)
                 self._firsts = {k: v for k, v in self._firsts.items() if k in self._topics}
                 self._times, self._stamps = self._origins()
                 self._announcements = list(self._announced())
-                left = (name for name in self._firsts if name in self._topics)
-                if all(self._topics[name].use == "camera" for name in left):
+                names = (name for name in self._firsts if name in self._topics)
+                if all(self._topics[name].use == "camera" for name in names):
                     raise ReplayError(f"{path}: expected a topic to replay; {self._reasons()}")
         except ReplayError:
             self._bag.close()
@@ -343,10 +343,10 @@ class RosBag(Reader):
 
     def _first_messages(self, topics: tuple[BagTopic, ...]) -> dict[str, tuple[str, int, Any]]:
         """Return type, time of receipt and content of the first message of each topic to read."""
-        names = list(chosen(self._found, topics, self._vehicle))
+        names = list(chosen(self._bag_topics, topics, self._vehicle))
         if not self._named:
-            there = self._found.items()
-            names = [name for name, (type_, count) in there if count and type_ in GUESSED]
+            listed = self._bag_topics.items()
+            names = [name for name, (type_, count) in listed if count and type_ in GUESSED]
         firsts: dict[str, tuple[str, int, Any]] = {}
         for name in sorted(names):
             try:
@@ -361,21 +361,21 @@ class RosBag(Reader):
 
     def _choose(self, topics: tuple[BagTopic, ...]) -> dict[str, BagTopic]:
         if self._named:
-            return chosen(self._found, topics, self._vehicle)
+            return chosen(self._bag_topics, topics, self._vehicle)
         messages = {name: message for name, (_, _, message) in self._firsts.items()}
-        given = self._chain.cameras if self._chain else ()
-        calibrated = {topic_in(self._found, camera.topic): camera.info for camera in given}
-        same_frame = self._mountings.same
-        streams = guess(self._found, messages, self._vehicle, same_frame, calibrated)
+        cameras = self._chain.cameras if self._chain else ()
+        calibrated = {topic_in(self._bag_topics, camera.topic): camera.info for camera in cameras}
+        same_frame = self._mountings.are_same
+        streams = guess(self._bag_topics, messages, self._vehicle, same_frame, calibrated)
         self.notes += streams.notes
         for reason in streams.left_out:
             self.complain(reason)
         if not streams.topics:
-            types = sorted((name, type_) for name, (type_, _) in self._found.items())
-            there = ", ".join(f"{name} ({type_})" for name, type_ in types)
+            types = sorted((name, type_) for name, (type_, _) in self._bag_topics.items())
+            listed = ", ".join(f"{name} ({type_})" for name, type_ in types)
             reasons = f"; {self._reasons()}" if self.trouble else ""
             raise ReplayError(
-                f"expected topics of cameras, IMUs or poses, found: {there or 'none'}{reasons}"
+                f"expected topics of cameras, IMUs or poses, found: {listed or 'none'}{reasons}"
             )
         return {topic.topic: topic for topic in streams.topics}
 
@@ -431,7 +431,7 @@ class RosBag(Reader):
     def _imu(self, name: str, topic: BagTopic, event: Event) -> ImuAnnouncement:
         assert isinstance(event, Imu)
         frame = topic.frame_id or self._firsts[name][2].header.frame_id
-        position, orientation = self._mountings.of(frame, axes_of(event.frame_id)) or _HERE
+        position, orientation = self._mountings.pose(frame, axes_of(event.frame_id)) or _IDENTITY
         return ImuAnnouncement(
             stamp=0,
             source=topic.source,
@@ -487,7 +487,7 @@ class RosBag(Reader):
         kinds = tuple(kind for _, kind in images)
         camera = camera_announcement(message, topic.source, kinds, topic.frame_id)
         info = calibration(message, first)
-        place, turn = self._mountings.of(message.header.frame_id) or (
+        place, turn = self._mountings.pose(message.header.frame_id) or (
             camera.position,
             camera.orientation,
         )
@@ -517,14 +517,16 @@ class RosBag(Reader):
         topics = {
             base_of(name): (source, name) for source, pairs in images.items() for name, _ in pairs
         }
-        own = next((n for n, i in enumerate(imus) if _is_of(chain, self._topics, i)), None)
-        body = imu_in_body(imus[own] if own is not None else None)
-        if own is not None:
-            imus[own] = with_noise(imus[own], chain)
+        index = next(
+            (n for n, i in enumerate(imus) if _is_calibrated(chain, self._topics, i)), None
+        )
+        body = imu_in_body(imus[index] if index is not None else None)
+        if index is not None:
+            imus[index] = with_noise(imus[index], chain)
         first = chain.cameras[0].topic if chain.cameras else ""
         _, name = topics.get(topic_in(topics, first), ("", ""))
-        ahead = self._mountings.of(self._firsts[name][2].header.frame_id) if name else None
-        places = mountings(chain, body, ahead)
+        camera_pose = self._mountings.pose(self._firsts[name][2].header.frame_id) if name else None
+        places = mountings(chain, body, camera_pose)
         cameras: list[CameraAnnouncement] = []
         for camera, (position, orientation) in zip(chain.cameras, places, strict=True):
             topic = topic_in(topics, camera.topic)
@@ -566,12 +568,12 @@ class RosBag(Reader):
             self.check_bits(name, np.frombuffer(message.data.tobytes(), f"{order}u2"))
 
     def _rate(self, name: str) -> float:
-        count = self._found[name][1]
+        count = self._bag_topics[name][1]
         seconds = (self._bag.end - self._bag.start) / 1e9
         return max(count - 1, 1) / seconds if seconds > 0 else 1.0
 
 
-def _is_of(chain: Chain, topics: Mapping[str, BagTopic], imu: ImuAnnouncement) -> bool:
+def _is_calibrated(chain: Chain, topics: Mapping[str, BagTopic], imu: ImuAnnouncement) -> bool:
     """Return whether a calibration's transforms are of an IMU: by its topic, or as the only one."""
     names = {name: topic.source for name, topic in topics.items() if topic.use == "imu"}
     named = topic_in(names, chain.imu.topic) if chain.imu and chain.imu.topic else ""
@@ -595,10 +597,10 @@ def readable(path: Path) -> Iterator[None]:
     except VisnavError:
         raise
     except Exception as error:
-        what = " ".join(str(error).split()) or type(error).__name__
+        text = " ".join(str(error).split()) or type(error).__name__
         if not isinstance(error, ReplayError | ValueError):
-            what = f"expected a readable bag, found: {what}"
-        raise ReplayError(what if str(path) in what else f"{path}: {what}") from error
+            text = f"expected a readable bag, found: {text}"
+        raise ReplayError(text if str(path) in text else f"{path}: {text}") from error
 
 
 def _stamp(message: Any) -> int:

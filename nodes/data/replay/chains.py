@@ -82,10 +82,10 @@ def as_pairs(cameras: Sequence[CameraAnnouncement]) -> list[CameraAnnouncement]:
     return paired
 
 
-def check_size(camera: KalibrCamera, size: Sequence[int], what: str) -> None:
+def check_size(camera: KalibrCamera, size: Sequence[int], name: str) -> None:
     """Raise a `ReplayError` unless a camera's images have the size (width, height) it is of."""
     if (camera.info.width, camera.info.height) != tuple(size):
         raise ReplayError(
-            f"{what}: expected images of {camera.info.width} x {camera.info.height} pixels, as the "
+            f"{name}: expected images of {camera.info.width} x {camera.info.height} pixels, as the "
             f"calibration of {camera.name} is of, found {size[0]} x {size[1]}"
         )

@@ -36,7 +36,7 @@ from events.frames import (
     rotation_to_ned,
 )
 from events.geometry import Pose, pose_matrix, pose_tuples
-from nodes.data.dataset.recording import notable
+from nodes.data.dataset.recording import extra_fields
 from nodes.data.replay.chains import as_pairs, chain_of, check_size, mountings, with_noise
 from nodes.data.replay.folders import (
     Dataset,
@@ -113,15 +113,15 @@ class Euroc(Dataset):
 
         TUM VI has its in ``dso``.
         """
-        given = chain_of(self.config)
+        chain = chain_of(self.config)
         sensors = [*self.folder.glob("cam[0-9]*"), *self.folder.glob("imu0")]
-        if given or all((sensor / "sensor.yaml").is_file() for sensor in sensors):
-            return given
+        if chain or all((sensor / "sensor.yaml").is_file() for sensor in sensors):
+            return chain
         paths = []
         for names in _CHAINS, _NOISES:
             places = (self.folder, self.folder.parent, self.folder.parent / "dso")
-            there = (place / name for place in places for name in names)
-            paths += [path for path in there if path.is_file()][:1]
+            candidates = (place / name for place in places for name in names)
+            paths += [path for path in candidates if path.is_file()][:1]
         if not paths:
             return None
         self.notes.append(f"calibration: {', '.join(map(str, paths))}")
@@ -132,7 +132,9 @@ class Euroc(Dataset):
             truth = self.folder / name / "data.csv"
             if truth.is_file():
                 self.notes.append(f"true poses: {truth}")
-                return read_truth(truth, self.complain, euroc=True, whole=self._whole(truth))
+                return read_truth(
+                    truth, self.complain, euroc=True, whole=self._is_last_line_whole(truth)
+                )
         return []
 
     def _measurement(self, stamp: int, values: list[float]) -> Imu:
@@ -159,8 +161,8 @@ class Euroc(Dataset):
         images = [self.first_image(files[0][1])[0] if files else "grey"]
         if files:
             self._check_bits(files[0][1])
-        if (given := mounted.get(folder.name)) is not None:
-            calibrated, place = given
+        if (mounting := mounted.get(folder.name)) is not None:
+            calibrated, place = mounting
             if files:
                 check_size(calibrated, self.first_image(files[0][1])[1:], str(files[0][1]))
             announced = camera_at(source, (*images,), calibrated.info, _rate_of(files), *place)
@@ -218,8 +220,8 @@ class Euroc(Dataset):
             )
             return announced if chain is None else with_noise(announced, chain)
         sensor = read_sensor(path)
-        given = sensor.list("data", 16) if "data" in sensor.lists else np.eye(4)
-        position, orientation = pose_tuples(np.reshape(given, (4, 4)))
+        pose = sensor.list("data", 16) if "data" in sensor.lists else np.eye(4)
+        position, orientation = pose_tuples(np.reshape(pose, (4, 4)))
         if (position, orientation) != ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)):
             self._imu_frame = self._imu_source
         announced = ImuAnnouncement(
@@ -239,14 +241,18 @@ class Euroc(Dataset):
 
     def _index(self, folder: Path) -> Files:
         path = folder / "data.csv"
-        rows = read_rows(path, ",", (2,), "timestamp, filename", whole=self._whole(path))
+        rows = read_rows(
+            path, ",", (2,), "timestamp, filename", whole=self._is_last_line_whole(path)
+        )
         files = sorted((row.nanoseconds(), folder / "data" / row.fields[1]) for row in rows)
-        return self._written(files)
+        return self._existing(files)
 
     def _measurements(self, path: Path) -> list[tuple[int, list[float]]]:
         if not path.is_file():
             return []
-        rows = read_rows(path, ",", (7,), "timestamp, w x 3, a x 3", whole=self._whole(path))
+        rows = read_rows(
+            path, ",", (7,), "timestamp, w x 3, a x 3", whole=self._is_last_line_whole(path)
+        )
         return sorted((row.nanoseconds(), row.numbers(1, 7)) for row in rows)
 
 
@@ -268,7 +274,7 @@ A = TypeVar("A", CameraAnnouncement, ImuAnnouncement)
 def _with_noted(announcement: A, sensor: Sensor) -> A:
     """Return an announcement with what our own data sets note beside the layout's words."""
     fields: dict[str, Any] = {}
-    for field in notable(announcement):
+    for field in extra_fields(announcement):
         name = field.name
         if name in sensor.lists:
             fields[name] = tuple(sensor.lists[name])
@@ -305,7 +311,7 @@ class TumRgbd(Dataset):
         self.images[self._source] = rgb = self._index("rgb.txt")
         depth = self._index("depth.txt") if (folder / "depth.txt").is_file() else []
         self.truth = self._poses()
-        depth = self._paired(depth, [stamp for stamp, _ in rgb])
+        depth = self._with_colour_stamps(depth, [stamp for stamp, _ in rgb])
         factor = self.config.depth_factor
         span = rgb[-1][0] - rgb[0][0]
         rate = (len(rgb) - 1) * 1e9 / span if span else 30.0
@@ -347,29 +353,31 @@ class TumRgbd(Dataset):
     def _camera_pose(self, stamp: int, position: Vector3, optical: Quaternion) -> PoseStamped:
         return PoseStamped(stamp=stamp, source=self._source, position=position, orientation=optical)
 
-    def _paired(self, depth: Files, stamps: list[int]) -> Files:
-        """Give each depth image the stamp of its colour image; those without are left out."""
-        taken: dict[int, tuple[int, Path]] = {}
+    def _with_colour_stamps(self, depth: Files, stamps: list[int]) -> Files:
+        """Return depth images with the stamps of their colour images; without one: left out."""
+        pairs: dict[int, tuple[int, Path]] = {}
         for stamp, path in depth:
             at = bisect.bisect_left(stamps, stamp)
             near = min(stamps[max(at - 1, 0) : at + 1], key=lambda s: abs(s - stamp))
             distance = abs(near - stamp)
-            if distance <= FARTHEST and (near not in taken or distance < taken[near][0]):
-                taken[near] = distance, path
-        if left_out := len(depth) - len(taken):
+            if distance <= FARTHEST and (near not in pairs or distance < pairs[near][0]):
+                pairs[near] = distance, path
+        if left_out := len(depth) - len(pairs):
             self.trouble.append(f"{left_out} depth images have no colour image near them")
-        return sorted((stamp, path) for stamp, (_, path) in taken.items())
+        return sorted((stamp, path) for stamp, (_, path) in pairs.items())
 
     def _index(self, name: str) -> Files:
         path = self.folder / name
-        rows = read_rows(path, None, (2,), "timestamp filename", whole=self._whole(path))
-        return self._written(sorted((row.seconds(), self.folder / row.fields[1]) for row in rows))
+        rows = read_rows(
+            path, None, (2,), "timestamp filename", whole=self._is_last_line_whole(path)
+        )
+        return self._existing(sorted((row.seconds(), self.folder / row.fields[1]) for row in rows))
 
     def _poses(self) -> list[tuple[int, Vector3, Quaternion]]:
         path = self.folder / "groundtruth.txt"
         if not path.is_file():
             return []
-        rows = read_truth(path, self.complain, euroc=False, whole=self._whole(path))
+        rows = read_truth(path, self.complain, euroc=False, whole=self._is_last_line_whole(path))
         return [
             (stamp, flip_yz((x, y, z)), rotation_to_ned((w, i, j, k)))
             for stamp, (x, y, z, w, i, j, k) in rows
@@ -436,10 +444,10 @@ class Kitti(Dataset):
         bodies = _AXES @ poses @ np.linalg.inv(_AXES)
         return [(s, *pose_tuples(body)) for s, body in zip(self._stamps, bodies, strict=True)]
 
-    def _count(self, where: Path, what: str, count: int) -> None:
+    def _count(self, path: Path, name: str, count: int) -> None:
         if count != len(self._stamps):
             raise ReplayError(
-                f"{where}: expected {len(self._stamps)} {what}, as many as times.txt has stamps, "
+                f"{path}: expected {len(self._stamps)} {name}, as many as times.txt has stamps, "
                 f"found {count}"
             )
 
@@ -460,15 +468,15 @@ _READERS: tuple[type[Dataset], ...] = (Euroc, TumRgbd, Kitti)
 
 def open_folder(path: Path, config: ReplayConfig, vehicle: str) -> Dataset:
     """Return the reader of a data set's folder; a `ReplayError` if its layout is unknown."""
-    if (other := open_other(path, config, vehicle)) is not None:
-        return other
+    if (dataset := open_other(path, config, vehicle)) is not None:
+        return dataset
     for reader in _READERS:
         if (folder := reader.find(path)) is not None:
             _check_calibration(reader, path, config)
             return reader(folder, config, vehicle)
-    *others, last = (reader.layout for reader in (*_others(), *_READERS))
+    *names, last = (reader.layout for reader in (*_other_readers(), *_READERS))
     raise ReplayError(
-        f"{path}: expected a ROS 2 bag (metadata.yaml), or a data set of {', '.join(others)} or "
+        f"{path}: expected a ROS 2 bag (metadata.yaml), or a data set of {', '.join(names)} or "
         f"{last}, found a folder with none of these"
     )
 
@@ -480,7 +488,7 @@ def open_other(path: Path, config: ReplayConfig, vehicle: str) -> Dataset | None
         ReplayError: The package's reader cannot be imported, or fails; the message names the
             package.
     """
-    for reader, whose in _others().items():
+    for reader, label in _other_readers().items():
         try:
             if (place := reader.find(path)) is not None:
                 _check_calibration(reader, path, config)
@@ -488,7 +496,7 @@ def open_other(path: Path, config: ReplayConfig, vehicle: str) -> Dataset | None
         except ReplayError:
             raise
         except Exception as error:
-            text = f"{path}: {whose} cannot read it: {type(error).__name__}: {error}"
+            text = f"{path}: {label} cannot read it: {type(error).__name__}: {error}"
             raise ReplayError(text) from error
     return None
 
@@ -502,7 +510,7 @@ def _check_calibration(reader: type[Dataset], path: Path, config: ReplayConfig) 
 
 
 @cache
-def _others() -> dict[type[Dataset], str]:
+def _other_readers() -> dict[type[Dataset], str]:
     """Import and return other packages' readers, with the name of each and of its package."""
     readers: dict[type[Dataset], str] = {}
     for offer in others(READERS):
@@ -511,11 +519,11 @@ def _others() -> dict[type[Dataset], str]:
         except CommandError as error:
             raise ReplayError(str(error)) from error
         if isinstance(loaded, type):  # rows for `judge` are no classes
-            whose = f"{offer.name} of the package {offer.package}"
+            label = f"{offer.name} of the package {offer.package}"
             if not issubclass(loaded, Dataset) or inspect.isabstract(loaded):
                 raise ReplayError(
-                    f"{whose}: expected a class derived from {Dataset.__module__}.Dataset, with "
+                    f"{label}: expected a class derived from {Dataset.__module__}.Dataset, with "
                     f"find and load in it, found {loaded.__name__}"
                 )
-            readers[loaded] = whose
+            readers[loaded] = label
     return readers

@@ -79,12 +79,17 @@ def as_pair(left: CameraAnnouncement, right: CameraAnnouncement) -> CameraAnnoun
     A pair has one size and one rate, less than 60 degrees between its directions, and the right one
     at least half of their distance to the left one's right.
     """
-    one, other = (pose_matrix(camera.position, camera.orientation) for camera in (left, right))
-    apart = other[:3, 3] - one[:3, 3]
+    left_pose, right_pose = (
+        pose_matrix(camera.position, camera.orientation) for camera in (left, right)
+    )
+    apart = right_pose[:3, 3] - left_pose[:3, 3]
     distance = float(np.linalg.norm(apart))
-    beside = apart @ one[:3, 0] > 0.5 * distance > 0.0 and one[:3, 2] @ other[:3, 2] > 0.5
-    alike = [(camera.info.width, camera.info.height, camera.rate) for camera in (left, right)]
-    if not beside or alike[0] != alike[1]:
+    beside = (
+        apart @ left_pose[:3, 0] > 0.5 * distance > 0.0
+        and left_pose[:3, 2] @ right_pose[:3, 2] > 0.5
+    )
+    formats = [(camera.info.width, camera.info.height, camera.rate) for camera in (left, right)]
+    if not beside or formats[0] != formats[1]:
         return right
     return msgspec.structs.replace(right, stereo=left.source, baseline=distance)
 
@@ -153,7 +158,7 @@ class Dataset(Reader):
         try:
             self._epoch = noted_epoch(folder / self.noted) if self.noted else []
             self.load()
-            self._begin()
+            self._announce_vehicle()
         except ValueError as error:
             raise ReplayError(str(error)) from None
 
@@ -201,7 +206,7 @@ class Dataset(Reader):
         for source, files in self.images.items():
             yield Rows(Image, source, files, partial(self._image, source))
 
-    # What follows from it.
+    # The methods below rely on the contract.
 
     def pose(
         self,
@@ -232,14 +237,14 @@ class Dataset(Reader):
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
         """Yield all events by stamp; at equal stamps, those of earlier `Rows` first."""
 
-        def made(table: Rows) -> Iterator[Event]:
+        def events(table: Rows) -> Iterator[Event]:
             for row in table.rows:
                 time = row[0] - self._origin
                 if start <= time and (end is None or time < end):
                     yield table.make(time, *row[1:])
 
-        wanted = (made(table) for table in self.rows() if wants(table.kind, table.source))
-        merged = heapq.merge(*wanted, key=lambda event: event.stamp)
+        streams = (events(table) for table in self.rows() if wants(table.kind, table.source))
+        merged = heapq.merge(*streams, key=lambda event: event.stamp)
         return (Timed(event.stamp, event) for event in merged)
 
     def _check_bits(self, path: Path) -> None:
@@ -248,19 +253,19 @@ class Dataset(Reader):
         if pixels.dtype == np.uint16:
             self.check_bits(str(path), pixels)
 
-    def _whole(self, path: Path) -> bool:
+    def _is_last_line_whole(self, path: Path) -> bool:
         """Return whether a file's last line counts: a killed run of ours may have cut it off."""
         try:
             with path.open("rb") as file:
                 file.seek(-1, 2)
                 torn = bool(self._epoch) and file.read() != b"\n"
-        except OSError:  # it is empty or unreadable, which whoever reads it says
+        except OSError:  # it is empty or unreadable, which its reader reports
             return True
         if torn:
             self.complain(f"{path}: the last line is cut off, and left out")
         return not torn
 
-    def _written(self, files: Files) -> Files:
+    def _existing(self, files: Files) -> Files:
         """Return a camera's images without those that a killed run of ours listed, not wrote."""
         existing = [entry for entry in files if not self._epoch or entry[1].is_file()]
         if existing and (missing := len(files) - len(existing)):
@@ -269,7 +274,7 @@ class Dataset(Reader):
             )
         return existing or files
 
-    def _begin(self) -> None:
+    def _announce_vehicle(self) -> None:
         """Choose time 0, cut the truth to the sensors' time, and announce the vehicle."""
         others = [row[0] for table in self.others for row in table.rows]
         firsts = [files[0][0] for files in self.images.values() if files]
@@ -277,14 +282,14 @@ class Dataset(Reader):
         if not firsts and not others:
             raise ReplayError(f"{self.folder}: expected the data of cameras or an IMU, found none")
         first, last = min([*firsts, *others]), max([*lasts, *others])
-        # One pose beside the sensors' time is kept at either end.
-        begin = bisect.bisect_right(self.truth, first, key=lambda row: row[0]) - 1
+        # One pose before and one after the sensors' time remain.
+        start = bisect.bisect_right(self.truth, first, key=lambda row: row[0]) - 1
         end = bisect.bisect_left(self.truth, last, key=lambda row: row[0]) + 1
-        self.truth = self.truth[max(begin, 0) : end]
+        self.truth = self.truth[max(start, 0) : end]
         self._origin = min([first, *(row[0] for row in self.truth[:1]), *self._epoch])
         if self.truth:
-            seen = min(firsts, default=self.truth[0][0])
-            row = next((row for row in self.truth if row[0] >= seen), self.truth[0])
+            first_image = min(firsts, default=self.truth[0][0])
+            row = next((row for row in self.truth if row[0] >= first_image), self.truth[0])
             self.sensors.insert(0, vehicle_at(self.odometry(row[0] - self._origin, *row[1:])))
 
     def _image(self, source: str, stamp: int, path: Path) -> Image:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Announcement, Event, Odometry, TrajectoryEstimate, VehicleAnnouncement
-from nodes.data.replay.bags import Recorded, RosBag, is_ours
+from nodes.data.replay.bags import Recorded, RosBag, is_recording
 from nodes.data.replay.chains import chain_of
 from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError, Timed
 from runtime import Node, Output
@@ -44,7 +44,7 @@ class ReadAhead:
         self._thread = threading.Thread(target=self._run, name="read ahead", daemon=True)
         self._thread.start()
 
-    def take(self) -> Batch | None:
+    def pop(self) -> Batch | None:
         """Wait for the next batch or an error (not on a loop); return `None` at the end."""
         with self._change:
             self._change.wait_for(lambda: self._batches or self._ended)
@@ -81,15 +81,15 @@ class ReadAhead:
         size = 0
         for event in self._events:
             batch.append(event)
-            size += _size_of(event)
+            size += _event_size(event)
             if len(batch) >= MOST or size >= LARGEST:
-                if not self._put(batch, size):
+                if not self._add(batch, size):
                     return
                 batch, size = [], 0
-        self._put(batch, size)
+        self._add(batch, size)
 
-    def _put(self, batch: Batch, size: int) -> bool:
-        """Add a batch when there is room; tell whether more is wanted."""
+    def _add(self, batch: Batch, size: int) -> bool:
+        """Add a batch when there is room; return False after `close`."""
         with self._change:
             while self._waiting and self._waiting + size > self._limit and not self._closed:
                 self._change.wait()
@@ -103,7 +103,7 @@ class ReadAhead:
             return True
 
 
-def _size_of(timed: Timed) -> int:
+def _event_size(timed: Timed) -> int:
     event = timed.event
     values = (getattr(event, name) for name in event.__struct_fields__)
     return _SMALL + sum(value.nbytes for value in values if isinstance(value, np.ndarray))
@@ -133,7 +133,7 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
 
         if (reader := open_other(path, config, vehicle)) is not None:
             return reader
-    if path.is_file() and path.suffix not in {".db3", ".bag"} and is_ours(path):
+    if path.is_file() and path.suffix not in {".db3", ".bag"} and is_recording(path):
         if config.calibration:
             raise ReplayError(
                 "calibration: expected a bag of ROS or a data set in EuRoC's layout beside it, "
@@ -168,10 +168,10 @@ class Timeline:
 
     def __init__(self) -> None:
         self._stretches: list[tuple[int, int, bool]] = []
-        """Begin (recording), begin (run), whether the previous stretch continues."""
+        """Start on the recording (ns), start on the run (ns), whether a pause precedes."""
         self.shift = 0  # the run's clock less the recording's time now (ns)
 
-    def go_on(self, position: int, now: int, *, pause: bool = False) -> None:
+    def start_stretch(self, position: int, now: int, *, pause: bool = False) -> None:
         """Start a stretch: the recording is played from `position` at `now` (run, ns)."""
         self._stretches.append((position, now, pause))
         self.shift = now - position
@@ -188,13 +188,13 @@ class Timeline:
         if stamp < 0:
             return None
         if isinstance(event, TrajectoryEstimate):
-            known, stamps = self._stamps(event.stamps)
+            played, stamps = self._stamps(event.stamps)
             return msgspec.structs.replace(
                 event,
                 stamp=stamp,
-                stamps=stamps[known],
-                positions=event.positions[known],
-                orientations=event.orientations[known],
+                stamps=stamps[played],
+                positions=event.positions[played],
+                orientations=event.orientations[played],
             )
         return msgspec.structs.replace(event, stamp=stamp)
 
@@ -210,14 +210,14 @@ class Timeline:
         self, times: npt.NDArray[np.int64]
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
         """Return a mask of the times played, and their last time on the run's clock."""
-        known, stamps = np.zeros(times.shape, np.bool_), times.copy()
+        played, stamps = np.zeros(times.shape, np.bool_), times.copy()
         first = last = np.iinfo(np.int64).max  # of what was played later: on recording and run
         for position, now, _ in reversed(self._stretches):
-            here = (times >= position) & (times < min(first, last - now + position))
-            stamps[here] += now - position
-            known |= here
+            mask = (times >= position) & (times < min(first, last - now + position))
+            stamps[mask] += now - position
+            played |= mask
             first, last = min(first, position), now
-        return known, stamps
+        return played, stamps
 
 
 _SLICE = SECOND // 10  # in real time, how long a sleep may keep `seek` waiting (ns)
@@ -274,11 +274,11 @@ class Replay(Node[ReplayConfig]):
     async def run(self) -> None:
         """Send all events from start to end, repeatedly if set."""
         assert self._reader is not None
-        begin = round(self.config.start * SECOND)
+        start = round(self.config.start * SECOND)
         end = round(self.config.end * SECOND) or None
-        position = begin
+        position = start
         while True:
-            self._timeline.go_on(position, self.clock.now())
+            self._timeline.start_stretch(position, self.clock.now())
             last = await self._play(position, end)
             if last is None and not self.sent and self._target is None:
                 self.log.fatal("%s", self._nothing())
@@ -289,11 +289,11 @@ class Replay(Node[ReplayConfig]):
             if self._target is not None:
                 position, self._target = self._target, None
             elif self.config.loop:
-                if over <= begin:
+                if over <= start:
                     self.log.fatal(
                         "loop: expected a recording that takes some time, found one moment"
                     )
-                position = begin
+                position = start
             else:
                 break
         self._log_trouble()
@@ -309,28 +309,28 @@ class Replay(Node[ReplayConfig]):
             await self.offload(self._reader.close)
 
     def on_change(self, before: ReplayConfig) -> None:
-        """Pause, go on, or go elsewhere."""
+        """Pause, resume, or seek."""
         if self.config.paused != before.paused:
             (self.pause if self.config.paused else self.resume)()
         if self.config.position != before.position:
             self.seek(self.config.position)
 
     def pause(self) -> None:
-        """Send nothing until `resume`; the clock goes on."""
+        """Send nothing until `resume`; the clock continues."""
         if self._paused_at is None:
             self._paused_at = self.clock.now()
             self._resumed.clear()
 
     def resume(self) -> None:
-        """Go on where `pause` came."""
+        """Continue at the position of `pause`."""
         if self._paused_at is not None:
             position = self._paused_at - self._timeline.shift
-            self._timeline.go_on(position, self.clock.now(), pause=True)
+            self._timeline.start_stretch(position, self.clock.now(), pause=True)
             self._paused_at = None
             self._resumed.set()
 
     def seek(self, seconds: float) -> None:
-        """Go on at another time of the recording; stamps stay on the run's clock."""
+        """Continue at another time of the recording; stamps stay on the run's clock."""
         self._target = max(round(seconds * SECOND), 0)
 
     @property
@@ -349,7 +349,7 @@ class Replay(Node[ReplayConfig]):
         send, now, timeline = self.events.send, self.clock.now, self._timeline
         last = None
         try:
-            while (batch := await self.offload(ahead.take)) is not None:
+            while (batch := await self.offload(ahead.pop)) is not None:
                 for last, event in batch:
                     if last + timeline.shift > now() or self._paused_at is not None:
                         await self._sleep_until(last)
@@ -363,7 +363,7 @@ class Replay(Node[ReplayConfig]):
         return last
 
     async def _sleep_until(self, time: int) -> None:
-        """Wait for a time of the recording; come back early if `seek` was called."""
+        """Wait for a time of the recording; return early if `seek` was called."""
         real = self.clock.kind == "real"
         while self._target is None:
             if self._paused_at is not None:
@@ -381,9 +381,9 @@ class Replay(Node[ReplayConfig]):
         self._choice = Choice(config.only, config.skip, announced)
         self._announcements = [a for a in announced if self._choice.announced(a)]
         if config.start:
-            self._announcements = [self._starting(reader, a) for a in self._announcements]
+            self._announcements = [self._at_start(reader, a) for a in self._announcements]
 
-    def _starting(self, reader: Reader, announcement: Announcement) -> Announcement:
+    def _at_start(self, reader: Reader, announcement: Announcement) -> Announcement:
         if not isinstance(announcement, VehicleAnnouncement):
             return announcement
 

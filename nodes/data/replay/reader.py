@@ -62,18 +62,18 @@ class Reader(ABC):
         """Return the noted end (ns); `None` if the last event is the end."""
         return None
 
-    def complain(self, what: str) -> None:
-        """Note an unreadable part; beyond `MOST_TROUBLE`, only the existence of more."""
-        if what in self.trouble or len(self.trouble) > MOST_TROUBLE:
+    def complain(self, text: str) -> None:
+        """Record an unreadable part; beyond `MOST_TROUBLE`, only the existence of more."""
+        if text in self.trouble or len(self.trouble) > MOST_TROUBLE:
             return
-        self.trouble.append(what if len(self.trouble) < MOST_TROUBLE else "and more of that kind")
+        self.trouble.append(text if len(self.trouble) < MOST_TROUBLE else "and more of that kind")
 
-    def check_bits(self, what: str, pixels: npt.NDArray[np.uint16]) -> None:
+    def check_bits(self, name: str, pixels: npt.NDArray[np.uint16]) -> None:
         """Complain of an image of 16 bits of which lower ones are used: its high byte is dark."""
-        most = int(pixels.max(initial=0))
-        if 0 < most < 1 << 13:
+        peak = int(pixels.max(initial=0))
+        if 0 < peak < 1 << 13:
             self.complain(
-                f"{what}: the first image uses {most.bit_length()} of its 16 bits; of 16 the high "
+                f"{name}: the first image uses {peak.bit_length()} of its 16 bits; of 16 the high "
                 "byte is taken, so it is dark"
             )
 
@@ -103,19 +103,19 @@ class Choice:
         self._sources = [name for name in only if name not in types]
         self._skip = list(skip)
         self._estimators = {a.source for a in announcements if isinstance(a, EstimatorAnnouncement)}
-        self._known: dict[tuple[type[Event], str], bool] = {}
+        self._answers: dict[tuple[type[Event], str], bool] = {}
         self.unmatched = {*only, *skip}  # names without a matching event so far
 
     def __call__(self, kind: type[Event], source: str) -> bool:
         """Return whether events of a type from a source are wanted."""
         key = kind, source
-        known = self._known.get(key)
-        if known is None:
-            known = self._known[key] = self._wants(kind, source)
-        return known
+        answer = self._answers.get(key)
+        if answer is None:
+            answer = self._answers[key] = self._wants(kind, source)
+        return answer
 
     def announced(self, announcement: Announcement) -> bool:
-        """Tell whether an announcement is to be made again: all are but those of no use."""
+        """Return whether to replay an announcement: all but those without selected events."""
         if any(self._matches(name, type(announcement), announcement.source) for name in self._skip):
             return False
         if isinstance(announcement, EstimatorAnnouncement):
@@ -123,7 +123,7 @@ class Choice:
         return True
 
     def _wants(self, kind: type[Event], source: str) -> bool:
-        # All are looked at, so that `unmatched` is right.
+        # All names are matched, so that `unmatched` is right.
         skipped = [self._matches(name, kind, source) for name in self._skip]
         of_type = [self._matches(name, kind, source) for name in self._types]
         of_source = [self._matches(name, kind, source) for name in self._sources]

@@ -42,8 +42,8 @@ SameFrame = Callable[[str, str], bool]  # whether two frames are at one place, a
 
 def topic_in(bag: Iterable[str], name: str) -> str:
     """Return a bag's topic by its name with or without the leading slash, else `name`."""
-    there = set(bag)
-    return next((topic for topic in (name, f"/{name}", name.lstrip("/")) if topic in there), name)
+    topics = set(bag)
+    return next((topic for topic in (name, f"/{name}", name.lstrip("/")) if topic in topics), name)
 
 
 def source_of(topic: str, use: str, vehicle: str) -> str:
@@ -147,7 +147,7 @@ def guess(
             result.notes.append(
                 f"{name}: not read, as {truth} is taken for the truth; name it in topics to have it"
             )
-    _add_cameras(_one_a_camera(images, result.notes), vehicle, same_frame, result)
+    _add_cameras(_one_per_camera(images, result.notes), vehicle, same_frame, result)
     return result
 
 
@@ -157,9 +157,9 @@ def _other_half(name: str, topics: Mapping[str, tuple[str, int]]) -> str:
     Both have the type of a whole IMU, with zeros for what they do not measure.
     """
     parts = name.split("/")
-    for one, other in (("accel", "gyro"), ("gyro", "accel")):
-        twin = "/".join(other if part == one else part for part in parts)
-        if one in parts and topics.get(twin, ("", 0))[0] == _IMU:
+    for part_name, twin_name in (("accel", "gyro"), ("gyro", "accel")):
+        twin = "/".join(twin_name if part == part_name else part for part in parts)
+        if part_name in parts and topics.get(twin, ("", 0))[0] == _IMU:
             return twin
     return ""
 
@@ -189,12 +189,18 @@ def _images(
             )
             return []
     space, _, last = base.rpartition("/")
-    own = f"{base}/camera_info"
-    beside = f"{space}/camera_info"
+    camera_topic = f"{base}/camera_info"
+    shared_topic = f"{space}/camera_info"
     pipeline = _OF_PIPELINE.fullmatch(last) is not None
     every = {base_of(other) for other, (t, n) in topics.items() if t in {_IMAGE, _COMPRESSED} and n}
     alone = pipeline or sum(other.rpartition("/")[0] == space for other in every) == 1
-    info_topic = own if own in firsts else beside if beside in firsts and alone else ""
+    info_topic = (
+        camera_topic
+        if camera_topic in firsts
+        else shared_topic
+        if shared_topic in firsts and alone
+        else ""
+    )
     info = calibrated.get(base)
     if info is None and info_topic:
         try:
@@ -219,19 +225,19 @@ def _images(
     ]
 
 
-def _one_a_camera(images: list[_Images], notes: list[str]) -> list[_Images]:
+def _one_per_camera(images: list[_Images], notes: list[str]) -> list[_Images]:
     """Return the preferred topic of each camera and kind; the others are noted."""
     groups: dict[tuple[str, bool], list[_Images]] = {}
     for image in images:
         groups.setdefault((image.camera, image.depth), []).append(image)
     chosen = []
     for group in groups.values():
-        first, *others = sorted(group, key=lambda image: image.rank)
+        first, *rejected = sorted(group, key=lambda image: image.rank)
         chosen.append(first)
-        for other in others:
-            what = "rectified images" if is_rectified(other.topic) else "images"
+        for image in rejected:
+            kind = "rectified images" if is_rectified(image.topic) else "images"
             notes.append(
-                f"{other.topic}: not read: {what} of the same camera as {first.topic}, which is; "
+                f"{image.topic}: not read: {kind} of the same camera as {first.topic}, which is; "
                 "to have these instead, name them in topics"
             )
     return sorted(chosen, key=lambda image: (image.depth, image.grey, image.topic))
@@ -243,7 +249,7 @@ def _add_cameras(
     sources: dict[str, str] = {}  # of image topics
     depths: set[str] = set()  # sources that have depth
     for image in chosen:
-        paired, why = (None, "") if not image.depth else _camera_of(image, chosen, same_frame)
+        paired, reason = (None, "") if not image.depth else _camera_of(image, chosen, same_frame)
         if paired is not None and sources[paired.topic] in depths:
             result.notes.append(
                 f"{image.topic}: not read: {sources[paired.topic]} has depth already; to have this "
@@ -262,7 +268,7 @@ def _add_cameras(
         use: Use = "depth" if image.depth else "image"
         result.topics.append(BagTopic(topic=image.topic, use=use, source=source))
         if paired is not None:
-            result.notes.append(f"{image.topic}: depth of {source}, as {paired.topic}{why}")
+            result.notes.append(f"{image.topic}: depth of {source}, as {paired.topic}{reason}")
             continue
         calibration = (
             f"calibration {image.info_topic}" if image.info_topic else "without a calibration"
@@ -272,7 +278,7 @@ def _add_cameras(
         if image.info_topic and is_rectified(image.topic):
             calibration += " (P, rectified)"
         result.notes.append(
-            f"{image.topic}: {use} of {source} ({image.encoding}), {calibration}{why}"
+            f"{image.topic}: {use} of {source} ({image.encoding}), {calibration}{reason}"
         )
         if image.info_topic:
             result.topics.append(BagTopic(topic=image.info_topic, use="camera", source=source))
@@ -303,9 +309,11 @@ def _difference(camera: _Images, depth: _Images) -> str | None:
         if 0 in (*camera.size, *depth.size) or camera.size == depth.size:
             return None
         return f"has {camera.size} pixels, not {depth.size}"
-    one, other = ((i.width, i.height) for i in (camera.info, depth.info))
-    if one != other:
-        return f"has {one[0]} x {one[1]} pixels, not {other[0]} x {other[1]}"
+    camera_size, depth_size = ((i.width, i.height) for i in (camera.info, depth.info))
+    if camera_size != depth_size:
+        return (
+            f"has {camera_size[0]} x {camera_size[1]} pixels, not {depth_size[0]} x {depth_size[1]}"
+        )
     k, d = ([i.fx, i.fy, i.cx, i.cy] for i in (camera.info, depth.info))
     if np.allclose(k, d, rtol=1e-3, atol=0.1):
         return None

@@ -83,10 +83,10 @@ def _pose(row: Row, *, euroc: bool, positions_only: bool) -> list[float]:
     position = row.numbers(1, 4)
     if positions_only:
         return [*position, 1.0, 0.0, 0.0, 0.0]
-    given = row.numbers(4, 8)
-    if len(given) < 4:
+    numbers = row.numbers(4, 8)
+    if len(numbers) < 4:
         row.wrong("a quaternion", f"{len(row.fields)} fields")
-    quaternion = np.array(given if euroc else [given[3], *given[:3]])
+    quaternion = np.array(numbers if euroc else [numbers[3], *numbers[:3]])
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) <= _TOLERANCE:
         row.wrong("a quaternion of length 1", f"w x y z = {quaternion.tolist()}")

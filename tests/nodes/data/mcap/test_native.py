@@ -21,7 +21,7 @@ def test_a_message_gives_back_its_event(event: Event) -> None:
     frame = pack(event).frame()
     message = native.message(frame)
     assert same(native.event(message), event)
-    assert native.lacking(message) == []
+    assert native.missing_arrays(message) == []
     assert native.describe(frame) == (kind_of(type(event)), event.source)
     assert native.fields(message)["stamp"] == 5 or event.stamp == 0
 
@@ -32,7 +32,9 @@ def test_a_message_without_its_arrays_takes_them_from_elsewhere(event: Event) ->
     packed = pack(event)
     message = native.message(packed.frame(), arrays=False)
     assert len(message) < 300
-    assert [array.shape for array in native.lacking(message)] == [a.shape for a in packed.arrays]
+    assert [array.shape for array in native.missing_arrays(message)] == [
+        a.shape for a in packed.arrays
+    ]
     assert same(native.event(message, packed.arrays), event)
 
 
@@ -41,7 +43,7 @@ def test_arrays_of_nothing_are_lacking_or_not() -> None:
     empty = cloud(1, "map", 0, colours=True)
     for arrays in (True, False):
         message = native.message(pack(empty).frame(), arrays)
-        missing = [np.zeros(array.shape, array.dtype) for array in native.lacking(message)]
+        missing = [np.zeros(array.shape, array.dtype) for array in native.missing_arrays(message)]
         assert same(native.event(message, missing), empty)
 
 
@@ -65,6 +67,6 @@ def test_other_arrays_than_those_that_lack_are_refused() -> None:
 @pytest.mark.parametrize("data", [b"", b"\0" * 20, b"\0" * 16 + b"\xff\xff\xff\xff", b"x" * 64])
 def test_nonsense_is_refused(data: bytes) -> None:
     """With an error that says so, whatever is asked of it."""
-    for ask in (native.lacking, native.event, native.fields):
+    for ask in (native.missing_arrays, native.event, native.fields):
         with pytest.raises(WireError):
             ask(data)

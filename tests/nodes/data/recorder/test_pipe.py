@@ -61,7 +61,7 @@ def test_silence_is_noticed() -> None:
             with os.fdopen(here, "wb") as file:
                 writer_process.write(file, 9, writer_process.END)
 
-    assert [record.what for record in writer_process.read_all(there, 0.001, while_idle)] == [
+    assert [record.kind for record in writer_process.read_all(there, 0.001, while_idle)] == [
         writer_process.END
     ]
     assert len(calls) == 2

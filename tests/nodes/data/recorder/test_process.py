@@ -93,9 +93,9 @@ def test_what_is_large_is_in_the_file_once(tmp_path: Path) -> None:
     record(path, [*announcements(), *said(SECOND)])
     with AnyReader([path]) as reader:
         own = {c.topic: data for c, _, data in reader.messages() if "/visnav" in c.topic}
-    assert native.lacking(own["/visnav/drone/front/Image"])
-    assert native.lacking(own["/visnav/map/PointCloud"])
-    assert not native.lacking(own["/visnav/odometry/TrackedFeatures"])
+    assert native.missing_arrays(own["/visnav/drone/front/Image"])
+    assert native.missing_arrays(own["/visnav/map/PointCloud"])
+    assert not native.missing_arrays(own["/visnav/odometry/TrackedFeatures"])
 
 
 def test_times_are_those_of_publication(tmp_path: Path) -> None:

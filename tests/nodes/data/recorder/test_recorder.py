@@ -148,7 +148,7 @@ def test_what_a_failed_chunk_had_is_not_counted(
             writer_process.write(file, stamp, writer_process.EVENT, pack(imu(stamp)))
     reply = process.run(there)
     os.close(there)
-    assert (reply.what, reply.text, reply.written) == ("error", "full", 0)
+    assert (reply.kind, reply.text, reply.written) == ("error", "full", 0)
 
 
 @pytest.mark.slow
@@ -192,12 +192,12 @@ def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> 
     backlog = Backlog(1 << 18, "wait")
     process = WriterProcess(request, backlog, failures.append, lambda _: None)
     process.start()
-    backlog.put(1, big(1))
+    backlog.add(1, big(1))
     wait_for_an_event(path)
     os.kill(process._child.pid, signal.SIGKILL)
     process._child.wait()
     for stamp in range(2, 9):
-        backlog.put(stamp, big(stamp))
+        backlog.add(stamp, big(stamp))
     backlog.wait_for_room()
     assert process.close(9)
     assert process.unwritten <= 7  # what it had written is not among them
@@ -217,7 +217,7 @@ def test_a_run_that_is_killed_leaves_a_whole_file(tmp_path: Path) -> None:
     process = WriterProcess(request, backlog, lambda _: None, lambda _: None)
     process.start()
     for event in said(5):
-        backlog.put(5, event)
+        backlog.add(5, event)
     while backlog.bytes:
         time.sleep(0.01)  # for the thread that hands over
     assert process._child.stdin is not None
@@ -263,14 +263,14 @@ def test_a_process_that_cannot_be_woken_is_ended_and_what_it_had_written_is_kept
     request = WriteRequest(str(path), config)
     process = WriterProcess(request, Backlog(1 << 30, "wait"), failures.append, lambda _: None)
     process.start()
-    process.backlog.put(1, big(1))
+    process.backlog.add(1, big(1))
     wait_for_an_event(path)
     os.kill(process._child.pid, signal.SIGSTOP)
     send = process._child.send_signal
     deaf = {signal.SIGCONT}
     monkeypatch.setattr(process._child, "send_signal", lambda s: s in deaf or send(s))
     for stamp in range(2, 20):
-        process.backlog.put(stamp, big(stamp))
+        process.backlog.add(stamp, big(stamp))
     assert not process.close(20, 0.05)
     assert process.close(20)
     (error,) = failures

@@ -25,7 +25,7 @@ def timed_images(count: int, made: list[int]) -> Iterator[Timed]:
 
 def drain(ahead: ReadAhead) -> list[Batch]:
     batches = []
-    while (batch := ahead.take()) is not None:
+    while (batch := ahead.pop()) is not None:
         batches.append(batch)
     return batches
 
@@ -65,7 +65,7 @@ def test_closing_stops_the_reading() -> None:
             closed.set()
 
     ahead = ReadAhead(events(), 8 * PIXELS)
-    ahead.take()
+    ahead.pop()
     ahead.close()
     assert closed.is_set()
 
@@ -79,6 +79,6 @@ def test_an_error_comes_after_what_was_read_before() -> None:
         raise ReplayError("a.mcap: damaged")
 
     ahead = ReadAhead(events(), 1 << 20)
-    assert len(ahead.take() or []) == MOST
+    assert len(ahead.pop() or []) == MOST
     with pytest.raises(ReplayError, match="damaged"):
-        ahead.take()
+        ahead.pop()

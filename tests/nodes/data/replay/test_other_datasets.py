@@ -53,9 +53,9 @@ def package(monkeypatch: pytest.MonkeyPatch) -> Iterator[Package]:
     offer.loaded = Mine
     for module in ("datasets", "node"):
         monkeypatch.setattr(f"nodes.data.replay.{module}.others", lambda _: (offer,))
-    datasets._others.cache_clear()
+    datasets._other_readers.cache_clear()
     yield offer
-    datasets._others.cache_clear()
+    datasets._other_readers.cache_clear()
 
 
 @pytest.mark.parametrize("folder", [True, False])
@@ -80,7 +80,7 @@ def test_what_it_does_not_know_is_read_as_before(package: Package, tmp_path: Pat
     with pytest.raises(ReplayError, match=r"a data set of mine \(\.mine\), EuRoC's .* or KITTI's"):
         open_reader(ReplayConfig(file=str(tmp_path)), "drone")
     package.loaded = ["a row for judge"]
-    datasets._others.cache_clear()
+    datasets._other_readers.cache_clear()
     with pytest.raises(ReplayError, match=r"a data set of EuRoC's"):
         open_reader(ReplayConfig(file=str(tmp_path)), "drone")
 

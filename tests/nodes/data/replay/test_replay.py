@@ -131,7 +131,7 @@ def test_each_pose_of_a_trajectory_is_when_it_was_played(
 ) -> None:
     timeline, recorded = Timeline(), [10, 30, 50, 80]
     for position, now, *pause in played:
-        timeline.go_on(position, now, pause=bool(pause))
+        timeline.start_stretch(position, now, pause=bool(pause))
     sent = TrajectoryEstimate(
         stamp=80,
         source="slam",
